@@ -1,0 +1,1 @@
+"""Hands and objects authored as USD, and read back from it."""

@@ -1,0 +1,1 @@
+"""Objects: procedural families, mesh import, USD writing and reading, contact sheets."""

@@ -1,0 +1,1 @@
+"""Warp kernels by role, CPU and CUDA from one source; knows Warp only."""

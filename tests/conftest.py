@@ -1,0 +1,30 @@
+"""Fixtures shared by all tests: devices, and the optional folder of real meshes."""
+
+import os
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+wp.config.quiet = True
+
+
+def devices() -> list[str]:
+    """Every Warp device present: the CPU and each CUDA device."""
+    wp.init()
+    return ["cpu", *(d.alias for d in wp.get_cuda_devices())]
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run every test that asks for ``device`` on each device present."""
+    if "device" in metafunc.fixturenames:
+        metafunc.parametrize("device", devices())
+
+
+@pytest.fixture(scope="session")
+def shared_dir() -> Path:
+    """The folder of measured data and meshes that is not part of the project (VD_SHARED, or ../shared)."""
+    folder = Path(os.environ.get("VD_SHARED", Path(__file__).resolve().parents[2] / "shared"))
+    if not folder.is_dir():
+        pytest.skip(f"no shared data at {folder}; set VD_SHARED to a folder with objects/ and dclaw/")
+    return folder

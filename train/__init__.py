@@ -1,0 +1,1 @@
+"""Training: rsl-rl runners, presets and the vd-train command line."""

@@ -1,0 +1,1 @@
+"""Core of Visual Dexterity on Newton: simulation, task, evaluation, viewing and benchmarks."""

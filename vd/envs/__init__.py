@@ -1,0 +1,1 @@
+"""The reorientation task: configuration and the batched environment."""

@@ -1,0 +1,1 @@
+"""Deterministic evaluation of policies: rollouts, statistics, reports."""

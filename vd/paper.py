@@ -1,0 +1,173 @@
+"""Every constant of the task, in one place, with where it comes from.
+
+Units are SI and radians; quaternions are xyzw. Where the released code and the paper disagree,
+the default is the paper's value and the code's value is kept as a ``*_code`` alternative.
+
+Tags used in ``source(...)``:
+
+* ``P``: the paper (Visual Dexterity, Science Robotics 2023), with the equation or table,
+* ``C``: the paper's released code (dexenv),
+* ``U``: the public four-finger URDF of that code,
+* ``D``: derived from the above; the derivation is in the text.
+
+Dimensions, limits, masses and gains of the hands are not here: they live in
+:mod:`vd.assets_usd.hand_spec`, from which the USD is authored, and are read back from the USD.
+"""
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+
+def source(value: Any, tag: str, note: str) -> Any:
+    """A dataclass field with a default and its provenance.
+
+    Args:
+        value: The default value (immutable).
+        tag: Where the value comes from: ``P``, ``C``, ``U`` or ``D``.
+        note: Equation, table or derivation.
+    """
+    return field(default=value, metadata={"tag": tag, "note": note})
+
+
+@dataclass(frozen=True)
+class SceneConstants:
+    """Geometry and timing of the scene, world frame (z up, table top at z = 0)."""
+
+    physics_hz: float = source(120.0, "C", "60 Hz with two PhysX substeps")
+    control_hz: float = source(12.0, "P", "position controllers at 12 Hz (Methods, action space)")
+    episode_s: float = source(10.0, "C", "resetTime: 120 control steps")
+    air_episode_s: float = source(15.0, "P", "in-air test: 180 control steps")
+    table_size_m: tuple[float, float, float] = source((0.6, 0.6, 0.1), "C", "fixed box")
+    table_top_m: float = source(0.0, "C", "table box centred at z = -0.05")
+    hand_height_m: float = source(0.25, "C", "base frame at (0, 0, 0.25), rotated pi about +y")
+    reset_joint_rad: tuple[float, float, float] = source((0.0, 0.8, -1.1), "C", "initial q of every finger")
+    object_start_m: tuple[float, float, float] = source((0.0, 0.0, 0.12), "C", "object reset position")
+    object_start_noise_m: float = source(0.01, "C", "uniform, per axis")
+    goal_position_m: tuple[float, float, float] = source((0.0, 0.0, 0.08), "C", "used by the fall test only")
+
+
+@dataclass(frozen=True)
+class ActionConstants:
+    """Smoothed relative joint increments (paper, Methods, action space)."""
+
+    ema_alpha: float = source(0.8, "P", "abar = alpha a + (1 - alpha) abar_prev")
+    scale_rad_s: float = source(3.5, "C", "target = q + abar * 3.5 rad/s / 12 Hz; nowhere in the paper")
+
+
+@dataclass(frozen=True)
+class ObservationConstants:
+    """Scales of the teacher observation (19G + 21 values, plus the previous action)."""
+
+    velocity_scale: float = source(0.2, "C", "joint and object angular velocity are multiplied by it")
+    noise_mean: float = source(-0.002, "P", "Table S3, state observation N(-0.002, 0.002)")
+    noise_std: float = source(0.002, "P", "Table S3")
+    noise_mean_code: float = source(0.0, "C", "i.i.d. part")
+    noise_offset_std_code: float = source(0.001, "C", "offset fixed between re-draws")
+
+
+@dataclass(frozen=True)
+class RewardConstants:
+    """Equations 1-5, 7 and 8 with the coefficients of Table S1."""
+
+    success: float = source(800.0, "P", "c1, eq. 1, Table S1")
+    rotation: float = source(1.0, "P", "c2, eq. 2, Table S1")
+    rotation_epsilon_rad: float = source(0.4, "P", "epsilon_theta, eq. 2, Table S1")
+    rotation_epsilon_rad_code: float = source(0.1, "C", "0.4 is the success tolerance in the code")
+    fingertip: float = source(-1.0, "P", "c3, eq. 3: sum of squared distances; the code takes the mean distance")
+    energy: float = source(-20.0, "P", "c4, eq. 4")
+    energy_clip_w_code: float = source(10.0, "C", "the code clips sum |qd tau| at 10 W; the paper does not")
+    fall: float = source(-100.0, "P", "c5, eq. 5")
+    table_contact: float = source(-1.0, "P", "c6, eq. 7; off by default in the code")
+    fingertip_height: float = source(-2.0, "P", "c7, eq. 8; absent from the code")
+    fingertip_height_m: float = source(0.16, "P", "p_z of eq. 8, world z in this frame")
+    table_contact_force_n: float = source(0.2, "C", "net table force that counts as contact")
+
+
+@dataclass(frozen=True)
+class SuccessConstants:
+    """Success and fall thresholds (paper, Supplementary Methods, success criteria; Table S1)."""
+
+    rotation_rad: float = source(0.4, "P", "theta; 0.1 in the precise variant")
+    joint_speed_rad_s: float = source(0.25, "P", "norm of qd")
+    object_speed_m_s: float = source(0.04, "P", "norm of v")
+    object_spin_rad_s: float = source(0.5, "P", "norm of omega")
+    action_norm: float = source(1.0, "C", "norm of the smoothed action; threshold only in the code")
+    fall_m: float = source(0.15, "P", "p-bar, eq. 5; distance from goal_position_m as in the code, not squared")
+
+
+@dataclass(frozen=True)
+class RandomisationConstants:
+    """Table S3 and the disturbance force (Supplementary Methods, robust policy learning)."""
+
+    action_noise_std: float = source(0.05, "P", "Table S3")
+    action_offset_std_code: float = source(0.015, "C", "offset fixed between re-draws")
+    stiffness_scale: tuple[float, float] = source((0.8, 1.2), "P", "Table S3")
+    damping_scale: tuple[float, float] = source((0.8, 1.2), "P", "Table S3")
+    link_mass_scale: tuple[float, float] = source((0.8, 1.2), "P", "Table S3")
+    friction: tuple[float, float] = source((0.24, 1.6), "P", "Table S3, robot and objects")
+    table_friction: tuple[float, float] = source((0.05, 1.0), "P", "Table S3")
+    table_friction_code: tuple[float, float] = source((0.005, 1.0), "C", "0.5 x U(0.01, 2)")
+    restitution: tuple[float, float] = source((0.0, 1.0), "P", "Table S3")
+    object_scale: tuple[float, float] = source((0.95, 1.05), "P", "Table S3")
+    object_mass_kg: tuple[float, float] = source((0.009, 0.324), "P", "Table S3")
+    gravity_std_code: float = source(0.4, "C", "m/s^2 per axis; not in the paper")
+    force_probability: float = source(0.2, "P", "per control step")
+    force_n_per_kg: float = source(15.0, "P", "c_d, Table S1: F = 15 m")
+    redraw_s: float = source(100.0, "C", "dynamics are drawn anew at a reset after 1200 control steps")
+
+
+@dataclass(frozen=True)
+class NominalMaterials:
+    """Material values without randomisation."""
+
+    friction: float = source(0.8, "C", "hand and object")
+    table_friction: float = source(0.5, "C", "table")
+    object_mass_kg: float = source(0.1, "D", "middle of the paper's base range U(0.03, 0.18) kg, rounded")
+
+
+@dataclass(frozen=True)
+class TeacherConstants:
+    """PPO of the teacher (Table S1)."""
+
+    num_worlds: int = source(32000, "P", "Table S1; the code uses 8000")
+    rollout_steps: int = source(8, "P", "Table S1")
+    minibatch_size: int = source(64000, "P", "Table S1: 4 minibatches of 32000 x 8")
+    epochs: int = source(12, "P", "Table S1")
+    actor_learning_rate: float = source(3e-4, "P", "Table S1")
+    critic_learning_rate: float = source(1e-3, "P", "Table S1")
+    clip: float = source(0.1, "P", "Table S1")
+    gamma: float = source(0.99, "P", "Table S1")
+    gae_lambda: float = source(0.95, "P", "Table S1")
+    hidden: tuple[int, ...] = source((512, 256, 256), "P", "MLP 512-256-256 ELU")
+    value_coefficient_code: float = source(5e-4, "C", "unclipped MSE; not given in the paper")
+    grad_norm_code: float = source(1.0, "C", "joint norm of actor and critic")
+    initial_log_std_code: float = source(-0.2, "C", "state-independent")
+
+
+@dataclass(frozen=True)
+class PaperConstants:
+    """All constants; ``PAPER`` is the one instance."""
+
+    scene: SceneConstants = SceneConstants()
+    action: ActionConstants = ActionConstants()
+    observation: ObservationConstants = ObservationConstants()
+    reward: RewardConstants = RewardConstants()
+    success: SuccessConstants = SuccessConstants()
+    randomisation: RandomisationConstants = RandomisationConstants()
+    materials: NominalMaterials = NominalMaterials()
+    teacher: TeacherConstants = TeacherConstants()
+
+
+PAPER = PaperConstants()
+"""The one instance of every constant."""
+
+
+def provenance() -> list[tuple[str, Any, str, str]]:
+    """Every constant as ``(dotted name, value, tag, note)``, for tables and tests."""
+    rows = []
+    for group in fields(PAPER):
+        constants = getattr(PAPER, group.name)
+        for item in fields(constants):
+            value = getattr(constants, item.name)
+            rows.append((f"{group.name}.{item.name}", value, item.metadata["tag"], item.metadata["note"]))
+    return rows

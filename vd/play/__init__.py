@@ -1,0 +1,1 @@
+"""Watching a policy: web viewer and headless video."""

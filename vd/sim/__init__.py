@@ -1,0 +1,1 @@
+"""Many worlds in Newton: scene building, stepping, guards."""
