@@ -1,0 +1,211 @@
+"""The teacher's observation: state of hand and object, goal, previous action, with sensor noise.
+
+World frame (z up), metres, radians, quaternions xyzw. G fingers, D = 3 G joints; O = 22 G + 21 values:
+the paper's 19 G + 21 and the previous action.
+"""
+
+import warp as wp
+from vd.kernels.rng import next_stream
+from vd.kernels.transforms import rotation_difference
+
+wp.set_module_options({"enable_backward": False})
+
+JOINTS_PER_FINGER = 3
+FINGERTIP_VALUES = 13
+"""Position 3, quaternion 4, linear velocity 3, angular velocity 3."""
+
+
+def teacher_observation_slices(fingers: int) -> dict[str, slice]:
+    """Columns of each part of the observation, in order, for a hand of ``fingers`` fingers."""
+    joints = JOINTS_PER_FINGER * fingers
+    sizes = {
+        "joint_position": joints,
+        "joint_velocity": joints,
+        "object_position": 3,
+        "object_orientation": 4,
+        "object_velocity": 3,
+        "object_spin": 3,
+        "goal_orientation": 4,
+        "relative_orientation": 4,
+        "fingertips": FINGERTIP_VALUES * fingers,
+        "previous_action": joints,
+    }
+    slices, start = {}, 0
+    for name, size in sizes.items():
+        slices[name] = slice(start, start + size)
+        start += size
+    return slices
+
+
+def teacher_observation_size(fingers: int) -> int:
+    """Number of values in the observation: 22 G + 21."""
+    return teacher_observation_slices(fingers)["previous_action"].stop
+
+
+@wp.struct
+class ObservationParams:
+    """Settings of the observation; an array of length 1 in device memory.
+
+    velocity_scale: Factor on joint velocities and on the object's angular velocity.
+    noise_mean: Mean of the noise on measured values, in their units.
+    noise_std: Standard deviation of that noise, independent in every value and step.
+    """
+
+    velocity_scale: float
+    noise_mean: float
+    noise_std: float
+
+
+@wp.func
+def fingertip_pose(body_q: wp.transform, tip_offset: wp.transform) -> wp.transform:
+    """Pose of a fingertip frame in the world frame."""
+    return wp.transform_multiply(body_q, tip_offset)
+
+
+@wp.func
+def write_vec3(row: int, column: int, value: wp.vec3, out: wp.array2d[float]) -> int:
+    """Write three values to ``out[row, column:]``; returns the next free column."""
+    for i in range(3):
+        out[row, column + i] = value[i]
+    return column + 3
+
+
+@wp.func
+def write_quat(row: int, column: int, value: wp.quat, out: wp.array2d[float]) -> int:
+    """Write xyzw to ``out[row, column:]``; returns the next free column."""
+    for i in range(4):
+        out[row, column + i] = value[i]
+    return column + 4
+
+
+@wp.kernel
+def fingertip_kernel(
+    # Model:
+    tip_body: wp.array[int],
+    tip_offset: wp.array[wp.transform],
+    # In:
+    body_q_in: wp.array2d[wp.transform],
+    # Out:
+    tip_pos_out: wp.array2d[wp.vec3],
+):
+    """Positions of the fingertips in the world frame. Launch: [N, G].
+
+    Args:
+        tip_body: Link of each fingertip, an index within a world, shape [G].
+        tip_offset: Fingertip frame in the frame of its link, shape [G].
+        body_q_in: Link poses in the world frame, shape [N, B].
+        tip_pos_out: Fingertip positions [m], shape [N, G].
+    """
+    world, finger = wp.tid()
+    tip = fingertip_pose(body_q_in[world, tip_body[finger]], tip_offset[finger])
+    tip_pos_out[world, finger] = wp.transform_get_translation(tip)
+
+
+@wp.kernel
+def teacher_observation_kernel(
+    # Model:
+    joint_lower: wp.array[float],
+    joint_upper: wp.array[float],
+    tip_body: wp.array[int],
+    tip_offset: wp.array[wp.transform],
+    body_com: wp.array[wp.vec3],
+    params: wp.array[ObservationParams],
+    # In:
+    joint_q_in: wp.array2d[float],
+    joint_qd_in: wp.array2d[float],
+    body_q_in: wp.array2d[wp.transform],
+    body_qd_in: wp.array2d[wp.spatial_vector],
+    goal_quat_in: wp.array[wp.quat],
+    smoothed_in: wp.array2d[float],
+    observation_offset_in: wp.array2d[float],
+    # In/Out:
+    rng: wp.array[wp.uint32],
+    # Out:
+    observation_out: wp.array2d[float],
+):
+    """Observation of the teacher, columns as in :func:`teacher_observation_slices`. Launch: [N].
+
+    Joint positions are mapped from [lower, upper] to [-1, 1]; the relative orientation is
+    q_object * conj(q_goal). Every measured value gets N(noise_mean, noise_std) + offset; the goal and
+    the previous action are known exactly and get neither.
+
+    Args:
+        joint_lower: Lower joint limits [rad], shape [D].
+        joint_upper: Upper joint limits [rad], shape [D].
+        tip_body: Link of each fingertip, an index within a world, shape [G].
+        tip_offset: Fingertip frame in the frame of its link, shape [G].
+        body_com: Centre of mass of each link in its frame [m], shape [B].
+        params: Settings, shape [1].
+        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
+        joint_qd_in: Hand joints [rad/s], object linear [m/s] and angular [rad/s] velocity, shape [N, D + 6].
+        body_q_in: Link poses in the world frame, shape [N, B].
+        body_qd_in: Link velocities in the world frame: linear of the centre of mass [m/s], angular
+            [rad/s], shape [N, B].
+        goal_quat_in: Wanted orientation of the object, shape [N].
+        smoothed_in: Previous (smoothed) action, shape [N, D].
+        observation_offset_in: Constant error of each measured value, shape [N, O].
+        rng: Random stream of each world, shape [N].
+        observation_out: Observation, shape [N, O].
+    """
+    world = wp.tid()
+    settings = params[0]
+    joints = joint_lower.shape[0]
+
+    for joint in range(joints):
+        span = joint_upper[joint] - joint_lower[joint]
+        above = joint_q_in[world, joint] - joint_lower[joint]
+        observation_out[world, joint] = 2.0 * above / span - 1.0
+        observation_out[world, joints + joint] = settings.velocity_scale * joint_qd_in[world, joint]
+
+    position = wp.vec3(
+        joint_q_in[world, joints], joint_q_in[world, joints + 1], joint_q_in[world, joints + 2]
+    )
+    orientation = wp.quat(
+        joint_q_in[world, joints + 3],
+        joint_q_in[world, joints + 4],
+        joint_q_in[world, joints + 5],
+        joint_q_in[world, joints + 6],
+    )
+    velocity = wp.vec3(
+        joint_qd_in[world, joints], joint_qd_in[world, joints + 1], joint_qd_in[world, joints + 2]
+    )
+    spin = wp.vec3(
+        joint_qd_in[world, joints + 3], joint_qd_in[world, joints + 4], joint_qd_in[world, joints + 5]
+    )
+    goal = goal_quat_in[world]
+
+    column = write_vec3(world, 2 * joints, position, observation_out)
+    column = write_quat(world, column, orientation, observation_out)
+    column = write_vec3(world, column, velocity, observation_out)
+    column = write_vec3(world, column, settings.velocity_scale * spin, observation_out)
+    goal_begin = column
+    column = write_quat(world, column, goal, observation_out)
+    goal_end = column
+    column = write_quat(world, column, rotation_difference(orientation, goal), observation_out)
+
+    for finger in range(tip_body.shape[0]):
+        body = tip_body[finger]
+        pose = body_q_in[world, body]
+        twist = body_qd_in[world, body]
+        tip = fingertip_pose(pose, tip_offset[finger])
+        tip_position = wp.transform_get_translation(tip)
+        angular = wp.spatial_bottom(twist)
+        arm = tip_position - wp.transform_point(pose, body_com[body])
+        linear = wp.spatial_top(twist) + wp.cross(angular, arm)
+        column = write_vec3(world, column, tip_position, observation_out)
+        column = write_quat(world, column, wp.transform_get_rotation(tip), observation_out)
+        column = write_vec3(world, column, linear, observation_out)
+        column = write_vec3(world, column, angular, observation_out)
+
+    measured_end = column
+    for joint in range(joints):
+        observation_out[world, measured_end + joint] = smoothed_in[world, joint]
+
+    state = rng[world]
+    for i in range(measured_end):
+        if i < goal_begin or i >= goal_end:
+            error = settings.noise_mean + observation_offset_in[world, i]
+            if settings.noise_std > 0.0:
+                error += settings.noise_std * wp.randn(state)
+            observation_out[world, i] = observation_out[world, i] + error
+    rng[world] = next_stream(state, world)

@@ -1,0 +1,170 @@
+"""Domain randomisation of Table S3 and the disturbance force on the object.
+
+Draws act on the worlds of an int32 mask; worlds outside it keep every bit. Ranges are (low, high).
+"""
+
+import warp as wp
+from vd.kernels.rng import next_stream, uniform
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class RandomisationParams:
+    """Ranges of the draws; an array of length 1 in device memory.
+
+    stiffness_scale: Factor on each joint's stiffness.
+    damping_scale: Factor on each joint's damping.
+    friction: Friction coefficient of the hand, and of the object.
+    table_friction: Friction coefficient of the table.
+    link_mass_scale: Factor on each link's mass.
+    object_mass: Mass of the object [kg].
+    action_offset_std: Standard deviation of the constant action error, in action units.
+    observation_offset_std: Standard deviation of the constant error of each observed value.
+    """
+
+    stiffness_scale: wp.vec2
+    damping_scale: wp.vec2
+    friction: wp.vec2
+    table_friction: wp.vec2
+    link_mass_scale: wp.vec2
+    object_mass: wp.vec2
+    action_offset_std: float
+    observation_offset_std: float
+
+
+@wp.struct
+class ForceParams:
+    """Settings of the disturbance force; an array of length 1 in device memory.
+
+    probability: Probability of a new force in a control step.
+    force_per_mass: Magnitude of a new force per mass of the object, c_d [N/kg].
+    decay: Factor on the force in a step without a new one: 0 in the paper, 0.998 in the released code.
+    """
+
+    probability: float
+    force_per_mass: float
+    decay: float
+
+
+@wp.kernel
+def draw_dynamics_kernel(
+    # Model:
+    nominal_kp: wp.array[float],
+    nominal_kd: wp.array[float],
+    params: wp.array[RandomisationParams],
+    # In:
+    mask_in: wp.array[int],
+    # In/Out:
+    rng: wp.array[wp.uint32],
+    # Out:
+    kp_out: wp.array2d[float],
+    kd_out: wp.array2d[float],
+    hand_friction_out: wp.array[float],
+    object_friction_out: wp.array[float],
+    table_friction_out: wp.array[float],
+    action_offset_out: wp.array2d[float],
+    observation_offset_out: wp.array2d[float],
+):
+    """Draw gains, frictions and constant errors of the masked worlds (Table S3). Launch: [N].
+
+    Args:
+        nominal_kp: Stiffness before randomisation [N m/rad], shape [D].
+        nominal_kd: Damping before randomisation [N m s/rad], shape [D].
+        params: Ranges, shape [1].
+        mask_in: 1 where a world is drawn anew, shape [N].
+        rng: Random stream of each world, shape [N].
+        kp_out: Stiffness [N m/rad], independent per joint, shape [N, D].
+        kd_out: Damping [N m s/rad], independent per joint, shape [N, D].
+        hand_friction_out: Friction coefficient of all hand shapes, shape [N].
+        object_friction_out: Friction coefficient of the object, shape [N].
+        table_friction_out: Friction coefficient of the table, shape [N].
+        action_offset_out: Constant action error, action units, shape [N, D].
+        observation_offset_out: Constant error of each observed value, shape [N, O].
+    """
+    world = wp.tid()
+    if mask_in[world] == 0:
+        return
+    settings = params[0]
+    state = rng[world]
+
+    for joint in range(nominal_kp.shape[0]):
+        state, kp_scale = uniform(state, settings.stiffness_scale)
+        state, kd_scale = uniform(state, settings.damping_scale)
+        kp_out[world, joint] = nominal_kp[joint] * kp_scale
+        kd_out[world, joint] = nominal_kd[joint] * kd_scale
+        action_offset_out[world, joint] = settings.action_offset_std * wp.randn(state)
+    state, hand_friction = uniform(state, settings.friction)
+    state, object_friction = uniform(state, settings.friction)
+    state, table_friction = uniform(state, settings.table_friction)
+    hand_friction_out[world] = hand_friction
+    object_friction_out[world] = object_friction
+    table_friction_out[world] = table_friction
+    for i in range(observation_offset_out.shape[1]):
+        observation_offset_out[world, i] = settings.observation_offset_std * wp.randn(state)
+    rng[world] = next_stream(state, world)
+
+
+@wp.kernel
+def draw_masses_kernel(
+    # Model:
+    params: wp.array[RandomisationParams],
+    # In:
+    mask_in: wp.array[int],
+    # In/Out:
+    rng: wp.array[wp.uint32],
+    # Out:
+    link_mass_scale_out: wp.array2d[float],
+    object_mass_out: wp.array[float],
+):
+    """Draw link and object masses of the masked worlds (Table S3). Launch: [N].
+
+    Args:
+        params: Ranges, shape [1].
+        mask_in: 1 where a world is drawn anew, shape [N].
+        rng: Random stream of each world, shape [N].
+        link_mass_scale_out: Factor on each link's mass, shape [N, L].
+        object_mass_out: Mass of the object [kg], shape [N].
+    """
+    world = wp.tid()
+    if mask_in[world] == 0:
+        return
+    settings = params[0]
+    state = rng[world]
+    for link in range(link_mass_scale_out.shape[1]):
+        state, scale = uniform(state, settings.link_mass_scale)
+        link_mass_scale_out[world, link] = scale
+    state, mass = uniform(state, settings.object_mass)
+    object_mass_out[world] = mass
+    rng[world] = next_stream(state, world)
+
+
+@wp.kernel
+def disturbance_force_kernel(
+    # Model:
+    object_mass: wp.array[float],
+    params: wp.array[ForceParams],
+    # In/Out:
+    force: wp.array[wp.vec3],
+    rng: wp.array[wp.uint32],
+):
+    """Disturbance force on the object for one control step (Supplementary Methods). Launch: [N].
+
+    With the given probability a new force of magnitude c_d m in a uniform random direction; otherwise
+    the old one times ``decay``.
+
+    Args:
+        object_mass: Mass of the object [kg], shape [N].
+        params: Settings, shape [1].
+        force: Force at the object's centre of mass, world frame [N], shape [N].
+        rng: Random stream of each world, shape [N].
+    """
+    world = wp.tid()
+    settings = params[0]
+    state = rng[world]
+    if wp.randf(state) < settings.probability:
+        direction = wp.sample_unit_sphere_surface(state)
+        force[world] = settings.force_per_mass * object_mass[world] * direction
+    else:
+        force[world] = settings.decay * force[world]
+    rng[world] = next_stream(state, world)

@@ -1,0 +1,78 @@
+"""Rotations and points: differences, angles, uniform draws on SO(3), points carried by links.
+
+Quaternions are xyzw and of unit length; angles are in radians, positions in metres.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+PI = wp.constant(3.14159265358979)
+
+
+@wp.func
+def rotation_difference(q: wp.quat, q_goal: wp.quat) -> wp.quat:
+    """Rotation from ``q_goal`` to ``q`` in the world frame: q * conj(q_goal)."""
+    return q * wp.quat(-q_goal[0], -q_goal[1], -q_goal[2], q_goal[3])
+
+
+@wp.func
+def rotation_angle(q: wp.quat) -> float:
+    """Angle of the rotation ``q`` in [0, pi]: 2 asin(min(norm(vec(q)), 1)). The same for q and -q."""
+    return 2.0 * wp.asin(wp.min(wp.length(wp.vec3(q[0], q[1], q[2])), 1.0))
+
+
+@wp.func
+def random_rotation(rng: wp.uint32):
+    """Draw uniformly from SO(3): four standard normals, normalised. Returns ``(rng, quaternion)``."""
+    x = wp.randn(rng)
+    y = wp.randn(rng)
+    z = wp.randn(rng)
+    w = wp.randn(rng)
+    return rng, wp.normalize(wp.quat(x, y, z, w))
+
+
+@wp.func
+def random_rotation_within(rng: wp.uint32, max_angle: float):
+    """Draw uniformly (Haar) among the rotations of at most ``max_angle``; returns ``(rng, quaternion)``.
+
+    The axis is uniform on the sphere and the angle has density proportional to 1 - cos(angle) on
+    [0, max_angle]. It is drawn by rejection from the density proportional to angle^2, which bounds it
+    (1 - cos(a) <= a^2 / 2); 61 % are accepted at max_angle = pi, more below. ``max_angle >= pi`` is all
+    of SO(3).
+    """
+    bound = wp.clamp(max_angle, 0.0, PI)
+    half = wp.float32(0.0)
+    accepted = wp.bool(False)
+    while not accepted:
+        half = 0.5 * bound * wp.pow(1.0 - wp.randf(rng), 1.0 / 3.0)
+        sine = wp.sin(half)
+        accepted = wp.randf(rng) * half * half <= sine * sine
+    axis = wp.sample_unit_sphere_surface(rng)
+    vector = axis * wp.sin(half)
+    return rng, wp.quat(vector[0], vector[1], vector[2], wp.cos(half))
+
+
+@wp.kernel
+def transform_link_points_kernel(
+    # Model:
+    points_in: wp.array[wp.vec3],
+    point_body_in: wp.array[int],
+    # In:
+    body_q_in: wp.array2d[wp.transform],
+    frame_in: wp.transform,
+    # Out:
+    points_out: wp.array2d[wp.vec3],
+):
+    """Carry points fixed to links into one frame: inverse(frame) * body_q * point. Launch: [N, P].
+
+    Args:
+        points_in: Points in the frame of their link [m], shape [P].
+        point_body_in: Link of each point, an index within a world, shape [P].
+        body_q_in: Link poses in the world frame, shape [N, B].
+        frame_in: Pose in the world frame of the frame in which the points are wanted.
+        points_out: Points in that frame [m], shape [N, P].
+    """
+    world, point = wp.tid()
+    link = wp.transform_multiply(wp.transform_inverse(frame_in), body_q_in[world, point_body_in[point]])
+    points_out[world, point] = wp.transform_point(link, points_in[point])
