@@ -1,0 +1,146 @@
+"""Errors, chance and intervals of the evaluation, against what is known of them."""
+
+import itertools
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vd.evaluate.statistics import (
+    CHANCE_MEAN_RAD,
+    chance_cdf,
+    choose_unit,
+    median_interval,
+    order_interval,
+    quat_multiply,
+    rate_intervals,
+    rotation_angle,
+    symmetric_error,
+)
+
+IDENTITY = np.array([[0.0, 0.0, 0.0, 1.0]])
+CUBE = Rotation.create_group("O").as_quat()
+
+
+def test_angle_agrees_with_scipy_at_every_size():
+    rng = np.random.default_rng(0)
+    a = Rotation.random(200, rng=rng)
+    axis = Rotation.random(200, rng=rng).apply([0.0, 0.0, 1.0])
+    angle = np.concatenate([10.0 ** rng.uniform(-9, 0, 100), rng.uniform(0, np.pi, 99), [np.pi]])
+    b = a * Rotation.from_rotvec(axis * angle[:, None])
+    np.testing.assert_allclose(rotation_angle(a.as_quat(), b.as_quat()), angle, atol=1e-14, rtol=1e-6)
+    np.testing.assert_allclose(rotation_angle(a.as_quat(), -b.as_quat()), angle, atol=1e-14, rtol=1e-6)
+    np.testing.assert_allclose(
+        quat_multiply(a.as_quat(), b.as_quat()), (a * b).as_quat(canonical=False), atol=1e-12
+    )
+
+
+def test_cube_error_is_the_least_over_its_24_rotations():
+    rng = np.random.default_rng(1)
+    goal = Rotation.random(50, rng=rng)
+    offset = Rotation.from_rotvec(Rotation.random(50, rng=rng).apply([0.0, 0.0, 0.2]))
+    assert len(CUBE) == 24
+    for symmetry in Rotation.from_quat(CUBE):
+        turned = (offset * goal * symmetry).as_quat()
+        np.testing.assert_allclose(symmetric_error(turned, goal.as_quat(), CUBE), 0.2, atol=1e-9)
+    # Nothing is farther from a cube's symmetries than 62.8 degrees.
+    far = symmetric_error(Rotation.random(5000, rng=rng).as_quat(), IDENTITY, CUBE)
+    assert far.max() < np.deg2rad(62.81)
+    quarter_turn = Rotation.from_euler("x", 90, degrees=True).as_quat()
+    assert symmetric_error(quarter_turn, IDENTITY[0], CUBE) == pytest.approx(0.0, abs=1e-9)
+    assert symmetric_error(quarter_turn, IDENTITY[0], IDENTITY) == pytest.approx(np.pi / 2)
+
+
+def test_chance_matches_random_rotations():
+    errors = rotation_angle(Rotation.random(200_000, rng=np.random.default_rng(2)).as_quat(), IDENTITY)
+    assert errors.mean() == pytest.approx(CHANCE_MEAN_RAD, abs=0.01)
+    for angle in (0.1, 0.4, 0.8, 2.0):
+        assert (errors <= angle).mean() == pytest.approx(chance_cdf(angle), abs=0.003)
+    assert chance_cdf(0.4) == pytest.approx(0.0034, abs=5e-5)
+    # Small balls around 24 equivalent goals do not meet: 24 times the chance.
+    assert chance_cdf(0.4, CUBE) == pytest.approx(24 * chance_cdf(0.4), rel=0.05)
+    assert chance_cdf(np.pi, CUBE) == 1.0
+
+
+def covers(interval, truth):
+    return interval.low <= truth <= interval.high
+
+
+def test_bca_covers_a_known_rate():
+    rng = np.random.default_rng(3)
+    outcomes = rng.random((300, 1, 100)) < 0.3
+    intervals = rate_intervals(outcomes, "episode")
+    assert all(i.method == "bca" for i in intervals)
+    assert 0.91 <= np.mean([covers(i, 0.3) for i in intervals]) <= 0.98
+
+
+def test_bca_covers_a_known_skewed_median():
+    rng = np.random.default_rng(4)
+    covered = [
+        covers(median_interval(rng.exponential(size=(1, 60)), "episode"), np.log(2)) for _ in range(60)
+    ]
+    assert np.mean(covered) >= 0.87
+
+
+def test_resampling_objects_covers_new_objects_and_resampling_episodes_does_not():
+    rng = np.random.default_rng(5)
+    rates = rng.beta(0.5, 0.5, size=(100, 20))  # objects differ strongly; mean rate 1/2
+    outcomes = rng.random((100, 20, 20)) < rates[..., None]
+    by_object = rate_intervals(outcomes, "object")
+    by_episode = rate_intervals(outcomes, "episode")
+    assert np.mean([covers(i, 0.5) for i in by_object]) >= 0.88
+    assert np.mean([covers(i, 0.5) for i in by_episode]) <= 0.7
+    # For these very objects the stratified interval is right, and narrower.
+    covered = [covers(i, truth) for i, truth in zip(by_episode, rates.mean(axis=1), strict=True)]
+    assert np.mean(covered) >= 0.9
+    assert all(i.value == pytest.approx(j.value) for i, j in zip(by_object, by_episode, strict=True))
+
+
+@pytest.mark.parametrize("unit", ["object", "episode"])
+@pytest.mark.parametrize("outcome", [False, True])
+def test_a_sample_without_spread_has_an_exact_interval(unit, outcome):
+    (interval,) = rate_intervals(np.full((1, 10, 30), outcome), unit)
+    size = 10 if unit == "object" else 300
+    width = 1 - 0.025 ** (1 / size)
+    assert interval.method == "clopper-pearson"
+    assert (interval.low, interval.high) == pytest.approx((1 - width, 1.0) if outcome else (0.0, width))
+
+
+def test_equal_rates_of_all_objects_do_not_look_certain():
+    outcomes = np.tile([True, False], (1, 10, 5))
+    (interval,) = rate_intervals(outcomes, "object")
+    assert interval.value == 0.5
+    assert interval.low < 0.3 and interval.high > 0.7
+
+
+@pytest.mark.parametrize("shape", list(itertools.product([1, 2, 9], [1, 2, 7])))
+@pytest.mark.parametrize("unit", ["object", "episode"])
+def test_small_samples_give_finite_intervals(shape, unit):
+    rng = np.random.default_rng(6)
+    intervals = [
+        *rate_intervals(rng.random((3, *shape)) < 0.5, unit),
+        median_interval(rng.random(shape), unit),
+    ]
+    for interval in intervals:
+        assert np.isfinite([interval.value, interval.low, interval.high]).all()
+        assert interval.low <= interval.value <= interval.high
+
+
+def test_median_of_objects_is_wider_where_objects_differ():
+    rng = np.random.default_rng(7)
+    values = rng.uniform(0, 3, size=(12, 1)) + 0.01 * rng.random((12, 50))
+    by_object, by_episode = median_interval(values, "object"), median_interval(values, "episode")
+    assert by_object.value == by_episode.value == pytest.approx(np.median(values))
+    assert by_object.high - by_object.low > 5 * (by_episode.high - by_episode.low)
+
+
+def test_order_interval_covers():
+    rng = np.random.default_rng(8)
+    covered = [covers(order_interval(rng.exponential(size=25)), np.log(2)) for _ in range(400)]
+    assert np.mean(covered) >= 0.94
+
+
+def test_the_unit_is_objects_once_there_are_enough():
+    assert choose_unit(3) == "episode"
+    assert choose_unit(24) == "object"
+    assert choose_unit(24, "episode") == "episode"
