@@ -1,0 +1,157 @@
+"""Bookkeeping over worlds: masks, statistics, and randomised values written into the simulator's model."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def world_mask_kernel(
+    # In:
+    mask_in: wp.array[wp.int32],
+    # Out:
+    mask_out: wp.array[wp.bool],
+):
+    """Turn a 0/1 mask, shape [N], into Newton's, shape [N + 1]; its last entry (global) is untouched."""
+    world = wp.tid()
+    mask_out[world] = mask_in[world] != 0
+
+
+@wp.kernel
+def redraw_mask_kernel(
+    # In:
+    reset_in: wp.array[wp.int32],
+    interval: int,
+    # In/Out:
+    age: wp.array[wp.int32],
+    # Out:
+    mask_out: wp.array[wp.int32],
+):
+    """Select worlds that reset and whose dynamics are at least ``interval`` control steps old.
+
+    Args:
+        reset_in: 1 where a world resets in this step, shape [N].
+        interval: Control steps for which drawn dynamics are kept at least.
+        age: Control steps since the last draw, shape [N]; counted here, zeroed where selected.
+        mask_out: 1 where dynamics are to be drawn anew, shape [N].
+    """
+    world = wp.tid()
+    age[world] = age[world] + 1
+    mask_out[world] = 0
+    if reset_in[world] != 0 and age[world] >= interval:
+        mask_out[world] = 1
+        age[world] = 0
+
+
+@wp.kernel
+def write_gains_kernel(
+    # In:
+    kp_in: wp.array2d[float],
+    kd_in: wp.array2d[float],
+    # Out:
+    model_kp: wp.array2d[float],
+    model_kd: wp.array2d[float],
+):
+    """Copy gains, shape [N, D], into the first D columns of the model's. Launch [N, D]."""
+    world, joint = wp.tid()
+    model_kp[world, joint] = kp_in[world, joint]
+    model_kd[world, joint] = kd_in[world, joint]
+
+
+@wp.kernel
+def write_friction_kernel(
+    # Model:
+    shape_world: wp.array[wp.int32],
+    shape_kind: wp.array[wp.int32],
+    nominal: wp.array[float],
+    nominal_hand: float,
+    kind_table: int,
+    kind_object: int,
+    kind_hand: int,
+    # In:
+    hand_friction: wp.array[float],
+    object_friction: wp.array[float],
+    table_friction: wp.array[float],
+    # Out:
+    friction_out: wp.array[float],
+):
+    """Write each shape's friction so that the solver's pair value is the average of the two bodies'.
+
+    The solver takes the friction of the geom with the higher priority: table over hand over object.
+    So the table carries the average of table and object, a hand shape that of hand and object; a
+    fingertip whose material differs from the nominal hand's keeps its ratio to it. Launch [S].
+
+    Args:
+        shape_world: World of each shape, shape [S].
+        shape_kind: Kind of each shape, shape [S].
+        nominal: Friction of each shape before randomisation, shape [S].
+        nominal_hand: Friction of the hand that ``hand_friction`` replaces.
+        kind_table: Kind of the table.
+        kind_object: Kind of the object's parts.
+        kind_hand: Kind of the hand's shapes.
+        hand_friction: Friction of the hand in each world, shape [N].
+        object_friction: Friction of the object in each world, shape [N].
+        table_friction: Friction of the table in each world, shape [N].
+        friction_out: Friction of each shape, shape [S].
+    """
+    shape = wp.tid()
+    world = shape_world[shape]
+    if world < 0:
+        return
+    kind = shape_kind[shape]
+    if kind == kind_object:
+        friction_out[shape] = object_friction[world]
+    elif kind == kind_table:
+        friction_out[shape] = 0.5 * (table_friction[world] + object_friction[world])
+    elif kind == kind_hand:
+        hand = hand_friction[world] * nominal[shape] / nominal_hand
+        friction_out[shape] = 0.5 * (hand + object_friction[world])
+
+
+@wp.kernel
+def write_object_force_kernel(
+    # In:
+    force_in: wp.array[wp.vec3],
+    object_body: int,
+    # Out:
+    body_force_out: wp.array2d[wp.spatial_vector],
+):
+    """Write a force [N] at the object's centre of mass, shape [N], into the body forces, shape [N, B]."""
+    world = wp.tid()
+    body_force_out[world, object_body] = wp.spatial_vector(force_in[world], wp.vec3(0.0))
+
+
+@wp.kernel
+def record_step_kernel(
+    # In:
+    joint_q: wp.array2d[float],
+    object_column: int,
+    # Out:
+    object_pose_out: wp.array[wp.transform],
+):
+    """Copy the object's pose (world frame) out of the joint positions, shape [N]."""
+    world = wp.tid()
+    c = object_column
+    object_pose_out[world] = wp.transform(
+        wp.vec3(joint_q[world, c], joint_q[world, c + 1], joint_q[world, c + 2]),
+        wp.quat(joint_q[world, c + 3], joint_q[world, c + 4], joint_q[world, c + 5], joint_q[world, c + 6]),
+    )
+
+
+@wp.kernel
+def count_goals_kernel(
+    # In:
+    success: wp.array[wp.int32],
+    fell: wp.array[wp.int32],
+    done: wp.array[wp.int32],
+    # In/Out:
+    counts: wp.array[float],
+):
+    """Add up over worlds: goals ended, goals reached, objects dropped. ``counts`` has shape [3]."""
+    world = wp.tid()
+    if done[world] != 0:
+        wp.atomic_add(counts, 0, 1.0)
+    if success[world] != 0:
+        wp.atomic_add(counts, 1, 1.0)
+    if fell[world] != 0:
+        wp.atomic_add(counts, 2, 1.0)

@@ -1,0 +1,156 @@
+"""``vd-bench sim``: control steps per second, memory and start-up, all measured in one run.
+
+Every row says what it includes. Physics only replays the solver's steps of a control step; the
+whole step adds actions, observations, rewards, resets and randomisation; with a policy adds its
+network and noise. States come from that policy's own actions in contact.
+"""
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from vd.envs.cfg import ReorientCfg, RewardCfg
+from vd.envs.reorient import ReorientEnv
+
+WARM_UP_STEPS = 36
+"""Control steps before timing: objects have landed and fingers reached them (3 s)."""
+
+
+@dataclass(frozen=True)
+class SimRow:
+    """One measured configuration."""
+
+    scene: str
+    """What was simulated."""
+    worlds: int
+    """Worlds side by side."""
+    physics_only: float
+    """Control steps/s of the physics alone, over all worlds."""
+    whole_step: float
+    """Control steps/s of the environment's step."""
+    with_policy: float
+    """Control steps/s with a policy network and its exploration noise."""
+    own_kernels: float
+    """Share of our kernels in the environment's step, in [0, 1]."""
+    memory_gb: float
+    """Device memory of simulation and environment [GB]; 0 on the CPU."""
+    start_s: float
+    """From an empty process state to the first finished step, kernels included [s]."""
+    contacts_mean: float
+    """Contacts per world, mean over worlds at the end."""
+    rows_max: int
+    """Most constraint rows in any world at the end."""
+
+
+def seconds_per_call(function: Any, calls: int, device: str) -> float:
+    """Mean wall time of ``calls`` calls [s], device work included."""
+    wp.synchronize_device(device)
+    start = time.perf_counter()
+    for _ in range(calls):
+        function()
+    wp.synchronize_device(device)
+    return (time.perf_counter() - start) / calls
+
+
+def captured(function: Any, device: str) -> Any:
+    """``function`` as one CUDA graph launch; itself on the CPU."""
+    if device == "cpu":
+        return function
+    with wp.ScopedCapture(device=device) as capture:
+        function()
+    return lambda: wp.capture_launch(capture.graph)
+
+
+def reaching_policy(env: ReorientEnv, seed: int) -> Any:
+    """A stand-in for an untrained teacher: its network with random weights, noisy, biased to close the hand.
+
+    The bias bends every finger inward for half of each second, so that fingers push the object around.
+    """
+    import torch
+
+    generator = torch.Generator().manual_seed(seed)
+    sizes = [env.num_observations, 512, 256, 256, env.num_actions]
+    layers: list[Any] = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [torch.nn.Linear(inputs, outputs), torch.nn.ELU()]
+    network = torch.nn.Sequential(*layers[:-1])
+    for parameter in network.parameters():
+        parameter.data = 0.1 * torch.randn(parameter.shape, generator=generator)
+    network.to(torch.device(str(env.device)))
+    observation, action = wp.to_torch(env.observation), wp.to_torch(env.action)
+    inward = torch.tensor([0.0, -1.0, -0.6] * env.num_fingers, device=action.device)
+    period = round(env.cfg.sim.control_hz)
+    count = 0
+
+    def act() -> None:
+        nonlocal count
+        closing = 1.0 if (count // (period // 2)) % 2 == 0 else -0.5
+        with torch.no_grad():
+            noise = 0.6 * torch.randn_like(action)
+            action.copy_((torch.tanh(network(observation)) * 0.3 + closing * inward + noise).clamp(-1.0, 1.0))
+        count += 1
+
+    return act
+
+
+def measure(
+    cfg: ReorientCfg, device: str, *, calls: int = 24, seed: int = 0, label: str = "mixed objects"
+) -> SimRow:
+    """Measure one configuration; raises if any contact was lost."""
+    begin = time.perf_counter()
+    on_gpu = device != "cpu"
+    before = free_memory(device) if on_gpu else 0
+    env = ReorientEnv(cfg, device)
+    policy = reaching_policy(env, seed)
+    env.step(env.action)
+    wp.synchronize_device(device)
+    start_s = time.perf_counter() - begin
+    memory = (before - free_memory(device)) / 1e9 if on_gpu else 0.0
+    for _ in range(WARM_UP_STEPS):
+        policy()
+        env.step(env.action)
+    env.check()
+
+    def with_policy() -> None:
+        policy()
+        env.step(env.action)
+
+    policy_time = seconds_per_call(with_policy, calls, device)
+    step_time = seconds_per_call(lambda: env.step(env.action), calls, device)
+    physics_time = seconds_per_call(captured(env.sim.physics_only, device), calls, device)
+    env.check()
+    data = env.sim.solver.mjw_data
+    n = cfg.num_worlds
+    return SimRow(
+        scene=label,
+        worlds=n,
+        physics_only=n / physics_time,
+        whole_step=n / step_time,
+        with_policy=n / policy_time,
+        own_kernels=max(0.0, 1.0 - physics_time / step_time),
+        memory_gb=memory,
+        start_s=start_s,
+        contacts_mean=float(data.nacon.numpy()[0]) / n,
+        rows_max=int(np.max(data.nefc.numpy())),
+    )
+
+
+def free_memory(device: str) -> int:
+    """Free memory of a CUDA device [bytes], after returning what allocators hold back."""
+    import torch
+
+    torch.cuda.empty_cache()
+    wp.set_mempool_release_threshold(device, 0)
+    wp.synchronize_device(device)
+    return int(wp.get_device(device).free_memory)
+
+
+def task(objects: tuple[str, ...], worlds: int, hand: str, randomise: bool) -> ReorientCfg:
+    """The benchmark's task: the paper's, with table support so that contacts are many."""
+    cfg = ReorientCfg(hand=hand, objects=objects, num_worlds=worlds, reward=RewardCfg(table_contact=0.0))
+    return dataclasses.replace(cfg, randomisation=dataclasses.replace(cfg.randomisation, enabled=randomise))

@@ -1,0 +1,178 @@
+"""Configuration of the reorientation task; every default is the paper's."""
+
+from dataclasses import dataclass, field
+from math import pi
+
+from vd.paper import PAPER
+from vd.sim.cfg import SimCfg
+
+
+@dataclass(frozen=True)
+class ActionCfg:
+    """Smoothed relative joint increments."""
+
+    ema_alpha: float = PAPER.action.ema_alpha
+    """Weight of the new action in the moving average."""
+    scale_rad_s: float = PAPER.action.scale_rad_s
+    """Joint speed that an action of 1 asks for [rad/s]."""
+
+
+@dataclass(frozen=True)
+class RewardCfg:
+    """Coefficients of equations 1-5, 7 and 8, and of our own shaping (off by default)."""
+
+    success: float = PAPER.reward.success
+    """c1: once for each goal reached."""
+    rotation: float = PAPER.reward.rotation
+    """c2: times 1 / (error + rotation_epsilon_rad)."""
+    rotation_epsilon_rad: float = PAPER.reward.rotation_epsilon_rad
+    """epsilon_theta [rad]; the released code uses 0.1."""
+    fingertip: float = PAPER.reward.fingertip
+    """c3: times the summed squared distance of fingertips and object."""
+    fingertip_mean_distance: bool = False
+    """Use the released code's form of c3: the mean distance."""
+    energy: float = PAPER.reward.energy
+    """c4: times the mechanical power [W]."""
+    energy_clip_w: float = 0.0
+    """Largest power that is counted [W]; 0 counts all (paper). The released code clips at 10."""
+    fall: float = PAPER.reward.fall
+    """c5: when the object leaves the workspace."""
+    table_contact: float = PAPER.reward.table_contact
+    """c6: while the object touches the table. Set 0 to learn with table support."""
+    fingertip_height: float = PAPER.reward.fingertip_height
+    """c7: for each fingertip above fingertip_height_m."""
+    progress: float = 0.0
+    """Ours: per radian by which the error fell since the last step."""
+    scale: float = 1.0
+    """Ours: factor on the sum; changes no optimum, keeps value targets near 1."""
+
+
+@dataclass(frozen=True)
+class SuccessCfg:
+    """When a goal counts as reached, and when the object counts as lost."""
+
+    rotation_rad: float = PAPER.success.rotation_rad
+    """Largest rotation error [rad]."""
+    joint_speed_rad_s: float = PAPER.success.joint_speed_rad_s
+    """Largest norm of the joint velocities [rad/s]; 0 does not ask."""
+    object_speed_m_s: float = PAPER.success.object_speed_m_s
+    """Largest speed of the object [m/s]; 0 does not ask."""
+    object_spin_rad_s: float = PAPER.success.object_spin_rad_s
+    """Largest angular speed of the object [rad/s]; 0 does not ask."""
+    action_norm: float = PAPER.success.action_norm
+    """Largest norm of the smoothed action; 0 does not ask."""
+    no_table_contact: bool = False
+    """Also ask that the object does not touch the table (in-air policies)."""
+    fall_m: float = PAPER.success.fall_m
+    """Distance from the goal position at which the object counts as lost [m]."""
+
+
+@dataclass(frozen=True)
+class GoalCfg:
+    """Which goals are drawn."""
+
+    max_angle_rad: float = pi
+    """Goals lie within this angle of the object's present orientation, uniform (Haar); pi is all of SO(3)."""
+
+
+@dataclass(frozen=True)
+class CurriculumCfg:
+    """Ours: make the task harder as the success rate allows. Off by default.
+
+    While the success rate of goals is above ``raise_at`` the difficulty grows by ``rate`` per update,
+    while it is below ``lower_at`` it shrinks; in between it stays. Difficulty 0 is ``stillness_start``
+    times the stillness thresholds and ``goal_start_rad``; difficulty 1 is the configured task.
+    """
+
+    enabled: bool = False
+    """Whether difficulty starts at 0 rather than 1."""
+    stillness_start: float = 12.0
+    """Factor on the four stillness thresholds at difficulty 0."""
+    goal_start_rad: float = 1.0
+    """Largest goal angle at difficulty 0 [rad]."""
+    raise_at: float = 0.6
+    """Success rate of goals above which the task gets harder."""
+    lower_at: float = 0.3
+    """Success rate of goals below which the task gets easier."""
+    rate: float = 0.02
+    """Change of the difficulty per update (one update each training iteration)."""
+    energy_start: float = 0.0
+    """Factor on the energy term at difficulty 0; it grows to 1."""
+
+
+@dataclass(frozen=True)
+class RandomisationCfg:
+    """Table S3 and the disturbance force."""
+
+    enabled: bool = True
+    """Randomise at all."""
+    stiffness_scale: tuple[float, float] = PAPER.randomisation.stiffness_scale
+    damping_scale: tuple[float, float] = PAPER.randomisation.damping_scale
+    link_mass_scale: tuple[float, float] = PAPER.randomisation.link_mass_scale
+    friction: tuple[float, float] = PAPER.randomisation.friction
+    table_friction: tuple[float, float] = PAPER.randomisation.table_friction
+    object_scale: tuple[float, float] = PAPER.randomisation.object_scale
+    object_scale_count: int = 3
+    """Object sizes are this many even steps of ``object_scale``: every size is a set of compiled meshes."""
+    object_mass_kg: tuple[float, float] = PAPER.randomisation.object_mass_kg
+    action_noise_std: float = PAPER.randomisation.action_noise_std
+    action_offset_std: float = 0.0
+    """The released code adds a constant offset of std 0.015."""
+    observation_noise_mean: float = PAPER.observation.noise_mean
+    observation_noise_std: float = PAPER.observation.noise_std
+    observation_offset_std: float = 0.0
+    """The released code adds a constant offset of std 0.001."""
+    force_probability: float = PAPER.randomisation.force_probability
+    force_n_per_kg: float = PAPER.randomisation.force_n_per_kg
+    force_decay: float = 0.0
+    """What remains of a force in the next control step: 0 in the paper, 0.998 in the released code."""
+    redraw_s: float = PAPER.randomisation.redraw_s
+    """Gains and frictions are drawn anew at the first reset after this time [s]."""
+
+
+@dataclass(frozen=True)
+class ReorientCfg:
+    """The in-hand reorientation task: hand, objects, worlds and all terms."""
+
+    hand: str = "dclaw4"
+    """Name of a hand (dclaw3, dclaw4) or path of a hand's USD."""
+    fingertip: str = "rigid"
+    """Fingertip variant: rigid or soft."""
+    objects: tuple[str, ...] = ("cube",)
+    """Object sets: names or folders of object USDs."""
+    num_worlds: int = 4096
+    """Worlds simulated side by side."""
+    seed: int = 0
+    """Seed of every random draw of the environment."""
+    episode_s: float = PAPER.scene.episode_s
+    """Length of an episode [s]."""
+    success_ends_episode: bool = False
+    """Reset the world on success (evaluation) instead of giving a new goal (training)."""
+    visuals: bool = False
+    """Keep visual shapes, for rendering."""
+    sim: SimCfg = field(default_factory=SimCfg)
+    action: ActionCfg = field(default_factory=ActionCfg)
+    reward: RewardCfg = field(default_factory=RewardCfg)
+    success: SuccessCfg = field(default_factory=SuccessCfg)
+    goal: GoalCfg = field(default_factory=GoalCfg)
+    curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
+    randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Control steps of an episode."""
+        return round(self.episode_s * self.sim.control_hz)
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        self.sim.validate()
+        if self.num_worlds < 1:
+            raise ValueError(f"num_worlds = {self.num_worlds}; at least 1 world is needed")
+        if self.max_episode_steps < 1:
+            raise ValueError(f"episode_s = {self.episode_s} is shorter than one control step")
+        if self.fingertip not in ("rigid", "soft"):
+            raise ValueError(f"fingertip = {self.fingertip!r}; choose rigid or soft")
+        if self.success.rotation_rad <= 0.0:
+            raise ValueError(f"success.rotation_rad = {self.success.rotation_rad}; it must be positive")
+        if self.goal.max_angle_rad <= 0.0:
+            raise ValueError(f"goal.max_angle_rad = {self.goal.max_angle_rad}; it must be positive")

@@ -1,0 +1,133 @@
+"""Configuration to device memory: the parameter structs that kernels read and curricula change."""
+
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from vd.envs.cfg import ReorientCfg
+from vd.kernels.actions import ActionParams
+from vd.kernels.observations import ObservationParams
+from vd.kernels.randomisation import ForceParams, RandomisationParams
+from vd.kernels.resets import GoalParams, StartParams
+from vd.kernels.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, RewardParams, SuccessParams
+from vd.paper import PAPER
+
+
+def _fill(struct: Any, **values: Any) -> Any:
+    for name, value in values.items():
+        setattr(struct, name, value)
+    return struct
+
+
+class TaskParameters:
+    """All parameter structs of the task, each an array of length 1 on the device.
+
+    Arrays because a CUDA graph bakes scalar arguments in; a curriculum writes into them instead.
+    """
+
+    def __init__(self, cfg: ReorientCfg, device: Any):
+        """Put the configuration at full difficulty on ``device``."""
+        self.cfg = cfg
+        random = cfg.randomisation
+        on = 1.0 if random.enabled else 0.0
+        scene = PAPER.scene
+
+        def array(struct: Any) -> wp.array:
+            return wp.array([struct], dtype=type(struct), device=device)
+
+        self.action = array(
+            _fill(
+                ActionParams(),
+                alpha=cfg.action.ema_alpha,
+                step_rad=cfg.action.scale_rad_s * cfg.sim.control_dt,
+                noise_std=on * random.action_noise_std,
+            )
+        )
+        self.observation = array(
+            _fill(
+                ObservationParams(),
+                velocity_scale=PAPER.observation.velocity_scale,
+                noise_mean=on * random.observation_noise_mean,
+                noise_std=on * random.observation_noise_std,
+            )
+        )
+        self.start = array(
+            _fill(StartParams(), position=wp.vec3(*scene.object_start_m), noise=scene.object_start_noise_m)
+        )
+        self.force = array(
+            _fill(
+                ForceParams(),
+                probability=on * random.force_probability,
+                force_per_mass=random.force_n_per_kg,
+                decay=random.force_decay,
+            )
+        )
+        materials = PAPER.materials
+        fixed = not random.enabled
+
+        def span(value: tuple[float, float], nominal: float) -> wp.vec2:
+            return wp.vec2(nominal, nominal) if fixed else wp.vec2(*value)
+
+        self.randomisation = array(
+            _fill(
+                RandomisationParams(),
+                stiffness_scale=span(random.stiffness_scale, 1.0),
+                damping_scale=span(random.damping_scale, 1.0),
+                friction=span(random.friction, materials.friction),
+                table_friction=span(random.table_friction, materials.table_friction),
+                link_mass_scale=span(random.link_mass_scale, 1.0),
+                object_mass=span(random.object_mass_kg, materials.object_mass_kg),
+                action_offset_std=on * random.action_offset_std,
+                observation_offset_std=on * random.observation_offset_std,
+            )
+        )
+        self.reward = array(RewardParams())
+        self.success = array(SuccessParams())
+        self.goal = array(GoalParams())
+        self._staging = {name: getattr(self, name).numpy() for name in ("reward", "success", "goal")}
+        self.set_difficulty(1.0)
+
+    def set_difficulty(self, difficulty: float) -> None:
+        """Write reward, success and goal parameters for a difficulty in [0, 1] (1: as configured)."""
+        cfg, curriculum = self.cfg, self.cfg.curriculum
+        # Thresholds shrink geometrically: each step of difficulty tightens by the same factor.
+        slack = curriculum.stillness_start ** (1.0 - difficulty)
+        energy = curriculum.energy_start + (1.0 - curriculum.energy_start) * difficulty
+        start = min(curriculum.goal_start_rad, cfg.goal.max_angle_rad)
+        reward, success = cfg.reward, cfg.success
+        self._write(
+            "reward",
+            success=reward.success,
+            rotation=reward.rotation,
+            rotation_epsilon=reward.rotation_epsilon_rad,
+            fingertip=reward.fingertip,
+            fingertip_form=FINGERTIP_MEAN if reward.fingertip_mean_distance else FINGERTIP_SQUARED_SUM,
+            energy=reward.energy * energy,
+            energy_clip=reward.energy_clip_w,
+            fall=reward.fall,
+            table_contact=reward.table_contact,
+            table_contact_force=PAPER.reward.table_contact_force_n,
+            fingertip_height=reward.fingertip_height,
+            height_limit=PAPER.reward.fingertip_height_m,
+            progress=reward.progress,
+            scale=reward.scale,
+        )
+        self._write(
+            "success",
+            rotation=success.rotation_rad,
+            joint_speed=success.joint_speed_rad_s * slack,
+            object_speed=success.object_speed_m_s * slack,
+            object_spin=success.object_spin_rad_s * slack,
+            action_norm=success.action_norm * slack,
+            no_table_contact=int(success.no_table_contact),
+            fall_distance=success.fall_m,
+            fall_center=np.array(PAPER.scene.goal_position_m, dtype=np.float32),
+        )
+        self._write("goal", max_angle=start + (cfg.goal.max_angle_rad - start) * difficulty)
+
+    def _write(self, name: str, **values: Any) -> None:
+        staging = self._staging[name]
+        for field, value in values.items():
+            staging[field][0] = value
+        getattr(self, name).assign(staging)

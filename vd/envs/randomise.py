@@ -1,0 +1,201 @@
+"""Domain randomisation (Table S3): draws on the device, written into the simulator's model."""
+
+from typing import TYPE_CHECKING, Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from vd.kernels.randomisation import disturbance_force_kernel, draw_dynamics_kernel, draw_masses_kernel
+from vd.kernels.worlds import (
+    redraw_mask_kernel,
+    write_friction_kernel,
+    write_gains_kernel,
+    write_object_force_kernel,
+)
+from vd.paper import PAPER
+from vd.sim.scene import SHAPE_HAND, SHAPE_OBJECT, SHAPE_TABLE
+
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
+
+# Drawn gains and frictions reach the solver once a second: a world in this many has new ones then.
+PUSH_INTERVAL_S = 1.0
+
+
+class Randomiser:
+    """Masses once at start-up; gains, frictions and constant errors at resets; forces every step.
+
+    With randomisation off the same arrays hold the nominal values.
+    """
+
+    def __init__(self, env: "ReorientEnv"):
+        """Allocate for ``env`` and draw the masses."""
+        self._env = env
+        cfg = env.cfg
+        self.enabled = cfg.randomisation.enabled
+        n, d = env.num_worlds, env.num_actions
+        device = env.device
+
+        def zeros(*shape: int, dtype: Any = float) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self.kp, self.kd = zeros(n, d), zeros(n, d)
+        """Joint stiffness [N m/rad] and damping [N m s/rad], shape [N, D]."""
+        self.hand_friction, self.object_friction, self.table_friction = zeros(n), zeros(n), zeros(n)
+        self.object_mass = zeros(n)
+        """Object mass [kg], shape [N]."""
+        self.action_offset = zeros(n, d)
+        self.observation_offset = zeros(n, env.num_observations)
+        self.force = zeros(n, dtype=wp.vec3)
+        """Disturbance force on the object [N], world frame, shape [N]."""
+        self._age, self._due = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
+        self._interval = round(cfg.randomisation.redraw_s * cfg.sim.control_hz)
+        self._push_interval = round(PUSH_INTERVAL_S * cfg.sim.control_hz)
+        self._push_graph: Any = None
+
+        model, scene = env.sim.model, env.scene
+        self._nominal_kp = wp.array(env.hand.kp, dtype=float, device=device)
+        self._nominal_kd = wp.array(env.hand.kd, dtype=float, device=device)
+        self._shape_kind = wp.array(scene.shape_kind, dtype=wp.int32, device=device)
+        self._nominal_friction = wp.clone(model.shape_material_mu)
+        self._model_kp = model.joint_target_ke.reshape((n, -1))
+        self._model_kd = model.joint_target_kd.reshape((n, -1))
+        self._draw_masses()
+
+    def _draw_masses(self) -> None:
+        """Draw link and object masses; inertias scale with them."""
+        env = self._env
+        n, model = env.num_worlds, env.sim.model
+        link_scale = wp.ones((n, len(env.scene.link_body)), dtype=float, device=env.device)
+        wp.launch(
+            draw_masses_kernel,
+            dim=n,
+            inputs=[env.parameters.randomisation, wp.ones(n, dtype=wp.int32, device=env.device), env.rng],
+            outputs=[link_scale, self.object_mass],
+            device=env.device,
+        )
+        factor = np.ones((n, env.scene.bodies_per_world))
+        factor[:, env.scene.link_body] = link_scale.numpy()
+        mass = model.body_mass.numpy().reshape(n, -1)
+        factor[:, env.scene.object_body] = self.object_mass.numpy() / mass[:, env.scene.object_body]
+        flat = factor.reshape(-1)
+        inverse = 1.0 / flat
+        for array, scale in (
+            (model.body_mass, flat),
+            (model.body_inv_mass, inverse),
+            (model.body_inertia, flat[:, None, None]),
+            (model.body_inv_inertia, inverse[:, None, None]),
+        ):
+            array.assign((array.numpy() * scale).astype(np.float32))
+        env.sim.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+
+    def redraw(self, reset: wp.array) -> None:
+        """Draw anew for the worlds of ``reset`` whose dynamics are old enough."""
+        if not self.enabled:
+            return
+        wp.launch(
+            redraw_mask_kernel,
+            dim=self._env.num_worlds,
+            inputs=[reset, self._interval, self._age],
+            outputs=[self._due],
+            device=self._env.device,
+        )
+        self.draw(self._due)
+
+    def draw(self, mask: wp.array) -> None:
+        """Draw gains, frictions and constant errors for the worlds of ``mask``, shape [N]."""
+        env = self._env
+        wp.launch(
+            draw_dynamics_kernel,
+            dim=env.num_worlds,
+            inputs=[self._nominal_kp, self._nominal_kd, env.parameters.randomisation, mask, env.rng],
+            outputs=[
+                self.kp,
+                self.kd,
+                self.hand_friction,
+                self.object_friction,
+                self.table_friction,
+                self.action_offset,
+                self.observation_offset,
+            ],
+            device=env.device,
+        )
+
+    def disturb(self) -> None:
+        """Draw this control step's disturbance force and apply it to the object."""
+        env = self._env
+        if not self.enabled:
+            return
+        wp.launch(
+            disturbance_force_kernel,
+            dim=env.num_worlds,
+            inputs=[self.object_mass, env.parameters.force, self.force, env.rng],
+            device=env.device,
+        )
+        wp.launch(
+            write_object_force_kernel,
+            dim=env.num_worlds,
+            inputs=[self.force, env.scene.object_body],
+            outputs=[env.sim.body_force],
+            device=env.device,
+        )
+
+    def after_step(self, steps: int) -> None:
+        """Hand what was drawn in this step to the solver, once a second (outside the step's graph)."""
+        if not self.enabled or steps % self._push_interval:
+            return
+        if self._env.device == "cpu":
+            self.push()
+            return
+        if self._push_graph is None:
+            with wp.ScopedCapture(device=self._env.device) as capture:
+                self.push()
+            self._push_graph = capture.graph
+        wp.capture_launch(self._push_graph)
+
+    def push(self) -> None:
+        """Write gains and frictions into the model and tell the solver."""
+        env = self._env
+        model = env.sim.model
+        wp.launch(
+            write_gains_kernel,
+            dim=(env.num_worlds, env.num_actions),
+            inputs=[self.kp, self.kd],
+            outputs=[self._model_kp, self._model_kd],
+            device=env.device,
+        )
+        wp.launch(
+            write_friction_kernel,
+            dim=model.shape_count,
+            inputs=[
+                model.shape_world,
+                self._shape_kind,
+                self._nominal_friction,
+                PAPER.materials.friction,
+                SHAPE_TABLE,
+                SHAPE_OBJECT,
+                SHAPE_HAND,
+                self.hand_friction,
+                self.object_friction,
+                self.table_friction,
+            ],
+            outputs=[model.shape_material_mu],
+            device=env.device,
+        )
+        flags = newton.ModelFlags.SHAPE_PROPERTIES | newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES
+        env.sim.solver.notify_model_changed(flags)
+
+    def stateful(self) -> dict[str, wp.array]:
+        """Arrays to save with a checkpoint. Masses are drawn from the seed alone and need no saving."""
+        return {
+            "kp": self.kp,
+            "kd": self.kd,
+            "hand_friction": self.hand_friction,
+            "object_friction": self.object_friction,
+            "table_friction": self.table_friction,
+            "action_offset": self.action_offset,
+            "observation_offset": self.observation_offset,
+            "force": self.force,
+            "dynamics_age": self._age,
+        }

@@ -1,0 +1,427 @@
+"""The in-hand reorientation environment: one call is one 12 Hz control step of N worlds.
+
+World frame: z up, table top at z = 0. SI units, radians, quaternions xyzw. Everything but the
+physics is Warp kernels; a step copies nothing to the host, and on CUDA it is one captured graph.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+
+from vd.assets_usd.hand_author import hand_usd
+from vd.assets_usd.hand_model import HandModel, read_hand
+from vd.assets_usd.objects.model import ObjectModel, load_set
+from vd.envs.cfg import ReorientCfg
+from vd.envs.parameters import TaskParameters
+from vd.envs.randomise import Randomiser
+from vd.kernels.actions import apply_action_kernel, joint_effort_kernel
+from vd.kernels.observations import fingertip_kernel, teacher_observation_kernel, teacher_observation_size
+from vd.kernels.resets import episode_kernel, reset_kernel
+from vd.kernels.rewards import REWARD_TERMS, reward_kernel
+from vd.kernels.rng import init_rng_kernel
+from vd.kernels.worlds import count_goals_kernel, record_step_kernel, world_mask_kernel
+from vd.paper import PAPER
+from vd.sim.scene import build_scene
+from vd.sim.simulator import Simulator
+
+
+def load_hand(name: str, fingertip: str = "rigid") -> HandModel:
+    """Read a hand by name (authored on demand) or by the path of its USD."""
+    path = Path(name) if name.endswith((".usd", ".usda", ".usdc")) else hand_usd(name)
+    return read_hand(path, fingertip=fingertip)
+
+
+class ReorientEnv:
+    """N worlds, each with a hand (F fingers, D = 3F joints), a table and an object to reorient.
+
+    All arrays are Warp arrays on ``device``; ``wp.to_torch`` views them without copying.
+    """
+
+    def __init__(self, cfg: ReorientCfg, device: str | None = None):
+        """Build the worlds and reset them.
+
+        Args:
+            cfg: The task.
+            device: Warp device; the first GPU, or else the CPU, by default.
+
+        Raises:
+            ValueError: For a configuration that cannot work, naming field and remedy.
+        """
+        cfg.validate()
+        self.cfg = cfg
+        self.device = str(wp.get_device(device or ("cuda:0" if wp.is_cuda_available() else "cpu")))
+        self.hand: HandModel = load_hand(cfg.hand, cfg.fingertip)
+        self.objects: list[ObjectModel] = load_set(list(cfg.objects))
+        random = cfg.randomisation
+        scales = np.linspace(*random.object_scale, random.object_scale_count) if random.enabled else [1.0]
+        self.scene = build_scene(
+            hand=self.hand,
+            objects=self.objects,
+            num_worlds=cfg.num_worlds,
+            cfg=cfg.sim,
+            device=self.device,
+            scales=[float(s) for s in scales],
+            visuals=cfg.visuals,
+        )
+        self.sim = Simulator(self.scene, cfg.sim)
+        self.parameters = TaskParameters(cfg, self.device)
+
+        self.num_worlds = n = cfg.num_worlds
+        self.num_fingers = f = len(self.hand.tip_body)
+        self.num_actions = d = len(self.hand.joint_names)
+        self.num_observations = teacher_observation_size(f)
+        self.max_episode_steps = cfg.max_episode_steps
+        self.world_object = self.scene.world_object
+        self.reward_term_names = REWARD_TERMS
+
+        def zeros(*shape: int, dtype: Any = float) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=self.device)
+
+        def array(values: Any, dtype: Any = float) -> wp.array:
+            return wp.array(values, dtype=dtype, device=self.device)
+
+        self.action = zeros(n, d)
+        """Action of the present step in [-1, 1], shape [N, D]."""
+        self.smoothed = zeros(n, d)
+        """Moving average of the applied actions, shape [N, D]."""
+        self.observation = zeros(n, self.num_observations)
+        """Teacher observation, fresh after resets and new goals, shape [N, O]."""
+        self.reward = zeros(n)
+        """Reward of the present step, shape [N]."""
+        self.reward_terms = zeros(n, len(REWARD_TERMS))
+        """Terms of the reward, unscaled, shape [N, T]."""
+        self.rotation_error = zeros(n)
+        """Angle to the goal at the end of the step, before resets [rad], shape [N]."""
+        self.success = zeros(n, dtype=wp.int32)
+        """1 where the goal was reached in this step, shape [N]."""
+        self.fell = zeros(n, dtype=wp.int32)
+        """1 where the object was lost in this step, shape [N]."""
+        self.timed_out = zeros(n, dtype=wp.int32)
+        """1 where the episode ended by its length alone, shape [N]."""
+        self.done = zeros(n, dtype=wp.int32)
+        """1 where the return ends: success, fall or time-out, shape [N]."""
+        self.goal_quat = zeros(n, dtype=wp.quat)
+        """Wanted orientation of the object, shape [N]."""
+        self.step_count = zeros(n, dtype=wp.int32)
+        """Control steps since the world's reset, shape [N]."""
+        self.goals_reached = zeros(n, dtype=wp.int32)
+        """Goals reached since the world's reset, shape [N]."""
+        self.object_pose_end = zeros(n, dtype=wp.transform)
+        """Object pose at the end of the step, before resets, shape [N]."""
+        self.goal_counts = zeros(3)
+        """Goals ended, goals reached and objects lost since cleared, over all worlds, shape [3]."""
+        self.tip_pos = zeros(n, f, dtype=wp.vec3)
+        """Fingertip positions [m], shape [N, F]."""
+        self.effort = zeros(n, d)
+        """Joint torques [N m], shape [N, D]."""
+        self.rng = zeros(n, dtype=wp.uint32)
+        """Random stream of each world, shape [N]."""
+
+        self._previous_error = zeros(n)
+        self._reset = zeros(n, dtype=wp.int32)
+        self._new_goal = zeros(n, dtype=wp.int32)
+        self._world_mask = zeros(n + 1, dtype=wp.bool)
+        self._given_start = zeros(n, dtype=wp.quat)
+        self._given_goal = zeros(n, dtype=wp.quat)
+        self._lower, self._upper = array(self.hand.lower), array(self.hand.upper)
+        self._effort_limit = array(self.hand.effort_limit)
+        self._tip_body = array(self.scene.link_body[self.hand.tip_body], wp.int32)
+        self._tip_offset = array(self.hand.tip_transform, wp.transform)
+        self._body_com = wp.clone(self.sim.model.body_com[: self.scene.bodies_per_world])
+        self._reset_q = array(np.tile(PAPER.scene.reset_joint_rad, f))
+        wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
+        self.randomiser = Randomiser(self)
+
+        self.difficulty = 0.0 if cfg.curriculum.enabled else 1.0
+        """Curriculum difficulty in [0, 1]; 1 is the configured task."""
+        self.parameters.set_difficulty(self.difficulty)
+        self._graph: Any = None
+        self._steps = 0
+        self.reset()
+
+    # Stepping
+
+    def reset(self, object_quat: np.ndarray | None = None, goal_quat: np.ndarray | None = None) -> None:
+        """Reset all worlds.
+
+        Args:
+            object_quat: Start orientations of the objects, xyzw, shape [N, 4]; random by default.
+            goal_quat: Goal orientations, xyzw, shape [N, 4]; drawn as configured by default.
+        """
+        for given, buffer in ((object_quat, self._given_start), (goal_quat, self._given_goal)):
+            if given is not None:
+                given = np.asarray(given, dtype=np.float32)
+                if given.shape != (self.num_worlds, 4):
+                    raise ValueError(
+                        f"reset() takes orientations of shape ({self.num_worlds}, 4), not {given.shape}"
+                    )
+                buffer.assign(given)
+        self._reset.fill_(1)
+        self._new_goal.zero_()
+        self.randomiser.draw(self._reset)
+        self._reset_worlds(use_start=object_quat is not None, use_goal=goal_quat is not None)
+        self.randomiser.push()
+        self._observe()
+
+    def step(self, action: Any) -> None:
+        """Simulate one control step; worlds that end are reset, and the observation is fresh.
+
+        Args:
+            action: Actions in [-1, 1], shape [N, D]: a Warp array or anything ``wp.copy`` takes.
+        """
+        if action.ptr != self.action.ptr:
+            wp.copy(self.action, action)
+        if self.device == "cpu":
+            self._step()
+        elif self._graph is None and self._steps < 1:
+            self._step()  # loads every kernel before the capture
+        else:
+            if self._graph is None:
+                with wp.ScopedCapture(device=self.device) as capture:
+                    self._step()
+                self._graph = capture.graph
+            wp.capture_launch(self._graph)
+        self._steps += 1
+        self.randomiser.after_step(self._steps)
+
+    def _step(self) -> None:
+        n, d, p = self.num_worlds, self.num_actions, self.parameters
+        sim = self.sim
+        wp.launch(
+            apply_action_kernel,
+            dim=n,
+            inputs=[
+                self._lower,
+                self._upper,
+                p.action,
+                self.action,
+                self.randomiser.action_offset,
+                sim.joint_q,
+                self.smoothed,
+                self.rng,
+            ],
+            outputs=[sim.target],
+            device=self.device,
+        )
+        self.randomiser.disturb()
+        sim.step()
+        self._fingertips()
+        wp.launch(
+            joint_effort_kernel,
+            dim=(n, d),
+            inputs=[
+                self._effort_limit,
+                self.randomiser.kp,
+                self.randomiser.kd,
+                sim.target,
+                sim.joint_q,
+                sim.joint_qd,
+            ],
+            outputs=[self.effort],
+            device=self.device,
+        )
+        wp.launch(
+            reward_kernel,
+            dim=n,
+            inputs=[
+                p.reward,
+                p.success,
+                sim.joint_q,
+                sim.joint_qd,
+                self.tip_pos,
+                self.effort,
+                self.goal_quat,
+                self.smoothed,
+                sim.table_force,
+                self._previous_error,
+            ],
+            outputs=[self.reward, self.reward_terms, self.rotation_error, self.success, self.fell],
+            device=self.device,
+        )
+        wp.launch(
+            episode_kernel,
+            dim=n,
+            inputs=[
+                self.success,
+                self.fell,
+                self.max_episode_steps,
+                int(self.cfg.success_ends_episode),
+                self.step_count,
+                self.goals_reached,
+            ],
+            outputs=[self.timed_out, self.done, self._reset, self._new_goal],
+            device=self.device,
+        )
+        wp.launch(
+            count_goals_kernel,
+            dim=n,
+            inputs=[self.success, self.fell, self.done],
+            outputs=[self.goal_counts],
+            device=self.device,
+        )
+        wp.launch(
+            record_step_kernel,
+            dim=n,
+            inputs=[sim.joint_q, d],
+            outputs=[self.object_pose_end],
+            device=self.device,
+        )
+        self.randomiser.redraw(self._reset)
+        self._reset_worlds()
+        self._observe()
+
+    def _reset_worlds(self, *, use_start: bool = False, use_goal: bool = False) -> None:
+        """Reset the worlds of ``_reset``, give a goal to those of ``_new_goal`` too."""
+        sim, p = self.sim, self.parameters
+        wp.launch(
+            reset_kernel,
+            dim=self.num_worlds,
+            inputs=[
+                self._reset_q,
+                p.start,
+                p.goal,
+                self._reset,
+                self._new_goal,
+                self._given_start,
+                int(use_start),
+                self._given_goal,
+                int(use_goal),
+                sim.joint_q,
+                self.rng,
+            ],
+            outputs=[
+                sim.joint_qd,
+                self.smoothed,
+                self.step_count,
+                self.goals_reached,
+                self.goal_quat,
+                self._previous_error,
+            ],
+            device=self.device,
+        )
+        # The solver warm-starts from the last accelerations, which mean nothing after a reset.
+        wp.launch(
+            world_mask_kernel,
+            dim=self.num_worlds,
+            inputs=[self._reset],
+            outputs=[self._world_mask],
+            device=self.device,
+        )
+        sim.solver.reset(sim.state, world_mask=self._world_mask, flags=newton.StateFlags(0))
+        sim.forward_kinematics()
+
+    def _fingertips(self) -> None:
+        wp.launch(
+            fingertip_kernel,
+            dim=(self.num_worlds, self.num_fingers),
+            inputs=[self._tip_body, self._tip_offset, self.sim.body_q],
+            outputs=[self.tip_pos],
+            device=self.device,
+        )
+
+    def _observe(self) -> None:
+        sim = self.sim
+        wp.launch(
+            teacher_observation_kernel,
+            dim=self.num_worlds,
+            inputs=[
+                self._lower,
+                self._upper,
+                self._tip_body,
+                self._tip_offset,
+                self._body_com,
+                self.parameters.observation,
+                sim.joint_q,
+                sim.joint_qd,
+                sim.body_q,
+                sim.body_qd,
+                self.goal_quat,
+                self.smoothed,
+                self.randomiser.observation_offset,
+                self.rng,
+            ],
+            outputs=[self.observation],
+            device=self.device,
+        )
+
+    # Reading
+
+    def object_pose(self) -> np.ndarray:
+        """Present object poses, position [m] and quaternion xyzw, shape [N, 7] (host copy)."""
+        return self.sim.joint_q.numpy()[:, self.num_actions : self.num_actions + 7]
+
+    def check(self) -> None:
+        """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or a state went bad."""
+        self.sim.check()
+
+    # Curriculum and checkpoints
+
+    def update_curriculum(self) -> dict[str, float]:
+        """Move the difficulty by the success rate since the last call; returns numbers to log."""
+        ended, reached, dropped = (float(v) for v in self.goal_counts.numpy())
+        self.goal_counts.zero_()
+        rate = reached / max(ended, 1.0)
+        cfg = self.cfg.curriculum
+        if cfg.enabled and ended > 0:
+            change = cfg.rate if rate > cfg.raise_at else -cfg.rate if rate < cfg.lower_at else 0.0
+            difficulty = min(1.0, max(0.0, self.difficulty + change))
+            if difficulty != self.difficulty:
+                self.difficulty = difficulty
+                self.parameters.set_difficulty(difficulty)
+        return {
+            "success_per_goal": rate,
+            "drop_per_goal": dropped / max(ended, 1.0),
+            "goals_ended": ended,
+            "difficulty": self.difficulty,
+        }
+
+    def _stateful(self) -> dict[str, wp.array]:
+        data = self.sim.solver.mjw_data
+        return {
+            "joint_q": self.sim.joint_q,
+            "joint_qd": self.sim.joint_qd,
+            "target": self.sim.target,
+            "warm_start": data.qacc_warmstart,
+            "smoothed": self.smoothed,
+            "goal_quat": self.goal_quat,
+            "step_count": self.step_count,
+            "goals_reached": self.goals_reached,
+            "previous_error": self._previous_error,
+            "goal_counts": self.goal_counts,
+            "observation": self.observation,
+            "rng": self.rng,
+            **self.randomiser.stateful(),
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to continue exactly: simulation, episodes, randomisation, curriculum, RNG."""
+        arrays = {name: array.numpy() for name, array in self._stateful().items()}
+        return {"arrays": arrays, "difficulty": self.difficulty, "steps": self._steps}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`.
+
+        Raises:
+            ValueError: If it belongs to another number of worlds or another hand.
+        """
+        for name, array in self._stateful().items():
+            saved = state["arrays"][name]
+            if saved.shape != array.numpy().shape:
+                raise ValueError(
+                    f"the saved environment has {name} of shape {saved.shape}, "
+                    f"this one {array.numpy().shape}; "
+                    "resume with the num_worlds and hand of the checkpoint"
+                )
+            array.assign(saved)
+        self._steps = int(state["steps"])
+        self.difficulty = float(state["difficulty"])
+        self.parameters.set_difficulty(self.difficulty)
+        self.randomiser.push()
+        self.sim.forward_kinematics()
+
+    def close(self) -> None:
+        """Release the captured graph."""
+        self._graph = None

@@ -1,0 +1,78 @@
+"""Settings of the physics, each with the reason for its value."""
+
+from dataclasses import dataclass
+
+from vd.paper import PAPER
+
+
+@dataclass(frozen=True)
+class SimCfg:
+    """Newton and SolverMuJoCo settings.
+
+    The values were chosen on a light object (0.1 kg) pinched by strong fingers (2.6 N m):
+    see "Contact settings" in ARCHITECTURE.md for the measurements behind them.
+    """
+
+    physics_hz: float = PAPER.scene.physics_hz
+    """Physics rate [Hz]; a whole, even multiple of ``control_hz``."""
+    control_hz: float = PAPER.scene.control_hz
+    """Policy rate [Hz]."""
+    cone: str = "elliptic"
+    """Friction cone. A pyramidal one lets a pinched object creep by millimetres per second."""
+    impratio: float = 10.0
+    """Frictional over normal impedance. 1 creeps an order of magnitude faster than 10."""
+    iterations: int = 20
+    """Newton solver iterations at most; it stops earlier by ``tolerance``."""
+    ls_iterations: int = 20
+    """Line-search iterations at most."""
+    tolerance: float = 1e-6
+    """Solver tolerance; single precision gains nothing below it."""
+    multiccd: bool = True
+    """Up to four contacts for a pair of convex parts. With one, flat objects never come to rest."""
+    contact_time_constant_s: float = 2.0 / 120.0
+    """Contact ``solref`` time constant [s]: two physics steps, the stiffest that is stable."""
+    contact_impedance: tuple[float, float] = (0.95, 0.99)
+    """Contact ``solimp`` d0 and dmax. Contact stiffness scales with the object's mass, so the default
+    (0.9, 0.95) lets fingers sink more than a millimetre into a 0.1 kg object."""
+    contact_impedance_width_m: float = 0.001
+    """Penetration over which the impedance rises from d0 to dmax [m]."""
+    gap_m: float = 0.002
+    """Detection distance beyond touching [m]. The default of 0.1 m, the size of the whole scene,
+    makes hundreds of candidate contacts a world that never touch."""
+    fingertip_torsion_m: float = 0.005
+    """Torsional friction radius of the fingertips [m], about the radius of their contact patch;
+    fingertip contacts have condim 4, all others 3."""
+    njmax: int = 160
+    """Constraint rows a world may use; an overflow stops the run and names this setting."""
+    nconmax: int = 64
+    """Contacts a world may use on average over all worlds; likewise."""
+
+    @property
+    def physics_dt(self) -> float:
+        """Physics step [s]."""
+        return 1.0 / self.physics_hz
+
+    @property
+    def control_dt(self) -> float:
+        """Control step [s]."""
+        return 1.0 / self.control_hz
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps per control step."""
+        return round(self.physics_hz / self.control_hz)
+
+    def validate(self) -> None:
+        """Raise ValueError for settings that cannot work, naming the field and the remedy."""
+        ratio = self.physics_hz / self.control_hz
+        if abs(ratio - round(ratio)) > 1e-6 or round(ratio) < 2 or round(ratio) % 2:
+            raise ValueError(
+                f"sim.physics_hz = {self.physics_hz} must be an even multiple of sim.control_hz = "
+                f"{self.control_hz} (states are swapped every physics step and must end where they began); "
+                f"set sim.physics_hz to {self.control_hz * max(2, 2 * round(ratio / 2))}"
+            )
+        if self.contact_time_constant_s < 2.0 * self.physics_dt * (1.0 - 1e-6):
+            raise ValueError(
+                f"sim.contact_time_constant_s = {self.contact_time_constant_s} is below two physics steps; "
+                f"set it to {2.0 * self.physics_dt} or raise sim.physics_hz"
+            )

@@ -1,0 +1,287 @@
+"""Build the scene of the paper in Newton: a downward hand over a table, an object in each world.
+
+World frame: z up, table top at z = 0, all worlds at one origin. SI units, quaternions xyzw.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+from vd.assets_usd.hand_model import HandModel, open_stage
+from vd.assets_usd.objects.model import ObjectModel
+from vd.paper import PAPER
+from vd.sim.cfg import SimCfg
+
+# Contact friction in MuJoCo is the larger of two geoms' unless one has a higher priority. The paper's
+# engine averages the two, so each pair's average is written to its higher-priority geom:
+# table over hand over object.
+PRIORITY_OBJECT, PRIORITY_HAND, PRIORITY_TABLE = 0, 1, 2
+
+CONDIM_SLIDING, CONDIM_TORSIONAL = 3, 4
+
+# What a shape is, for friction randomisation and contact forces.
+SHAPE_OTHER, SHAPE_TABLE, SHAPE_OBJECT, SHAPE_HAND = 0, 1, 2, 3
+
+OBJECT_COLOR, TABLE_COLOR = (0.93, 0.60, 0.18), (0.55, 0.5, 0.45)
+OBJECT_LABEL = "object"
+TABLE_LABEL = "table"
+
+
+@dataclass
+class Scene:
+    """A finalized Newton model and where things are in it.
+
+    With N worlds, B bodies a world and S shapes in all.
+    """
+
+    model: newton.Model
+    """The model of all worlds."""
+    hand: HandModel
+    """The hand, as read from its USD."""
+    objects: list[ObjectModel]
+    """The objects in use."""
+    world_object: np.ndarray
+    """Index into ``objects`` for every world, shape [N]."""
+    bodies_per_world: int
+    """B."""
+    link_body: np.ndarray
+    """Body index within a world of every hand link, shape [3F]."""
+    object_body: int
+    """Body index within a world of the object."""
+    shape_kind: np.ndarray
+    """SHAPE_* of every shape, shape [S]."""
+
+    @property
+    def num_worlds(self) -> int:
+        """N."""
+        return len(self.world_object)
+
+
+def hand_mount() -> wp.transform:
+    """Pose of the hand's base in the world: palm down, turned pi about +y."""
+    return wp.transform(wp.vec3(0.0, 0.0, PAPER.scene.hand_height_m), wp.quat(0.0, 1.0, 0.0, 0.0))
+
+
+def assign_objects(num_worlds: int, num_objects: int) -> np.ndarray:
+    """Spread objects evenly over worlds in contiguous blocks, shape [num_worlds], non-decreasing.
+
+    Blocks because Newton copies a run of equal worlds in one pass.
+    """
+    return (np.arange(num_worlds) * num_objects) // num_worlds
+
+
+def new_builder() -> newton.ModelBuilder:
+    """An empty builder that knows MuJoCo's contact attributes."""
+    builder = newton.ModelBuilder()
+    SolverMuJoCo.register_custom_attributes(builder)
+    return builder
+
+
+def contact_attributes(cfg: SimCfg, priority: int, condim: int = CONDIM_SLIDING) -> dict[str, object]:
+    """MuJoCo attributes of a collision shape."""
+    d0, dmax = cfg.contact_impedance
+    return {
+        "mujoco:condim": condim,
+        "mujoco:geom_priority": priority,
+        "mujoco:geom_solimp": wp.types.vector(5, float)(d0, dmax, cfg.contact_impedance_width_m, 0.5, 2.0),
+    }
+
+
+def shape_cfg(cfg: SimCfg, friction: float, *, visual: bool = False) -> newton.ModelBuilder.ShapeConfig:
+    """Newton's shape settings for a colliding (or visual-only) shape."""
+    # kd and ke such that MuJoCo's solref becomes (time constant, damping ratio 1).
+    kd = 2.0 / cfg.contact_time_constant_s
+    return newton.ModelBuilder.ShapeConfig(
+        density=0.0,
+        mu=friction,
+        ke=(0.5 * kd) ** 2,
+        kd=kd,
+        gap=cfg.gap_m,
+        margin=0.0,
+        mu_torsional=cfg.fingertip_torsion_m,
+        has_shape_collision=not visual,
+        has_particle_collision=False,
+        is_visible=visual,
+    )
+
+
+def build_hand(usd: str, *, fingertip: str, cfg: SimCfg, visuals: bool) -> newton.ModelBuilder:
+    """The hand alone, mounted over the table, with the project's contact settings.
+
+    Args:
+        usd: Path of the hand's USD.
+        fingertip: Variant of the fingertip, ``rigid`` or ``soft``.
+        cfg: Contact settings. Friction, and softness where the USD authors it, stay the USD's.
+        visuals: Keep visual-only shapes (for rendering; training has no use for them).
+    """
+    builder = new_builder()
+    builder.default_shape_cfg = shape_cfg(cfg, PAPER.materials.friction)
+    builder.add_usd(
+        open_stage(usd, fingertip=fingertip),
+        xform=hand_mount(),
+        floating=False,
+        enable_self_collisions=True,
+        load_sites=False,
+        load_visual_shapes=visuals,
+        hide_collision_shapes=True,
+    )
+    softness = builder.custom_attributes["mujoco:geom_solimp"].values or {}
+    stiff = shape_cfg(cfg, 0.0)
+    for shape in range(builder.shape_count):
+        if not builder.shape_flags[shape] & newton.ShapeFlags.COLLIDE_SHAPES:
+            continue
+        is_tip = "tip" in builder.shape_label[shape].rsplit("/", 1)[-1]
+        builder.shape_gap[shape] = cfg.gap_m
+        builder.shape_margin[shape] = 0.0
+        attributes = contact_attributes(cfg, PRIORITY_HAND, CONDIM_TORSIONAL if is_tip else CONDIM_SLIDING)
+        if shape in softness:
+            del attributes["mujoco:geom_solimp"]
+        else:
+            builder.shape_material_ke[shape] = stiff.ke
+            builder.shape_material_kd[shape] = stiff.kd
+        builder.shape_material_mu_torsional[shape] = cfg.fingertip_torsion_m
+        for key, value in attributes.items():
+            builder.custom_attributes[key].values[shape] = value
+    return builder
+
+
+def add_table(builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool) -> None:
+    """Add the table as a static box of this world."""
+    size = PAPER.scene.table_size_m
+    config = shape_cfg(cfg, PAPER.materials.table_friction)
+    config.is_visible = visible
+    builder.add_shape_box(
+        body=-1,
+        xform=wp.transform(wp.vec3(0.0, 0.0, PAPER.scene.table_top_m - 0.5 * size[2]), wp.quat_identity()),
+        hx=0.5 * size[0],
+        hy=0.5 * size[1],
+        hz=0.5 * size[2],
+        cfg=config,
+        label=TABLE_LABEL,
+        color=TABLE_COLOR,
+        custom_attributes=contact_attributes(cfg, PRIORITY_TABLE),
+    )
+
+
+def scaled_mesh(vertices: np.ndarray, faces: np.ndarray, scale: float) -> newton.Mesh:
+    """A Newton mesh of ``vertices`` [V, 3] times ``scale``; mass properties are the body's."""
+    return newton.Mesh(np.asarray(vertices) * scale, np.asarray(faces).flatten(), compute_inertia=False)
+
+
+def add_object(
+    builder: newton.ModelBuilder, item: ObjectModel, cfg: SimCfg, *, scale: float, visuals: bool
+) -> int:
+    """Add a free object made of its convex parts; returns its body index.
+
+    Args:
+        builder: The world's builder.
+        item: The object; its frame's origin is its centre of mass.
+        cfg: Contact settings.
+        scale: Uniform factor on its size. The mass stays; the inertia follows the size.
+        visuals: Add the visual mesh too.
+    """
+    body = builder.add_body(
+        xform=wp.transform(wp.vec3(*PAPER.scene.object_start_m), wp.quat_identity()),
+        mass=item.mass_kg,
+        inertia=wp.mat33(*(item.inertia_matrix * scale**2).flatten()),
+        label=OBJECT_LABEL,
+        lock_inertia=True,
+    )
+    for index, (vertices, faces) in enumerate(item.hulls):
+        builder.add_shape_convex_hull(
+            body,
+            mesh=scaled_mesh(vertices, faces, scale),
+            cfg=shape_cfg(cfg, PAPER.materials.friction),
+            label=f"{OBJECT_LABEL}/hull_{index}",
+            custom_attributes=contact_attributes(cfg, PRIORITY_OBJECT),
+        )
+    if visuals:
+        builder.add_shape_mesh(
+            body,
+            mesh=scaled_mesh(item.vertices, item.faces, scale),
+            cfg=shape_cfg(cfg, PAPER.materials.friction, visual=True),
+            label=f"{OBJECT_LABEL}/visual",
+            color=OBJECT_COLOR,
+        )
+    return body
+
+
+def build_scene(
+    *,
+    hand: HandModel,
+    objects: Sequence[ObjectModel],
+    num_worlds: int,
+    cfg: SimCfg,
+    device: str,
+    scales: Sequence[float] = (1.0,),
+    visuals: bool = False,
+) -> Scene:
+    """Build and finalize ``num_worlds`` worlds.
+
+    Args:
+        hand: The hand, read from USD (path and fingertip kind are taken from it).
+        objects: Objects, spread evenly over the worlds.
+        num_worlds: N.
+        cfg: Physics settings.
+        device: Warp device.
+        scales: Size factors, spread evenly over the worlds of each object.
+        visuals: Include visual shapes.
+
+    Raises:
+        ValueError: If there is no object, or fewer worlds than objects.
+    """
+    cfg.validate()
+    if not objects:
+        raise ValueError("no objects to simulate; name a set with --objects (vd-assets makes them)")
+    if num_worlds < len(objects):
+        raise ValueError(
+            f"num_worlds = {num_worlds} is fewer than the {len(objects)} objects; "
+            "raise num_worlds or name fewer objects"
+        )
+    hand_builder = build_hand(hand.path, fingertip=hand.fingertip, cfg=cfg, visuals=visuals)
+    world_object = assign_objects(num_worlds, len(objects))
+    scene = new_builder()
+    for index, item in enumerate(objects):
+        count = int(np.count_nonzero(world_object == index))
+        per_scale = np.bincount(assign_objects(count, len(scales)), minlength=len(scales)) if count else []
+        for scale, copies in zip(scales, per_scale, strict=False):
+            if copies == 0:
+                continue
+            world = new_builder()
+            world.add_builder(hand_builder)
+            add_table(world, cfg, visible=visuals)
+            add_object(world, item, cfg, scale=float(scale), visuals=visuals)
+            scene.replicate(world, int(copies))
+    model = scene.finalize(device=device)
+    return describe(model, hand, list(objects), world_object)
+
+
+def describe(
+    model: newton.Model, hand: HandModel, objects: list[ObjectModel], world_object: np.ndarray
+) -> Scene:
+    """Find the hand's links, the object and the kinds of shapes in a finalized model."""
+    bodies = model.body_count // len(world_object)
+    names = [label.rsplit("/", 1)[-1] for label in model.body_label[:bodies]]
+    shape_body = model.shape_body.numpy()
+    object_body = names.index(OBJECT_LABEL)
+    kind = np.full(model.shape_count, SHAPE_OTHER, dtype=np.int32)
+    collides = (model.shape_flags.numpy() & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0
+    on_object = (shape_body >= 0) & (shape_body % bodies == object_body)
+    is_table = np.array([label.rsplit("/", 1)[-1] == TABLE_LABEL for label in model.shape_label])
+    kind[collides & ~on_object & ~is_table] = SHAPE_HAND
+    kind[collides & on_object] = SHAPE_OBJECT
+    kind[collides & is_table] = SHAPE_TABLE
+    return Scene(
+        model=model,
+        hand=hand,
+        objects=objects,
+        world_object=world_object,
+        bodies_per_world=bodies,
+        link_body=np.array([names.index(link) for link in hand.link_names], dtype=np.int32),
+        object_body=object_body,
+        shape_kind=kind,
+    )

@@ -1,0 +1,228 @@
+"""Step many worlds with SolverMuJoCo, with the velocity limits and guards the solver lacks."""
+
+from dataclasses import dataclass
+
+import newton
+import numpy as np
+import warp as wp
+from newton.solvers import SolverMuJoCo
+
+from vd.kernels.actions import limit_joint_velocity_kernel
+from vd.kernels.contacts import pair_force_kernel
+from vd.kernels.guard import collect_overflow_kernel, guard_kernel
+from vd.sim.cfg import SimCfg
+from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
+
+# Faster than any joint (8 rad/s) or dropped object (2 m/s) can be; an object that spins faster than
+# this is a solver failure on its way to NaN.
+MAX_SPEED = 500.0
+
+# MuJoCo Warp's overflow bits that mean lost contacts or constraint rows, by the setting to change.
+# Its other bits count solver and line-search iterations, which are stopping rules, not losses.
+OVERFLOW_REMEDY = {
+    1 << 0: ("constraint rows", "sim.njmax"),
+    1 << 1: ("constraint Jacobian entries", "sim.njmax"),
+    1 << 2: ("broad-phase pairs", "sim.nconmax"),
+    1 << 3: ("contacts", "sim.nconmax"),
+}
+
+
+class SimulationError(RuntimeError):
+    """The simulation lost contacts or left the finite numbers; says what to change."""
+
+
+@dataclass
+class NanDump:
+    """The control step in which one world went bad, ready to be replayed."""
+
+    world: int
+    """World index."""
+    object_name: str
+    """Its object."""
+    joint_q: np.ndarray
+    """Positions before the step, shape [D + 7]."""
+    joint_qd: np.ndarray
+    """Velocities before the step, shape [D + 6]."""
+    target: np.ndarray
+    """Joint targets of the step [rad], shape [D]."""
+
+
+class Simulator:
+    """N worlds in Newton; one call simulates one control step without touching the host.
+
+    Views per world (D hand joints, B bodies): ``joint_q`` [N, D + 7], ``joint_qd`` [N, D + 6],
+    ``target`` [N, T] with T >= D, ``body_q`` [N, B], ``body_qd`` [N, B], ``body_force`` [N, B].
+    """
+
+    def __init__(self, scene: Scene, cfg: SimCfg):
+        """Build the solver of a scene.
+
+        Args:
+            scene: The worlds.
+            cfg: Physics settings.
+        """
+        cfg.validate()
+        self.scene, self.cfg = scene, cfg
+        self.model = scene.model
+        self.device = self.model.device
+        self.num_worlds = n = scene.num_worlds
+        self.solver = SolverMuJoCo(
+            self.model,
+            solver="newton",
+            integrator="implicitfast",
+            cone=cfg.cone,
+            impratio=cfg.impratio,
+            iterations=cfg.iterations,
+            ls_iterations=cfg.ls_iterations,
+            tolerance=cfg.tolerance,
+            njmax=cfg.njmax,
+            nconmax=cfg.nconmax,
+            enable_multiccd=cfg.multiccd,
+            kinematic_switchable_roots=False,
+        )
+        self.solver.mjw_model.opt.warn_overflow = False  # detected below, on the device, without prints
+        self.state, self._next = self.model.state(), self.model.state()
+        self.control = self.model.control()
+        self._observables = self.solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW})
+        self._overflow_mask = sum(OVERFLOW_REMEDY)
+
+        self.joint_q = self.state.joint_q.reshape((n, -1))
+        self.joint_qd = self.state.joint_qd.reshape((n, -1))
+        self.target = self.control.joint_target_q.reshape((n, -1))
+        self.body_q = self.state.body_q.reshape((n, -1))
+        self.body_qd = self.state.body_qd.reshape((n, -1))
+        self.body_force = self.state.body_f.reshape((n, -1))
+        self._next_body_force = self._next.body_f.reshape((n, -1))
+        self._next_q = self._next.joint_q.reshape((n, -1))
+        self._next_qd = self._next.joint_qd.reshape((n, -1))
+
+        def array(values: np.ndarray, dtype: type = wp.int32) -> wp.array:
+            return wp.array(values, dtype=dtype, device=self.device)
+
+        self.velocity_limit = array(scene.hand.velocity_limit, wp.float32)
+        """Joint speed limits [rad/s], shape [D]."""
+        geom_shape = self.solver.mjc_geom_to_newton_shape.numpy()
+        self._geom_kind = array(np.where(geom_shape >= 0, scene.shape_kind[geom_shape], 0).astype(np.int32))
+        self.table_force = wp.zeros(n, dtype=float, device=self.device)
+        """Normal force between object and table at the end of the control step [N], shape [N]."""
+        self.overflow = wp.zeros(n, dtype=wp.int32, device=self.device)
+        self.bad = wp.zeros(n, dtype=wp.int32, device=self.device)
+        self._start_q, self._start_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
+        self._dump_q, self._dump_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
+        self._dump_target = wp.clone(self.target)
+
+    def step(self) -> None:
+        """Simulate one control step with the present ``target`` and ``body_force``.
+
+        Device work only, so that it can be captured in a CUDA graph.
+        """
+        wp.copy(self._start_q, self.joint_q)
+        wp.copy(self._start_qd, self.joint_qd)
+        wp.copy(self._next_body_force, self.body_force)
+        self._physics_steps(limits=True)
+        self._table_contact()
+        wp.launch(
+            guard_kernel,
+            dim=self.num_worlds,
+            inputs=[self.joint_q, self.joint_qd, self._start_q, self._start_qd, self.target, MAX_SPEED],
+            outputs=[self.bad, self._dump_q, self._dump_qd, self._dump_target],
+            device=self.device,
+        )
+
+    def _physics_steps(self, *, limits: bool) -> None:
+        """The physics steps of one control step; states end where they began."""
+        here, there = (self.state, self.joint_q, self.joint_qd), (self._next, self._next_q, self._next_qd)
+        for _ in range(self.cfg.substeps):
+            self.solver.step(
+                here[0], there[0], self.control, None, self.cfg.physics_dt, observables=self._observables
+            )
+            if limits:
+                self._limit_and_collect(here[1], *there[1:])
+            here, there = there, here
+
+    def physics_only(self) -> None:
+        """The solver's share of a control step, nothing of ours (for benchmarks)."""
+        self._physics_steps(limits=False)
+
+    def _limit_and_collect(self, previous_q: wp.array2d, q: wp.array2d, qd: wp.array2d) -> None:
+        # The solver knows no joint velocity limits.
+        wp.launch(
+            limit_joint_velocity_kernel,
+            dim=(self.num_worlds, len(self.velocity_limit)),
+            inputs=[self.velocity_limit, self.cfg.physics_dt, previous_q],
+            outputs=[q, qd],
+            device=self.device,
+        )
+        wp.launch(
+            collect_overflow_kernel,
+            dim=self.num_worlds,
+            inputs=[self._observables.overflow, self._overflow_mask],
+            outputs=[self.overflow],
+            device=self.device,
+        )
+
+    def _table_contact(self) -> None:
+        data = self.solver.mjw_data
+        self.table_force.zero_()
+        wp.launch(
+            pair_force_kernel,
+            dim=data.naconmax,
+            inputs=[
+                data.nacon,
+                data.contact.worldid,
+                data.contact.geom,
+                data.contact.efc_address,
+                data.contact.dim,
+                data.efc.force,
+                self._geom_kind,
+                SHAPE_TABLE,
+                SHAPE_OBJECT,
+                int(self.cfg.cone == "pyramidal"),
+            ],
+            outputs=[self.table_force],
+            device=self.device,
+        )
+
+    def forward_kinematics(self) -> None:
+        """Refresh ``body_q`` and ``body_qd`` of all worlds from the joint state (after a reset)."""
+        newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
+
+    def check(self) -> None:
+        """Raise if any step since the last check lost contacts or went non-finite (one host read).
+
+        Raises:
+            SimulationError: Names the worlds, the numbers and the setting to change.
+        """
+        overflow = self.overflow.numpy()
+        if overflow.any():
+            worlds = np.flatnonzero(overflow)
+            names = {self.scene.objects[self.scene.world_object[w]].name for w in worlds}
+            lines = [
+                f"ran out of {what}: raise {setting} (now {getattr(self.cfg, setting.removeprefix('sim.'))})"
+                for bit, (what, setting) in OVERFLOW_REMEDY.items()
+                if np.any(overflow & bit)
+            ]
+            raise SimulationError(
+                f"{len(worlds)} of {self.num_worlds} worlds lost contacts (first: world {worlds[0]}; "
+                f"objects: {', '.join(sorted(names)[:5])}): {'; '.join(lines)}"
+            )
+        bad = self.bad.numpy()
+        if bad.any():
+            worlds = np.flatnonzero(bad)
+            name = self.scene.objects[self.scene.world_object[worlds[0]]].name
+            raise SimulationError(
+                f"{len(worlds)} of {self.num_worlds} worlds left the finite numbers or exceeded "
+                f"{MAX_SPEED:g} m/s or rad/s (first: world {worlds[0]}, object {name}). "
+                "Replay the saved dump with "
+                "`vd-bench replay DUMP`; then raise sim.physics_hz or sim.contact_time_constant_s"
+            )
+
+    def dumps(self) -> list[NanDump]:
+        """The step that went bad, for every bad world."""
+        names = self.scene.objects
+        q, qd, target = self._dump_q.numpy(), self._dump_qd.numpy(), self._dump_target.numpy()
+        dofs = len(self.velocity_limit)
+        return [
+            NanDump(int(w), names[self.scene.world_object[w]].name, q[w], qd[w], target[w, :dofs])
+            for w in np.flatnonzero(self.bad.numpy())
+        ]
