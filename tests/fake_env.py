@@ -1,0 +1,122 @@
+"""A test double of the environment: objects turn as the action says, without physics.
+
+The first three actions of a world are its object's angular velocity [rad/s, world frame]; ``fall_at`` makes
+chosen worlds drop their object. Everything evaluation and viewing read is there, with the meaning it has in
+``vd.envs``.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+IDENTITY = np.array([[0.0, 0.0, 0.0, 1.0]])
+
+
+@dataclass
+class FakeObject:
+    name: str = "thing"
+    symmetry: np.ndarray = field(default_factory=IDENTITY.copy)
+
+
+@dataclass
+class FakeHand:
+    name: str = "dclaw3"
+
+
+class FakeEnv:
+    def __init__(
+        self,
+        objects=(FakeObject(),),
+        num_worlds=1,
+        max_episode_steps=24,
+        tolerance=0.4,
+        fall_at=None,
+        fingers=3,
+    ):
+        self.objects = list(objects)
+        self.hand = FakeHand(f"dclaw{fingers}")
+        self.device = "cpu"
+        self.num_worlds = n = num_worlds
+        self.num_actions, self.num_observations = 3 * fingers, 8
+        self.max_episode_steps = max_episode_steps
+        self.control_dt = 1.0 / 12.0
+        self.world_object = (np.arange(n) * len(self.objects)) // n
+        self.reward_term_names = ("success", "rotation", "energy")
+        self.tolerance, self.fall_at = tolerance, fall_at or {}
+        self.still_speed = 0.5
+
+        def zeros(shape, dtype=float):
+            return wp.zeros(shape, dtype=dtype, device="cpu")
+
+        self.observation = zeros((n, self.num_observations))
+        self.reward, self.reward_terms = zeros(n), zeros((n, 3))
+        self.success, self.fell = zeros(n, wp.int32), zeros(n, wp.int32)
+        self.timed_out, self.done = zeros(n, wp.int32), zeros(n, wp.int32)
+        self.rotation_error, self.goal_quat = zeros(n), zeros(n, wp.quat)
+        self.step_count, self.goals_reached = zeros(n, wp.int32), zeros(n, wp.int32)
+        self.object_pose_end = zeros(n, wp.transform)
+        self._rng = np.random.default_rng(0)
+        self.resets = 0
+        self.reset()
+
+    def reset(self, object_quat=None, goal_quat=None):
+        """Reset all worlds."""
+        self._restart(np.arange(self.num_worlds), object_quat, goal_quat)
+        self.resets += 1
+        self._publish()
+
+    def _restart(self, worlds, object_quat=None, goal_quat=None):
+        if object_quat is None:
+            object_quat = Rotation.random(len(worlds), rng=self._rng).as_quat()
+        if goal_quat is None:
+            goal_quat = Rotation.random(len(worlds), rng=self._rng).as_quat()
+        self.goal_quat.numpy()[worlds] = goal_quat
+        if not hasattr(self, "_quat"):
+            self._quat = np.tile(IDENTITY, (self.num_worlds, 1))
+        self._quat[worlds] = object_quat
+        self.step_count.numpy()[worlds] = 0
+
+    def step(self, action):
+        """Turn the objects for one control step."""
+        a = action.numpy()
+        assert a.shape == (self.num_worlds, self.num_actions) and a.dtype == np.float32
+        turned = Rotation.from_rotvec(a[:, :3] * self.control_dt) * Rotation.from_quat(self._quat)
+        self._quat = turned.as_quat()
+        steps = self.step_count.numpy()
+        steps += 1
+        goal = Rotation.from_quat(self.goal_quat.numpy())
+        error = (goal * turned.inv()).magnitude()
+        still = np.linalg.norm(a[:, :3], axis=1) <= self.still_speed
+        fell = np.array([steps[w] == self.fall_at.get(w, -1) for w in range(self.num_worlds)])
+        success = (error <= self.tolerance) & still & ~fell
+        timed_out = (steps >= self.max_episode_steps) & ~success & ~fell
+        done = success | fell | timed_out
+        for array, value in (
+            (self.success, success),
+            (self.fell, fell),
+            (self.timed_out, timed_out),
+            (self.done, done),
+        ):
+            array.numpy()[:] = value
+        self.rotation_error.numpy()[:] = error
+        self.object_pose_end.numpy()[:] = self._pose()
+        self.reward_terms.numpy()[:] = np.stack([800.0 * success, 1 / (error + 0.1), -(a**2).sum(1)], axis=1)
+        self.reward.numpy()[:] = self.reward_terms.numpy().sum(axis=1)
+        self.goals_reached.numpy()[:] += success
+        self._restart(np.flatnonzero(done))
+        self._publish()
+
+    def _pose(self):
+        return np.concatenate([np.tile([0.0, 0.0, 0.08], (self.num_worlds, 1)), self._quat], axis=1)
+
+    def object_pose(self):
+        """Present poses."""
+        return self._pose()
+
+    def _publish(self):
+        self.observation.numpy()[:] = np.concatenate([self._quat, self.goal_quat.numpy()], axis=1)
+
+    def close(self):
+        """Nothing to release."""

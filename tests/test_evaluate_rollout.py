@@ -1,0 +1,167 @@
+"""Which step of which episode is measured, on a stand-in environment without physics."""
+
+import numpy as np
+import pytest
+import torch
+from fake_env import FakeEnv, FakeObject
+from scipy.spatial.transform import Rotation
+
+from vd.evaluate.result import TOLERANCES_RAD, EvalResult, Protocol, summarise
+from vd.evaluate.rollout import collect, draw_starts_and_goals
+from vd.evaluate.statistics import rotation_angle
+
+CONTROL_HZ = 12.0
+CUBE = Rotation.create_group("O").as_quat()
+
+
+class Turn:
+    """Turns every object about the vertical at a fixed speed, and stops after ``until`` steps."""
+
+    def __init__(self, speed, until=10**9):
+        self.speed, self.until, self.calls = speed, until, 0
+
+    def act(self, observation):
+        """The same action in every world."""
+        self.calls += 1
+        action = torch.zeros(len(observation), 9)
+        action[:, 2] = self.speed if self.calls <= self.until else 0.0
+        return action
+
+
+def quarter_turn_ahead(worlds=1, angle=np.pi / 2):
+    start = np.tile([0.0, 0.0, 0.0, 1.0], (1, worlds, 1))
+    goal = np.tile(Rotation.from_rotvec([0, 0, angle]).as_quat(), (1, worlds, 1))
+    return start, goal
+
+
+def test_a_policy_that_passes_the_goal_and_leaves_has_its_last_error():
+    env = FakeEnv(max_episode_steps=24)
+    starts, goals = quarter_turn_ahead()
+    (episode,) = collect(env, Turn(np.pi / 2), starts, goals)  # half a turn in two seconds; passes after one
+    assert episode.steps == 24 and not episode.stopped and not episode.fell
+    assert episode.error_rad == pytest.approx(np.pi / 2, abs=1e-5)
+
+
+def test_a_policy_that_stops_at_the_goal_has_the_error_of_its_stop():
+    env = FakeEnv(max_episode_steps=24)
+    starts, goals = quarter_turn_ahead()
+    (episode,) = collect(env, Turn(np.pi / 2, until=11), starts, goals)
+    assert episode.stopped and episode.steps == 12
+    assert episode.error_rad == pytest.approx(np.pi / 24, abs=1e-5)
+
+
+def test_a_drop_ends_the_episode_and_fails_at_every_tolerance():
+    env = FakeEnv(max_episode_steps=24, fall_at={0: 5})
+    starts, goals = quarter_turn_ahead(angle=0.6)
+    (episode,) = collect(env, Turn(0.6 * 12 / 5), starts, goals)  # within 0.1 rad at the moment of the drop
+    assert episode.fell and not episode.stopped and episode.steps == 5
+    assert episode.error_rad < 0.1
+    assert episode.scored_error_rad == np.pi
+
+
+def test_only_the_first_episode_of_a_world_in_a_round_counts():
+    env = FakeEnv(
+        num_worlds=2, max_episode_steps=24, fall_at={0: 3}
+    )  # world 0 goes on dropping every 3 steps
+    starts, goals = quarter_turn_ahead(worlds=2)
+    first, second = collect(env, Turn(0.0), starts, goals)
+    assert first.fell and first.steps == 3
+    assert not second.fell and second.steps == 24
+    assert env.resets == 2  # one of the constructor, one round
+
+
+@pytest.mark.parametrize("worlds", [3, 5, 12, 40])
+def test_every_start_and_goal_is_run_once_whatever_the_number_of_worlds(worlds):
+    objects = [FakeObject("a"), FakeObject("b", CUBE), FakeObject("c")]
+    drawn = [draw_starts_and_goals(o.name, 4, seed=1) for o in objects]
+    starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
+    episodes = collect(FakeEnv(objects, num_worlds=worlds, max_episode_steps=2), Turn(0.0), starts, goals)
+    assert [e.object_index for e in episodes] == [0] * 4 + [1] * 4 + [2] * 4
+    np.testing.assert_allclose([e.goal_quat for e in episodes], goals.reshape(-1, 4))
+    # Nothing moves, so the error stays: up to symmetry for the cube.
+    np.testing.assert_allclose(
+        [e.error_rad for e in episodes], [e.start_error_rad for e in episodes], atol=2e-3
+    )
+    plain = rotation_angle(starts[1], goals[1])
+    assert all(e.error_rad <= a + 1e-3 for e, a in zip(episodes[4:8], plain, strict=True))
+    assert max(e.error_rad for e in episodes[4:8]) < 1.1 < plain.max()
+
+
+def test_fewer_worlds_than_objects_is_refused():
+    env = FakeEnv([FakeObject("a"), FakeObject("b")], num_worlds=2)
+    env.world_object[:] = 0
+    with pytest.raises(ValueError, match="no world simulates object 1"):
+        collect(env, Turn(0.0), *(np.tile(x, (2, 1, 1)) for x in quarter_turn_ahead()))
+
+
+def test_starts_and_goals_depend_on_name_and_seed_alone():
+    start, goal = draw_starts_and_goals("shoe", 50, seed=3)
+    again = draw_starts_and_goals("shoe", 50, seed=3)
+    np.testing.assert_array_equal(start, again[0])
+    np.testing.assert_array_equal(goal, again[1])
+    assert rotation_angle(start, draw_starts_and_goals("shoe", 50, seed=4)[0]).min() > 0.0
+    assert rotation_angle(start, draw_starts_and_goals("boot", 50, seed=3)[0]).min() > 0.0
+
+
+def test_goals_are_uniform_within_the_largest_angle():
+    angle = rotation_angle(*draw_starts_and_goals("x", 20_000, seed=0))
+    assert angle.mean() == pytest.approx(np.pi / 2 + 2 / np.pi, abs=0.02)
+    near = rotation_angle(*draw_starts_and_goals("x", 20_000, seed=0, max_goal_angle=1.0))
+    assert near.max() <= 1.0
+    # Of uniform rotations within 1 rad, the share within 0.8 rad:
+    assert (near <= 0.8).mean() == pytest.approx((0.8 - np.sin(0.8)) / (1 - np.sin(1.0)), abs=0.015)
+
+
+def result_of(objects, episodes=10, worlds=None, fall_at=None, policy=None):
+    drawn = [draw_starts_and_goals(o.name, episodes, seed=1) for o in objects]
+    starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
+    env = FakeEnv(objects, num_worlds=worlds or len(objects) * episodes, max_episode_steps=4, fall_at=fall_at)
+    recorded = collect(env, policy or Turn(0.0), starts, goals)
+    protocol = Protocol(
+        policy="zero",
+        objects="set",
+        hand="dclaw3",
+        episodes=episodes,
+        seed=1,
+        max_goal_angle_rad=float(np.pi),
+        stop_tolerance_rad=0.4,
+        episode_s=4 / CONTROL_HZ,
+        control_hz=CONTROL_HZ,
+        randomised=False,
+    )
+    return summarise(protocol, tuple(o.name for o in objects), [o.symmetry for o in objects], recorded)
+
+
+def test_rates_count_what_happened():
+    result = result_of([FakeObject("a"), FakeObject("b", CUBE)], episodes=10, fall_at={0: 1, 13: 2})
+    assert result.overall.drop_rate.value == pytest.approx(2 / 20)
+    assert [s.drop_rate.value for s in result.per_object] == pytest.approx([0.1, 0.1])
+    for tolerance in TOLERANCES_RAD:
+        counted = np.mean([not e.fell and e.error_rad <= tolerance for e in result.episodes])
+        assert result.overall.success[str(tolerance)].value == pytest.approx(counted)
+    assert result.overall.unit == "episode"
+    assert result.per_object[1].chance["0.4"] > 20 * result.per_object[0].chance["0.4"]
+
+
+def test_time_to_success_is_of_successes_alone():
+    goal_at_start = result_of([FakeObject("a")], episodes=6, policy=Turn(0.0))
+    assert goal_at_start.overall.stop_rate.value == 0.0
+    assert goal_at_start.overall.time_to_success_s is None
+    env = FakeEnv(max_episode_steps=24)
+    start, goal = quarter_turn_ahead()
+    (episode,) = collect(env, Turn(np.pi / 2, until=11), start, goal)
+    protocol = goal_at_start.protocol.__class__(**{**goal_at_start.protocol.__dict__, "episodes": 1})
+    result = summarise(protocol, ("a",), [np.array([[0.0, 0.0, 0.0, 1.0]])], (episode,))
+    assert result.overall.time_to_success_s.value == pytest.approx(1.0)
+
+
+def test_json_round_trip(tmp_path):
+    result = result_of([FakeObject("a"), FakeObject("b", CUBE)])
+    result.write(tmp_path / "eval.json")
+    assert EvalResult.read(tmp_path / "eval.json") == result
+
+
+def test_a_foreign_file_is_refused(tmp_path):
+    (tmp_path / "x.json").write_text('{"format_version": 99}')
+    with pytest.raises(ValueError, match=r"x.json: format_version is 99"):
+        EvalResult.read(tmp_path / "x.json")

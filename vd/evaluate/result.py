@@ -1,0 +1,231 @@
+"""What an evaluation found: the episodes, and the summary computed from them; both as JSON.
+
+Angles are radians, times seconds, quaternions xyzw.
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from vd.config import from_dict, to_dict
+from vd.evaluate.statistics import (
+    Interval,
+    Unit,
+    chance_cdf,
+    choose_unit,
+    median_interval,
+    order_interval,
+    rate_intervals,
+)
+from vd.files import write_json
+
+TOLERANCES_RAD = (0.1, 0.2, 0.4, 0.8)
+"""Errors at which success is reported; the paper's figures use 0.1, 0.4 and 0.8."""
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One start and one goal of one object, to its end or stop."""
+
+    object_index: int
+    """Index into :attr:`EvalResult.object_names`."""
+    start_quat: tuple[float, float, float, float]
+    """Object orientation at the reset."""
+    goal_quat: tuple[float, float, float, float]
+    """Goal orientation."""
+    start_error_rad: float
+    """Orientation error at the reset, up to the object's symmetry."""
+    error_rad: float
+    """Orientation error at the last step of the episode, up to the object's symmetry."""
+    steps: int
+    """Control steps simulated."""
+    stopped: bool
+    """All success criteria (orientation and stillness) held at the last step."""
+    fell: bool
+    """The object left the hand."""
+
+    @property
+    def scored_error_rad(self) -> float:
+        """The error that counts: pi, the largest there is, for a dropped object."""
+        return float(np.pi) if self.fell else self.error_rad
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """How the episodes were run."""
+
+    policy: str
+    """Checkpoint path, or the name of a built-in agent."""
+    objects: str
+    """Object set as it was named."""
+    hand: str
+    """Hand name."""
+    episodes: int
+    """Episodes per object, M."""
+    seed: int
+    """Of starts, goals, and the randomisation if it is on."""
+    max_goal_angle_rad: float
+    """Goals are uniform in orientation within this angle of the start; pi is all of SO(3)."""
+    stop_tolerance_rad: float
+    """Orientation tolerance of the success criteria that stop an episode."""
+    episode_s: float
+    """Time limit."""
+    control_hz: float
+    """Policy rate."""
+    randomised: bool
+    """Domain randomisation, noise and disturbances as in training."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Rates and medians of all objects, or of one."""
+
+    name: str
+    """Object name, or ``all``."""
+    episodes: int
+    """Number of episodes behind it."""
+    unit: Unit
+    """What was resampled for the intervals."""
+    success: dict[str, Interval]
+    """By tolerance [rad] (as text): share of episodes that ended within it, not dropped."""
+    stop_rate: Interval
+    """Share of episodes in which all success criteria held at once."""
+    drop_rate: Interval
+    """Share of episodes in which the object was dropped."""
+    median_error_rad: Interval
+    """Median final error; a dropped object counts as pi."""
+    mean_error_rad: float
+    """Mean final error as measured, drops included, to compare with chance (2.21 rad)."""
+    time_to_success_s: Interval | None
+    """Median time to the stop of the episodes that stopped; None if none did."""
+    chance: dict[str, float]
+    """By tolerance: success of an orientation drawn uniformly from SO(3)."""
+    start: dict[str, float]
+    """By tolerance: success of leaving the object as it was at the reset."""
+
+
+@dataclass(frozen=True)
+class EvalResult:
+    """An evaluation: protocol, episodes and summaries."""
+
+    protocol: Protocol
+    object_names: tuple[str, ...]
+    """K names."""
+    overall: Summary
+    """Over all objects."""
+    per_object: tuple[Summary, ...]
+    """In the order of ``object_names``."""
+    episodes: tuple[Episode, ...]
+    """K x M episodes, object by object."""
+    format_version: int = FORMAT_VERSION
+    software: dict[str, str] = field(default_factory=dict)
+    """Versions of what ran."""
+
+    def errors(self) -> np.ndarray:
+        """Scored final errors [rad], shape [K, M]."""
+        errors = np.array([episode.scored_error_rad for episode in self.episodes])
+        return errors.reshape(len(self.object_names), -1)
+
+    def start_errors(self) -> np.ndarray:
+        """Errors at the reset [rad], shape [K, M]."""
+        errors = np.array([episode.start_error_rad for episode in self.episodes])
+        return errors.reshape(len(self.object_names), -1)
+
+    def write(self, path: Path) -> None:
+        """Write the result as JSON, atomically."""
+        write_json(path, to_dict(self))
+
+    @staticmethod
+    def read(path: Path) -> "EvalResult":
+        """Read a result that :meth:`write` wrote.
+
+        Raises:
+            ValueError: Not such a file, or of another format version.
+        """
+        values: Any = json.loads(Path(path).read_text())
+        version = values.get("format_version") if isinstance(values, dict) else None
+        if version != FORMAT_VERSION:
+            raise ValueError(
+                f"{path}: format_version is {version}, this version reads {FORMAT_VERSION}; run vd-eval again"
+            )
+        # Dictionaries keep their values as they are in the file: turn those of intervals back by hand.
+        for summary in (values["overall"], *values["per_object"]):
+            summary["success"] = {
+                name: from_dict(Interval, interval) for name, interval in summary["success"].items()
+            }
+        return from_dict(EvalResult, values)
+
+
+def summarise(
+    protocol: Protocol,
+    object_names: tuple[str, ...],
+    symmetries: list[np.ndarray],
+    episodes: tuple[Episode, ...],
+    *,
+    resample: Literal["auto", "object", "episode"] = "auto",
+    software: dict[str, str] | None = None,
+) -> EvalResult:
+    """Compute every rate, median and interval of an evaluation.
+
+    Args:
+        protocol: How it was run.
+        object_names: K names.
+        symmetries: For each object its symmetry rotations xyzw, shapes [S, 4].
+        episodes: K x M episodes, object by object.
+        resample: What the bootstrap draws anew: ``object``, ``episode``, or by the number of objects.
+        software: Versions to record.
+    """
+    chances = [chance_cdf(np.array(TOLERANCES_RAD), symmetry) for symmetry in symmetries]
+    by_object = [episodes[i : i + protocol.episodes] for i in range(0, len(episodes), protocol.episodes)]
+    if len(by_object) != len(object_names) or any(len(group) != protocol.episodes for group in by_object):
+        raise ValueError(
+            f"{len(episodes)} episodes are not {len(object_names)} objects x {protocol.episodes}"
+        )
+    return EvalResult(
+        protocol=protocol,
+        object_names=object_names,
+        overall=_summary(
+            "all", by_object, choose_unit(len(object_names), resample), np.mean(chances, axis=0), protocol
+        ),
+        per_object=tuple(
+            _summary(name, [group], "episode", chance, protocol)
+            for name, group, chance in zip(object_names, by_object, chances, strict=True)
+        ),
+        episodes=episodes,
+        software=software or {},
+    )
+
+
+def _summary(
+    name: str, groups: list[tuple[Episode, ...]], unit: Unit, chance: np.ndarray, protocol: Protocol
+) -> Summary:
+    def table(attribute: str) -> np.ndarray:
+        return np.array([[getattr(episode, attribute) for episode in group] for group in groups])
+
+    errors, stopped, fell = table("scored_error_rad"), table("stopped"), table("fell")
+    start = table("start_error_rad")
+    times = table("steps")[stopped] / protocol.control_hz
+    within = np.stack([errors <= tolerance for tolerance in TOLERANCES_RAD])
+    rates = rate_intervals(np.concatenate([within, stopped[None], fell[None]]), unit)
+    labels = [str(tolerance) for tolerance in TOLERANCES_RAD]
+    return Summary(
+        name=name,
+        episodes=errors.size,
+        unit=unit,
+        success=dict(zip(labels, rates[:-2], strict=True)),
+        stop_rate=rates[-2],
+        drop_rate=rates[-1],
+        median_error_rad=median_interval(errors, unit),
+        mean_error_rad=float(table("error_rad").mean()),
+        time_to_success_s=order_interval(times) if times.size else None,
+        chance=dict(zip(labels, map(float, chance), strict=True)),
+        start={
+            label: float((start <= tolerance).mean())
+            for label, tolerance in zip(labels, TOLERANCES_RAD, strict=True)
+        },
+    )
