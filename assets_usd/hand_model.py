@@ -1,0 +1,560 @@
+"""Read a hand back from USD: everything that simulator, training and deployment know about it.
+
+Nothing here comes from :mod:`vd.assets_usd.hand_spec`; a hand that someone else authored in the
+layout of :mod:`vd.assets_usd.hand_author` reads the same.
+
+Units are SI and radians, quaternions are xyzw. Frames: the base frame is that of link ``base``; a
+pose is a row ``(x, y, z, qx, qy, qz, qw)``.
+"""
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pxr import Gf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
+from scipy.spatial.transform import Rotation
+
+OPTICAL_FROM_USD = Rotation.from_euler("x", 180, degrees=True)
+"""A USD camera looks along -z with +y up; the optical frame along +z with +y down."""
+
+LINK_NAME = re.compile(r"f(\d+)_l([1-3])")
+JOINTS_PER_FINGER = 3
+ORTHONORMAL_TOLERANCE = 1e-5
+"""Allowed scale or shear in the transform of a link, above the rounding of single precision."""
+
+
+class HandError(ValueError):
+    """A USD file that is not a hand; says which file, prim and attribute, and what to do."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel:
+    """A pinhole camera fixed to the base.
+
+    Attributes:
+        width: Image width [px].
+        height: Image height [px].
+        fx: Horizontal focal length [px].
+        fy: Vertical focal length [px].
+        cx: Principal point, from the left edge of the image [px].
+        cy: Principal point, from the top edge of the image [px].
+        near: Nearest depth [m].
+        far: Farthest depth [m].
+        position: Origin of the optical frame in the base frame [3] [m].
+        quaternion: Optical frame (x right, y down, z forward) in the base frame, xyzw [4].
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    near: float
+    far: float
+    position: np.ndarray
+    quaternion: np.ndarray
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The intrinsic matrix [3, 3] [px]."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixel (u, v) and depth [m] of points [.., 3] [m] of the base frame, as [.., 3].
+
+        A point behind the camera has a negative depth, and pixels without a meaning.
+        """
+        points = np.asarray(points, dtype=float)
+        flat = (points - self.position).reshape(-1, 3)
+        optical = Rotation.from_quat(self.quaternion).inv().apply(flat)
+        image = optical @ self.matrix.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = image[:, :2] / image[:, 2:]
+        return np.concatenate([pixels, image[:, 2:]], axis=1).reshape(points.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionShape:
+    """A collision primitive.
+
+    Attributes:
+        path: Prim path, which is also the label of the shape in Newton.
+        link: Index of its link.
+        kind: ``box``, ``sphere``, ``capsule`` or ``cylinder``.
+        size: Half extents of a box; (radius,) of a sphere; (radius, half the length without the caps)
+            of a capsule; (radius, half height) of a cylinder [m]. The last two lie along z of ``frame``.
+        frame: Pose in the link frame [7].
+        friction: Coefficient of (dynamic) friction.
+        restitution: Coefficient of restitution.
+        stiffness: Newton's contact stiffness.
+        damping: Newton's contact damping.
+        gap: Distance at which contacts are looked for [m].
+        fingertip: Whether its material is that of the fingertip variant.
+    """
+
+    path: str
+    link: int
+    kind: str
+    size: tuple[float, ...]
+    frame: np.ndarray
+    friction: float
+    restitution: float
+    stiffness: float
+    damping: float
+    gap: float
+    fingertip: bool
+
+
+@dataclass(frozen=True, eq=False)
+class HandModel:
+    """A hand as read from USD; F fingers, D = 3F joints, L = D + 1 links (``base`` is link 0).
+
+    Joints and links are ordered by finger and from the palm: ``f0_j1, f0_j2, f0_j3, f1_j1, ...``.
+
+    Attributes:
+        name: Name of the hand.
+        fingertip: Selected kind of fingertip.
+        path: The file it was read from.
+        num_fingers: F.
+        link_names: Names of the links [L].
+        joint_names: Names of the joints [D].
+        joint_parent: Index of each joint's parent link [D].
+        joint_child: Index of each joint's child link [D].
+        joint_axis: Unit axis in both joint frames [D, 3].
+        joint_parent_frame: Pose of the joint frame in the parent link [D, 7].
+        joint_child_frame: Pose of the joint frame in the child link [D, 7].
+        lower: Lower limits [D] [rad].
+        upper: Upper limits [D] [rad].
+        kp: Drive stiffness [D] [N m/rad].
+        kd: Drive damping [D] [N m s/rad].
+        effort: Torque limits [D] [N m].
+        velocity_limit: Speed limits [D] [rad/s].
+        armature: Rotor inertia about each axis [D] [kg m^2].
+        link_mass: Masses [L] [kg].
+        link_com: Centres of mass in the link frames [L, 3] [m].
+        link_inertia: Inertia about the centre of mass in the link frames [L, 3, 3] [kg m^2].
+        tip_names: Names of the fingertip sites [F].
+        tip_link: Index of the link of each site [F].
+        tip_frame: Pose of each site in its link [F, 7].
+        camera: The depth camera.
+        point_names: What each set of surface samples covers [P]; ``f0_motor, f0_l1, f0_l2, f0_l3, ...``.
+            P = 4F: the palm itself is not sampled, as in the paper's released code.
+        point_link: Link whose frame each set is in [P]; the first motors are fixed to link 0.
+        link_points: Surface samples [P, 500, 3] [m].
+        shapes: Collision primitives.
+        filtered_pairs: Pairs of links (lower index first) that never collide.
+    """
+
+    name: str
+    fingertip: str
+    path: Path
+    num_fingers: int
+    link_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    joint_parent: np.ndarray
+    joint_child: np.ndarray
+    joint_axis: np.ndarray
+    joint_parent_frame: np.ndarray
+    joint_child_frame: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    kp: np.ndarray
+    kd: np.ndarray
+    effort: np.ndarray
+    velocity_limit: np.ndarray
+    armature: np.ndarray
+    link_mass: np.ndarray
+    link_com: np.ndarray
+    link_inertia: np.ndarray
+    tip_names: tuple[str, ...]
+    tip_link: np.ndarray
+    tip_frame: np.ndarray
+    camera: CameraModel
+    point_names: tuple[str, ...]
+    point_link: np.ndarray
+    link_points: np.ndarray
+    shapes: tuple[CollisionShape, ...]
+    filtered_pairs: tuple[tuple[int, int], ...]
+
+    @property
+    def num_joints(self) -> int:
+        """D."""
+        return len(self.joint_names)
+
+    def forward_kinematics(self, q: np.ndarray) -> np.ndarray:
+        """Poses of all links in the base frame.
+
+        Args:
+            q: Joint positions [.., D] [rad].
+
+        Returns:
+            Poses [.., L, 7].
+
+        Raises:
+            ValueError: The last axis of ``q`` is not D long.
+        """
+        q = np.asarray(q, dtype=float)
+        if q.shape[-1:] != (self.num_joints,):
+            raise ValueError(
+                f"{self.name}: q has shape {q.shape}; its last axis must be {self.num_joints} joints"
+            )
+        batch = q.shape[:-1]
+        flat = q.reshape(-1, self.num_joints)
+        poses = np.empty((len(flat), len(self.link_names), 7))
+        poses[:, 0] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+        for joint in range(self.num_joints):  # parents come before their children
+            turn = Rotation.from_rotvec(flat[:, joint, None] * self.joint_axis[joint]).as_quat()
+            motion = np.concatenate([np.zeros((len(flat), 3)), turn], axis=1)
+            pose = compose(poses[:, self.joint_parent[joint]], self.joint_parent_frame[joint])
+            pose = compose(compose(pose, motion), invert(self.joint_child_frame[joint]))
+            poses[:, self.joint_child[joint]] = pose
+        return poses.reshape(*batch, len(self.link_names), 7)
+
+    def tip_poses(self, q: np.ndarray) -> np.ndarray:
+        """Poses of the fingertip sites in the base frame, [.., F, 7], for ``q`` [.., D] [rad]."""
+        return compose(self.forward_kinematics(q)[..., self.tip_link, :], self.tip_frame)
+
+
+def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Poses ``first * second``; [.., 7] each, broadcast against each other."""
+    first, second = np.broadcast_arrays(np.asarray(first, dtype=float), np.asarray(second, dtype=float))
+    a, b = first.reshape(-1, 7), second.reshape(-1, 7)
+    turn = Rotation.from_quat(a[:, 3:])
+    moved = turn.apply(b[:, :3]) + a[:, :3]
+    return np.concatenate([moved, (turn * Rotation.from_quat(b[:, 3:])).as_quat()], axis=1).reshape(
+        first.shape
+    )
+
+
+def invert(pose: np.ndarray) -> np.ndarray:
+    """The inverse of one pose [7]."""
+    turn = Rotation.from_quat(pose[3:]).inv()
+    return np.concatenate([-turn.apply(pose[:3]), turn.as_quat()])
+
+
+def open_stage(path: Path, fingertip: str = "rigid") -> Usd.Stage:
+    """The stage of a hand with a kind of fingertip selected in the session layer.
+
+    Pass the stage itself, not the path, to ``newton.ModelBuilder.add_usd``: the selection is not in the file.
+
+    Raises:
+        HandError: The file is missing, no USD, or has no such fingertip.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise HandError(f"{path}: no such file; author one with vd.assets_usd.hand_author.hand_usd(name)")
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise HandError(f"{path}: not a USD file ({error}); author the hand again") from error
+    root = stage.GetDefaultPrim()
+    if not root:
+        raise HandError(f"{path}: the stage has no default prim; set it to the hand's root prim")
+    variants = root.GetVariantSet("fingertip")
+    kinds = variants.GetVariantNames()
+    if fingertip not in kinds:
+        raise HandError(
+            f"{path}: {root.GetPath()} has no variant {fingertip!r} in its set 'fingertip': "
+            f"choose one of {', '.join(kinds) or 'none (author the hand again)'}"
+        )
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        variants.SetVariantSelection(fingertip)
+    return stage
+
+
+def read_hand(path: Path, *, fingertip: str = "rigid") -> HandModel:
+    """Read a hand from USD.
+
+    Args:
+        path: File in the layout of :mod:`vd.assets_usd.hand_author`.
+        fingertip: Kind of fingertip, a variant of the file (``rigid`` or ``soft``).
+
+    Raises:
+        HandError: The file is not a hand; names the prim and the attribute.
+    """
+    return _Reader(Path(path), fingertip).read()
+
+
+class _Reader:
+    """One reading of one file; every method raises :class:`HandError`."""
+
+    def __init__(self, path: Path, fingertip: str):
+        self.path = path
+        self.fingertip = fingertip
+        self.stage = open_stage(path, fingertip)
+        self.root = self.stage.GetDefaultPrim()
+        self.cache = UsdGeom.XformCache()
+
+    def fail(self, where: Any, what: str, remedy: str) -> HandError:
+        """The error to raise for a prim or a path."""
+        prim = where.GetPath() if isinstance(where, Usd.Prim) else where
+        return HandError(f"{self.path}: {prim}: {what}; {remedy}")
+
+    def prim(self, relative: str) -> Usd.Prim:
+        """The prim at a path below the root."""
+        path = self.root.GetPath().AppendPath(relative)
+        prim = self.stage.GetPrimAtPath(path)
+        if not prim:
+            raise self.fail(path, "the prim is missing", "add it, or author the hand again")
+        return prim
+
+    def value(self, prim: Usd.Prim, attribute: str) -> Any:
+        """The value of an attribute, which must have been authored."""
+        found = prim.GetAttribute(attribute)
+        if not found or not found.HasAuthoredValue():
+            raise self.fail(prim, f"'{attribute}' is not authored", "give it a value")
+        return found.Get()
+
+    def number(self, prim: Usd.Prim, attribute: str, *, positive: bool = False) -> float:
+        """The value of a scalar attribute: finite, and above zero where that is asked for."""
+        number = float(self.value(prim, attribute))
+        if not math.isfinite(number) or (positive and number <= 0.0):
+            wanted = "positive" if positive else "finite"
+            raise self.fail(prim, f"'{attribute}' is {number}", f"it must be {wanted}")
+        return number
+
+    def read(self) -> HandModel:
+        """The whole hand."""
+        self._check_units()
+        if not self.root.HasAPI(UsdPhysics.ArticulationRootAPI):
+            raise self.fail(self.root, "PhysicsArticulationRootAPI is missing", "apply it to the root prim")
+        fingers = self._fingers()
+        order = [(f, i) for f in range(fingers) for i in range(1, JOINTS_PER_FINGER + 1)]
+        links = ("base", *(f"f{f}_l{i}" for f, i in order))
+        joints = [self.prim(f"f{f}_j{i}") for f, i in order]
+        bodies = [self.prim(name) for name in links]
+        index = {body.GetPath(): i for i, body in enumerate(bodies)}
+        masses = [self._mass(body) for body in bodies]
+        frames = [self._joint_frames(joint, index) for joint in joints]
+        drives = np.array([self._drive(joint) for joint in joints])
+        tips = [f"f{f}_tip" for f in range(fingers)]
+        tip_prims = [self.prim(f"f{f}_l{JOINTS_PER_FINGER}/{tip}") for f, tip in enumerate(tips)]
+        points = [(f"f{f}_motor", self.prim(f"base/f{f}_motor_points"), 0) for f in range(fingers)]
+        points += [(links[i], self.prim(f"{links[i]}/points"), i) for i in range(1, len(links))]
+        points.sort(key=lambda entry: (int(entry[0][1 : entry[0].index("_")]), entry[2]))
+        return HandModel(
+            name=self.root.GetName(),
+            fingertip=self.fingertip,
+            path=self.path,
+            num_fingers=fingers,
+            link_names=links,
+            joint_names=tuple(joint.GetName() for joint in joints),
+            joint_parent=np.array([frame[0] for frame in frames]),
+            joint_child=np.array([frame[1] for frame in frames]),
+            joint_axis=np.array([self._axis(joint) for joint in joints]),
+            joint_parent_frame=np.array([frame[2] for frame in frames]),
+            joint_child_frame=np.array([frame[3] for frame in frames]),
+            lower=drives[:, 0],
+            upper=drives[:, 1],
+            kp=drives[:, 2],
+            kd=drives[:, 3],
+            effort=drives[:, 4],
+            velocity_limit=drives[:, 5],
+            armature=drives[:, 6],
+            link_mass=np.array([mass for mass, _, _ in masses]),
+            link_com=np.array([com for _, com, _ in masses]),
+            link_inertia=np.array([inertia for _, _, inertia in masses]),
+            tip_names=tuple(tips),
+            tip_link=np.array([index[prim.GetParent().GetPath()] for prim in tip_prims]),
+            tip_frame=np.array([self._relative(prim, prim.GetParent()) for prim in tip_prims]),
+            camera=self._camera(self.prim("base/camera"), bodies[0]),
+            point_names=tuple(name for name, _, _ in points),
+            point_link=np.array([link for _, _, link in points]),
+            link_points=self._points([prim for _, prim, _ in points]),
+            shapes=tuple(shape for i, body in enumerate(bodies) for shape in self._shapes(body, i)),
+            filtered_pairs=self._filtered(bodies, index),
+        )
+
+    def _check_units(self) -> None:
+        if UsdGeom.GetStageUpAxis(self.stage) != UsdGeom.Tokens.z:
+            raise self.fail("/", "'upAxis' is not Z", "author the hand with z up")
+        for name, unit in (
+            ("metersPerUnit", UsdGeom.GetStageMetersPerUnit(self.stage)),
+            ("kilogramsPerUnit", UsdPhysics.GetStageKilogramsPerUnit(self.stage)),
+        ):
+            if unit != 1.0:
+                raise self.fail("/", f"'{name}' is {unit}", "author the hand in metres and kilograms")
+
+    def _fingers(self) -> int:
+        """The number of fingers, numbered without gaps."""
+        matches = [LINK_NAME.fullmatch(child.GetName()) for child in self.root.GetChildren()]
+        found = sorted({int(match[1]) for match in matches if match})
+        if not found or found != list(range(len(found))):
+            raise self.fail(
+                self.root,
+                f"fingers {found} found",
+                "name links f0_l1 to f0_l3, f1_l1 and so on, without gaps",
+            )
+        return len(found)
+
+    def _relative(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
+        """Pose [7] of a prim in the frame of an ancestor; a scale is dropped, shear is refused."""
+        matrix, _ = self.cache.ComputeRelativeTransform(prim, ancestor)
+        rows = np.array(matrix)[:3, :3]
+        scale = np.linalg.norm(rows, axis=1)
+        turn = (rows / scale[:, None]).T  # USD transforms row vectors
+        if np.abs(turn @ turn.T - np.eye(3)).max() > ORTHONORMAL_TOLERANCE or np.linalg.det(turn) < 0.0:
+            raise self.fail(
+                prim, "its transform shears or mirrors", "use translation, rotation and scale only"
+            )
+        return np.concatenate([np.array(matrix.ExtractTranslation()), Rotation.from_matrix(turn).as_quat()])
+
+    def _mass(self, body: Usd.Prim) -> tuple[float, np.ndarray, np.ndarray]:
+        if not body.HasAPI(UsdPhysics.RigidBodyAPI):
+            raise self.fail(body, "PhysicsRigidBodyAPI is missing", "apply it to every link")
+        mass = self.number(body, "physics:mass", positive=True)
+        com = np.array(self.value(body, "physics:centerOfMass"), dtype=float)
+        moments = np.array(self.value(body, "physics:diagonalInertia"), dtype=float)
+        if not np.all(moments > 0.0) or 2.0 * moments.max() > moments.sum() * (1.0 + ORTHONORMAL_TOLERANCE):
+            raise self.fail(
+                body,
+                f"'physics:diagonalInertia' is {moments}",
+                "three positive moments, none above the sum of two",
+            )
+        axes = Rotation.from_quat(_xyzw(self.value(body, "physics:principalAxes"))).as_matrix()
+        return mass, com, axes @ np.diag(moments) @ axes.T
+
+    def _axis(self, joint: Usd.Prim) -> np.ndarray:
+        return np.eye(3)["XYZ".index(self.value(joint, "physics:axis"))]
+
+    def _joint_frames(
+        self, joint: Usd.Prim, index: dict[Any, int]
+    ) -> tuple[int, int, np.ndarray, np.ndarray]:
+        """Parent link, child link, and the joint frame in each."""
+        if not joint.IsA(UsdPhysics.RevoluteJoint):
+            raise self.fail(
+                joint, f"is a {joint.GetTypeName() or 'typeless prim'}", "make it a PhysicsRevoluteJoint"
+            )
+        links, frames = [], []
+        for side in (0, 1):
+            targets = joint.GetRelationship(f"physics:body{side}").GetTargets()
+            if len(targets) != 1 or targets[0] not in index:
+                names = [str(target) for target in targets]
+                raise self.fail(joint, f"'physics:body{side}' is {names}", "point it at one link of the hand")
+            links.append(index[targets[0]])
+            position = np.array(self.value(joint, f"physics:localPos{side}"), dtype=float)
+            frames.append(np.concatenate([position, _xyzw(self.value(joint, f"physics:localRot{side}"))]))
+        finger, number = re.findall(r"\d+", joint.GetName())
+        child = self.root.GetPath().AppendChild(f"f{finger}_l{number}")
+        parent = self.root.GetPath().AppendChild("base" if number == "1" else f"f{finger}_l{int(number) - 1}")
+        if links != [index[parent], index[child]]:
+            raise self.fail(joint, "joins other links than its name says", f"join {parent} and {child}")
+        return links[0], links[1], frames[0], frames[1]
+
+    def _drive(self, joint: Usd.Prim) -> tuple[float, ...]:
+        """Limits, kp, kd, effort, velocity limit and armature, in radians."""
+        lower = self.number(joint, "physics:lowerLimit")
+        upper = self.number(joint, "physics:upperLimit")
+        if lower >= upper:
+            raise self.fail(
+                joint, f"'physics:lowerLimit' {lower} is not below 'physics:upperLimit' {upper}", "swap"
+            )
+        stiffness = self.number(joint, "drive:angular:physics:stiffness", positive=True)
+        damping = self.number(joint, "drive:angular:physics:damping", positive=True)
+        return (
+            math.radians(lower),
+            math.radians(upper),
+            math.degrees(stiffness),  # authored per degree
+            math.degrees(damping),
+            self.number(joint, "drive:angular:physics:maxForce", positive=True),
+            math.radians(self.number(joint, "newton:velocityLimit", positive=True)),
+            self.number(joint, "newton:armature"),
+        )
+
+    def _camera(self, prim: Usd.Prim, base: Usd.Prim) -> CameraModel:
+        if not prim.IsA(UsdGeom.Camera):
+            raise self.fail(prim, f"is a {prim.GetTypeName() or 'typeless prim'}", "make it a Camera")
+        width, height = (int(n) for n in self.value(prim, "vd:resolution"))
+        focal = self.number(prim, "focalLength", positive=True)
+        across = self.number(prim, "horizontalAperture", positive=True)
+        down = self.number(prim, "verticalAperture", positive=True)
+        near, far = self.value(prim, "clippingRange")
+        pose = self._relative(prim, base)
+        # A window shifted to the right moves the principal point to the left in the image; up, down.
+        return CameraModel(
+            width=width,
+            height=height,
+            fx=focal / across * width,
+            fy=focal / down * height,
+            cx=(0.5 - self.number(prim, "horizontalApertureOffset") / across) * width,
+            cy=(0.5 + self.number(prim, "verticalApertureOffset") / down) * height,
+            near=float(near),
+            far=float(far),
+            position=pose[:3],
+            quaternion=(Rotation.from_quat(pose[3:]) * OPTICAL_FROM_USD).as_quat(),
+        )
+
+    def _points(self, prims: list[Usd.Prim]) -> np.ndarray:
+        sets = [np.array(self.value(prim, "points"), dtype=np.float32) for prim in prims]
+        for prim, samples in zip(prims, sets, strict=True):
+            if samples.shape != sets[0].shape or not np.isfinite(samples).all() or not samples.size:
+                raise self.fail(
+                    prim,
+                    f"'points' has shape {samples.shape}",
+                    f"{len(sets[0])} finite points, as many on each link",
+                )
+        return np.stack(sets)
+
+    def _shapes(self, body: Usd.Prim, link: int) -> list[CollisionShape]:
+        prims = [prim for prim in Usd.PrimRange(body) if prim.HasAPI(UsdPhysics.CollisionAPI)]
+        if not prims:
+            raise self.fail(body, "has no collider", "apply PhysicsCollisionAPI to a primitive below it")
+        return [self._shape(prim, body, link) for prim in prims]
+
+    def _shape(self, prim: Usd.Prim, body: Usd.Prim, link: int) -> CollisionShape:
+        frame = self._relative(prim, body)
+        matrix, _ = self.cache.ComputeRelativeTransform(prim, body)
+        scale = np.linalg.norm(np.array(matrix)[:3, :3], axis=1)
+        kind = str(prim.GetTypeName())
+        size: tuple[float, ...]
+        if kind == "Cube":
+            half = self.number(prim, "size", positive=True) / 2.0
+            size = tuple(float(half * s) for s in scale)
+        elif kind in ("Sphere", "Capsule", "Cylinder"):
+            if np.abs(scale - 1.0).max() > ORTHONORMAL_TOLERANCE:
+                raise self.fail(prim, f"is scaled by {scale}", "put the size into its radius and height")
+            size = (self.number(prim, "radius", positive=True),)
+            if kind != "Sphere":
+                size += (self.number(prim, "height", positive=True) / 2.0,)
+                upright = np.roll(np.eye(3), "XYZ".index(self.value(prim, "axis")) - 2, axis=1)
+                frame[3:] = (Rotation.from_quat(frame[3:]) * Rotation.from_matrix(upright)).as_quat()
+        else:
+            raise self.fail(prim, f"is a {kind}", "collide with a Cube, Sphere, Capsule or Cylinder")
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial("physics")
+        if not material:
+            raise self.fail(prim, "no physics material is bound", "bind one with friction")
+        surface = material.GetPrim()
+        return CollisionShape(
+            path=str(prim.GetPath()),
+            link=link,
+            kind="box" if kind == "Cube" else kind.lower(),
+            size=size,
+            frame=frame,
+            friction=self.number(surface, "physics:dynamicFriction"),
+            restitution=self.number(surface, "physics:restitution"),
+            stiffness=self.number(surface, "newton:contactStiffness", positive=True),
+            damping=self.number(surface, "newton:contactDamping", positive=True),
+            gap=self.number(prim, "newton:contactGap"),
+            fingertip=surface.GetName() == "fingertip_surface",
+        )
+
+    def _filtered(self, bodies: list[Usd.Prim], index: dict[Any, int]) -> tuple[tuple[int, int], ...]:
+        pairs = set()
+        for first, body in enumerate(bodies):
+            for target in body.GetRelationship("physics:filteredPairs").GetTargets():
+                if target not in index or index[target] == first:
+                    raise self.fail(
+                        body, f"'physics:filteredPairs' names {target}", "name another link of the hand"
+                    )
+                pairs.add((min(first, index[target]), max(first, index[target])))
+        return tuple(sorted(pairs))
+
+
+def _xyzw(quaternion: Gf.Quatf) -> np.ndarray:
+    """A USD quaternion as a unit quaternion xyzw [4], in double precision."""
+    components = np.array([*quaternion.GetImaginary(), quaternion.GetReal()], dtype=float)
+    return np.asarray(components / np.linalg.norm(components))
