@@ -1,0 +1,147 @@
+"""Reading foreign meshes: load, refuse what is none, repair, choose the scale."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd.assets_usd.objects.geometry import Solid, solid_of_mesh, solid_of_voxels, voxelise_surface
+
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+
+LONGEST_SIDE_M = (0.095, 0.165)
+"""Range of an object's longest side: the objects of the paper."""
+
+UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
+"""Units a mesh may be in; the first that needs the least rescaling is taken."""
+
+FLAT = 1e-3
+"""A mesh thinner than this share of its longest side has no volume to simulate."""
+
+
+class MeshError(ValueError):
+    """A mesh is refused; the message is the reason."""
+
+
+@dataclass(frozen=True)
+class RepairedMesh:
+    """A cleaned mesh in its own units.
+
+    Attributes:
+        vertices: [V, 3] float64.
+        faces: [T, 3] int32.
+        watertight: Closed, consistently wound and of one piece.
+        notes: What was done.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    watertight: bool
+    notes: tuple[str, ...]
+
+
+def load_mesh(path: Path) -> Any:
+    """Load a mesh file as one ``trimesh.Trimesh``, unprocessed.
+
+    Raises:
+        MeshError: Unsupported type, unreadable, empty, without faces, or with non-finite vertices.
+    """
+    import trimesh
+
+    path = Path(path)
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise MeshError(f"unsupported type {path.suffix or '(no suffix)'}; use {', '.join(MESH_SUFFIXES)}")
+    if not path.is_file():
+        raise MeshError("no such file")
+    if path.stat().st_size == 0:
+        raise MeshError("empty file")
+    try:
+        # Textures and materials are not needed, and missing ones must not stop the import.
+        loaded = trimesh.load(path, process=False, skip_materials=True)
+        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+    except Exception as error:  # parsers raise anything on a broken file
+        raise MeshError(f"not a mesh: {type(error).__name__}: {error}") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        points = len(getattr(mesh, "vertices", ()))
+        raise MeshError(f"not a mesh: {points} points and no faces" if points else "empty: no faces")
+    if not np.isfinite(mesh.vertices).all():
+        bad = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
+        raise MeshError(f"{bad} of {len(mesh.vertices)} vertices are NaN or infinite")
+    return mesh
+
+
+def repair_mesh(mesh: Any) -> RepairedMesh:
+    """Merge vertices, drop degenerate and duplicate faces, fix winding, fill small holes.
+
+    Raises:
+        MeshError: Nothing but degenerate faces, or flat.
+    """
+    import trimesh
+
+    notes = []
+    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    before = len(mesh.faces)
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
+    mesh.remove_unreferenced_vertices()
+    if not len(mesh.faces):
+        raise MeshError(f"degenerate: all {before} faces have no area")
+    if len(mesh.faces) < before:
+        notes.append(f"removed {before - len(mesh.faces)} degenerate or duplicate faces")
+    extents = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), full_matrices=False)[2]
+    spread = np.ptp(mesh.vertices @ extents.T, axis=0)
+    if spread.min() < FLAT * spread.max():
+        raise MeshError(f"degenerate: flat ({spread.min():.3g} thick for {spread.max():.3g} long)")
+    if not mesh.is_watertight:
+        trimesh.repair.fill_holes(mesh)
+        if mesh.is_watertight:
+            notes.append("filled holes")
+    if not mesh.is_winding_consistent:
+        notes.append("fixed winding")
+    trimesh.repair.fix_normals(mesh)
+    one_piece = mesh.body_count == 1
+    watertight = bool(mesh.is_watertight and mesh.is_winding_consistent and one_piece and mesh.volume > 0.0)
+    if not mesh.is_watertight:
+        notes.append("not watertight: volume and mass properties from a voxelised solid")
+    elif not one_piece:
+        notes.append(f"{mesh.body_count} pieces: volume and mass properties from a voxelised solid")
+    return RepairedMesh(
+        np.asarray(mesh.vertices, dtype=np.float64),
+        np.asarray(mesh.faces, dtype=np.int32),
+        watertight,
+        tuple(notes),
+    )
+
+
+def choose_scale(longest: float) -> tuple[float, str]:
+    """Factor from a mesh's units to metres, so that its longest side lies in ``LONGEST_SIDE_M``.
+
+    The unit (m, mm, cm) is the one that needs the least rescaling. A longest side inside the range
+    then stays as it is; outside, it is scaled to the nearer bound.
+
+    Args:
+        longest: Longest side of the bounding box in the mesh's units.
+
+    Returns:
+        The factor and a note, empty if the mesh is taken as it is.
+    """
+    low, high = LONGEST_SIDE_M
+
+    def rescale(factor: float) -> float:
+        side = longest * factor
+        return float(np.clip(side, low, high)) / side
+
+    unit, factor = min(UNITS_M.items(), key=lambda item: abs(np.log(rescale(item[1]))))
+    fit = rescale(factor)
+    words = [] if unit == "m" else [f"taken as {unit}"]
+    if fit != 1.0:
+        words.append(f"scaled by {fit:.3g} to {longest * factor * fit:.3f} m")
+    return factor * fit, ", ".join(words)
+
+
+def solid_of(mesh: RepairedMesh) -> tuple[Solid, str]:
+    """Mass properties of a mesh at density 1, and the method: exact if watertight, else voxels."""
+    if mesh.watertight:
+        return solid_of_mesh(mesh.vertices, mesh.faces), "exact mesh volume"
+    return solid_of_voxels(*voxelise_surface(mesh.vertices, mesh.faces)), "voxelised solid"

@@ -1,0 +1,379 @@
+"""The object format: one USD file per rigid object, written and read here and nowhere else.
+
+Layout of a file (metres, kilograms, z up; the origin is the centre of mass)::
+
+    /<name>              Xform, default prim; RigidBodyAPI, MassAPI (mass, inertia, principal axes)
+      visual             Mesh, for pictures only
+      collision/hull_0.. Mesh with CollisionAPI and MeshCollisionAPI (convexHull), bound to material
+      surface_points     Points, the object's point cloud
+      material           physics material (nominal friction)
+
+Everything that is not geometry or physics (licence, source, errors, symmetries) is custom data of
+the root prim under ``visualDexterity``. Files are binary crates (``.usd``): 150 objects are a few MB.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.objects.geometry import Hull, Solid, principal_axes
+from vd.files import atomic_path
+from vd.paper import PAPER
+
+FORMAT_VERSION = 1
+SURFACE_POINTS = 500
+"""Points of an object's cloud (the paper samples 500 from each CAD model)."""
+
+SUFFIXES = (".usd", ".usda", ".usdc")
+IDENTITY = np.array([[0.0, 0.0, 0.0, 1.0]])
+_CUSTOM = "visualDexterity"
+
+
+class ObjectError(ValueError):
+    """An object file or set cannot be used; the message names it, the field and the remedy."""
+
+
+@dataclass(frozen=True)
+class ObjectModel:
+    """A rigid object with its origin at the centre of mass (object frame, SI).
+
+    Attributes:
+        name: Prim and file name.
+        vertices: Visual mesh, [V, 3] float32.
+        faces: Visual triangles, [T, 3] int32, outward.
+        hulls: Convex collision parts.
+        mass_kg: Nominal mass.
+        inertia: Principal moments about the centre of mass, [3], kg m^2.
+        inertia_quat: Principal frame in the object frame, quaternion xyzw, [4].
+        surface_points: Even samples of the surface, [500, 3] float32.
+        symmetry: Rotations that map the object to itself, quaternions xyzw [K, 4]; the identity first.
+        licence: Licence of the shape.
+        source: Where the shape comes from.
+        family: Kind of object (procedural family, or ``imported``).
+        split: ``train``, ``test`` or empty.
+        scale: Factor from the source's units to metres in this file.
+        volume_error: |volume of the union of hulls - volume of the solid| / volume of the solid.
+        volume_method: How that was estimated.
+        content_hash: Hash of what the file was made from; equal hashes need no new work.
+        notes: What was repaired or assumed.
+    """
+
+    name: str
+    vertices: np.ndarray
+    faces: np.ndarray
+    hulls: tuple[Hull, ...]
+    mass_kg: float
+    inertia: np.ndarray
+    inertia_quat: np.ndarray
+    surface_points: np.ndarray
+    symmetry: np.ndarray = field(default_factory=IDENTITY.copy)
+    licence: str = "unknown"
+    source: str = ""
+    family: str = ""
+    split: str = ""
+    scale: float = 1.0
+    volume_error: float = 0.0
+    volume_method: str = ""
+    content_hash: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def com(self) -> np.ndarray:
+        """Centre of mass in the object frame: zero by construction, [3]."""
+        return np.zeros(3)
+
+    @property
+    def inertia_matrix(self) -> np.ndarray:
+        """Inertia about the centre of mass in the object frame, [3, 3], kg m^2."""
+        axes = Rotation.from_quat(self.inertia_quat).as_matrix()
+        return axes @ np.diag(self.inertia) @ axes.T
+
+    @property
+    def longest_side(self) -> float:
+        """Longest side of the axis-aligned bounding box of the visual mesh, m."""
+        return float(np.ptp(self.vertices, axis=0).max())
+
+    @property
+    def diameter(self) -> float:
+        """Largest distance between two points of the object, m."""
+        from scipy.spatial import ConvexHull
+        from scipy.spatial.distance import pdist
+
+        return float(pdist(self.vertices[ConvexHull(self.vertices).vertices]).max())
+
+    @property
+    def radius(self) -> float:
+        """Largest distance of the surface from the centre of mass, m."""
+        return float(np.linalg.norm(self.vertices, axis=1).max())
+
+
+def build_model(
+    name: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    hulls: Sequence[Hull],
+    solid: Solid,
+    points: np.ndarray,
+    *,
+    mass_kg: float = PAPER.materials.object_mass_kg,
+    **fields: Any,
+) -> ObjectModel:
+    """Assemble a model from geometry in any frame: moves the origin to the solid's centroid.
+
+    Args:
+        name: A valid prim name.
+        vertices: Visual mesh [V, 3], m.
+        faces: [T, 3].
+        hulls: Collision parts in the same frame.
+        solid: Mass properties at density 1 in the same frame.
+        points: Surface points [500, 3] in the same frame.
+        mass_kg: Mass; the inertia is scaled to it.
+        **fields: The remaining fields of :class:`ObjectModel`.
+
+    Raises:
+        ObjectError: The solid has no volume.
+    """
+    if not solid.volume > 0.0:
+        raise ObjectError(f"{name}: the solid has no volume")
+    moments, quat = principal_axes(solid.inertia * (mass_kg / solid.volume))
+    return ObjectModel(
+        name=name,
+        vertices=np.asarray(vertices - solid.centroid, dtype=np.float32),
+        faces=np.asarray(faces, dtype=np.int32),
+        hulls=tuple(
+            Hull(np.asarray(h.vertices - solid.centroid, np.float32), np.asarray(h.faces, np.int32))
+            for h in hulls
+        ),
+        mass_kg=float(mass_kg),
+        inertia=moments,
+        inertia_quat=quat,
+        surface_points=np.asarray(points - solid.centroid, dtype=np.float32),
+        **fields,
+    )
+
+
+def _add_mesh(stage: Any, path: str, vertices: np.ndarray, faces: np.ndarray) -> Any:
+    from pxr import UsdGeom, Vt
+
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, dtype=np.float32)))
+    mesh.CreateFaceVertexIndicesAttr(
+        Vt.IntArray.FromNumpy(np.ascontiguousarray(faces, dtype=np.int32).reshape(-1))
+    )
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    extent = np.stack([vertices.min(axis=0), vertices.max(axis=0)]).astype(np.float32)
+    mesh.CreateExtentAttr(Vt.Vec3fArray.FromNumpy(extent))
+    return mesh
+
+
+def write_object(path: Path, model: ObjectModel) -> Path:
+    """Write a model to one USD file, atomically.
+
+    Args:
+        path: Target; ``.usd``/``.usdc`` are binary, ``.usda`` is text.
+        model: What to write.
+
+    Returns:
+        The path.
+
+    Raises:
+        ObjectError: The name is no valid prim name or the suffix is not a USD one.
+    """
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
+
+    path = Path(path)
+    if path.suffix not in SUFFIXES:
+        raise ObjectError(f"{path}: the suffix must be one of {', '.join(SUFFIXES)}")
+    if not Sdf.Path.IsValidIdentifier(model.name):
+        raise ObjectError(f"{path}: name {model.name!r} is no valid prim name; use letters, digits and _")
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+    root = f"/{model.name}"
+    prim = UsdGeom.Xform.Define(stage, root).GetPrim()
+    stage.SetDefaultPrim(prim)
+    UsdPhysics.RigidBodyAPI.Apply(prim)
+    mass = UsdPhysics.MassAPI.Apply(prim)
+    mass.CreateMassAttr(model.mass_kg)
+    mass.CreateCenterOfMassAttr(Gf.Vec3f(0.0))
+    mass.CreateDiagonalInertiaAttr(Gf.Vec3f(*map(float, model.inertia)))
+    x, y, z, w = map(float, model.inertia_quat)
+    mass.CreatePrincipalAxesAttr(Gf.Quatf(w, x, y, z))
+
+    material = UsdShade.Material.Define(stage, f"{root}/material")
+    physics = UsdPhysics.MaterialAPI.Apply(material.GetPrim())
+    physics.CreateStaticFrictionAttr(PAPER.materials.friction)
+    physics.CreateDynamicFrictionAttr(PAPER.materials.friction)
+
+    _add_mesh(stage, f"{root}/visual", model.vertices, model.faces)
+    UsdGeom.Scope.Define(stage, f"{root}/collision")
+    for i, hull in enumerate(model.hulls):
+        mesh = _add_mesh(stage, f"{root}/collision/hull_{i}", hull.vertices, hull.faces)
+        mesh.CreatePurposeAttr(UsdGeom.Tokens.guide)
+        UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
+        collision = UsdPhysics.MeshCollisionAPI.Apply(mesh.GetPrim())
+        collision.CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
+        UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material, materialPurpose="physics")
+    points = UsdGeom.Points.Define(stage, f"{root}/surface_points")
+    points.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(model.surface_points, np.float32)))
+    points.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    prim.SetCustomDataByKey(
+        _CUSTOM,
+        {
+            "formatVersion": FORMAT_VERSION,
+            "licence": model.licence,
+            "source": model.source,
+            "family": model.family,
+            "split": model.split,
+            "scale": float(model.scale),
+            "volumeError": float(model.volume_error),
+            "volumeMethod": model.volume_method,
+            "contentHash": model.content_hash,
+            "notes": "\n".join(model.notes),
+            "symmetry": Vt.DoubleArray.FromNumpy(
+                np.ascontiguousarray(model.symmetry, np.float64).reshape(-1)
+            ),
+        },
+    )
+    with atomic_path(path) as temporary:
+        stage.GetRootLayer().Export(str(temporary))
+    return path
+
+
+def _open(path: Path) -> tuple[Any, Any, dict[str, Any]]:
+    """Stage, root prim and custom data of an object file."""
+    from pxr import Sdf, Tf, Usd
+
+    path = Path(path)
+    if not path.is_file():
+        raise ObjectError(f"{path}: no such object file")
+    try:
+        # Anonymous: a layer cached by path would hide that the file was written anew.
+        layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    except Tf.ErrorException as error:
+        raise ObjectError(f"{path}: not a USD file; import it again") from error
+    if layer is None:
+        raise ObjectError(f"{path}: not a USD file; import it again")
+    stage = Usd.Stage.Open(layer)
+    prim = stage.GetDefaultPrim()
+    data = dict(prim.GetCustomDataByKey(_CUSTOM) or {}) if prim else {}
+    version = data.get("formatVersion")
+    if version != FORMAT_VERSION:
+        raise ObjectError(
+            f"{path}: formatVersion is {version}, this version reads {FORMAT_VERSION}; "
+            "write the object again with vd-assets import or vd-assets objects"
+        )
+    return stage, prim, data
+
+
+def read_hash(path: Path) -> str | None:
+    """The content hash of an object file, or None where there is no readable one."""
+    try:
+        return str(_open(path)[2]["contentHash"])
+    except ObjectError:
+        return None
+
+
+def read_object(path: Path) -> ObjectModel:
+    """Read an object file.
+
+    Args:
+        path: A file written by :func:`write_object`.
+
+    Raises:
+        ObjectError: The file is missing, no USD, of another version, or a part is missing.
+    """
+    from pxr import UsdGeom, UsdPhysics
+
+    path = Path(path)
+    stage, prim, data = _open(path)
+    root = prim.GetPath()
+
+    def array(relative: str, attribute: str, columns: int, dtype: Any) -> np.ndarray:
+        child = stage.GetPrimAtPath(root.AppendPath(relative))
+        value = child.GetAttribute(attribute).Get() if child else None
+        if value is None or not len(value):
+            raise ObjectError(f"{path}: {relative}.{attribute} is missing; import the object again")
+        return np.array(value, dtype=dtype).reshape(-1, columns)
+
+    hulls = []
+    collision = stage.GetPrimAtPath(root.AppendPath("collision"))
+    for child in collision.GetChildren() if collision else ():
+        if child.HasAPI(UsdPhysics.CollisionAPI) and child.IsA(UsdGeom.Mesh):
+            name = f"collision/{child.GetName()}"
+            hulls.append(
+                Hull(array(name, "points", 3, np.float32), array(name, "faceVertexIndices", 3, np.int32))
+            )
+    if not hulls:
+        raise ObjectError(f"{path}: collision has no hull; import the object again")
+    mass = UsdPhysics.MassAPI(prim)
+    axes = mass.GetPrincipalAxesAttr().Get()
+    quat = np.array([*axes.GetImaginary(), axes.GetReal()], dtype=np.float64)
+    notes = str(data["notes"])
+    return ObjectModel(
+        name=prim.GetName(),
+        vertices=array("visual", "points", 3, np.float32),
+        faces=array("visual", "faceVertexIndices", 3, np.int32),
+        hulls=tuple(hulls),
+        mass_kg=float(mass.GetMassAttr().Get()),
+        inertia=np.array(mass.GetDiagonalInertiaAttr().Get(), dtype=np.float64),
+        inertia_quat=quat / np.linalg.norm(quat),
+        surface_points=array("surface_points", "points", 3, np.float32),
+        symmetry=np.array(data["symmetry"], dtype=np.float64).reshape(-1, 4),
+        licence=str(data["licence"]),
+        source=str(data["source"]),
+        family=str(data["family"]),
+        split=str(data["split"]),
+        scale=float(data["scale"]),
+        volume_error=float(data["volumeError"]),
+        volume_method=str(data["volumeMethod"]),
+        content_hash=str(data["contentHash"]),
+        notes=tuple(notes.split("\n")) if notes else (),
+    )
+
+
+def object_files(folder: Path) -> list[Path]:
+    """The object files of a set's folder, sorted by name."""
+    return sorted(p for p in Path(folder).iterdir() if p.suffix in SUFFIXES and not p.name.startswith("."))
+
+
+def load_set(names_or_paths: str | Path | Iterable[str | Path]) -> list[ObjectModel]:
+    """Load objects: files, folders of files, or names of sets, in the order given.
+
+    Args:
+        names_or_paths: One entry or several. A name stands for a built-in set (``cube``, ``cuboid``,
+            ``symmetric``, ``procedural-150-seed0``, ``procedural-heldout``), authored into the asset
+            cache on first use, or for an imported set's folder there.
+
+    Raises:
+        ObjectError: An entry is neither, a folder holds no object, or two objects share a name.
+    """
+    from vd.assets_usd.objects.sets import set_folder
+
+    entries = [names_or_paths] if isinstance(names_or_paths, str | Path) else list(names_or_paths)
+    if not entries:
+        raise ObjectError("no object set was named; for example: cube, procedural-150-seed0, or a folder")
+    files: list[Path] = []
+    for entry in entries:
+        path = Path(entry).expanduser()
+        if path.is_file():
+            files.append(path)
+            continue
+        folder = path if path.is_dir() else set_folder(str(entry))
+        found = object_files(folder)
+        if not found:
+            raise ObjectError(f"{folder}: no object file (*.usd); make some with: vd-assets import MESHES")
+        files += found
+    models = [read_object(p) for p in dict.fromkeys(files)]
+    seen: dict[str, Path] = {}
+    for model, path in zip(models, dict.fromkeys(files), strict=True):
+        if model.name in seen:
+            raise ObjectError(f"{path}: object {model.name} is also in {seen[model.name]}; leave one out")
+        seen[model.name] = path
+    return models

@@ -1,0 +1,239 @@
+"""Procedural object sets: our own shapes, deterministic from a seed, with exact convex parts."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.objects.families import TRAINING
+from vd.assets_usd.objects.families_held_out import HELD_OUT
+from vd.assets_usd.objects.geometry import (
+    Hull,
+    hull_depth,
+    principal_axes,
+    solid_of_hulls,
+    surface_points,
+    union_depth,
+    voxelise_hulls,
+)
+from vd.assets_usd.objects.meshes import LONGEST_SIDE_M
+from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectModel, build_model
+from vd.assets_usd.objects.primitives import box
+
+PROCEDURAL_VERSION = 1
+"""Part of every content hash: raise it when a family draws something else."""
+
+LICENCE = "Apache-2.0"
+
+CUBE_SIDE_M = 0.07
+"""Side of the cube, the usual in-hand cube. Below ``LONGEST_SIDE_M``, which holds for the complex
+objects: a cube of 95 mm would not pass between the fingers."""
+
+CUBOID_SIDES_M = (0.05, 0.07, 0.10)
+"""Sides of the cuboid, all different: its group is the four rotations of a brick."""
+
+MAX_PARTS = 8
+
+MIN_ASYMMETRY = 0.008
+"""Least asymmetry (see :func:`asymmetry`) of a training object: about 1 mm of mean surface distance."""
+
+CANDIDATE_FOLDS = (2, 3, 4, 5, 6)
+"""Orders of the rotations tried about each principal axis."""
+
+PROBES = 200
+"""Surface points that measure a symmetry."""
+
+ATTEMPTS = 50
+"""Draws before a kind is reported as unable to give a valid object."""
+
+
+def candidate_rotations(inertia: np.ndarray) -> np.ndarray:
+    """Rotations a solid could be symmetric under, [R, 3, 3].
+
+    A rotation that maps a solid to itself keeps its inertia, so it turns about a principal axis
+    unless all moments are equal. Tried are the folds of ``CANDIDATE_FOLDS`` about each axis; if the
+    moments are within 10 % of one another, a grid of the whole rotation group is added.
+    """
+    moments, quat = principal_axes(inertia)
+    axes = Rotation.from_quat(quat).as_matrix().T
+    angles = sorted({2.0 * np.pi * j / k for k in CANDIDATE_FOLDS for j in range(1, k // 2 + 1)})
+    rotations = [Rotation.from_rotvec(angle * axis).as_matrix() for axis in axes for angle in angles]
+    if moments[2] < 1.1 * moments[0]:
+        grid = Rotation.random(600, rng=np.random.default_rng(0))
+        rotations += list(grid[grid.magnitude() > np.pi / 4].as_matrix())
+    return np.array(rotations)
+
+
+def asymmetry(hulls: Sequence[Hull], points: np.ndarray) -> float:
+    """How far a union of hulls is from any rotational symmetry, relative to its size.
+
+    Args:
+        hulls: Parts in any frame.
+        points: Points on the surface of the union, [n, 3].
+
+    Returns:
+        Least mean distance of the rotated surface points to the surface over the candidate
+        rotations about the centre of mass, divided by the longest side: 0 for a symmetric solid.
+    """
+    solid = solid_of_hulls(hulls)
+    centred = [Hull(h.vertices - solid.centroid, h.faces) for h in hulls]
+    away = (points - solid.centroid)[:: max(len(points) // PROBES, 1)]
+    size = float(np.ptp(points, axis=0).max())
+    rotations = candidate_rotations(solid.inertia)
+    turned = np.einsum("rij,nj->rni", rotations, away).reshape(-1, 3)
+    distance = np.abs(union_depth(centred, turned)).reshape(len(rotations), -1).mean(axis=1)
+    return float(distance.min()) / size
+
+
+def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles of all parts, without those wholly inside another part: vertices [V, 3], faces [T, 3]."""
+    vertices, faces = [], []
+    count = 0
+    for i, hull in enumerate(hulls):
+        inside = np.zeros(len(hull.faces), dtype=bool)
+        for j, other in enumerate(hulls):
+            if j != i:
+                inside |= (hull_depth(other, hull.vertices) < 0.0)[hull.faces].all(axis=1)
+        used, index = np.unique(hull.faces[~inside], return_inverse=True)
+        vertices.append(hull.vertices[used])
+        faces.append(index.reshape(-1, 3) + count)
+        count += len(used)
+    return np.concatenate(vertices), np.concatenate(faces).astype(np.int32)
+
+
+def is_connected(hulls: Sequence[Hull]) -> bool:
+    """Whether the union of hulls is one piece (on a voxel grid)."""
+    return ndimage.label(voxelise_hulls(hulls, voxels=64)[0])[1] == 1
+
+
+def model_of_parts(
+    name: str, hulls: Sequence[Hull], longest_side: float | None = None, **fields: object
+) -> ObjectModel:
+    """A model whose collision parts are its shape: scale, mass properties and surface points.
+
+    Args:
+        name: Object name.
+        hulls: Convex parts.
+        longest_side: Longest side of the bounding box to scale to, m; as it is if None.
+        **fields: Further fields of :class:`ObjectModel`.
+    """
+    everything = np.concatenate([h.vertices for h in hulls])
+    scale = 1.0 if longest_side is None else longest_side / float(np.ptp(everything, axis=0).max())
+    parts = [Hull(h.vertices * scale, h.faces) for h in hulls]
+    vertices, faces = union_surface(parts)
+    points = surface_points(vertices, faces, SURFACE_POINTS, outside=parts)
+    return build_model(
+        name,
+        vertices,
+        faces,
+        parts,
+        solid_of_hulls(parts),
+        points,
+        licence=LICENCE,
+        volume_error=0.0,
+        volume_method="the parts are the shape",
+        **fields,
+    )
+
+
+def draw_object(
+    name: str, make: Callable[[np.random.Generator], list[Hull]], seed: Sequence[int], **fields: object
+) -> ObjectModel:
+    """One object of a kind: the first draw that is one piece and not rotationally symmetric.
+
+    Args:
+        name: Object name.
+        make: Kind.
+        seed: Entropy; equal entropy gives an equal object.
+        **fields: Further fields of :class:`ObjectModel`.
+
+    Raises:
+        RuntimeError: No valid draw (a mistake in the kind).
+    """
+    rng = np.random.default_rng(seed)
+    for _ in range(ATTEMPTS):
+        hulls = make(rng)
+        longest = float(rng.uniform(*LONGEST_SIDE_M))
+        if len(hulls) > MAX_PARTS or not is_connected(hulls):
+            continue
+        model = model_of_parts(name, hulls, longest, **fields)
+        if asymmetry(model.hulls, model.surface_points) >= MIN_ASYMMETRY:
+            return model
+    raise RuntimeError(f"{name}: no valid object in {ATTEMPTS} draws")
+
+
+def procedural_set(
+    count: int,
+    seed: int,
+    *,
+    held_out: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> list[ObjectModel]:
+    """Objects in turn from every family, deterministic from the seed.
+
+    Args:
+        count: Number of objects.
+        seed: Seed of the set. Object i depends on the seed and i alone.
+        held_out: Take the held-out families in place of the training ones.
+        progress: Called with each name, the number done and the number of all.
+    """
+    families = HELD_OUT if held_out else TRAINING
+    order = list(families.items())
+    models = []
+    for i in range(count):
+        family, kinds = order[i % len(order)]
+        kind, make = list(kinds.items())[(i // len(order)) % len(kinds)]
+        name = f"{kind}_s{seed}_{i:03d}"
+        models.append(
+            draw_object(
+                name,
+                make,
+                (PROCEDURAL_VERSION, int(held_out), seed, i),
+                family=family,
+                split="test" if held_out else "train",
+                source=f"procedural {family}/{kind}, seed {seed}, index {i}",
+                content_hash=f"procedural-{PROCEDURAL_VERSION}-{int(held_out)}-{seed}-{i}",
+            )
+        )
+        if progress:
+            progress(name, i + 1, count)
+    return models
+
+
+def cube_rotations() -> np.ndarray:
+    """The 24 rotations of a cube as quaternions xyzw, the identity first, [24, 4]."""
+    return _identity_first(Rotation.create_group("O"))
+
+
+def brick_rotations() -> np.ndarray:
+    """The 4 rotations of a cuboid with three different sides, xyzw, the identity first, [4, 4]."""
+    return _identity_first(Rotation.create_group("D2"))
+
+
+def _identity_first(group: Rotation) -> np.ndarray:
+    return group[np.argsort(group.magnitude(), kind="stable")].as_quat(canonical=True)
+
+
+def cube(side: float = CUBE_SIDE_M) -> ObjectModel:
+    """The cube, with its group of 24 rotations."""
+    return model_of_parts(
+        "cube",
+        [box((0, 0, 0), (side, side, side))],
+        family="symmetric",
+        source="procedural cube",
+        symmetry=cube_rotations(),
+        content_hash=f"cube-{PROCEDURAL_VERSION}-{side}",
+    )
+
+
+def cuboid(sides: Sequence[float] = CUBOID_SIDES_M) -> ObjectModel:
+    """The cuboid, with its group of four rotations."""
+    return model_of_parts(
+        "cuboid",
+        [box((0, 0, 0), sides)],
+        family="symmetric",
+        source="procedural cuboid",
+        symmetry=brick_rotations(),
+        content_hash=f"cuboid-{PROCEDURAL_VERSION}-{list(sides)}",
+    )
