@@ -1,0 +1,147 @@
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_oracle import EXAMPLES, device_array, floats, settings_array, streams, unwritten
+
+from vd.kernels.actions import (
+    ActionParams,
+    apply_action_kernel,
+    joint_effort_kernel,
+    limit_joint_velocity_kernel,
+)
+from vd.paper import PAPER
+
+EXTRA = 7
+"""Columns of Newton's arrays beyond the hand's: the object's."""
+
+STEP_RAD = PAPER.action.scale_rad_s / PAPER.scene.control_hz
+
+
+def apply_action(device, action, offset, q, smoothed, lower, upper, *, noise_std=0.0, seed=0, alpha=0.8):
+    """One launch; returns the smoothed action and the targets (with the EXTRA columns) and the streams."""
+    worlds, joints = action.shape
+    smoothed_array = device_array(smoothed, float, device)
+    target = unwritten((worlds, joints + EXTRA), float, device)
+    rng = streams(worlds, seed, device)
+    params = settings_array(ActionParams, device, alpha=alpha, step_rad=STEP_RAD, noise_std=noise_std)
+    wp.launch(
+        apply_action_kernel,
+        dim=worlds,
+        inputs=[
+            device_array(lower, float, device),
+            device_array(upper, float, device),
+            params,
+            device_array(action, float, device),
+            device_array(offset, float, device),
+            device_array(np.pad(q, ((0, 0), (0, EXTRA)), constant_values=np.nan), float, device),
+            smoothed_array,
+            rng,
+        ],
+        outputs=[target],
+        device=device,
+    )
+    return smoothed_array.numpy(), target.numpy(), rng.numpy()
+
+
+@EXAMPLES
+@given(
+    data=st.data(),
+    fingers=st.sampled_from([3, 4]),
+    worlds=st.integers(1, 3),
+    alpha=st.sampled_from([0.8, 1.0, 0.25]),
+)
+def test_targets_match_the_paper(device, data, fingers, worlds, alpha):
+    shape = (worlds, 3 * fingers)
+    action, offset = data.draw(floats(shape)), data.draw(floats(shape, -0.1, 0.1))
+    q, smoothed = data.draw(floats(shape)), data.draw(floats(shape, -1.0, 1.0))
+    lower, upper = data.draw(floats(shape[1:], -2.0, -0.4)), data.draw(floats(shape[1:], 0.4, 2.0))
+    average, target, _ = apply_action(device, action, offset, q, smoothed, lower, upper, alpha=alpha)
+    expected = alpha * np.clip(action + offset, -1, 1) + (1 - alpha) * smoothed
+    np.testing.assert_allclose(average, expected, atol=1e-6)
+    joints = shape[1]
+    np.testing.assert_allclose(target[:, :joints], np.clip(q + expected * STEP_RAD, lower, upper), atol=1e-6)
+    assert np.isnan(target[:, joints:]).all(), "the object's columns are not the kernel's to write"
+
+
+def test_action_noise_has_the_moments_of_table_s3(device):
+    std = PAPER.randomisation.action_noise_std
+    zero = np.zeros((20_000, 9))
+    limits = np.full(9, 2.0)
+    noise, _, rng = apply_action(
+        device, zero, zero, zero, zero, -limits, limits, noise_std=std, seed=3, alpha=1.0
+    )
+    assert noise.mean() == pytest.approx(0.0, abs=5 * std / np.sqrt(noise.size))
+    assert noise.std() == pytest.approx(std, rel=0.01)
+    correlation = np.corrcoef(noise.T)
+    assert np.abs(correlation - np.eye(9)).max() < 0.05, "joints share noise"
+    assert np.abs(np.corrcoef(noise[:-1, 0], noise[1:, 0])[0, 1]) < 0.05, "neighbouring worlds share noise"
+    again = apply_action(device, zero, zero, zero, zero, -limits, limits, noise_std=std, seed=3, alpha=1.0)
+    np.testing.assert_array_equal(noise, again[0])
+    assert not np.any(rng == streams(len(zero), 3, device).numpy()), "the streams did not advance"
+
+
+def test_noise_is_added_before_clipping(device):
+    one = np.ones((1000, 9))
+    zero = np.zeros_like(one)
+    limits = np.full(9, 2.0)
+    noisy, _, _ = apply_action(device, one, zero, zero, zero, -limits, limits, noise_std=0.5, alpha=1.0)
+    assert noisy.max() == 1.0
+    assert np.mean(noisy == 1.0) == pytest.approx(0.5, abs=0.03)
+
+
+@EXAMPLES
+@given(data=st.data(), fingers=st.sampled_from([3, 4]), worlds=st.integers(1, 3))
+def test_velocity_limit_shortens_the_step(device, data, fingers, worlds):
+    joints, dt = 3 * fingers, 1 / PAPER.scene.physics_hz
+    q_prev, qd = (
+        data.draw(floats((worlds, joints + EXTRA))),
+        data.draw(floats((worlds, joints + EXTRA), -12, 12)),
+    )
+    limit = data.draw(floats((joints,), 1.0, 8.0))
+    q = (q_prev + dt * qd).astype(np.float32)
+    q_array, qd_array = device_array(q, float, device), device_array(qd, float, device)
+    wp.launch(
+        limit_joint_velocity_kernel,
+        dim=(worlds, joints),
+        inputs=[
+            device_array(limit, float, device),
+            dt,
+            device_array(q_prev, float, device),
+            q_array,
+            qd_array,
+        ],
+        device=device,
+    )
+    over = np.zeros(q.shape, bool)
+    over[:, :joints] = np.abs(qd[:, :joints]) > limit
+    expected_qd = qd.copy()
+    expected_qd[:, :joints] = np.clip(qd[:, :joints], -limit, limit)
+    np.testing.assert_array_equal(qd_array.numpy(), expected_qd)
+    np.testing.assert_array_equal(q_array.numpy()[~over], q[~over])
+    np.testing.assert_allclose(q_array.numpy(), q_prev + dt * expected_qd, atol=1e-6)
+
+
+def test_velocity_exactly_at_its_limit_is_left_alone(device):
+    q, qd = device_array([[1.0, 2.0]], float, device), device_array([[3.0, -3.0]], float, device)
+    limit = device_array([3.0, 3.0], float, device)
+    wp.launch(limit_joint_velocity_kernel, dim=(1, 2), inputs=[limit, 0.01, q, q, qd], device=device)
+    np.testing.assert_array_equal(q.numpy(), [[1.0, 2.0]])
+    np.testing.assert_array_equal(qd.numpy(), [[3.0, -3.0]])
+
+
+@EXAMPLES
+@given(data=st.data(), fingers=st.sampled_from([3, 4]), worlds=st.integers(1, 3))
+def test_effort_is_that_of_a_saturated_pd_servo(device, data, fingers, worlds):
+    shape = (worlds, 3 * fingers)
+    wide = (worlds, 3 * fingers + EXTRA)
+    kp, kd = data.draw(floats(shape, 0, 5)), data.draw(floats(shape, 0, 0.5))
+    effort = data.draw(floats(shape[1:], 0.1, 3))
+    target, q, qd = (data.draw(floats(wide)) for _ in range(3))
+    out = unwritten(shape, float, device)
+    inputs = [device_array(a, float, device) for a in (effort, kp, kd, target, q, qd)]
+    wp.launch(joint_effort_kernel, dim=shape, inputs=inputs, outputs=[out], device=device)
+    hand = slice(0, shape[1])
+    torque = kp * (target[:, hand].astype(np.float64) - q[:, hand]) - kd * qd[:, hand]
+    np.testing.assert_allclose(out.numpy(), np.clip(torque, -effort, effort), atol=1e-5)

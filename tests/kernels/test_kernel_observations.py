@@ -1,0 +1,227 @@
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_oracle import (
+    EXAMPLES,
+    device_array,
+    floats,
+    goals,
+    pose_matrix,
+    quaternions,
+    relative_quaternion,
+    settings_array,
+    streams,
+    transforms,
+    unwritten,
+)
+from scipy.spatial.transform import Rotation
+
+from vd.kernels.observations import (
+    ObservationParams,
+    fingertip_kernel,
+    teacher_observation_kernel,
+    teacher_observation_size,
+    teacher_observation_slices,
+)
+from vd.paper import PAPER
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
+    """A state of N worlds with a hand of 3 or 4 fingers, and everything the observation is made of."""
+    fingers, worlds = draw(st.sampled_from([3, 4])), draw(st.integers(1, 3))
+    joints, bodies = 3 * fingers, 3 * fingers + 2
+    orientation = draw(quaternions((worlds,)))
+    return {
+        "lower": draw(floats((joints,), -2, -0.4)),
+        "upper": draw(floats((joints,), 0.4, 2)),
+        "tip_body": np.array(draw(st.permutations(range(bodies)))[:fingers]),
+        "tip_offset": draw(transforms((fingers,))),
+        "body_com": draw(floats((bodies, 3), -0.1, 0.1)),
+        "q": np.concatenate([draw(floats((worlds, joints + 3))), orientation], axis=1),
+        "qd": draw(floats((worlds, joints + 6), -5, 5)),
+        "body_q": draw(transforms((worlds, bodies))),
+        "body_qd": draw(floats((worlds, bodies, 6), -3, 3)),
+        "goal": draw(goals(orientation)),
+        "smoothed": draw(floats((worlds, joints), -1, 1)),
+        "offset": draw(floats((worlds, teacher_observation_size(fingers)), -0.01, 0.01)),
+    }
+
+
+def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0):
+    """Launch the kernel on a scene; returns observation and streams."""
+    worlds = len(scene["q"])
+    out = unwritten((worlds, teacher_observation_size(len(scene["tip_body"]))), float, device)
+    params = settings_array(
+        ObservationParams,
+        device,
+        velocity_scale=PAPER.observation.velocity_scale,
+        noise_mean=noise_mean,
+        noise_std=noise_std,
+    )
+    rng = streams(worlds, seed, device)
+    wp.launch(
+        teacher_observation_kernel,
+        dim=worlds,
+        inputs=[
+            device_array(scene["lower"], float, device),
+            device_array(scene["upper"], float, device),
+            device_array(scene["tip_body"], int, device),
+            device_array(scene["tip_offset"], wp.transform, device),
+            device_array(scene["body_com"], wp.vec3, device),
+            params,
+            device_array(scene["q"], float, device),
+            device_array(scene["qd"], float, device),
+            device_array(scene["body_q"], wp.transform, device),
+            device_array(scene["body_qd"], wp.spatial_vector, device),
+            device_array(scene["goal"], wp.quat, device),
+            device_array(scene["smoothed"], float, device),
+            device_array(scene["offset"], float, device),
+            rng,
+        ],
+        outputs=[out],
+        device=device,
+    )
+    return out.numpy(), rng.numpy()
+
+
+def expected_observation(scene):
+    """The observation without noise and offset, computed part by part in float64."""
+    joints = len(scene["lower"])
+    worlds, fingers = len(scene["q"]), len(scene["tip_body"])
+    q, qd = scene["q"].astype(np.float64), scene["qd"].astype(np.float64)
+    middle, half = (scene["upper"] + scene["lower"]) / 2.0, (scene["upper"] - scene["lower"]) / 2.0
+    body = pose_matrix(scene["body_q"])[:, scene["tip_body"]]
+    tip = body @ pose_matrix(scene["tip_offset"])
+    com = (
+        np.einsum("nfij,fj->nfi", body[..., :3, :3], scene["body_com"][scene["tip_body"]]) + body[..., :3, 3]
+    )
+    linear, angular = np.split(scene["body_qd"][:, scene["tip_body"]].astype(np.float64), 2, axis=-1)
+    tip_quat = np.empty((worlds, fingers, 4))
+    for f in range(fingers):  # the sign of the product quaternion is part of the observation
+        inverse_offset = scene["tip_offset"][f, 3:] * [-1, -1, -1, 1]
+        tip_quat[:, f] = relative_quaternion(scene["body_q"][:, scene["tip_body"][f], 3:], inverse_offset)
+    tips = np.concatenate(
+        [tip[..., :3, 3], tip_quat, linear + np.cross(angular, tip[..., :3, 3] - com), angular], axis=-1
+    )
+    return np.concatenate(
+        [
+            (q[:, :joints] - middle) / half,
+            0.2 * qd[:, :joints],
+            q[:, joints:],
+            qd[:, joints : joints + 3],
+            0.2 * qd[:, joints + 3 :],
+            scene["goal"],
+            relative_quaternion(q[:, joints + 3 :], scene["goal"]),
+            tips.reshape(worlds, -1),
+            scene["smoothed"],
+        ],
+        axis=1,
+    )
+
+
+def measured(fingers):
+    """Mask of the columns that a sensor measures."""
+    slices = teacher_observation_slices(fingers)
+    mask = np.ones(teacher_observation_size(fingers), bool)
+    mask[slices["goal_orientation"]] = False
+    mask[slices["previous_action"]] = False
+    return mask
+
+
+@pytest.mark.parametrize(("fingers", "size"), [(3, 87), (4, 109)])
+def test_sizes_are_those_of_the_paper_and_columns_tile_the_observation(fingers, size):
+    assert teacher_observation_size(fingers) == size == 19 * fingers + 21 + 3 * fingers
+    slices = list(teacher_observation_slices(fingers).values())
+    columns = np.concatenate([np.arange(s.start, s.stop) for s in slices])
+    np.testing.assert_array_equal(columns, np.arange(size))
+
+
+@EXAMPLES
+@given(scene=scenes())
+def test_observation_matches_the_oracle(device, scene):
+    out, _ = observe(device, scene)
+    expected = expected_observation(scene)
+    mask = measured(len(scene["tip_body"]))
+    expected[:, mask] += scene["offset"][:, mask]
+    np.testing.assert_allclose(out, expected, rtol=1e-5, atol=1e-5)
+
+
+@EXAMPLES
+@given(scene=scenes())
+def test_fingertip_positions_are_those_observed(device, scene):
+    worlds, fingers = len(scene["q"]), len(scene["tip_body"])
+    out = unwritten((worlds, fingers), wp.vec3, device)
+    wp.launch(
+        fingertip_kernel,
+        dim=(worlds, fingers),
+        inputs=[
+            device_array(scene["tip_body"], int, device),
+            device_array(scene["tip_offset"], wp.transform, device),
+            device_array(scene["body_q"], wp.transform, device),
+        ],
+        outputs=[out],
+        device=device,
+    )
+    tip = pose_matrix(scene["body_q"])[:, scene["tip_body"]] @ pose_matrix(scene["tip_offset"])
+    np.testing.assert_allclose(out.numpy(), tip[..., :3, 3], atol=1e-6)
+
+
+@EXAMPLES
+@given(scene=scenes())
+def test_fingertip_velocity_is_the_derivative_of_its_position(device, scene):
+    fingers, step = len(scene["tip_body"]), 1e-5
+    scene["offset"][:] = 0.0
+    out, _ = observe(device, scene)
+    scene = {name: np.asarray(value, np.float64) for name, value in scene.items()}
+    tips = out[:, teacher_observation_slices(fingers)["fingertips"]].reshape(len(out), fingers, 13)
+    for world in range(len(out)):
+        for finger, body in enumerate(scene["tip_body"].astype(int)):
+            pose, twist = scene["body_q"][world, body], scene["body_qd"][world, body]
+            com_in_body, in_body = scene["body_com"][body], scene["tip_offset"][finger, :3]
+            rotation = Rotation.from_quat(pose[3:])
+            com = pose[:3] + rotation.apply(com_in_body)
+            moved = Rotation.from_rotvec(step * twist[3:]) * rotation
+            after = com + step * twist[:3] + moved.apply(in_body - com_in_body)
+            velocity = (after - (pose[:3] + rotation.apply(in_body))) / step
+            np.testing.assert_allclose(tips[world, finger, 7:10], velocity, atol=2e-4)
+
+
+def uniform_scene(fingers, worlds):
+    """The same resting state in every world."""
+    joints = 3 * fingers
+    identity = np.array([0.0, 0.0, 0.0, 1.0])
+    pose = np.append(np.zeros(3), identity)
+    return {
+        "lower": np.full(joints, -2.0),
+        "upper": np.full(joints, 2.0),
+        "tip_body": np.arange(fingers),
+        "tip_offset": np.tile(pose, (fingers, 1)),
+        "body_com": np.zeros((joints, 3)),
+        "q": np.tile(np.append(np.zeros(joints), pose), (worlds, 1)),
+        "qd": np.zeros((worlds, joints + 6)),
+        "body_q": np.tile(pose, (worlds, joints, 1)),
+        "body_qd": np.zeros((worlds, joints, 6)),
+        "goal": np.tile(identity, (worlds, 1)),
+        "smoothed": np.zeros((worlds, joints)),
+        "offset": np.zeros((worlds, teacher_observation_size(fingers))),
+    }
+
+
+@pytest.mark.parametrize("fingers", [3, 4])
+def test_noise_of_table_s3_on_measured_values_only(device, fingers):
+    mean, std = PAPER.observation.noise_mean, PAPER.observation.noise_std
+    scene = uniform_scene(fingers, 20_000)
+    clean, _ = observe(device, scene)
+    noisy, rng = observe(device, scene, noise_mean=mean, noise_std=std, seed=9)
+    mask = measured(fingers)
+    np.testing.assert_array_equal(noisy[:, ~mask], clean[:, ~mask])
+    noise = (noisy - clean)[:, mask]
+    bound = 6 / np.sqrt(len(noise))
+    np.testing.assert_allclose(noise.mean(axis=0), mean, atol=std * bound)
+    np.testing.assert_allclose(noise.std(axis=0), std, rtol=bound)
+    assert np.abs(np.corrcoef(noise.T) - np.eye(mask.sum())).max() < bound, "values share noise"
+    assert np.abs(np.corrcoef(noise[:50]) - np.eye(50)).max() < 0.7, "worlds share noise"
+    assert not np.any(rng == streams(len(noise), 9, device).numpy()), "the streams did not advance"

@@ -1,0 +1,214 @@
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_oracle import ALPHA, EXAMPLES, device_array, settings_array, streams, unwritten
+from scipy import stats
+
+from vd.kernels.randomisation import (
+    ForceParams,
+    RandomisationParams,
+    disturbance_force_kernel,
+    draw_dynamics_kernel,
+    draw_masses_kernel,
+)
+from vd.kernels.rng import next_stream
+from vd.paper import PAPER
+
+DR = PAPER.randomisation
+RANGES = {
+    "stiffness_scale": wp.vec2(*DR.stiffness_scale),
+    "damping_scale": wp.vec2(*DR.damping_scale),
+    "friction": wp.vec2(*DR.friction),
+    "table_friction": wp.vec2(*DR.table_friction),
+    "link_mass_scale": wp.vec2(*DR.link_mass_scale),
+    "object_mass": wp.vec2(*DR.object_mass_kg),
+    "action_offset_std": DR.action_offset_std_code,
+    "observation_offset_std": PAPER.observation.noise_offset_std_code,
+}
+KP, KD = [2.772, 3.559, 3.559], [0.2739, 0.3824, 0.3824]
+OUTPUTS = (
+    "kp",
+    "kd",
+    "hand_friction",
+    "object_friction",
+    "table_friction",
+    "action_offset",
+    "observation_offset",
+)
+
+
+def draw_dynamics(device, mask, fingers=3, seed=0, observation_size=87, **changes):
+    """Launch; returns every output and the streams by name."""
+    worlds, joints = len(mask), 3 * fingers
+    shapes = [(worlds, joints)] * 2 + [(worlds,)] * 3 + [(worlds, joints), (worlds, observation_size)]
+    out = {name: unwritten(shape, float, device) for name, shape in zip(OUTPUTS, shapes, strict=True)}
+    rng = streams(worlds, seed, device)
+    wp.launch(
+        draw_dynamics_kernel,
+        dim=worlds,
+        inputs=[
+            device_array(np.tile(KP, fingers), float, device),
+            device_array(np.tile(KD, fingers), float, device),
+            settings_array(RandomisationParams, device, **{**RANGES, **changes}),
+            device_array(mask, int, device),
+            rng,
+        ],
+        outputs=list(out.values()),
+        device=device,
+    )
+    return {**{name: array.numpy() for name, array in out.items()}, "rng": rng.numpy()}
+
+
+def draw_masses(device, mask, links=9, seed=0):
+    """Launch; returns link scales, object masses and streams."""
+    worlds = len(mask)
+    out = [unwritten((worlds, links), float, device), unwritten(worlds, float, device)]
+    rng = streams(worlds, seed, device)
+    params = settings_array(RandomisationParams, device, **RANGES)
+    inputs = [params, device_array(mask, int, device), rng]
+    wp.launch(draw_masses_kernel, dim=worlds, inputs=inputs, outputs=out, device=device)
+    return out[0].numpy(), out[1].numpy(), rng.numpy()
+
+
+def assert_uniform(values, bounds):
+    low, high = np.float32(bounds[0]), np.float32(bounds[1])
+    assert values.min() >= low - 1e-6
+    assert values.max() <= high + 1e-6
+    assert stats.kstest(np.ravel(values), stats.uniform(low, high - low).cdf).pvalue > ALPHA
+
+
+def assert_uncorrelated(columns, bound):
+    """Columns [N, K] that no pair of shares anything linear."""
+    correlation = np.corrcoef(np.asarray(columns, float).T)
+    assert np.abs(correlation - np.eye(len(correlation))).max() < bound
+
+
+def test_dynamics_have_the_ranges_of_table_s3(device):
+    worlds = 20_000
+    drawn = draw_dynamics(device, np.ones(worlds, int), fingers=4, seed=1, observation_size=109)
+    kp_scale, kd_scale = drawn["kp"] / np.tile(KP, 4), drawn["kd"] / np.tile(KD, 4)
+    for joint in range(12):
+        assert_uniform(kp_scale[:, joint], DR.stiffness_scale)
+        assert_uniform(kd_scale[:, joint], DR.damping_scale)
+    assert_uniform(drawn["hand_friction"], DR.friction)
+    assert_uniform(drawn["object_friction"], DR.friction)
+    assert_uniform(drawn["table_friction"], DR.table_friction)
+    for name, std in (
+        ("action_offset", DR.action_offset_std_code),
+        ("observation_offset", PAPER.observation.noise_offset_std_code),
+    ):
+        assert stats.kstest(np.ravel(drawn[name]) / std, stats.norm.cdf).pvalue > ALPHA
+    frictions = np.stack([drawn["hand_friction"], drawn["object_friction"], drawn["table_friction"]], axis=1)
+    assert_uncorrelated(np.hstack([kp_scale, kd_scale, frictions, drawn["action_offset"]]), 0.05)
+
+
+def test_no_offsets_by_default(device):
+    drawn = draw_dynamics(device, np.ones(3, int), action_offset_std=0.0, observation_offset_std=0.0)
+    assert not drawn["action_offset"].any()
+    assert not drawn["observation_offset"].any()
+
+
+def test_masses_have_the_ranges_of_table_s3(device):
+    scale, mass, _ = draw_masses(device, np.ones(20_000, int), links=12, seed=2)
+    for link in range(12):
+        assert_uniform(scale[:, link], DR.link_mass_scale)
+    assert_uniform(mass, DR.object_mass_kg)
+    assert_uncorrelated(np.column_stack([scale, mass]), 0.05)
+
+
+@EXAMPLES
+@given(mask=st.lists(st.integers(0, 1), min_size=1, max_size=8), fingers=st.sampled_from([3, 4]))
+def test_only_masked_worlds_are_drawn(device, mask, fingers):
+    mask = np.array(mask)
+    drawn = draw_dynamics(device, mask, fingers, seed=3)
+    scale, mass, rng = draw_masses(device, mask, seed=3)
+    before = streams(len(mask), 3, device).numpy()
+    for array in (*(drawn[name] for name in OUTPUTS), scale, mass):
+        assert np.isnan(array[mask == 0]).all()
+        assert np.isfinite(array[mask == 1]).all()
+    for after in (drawn["rng"], rng):
+        np.testing.assert_array_equal(after[mask == 0], before[mask == 0])
+        assert np.all(after[mask == 1] != before[mask == 1])
+
+
+def test_draws_repeat_with_the_seed_whatever_the_other_worlds_do(device):
+    everything = draw_dynamics(device, np.ones(64, int), seed=4)
+    half = draw_dynamics(device, np.arange(64) % 2, seed=4)
+    other = draw_dynamics(device, np.ones(64, int), seed=5)
+    for name in OUTPUTS:
+        np.testing.assert_array_equal(everything[name][1::2], half[name][1::2])
+        assert not np.array_equal(everything[name], other[name])
+
+
+@wp.kernel(enable_backward=False)
+def walk_kernel(rng: wp.array[wp.uint32], out: wp.array[float]):
+    world = wp.tid()
+    state = rng[world]
+    out[world] = wp.randf(state)
+    rng[world] = next_stream(state, world)
+
+
+def walk(device, rng, steps):
+    """Draw one number per world and step; returns [steps, N]."""
+    out = wp.empty(len(rng), dtype=float, device=device)
+    rows = []
+    for _ in range(steps):
+        wp.launch(walk_kernel, dim=len(rng), inputs=[rng], outputs=[out], device=device)
+        rows.append(out.numpy().copy())  # on the CPU numpy() is a view
+    return np.array(rows)
+
+
+def test_streams_of_different_worlds_never_walk_together(device):
+    numbers = walk(device, streams(300, 6, device), 400)
+    assert stats.kstest(np.ravel(numbers), stats.uniform.cdf).pvalue > ALPHA
+    assert_uncorrelated(numbers, 0.35)  # between worlds, 400 steps
+    assert_uncorrelated(numbers[:100].T, 0.4)  # between steps, 300 worlds
+    # Even from one and the same state the worlds part after their first draw.
+    same = device_array(np.full(50, 12345), wp.uint32, device)
+    numbers = walk(device, same, 20)
+    assert len(np.unique(numbers[0])) == 1
+    assert all(len(np.unique(row)) == 50 for row in numbers[1:])
+
+
+def force_array(device, force, mass, seed, **changes):
+    """Launch one step; returns forces."""
+    values = {"probability": DR.force_probability, "force_per_mass": DR.force_n_per_kg, "decay": 0.0}
+    array = device_array(force, wp.vec3, device)
+    wp.launch(
+        disturbance_force_kernel,
+        dim=len(mass),
+        inputs=[
+            device_array(mass, float, device),
+            settings_array(ForceParams, device, **{**values, **changes}),
+            array,
+            streams(len(mass), seed, device),
+        ],
+        device=device,
+    )
+    return array.numpy().astype(float)
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.998])
+def test_disturbance_has_the_paper_s_rate_and_magnitude_and_any_direction(device, decay):
+    worlds = 50_000
+    rng = np.random.default_rng(0)
+    mass = rng.uniform(*DR.object_mass_kg, worlds).astype(np.float32)
+    before = rng.normal(size=(worlds, 3)).astype(np.float32)
+    force = force_array(device, before, mass, 11, decay=decay)
+    old = np.all(np.abs(force - decay * before) < 1e-6, axis=1)
+    drawn = force[~old]
+    assert len(drawn) / worlds == pytest.approx(DR.force_probability, abs=0.01)
+    magnitude = np.linalg.norm(drawn, axis=1)
+    np.testing.assert_allclose(magnitude, DR.force_n_per_kg * mass[~old], rtol=1e-5)
+    direction = drawn / magnitude[:, None]
+    for axis in range(3):  # Archimedes: each coordinate of a uniform direction is uniform
+        assert stats.kstest(direction[:, axis], stats.uniform(-1, 2).cdf).pvalue > ALPHA
+    np.testing.assert_allclose(direction.T @ direction / len(direction), np.eye(3) / 3, atol=0.02)
+
+
+@pytest.mark.parametrize(("probability", "share"), [(0.0, 0.0), (1.0, 1.0)])
+def test_disturbance_never_and_always(device, probability, share):
+    force = force_array(device, np.ones((1000, 3)), np.ones(1000), 12, probability=probability)
+    assert np.mean(np.any(force != 0.0, axis=1)) == share

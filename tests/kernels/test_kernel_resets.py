@@ -1,0 +1,177 @@
+import itertools
+
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_oracle import (
+    ALPHA,
+    EXAMPLES,
+    SENTINEL,
+    angle_between,
+    ball_cdf,
+    device_array,
+    quaternions,
+    rotation_angles,
+    settings_array,
+    streams,
+    unwritten,
+)
+from scipy import stats
+
+from vd.kernels.resets import GoalParams, StartParams, episode_kernel, reset_kernel
+from vd.paper import PAPER
+
+START = np.array(PAPER.scene.object_start_m)
+NOISE = PAPER.scene.object_start_noise_m
+
+
+@pytest.mark.parametrize("hold", [0, 1])
+def test_episode_ends_as_stated_in_every_case(device, hold):
+    cases = list(itertools.product([0, 1], [0, 1], [3, 8, 9, 20]))  # success, fell, steps before; limit 10
+    success, fell, before = (np.array(column) for column in zip(*cases, strict=True))
+    count = len(cases)
+    steps, goals = device_array(before, int, device), device_array(np.full(count, 5), int, device)
+    names = ("timed_out", "done", "reset", "new_goal")
+    out = {name: unwritten(count, int, device) for name in names}
+    inputs = [device_array(success, int, device), device_array(fell, int, device), 10, hold, steps, goals]
+    wp.launch(episode_kernel, dim=count, inputs=inputs, outputs=list(out.values()), device=device)
+    np.testing.assert_array_equal(steps.numpy(), before + 1)
+    np.testing.assert_array_equal(goals.numpy(), 5 + success)
+    for i, (s, f, b) in enumerate(cases):
+        end = b + 1 >= 10
+        assert out["timed_out"].numpy()[i] == int(end and not s and not f)
+        assert out["done"].numpy()[i] == int(bool(s or f or end))
+        reset = bool(f or end or (s and hold))
+        assert out["reset"].numpy()[i] == int(reset)
+        assert out["new_goal"].numpy()[i] == int(bool(s) and not reset)
+
+
+class World:
+    """State of N worlds before a reset, and the launch."""
+
+    def __init__(self, device, worlds, fingers=3, seed=0, orientation=None):
+        self.device, self.joints = device, 3 * fingers
+        joints = self.joints
+        self.reset_q = np.tile(PAPER.scene.reset_joint_rad, fingers).astype(np.float32)
+        q = np.random.default_rng(1).normal(size=(worlds, joints + 7)).astype(np.float32)
+        q[:, joints + 3 :] /= np.linalg.norm(q[:, joints + 3 :], axis=1, keepdims=True)
+        if orientation is not None:
+            q[:, joints + 3 :] = orientation
+        self.before = {
+            "q": q,
+            "rng": streams(worlds, seed, device).numpy(),
+            "qd": np.full((worlds, joints + 6), np.nan, np.float32),
+            "smoothed": np.full((worlds, joints), np.nan, np.float32),
+            "steps": np.full(worlds, SENTINEL, np.int32),
+            "goals": np.full(worlds, SENTINEL, np.int32),
+            "goal": np.full((worlds, 4), np.nan, np.float32),
+            "error": np.full(worlds, np.nan, np.float32),
+        }
+
+    def reset(self, mask, new_goal, max_angle=np.pi, noise=NOISE, start_quat=None, goal_quat=None):
+        """Launch; returns every array by name."""
+        types = {"rng": wp.uint32, "steps": int, "goals": int, "goal": wp.quat}
+        state = {n: device_array(a, types.get(n, float), self.device) for n, a in self.before.items()}
+        none = np.zeros((0, 4), np.float32)
+        wp.launch(
+            reset_kernel,
+            dim=len(mask),
+            inputs=[
+                device_array(self.reset_q, float, self.device),
+                settings_array(StartParams, self.device, position=wp.vec3(*START), noise=noise),
+                settings_array(GoalParams, self.device, max_angle=max_angle),
+                device_array(mask, int, self.device),
+                device_array(new_goal, int, self.device),
+                device_array(none if start_quat is None else start_quat, wp.quat, self.device),
+                int(start_quat is not None),
+                device_array(none if goal_quat is None else goal_quat, wp.quat, self.device),
+                int(goal_quat is not None),
+                state["q"],
+                state["rng"],
+            ],
+            outputs=[state[n] for n in ("qd", "smoothed", "steps", "goals", "goal", "error")],
+            device=self.device,
+        )
+        return {name: array.numpy() for name, array in state.items()}
+
+
+@EXAMPLES
+@given(data=st.data(), fingers=st.sampled_from([3, 4]), worlds=st.integers(1, 6), given_quats=st.booleans())
+def test_only_masked_worlds_change_and_only_in_what_is_theirs(device, data, fingers, worlds, given_quats):
+    mask = np.array(data.draw(st.lists(st.integers(0, 1), min_size=worlds, max_size=worlds)))
+    new_goal = np.array(data.draw(st.lists(st.integers(0, 1), min_size=worlds, max_size=worlds)))
+    start = data.draw(quaternions((worlds,))) if given_quats else None
+    goal = data.draw(quaternions((worlds,))) if given_quats else None
+    world = World(device, worlds, fingers, orientation=data.draw(quaternions((worlds,))))
+    after = world.reset(mask, new_goal, start_quat=start, goal_quat=goal)
+    joints = world.joints
+    untouched = (mask == 0) & (new_goal == 0)
+    for name, array in after.items():
+        before = world.before[name]
+        assert array[untouched].tobytes() == before[untouched].tobytes(), (
+            f"{name} of a world outside the masks"
+        )
+    for name in ("q", "qd", "steps", "goals"):
+        kept = mask == 0
+        assert after[name][kept].tobytes() == world.before[name][kept].tobytes(), f"{name} at a new goal"
+
+    reset = mask == 1
+    np.testing.assert_array_equal(after["q"][reset, :joints], np.tile(world.reset_q, (reset.sum(), 1)))
+    assert np.abs(after["q"][reset, joints : joints + 3] - START).max(initial=0.0) <= NOISE + 1e-6
+    for name in ("qd", "steps", "goals"):
+        assert not after[name][reset].any(), name
+    changed = ~untouched
+    assert not after["smoothed"][changed].any()
+    assert np.all(after["rng"][changed] != world.before["rng"][changed])
+    orientation = after["q"][:, joints + 3 :]
+    np.testing.assert_allclose(np.linalg.norm(orientation[reset], axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(after["goal"][changed], axis=1), 1.0, atol=1e-6)
+    if start is not None and goal is not None:
+        np.testing.assert_array_equal(orientation[reset], start[reset])
+        np.testing.assert_array_equal(after["goal"][changed], goal[changed])
+    if changed.any():
+        error = angle_between(orientation[changed], after["goal"][changed])
+        np.testing.assert_allclose(after["error"][changed], error, atol=2e-3)
+
+
+def test_starts_and_goals_are_uniform_and_independent(device):
+    worlds = 50_000
+    everywhere = np.ones(worlds, int)
+    world = World(device, worlds, seed=7)
+    after = world.reset(everywhere, 0 * everywhere)
+    joints = world.joints
+    for axis in range(3):
+        offset = after["q"][:, joints + axis] - START[axis]
+        uniform = stats.uniform(-NOISE, 2 * NOISE)
+        assert stats.kstest(offset, uniform.cdf).pvalue > ALPHA
+    start, goal = after["q"][:, joints + 3 :].astype(float), after["goal"].astype(float)
+    for q in (start, goal):
+        assert stats.kstest(rotation_angles(q), lambda a: ball_cdf(a, np.pi)).pvalue > ALPHA
+    assert after["error"].mean() == pytest.approx(np.pi / 2 + 2 / np.pi, abs=0.015)
+    assert stats.kstest(after["error"], lambda a: ball_cdf(a, np.pi)).pvalue > ALPHA
+    cross = np.corrcoef(np.hstack([start * np.sign(start[:, 3:]), goal * np.sign(goal[:, 3:])]).T)[:4, 4:]
+    assert np.abs(cross).max() < 0.03, "goals depend on starts"
+
+    again = World(device, worlds, seed=7).reset(everywhere, 0 * everywhere)
+    assert all(after[name].tobytes() == again[name].tobytes() for name in after), (
+        "the seed does not fix the draw"
+    )
+
+
+@pytest.mark.parametrize("max_angle", [0.3, 1.0])
+def test_new_goals_stay_within_their_angle_of_the_present_orientation(device, max_angle):
+    worlds = 20_000
+    everywhere = np.ones(worlds, int)
+    world = World(device, worlds, seed=8)
+    after = world.reset(0 * everywhere, everywhere, max_angle=max_angle)
+    orientation = world.before["q"][:, world.joints + 3 :]
+    error = angle_between(orientation, after["goal"])
+    assert error.max() <= max_angle + 1e-3
+    assert stats.kstest(error, lambda a: ball_cdf(a, max_angle)).pvalue > ALPHA
+
+
+def test_no_noise_puts_the_object_exactly_at_its_start(device):
+    after = World(device, 4).reset(np.ones(4, int), np.zeros(4, int), noise=0.0)
+    np.testing.assert_array_equal(after["q"][:, 9:12], np.tile(START.astype(np.float32), (4, 1)))
