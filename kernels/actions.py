@@ -6,6 +6,7 @@ Arrays ``[N, *]`` hold at least D columns, the D hand joints first.
 """
 
 import warp as wp
+
 from vd.kernels.rng import next_stream
 
 wp.set_module_options({"enable_backward": False})

@@ -5,6 +5,7 @@ the paper's 19 G + 21 and the previous action.
 """
 
 import warp as wp
+
 from vd.kernels.rng import next_stream
 from vd.kernels.transforms import rotation_difference
 

@@ -4,6 +4,7 @@ Draws act on the worlds of an int32 mask; worlds outside it keep every bit. Rang
 """
 
 import warp as wp
+
 from vd.kernels.rng import next_stream, uniform
 
 wp.set_module_options({"enable_backward": False})

@@ -5,6 +5,7 @@ Order in a control step: after the reward, :func:`episode_kernel` decides what e
 """
 
 import warp as wp
+
 from vd.kernels.rng import next_stream
 from vd.kernels.transforms import random_rotation, random_rotation_within, rotation_angle, rotation_difference
 

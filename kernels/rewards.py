@@ -4,6 +4,7 @@ World frame (z up, table top at z = 0), SI units, radians, quaternions xyzw.
 """
 
 import warp as wp
+
 from vd.kernels.transforms import rotation_angle, rotation_difference
 
 wp.set_module_options({"enable_backward": False})
