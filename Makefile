@@ -1,0 +1,76 @@
+# `make demo` and `make test` do everything on a fresh machine; the first of them prepares the environment.
+
+VENV ?= .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+# An interpreter is asked for its version: some machines have launchers for versions they do not run.
+PYTHON ?= $(shell for p in python3.11 python3.12 python3; do \
+	"$$p" -c 'import sys; sys.exit(sys.version_info[:2] not in {(3, 11), (3, 12)})' 2>/dev/null \
+	&& command -v "$$p" && break; done)
+
+# Extra wheel index for torch alone, such as PyTorch's CPU index: make demo TORCH_INDEX=URL.
+TORCH_INDEX ?=
+# Processes of the tests; each of them compiles and simulates, so more than cores only slows down.
+TEST_JOBS ?= 2
+# Folder of OBJ, STL, PLY or GLB files for the demo: make demo MESHES=DIR.
+MESHES ?=
+DEMO_ARGS ?=
+TEST_ARGS ?=
+BENCH_ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help env demo test lint type format bench clean
+
+help:
+	@echo 'make demo     author the assets, train and evaluate a small policy, write demo/index.html'
+	@echo '              MESHES=DIR adds your own meshes; DEMO_ARGS="--minutes 8" passes options on'
+	@echo 'make test     all tests; TEST_ARGS="-k rewards" chooses some'
+	@echo 'make lint     ruff, without changing files      make format   the same, changing files'
+	@echo 'make type     mypy on the built package         make bench    simulation throughput'
+	@echo 'make env      only the environment (.venv)      make clean    remove build products'
+	@echo 'TORCH_INDEX=URL takes torch from another wheel index, such as its CPU-only one'
+
+env: $(STAMP)
+
+# torch comes first: where no GPU is found, its size is worth a word before the download starts.
+$(STAMP): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { \
+	  echo 'No Python 3.11 or 3.12 found. Install one (Debian, Ubuntu: apt install python3.11 python3.11-venv;' >&2; \
+	  echo 'elsewhere: pyenv install 3.11) or name it: make PYTHON=/path/to/python3.11' >&2; exit 1; }
+	@test -n "$(TORCH_INDEX)" || command -v nvidia-smi >/dev/null || \
+	  echo 'No GPU found. If pip chooses the CUDA build of torch below (gigabytes), stop it and set TORCH_INDEX, see README.'
+	test -x $(BIN)/pip || "$(PYTHON)" -m venv --clear $(VENV)
+	$(BIN)/pip install -c constraints.txt setuptools
+	$(BIN)/pip install -c constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch
+	$(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[dev]'
+	@touch $(STAMP)
+
+demo: $(STAMP)
+	$(BIN)/python -m vd.train.demo $(if $(MESHES),--meshes "$(MESHES)") $(DEMO_ARGS)
+
+# A file's tests stay in one process: its fixtures build simulators, which is what takes the time.
+test: $(STAMP)
+	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist loadfile $(TEST_ARGS)
+
+lint: $(STAMP)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: $(STAMP)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# The folders become one package only when installed, so the checker reads the built wheel.
+type: $(STAMP)
+	rm -rf build/lib build/bdist.* build/types
+	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir build/types .
+	cd build/types && "$(abspath $(BIN))/python" -m zipfile -e *.whl . && \
+	  "$(abspath $(BIN))/mypy" --config-file ../../pyproject.toml -p vd
+
+bench: $(STAMP)
+	$(BIN)/vd-bench sim $(BENCH_ARGS)
+
+clean:
+	rm -rf build dist *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	find . -name __pycache__ -type d -not -path './$(VENV)/*' -prune -exec rm -rf {} +

@@ -1,0 +1,170 @@
+"""Rules of ARCHITECTURE.md that a machine can check: layers, sizes, light commands, sourced constants."""
+
+import ast
+import math
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from vd.paper import provenance
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+SCRIPTS: dict[str, str] = PROJECT["project"]["scripts"]
+PACKAGE_DIRS: dict[str, str] = PROJECT["tool"]["setuptools"]["package-dir"]
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+
+MAX_LINES = 600
+LEAVES = ("vd.paper", "vd.files")
+# What each part may import of this project; the longest prefix of a module's name decides.
+ALLOWED: dict[str, tuple[str, ...]] = {
+    "vd.paper": (),
+    "vd.files": (),
+    "vd.kernels": ("vd.kernels",),
+    "vd.assets_usd": (*LEAVES, "vd.kernels", "vd.assets_usd"),
+    "vd.sim": (*LEAVES, "vd.kernels", "vd.assets_usd", "vd.sim"),
+    "vd.envs": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim", "vd.envs"),
+    "vd": ("vd",),
+    "vd.train": ("vd",),
+    "vd.deploy": ("vd",),
+}
+FORBIDDEN: dict[str, tuple[str, ...]] = {
+    "vd": ("vd.train", "vd.deploy"),
+    "vd.train": ("vd.deploy",),
+    "vd.deploy": ("vd.train",),
+}
+# Libraries that one part keeps to itself.
+OWNED_LIBRARIES = {"pxr": "vd.assets_usd", "coacd": "vd.assets_usd", "rsl_rl": "vd.train"}
+# Libraries whose import takes seconds: help must not wait for them.
+HEAVY = {"torch", "newton", "mujoco", "pxr", "rsl_rl", "matplotlib", "coacd"}
+
+
+def modules() -> Iterator[tuple[str, Path]]:
+    """Every module of the package with its file, each once."""
+    for package, folder in PACKAGE_DIRS.items():
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            parts = path.relative_to(ROOT / folder).with_suffix("").parts
+            yield ".".join([package, *(part for part in parts if part != "__init__")]), path
+
+
+def imports(path: Path) -> set[str]:
+    """Names of all modules a file imports, inside functions and for type checking too."""
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import; name the module in full"
+            names |= {node.module or ""} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def within(name: str, prefix: str) -> bool:
+    """Whether ``name`` is the module ``prefix`` or lies below it."""
+    return name == prefix or name.startswith(prefix + ".")
+
+
+def rule(table: dict[str, tuple[str, ...]], module: str) -> tuple[str, ...]:
+    """The entry of the longest prefix of ``module`` in ``table``."""
+    return table.get(max((key for key in table if within(module, key)), key=len, default=""), ())
+
+
+def test_imports_go_one_way():
+    wrong = []
+    for module, path in modules():
+        for name in imports(path):
+            if not within(name, "vd") or name == "vd":
+                continue
+            # `from vd.paper import PAPER` yields vd.paper and vd.paper.PAPER: both lie within vd.paper.
+            allowed = any(within(name, prefix) for prefix in rule(ALLOWED, module))
+            forbidden = any(within(name, prefix) for prefix in rule(FORBIDDEN, module))
+            if forbidden or not allowed:
+                wrong.append(f"{module} imports {name}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_kernels_import_nothing_but_warp():
+    for module, path in modules():
+        if within(module, "vd.kernels"):
+            others = {name.split(".")[0] for name in imports(path)} - {"vd", "warp", *sys.stdlib_module_names}
+            assert not others, f"{module} imports {others}"
+
+
+def test_libraries_stay_with_their_owner():
+    wrong = [
+        f"{module} imports {name}"
+        for module, path in modules()
+        for name in imports(path)
+        if not within(module, OWNED_LIBRARIES.get(name.split(".")[0], "vd"))
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_files_are_short():
+    files = [path for _, path in modules()] + sorted((ROOT / "tests").rglob("*.py"))
+    long = {
+        str(path.relative_to(ROOT)): n
+        for path in files
+        if (n := len(path.read_text().splitlines())) > MAX_LINES
+    }
+    assert not long, f"over {MAX_LINES} lines: {long}"
+
+
+def subcommands() -> list[tuple[str, str]]:
+    """Each command line of the project: every script alone, and with the subcommands that documents name."""
+    text = "\n".join(path.read_text() for path in DOCUMENTS)
+    pairs = {(script, "") for script in SCRIPTS}
+    for script in SCRIPTS:
+        pairs |= {(script, name) for name in re.findall(rf"\b{script} ([a-z]+)\b", text)}
+    return sorted(pairs)
+
+
+@pytest.mark.parametrize(("script", "subcommand"), subcommands())
+def test_help_works_and_loads_nothing_heavy(script, subcommand, tmp_path):
+    module, function = SCRIPTS[script].split(":")
+    code = f"""
+import sys
+sys.argv = [{script!r}, *{subcommand.split()!r}, "--help"]
+from {module} import {function}
+try:
+    status = {function}()
+except SystemExit as stop:
+    status = stop.code
+print("LOADED", *sorted({HEAVY!r} & set(sys.modules)))
+sys.exit(status or 0)
+"""
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr or run.stdout
+    help_text, _, loaded = run.stdout.partition("LOADED")
+    assert "--help" in help_text
+    assert not loaded.split(), f"{script} {subcommand} --help imports {loaded}"
+
+
+def test_every_constant_names_its_source():
+    rows = provenance()
+    assert rows
+    for name, value, tag, note in rows:
+        assert tag in {"P", "C", "U", "D"}, f"{name}: unknown tag {tag!r}"
+        assert len(note) > 3, f"{name}: where does it come from?"
+        if name.endswith("_code"):
+            assert tag == "C", f"{name}: *_code is for values of the released code"
+        numbers = value if isinstance(value, tuple) else (value,)
+        assert all(math.isfinite(number) for number in numbers), name
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_documents_name_what_exists(document):
+    text = document.read_text()
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", text):
+        if "://" not in target:
+            assert (document.parent / target).exists(), f"{document.name} links to {target}"
+    makefile = (ROOT / "Makefile").read_text()
+    for target in re.findall(r"`make ([a-z]+)", text):
+        assert re.search(rf"^{target}:", makefile, re.MULTILINE), f"{document.name}: no `make {target}`"
