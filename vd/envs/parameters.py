@@ -14,12 +14,6 @@ from vd.kernels.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, RewardPara
 from vd.paper import PAPER
 
 
-def _fill(struct: Any, **values: Any) -> Any:
-    for name, value in values.items():
-        setattr(struct, name, value)
-    return struct
-
-
 class TaskParameters:
     """All parameter structs of the task, each an array of length 1 on the device.
 
@@ -33,35 +27,32 @@ class TaskParameters:
         on = 1.0 if random.enabled else 0.0
         scene = PAPER.scene
 
-        def array(struct: Any) -> wp.array:
-            return wp.array([struct], dtype=type(struct), device=device)
+        def array(struct_type: Any, **values: Any) -> wp.array:
+            struct = struct_type()
+            for name, value in values.items():
+                setattr(struct, name, value)
+            return wp.array([struct], dtype=struct_type, device=device)
 
         self.action = array(
-            _fill(
-                ActionParams(),
-                alpha=cfg.action.ema_alpha,
-                step_rad=cfg.action.scale_rad_s * cfg.sim.control_dt,
-                noise_std=on * random.action_noise_std,
-            )
+            ActionParams,
+            alpha=cfg.action.ema_alpha,
+            step_rad=cfg.action.scale_rad_s * cfg.sim.control_dt,
+            noise_std=on * random.action_noise_std,
         )
         self.observation = array(
-            _fill(
-                ObservationParams(),
-                velocity_scale=PAPER.observation.velocity_scale,
-                noise_mean=on * random.observation_noise_mean,
-                noise_std=on * random.observation_noise_std,
-            )
+            ObservationParams,
+            velocity_scale=PAPER.observation.velocity_scale,
+            noise_mean=on * random.observation_noise_mean,
+            noise_std=on * random.observation_noise_std,
         )
         self.start = array(
-            _fill(StartParams(), position=wp.vec3(*scene.object_start_m), noise=scene.object_start_noise_m)
+            StartParams, position=wp.vec3(*scene.object_start_m), noise=scene.object_start_noise_m
         )
         self.force = array(
-            _fill(
-                ForceParams(),
-                probability=on * random.force_probability,
-                force_per_mass=random.force_n_per_kg,
-                decay=random.force_decay,
-            )
+            ForceParams,
+            probability=on * random.force_probability,
+            force_per_mass=random.force_n_per_kg,
+            decay=random.force_decay,
         )
         materials = PAPER.materials
         fixed = not random.enabled
@@ -70,21 +61,19 @@ class TaskParameters:
             return wp.vec2(nominal, nominal) if fixed else wp.vec2(*value)
 
         self.randomisation = array(
-            _fill(
-                RandomisationParams(),
-                stiffness_scale=span(random.stiffness_scale, 1.0),
-                damping_scale=span(random.damping_scale, 1.0),
-                friction=span(random.friction, materials.friction),
-                table_friction=span(random.table_friction, materials.table_friction),
-                link_mass_scale=span(random.link_mass_scale, 1.0),
-                object_mass=span(random.object_mass_kg, materials.object_mass_kg),
-                action_offset_std=on * random.action_offset_std,
-                observation_offset_std=on * random.observation_offset_std,
-            )
+            RandomisationParams,
+            stiffness_scale=span(random.stiffness_scale, 1.0),
+            damping_scale=span(random.damping_scale, 1.0),
+            friction=span(random.friction, materials.friction),
+            table_friction=span(random.table_friction, materials.table_friction),
+            link_mass_scale=span(random.link_mass_scale, 1.0),
+            object_mass=span(random.object_mass_kg, materials.object_mass_kg),
+            action_offset_std=on * random.action_offset_std,
+            observation_offset_std=on * random.observation_offset_std,
         )
-        self.reward = array(RewardParams())
-        self.success = array(SuccessParams())
-        self.goal = array(GoalParams())
+        self.reward = array(RewardParams)
+        self.success = array(SuccessParams)
+        self.goal = array(GoalParams)
         self._staging = {name: getattr(self, name).numpy() for name in ("reward", "success", "goal")}
         self.set_difficulty(1.0)
 

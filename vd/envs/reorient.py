@@ -70,8 +70,8 @@ class ReorientEnv:
         self.parameters = TaskParameters(cfg, self.device)
 
         self.num_worlds = n = cfg.num_worlds
-        self.num_fingers = f = len(self.hand.tip_body)
-        self.num_actions = d = len(self.hand.joint_names)
+        self.num_fingers = f = self.hand.num_fingers
+        self.num_actions = d = self.hand.num_joints
         self.num_observations = teacher_observation_size(f)
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
@@ -127,9 +127,9 @@ class ReorientEnv:
         self._given_start = zeros(n, dtype=wp.quat)
         self._given_goal = zeros(n, dtype=wp.quat)
         self._lower, self._upper = array(self.hand.lower), array(self.hand.upper)
-        self._effort_limit = array(self.hand.effort_limit)
-        self._tip_body = array(self.scene.link_body[self.hand.tip_body], wp.int32)
-        self._tip_offset = array(self.hand.tip_transform, wp.transform)
+        self._effort_limit = array(self.hand.effort)
+        self._tip_body = array(self.scene.link_body[self.hand.tip_link], wp.int32)
+        self._tip_offset = array(self.hand.tip_frame, wp.transform)
         self._body_com = wp.clone(self.sim.model.body_com[: self.scene.bodies_per_world])
         self._reset_q = array(np.tile(PAPER.scene.reset_joint_rad, f))
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)

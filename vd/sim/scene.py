@@ -49,7 +49,7 @@ class Scene:
     bodies_per_world: int
     """B."""
     link_body: np.ndarray
-    """Body index within a world of every hand link, shape [3F]."""
+    """Body index within a world of every hand link, base first, shape [3F + 1]."""
     object_body: int
     """Body index within a world of the object."""
     shape_kind: np.ndarray
@@ -109,19 +109,18 @@ def shape_cfg(cfg: SimCfg, friction: float, *, visual: bool = False) -> newton.M
     )
 
 
-def build_hand(usd: str, *, fingertip: str, cfg: SimCfg, visuals: bool) -> newton.ModelBuilder:
+def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBuilder:
     """The hand alone, mounted over the table, with the project's contact settings.
 
     Args:
-        usd: Path of the hand's USD.
-        fingertip: Variant of the fingertip, ``rigid`` or ``soft``.
+        hand: The hand; its file is read again by Newton, with the same fingertip variant.
         cfg: Contact settings. Friction, and softness where the USD authors it, stay the USD's.
         visuals: Keep visual-only shapes (for rendering; training has no use for them).
     """
     builder = new_builder()
     builder.default_shape_cfg = shape_cfg(cfg, PAPER.materials.friction)
     builder.add_usd(
-        open_stage(usd, fingertip=fingertip),
+        open_stage(hand.path, hand.fingertip),
         xform=hand_mount(),
         floating=False,
         enable_self_collisions=True,
@@ -129,21 +128,15 @@ def build_hand(usd: str, *, fingertip: str, cfg: SimCfg, visuals: bool) -> newto
         load_visual_shapes=visuals,
         hide_collision_shapes=True,
     )
-    softness = builder.custom_attributes["mujoco:geom_solimp"].values or {}
-    stiff = shape_cfg(cfg, 0.0)
+    tips = {shape.path for shape in hand.shapes if shape.fingertip}
     for shape in range(builder.shape_count):
         if not builder.shape_flags[shape] & newton.ShapeFlags.COLLIDE_SHAPES:
             continue
-        is_tip = "tip" in builder.shape_label[shape].rsplit("/", 1)[-1]
+        is_tip = builder.shape_label[shape] in tips
         builder.shape_gap[shape] = cfg.gap_m
         builder.shape_margin[shape] = 0.0
-        attributes = contact_attributes(cfg, PRIORITY_HAND, CONDIM_TORSIONAL if is_tip else CONDIM_SLIDING)
-        if shape in softness:
-            del attributes["mujoco:geom_solimp"]
-        else:
-            builder.shape_material_ke[shape] = stiff.ke
-            builder.shape_material_kd[shape] = stiff.kd
         builder.shape_material_mu_torsional[shape] = cfg.fingertip_torsion_m
+        attributes = contact_attributes(cfg, PRIORITY_HAND, CONDIM_TORSIONAL if is_tip else CONDIM_SLIDING)
         for key, value in attributes.items():
             builder.custom_attributes[key].values[shape] = value
     return builder
@@ -242,7 +235,7 @@ def build_scene(
             f"num_worlds = {num_worlds} is fewer than the {len(objects)} objects; "
             "raise num_worlds or name fewer objects"
         )
-    hand_builder = build_hand(hand.path, fingertip=hand.fingertip, cfg=cfg, visuals=visuals)
+    hand_builder = build_hand(hand, cfg, visuals=visuals)
     world_object = assign_objects(num_worlds, len(objects))
     scene = new_builder()
     for index, item in enumerate(objects):
