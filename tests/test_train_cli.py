@@ -1,0 +1,177 @@
+"""Presets, flags and the configuration file of training."""
+
+import dataclasses
+import json
+import typing
+from pathlib import Path
+
+import pytest
+
+from vd.config import from_dict, to_dict
+from vd.paper import PAPER
+from vd.train.cli import main, parse_teacher, resolve_device
+from vd.train.config import minibatches, validate
+from vd.train.presets import PRESETS, PresetName, TeacherCfg, smoke
+
+
+@pytest.mark.parametrize("name", sorted(PRESETS))
+def test_every_preset_parses_validates_and_survives_a_file(name):
+    preset = PRESETS[name]()
+    assert preset.preset == name
+    assert parse_teacher(["--preset", name]) == preset
+    validate(preset.ppo, preset.policy, preset.run)
+    preset.env.validate()
+    assert from_dict(TeacherCfg, json.loads(json.dumps(to_dict(preset)))) == preset
+
+
+def test_presets_are_the_choices_of_the_flag():
+    assert set(typing.get_args(PresetName)) == set(PRESETS)
+
+
+def test_paper_preset_is_the_paper():
+    cfg, paper = PRESETS["paper"](), PAPER.teacher
+    assert parse_teacher([]) == cfg, "the paper's preset is the default"
+    assert cfg.env.num_worlds == paper.num_worlds == 32000
+    assert (cfg.ppo.rollout_steps, cfg.ppo.epochs) == (8, 12)
+    assert minibatches(cfg.ppo, cfg.env.num_worlds) == 4
+    assert cfg.env.num_worlds * cfg.ppo.rollout_steps // 4 == paper.minibatch_size == 64000
+    assert (cfg.ppo.actor_learning_rate, cfg.ppo.critic_learning_rate) == (3e-4, 1e-3)
+    assert (cfg.ppo.clip, cfg.ppo.gamma, cfg.ppo.gae_lambda) == (0.1, 0.99, 0.95)
+    assert (cfg.ppo.schedule, cfg.ppo.optimizer) == ("fixed", "adam")
+    assert cfg.policy.hidden == (512, 256, 256) and cfg.policy.activation == "elu"
+    assert cfg.policy.distribution == "gaussian" and not cfg.policy.normalise_observations
+    assert cfg.env == type(cfg.env)(num_worlds=32000), (
+        "the task is the paper's, by the environment's defaults"
+    )
+
+
+def test_our_presets_bound_a_state_dependent_std():
+    for name in ("gpu", "multi-gpu", "cpu-demo"):
+        policy = PRESETS[name]().policy
+        assert policy.distribution == "state-dependent"
+        assert 0.0 < policy.std_range[0] < policy.initial_std < policy.std_range[1] <= 1.0
+
+
+def _flags(cls: type, prefix: str = "--") -> list[str]:
+    """Flags that the nested dataclass ``cls`` should have."""
+    flags = []
+    hints = typing.get_type_hints(cls)
+    for field in dataclasses.fields(cls):
+        name = field.name.replace("_", "-")
+        if dataclasses.is_dataclass(hints[field.name]):
+            inner = prefix if name == "run" else f"{prefix}{name}."
+            flags += _flags(hints[field.name], inner)
+        else:
+            flags.append(prefix + name)
+    return flags
+
+
+def test_help_lists_every_nested_field(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["teacher", "--help"])
+    assert end.value.code == 0
+    text = capsys.readouterr().out
+    flags = _flags(TeacherCfg)
+    assert len(flags) > 80 and "--env.reward.success" in flags and "--max-minutes" in flags
+    assert [flag for flag in flags if flag not in text] == []
+
+
+def test_help_needs_neither_torch_nor_the_simulator():
+    import subprocess
+    import sys
+
+    code = (
+        "import sys; from vd.train.cli import parse_teacher; parse_teacher(['--preset', 'gpu']);"
+        "heavy = {'torch', 'warp', 'newton', 'matplotlib', 'rsl_rl'} & set(sys.modules);"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_flags_override_the_preset_and_short_forms_mean_the_environment():
+    cfg = parse_teacher(
+        [
+            *("--preset", "gpu", "--hand", "dclaw3", "--objects", "cube", "cuboid", "--num_worlds=128"),
+            *("--seed", "7", "--ppo.epochs", "3", "--env.reward.energy=-1.5", "--run-dir", "runs/x"),
+            *("--max-minutes", "2.5"),
+        ]
+    )
+    assert (cfg.env.hand, cfg.env.objects) == ("dclaw3", ("cube", "cuboid"))
+    assert (cfg.env.num_worlds, cfg.env.seed) == (128, 7)
+    assert cfg.env.reward.energy == -1.5 and cfg.ppo.epochs == 3
+    assert cfg.run.run_dir == Path("runs/x") and cfg.run.max_minutes == 2.5
+    assert cfg.policy == PRESETS["gpu"]().policy
+
+
+def test_smoke_is_small_and_short():
+    cfg = parse_teacher(["--smoke", "--num-worlds", "8"])
+    assert cfg.smoke and cfg.run.device == "cpu" and cfg.run.max_minutes == 1.0 and cfg.env.num_worlds == 8
+    assert smoke().env.num_worlds * smoke().ppo.rollout_steps * 20 > smoke().run.max_steps
+
+
+def test_resume_starts_from_the_runs_own_configuration(tmp_path):
+    saved = dataclasses.replace(
+        PRESETS["gpu"](), run=dataclasses.replace(PRESETS["gpu"]().run, save_every=17)
+    )
+    (tmp_path / "config.json").write_text(json.dumps(to_dict(saved)))
+    cfg = parse_teacher(["--run-dir", str(tmp_path), "--resume", "--max-steps", "123"])
+    assert cfg.resume == "latest" and cfg.run.save_every == 17 and cfg.run.max_steps == 123
+    assert cfg.env == saved.env and cfg.run.run_dir == tmp_path
+    assert parse_teacher(["--run-dir", str(tmp_path), "--resume", "best"]).resume == "best"
+    with pytest.raises(FileNotFoundError, match="--run-dir"):
+        parse_teacher(["--run-dir", str(tmp_path / "none"), "--resume"])
+    (tmp_path / "config.json").write_text('{"ppo": {"epoch": 3}}')
+    with pytest.raises(ValueError, match=r"ppo has no field epoch"):
+        parse_teacher(["--run-dir", str(tmp_path), "--resume"])
+
+
+def test_a_folder_with_a_run_is_not_overwritten(tmp_path, capsys):
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints" / "model_0000001.pt").touch()
+    assert main(["teacher", "--smoke", "--run-dir", str(tmp_path)]) == 1
+    assert "add --resume" in capsys.readouterr().err
+    assert not (tmp_path / "config.json").exists()
+
+
+def test_unknown_commands_devices_and_missing_files_are_explained(tmp_path, capsys):
+    assert main(["student"]) == 2
+    assert "no command 'student'" in capsys.readouterr().err
+    assert main(["curves", str(tmp_path)]) == 1
+    assert "progress.jsonl" in capsys.readouterr().err
+    assert main(["export", str(tmp_path / "x.pt")]) == 1
+    for device in ("gpu", "cuda:97", "cuda:x"):
+        with pytest.raises(ValueError, match="--device"):
+            resolve_device(device)
+    assert resolve_device("cpu") == "cpu"
+
+
+def test_export_and_curves_commands(tmp_path):
+    from train_dummy import make_runner
+
+    from vd.policy import load_policy
+
+    make_runner(tmp_path).learn(1)
+    whole = tmp_path / "checkpoints" / "model_0000001.pt"
+    assert main(["export", str(whole), str(tmp_path / "out.pt")]) == 0
+    assert load_policy(tmp_path / "out.pt").iteration == 1
+    assert (tmp_path / "out.pt").stat().st_size < whole.stat().st_size
+    assert main(["curves", str(tmp_path)]) == 0
+    assert (tmp_path / "curves.png").is_file()
+
+
+def test_configuration_errors_name_the_path_of_the_field():
+    good = to_dict(PRESETS["gpu"]())
+    for path, value, message in (
+        (("ppo", "epochs"), "three", "ppo.epochs: expected int"),
+        (("env", "sim", "cone"), 3, "env.sim.cone: expected str"),
+        (("policy", "std_range"), [0.1], "policy.std_range: expected 2 values"),
+        (("ppo", "schedule"), "linear", "ppo.schedule: 'linear' is not one of"),
+        (("env", "reward"), 3, "env.reward: expected fields of RewardCfg"),
+    ):
+        bad = json.loads(json.dumps(good))
+        inner = bad
+        for key in path[:-1]:
+            inner = inner[key]
+        inner[path[-1]] = value
+        with pytest.raises(ValueError, match=message.replace(".", r"\.")):
+            from_dict(TeacherCfg, bad)

@@ -1,0 +1,256 @@
+"""The vectorised environment, the algorithm and the distribution, on an environment with known answers."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
+
+from vd.policy import TrainedPolicy
+from vd.train.config import PolicyCfg, PpoCfg, RunCfg, minibatches, validate
+from vd.train.distribution import BoundedStdGaussian
+from vd.train.metrics import GoalWindow, StepMeans, read_progress
+from vd.train.vec_env import ReorientVecEnv
+
+
+@pytest.fixture
+def env() -> ReorientVecEnv:
+    return ReorientVecEnv(DummyEnv(num_worlds=4))
+
+
+def test_vec_env_contract(env):
+    assert isinstance(env, VecEnv)
+    observation = env.get_observations()
+    assert isinstance(observation, TensorDict) and observation.batch_size == torch.Size([4])
+    assert observation["policy"].shape == (4, 5) and observation["policy"].dtype == torch.float32
+    keys = None
+    for _ in range(12):
+        observation, reward, done, extras = env.step(torch.zeros(4, 2))
+        assert observation["policy"].shape == (4, 5)
+        assert reward.shape == done.shape == extras["time_outs"].shape == (4,)
+        assert keys in (None, list(extras["log"]))
+        keys = list(extras["log"])
+        assert all(value.ndim == 0 for value in extras["log"].values())
+    assert {"reward/total", "reward/distance", "reward/bonus", "task/rotation_error", "task/reached"} <= set(
+        keys
+    )
+
+
+def test_actions_reach_the_environment_and_outputs_are_of_this_step(env):
+    target = wp.to_torch(env.env.observation)[:, :2].clone()
+    _, reward, _, extras = env.step(target + 0.5)
+    assert torch.allclose(reward, torch.full((4,), -0.5), atol=1e-6)
+    assert float(extras["log"]["reward/total"]) == pytest.approx(-0.5, abs=1e-6)
+    assert float(extras["log"]["task/rotation_error"]) == pytest.approx(math.sqrt(0.5), abs=1e-6)
+
+
+def test_observation_survives_the_next_step(env):
+    before = env.get_observations()
+    kept = before["policy"].clone()
+    env.step(torch.zeros(4, 2))
+    assert torch.equal(before["policy"], kept)
+    assert not torch.equal(env.get_observations()["policy"], kept)
+
+
+def test_rollout_pairs_each_observation_with_its_own_action(tmp_path):
+    runner = make_runner(tmp_path)
+    observation = runner.env.get_observations()
+    shown, taken = [], []
+    with torch.inference_mode():
+        for _ in range(8):
+            shown.append(observation["policy"].clone())
+            actions = runner.alg.act(observation)
+            taken.append(actions.clone())
+            observation, reward, done, extras = runner.env.step(actions)
+            runner.alg.process_env_step(observation, reward, done, extras)
+    assert torch.equal(runner.alg.storage.observations["policy"], torch.stack(shown))
+    assert torch.equal(runner.alg.storage.actions, torch.stack(taken))
+
+
+def _fixed_flags(env: ReorientVecEnv, success, fell, timed_out) -> None:
+    """Make the dummy end its step with the given flags."""
+    flags = {"success": success, "fell": fell, "timed_out": timed_out}
+
+    def step(_action: wp.array) -> None:
+        for name, values in flags.items():
+            getattr(env.env, name).assign(np.array(values, dtype=np.int32))
+
+    env.env.step = step
+
+
+def test_success_is_done_and_only_a_pure_time_out_bootstraps(env):
+    _fixed_flags(env, success=[1, 0, 0, 1], fell=[0, 1, 0, 0], timed_out=[0, 0, 1, 1])
+    _, _, done, extras = env.step(torch.zeros(4, 2))
+    assert done.tolist() == [1, 1, 1, 1]
+    assert extras["time_outs"].tolist() == [0, 0, 1, 0]
+    shares = {name: float(extras["log"][f"task/{name}"]) for name in ("reached", "dropped", "timed_out")}
+    assert shares == {"reached": 0.5, "dropped": 0.25, "timed_out": 0.25}
+
+
+def test_time_out_adds_the_discounted_value_of_the_stored_observation(tmp_path):
+    runner = make_runner(tmp_path, env=DummyEnv(num_worlds=4))
+    _fixed_flags(runner.env, success=[1, 0, 0, 0], fell=[0, 1, 0, 0], timed_out=[0, 0, 1, 0])
+    observation = runner.env.get_observations()
+    with torch.inference_mode():
+        value = runner.alg.critic(observation).squeeze(1)
+        actions = runner.alg.act(observation)
+        observation, _, done, extras = runner.env.step(actions)
+        reward = torch.tensor([1.0, 2.0, 3.0, 4.0])
+        runner.alg.process_env_step(observation, reward, done, extras)
+    expected = reward + runner.alg.gamma * value * torch.tensor([0.0, 0.0, 1.0, 0.0])
+    assert torch.allclose(runner.alg.storage.rewards[0].squeeze(1), expected)
+    assert runner.alg.storage.dones[0].flatten().tolist() == [1, 1, 1, 0]
+
+
+def test_staggering_sets_the_environments_own_counter(env):
+    env.episode_length_buf = torch.tensor([9, 0, 5, 2])
+    assert env.env.step_count.numpy().tolist() == [9, 0, 5, 2]
+    _, _, _, extras = env.step(torch.full((4, 2), 5.0))
+    assert extras["time_outs"][0] == 1 or env.env.fell.numpy()[0] == 1
+
+
+@pytest.mark.parametrize("distribution", ["state-dependent", "gaussian"])
+def test_learns_to_follow_the_target(tmp_path, distribution):
+    ppo = dataclasses.replace(SMALL_PPO, minibatch_size=128)
+    policy = dataclasses.replace(SMALL_POLICY, distribution=distribution)
+    runner = make_runner(tmp_path, env=DummyEnv(num_worlds=64), ppo=ppo, policy=policy, save_every=100)
+    runner.learn(25)
+    rows = read_progress(tmp_path / "progress.jsonl")
+    first, last = rows[0], rows[-1]
+    assert last["reward/distance"] > 0.3 * first["reward/distance"]
+    assert last["success_per_goal"] > 2 * first["success_per_goal"]
+    assert last["action_std"] < first["action_std"]
+    assert last["loss/value"] < 0.2 * first["loss/value"]
+
+
+def test_two_learning_rates_survive_the_adaptive_schedule(tmp_path):
+    ppo = dataclasses.replace(SMALL_PPO, schedule="adaptive", desired_kl=1e-4)
+    runner = make_runner(tmp_path, ppo=ppo)
+    actor, critic = runner.alg.optimizer.param_groups
+    assert (actor["lr"], critic["lr"]) == (2e-3, 3e-3)
+    ids = [{id(p) for p in group["params"]} for group in (actor, critic)]
+    assert ids == [
+        {id(p) for p in runner.alg.actor.parameters()},
+        {id(p) for p in runner.alg.critic.parameters()},
+    ]
+    runner.learn(2)
+    assert actor["lr"] == runner.alg.learning_rate < 2e-3
+    assert critic["lr"] == 3e-3
+
+
+def test_gradient_is_clipped_by_the_joint_norm(tmp_path):
+    ppo = dataclasses.replace(SMALL_PPO, grad_norm=1e-3, value_coefficient=100.0)
+    runner = make_runner(tmp_path, ppo=ppo)
+    norms = []
+
+    def record(*_args) -> None:
+        parameters = [*runner.alg.actor.parameters(), *runner.alg.critic.parameters()]
+        norms.append(math.sqrt(sum(float(p.grad.square().sum()) for p in parameters)))
+
+    runner.alg.optimizer.register_step_pre_hook(record)
+    runner.learn(1)
+    assert norms == pytest.approx([1e-3] * len(norms), rel=1e-2)
+
+
+def test_every_sample_is_used_once_an_epoch(tmp_path):
+    ppo = dataclasses.replace(SMALL_PPO, epochs=2, minibatch_size=32)
+    runner = make_runner(tmp_path, ppo=ppo)
+    observation = runner.env.get_observations()
+    with torch.inference_mode():
+        for _ in range(8):
+            actions = runner.alg.act(observation)
+            observation, reward, done, extras = runner.env.step(actions)
+            runner.alg.process_env_step(observation, reward, done, extras)
+    wanted = runner.alg.storage.actions_log_prob.flatten().sort().values
+    batches = [batch["log_prob"] for batch in runner.alg._minibatches()]
+    assert len(batches) == 2 * 4
+    for epoch in (batches[:4], batches[4:]):
+        assert torch.equal(torch.cat(epoch).sort().values, wanted)
+    assert not torch.equal(torch.cat(batches[:4]), torch.cat(batches[4:]))
+
+
+def test_state_dependent_std_starts_as_asked_and_keeps_a_gradient_at_the_bounds():
+    distribution = BoundedStdGaussian(3, init_std=0.5, std_range=(0.02, 1.0))
+    head = torch.nn.Linear(4, 6)
+    distribution.init_mlp_weights(torch.nn.Sequential(head, torch.nn.Unflatten(-1, [2, 3])))
+    distribution.update(head(torch.randn(7, 4)).view(7, 2, 3))
+    assert torch.allclose(distribution.std, torch.full((7, 3), 0.5), atol=1e-5)
+    raw = torch.tensor([[[0.0, 0.0, 0.0], [-8.0, 0.0, 8.0]]], requires_grad=True)
+    distribution.update(raw)
+    std = distribution.std[0].detach()
+    assert ((std > 0.02) & (std < 1.0)).all() and (std.diff() > 0).all()
+    distribution.std.sum().backward()
+    assert (raw.grad[0, 1].abs() > 0).all()
+
+
+def test_step_means_and_window_ratios():
+    means = StepMeans()
+    for value in (1.0, 3.0):
+        means.add({"a": torch.tensor(value), "b": torch.tensor(-value)})
+    assert means.read() == {"a": 2.0, "b": -2.0}
+    window = GoalWindow(2)
+    row = {"task/reached": 0.0, "task/dropped": 0.0, "task/timed_out": 0.0, "reward/total": 1.0}
+    assert window.add(row)["success_per_goal"] is None
+    result = window.add(
+        row | {"task/reached": 0.3, "task/dropped": 0.1, "task/timed_out": 0.2, "reward/total": 3.0}
+    )
+    assert result["success_per_goal"] == pytest.approx(0.5)
+    assert result["goals_per_episode"] == pytest.approx(1.0)
+    assert result["drop_rate"] == pytest.approx(1 / 3)
+    assert result["mean_reward"] == 2.0
+    # The third iteration pushes the first out.
+    assert window.add(row | {"task/timed_out": 0.6})["success_per_goal"] == pytest.approx(0.25)
+
+
+def test_minibatches_are_never_larger_than_asked():
+    assert minibatches(PpoCfg(rollout_steps=8, minibatch_size=64000), 32000) == 4
+    assert minibatches(PpoCfg(rollout_steps=8, minibatch_size=64000), 100) == 1
+    assert minibatches(PpoCfg(rollout_steps=10, minibatch_size=64), 10) == 2
+
+
+@pytest.mark.parametrize(
+    ("ppo", "policy", "flag"),
+    [
+        (PpoCfg(epochs=0), PolicyCfg(), "--ppo.epochs"),
+        (PpoCfg(gamma=1.5), PolicyCfg(), "--ppo.gamma"),
+        (PpoCfg(actor_learning_rate=float("nan")), PolicyCfg(), "--ppo.actor-learning-rate"),
+        (PpoCfg(), PolicyCfg(initial_std=2.0, std_range=(0.1, 1.0)), "--policy.std-range"),
+        (PpoCfg(), PolicyCfg(hidden=(64, 0)), "--policy.hidden"),
+    ],
+)
+def test_bad_settings_are_named(ppo, policy, flag):
+    with pytest.raises(ValueError, match=flag):
+        validate(ppo, policy, RunCfg())
+
+
+@pytest.mark.parametrize("distribution", ["state-dependent", "gaussian"])
+@pytest.mark.parametrize("normalise", [False, True])
+def test_policy_equals_the_actor_it_came_from(tmp_path, distribution, normalise):
+    policy = dataclasses.replace(SMALL_POLICY, distribution=distribution, normalise_observations=normalise)
+    runner = make_runner(tmp_path, policy=policy)
+    runner.learn(3)
+    from vd.policy import load_policy
+
+    observation = runner.env.get_observations()
+    wanted = runner.alg.get_policy()(observation)
+    for file in (tmp_path / "checkpoints" / "model_0000003.pt", tmp_path / "policy.pt"):
+        loaded = load_policy(file)
+        assert isinstance(loaded, TrainedPolicy)
+        assert torch.allclose(loaded.act(observation["policy"]), wanted, atol=1e-6)
+        assert loaded.hand == "dummy" and loaded.iteration == 3
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU to see copies to the host")
+def test_a_step_copies_nothing_to_the_host():
+    env = ReorientVecEnv(DummyEnv(num_worlds=4, device="cuda:0"))
+    env.env.step = lambda _action: None  # the dummy itself works on the host
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        env.step(torch.zeros((4, 2), device="cuda:0"))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")

@@ -1,0 +1,326 @@
+"""How runs end and go on: checkpoints, resuming, signals, limits, divergence, several processes."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from train_dummy import DummyEnv, make_runner
+
+from vd.policy import RandomPolicy, ZeroPolicy, load_policy
+from vd.train.checkpoint import (
+    checkpoint_path,
+    find_checkpoint,
+    list_checkpoints,
+    load_checkpoint,
+    random_state,
+    save_checkpoint,
+    set_random_state,
+)
+from vd.train.metrics import read_progress
+from vd.train.runner import Interrupted, TrainingDivergedError
+
+TIMING = ("elapsed_s", "steps_per_s", "collect_s", "learn_s")
+
+
+def _weights(runner) -> dict[str, torch.Tensor]:
+    saved = runner.alg.save()
+    return saved["actor_state_dict"] | {f"critic.{k}": v for k, v in saved["critic_state_dict"].items()}
+
+
+def _rows(folder: Path) -> list[dict]:
+    return [
+        {k: v for k, v in row.items() if k not in TIMING} for row in read_progress(folder / "progress.jsonl")
+    ]
+
+
+@pytest.mark.parametrize("schedule", ["fixed", "adaptive"])
+def test_three_and_three_more_equal_six(tmp_path, schedule):
+    from dataclasses import replace
+
+    from train_dummy import SMALL_PPO
+
+    ppo = replace(SMALL_PPO, schedule=schedule)
+    whole = make_runner(tmp_path / "whole", ppo=ppo)
+    whole.learn(6)
+
+    part = tmp_path / "part"
+    make_runner(part, ppo=ppo).learn(3)
+    resumed = make_runner(part, ppo=ppo, env=DummyEnv(num_worlds=16, seed=99), seed=99)
+    resumed.load(str(find_checkpoint(part, "latest")))
+    assert resumed.current_learning_iteration == 3
+    resumed.learn(3)
+
+    one, two = _weights(whole), _weights(resumed)
+    assert all(torch.equal(one[name], two[name]) for name in one)
+    assert _rows(tmp_path / "whole") == _rows(part)
+    assert [row["iteration"] for row in _rows(part)] == [1, 2, 3, 4, 5, 6]
+    assert resumed.env_steps == whole.env_steps
+    assert resumed.alg.learning_rate == whole.alg.learning_rate
+    assert resumed.env.env.difficulty == whole.env.env.difficulty
+
+
+def test_resuming_from_an_older_checkpoint_rewrites_the_curve(tmp_path):
+    make_runner(tmp_path, save_every=2).learn(6)
+    before = _rows(tmp_path)
+    resumed = make_runner(tmp_path, save_every=2, seed=5)
+    resumed.load(str(checkpoint_path(tmp_path, 2)))
+    resumed.learn(4)
+    assert _rows(tmp_path) == before
+
+
+def test_keeps_the_last_few_and_the_best(tmp_path):
+    runner = make_runner(tmp_path, save_every=1, keep_last=2)
+    runner.learn(5)
+    assert [p.name for p in list_checkpoints(tmp_path)] == ["model_0000004.pt", "model_0000005.pt"]
+    best = load_checkpoint(find_checkpoint(tmp_path, "best"))
+    scores = [
+        (row["task/difficulty"], row["success_per_goal"] or 0.0, row["mean_reward"])
+        for row in _rows(tmp_path)
+    ]
+    assert best["iter"] == 1 + scores.index(max(scores))
+    assert load_policy(tmp_path / "policy.pt").iteration == best["iter"]
+
+
+def test_a_crash_while_writing_leaves_the_old_checkpoint(tmp_path, monkeypatch):
+    path = tmp_path / "checkpoints" / "model_0000001.pt"
+    save_checkpoint(path, {"actor_state_dict": {"w": torch.ones(2)}})
+
+    def torn(_state, file) -> None:
+        file.write(b"half a checkpoint")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(torch, "save", torn)
+    with pytest.raises(OSError, match="disk full"):
+        save_checkpoint(path, {"actor_state_dict": {"w": torch.zeros(2)}})
+    monkeypatch.undo()
+    assert torch.equal(load_checkpoint(path)["actor_state_dict"]["w"], torch.ones(2))
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_a_killed_writer_is_not_taken_for_a_checkpoint(tmp_path):
+    runner = make_runner(tmp_path, save_every=1)
+    runner.learn(1)
+    torn = tmp_path / "checkpoints" / ".model_0000002.x1.pt"
+    torn.write_bytes(b"torn")
+    assert find_checkpoint(tmp_path, "latest").name == "model_0000001.pt"
+    runner.learn(1)
+    assert not torn.exists()
+
+
+def test_damaged_and_missing_files_are_explained(tmp_path):
+    bad = tmp_path / "model_0000001.pt"
+    bad.write_bytes(b"not a checkpoint")
+    with pytest.raises(ValueError, match="damaged"):
+        load_checkpoint(bad)
+    with pytest.raises(ValueError, match="damaged"):
+        load_policy(bad)
+    with pytest.raises(FileNotFoundError, match="no policy at"):
+        load_policy(tmp_path / "none.pt")
+    with pytest.raises(FileNotFoundError, match="no checkpoint"):
+        find_checkpoint(tmp_path, "latest")
+    torch.save({"other": 1}, bad)
+    with pytest.raises(ValueError, match="holds no policy"):
+        load_policy(bad)
+
+
+def test_a_checkpoint_of_another_network_is_refused(tmp_path):
+    from dataclasses import replace
+
+    from train_dummy import SMALL_POLICY
+
+    make_runner(tmp_path).learn(1)
+    other = make_runner(tmp_path / "other", policy=replace(SMALL_POLICY, hidden=(8,)))
+    with pytest.raises(ValueError, match="does not fit"):
+        other.load(str(find_checkpoint(tmp_path, "latest")))
+
+
+def test_policy_refuses_observations_of_another_hand(tmp_path):
+    make_runner(tmp_path).learn(1)
+    policy = load_policy(tmp_path / "policy.pt")
+    with pytest.raises(ValueError, match=r"trained on observations \[N, 5\]"):
+        policy.act(torch.zeros(3, 6))
+
+
+def test_zero_and_random_agents():
+    observation = torch.zeros(100, 7)
+    assert torch.equal(ZeroPolicy(3).act(observation), torch.zeros(100, 3))
+    first, again = RandomPolicy(3, seed=1), RandomPolicy(3, seed=1)
+    actions = first.act(observation)
+    assert torch.equal(actions, again.act(observation))
+    assert not torch.equal(actions, first.act(observation))
+    assert actions.abs().max() <= 1.0 and actions.std() > 0.4
+
+
+def test_random_states_are_restored():
+    import random
+
+    state = random_state("cpu")
+    draw = (random.random(), np.random.rand(), float(torch.rand(())))  # noqa: NPY002
+    set_random_state(state, "cpu")
+    assert draw == (random.random(), np.random.rand(), float(torch.rand(())))  # noqa: NPY002
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_saves_and_the_run_goes_on(tmp_path, number):
+    env = DummyEnv(num_worlds=16)
+    runner = make_runner(tmp_path, env=env, save_every=100)
+    step, handler = env.step, signal.getsignal(number)
+
+    def interrupting(action) -> None:
+        step(action)
+        if env.steps == 20:  # in the middle of the third rollout of 8 steps
+            os.kill(os.getpid(), number)
+
+    env.step = interrupting
+    with pytest.raises(Interrupted):
+        runner.learn(10)
+    assert signal.getsignal(number) == handler
+    assert env.steps == 20, "the rollout was not cut short"
+    assert find_checkpoint(tmp_path, "latest").name == "model_0000002.pt"
+    resumed = make_runner(tmp_path)
+    resumed.load(str(find_checkpoint(tmp_path, "latest")))
+    resumed.learn(1)
+    assert [row["iteration"] for row in _rows(tmp_path)] == [1, 2, 3]
+
+
+def test_limits_of_steps_and_time(tmp_path):
+    runner = make_runner(tmp_path / "steps", max_steps=300)  # 16 worlds x 8 steps = 128 an iteration
+    runner.learn()
+    assert runner.current_learning_iteration == 3 and runner.env_steps == 384
+    timed = make_runner(tmp_path / "time", deadline=time.monotonic(), save_every=100)
+    timed.learn(50)
+    assert timed.current_learning_iteration == 1
+    assert find_checkpoint(tmp_path / "time", "latest").name == "model_0000001.pt"
+
+
+def test_environment_is_checked_and_its_curriculum_moved_once_an_iteration(tmp_path):
+    env = DummyEnv(num_worlds=16)
+    make_runner(tmp_path, env=env).learn(3)
+    assert env.checks == env.updates == 3
+
+
+@pytest.mark.parametrize("where", ["observation", "reward"])
+def test_nan_from_the_simulation_stops_before_the_update(tmp_path, where):
+    env = DummyEnv(num_worlds=16)
+    runner = make_runner(tmp_path, env=env, save_every=1)
+    step = env.step
+
+    def poisoned(action) -> None:
+        step(action)
+        if env.steps == 12:
+            values = getattr(env, where).numpy().copy()
+            values[3] = np.nan
+            getattr(env, where).assign(values)
+
+    env.step = poisoned
+    with pytest.raises(TrainingDivergedError, match=rf"{where}s.*not finite in 1 worlds \(first: \[3\]\)"):
+        runner.learn(5)
+    assert all(torch.isfinite(w).all() for w in _weights(runner).values())
+    assert find_checkpoint(tmp_path, "latest").name == "model_0000001.pt"
+
+
+def test_nan_in_the_networks_stops_with_what_to_change(tmp_path):
+    runner = make_runner(tmp_path)
+    update = runner.alg.update
+
+    def broken() -> dict[str, float]:
+        losses = update()
+        with torch.no_grad():
+            next(runner.alg.actor.parameters())[0, 0] = float("inf")
+        return losses
+
+    runner.alg.update = broken
+    with pytest.raises(TrainingDivergedError, match=r"parameters.*--ppo\.actor-learning-rate"):
+        runner.learn(1)
+
+
+def test_values_that_are_not_finite_become_null_and_a_torn_line_is_skipped(tmp_path):
+    from vd.train.metrics import ProgressFile
+
+    log = ProgressFile(tmp_path, tensorboard=False)
+    log.write({"iteration": 1, "value": float("nan")})
+    log.close()
+    path = tmp_path / "progress.jsonl"
+    path.write_text(path.read_text() + '{"iteration": 2, "va')
+    assert read_progress(path) == [{"iteration": 1, "value": None}]
+    path.write_text('{"iteration": 2, "va\n{"iteration": 3}\n')
+    with pytest.raises(ValueError, match="line 1"):
+        read_progress(path)
+
+
+def test_curves_are_drawn(tmp_path):
+    import imageio.v3 as imageio
+
+    from vd.train.curves import plot_curves
+
+    make_runner(tmp_path).learn(3)
+    plot_curves(tmp_path / "progress.jsonl", tmp_path / "curves.png")
+    image = imageio.imread(tmp_path / "curves.png")
+    assert image.shape[0] > 500 and image.std() > 5
+    (tmp_path / "empty.jsonl").write_text("")
+    with pytest.raises(ValueError, match="no iteration"):
+        plot_curves(tmp_path / "empty.jsonl", tmp_path / "empty.png")
+
+
+def test_tensorboard_files_hold_the_curve(tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    make_runner(tmp_path, tensorboard=True).learn(2)
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [e.step for e in events.Scalars("task/rotation_error")] == [1, 2]
+    assert "run/success_per_goal" in events.Tags()["scalars"]
+
+
+DISTRIBUTED = """
+import json, sys
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+sys.path.insert(0, {tests!r})
+from train_dummy import DummyEnv, make_runner
+from vd.train.checkpoint import find_checkpoint
+import os
+rank, folder = int(os.environ["RANK"]), Path({folder!r})
+runner = make_runner(folder, env=DummyEnv(num_worlds=8, seed=rank), seed=rank, save_every=2)
+runner.learn(2)
+torch.manual_seed(100 + rank)
+runner.load(str(find_checkpoint(folder, "latest")))
+draw = float(torch.rand(()))
+networks = (runner.alg.actor, runner.alg.critic)
+weights = torch.cat([p.detach().flatten() for network in networks for p in network.parameters()])
+target = runner.env.env._target.sum()
+(folder / f"rank{{rank}}.json").write_text(json.dumps(dict(
+    weights=weights.tolist(), draw=draw, target=float(target), steps=runner.env_steps, main=runner.is_main)))
+runner.shutdown()
+"""
+
+
+@pytest.mark.slow
+def test_two_processes_keep_the_same_parameters_and_their_own_worlds(tmp_path):
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    code = DISTRIBUTED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    # No PATH: nothing may depend on a git binary, which rsl-rl's logger looks for.
+    shared = os.environ | {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "PATH": ""}
+    processes = [
+        subprocess.Popen([sys.executable, "-c", code], env=shared | {"RANK": str(r), "LOCAL_RANK": str(r)})
+        for r in range(2)
+    ]
+    assert [p.wait(timeout=120) for p in processes] == [0, 0]
+    one, two = (json.loads((tmp_path / f"rank{r}.json").read_text()) for r in range(2))
+    assert one["weights"] == two["weights"]
+    assert one["draw"] != two["draw"] and one["target"] != two["target"]
+    assert one["steps"] == two["steps"] == 2 * 8 * 8 * 2
+    assert one["main"] and not two["main"]
+    assert [row["iteration"] for row in _rows(tmp_path)] == [1, 2]

@@ -1,0 +1,140 @@
+"""Checkpoints: whole or absent, readable without running code, with every random state."""
+
+import os
+import random
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from vd.files import atomic_path
+
+CHECKPOINT_FOLDER = "checkpoints"
+BEST_NAME = "best.pt"
+_NAME = re.compile(r"model_(\d+)\.pt")
+_ARRAY = "__numpy__"
+
+
+def checkpoint_path(run_dir: Path, iteration: int) -> Path:
+    """File of the checkpoint after ``iteration`` iterations."""
+    return run_dir / CHECKPOINT_FOLDER / f"model_{iteration:07d}.pt"
+
+
+def list_checkpoints(run_dir: Path) -> list[Path]:
+    """Periodic checkpoints of a run, oldest first (``best.pt`` is not among them)."""
+    files = [p for p in (run_dir / CHECKPOINT_FOLDER).glob("model_*.pt") if _NAME.fullmatch(p.name)]
+    return sorted(files, key=_iteration_of)
+
+
+def find_checkpoint(run_dir: Path, which: str) -> Path:
+    """The checkpoint that ``--resume`` names: ``latest``, ``best`` or a file.
+
+    Raises:
+        FileNotFoundError: There is none; the message says what is there.
+    """
+    files = list_checkpoints(run_dir)
+    if which == "latest":
+        if files:
+            return files[-1]
+        raise FileNotFoundError(
+            f"--resume: no checkpoint in {run_dir / CHECKPOINT_FOLDER}; leave --resume out to start"
+        )
+    path = run_dir / CHECKPOINT_FOLDER / BEST_NAME if which == "best" else Path(which)
+    if not path.is_file():
+        found = ", ".join(p.name for p in files) or "none"
+        raise FileNotFoundError(f"--resume: no file {path}; checkpoints of {run_dir}: {found}")
+    return path
+
+
+def prune_checkpoints(run_dir: Path, keep: int) -> None:
+    """Delete all but the newest ``keep`` periodic checkpoints, and what a killed run left half-written."""
+    for path in list_checkpoints(run_dir)[:-keep]:
+        path.unlink(missing_ok=True)
+    for path in (run_dir / CHECKPOINT_FOLDER).glob(".*.pt"):
+        path.unlink(missing_ok=True)
+
+
+def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
+    """Write ``state`` (tensors, arrays, plain values); ``path`` is the old file or the whole new one."""
+    with atomic_path(path) as temporary:
+        with temporary.open("wb") as file:
+            torch.save(_plain(state), file)
+            file.flush()
+            os.fsync(file.fileno())  # a rename alone may survive a power cut without the data
+
+
+def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
+    """Read a checkpoint without executing anything in it.
+
+    Raises:
+        ValueError: The file is damaged or not a checkpoint.
+    """
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"{path} is damaged or no checkpoint ({reason}); give --resume another file of its folder"
+        ) from error
+    if not isinstance(state, dict) or "actor_state_dict" not in state:
+        raise ValueError(
+            f"{path} holds no actor; give --resume a file that vd-train wrote in {CHECKPOINT_FOLDER}/"
+        )
+    return _restored(state)
+
+
+def random_state(device: str) -> dict[str, Any]:
+    """State of the random generators of Python, NumPy and torch (CPU, and ``device`` if it is a GPU)."""
+    version, internal, gauss = random.getstate()
+    name, keys, position, has_gauss, cached = np.random.get_state()  # noqa: NPY002  # others' code may use it
+    state: dict[str, Any] = {
+        "python": [version, list(internal), gauss],
+        "numpy": [str(name), np.asarray(keys), int(position), int(has_gauss), float(cached)],
+        "torch": torch.get_rng_state(),
+    }
+    if device.startswith("cuda"):
+        state["cuda"] = torch.cuda.get_rng_state(device)
+    return state
+
+
+def set_random_state(state: dict[str, Any], device: str) -> None:
+    """Restore what :func:`random_state` gave. A GPU state is skipped where there is no GPU."""
+    version, internal, gauss = state["python"]
+    random.setstate((version, tuple(internal), gauss))
+    np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
+    torch.set_rng_state(state["torch"].cpu())
+    if device.startswith("cuda") and "cuda" in state:
+        torch.cuda.set_rng_state(state["cuda"].cpu(), device)
+
+
+def _iteration_of(path: Path) -> int:
+    match = _NAME.fullmatch(path.name)
+    return int(match.group(1)) if match else -1
+
+
+def _plain(value: Any) -> Any:
+    """``value`` with NumPy arrays and scalars as tensors and numbers, which load without running code."""
+    if isinstance(value, np.ndarray):
+        return {_ARRAY: torch.from_numpy(np.ascontiguousarray(value)), "shape": list(value.shape)}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(_plain(item) for item in value)
+    return value
+
+
+def _restored(value: Any) -> Any:
+    """The inverse of :func:`_plain`."""
+    if isinstance(value, dict):
+        if _ARRAY in value:
+            return value[_ARRAY].cpu().numpy().reshape(value["shape"])
+        return {key: _restored(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(_restored(item) for item in value)
+    return value

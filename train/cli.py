@@ -1,0 +1,273 @@
+"""Command line of training: ``vd-train teacher``, ``vd-train export``, ``vd-train curves``."""
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from vd.config import from_dict, to_dict
+from vd.files import write_json
+from vd.train.presets import PRESETS, TeacherCfg, smoke
+
+if TYPE_CHECKING:
+    from vd.train.runner import TeacherRunner
+
+CONFIG_NAME = "config.json"
+"""The resolved configuration, in the run's folder, written before training."""
+
+USAGE = """usage: vd-train COMMAND [flags]
+
+commands:
+  teacher   train the teacher with PPO           vd-train teacher --preset gpu --run-dir runs/first
+  export    write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
+  curves    draw the curves of a run             vd-train curves runs/first
+
+Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset multi-gpu
+Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
+               -m vd.train.cli teacher --preset multi-gpu --run-dir SHARED/FOLDER
+
+vd-train COMMAND --help lists the flags of a command."""
+
+TEACHER_HELP = """Train the teacher: PPO on the simulator's state.
+
+Flags start from --preset, or with --resume from the run's config.json. Short forms: --hand, --objects,
+--num-worlds and --seed stand for --env.hand, --env.objects, --env.num-worlds and --env.seed. Ctrl-C saves."""
+
+SHORT_FORMS = ("hand", "objects", "num-worlds", "seed")
+"""Fields of the environment that are common enough to be flags without the ``--env.`` prefix."""
+
+
+@dataclass
+class ExportCfg:
+    """Write the policy of a checkpoint, without optimiser and training state."""
+
+    checkpoint: Annotated[Path, tyro.conf.Positional]
+    """Checkpoint of vd-train teacher."""
+    output: Annotated[Path, tyro.conf.Positional] = Path("policy.pt")
+    """File to write."""
+
+
+@dataclass
+class CurvesCfg:
+    """Draw success, reward, terms, std, error and speed of runs against control steps."""
+
+    runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Folders of runs, or progress.jsonl files."""
+    output: Path | None = None
+    """PNG to write; curves.png beside the first run's progress by default."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``vd-train``.
+
+    Returns:
+        Exit status: 0 at the end, 1 on an error, 130 if interrupted and saved.
+    """
+    started = time.monotonic()
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    commands = {"teacher": _teacher, "export": _export, "curves": _curves}
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE)
+        return 0 if arguments else 2
+    if arguments[0] not in commands:
+        print(
+            f"vd-train: no command '{arguments[0]}'; one of {', '.join(commands)}\n\n{USAGE}", file=sys.stderr
+        )
+        return 2
+    try:
+        return commands[arguments[0]](arguments[1:], started)
+    except (ValueError, FileNotFoundError, FileExistsError, RuntimeError) as error:
+        if os.environ.get("VD_DEBUG"):
+            raise
+        print(f"vd-train: {error}\n(VD_DEBUG=1 shows where)", file=sys.stderr)
+        return 1
+
+
+def parse_teacher(arguments: Sequence[str]) -> TeacherCfg:
+    """The configuration that command-line flags ask for.
+
+    The first pass finds where to start from (``--preset``, ``--smoke``, or the run's own configuration
+    with ``--resume``), the second reads every flag with those values as defaults.
+
+    Raises:
+        FileNotFoundError: ``--resume`` names a run without a configuration.
+        ValueError: The run's configuration is not one of this version.
+    """
+    arguments = _normalise(arguments)
+    preset = _value_of(arguments, "--preset") or "paper"
+    if "--resume" in arguments:
+        base = _saved_config(arguments, preset)
+    elif "--smoke" in arguments:
+        base = smoke()
+    else:
+        base = PRESETS.get(preset, PRESETS["paper"])()  # the second pass refuses an unknown name
+    return tyro.cli(
+        TeacherCfg, args=arguments, default=base, prog="vd-train teacher", description=TEACHER_HELP
+    )
+
+
+def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherRunner":
+    """Build environment and learner as ``cfg`` says, save the resolved configuration, and resume if asked.
+
+    Args:
+        cfg: Configuration.
+        started: ``time.monotonic()`` from which ``max_minutes`` counts; now by default.
+
+    Raises:
+        FileExistsError: The run folder holds another run and ``resume`` is not set.
+    """
+    import torch
+
+    from vd.envs.reorient import ReorientEnv
+    from vd.train.checkpoint import find_checkpoint, list_checkpoints
+    from vd.train.runner import TeacherRunner
+    from vd.train.vec_env import ReorientVecEnv
+
+    rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
+    cfg = replace(cfg, run=replace(cfg.run, device=device))
+    checkpoint = find_checkpoint(cfg.run.run_dir, cfg.resume) if cfg.resume else None
+    if checkpoint is None and list_checkpoints(cfg.run.run_dir):
+        raise FileExistsError(
+            f"{cfg.run.run_dir} holds a run; add --resume to go on with it, or choose another --run-dir"
+        )
+    task = to_dict(cfg.env)
+    if rank == 0:
+        # Before anything is built: a run that fails at once still says what it was.
+        saved = to_dict(replace(cfg, resume=None))
+        saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
+        write_json(cfg.run.run_dir / CONFIG_NAME, saved)
+    # Actions of different processes have to differ; parameters are broadcast from the first.
+    torch.manual_seed(cfg.env.seed + rank)
+    # TF32 halves the update on a GPU; the simulator is not touched by it.
+    torch.set_float32_matmul_precision("high")
+    env = ReorientVecEnv(ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank), device))
+    deadline = None
+    if cfg.run.max_minutes is not None:
+        deadline = (time.monotonic() if started is None else started) + 60.0 * cfg.run.max_minutes
+    runner = TeacherRunner(env, cfg.ppo, cfg.policy, cfg.run, task=task, device=device, deadline=deadline)
+    if checkpoint is not None:
+        runner.load(str(checkpoint))
+    return runner
+
+
+def resolve_device(name: str) -> str:
+    """The torch device for ``--device``: ``auto`` is this process's GPU (torchrun), the first GPU, or the CPU.
+
+    Raises:
+        ValueError: The device does not exist here.
+    """
+    import torch
+
+    if name == "auto":
+        name = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
+    if name == "cuda":
+        name = "cuda:0"
+    if name == "cpu":
+        return name
+    index = name.removeprefix("cuda:")
+    if not name.startswith("cuda:") or not index.isdigit():
+        raise ValueError(f"--device is '{name}'; it has to be auto, cpu, or cuda:N")
+    if int(index) >= torch.cuda.device_count():
+        raise ValueError(
+            f"--device is '{name}', but torch finds {torch.cuda.device_count()} GPUs; use auto or cpu"
+        )
+    return name
+
+
+def _teacher(arguments: list[str], started: float) -> int:
+    cfg = parse_teacher(arguments)
+
+    from vd.train.runner import EXIT_INTERRUPTED, Interrupted
+
+    print("building the worlds (kernels are compiled at the first start, which takes a minute or two) ...")
+    runner = build_teacher(cfg, started=started)
+    folder = cfg.run.run_dir
+    if runner.current_learning_iteration:
+        print(f"resumed after iteration {runner.current_learning_iteration} of {runner.total_iterations}")
+    try:
+        runner.learn()
+    except Interrupted:
+        print(f"saved in {folder}; go on with: vd-train teacher --run-dir {folder} --resume")
+        return EXIT_INTERRUPTED
+    finally:
+        runner.env.close()
+        runner.shutdown()
+    if runner.is_main:
+        print(f"done: {folder}/policy.pt is the best policy, vd-train curves {folder} draws the curves")
+    return 0
+
+
+def _export(arguments: list[str], _started: float) -> int:
+    cfg = tyro.cli(ExportCfg, args=arguments, prog="vd-train export")
+
+    from vd.policy import policy_export
+    from vd.train.checkpoint import load_checkpoint, save_checkpoint
+
+    save_checkpoint(cfg.output, policy_export(load_checkpoint(cfg.checkpoint)))
+    print(cfg.output)
+    return 0
+
+
+def _curves(arguments: list[str], _started: float) -> int:
+    cfg = tyro.cli(CurvesCfg, args=arguments, prog="vd-train curves")
+
+    from vd.train.curves import plot_curves
+    from vd.train.metrics import PROGRESS_FILE
+
+    files = [run / PROGRESS_FILE if run.is_dir() else run for run in cfg.runs]
+    output = cfg.output or files[0].with_name("curves.png")
+    plot_curves(files, output)
+    print(output)
+    return 0
+
+
+def _normalise(arguments: Sequence[str]) -> list[str]:
+    """Spell out short forms, ``--flag=value``, and a bare ``--resume``."""
+    result: list[str] = []
+    for argument in arguments:
+        flag, equals, value = argument.partition("=")
+        if argument.startswith("--"):
+            flag = flag.replace("_", "-")
+            if flag.removeprefix("--") in SHORT_FORMS:
+                flag = f"--env.{flag.removeprefix('--')}"
+            result += [flag, value] if equals else [flag]
+        else:
+            result.append(argument)
+    for index, argument in enumerate(result):
+        if argument == "--resume" and (index + 1 == len(result) or result[index + 1].startswith("--")):
+            result[index + 1 : index + 1] = ["latest"]
+            break
+    return result
+
+
+def _value_of(arguments: list[str], flag: str) -> str | None:
+    """Value after the last ``flag``, or ``None``."""
+    places = [index for index, argument in enumerate(arguments[:-1]) if argument == flag]
+    return arguments[places[-1] + 1] if places else None
+
+
+def _saved_config(arguments: list[str], preset: str) -> TeacherCfg:
+    """Configuration of the run that ``--resume`` goes on with."""
+    import json
+
+    start = PRESETS.get(preset, PRESETS["paper"])()
+    run_dir = Path(_value_of(arguments, "--run-dir") or start.run.run_dir)
+    path = run_dir / CONFIG_NAME
+    if not path.is_file():
+        raise FileNotFoundError(f"--resume: no {path}; give the --run-dir of the run to go on with")
+    try:
+        cfg = from_dict(TeacherCfg, json.loads(path.read_text()))
+    except ValueError as error:
+        raise ValueError(
+            f"{path}: {error}; it was written by another version, start anew or edit it"
+        ) from error
+    return replace(cfg, run=replace(cfg.run, run_dir=run_dir))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

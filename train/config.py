@@ -1,0 +1,168 @@
+"""Settings of the learner: PPO, the networks and the run. Pure data, cheap to import.
+
+Defaults are the paper's (Table S1), or its released code's where the paper says nothing.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from vd.paper import PAPER
+
+
+@dataclass
+class PpoCfg:
+    """Proximal policy optimisation."""
+
+    rollout_steps: int = PAPER.teacher.rollout_steps
+    """Control steps of every world between two updates."""
+    minibatch_size: int = PAPER.teacher.minibatch_size
+    """Samples of an optimiser step on one GPU (at most worlds x rollout steps)."""
+    epochs: int = PAPER.teacher.epochs
+    """Passes over a rollout."""
+    actor_learning_rate: float = PAPER.teacher.actor_learning_rate
+    """Actor's learning rate; the start of it with --ppo.schedule adaptive."""
+    critic_learning_rate: float = PAPER.teacher.critic_learning_rate
+    """Critic's learning rate, never adapted."""
+    schedule: Literal["fixed", "adaptive"] = "fixed"
+    """adaptive: the actor's rate follows the KL divergence of its updates."""
+    desired_kl: float = 0.01
+    """KL divergence that the adaptive schedule aims at."""
+    clip: float = PAPER.teacher.clip
+    """Bound of the probability ratio's distance from 1."""
+    gamma: float = PAPER.teacher.gamma
+    """Discount per control step."""
+    gae_lambda: float = PAPER.teacher.gae_lambda
+    """Decay of the generalised advantage estimate."""
+    value_coefficient: float = PAPER.teacher.value_coefficient_code
+    """Weight of the value loss; acts through the joint gradient norm only."""
+    entropy_coefficient: float = 0.0
+    """Weight of the entropy bonus."""
+    grad_norm: float = PAPER.teacher.grad_norm_code
+    """Joint gradient norm of actor and critic is clipped to this."""
+    optimizer: Literal["adam", "adamw"] = "adam"
+    """Optimiser: the paper says Adam, its code uses AdamW."""
+
+
+@dataclass
+class PolicyCfg:
+    """Networks of actor and critic."""
+
+    hidden: tuple[int, ...] = PAPER.teacher.hidden
+    """Width of the hidden layers, the same for actor and critic."""
+    activation: Literal["elu", "relu", "tanh", "gelu"] = "elu"
+    """Activation function."""
+    distribution: Literal["gaussian", "state-dependent"] = "gaussian"
+    """gaussian: a learned std per action, as in the paper's code; state-dependent: the network's, bounded."""
+    initial_std: float = math.exp(PAPER.teacher.initial_log_std_code)
+    """Standard deviation of every action at the start."""
+    std_range: tuple[float, float] = (1e-6, 1e6)
+    """Bounds of the standard deviation; the default leaves it free, as in the paper's code."""
+    normalise_observations: bool = False
+    """Subtract a running mean and divide by a running std; the paper does not."""
+
+
+@dataclass
+class RunCfg:
+    """Where, how long and how reproducibly."""
+
+    run_dir: Path = Path("runs/teacher")
+    """Folder for configuration, checkpoints, curves and TensorBoard files."""
+    device: str = "auto"
+    """cpu, cuda:0, ... or auto: the first GPU, else the CPU (under torchrun: each process its own GPU)."""
+    max_steps: int = 10_000_000_000
+    """End after this many control steps, all worlds and GPUs together, resumed ones counted."""
+    max_minutes: float | None = None
+    """End after this much time since the start of this command, with a checkpoint."""
+    save_every: int = 100
+    """Iterations between checkpoints."""
+    keep_last: int = 3
+    """Periodic checkpoints to keep besides the best."""
+    stagger: bool = True
+    """Start worlds at random times of their first episode, so that time-outs do not come all at once."""
+    tensorboard: bool = True
+    """Write TensorBoard files (tensorboard --logdir RUN-DIR)."""
+
+
+def minibatches(ppo: PpoCfg, num_envs: int) -> int:
+    """Minibatches in a rollout of ``num_envs`` worlds, of at most ``minibatch_size`` samples each."""
+    return max(1, math.ceil(num_envs * ppo.rollout_steps / ppo.minibatch_size))
+
+
+def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
+    """Refuse settings that cannot train.
+
+    Raises:
+        ValueError: The flag, its value and what it has to be.
+    """
+    positive = {
+        "--ppo.rollout-steps": ppo.rollout_steps,
+        "--ppo.minibatch-size": ppo.minibatch_size,
+        "--ppo.epochs": ppo.epochs,
+        "--ppo.actor-learning-rate": ppo.actor_learning_rate,
+        "--ppo.critic-learning-rate": ppo.critic_learning_rate,
+        "--ppo.desired-kl": ppo.desired_kl,
+        "--ppo.clip": ppo.clip,
+        "--ppo.grad-norm": ppo.grad_norm,
+        "--policy.initial-std": policy.initial_std,
+        "--policy.hidden": min(policy.hidden, default=0),
+        "--max-steps": run.max_steps,
+        "--save-every": run.save_every,
+        "--keep-last": run.keep_last,
+    }
+    if run.max_minutes is not None:
+        positive["--max-minutes"] = run.max_minutes
+    for flag, value in positive.items():
+        if not value > 0:
+            raise ValueError(f"{flag} is {value}; it has to be positive")
+    for flag, share in {"--ppo.gamma": ppo.gamma, "--ppo.gae-lambda": ppo.gae_lambda}.items():
+        if not 0.0 <= share <= 1.0:
+            raise ValueError(f"{flag} is {share}; it has to be in [0, 1]")
+    low, high = policy.std_range
+    if not 0.0 < low < policy.initial_std < high:
+        raise ValueError(
+            f"--policy.std-range is {low} {high}; it has to be positive and hold --policy.initial-std "
+            f"{policy.initial_std} inside"
+        )
+
+
+def rsl_rl_config(ppo: PpoCfg, policy: PolicyCfg, num_envs: int) -> dict[str, Any]:
+    """The dictionary that rsl-rl's runner builds algorithm and models from."""
+    from vd.train.distribution import BoundedStdGaussian  # imports torch
+    from vd.train.ppo import TeacherPPO
+
+    distribution: dict[str, Any] = {"init_std": policy.initial_std, "std_range": policy.std_range}
+    if policy.distribution == "gaussian":
+        distribution |= {"class_name": "GaussianDistribution", "std_type": "log"}
+    else:
+        distribution |= {"class_name": BoundedStdGaussian}
+    network = {
+        "class_name": "MLPModel",
+        "hidden_dims": policy.hidden,
+        "activation": policy.activation,
+        "obs_normalization": policy.normalise_observations,
+    }
+    return {
+        "num_steps_per_env": ppo.rollout_steps,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": network | {"distribution_cfg": distribution},
+        "critic": network,
+        "algorithm": {
+            "class_name": TeacherPPO,
+            "num_learning_epochs": ppo.epochs,
+            "num_mini_batches": minibatches(ppo, num_envs),
+            "learning_rate": ppo.actor_learning_rate,
+            "critic_learning_rate": ppo.critic_learning_rate,
+            "schedule": ppo.schedule,
+            "desired_kl": ppo.desired_kl,
+            "clip_param": ppo.clip,
+            "gamma": ppo.gamma,
+            "lam": ppo.gae_lambda,
+            "value_loss_coef": ppo.value_coefficient,
+            "entropy_coef": ppo.entropy_coefficient,
+            "max_grad_norm": ppo.grad_norm,
+            "optimizer": ppo.optimizer,
+            "use_clipped_value_loss": False,
+        },
+    }

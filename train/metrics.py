@@ -1,0 +1,142 @@
+"""What a run reports: sums on the device, read once an iteration, as JSON lines and in TensorBoard."""
+
+import json
+import math
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from vd.files import write_text
+
+PROGRESS_FILE = "progress.jsonl"
+
+
+class StepMeans:
+    """Means of ``extras["log"]`` over an iteration's steps, without a copy to the host before the end."""
+
+    def __init__(self) -> None:
+        self._names: tuple[str, ...] = ()
+        self._sum: torch.Tensor | None = None
+        self._steps = 0
+
+    def add(self, log: dict[str, torch.Tensor]) -> None:
+        """Add one step's scalars; every step has the same keys."""
+        values = torch.stack(tuple(log.values()))
+        if self._sum is None:
+            self._names, self._sum = tuple(log), torch.zeros_like(values)
+        self._sum += values
+        self._steps += 1
+
+    def clear(self) -> None:
+        """Forget the steps so far."""
+        self._sum, self._steps = None, 0
+
+    def read(self, world_size: int = 1) -> dict[str, float]:
+        """Means by name, averaged over the ranks, and start anew. Waits for the device."""
+        assert self._sum is not None, "no step was added"
+        mean = self._sum / self._steps
+        if world_size > 1:
+            torch.distributed.all_reduce(mean)
+            mean = mean / world_size
+        self.clear()
+        return dict(zip(self._names, mean.tolist(), strict=True))
+
+
+class GoalWindow:
+    """How goals ended over the last episode's worth of iterations.
+
+    Success per goal is a ratio of rare events; a window as long as an episode holds about one ended goal
+    of every world, and weighs early and late steps of an episode alike.
+
+    Args:
+        length: Iterations in the window.
+    """
+
+    def __init__(self, length: int) -> None:
+        self._rows: deque[tuple[float, float, float, float]] = deque(maxlen=max(1, length))
+
+    def add(self, means: dict[str, float]) -> dict[str, float | None]:
+        """Take an iteration's means and give the window's ratios.
+
+        Returns:
+            ``success_per_goal``, ``goals_per_episode``, ``drop_rate`` (episodes that ended in a fall), each
+            ``None`` until a goal or episode has ended, and ``mean_reward`` per control step.
+        """
+        self._rows.append(
+            (means["task/reached"], means["task/dropped"], means["task/timed_out"], means["reward/total"])
+        )
+        reached, dropped, timed_out, reward = (math.fsum(column) for column in zip(*self._rows, strict=True))
+        goals, episodes = reached + dropped + timed_out, dropped + timed_out
+        return {
+            "success_per_goal": reached / goals if goals > 0 else None,
+            "goals_per_episode": reached / episodes if episodes > 0 else None,
+            "drop_rate": dropped / episodes if episodes > 0 else None,
+            "mean_reward": reward / len(self._rows),
+        }
+
+    def state_dict(self) -> list[list[float]]:
+        """The rows, oldest first."""
+        return [list(row) for row in self._rows]
+
+    def load_state_dict(self, rows: list[list[float]]) -> None:
+        """Restore :meth:`state_dict`."""
+        self._rows.clear()
+        self._rows.extend((row[0], row[1], row[2], row[3]) for row in rows)
+
+
+class ProgressFile:
+    """One JSON object per iteration in ``progress.jsonl``, and the same numbers in TensorBoard.
+
+    Args:
+        run_dir: Folder of the run.
+        tensorboard: Whether to write TensorBoard files too, in ``run_dir/tensorboard``.
+        done: Iterations to keep from an earlier run of this folder; later lines are dropped, since the
+            resumed run writes them anew.
+    """
+
+    def __init__(self, run_dir: Path, *, tensorboard: bool = True, done: int = 0) -> None:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        path = run_dir / PROGRESS_FILE
+        kept = [row for row in read_progress(path) if row["iteration"] <= done] if path.is_file() else []
+        write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
+        self._file = path.open("a", encoding="utf-8")
+        self._board: Any = None
+        if tensorboard:
+            from torch.utils.tensorboard import SummaryWriter  # heavy, and optional
+
+            self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=done + 1, flush_secs=10)
+
+    def write(self, row: dict[str, Any]) -> None:
+        """Add an iteration. Values that are not finite become ``null``."""
+        row = {key: None if isinstance(v, float) and not math.isfinite(v) else v for key, v in row.items()}
+        self._file.write(json.dumps(row) + "\n")
+        self._file.flush()
+        if self._board is not None:
+            for key, value in row.items():
+                if value is not None:
+                    self._board.add_scalar(key if "/" in key else f"run/{key}", value, row["iteration"])
+
+    def close(self) -> None:
+        """Flush and close both."""
+        self._file.close()
+        if self._board is not None:
+            self._board.close()
+
+
+def read_progress(path: Path) -> list[dict[str, Any]]:
+    """Read ``progress.jsonl``; a last line cut short by a crash is left out.
+
+    Raises:
+        ValueError: A line before the last is not JSON.
+    """
+    lines = path.read_text(encoding="utf-8").splitlines()
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError as error:
+            if number < len(lines):
+                raise ValueError(f"{path}, line {number}: not JSON ({error})") from error
+    return rows

@@ -1,0 +1,158 @@
+"""Proximal policy optimisation as the paper runs it, on top of rsl-rl's."""
+
+from collections.abc import Iterator
+from itertools import chain
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.storage import RolloutStorage
+from torch import nn
+
+MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2
+"""Bounds of the adaptive schedule, as in rsl-rl."""
+KL_STEP = 1.5
+"""Factor by which the adaptive schedule changes the actor's learning rate, as in rsl-rl."""
+KL_BAND = 2.0
+"""The rate is left alone while the KL divergence is within this factor of the wanted one."""
+
+ACTOR_GROUP, CRITIC_GROUP = 0, 1
+"""Optimiser groups. rsl-rl reads the learning rate it reports from group 0, so the actor is first."""
+
+
+class TeacherPPO(PPO):
+    """PPO with two learning rates, an unclipped value loss and one gradient norm for actor and critic.
+
+    What differs from rsl-rl's PPO, and why:
+
+    * actor and critic have their own learning rates (Table S1: 3e-4 and 1e-3) in one optimiser. rsl-rl's
+      adaptive schedule writes one rate into every group; here it moves the actor's only, since the KL
+      divergence it follows says nothing about the critic;
+    * the gradient is clipped by the joint norm of actor and critic, as in the paper's code. The value
+      coefficient acts through that norm alone, because Adam ignores the scale of a gradient;
+    * samples are permuted in every epoch (rsl-rl repeats the same minibatches), and statistics stay on
+      the device until the end of the update (rsl-rl waits for the device after each minibatch).
+
+    Time-outs: rsl-rl adds ``gamma * V(s_t)`` to the reward of a step that timed out and treats it as
+    terminal. The value belongs to the stored observation *before* the step, because the observation
+    returned after it is already the new episode's. That stands in for ``V(s_{t+1})`` of the state that was
+    cut off, one control step later: a small error in one step of an episode, and no bias towards zero.
+
+    Args:
+        actor: Policy.
+        critic: Value function.
+        storage: Rollout of T steps in N worlds.
+        critic_learning_rate: The critic's rate; ``learning_rate`` is the actor's.
+        **kwargs: rsl-rl's PPO arguments.
+    """
+
+    def __init__(
+        self,
+        actor: MLPModel,
+        critic: MLPModel,
+        storage: RolloutStorage,
+        *,
+        critic_learning_rate: float,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(actor, critic, storage, **kwargs)
+        if self.actor.is_recurrent or self.critic.is_recurrent or self.rnd or self.symmetry:
+            raise ValueError("TeacherPPO trains feed-forward networks, without RND and symmetry")
+        self.optimizer = type(self.optimizer)(
+            [
+                {"params": list(self.actor.parameters()), "lr": self.learning_rate},
+                {"params": list(self.critic.parameters()), "lr": critic_learning_rate},
+            ]
+        )
+
+    @property
+    def critic_learning_rate(self) -> float:
+        """The critic's learning rate."""
+        return self.optimizer.param_groups[CRITIC_GROUP]["lr"]
+
+    def update(self) -> dict[str, float]:
+        """Run all epochs over the rollout.
+
+        Returns:
+            Means over the minibatches: ``surrogate``, ``value``, ``entropy``, ``kl`` (old to new policy),
+            ``clip_fraction``, ``grad_norm`` (before clipping), and ``explained_variance`` of the returns by
+            the values of the rollout.
+        """
+        totals = torch.zeros(6, device=self.device)
+        batches = 0
+        for batch in self._minibatches():
+            totals += self._minibatch_step(batch)
+            batches += 1
+        flat = self.storage.observations.flatten(0, 1)
+        self.actor.update_normalization(flat)
+        self.critic.update_normalization(flat)
+        returns, values = self.storage.returns, self.storage.values
+        explained = 1.0 - (returns - values).var() / returns.var().clamp_min(1e-8)
+        self.storage.clear()
+        names = ("surrogate", "value", "entropy", "kl", "clip_fraction", "grad_norm", "explained_variance")
+        # The only wait for the device in the update.
+        return dict(zip(names, torch.cat((totals / batches, explained[None])).tolist(), strict=True))
+
+    def _minibatches(self) -> Iterator[dict[str, Any]]:
+        """Samples of the rollout, permuted anew in every epoch; a remainder is left out at random."""
+        storage = self.storage
+        flat = {
+            "observations": storage.observations.flatten(0, 1),
+            "actions": storage.actions.flatten(0, 1),
+            "log_prob": storage.actions_log_prob.flatten(),
+            "advantages": storage.advantages.flatten(),
+            "returns": storage.returns.flatten(),
+        }
+        parameters = tuple(p.flatten(0, 1) for p in storage.distribution_params)  # type: ignore[union-attr]
+        samples = storage.num_envs * storage.num_transitions_per_env
+        size = samples // self.num_mini_batches
+        for _ in range(self.num_learning_epochs):
+            order = torch.randperm(samples, device=self.device)
+            for index in order[: size * self.num_mini_batches].split(size):
+                batch: dict[str, Any] = {name: tensor[index] for name, tensor in flat.items()}
+                yield batch | {"old": tuple(p[index] for p in parameters)}
+
+    def _minibatch_step(self, batch: dict[str, Any]) -> torch.Tensor:
+        """One optimiser step.
+
+        Returns:
+            The six statistics of :meth:`update`, on the device, detached.
+        """
+        self.actor(batch["observations"], stochastic_output=True)
+        log_ratio = self.actor.get_output_log_prob(batch["actions"]) - batch["log_prob"]
+        entropy = self.actor.output_entropy.mean()
+        with torch.no_grad():
+            kl = self.actor.get_kl_divergence(batch["old"], self.actor.output_distribution_params).mean()
+        if self.schedule == "adaptive":
+            self._adapt_learning_rate(kl)
+
+        ratio = torch.exp(log_ratio)
+        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate = -torch.minimum(batch["advantages"] * ratio, batch["advantages"] * clipped).mean()
+        value = (batch["returns"] - self.critic(batch["observations"]).squeeze(-1)).square().mean()
+        loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
+
+        self.optimizer.zero_grad()
+        loss.backward()
+        if self.is_multi_gpu:
+            self.reduce_parameters()
+        parameters = chain(self.actor.parameters(), self.critic.parameters())
+        grad_norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        self.optimizer.step()
+        with torch.no_grad():
+            clip_fraction = ((ratio - 1.0).abs() > self.clip_param).float().mean()
+            return torch.stack((surrogate, value, entropy, kl, clip_fraction, grad_norm)).detach()
+
+    def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
+        """Move the actor's learning rate so that the KL divergence of an update nears ``desired_kl``."""
+        if self.is_multi_gpu:
+            # Every rank sees the same mean and so takes the same decision.
+            torch.distributed.all_reduce(kl)
+            kl = kl / self.gpu_world_size
+        divergence = float(kl)
+        if divergence > self.desired_kl * KL_BAND:
+            self.learning_rate = max(MIN_LEARNING_RATE, self.learning_rate / KL_STEP)
+        elif 0.0 < divergence < self.desired_kl / KL_BAND:
+            self.learning_rate = min(MAX_LEARNING_RATE, self.learning_rate * KL_STEP)
+        self.optimizer.param_groups[ACTOR_GROUP]["lr"] = self.learning_rate

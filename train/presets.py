@@ -1,0 +1,123 @@
+"""Presets of the teacher: the paper's settings, and settings for machines at hand."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, RewardCfg, SuccessCfg
+from vd.paper import PAPER
+from vd.train.config import PolicyCfg, PpoCfg, RunCfg
+
+PresetName = Literal["paper", "cpu-demo", "gpu", "multi-gpu"]
+
+
+@dataclass
+class TeacherCfg:
+    """Train the teacher: PPO on the simulator's state."""
+
+    preset: PresetName = "paper"
+    """Settings to start from; every other flag overrides one of them."""
+    resume: str | None = None
+    """Go on from a checkpoint of --run-dir: latest (a bare --resume), best, or a file."""
+    smoke: bool = False
+    """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute."""
+    run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
+    ppo: PpoCfg = field(default_factory=PpoCfg)
+    policy: PolicyCfg = field(default_factory=PolicyCfg)
+    env: ReorientCfg = field(default_factory=ReorientCfg)
+
+
+def paper() -> TeacherCfg:
+    """Table S1 as it stands, and the released code where the paper is silent."""
+    return TeacherCfg(
+        preset="paper",
+        run=RunCfg(run_dir=Path("runs/paper")),
+        env=ReorientCfg(num_worlds=PAPER.teacher.num_worlds),
+    )
+
+
+def gpu() -> TeacherCfg:
+    """One GPU: half the paper's worlds, rollouts twice as long, a state-dependent bounded std."""
+    return TeacherCfg(
+        preset="gpu",
+        run=RunCfg(run_dir=Path("runs/gpu")),
+        ppo=PpoCfg(
+            rollout_steps=16,
+            minibatch_size=65536,
+            epochs=5,
+            schedule="adaptive",
+            clip=0.2,
+            value_coefficient=1.0,
+            entropy_coefficient=1e-3,
+        ),
+        policy=PolicyCfg(distribution="state-dependent", initial_std=0.5, std_range=(0.02, 1.0)),
+        env=ReorientCfg(num_worlds=16384),
+    )
+
+
+def multi_gpu() -> TeacherCfg:
+    """The gpu preset on every GPU of a torchrun: worlds and minibatches are per GPU."""
+    return replace(gpu(), preset="multi-gpu", run=RunCfg(run_dir=Path("runs/multi-gpu")))
+
+
+def cpu_demo() -> TeacherCfg:
+    """Minutes on two cores; an easier task: near goals, table support, no stillness, no randomisation."""
+    return TeacherCfg(
+        preset="cpu-demo",
+        run=RunCfg(run_dir=Path("runs/cpu-demo"), device="cpu", max_steps=200_000, save_every=10),
+        ppo=PpoCfg(
+            rollout_steps=16,
+            minibatch_size=1024,
+            epochs=5,
+            actor_learning_rate=1e-3,
+            schedule="adaptive",
+            clip=0.2,
+            value_coefficient=1.0,
+        ),
+        policy=PolicyCfg(
+            hidden=(256, 128, 64), distribution="state-dependent", initial_std=0.5, std_range=(0.02, 1.0)
+        ),
+        env=ReorientCfg(
+            num_worlds=256,
+            reward=RewardCfg(
+                success=10.0, energy=-0.1, progress=10.0, table_contact=0.0, fall=-10.0, scale=0.1
+            ),
+            success=SuccessCfg(
+                joint_speed_rad_s=0.0, object_speed_m_s=0.0, object_spin_rad_s=0.0, action_norm=0.0
+            ),
+            goal=GoalCfg(max_angle_rad=1.0),
+            curriculum=CurriculumCfg(enabled=False),
+            randomisation=RandomisationCfg(enabled=False),
+        ),
+    )
+
+
+PRESETS: dict[str, Callable[[], TeacherCfg]] = {
+    "paper": paper,
+    "cpu-demo": cpu_demo,
+    "gpu": gpu,
+    "multi-gpu": multi_gpu,
+}
+"""Presets by name."""
+
+
+def smoke() -> TeacherCfg:
+    """The cpu-demo preset shrunk to run through everything in at most a minute."""
+    cfg = cpu_demo()
+    return replace(
+        cfg,
+        smoke=True,
+        run=replace(
+            cfg.run,
+            run_dir=Path("runs/smoke"),
+            max_steps=2048,
+            max_minutes=1.0,
+            save_every=1,
+            tensorboard=False,
+        ),
+        ppo=replace(cfg.ppo, minibatch_size=128, epochs=2),
+        env=replace(cfg.env, num_worlds=16),
+    )

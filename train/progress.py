@@ -1,0 +1,121 @@
+"""The live progress of a run: one line in place on a terminal, a line now and then elsewhere."""
+
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Any
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.text import Text
+
+PLAIN_INTERVAL_S = 10.0
+"""Time between lines when the output is a file or a pipe."""
+
+
+def format_duration(seconds: float | None) -> str:
+    """``h:mm:ss``, or ``?`` if unknown."""
+    if seconds is None:
+        return "?"
+    minutes, second = divmod(int(max(seconds, 0.0)), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02d}:{second:02d}"
+
+
+def format_steps(count: float) -> str:
+    """A count with a thousands or millions suffix."""
+    for size, suffix in ((1e9, " G"), (1e6, " M"), (1e3, " k")):
+        if count >= size:
+            return f"{count / size:.2f}{suffix}"
+    return f"{count:.0f}"
+
+
+def _percent(value: float | None) -> str:
+    return "-" if value is None else f"{100.0 * value:.1f} %"
+
+
+def summary(row: Mapping[str, Any], total: int, left_s: float | None) -> str:
+    """The main figures of an iteration in one line.
+
+    Args:
+        row: A row of ``progress.jsonl``.
+        total: Iterations of the whole run.
+        left_s: Estimated time left [s].
+    """
+    return (
+        f"iteration {row['iteration']}/{total} | {format_steps(row['env_steps'])} steps, "
+        f"{format_steps(row['steps_per_s'])}/s | success {_percent(row['success_per_goal'])} of goals | "
+        f"reward {row['mean_reward']:.3f} | error {row['task/rotation_error']:.2f} rad | "
+        f"std {row['action_std']:.3f} | left {format_duration(left_s)}"
+    )
+
+
+def reward_line(row: Mapping[str, Any]) -> str:
+    """The reward terms of an iteration: mean per control step."""
+    terms = {key.removeprefix("reward/"): value for key, value in row.items() if key.startswith("reward/")}
+    terms.pop("total", None)
+    return "rewards per step: " + "  ".join(f"{name} {value:+.3f}" for name, value in terms.items())
+
+
+class ProgressLine:
+    """Shows the latest iteration; a context manager.
+
+    Args:
+        total: Iterations of the whole run.
+        done: Iterations already done by earlier runs.
+        enabled: Show anything (false on all ranks but the first).
+    """
+
+    def __init__(self, total: int, *, done: int = 0, enabled: bool = True) -> None:
+        self._total, self._enabled = total, enabled
+        self._console = Console()
+        self._bar = Progress(
+            TextColumn("{task.percentage:5.1f} %"), BarColumn(bar_width=None), console=self._console
+        )
+        self._task = self._bar.add_task("train", total=total, completed=done)
+        self._live: Live | None = None
+        self._printed = -PLAIN_INTERVAL_S
+        self._last: tuple[dict[str, Any], float | None] | None = None
+        self._last_printed = False
+
+    def __enter__(self) -> "ProgressLine":
+        if self._enabled and self._console.is_terminal:
+            self._live = Live(Text("first iteration ..."), console=self._console, refresh_per_second=4)
+            self._live.start()
+        elif self._enabled:
+            self._console.print("first iteration ...")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+        elif self._enabled and self._last is not None and not self._last_printed:
+            self._print()
+
+    def update(self, row: dict[str, Any], left_s: float | None) -> None:
+        """Show an iteration."""
+        if not self._enabled:
+            return
+        self._last, self._last_printed = (row, left_s), False
+        if self._live is not None:
+            self._bar.update(self._task, completed=row["iteration"])
+            self._live.update(
+                Group(Text(summary(row, self._total, left_s)), Text(reward_line(row), "dim"), self._bar)
+            )
+        elif time.monotonic() - self._printed >= PLAIN_INTERVAL_S:
+            self._print()
+
+    def note(self, message: str) -> None:
+        """Print a message above the line."""
+        if self._enabled:
+            self._console.print(message, highlight=False, soft_wrap=True)
+
+    def _print(self) -> None:
+        assert self._last is not None
+        row, left_s = self._last
+        self._console.print(summary(row, self._total, left_s), highlight=False, soft_wrap=True)
+        self._console.print("  " + reward_line(row), highlight=False, soft_wrap=True)
+        self._printed, self._last_printed = time.monotonic(), True

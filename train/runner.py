@@ -1,0 +1,414 @@
+"""The training loop: rollouts and updates, curves, checkpoints, and every way a run can end."""
+
+import contextlib
+import io
+import math
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import torch
+from rsl_rl.runners import OnPolicyRunner
+from tensordict import TensorDict
+
+from vd.policy import PolicySpec, policy_export, spec_dict
+from vd.train.checkpoint import (
+    BEST_NAME,
+    CHECKPOINT_FOLDER,
+    checkpoint_path,
+    load_checkpoint,
+    prune_checkpoints,
+    random_state,
+    save_checkpoint,
+    set_random_state,
+)
+from vd.train.config import PolicyCfg, PpoCfg, RunCfg, rsl_rl_config, validate
+from vd.train.metrics import GoalWindow, ProgressFile, StepMeans
+from vd.train.ppo import TeacherPPO
+from vd.train.progress import ProgressLine
+from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
+
+POLICY_NAME = "policy.pt"
+"""The best policy so far, in the run's folder: what vd-eval, vd-play and deployment read."""
+EXIT_INTERRUPTED = 130
+"""Exit status after Ctrl-C or SIGTERM, with everything saved."""
+LOWER_RATES = "lower --ppo.actor-learning-rate, --ppo.critic-learning-rate or --ppo.grad-norm"
+"""Remedy for networks that diverge."""
+
+
+class TrainingDivergedError(RuntimeError):
+    """Observations, rewards, losses or parameters are no longer finite."""
+
+
+class Interrupted(Exception):  # noqa: N818  # not an error: the run was asked to stop and has saved
+    """Ctrl-C or SIGTERM; the run is saved."""
+
+
+class TeacherRunner(OnPolicyRunner):
+    """rsl-rl's on-policy runner with a loop that can be stopped, resumed and watched.
+
+    Under ``torchrun`` every process simulates its own worlds; rsl-rl averages the gradients, and the first
+    process logs and saves, with the random and environment state of all.
+
+    Args:
+        env: Vectorised environment.
+        ppo: Algorithm settings.
+        policy: Network settings.
+        run: Run settings.
+        task: The environment's configuration as a dictionary, kept with every policy.
+        device: Torch device of networks and rollouts; the environment's.
+        deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
+
+    Attributes:
+        current_learning_iteration: Iterations completed, over all resumed runs.
+        env_steps: Control steps completed, over all worlds and processes.
+    """
+
+    alg: TeacherPPO
+    env: ReorientVecEnv
+
+    def __init__(
+        self,
+        env: ReorientVecEnv,
+        ppo: PpoCfg,
+        policy: PolicyCfg,
+        run: RunCfg,
+        *,
+        task: dict[str, Any],
+        device: str,
+        deadline: float | None = None,
+    ) -> None:
+        validate(ppo, policy, run)
+        self.run, self.policy_cfg, self.task = run, policy, task
+        self._deadline = deadline
+        # rsl-rl prints its models and observation groups while it builds them.
+        with contextlib.redirect_stdout(io.StringIO()):
+            super().__init__(env, rsl_rl_config(ppo, policy, env.num_envs), log_dir=None, device=device)
+        self.env_steps = 0
+        self._steps_per_iteration = ppo.rollout_steps * env.num_envs * self.gpu_world_size
+        self.total_iterations = math.ceil(run.max_steps / self._steps_per_iteration)
+        self._elapsed_s = 0.0
+        self._means = StepMeans()
+        # Two episodes, so that a window never misses the time-outs of worlds that run in step.
+        self._window = GoalWindow(math.ceil(2 * env.max_episode_length / ppo.rollout_steps))
+        self._score = (0.0, 0.0, -math.inf)
+        self._best: tuple[float, ...] | None = None
+        self._signal = 0
+        self._resumed = False
+
+    @property
+    def is_main(self) -> bool:
+        """Whether this process logs and saves."""
+        return self.gpu_global_rank == 0
+
+    def learn(
+        self, num_learning_iterations: int | None = None, init_at_random_ep_len: bool | None = None
+    ) -> None:
+        """Train until the steps, the time or the user end it, and save.
+
+        Args:
+            num_learning_iterations: Iterations to do now; up to ``run.max_steps`` if ``None``.
+            init_at_random_ep_len: Stagger the first episodes; as ``run.stagger`` says if ``None``, and
+                never in a resumed run.
+
+        Raises:
+            Interrupted: Ctrl-C or SIGTERM, after saving.
+            TrainingDivergedError: Something is not finite any more. The last checkpoint is from before.
+        """
+        first = self.current_learning_iteration
+        total = self.total_iterations if num_learning_iterations is None else first + num_learning_iterations
+        stagger = self.run.stagger if init_at_random_ep_len is None else init_at_random_ep_len
+        if stagger and not self._resumed:
+            steps = self.env.episode_length_buf
+            self.env.episode_length_buf = torch.randint_like(steps, high=int(self.env.max_episode_length))
+        if self.is_distributed:
+            self.alg.broadcast_parameters()
+        self.alg.train_mode()
+        log = (
+            ProgressFile(self.run.run_dir, tensorboard=self.run.tensorboard, done=first)
+            if self.is_main
+            else None
+        )
+        progress = ProgressLine(total, done=first, enabled=self.is_main)
+        saved = first
+        try:
+            with self._signals(progress.note), progress:
+                observation = self.env.get_observations()
+                while self.current_learning_iteration < total:
+                    row, observation = self._iterate(observation)
+                    if row is None:
+                        break
+                    if log is not None:
+                        log.write(row)
+                    progress.update(row, self._time_left(total, first))
+                    if self.current_learning_iteration % self.run.save_every == 0:
+                        self._save_periodic()
+                        saved = self.current_learning_iteration
+                    if self._should_stop():
+                        break
+                if saved < self.current_learning_iteration or self.current_learning_iteration == 0:
+                    self._save_periodic()
+        finally:
+            if log is not None:
+                log.close()
+        if self._signal:
+            raise Interrupted
+
+    def _iterate(self, observation: TensorDict) -> tuple[dict[str, Any] | None, TensorDict]:
+        """One rollout and update.
+
+        Returns:
+            The row for ``progress.jsonl``, or ``None`` if a signal cut the rollout short; the observation.
+        """
+        start = time.perf_counter()
+        with torch.inference_mode():
+            for _ in range(self.cfg["num_steps_per_env"]):
+                # With several processes all must do the same collectives, so they stop between iterations.
+                if self._signal and not self.is_distributed:
+                    self.alg.storage.clear()
+                    self._means.clear()
+                    return None, observation
+                try:
+                    actions = self.alg.act(observation)
+                except RuntimeError:  # torch refuses to sample from NaN on the CPU
+                    self._check_rollout(observation)
+                    raise
+                observation, rewards, dones, extras = self.env.step(actions)
+                self.alg.process_env_step(observation, rewards, dones, extras)
+                self._means.add(extras["log"])
+            action_std = float(self.alg.get_policy().output_std.mean())
+            self._check_rollout(observation)
+            self.alg.compute_returns(observation)
+        collected = time.perf_counter()
+        losses = self.alg.update()
+        self._check_update(losses)
+        end = time.perf_counter()
+
+        self.current_learning_iteration += 1
+        self.env_steps += self._steps_per_iteration
+        self._elapsed_s += end - start
+        means = self._means.read(self.gpu_world_size)
+        row: dict[str, Any] = {
+            "iteration": self.current_learning_iteration,
+            "env_steps": self.env_steps,
+            "elapsed_s": round(self._elapsed_s, 3),
+            "steps_per_s": self._steps_per_iteration / (end - start),
+            "collect_s": round(collected - start, 4),
+            "learn_s": round(end - collected, 4),
+            **self._window.add(means),
+            "action_std": action_std,
+            "actor_learning_rate": self.alg.learning_rate,
+            "critic_learning_rate": self.alg.critic_learning_rate,
+            **means,
+            **self.env.end_iteration(),
+            **{f"loss/{name}": value for name, value in losses.items()},
+        }
+        self._score = (row["task/difficulty"], row["success_per_goal"] or 0.0, row["mean_reward"])
+        return row, observation
+
+    def save(self, path: str, infos: dict | None = None) -> None:
+        """Write a checkpoint, whole or not at all. With several processes every one has to call it.
+
+        Args:
+            path: File to write.
+            infos: Anything to keep with it (plain values).
+        """
+        state = self._state(infos)
+        if self.is_main:
+            save_checkpoint(Path(path), state)
+
+    def load(
+        self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
+    ) -> dict:
+        """Go on from a checkpoint: networks, optimiser, iteration, curriculum and every random state.
+
+        Args:
+            path: The checkpoint.
+            load_cfg: rsl-rl's choice of parts; all if ``None``. Random and environment state come with all.
+            strict: Whether the networks have to fit exactly.
+            map_location: Device to read to.
+
+        Raises:
+            ValueError: The file is damaged, or of another network or number of processes.
+        """
+        state = load_checkpoint(Path(path), map_location or self.device)
+        try:
+            everything = self.alg.load(state, load_cfg, strict)
+        except (RuntimeError, ValueError, KeyError) as error:
+            raise ValueError(
+                f"{path} does not fit this run's networks or hand; resume with the configuration it was "
+                f"trained with (its run folder's config.json), or start anew ({error})"
+            ) from error
+        if everything:
+            self.current_learning_iteration = state["iter"]
+            self.env_steps = state["env_steps"]
+            self._elapsed_s = state["elapsed_s"]
+            self._best = tuple(state["best"]) if state["best"] is not None else None
+            self._window.load_state_dict(state["window"])
+            ranks = state["ranks"]
+            if len(ranks) != self.gpu_world_size:
+                raise ValueError(
+                    f"{path} is from a run of {len(ranks)} processes, this one has {self.gpu_world_size}; "
+                    f"start torchrun with as many"
+                )
+            mine = ranks[self.gpu_global_rank]
+            self.env.load_state_dict(mine["env"])
+            set_random_state(mine["random"], self.device)
+            self._resumed = True
+        return state["infos"]
+
+    def _state(self, infos: dict | None) -> dict[str, Any]:
+        """Everything a checkpoint holds."""
+        mine = {"random": random_state(self.device), "env": self.env.state_dict()}
+        ranks: list[Any] = [mine]
+        if self.is_distributed:
+            ranks = [None] * self.gpu_world_size
+            torch.distributed.all_gather_object(ranks, mine)
+        spec = PolicySpec(
+            num_observations=self.env.get_observations()[OBSERVATION_GROUP].shape[1],
+            num_actions=self.env.num_actions,
+            hidden=self.policy_cfg.hidden,
+            activation=self.policy_cfg.activation,
+            distribution=self.policy_cfg.distribution,
+            normalise_observations=self.policy_cfg.normalise_observations,
+        )
+        return self.alg.save() | {
+            "iter": self.current_learning_iteration,
+            "infos": infos,
+            "env_steps": self.env_steps,
+            "elapsed_s": self._elapsed_s,
+            "best": list(self._best) if self._best is not None else None,
+            "window": self._window.state_dict(),
+            "ranks": ranks,
+            "policy": spec_dict(spec),
+            "task": self.task,
+        }
+
+    def _save_periodic(self) -> None:
+        """Write the checkpoint of this iteration, and the best if it is one.
+
+        The best is chosen by difficulty of the curriculum, then success per goal over the last two
+        episodes, then mean reward, in that order: while nothing succeeds the reward decides.
+        """
+        path = checkpoint_path(self.run.run_dir, self.current_learning_iteration)
+        better = self.current_learning_iteration > 0 and (self._best is None or self._score > self._best)
+        if better:
+            self._best = self._score
+        state = self._state(None)
+        if not self.is_main:
+            return
+        save_checkpoint(path, state)
+        if better:
+            save_checkpoint(path.with_name(BEST_NAME), state)
+        if better or not (self.run.run_dir / POLICY_NAME).exists():
+            save_checkpoint(self.run.run_dir / POLICY_NAME, policy_export(state))
+        prune_checkpoints(self.run.run_dir, self.run.keep_last)
+
+    def _check_rollout(self, latest: TensorDict) -> None:
+        """Stop before an update on values that are not finite. One wait for the device an iteration."""
+        storage = self.alg.storage
+        tensors = (
+            ("observations", latest[OBSERVATION_GROUP][None]),
+            ("observations", storage.observations[OBSERVATION_GROUP]),
+            ("rewards", storage.rewards),
+            ("actions", storage.actions),
+            ("values", storage.values),
+        )
+        finite = torch.stack([torch.isfinite(tensor).all() for _, tensor in tensors]).tolist()
+        bad = [pair for pair, ok in zip(tensors, finite, strict=True) if not ok]
+        if not bad:
+            return
+        self.env.check()  # says more, if the simulation is the cause
+        name, tensor = bad[0]
+        worlds = ~torch.isfinite(tensor).all(dim=2).all(dim=0)
+        if name in ("observations", "rewards"):
+            remedy = "the simulation gave them: raise --env.sim.physics-hz or lower --env.action.scale-rad-s"
+        else:
+            remedy = f"the networks gave them: {LOWER_RATES}"
+        raise TrainingDivergedError(
+            f"iteration {self.current_learning_iteration + 1}: {name} not finite in "
+            f"{int(worlds.sum())} worlds (first: {worlds.nonzero().flatten()[:8].tolist()}); "
+            f"{remedy}. {self._last_good()}"
+        )
+
+    def _check_update(self, losses: dict[str, float]) -> None:
+        """Stop when a loss, a gradient or a parameter is not finite."""
+        bad = [name for name, value in losses.items() if not math.isfinite(value)]
+        # A sum is finite only if all its terms are; one number for both networks, one wait.
+        parameters = [*self.alg.actor.parameters(), *self.alg.critic.parameters()]
+        if not math.isfinite(float(torch.stack([p.detach().sum() for p in parameters]).sum())):
+            bad.append("parameters")
+        if bad:
+            raise TrainingDivergedError(
+                f"iteration {self.current_learning_iteration + 1}: {', '.join(bad)} not finite after the "
+                f"update; {LOWER_RATES}, or raise the lower end of --policy.std-range. {self._last_good()}"
+            )
+
+    def _last_good(self) -> str:
+        folder = self.run.run_dir / CHECKPOINT_FOLDER
+        return f"The last checkpoint in {folder} is from before; go on from it with --resume"
+
+    def _time_left(self, total: int, first: int) -> float | None:
+        """Estimate from this run's own pace, and the deadline if that is nearer [s]."""
+        done = self.current_learning_iteration - first
+        pace = (time.monotonic() - self._started) / max(done, 1)
+        left = pace * (total - self.current_learning_iteration)
+        return left if self._deadline is None else min(left, self._deadline - time.monotonic())
+
+    def _should_stop(self) -> bool:
+        """Whether a signal or the deadline asks for the end; all processes agree."""
+        late = self._deadline is not None and time.monotonic() >= self._deadline
+        if not self.is_distributed:
+            return bool(self._signal) or late
+        wishes = torch.tensor([float(self._signal), float(late)], device=self.device)
+        torch.distributed.all_reduce(wishes, op=torch.distributed.ReduceOp.MAX)
+        self._signal = int(wishes[0])
+        return bool(self._signal) or bool(wishes[1])
+
+    @contextlib.contextmanager
+    def _signals(self, note: Callable[[str], None]) -> Iterator[None]:
+        """Turn Ctrl-C and SIGTERM into a request to stop; a second one stops at once, without saving."""
+        self._started = time.monotonic()
+
+        def request(number: int, _frame: FrameType | None) -> None:
+            if self._signal:
+                raise KeyboardInterrupt
+            self._signal = number
+            note("stopping: saving a checkpoint (again to stop at once, without saving)")
+
+        previous = {}
+        with contextlib.suppress(ValueError):  # signals belong to the main thread; elsewhere there are none
+            for number in (signal.SIGINT, signal.SIGTERM):
+                previous[number] = signal.signal(number, request)
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def _configure_multi_gpu(self) -> None:
+        """As rsl-rl, and with gloo where the device is the CPU (tests, smoke runs)."""
+        if int(os.environ.get("WORLD_SIZE", "1")) == 1 or self.device.startswith("cuda"):
+            super()._configure_multi_gpu()
+            return
+        self.is_distributed = True
+        self.gpu_world_size = int(os.environ["WORLD_SIZE"])
+        self.gpu_local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+        self.gpu_global_rank = int(os.environ["RANK"])
+        self.cfg["multi_gpu"] = {
+            "global_rank": self.gpu_global_rank,
+            "local_rank": self.gpu_local_rank,
+            "world_size": self.gpu_world_size,
+        }
+        torch.distributed.init_process_group(
+            "gloo", rank=self.gpu_global_rank, world_size=self.gpu_world_size
+        )
+
+    def shutdown(self) -> None:
+        """Leave the process group, so that torchrun ends without a warning."""
+        if self.is_distributed:
+            torch.distributed.destroy_process_group()

@@ -1,0 +1,149 @@
+"""The environment as rsl-rl sees it: a vectorised environment of torch tensors on the simulator's device."""
+
+from typing import Any
+
+import torch
+import warp as wp
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+from vd.config import to_dict
+from vd.paper import PAPER
+
+OBSERVATION_GROUP = "policy"
+"""The one observation group; actor and critic both read it, as in the paper."""
+
+
+class ReorientVecEnv(VecEnv):
+    """N worlds of a :class:`vd.envs.ReorientEnv` behind rsl-rl's interface.
+
+    Rewards and flags are torch views of the environment's Warp arrays, without a copy. Observations
+    are copied once, on the device: rsl-rl stores the observation of a step only *after* the next step has
+    overwritten the environment's array, so a view would silently pair each action with the observation
+    that followed it.
+
+    Warp and torch work on different CUDA streams. Warp's are ordered against torch's default stream by
+    CUDA itself, so torch has to stay on that stream, and nothing waits on the host.
+
+    ``done`` for PPO is success, fall or time-out. A success gives the world a new goal and no reset, but ends
+    the goal's return: it is not bootstrapped. Only a time-out without success or fall is
+    (``extras["time_outs"]``). The observation returned is always that of the next action, after a reset
+    or with the new goal.
+
+    Args:
+        env: The environment, already reset.
+
+    Attributes:
+        num_envs: Worlds N.
+        num_actions: Actions D.
+        max_episode_length: Control steps of an episode.
+        device: Torch device of every tensor.
+        cfg: The environment's configuration as a dictionary.
+    """
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+        self.num_envs = env.num_worlds
+        self.num_actions = env.num_actions
+        self.max_episode_length = env.max_episode_steps
+        self.device = str(wp.device_to_torch(env.device))
+        self.cfg: dict[str, Any] = to_dict(env.cfg)
+        self._observation = wp.to_torch(env.observation)
+        self._reward = wp.to_torch(env.reward)
+        self._reward_terms = wp.to_torch(env.reward_terms)
+        self._success = wp.to_torch(env.success)
+        self._fell = wp.to_torch(env.fell)
+        self._timed_out = wp.to_torch(env.timed_out)
+        self._rotation_error = wp.to_torch(env.rotation_error)
+        self._step_count = wp.to_torch(env.step_count)
+        # The environment's own buffer: a captured CUDA graph reads its input from a fixed address.
+        self._action = wp.to_torch(env.action)
+        self.log_names = (
+            "reward/total",
+            *(f"reward/{name}" for name in env.reward_term_names),
+            "task/rotation_error",
+            "task/within_tolerance",
+            "task/reached",
+            "task/dropped",
+            "task/timed_out",
+            "policy/action_norm",
+        )
+
+    @property
+    def episode_length_buf(self) -> torch.Tensor:
+        """Control steps since the last reset of every world [N], a view; assigning copies into it."""
+        return self._step_count
+
+    @episode_length_buf.setter
+    def episode_length_buf(self, value: torch.Tensor) -> None:
+        self._step_count.copy_(value)
+
+    def get_observations(self) -> TensorDict:
+        """The observation for the next action, ``{"policy": [N, O]}``, a copy on the device."""
+        return TensorDict({OBSERVATION_GROUP: self._observation.clone()}, batch_size=[self.num_envs])
+
+    def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
+        """Simulate one control step.
+
+        Args:
+            actions: Actions [N, D]; the environment clips them to [-1, 1].
+
+        Returns:
+            Observation for the next action; reward [N] (view); done [N] (int64); and extras with
+            ``time_outs`` [N] (float) and ``log``: scalars on the device, the same keys from the first step.
+            ``reward/*`` and ``task/rotation_error`` [rad] are means over worlds, ``task/reached``,
+            ``task/dropped``, ``task/timed_out`` the share of worlds whose goal ended that way in this step,
+            ``task/within_tolerance`` the share within the paper's success tolerance, moving or not.
+        """
+        self._action.copy_(actions)
+        self.env.step(self.env.action)
+        reached = self._success > 0
+        dropped = (self._fell > 0) & ~reached
+        timed_out = (self._timed_out > 0) & ~reached & ~dropped
+        done = reached | dropped | timed_out
+        shares = torch.stack(
+            (
+                self._rotation_error,
+                (self._rotation_error <= PAPER.success.rotation_rad).float(),
+                reached.float(),
+                dropped.float(),
+                timed_out.float(),
+                actions.norm(dim=-1),
+            )
+        ).mean(dim=1)
+        values = torch.cat((self._reward.mean()[None], self._reward_terms.mean(dim=0), shares))
+        log = dict(zip(self.log_names, values.unbind(), strict=True))
+        return (
+            self.get_observations(),
+            self._reward,
+            done.long(),
+            {"time_outs": timed_out.float(), "log": log},
+        )
+
+    def check(self) -> None:
+        """Let the environment raise on NaN or on a contact capacity that overflowed. Copies to the host."""
+        self.env.check()
+
+    def end_iteration(self) -> dict[str, float]:
+        """Once an iteration: check the simulation, move the curriculum.
+
+        Returns:
+            ``task/difficulty``: 0 to 1, 1 is the configured task.
+
+        Raises:
+            SimulationError: NaN or lost contacts, with the numbers and the setting to change.
+        """
+        self.env.check()
+        return {"task/difficulty": self.env.update_curriculum()["difficulty"]}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Simulation, episodes, curriculum and random state of the environment (arrays and plain values)."""
+        return self.env.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        self.env.load_state_dict(state)
+
+    def close(self) -> None:
+        """Release the simulation."""
+        self.env.close()

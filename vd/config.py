@@ -1,0 +1,98 @@
+"""Typed configurations to and from plain dictionaries (JSON, checkpoints), checked field by field."""
+
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from enum import Enum
+from pathlib import Path
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+def to_dict(value: Any) -> Any:
+    """Turn nested dataclasses into dictionaries of numbers, strings, lists and ``None``.
+
+    Raises:
+        TypeError: A field holds something that a JSON file cannot.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: to_dict(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): to_dict(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [to_dict(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Enum):
+        return value.value
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    raise TypeError(f"a configuration cannot hold a {type(value).__name__}: {value!r}")
+
+
+def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
+    """Build the dataclass ``cls`` from what :func:`to_dict` wrote. Fields that are absent keep their default.
+
+    Args:
+        cls: A dataclass.
+        values: Field values by name.
+        where: Dotted path of ``values``, for error messages.
+
+    Raises:
+        ValueError: A field that ``cls`` does not have, or a value of the wrong type, named by its path.
+    """
+    hints = typing.get_type_hints(cls)
+    names = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    unknown = sorted(set(values) - names)
+    if unknown:
+        raise ValueError(
+            f"{where or cls.__name__} has no field {', '.join(unknown)}; it has {', '.join(sorted(names))}"
+        )
+    prefix = f"{where}." if where else ""
+    return cls(**{name: _convert(hints[name], item, prefix + name) for name, item in values.items()})
+
+
+def _convert(hint: Any, value: Any, where: str) -> Any:
+    """``value`` as the type ``hint`` asks for: nested dataclasses, tuples, paths and unions of them."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is typing.Annotated:
+        return _convert(args[0], value, where)
+    if origin in (typing.Union, types.UnionType):
+        return _convert_union(args, value, where)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        if not isinstance(value, Mapping):
+            raise ValueError(f"{where}: expected fields of {hint.__name__}, got {value!r}")
+        return from_dict(hint, value, where=where)
+    if origin in (tuple, list) and isinstance(value, (list, tuple)):
+        inner = [args[0]] * len(value) if origin is list or args[-1:] == (Ellipsis,) else list(args)
+        if len(inner) != len(value):
+            raise ValueError(f"{where}: expected {len(inner)} values, got {len(value)}")
+        return origin(_convert(kind, item, where) for kind, item in zip(inner, value, strict=True))
+    if origin is typing.Literal:
+        if value not in args:
+            raise ValueError(f"{where}: {value!r} is not one of {', '.join(map(repr, args))}")
+        return value
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(hint, type) and issubclass(hint, (Path, Enum)):
+        return hint(value)
+    if isinstance(hint, type) and (not isinstance(value, hint) or (hint is int and isinstance(value, bool))):
+        raise ValueError(f"{where}: expected {hint.__name__}, got {value!r}")
+    return value
+
+
+def _convert_union(options: tuple[Any, ...], value: Any, where: str) -> Any:
+    """``value`` as the first of ``options`` that takes it."""
+    if value is None and type(None) in options:
+        return None
+    errors = []
+    for option in options:
+        if option is type(None):
+            continue
+        try:
+            return _convert(option, value, where)
+        except ValueError as error:
+            errors.append(str(error))
+    raise ValueError("; ".join(errors) or f"{where}: cannot be {value!r}")

@@ -1,0 +1,215 @@
+"""Policies for evaluation, the viewer and the robot: a trained actor from a file, zero or random actions.
+
+Reading a policy needs torch only, no simulator and no rsl-rl, and executes nothing in the file.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import nn
+
+from vd.config import from_dict, to_dict
+
+POLICY_FORMAT = "visual-dexterity policy 1"
+_ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "gelu": nn.GELU}
+_NORMALISER_EPSILON = 1e-2
+"""Added to the running std by the normaliser that trained the actor (rsl-rl's EmpiricalNormalization)."""
+
+
+class Policy(Protocol):
+    """Anything that acts on observations."""
+
+    num_actions: int
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """Actions [N, D] in about [-1, 1] for observations [N, O], on the same device."""
+        ...
+
+
+@dataclass(frozen=True)
+class PolicySpec:
+    """What is needed to rebuild an actor around its weights.
+
+    Attributes:
+        num_observations: Observation length O.
+        num_actions: Actions D.
+        hidden: Widths of the hidden layers.
+        activation: Name of the activation function.
+        distribution: ``gaussian`` (the network gives the mean) or ``state-dependent`` (mean, then std).
+        normalise_observations: Whether a running normalisation belongs to the actor.
+    """
+
+    num_observations: int
+    num_actions: int
+    hidden: tuple[int, ...]
+    activation: str
+    distribution: str
+    normalise_observations: bool
+
+
+class TrainedPolicy:
+    """The deterministic policy of a trained actor: the mean of its action distribution.
+
+    Args:
+        spec: Shape of the network.
+        weights: State of rsl-rl's actor (``mlp.*`` and, if it normalises, ``obs_normalizer.*``).
+        task: Configuration of the environment it was trained in, as a dictionary.
+        iteration: Iterations it was trained for.
+        env_steps: Control steps it was trained for.
+        device: Torch device.
+
+    Attributes:
+        hand: Name of the hand it moves, as ``task`` says ("" if it does not).
+    """
+
+    def __init__(
+        self,
+        spec: PolicySpec,
+        weights: dict[str, torch.Tensor],
+        *,
+        task: dict[str, Any],
+        iteration: int = 0,
+        env_steps: int = 0,
+        device: str = "cpu",
+    ) -> None:
+        self.spec, self.task, self.iteration, self.env_steps = spec, task, iteration, env_steps
+        self.hand = str(task.get("hand", ""))
+        self.num_observations, self.num_actions = spec.num_observations, spec.num_actions
+        self._mean: torch.Tensor | None = None
+        self._scale: torch.Tensor | None = None
+        if spec.normalise_observations:
+            self._mean = weights["obs_normalizer._mean"].to(device)
+            self._scale = weights["obs_normalizer._std"].to(device) + _NORMALISER_EPSILON
+        self._network = _network(spec).to(device)
+        inside = {key.removeprefix("mlp."): value for key, value in weights.items() if key.startswith("mlp.")}
+        self._network.load_state_dict(inside)
+        self._network.requires_grad_(False)
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """Mean action.
+
+        Args:
+            observation: Observations [N, O] on the policy's device.
+
+        Returns:
+            Actions [N, D].
+
+        Raises:
+            ValueError: The observation has another length than the policy was trained on.
+        """
+        if observation.ndim != 2 or observation.shape[1] != self.num_observations:
+            raise ValueError(
+                f"the policy was trained on observations [N, {self.num_observations}] of hand "
+                f"'{self.hand}', but got {tuple(observation.shape)}; use the hand it was trained for"
+            )
+        with torch.no_grad():
+            if self._mean is not None:
+                observation = (observation - self._mean) / self._scale
+            output = self._network(observation)
+        # A state-dependent std is the second half of the output.
+        return output[:, : self.num_actions]
+
+
+class ZeroPolicy:
+    """Keeps still: every action is zero.
+
+    Args:
+        num_actions: Actions D.
+    """
+
+    def __init__(self, num_actions: int) -> None:
+        self.num_actions = num_actions
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """Zeros [N, D]."""
+        return observation.new_zeros((observation.shape[0], self.num_actions))
+
+
+class RandomPolicy:
+    """Actions uniform in [-1, 1], the same for the same seed on the same device.
+
+    Args:
+        num_actions: Actions D.
+        seed: Seed of the sequence.
+        device: Torch device of the observations it will get.
+    """
+
+    def __init__(self, num_actions: int, *, seed: int = 0, device: str = "cpu") -> None:
+        self.num_actions = num_actions
+        self._generator = torch.Generator(device=device).manual_seed(seed)
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """Uniform actions [N, D]."""
+        shape = (observation.shape[0], self.num_actions)
+        return torch.rand(shape, generator=self._generator, device=observation.device) * 2.0 - 1.0
+
+
+def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
+    """Rebuild the actor from a checkpoint of ``vd-train`` or from an exported ``policy.pt``.
+
+    Args:
+        path: The file.
+        device: Torch device to run on.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: The file is damaged, or not a policy.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"no policy at {path}; give a policy.pt or a file of a run's checkpoints folder"
+        )
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except Exception as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(
+            f"{path} is damaged or no policy ({reason}); export it again with vd-train export"
+        ) from error
+    if not isinstance(state, dict) or not {"policy", "actor_state_dict", "task"} <= state.keys():
+        raise ValueError(f"{path} holds no policy; give a file that vd-train wrote")
+    try:
+        spec = from_dict(PolicySpec, state["policy"], where="policy")
+        return TrainedPolicy(
+            spec,
+            state["actor_state_dict"],
+            task=state["task"],
+            iteration=int(state["iter"]),
+            env_steps=int(state["env_steps"]),
+            device=device,
+        )
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{path}: the weights do not fit the network it describes ({error})") from error
+
+
+def policy_export(state: dict[str, Any]) -> dict[str, Any]:
+    """The part of a checkpoint that :func:`load_policy` needs: weights, network, task; no optimiser."""
+    return {
+        "format": POLICY_FORMAT,
+        "policy": state["policy"],
+        "task": state["task"],
+        "iter": state["iter"],
+        "env_steps": state["env_steps"],
+        "actor_state_dict": {key: value.detach().cpu() for key, value in state["actor_state_dict"].items()},
+    }
+
+
+def spec_dict(spec: PolicySpec) -> dict[str, Any]:
+    """``spec`` as plain values, for a checkpoint."""
+    return to_dict(spec)
+
+
+def _network(spec: PolicySpec) -> nn.Sequential:
+    """The multilayer perceptron with the layer names rsl-rl gives it."""
+    if spec.activation not in _ACTIVATIONS:
+        raise ValueError(f"unknown activation '{spec.activation}'; known: {', '.join(_ACTIVATIONS)}")
+    outputs = spec.num_actions * (2 if spec.distribution == "state-dependent" else 1)
+    layers: list[nn.Module] = []
+    width = spec.num_observations
+    for hidden in spec.hidden:
+        layers += [nn.Linear(width, hidden), _ACTIVATIONS[spec.activation]()]
+        width = hidden
+    return nn.Sequential(*layers, nn.Linear(width, outputs))
