@@ -1,6 +1,7 @@
 """The folders are one package, `vd`, in a wheel as in the editable install that runs the tests."""
 
 import configparser
+import importlib.metadata
 import shutil
 import subprocess
 import sys
@@ -9,6 +10,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -24,6 +27,29 @@ def installed_names() -> set[str]:
         for package, folder in PACKAGE_DIRS.items()
         for path in (ROOT / folder).rglob("*.py")
     }
+
+
+def required_distributions() -> set[str]:
+    """Names of everything that the package with its extra ``dev`` needs on this machine, directly or not."""
+    needed: set[str] = set()
+    project = PROJECT["project"]
+    waiting = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    while waiting:
+        requirement = Requirement(waiting.pop())
+        name = canonicalize_name(requirement.name)
+        extras = {"", *requirement.extras}
+        if requirement.marker and not any(requirement.marker.evaluate({"extra": extra}) for extra in extras):
+            continue
+        key = f"{name}[{','.join(sorted(requirement.extras))}]"
+        if key in needed:
+            continue
+        needed.add(key)
+        for text in importlib.metadata.requires(name) or []:
+            child = Requirement(text)
+            if not child.marker or any(child.marker.evaluate({"extra": extra}) for extra in extras):
+                child.marker = None
+                waiting.append(str(child))
+    return {key.split("[")[0] for key in needed}
 
 
 @pytest.fixture(scope="module")
@@ -103,3 +129,15 @@ def test_editable_install_imports_the_checkout(tmp_path):
     files = imported_files(None, tmp_path)
     assert set(files) == set(IMPORTED)
     assert all(path.is_relative_to(ROOT) for path in files.values())
+
+
+def test_constraints_pin_everything():
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    pins = dict(line.split("==") for line in lines if not line.startswith("#"))
+    assert not [name for name, version in pins.items() if "+" in version], "a build tag binds to one machine"
+    pinned = {canonicalize_name(name) for name in pins}
+    # torch itself pins the libraries of its CUDA build.
+    missing = {
+        n for n in required_distributions() - pinned if not n.startswith(("nvidia-", "cuda-", "triton"))
+    }
+    assert not missing, f"add to constraints.txt: {sorted(missing)}"
