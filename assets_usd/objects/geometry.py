@@ -22,6 +22,10 @@ SIMPLIFY_TOLERANCE = 1e-3
 """Simplifying a hull stops once every vertex left out is this close to it, relative to its size."""
 
 
+FINEST_GRID, COARSEST_GRID, GRID_BISECTIONS = 512.0, 8.0, 12
+"""Grids tried when a mesh is coarsened: cells along its longest side, and bisection steps."""
+
+
 class Hull(NamedTuple):
     """A convex polyhedron: ``vertices`` [V, 3] and outward triangles ``faces`` [T, 3]."""
 
@@ -173,7 +177,7 @@ def voxelise_surface(
     vertices = np.asarray(vertices, dtype=np.float64)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     pitch = float((high - low).max()) / voxels
-    margin = 3
+    margin = 2
     shape = np.ceil((high - low) / pitch).astype(int) + 1 + 2 * margin
     origin = low - margin * pitch
     area = triangle_areas(vertices, faces)
@@ -181,7 +185,7 @@ def voxelise_surface(
     points = random_surface_points(vertices, faces, count, np.random.default_rng(0))
     surface = np.zeros(shape, dtype=bool)
     surface[tuple(np.rint((points - origin) / pitch).astype(int).T)] = True
-    closed = ndimage.binary_closing(surface, np.ones((3, 3, 3), dtype=bool), iterations=2)
+    closed = ndimage.binary_closing(surface, np.ones((3, 3, 3), dtype=bool))
     solid = ndimage.binary_fill_holes(closed | surface)
     inner = ndimage.binary_erosion(solid)
     # Surface voxels stick out by half a voxel: keep every second one of the outer layer.
@@ -282,33 +286,59 @@ def cluster_vertices(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coarsen a mesh to at most ``max_faces`` triangles by merging the vertices of a grid cell.
 
-    The finest grid that meets the limit is found by bisection; each cell's vertices become their
-    mean. Enough for a picture; the solid and the hulls are computed before.
+    The finest grid that meets the limit is found by bisection. A cell's vertex minimises the squared
+    distance to the planes of the triangles around it (quadric error), which keeps edges sharp; the
+    bounding box is kept. For pictures only: the solid and the hulls are computed before.
     """
     if len(faces) <= max_faces:
         return vertices, faces
-    low = vertices.min(axis=0)
-    size = float(np.ptp(vertices, axis=0).max())
-    fine, coarse = 512.0, 8.0
-    best = (vertices, faces)
-    for _ in range(12):
+    low, side = vertices.min(axis=0), np.ptp(vertices, axis=0)
+    fine, coarse = FINEST_GRID, COARSEST_GRID
+    cluster, merged = _clustered(vertices, faces, coarse)
+    for _ in range(GRID_BISECTIONS):
         cells = (fine + coarse) / 2.0
-        key = np.floor((vertices - low) / size * cells).astype(np.int64)
-        _, cluster = np.unique(key, axis=0, return_inverse=True)
-        cluster = cluster.reshape(-1)
-        merged = cluster[faces]
-        distinct = (
-            (merged[:, 0] != merged[:, 1]) & (merged[:, 1] != merged[:, 2]) & (merged[:, 2] != merged[:, 0])
-        )
-        merged = merged[distinct]
-        _, first = np.unique(np.sort(merged, axis=1), axis=0, return_index=True)
-        merged = merged[np.sort(first)]
-        if len(merged) > max_faces:
+        trial = _clustered(vertices, faces, cells)
+        if len(trial[1]) > max_faces:
             fine = cells
-            continue
-        coarse = cells
-        mean = np.stack([np.bincount(cluster, vertices[:, i]) for i in range(3)], axis=1)
-        mean /= np.bincount(cluster)[:, None]
-        used, index = np.unique(merged, return_inverse=True)
-        best = (mean[used], index.reshape(-1, 3).astype(np.int32))
-    return best
+        else:
+            coarse = cells
+            cluster, merged = trial
+    used, index = np.unique(merged, return_inverse=True)
+    moved = _quadric_vertices(vertices, faces, cluster, float(side.max()) / coarse)[used]
+    spread = np.ptp(moved, axis=0)
+    moved = low + (moved - moved.min(axis=0)) * np.where(spread > 0.0, side / np.maximum(spread, 1e-30), 1.0)
+    return moved, index.reshape(-1, 3).astype(np.int32)
+
+
+def _clustered(vertices: np.ndarray, faces: np.ndarray, cells: float) -> tuple[np.ndarray, np.ndarray]:
+    """Cell of each vertex [V] on a grid of ``cells`` along the longest side, and the triangles left."""
+    low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
+    key = np.floor((vertices - low) / size * cells).astype(np.int64)
+    cluster = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
+    merged = cluster[faces]
+    a, b, c = merged.T
+    merged = merged[(a != b) & (b != c) & (c != a)]
+    first = np.unique(np.sort(merged, axis=1), axis=0, return_index=True)[1]
+    return cluster, merged[np.sort(first)]
+
+
+def _quadric_vertices(
+    vertices: np.ndarray, faces: np.ndarray, cluster: np.ndarray, cell: float
+) -> np.ndarray:
+    """Vertex of each cluster: near its mean, on the planes of its triangles, at most a cell away."""
+    count = int(cluster.max()) + 1
+    mean = np.stack([np.bincount(cluster, vertices[:, i], count) for i in range(3)], axis=1)
+    mean = mean / np.bincount(cluster, minlength=count)[:, None]
+    corner = vertices[faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal /= np.maximum(length, 1e-30)
+    matrix, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
+    for k in range(3):
+        where = cluster[faces[:, k]]
+        offset = np.einsum("ij,ij->i", normal, corner[:, 0] - mean[where])
+        np.add.at(matrix, where, length[:, :, None] * normal[:, :, None] * normal[:, None, :])
+        np.add.at(right, where, length * normal * offset[:, None])
+    # The mean pulls weakly where the planes leave a direction free.
+    matrix += (1e-2 * np.trace(matrix, axis1=1, axis2=2) + 1e-30)[:, None, None] * np.eye(3)
+    return mean + np.clip(np.linalg.solve(matrix, right[:, :, None])[:, :, 0], -cell, cell)

@@ -19,6 +19,11 @@ SIDES = 12
 """Sides of a cylinder: 24 vertices."""
 
 
+def vec(*components: float) -> np.ndarray:
+    """The components as an array."""
+    return np.array(components, dtype=np.float64)
+
+
 def _unit_sphere() -> np.ndarray:
     """The 12 vertices of an icosahedron and the 20 of its dual, on the unit sphere, [32, 3]."""
     points = [np.roll([0.0, i, j * GOLDEN], k) for i, j, k in product((-1, 1), (-1, 1), range(3))]

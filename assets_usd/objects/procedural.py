@@ -6,8 +6,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.objects.families import TRAINING
-from vd.assets_usd.objects.families_held_out import HELD_OUT
+from vd.assets_usd.objects.families import HELD_OUT, TRAINING, Maker
 from vd.assets_usd.objects.geometry import (
     Hull,
     hull_depth,
@@ -35,8 +34,12 @@ CUBOID_SIDES_M = (0.05, 0.07, 0.10)
 
 MAX_PARTS = 8
 
-MIN_ASYMMETRY = 0.008
-"""Least asymmetry (see :func:`asymmetry`) of a training object: about 1 mm of mean surface distance."""
+MIN_ASYMMETRY = 0.012
+"""Least asymmetry (see :func:`asymmetry`) of a training object: 1.5 mm of mean surface distance at 12 cm."""
+
+STRETCH, SHEAR = 0.35, 0.25
+"""Spread of the random stretch of each axis (log scale) and of the shear of x by z: one kind then
+gives short and long, fat and lean objects."""
 
 CANDIDATE_FOLDS = (2, 3, 4, 5, 6)
 """Orders of the rotations tried about each principal axis."""
@@ -65,25 +68,19 @@ def candidate_rotations(inertia: np.ndarray) -> np.ndarray:
     return np.array(rotations)
 
 
-def asymmetry(hulls: Sequence[Hull], points: np.ndarray) -> float:
-    """How far a union of hulls is from any rotational symmetry, relative to its size.
-
-    Args:
-        hulls: Parts in any frame.
-        points: Points on the surface of the union, [n, 3].
+def asymmetry(model: ObjectModel) -> float:
+    """How far an object whose hulls are its shape is from any rotational symmetry.
 
     Returns:
         Least mean distance of the rotated surface points to the surface over the candidate
         rotations about the centre of mass, divided by the longest side: 0 for a symmetric solid.
     """
-    solid = solid_of_hulls(hulls)
-    centred = [Hull(h.vertices - solid.centroid, h.faces) for h in hulls]
-    away = (points - solid.centroid)[:: max(len(points) // PROBES, 1)]
-    size = float(np.ptp(points, axis=0).max())
-    rotations = candidate_rotations(solid.inertia)
-    turned = np.einsum("rij,nj->rni", rotations, away).reshape(-1, 3)
-    distance = np.abs(union_depth(centred, turned)).reshape(len(rotations), -1).mean(axis=1)
-    return float(distance.min()) / size
+    # Farthest-point samples: any leading part of them is itself evenly spread.
+    points = model.surface_points[:PROBES]
+    rotations = candidate_rotations(model.inertia_matrix)
+    turned = np.einsum("rij,nj->rni", rotations, points).reshape(-1, 3)
+    distance = np.abs(union_depth(model.hulls, turned)).reshape(len(rotations), -1).mean(axis=1)
+    return float(distance.min()) / model.longest_side
 
 
 def union_surface(hulls: Sequence[Hull]) -> tuple[np.ndarray, np.ndarray]:
@@ -137,9 +134,14 @@ def model_of_parts(
     )
 
 
-def draw_object(
-    name: str, make: Callable[[np.random.Generator], list[Hull]], seed: Sequence[int], **fields: object
-) -> ObjectModel:
+def deformed(hulls: Sequence[Hull], rng: np.random.Generator) -> list[Hull]:
+    """Parts under one random stretch and shear, which keeps them convex and y a mirror axis."""
+    matrix = np.diag(np.exp(rng.uniform(-STRETCH, STRETCH, 3)))
+    matrix[0, 2] = rng.uniform(-SHEAR, SHEAR)
+    return [Hull(h.vertices @ matrix.T, h.faces) for h in hulls]
+
+
+def draw_object(name: str, make: Maker, seed: Sequence[int], **fields: object) -> ObjectModel:
     """One object of a kind: the first draw that is one piece and not rotationally symmetric.
 
     Args:
@@ -153,12 +155,12 @@ def draw_object(
     """
     rng = np.random.default_rng(seed)
     for _ in range(ATTEMPTS):
-        hulls = make(rng)
+        hulls = deformed(make(rng), rng)
         longest = float(rng.uniform(*LONGEST_SIDE_M))
         if len(hulls) > MAX_PARTS or not is_connected(hulls):
             continue
         model = model_of_parts(name, hulls, longest, **fields)
-        if asymmetry(model.hulls, model.surface_points) >= MIN_ASYMMETRY:
+        if asymmetry(model) >= MIN_ASYMMETRY:
             return model
     raise RuntimeError(f"{name}: no valid object in {ATTEMPTS} draws")
 
@@ -183,7 +185,8 @@ def procedural_set(
     models = []
     for i in range(count):
         family, kinds = order[i % len(order)]
-        kind, make = list(kinds.items())[(i // len(order)) % len(kinds)]
+        make = kinds[(i // len(order)) % len(kinds)]
+        kind = make.__name__
         name = f"{kind}_s{seed}_{i:03d}"
         models.append(
             draw_object(

@@ -1,6 +1,5 @@
 """Named object sets in the asset cache: built-in ones are authored on first use."""
 
-import os
 import re
 import shutil
 import tempfile
@@ -81,7 +80,7 @@ def set_folder(name: str) -> Path:
         write_set(aside, make())
         aside.chmod(0o755)
         try:
-            os.replace(aside, folder)
+            aside.replace(folder)
         except OSError:
             if not (folder.is_dir() and object_files(folder)):
                 raise

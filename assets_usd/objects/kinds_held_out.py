@@ -1,24 +1,27 @@
-"""Held-out families: kinds that no training family contains. Conventions as in :mod:`.families`."""
+"""Kinds of the held-out families, which no training family contains. Conventions as in :mod:`.families`."""
+
+from itertools import pairwise
 
 import numpy as np
 
-from vd.assets_usd.objects.families import Maker
 from vd.assets_usd.objects.geometry import Hull
-from vd.assets_usd.objects.primitives import box, cylinder, ellipsoid, prism, rod
+from vd.assets_usd.objects.primitives import box, cylinder, ellipsoid, prism, rod, vec
 
 
 def mug(rng: np.random.Generator) -> list[Hull]:
     """Five walls, a bottom, a handle of two rods: open, so truly concave."""
     radius, height, wall = rng.uniform(0.8, 1.0), rng.uniform(1.5, 2.2), rng.uniform(0.14, 0.2)
-    parts = [cylinder((0, 0, 0), (0, 0, wall * 1.4), radius, sides=10)]
-    angles = 2.0 * np.pi * np.arange(6) / 5 + np.pi / 5
-    for start, end in zip(angles[:-1], angles[1:], strict=True):
+    angles = 2.0 * np.pi * np.arange(6) / 5
+    bottom = [(0.95 * radius * np.cos(t), 0.95 * radius * np.sin(t)) for t in angles[:5]]
+    parts = [prism(bottom, 0.0, 1.4 * wall, axis="z")]
+    for start, end in pairwise(angles):
         outline = [(r * np.cos(t), r * np.sin(t)) for r in (radius, radius - wall) for t in (start, end)]
         parts.append(prism(outline, 0.0, height, axis="z"))
     reach = rng.uniform(0.5, 0.8)
     low, high = 0.2 * height, rng.uniform(0.7, 0.9) * height
     corner = (-radius - reach, 0.0, rng.uniform(0.4, 0.6) * height)
-    inner = -radius * 0.75
+    # The middle of the wall opposite the first corner; the rod's cap must not come through it.
+    inner = -radius * np.cos(np.pi / 5) - 0.04
     parts += [rod((inner, 0, low), corner, 0.15), rod(corner, (inner, 0, high), 0.15)]
     return parts
 
@@ -71,32 +74,21 @@ def chair(rng: np.random.Generator) -> list[Hull]:
             top = np.array([x * (depth / 2 - thick), y * (width / 2 - thick), leg])
             parts.append(rod(top, top * (1 + splay, 1 + splay, 0), thick, 0.8 * thick))
     arm = rng.uniform(0.35, 0.5)
-    for y in (-1, 1):
-        parts.append(
-            prism(
-                [
-                    (-depth / 2 - 0.1, leg),
-                    (depth * 0.3, leg),
-                    (depth * 0.4, leg + arm),
-                    (-depth / 2 - 0.1, leg + arm),
-                ],
-                y * width / 2 - 0.1,
-                y * width / 2 + 0.1,
-            )
-        )
-    return parts
+    rear = -depth / 2 - 0.1
+    rest = [(rear, leg), (depth * 0.3, leg), (depth * 0.4, leg + arm), (rear, leg + arm)]
+    return parts + [prism(rest, y * width / 2 - 0.1, y * width / 2 + 0.1) for y in (-1, 1)]
 
 
 def desk_lamp(rng: np.random.Generator) -> list[Hull]:
     """Foot, two arms, joint, shade, switch."""
     elbow = np.array([-rng.uniform(0.4, 0.7), 0.0, rng.uniform(1.0, 1.4)])
-    head = elbow + (rng.uniform(0.9, 1.3), 0.0, rng.uniform(0.3, 0.7))
+    head = elbow + vec(rng.uniform(0.9, 1.3), 0.0, rng.uniform(0.3, 0.7))
     return [
         cylinder((0, 0, 0), (0, 0, 0.22), rng.uniform(0.6, 0.8), 0.55),
         rod((0, 0, 0.1), elbow, 0.15),
         rod(elbow, head, 0.15),
         ellipsoid(elbow, (0.24, 0.24, 0.24)),
-        cylinder(head + (-0.1, 0, 0.15), head + (0.45, 0, -0.5), 0.2, rng.uniform(0.5, 0.65)),
+        cylinder(head + vec(-0.1, 0, 0.15), head + vec(0.45, 0, -0.5), 0.2, rng.uniform(0.5, 0.65)),
         box((0.35, 0.2, 0.25), (0.2, 0.2, 0.2)),
     ]
 
@@ -106,7 +98,7 @@ def robot(rng: np.random.Generator) -> list[Hull]:
     width, height = rng.uniform(0.8, 1.1), rng.uniform(0.9, 1.3)
     parts = [
         box((0, 0, height / 2), (0.6, width, height), top=(1.0, 1.15)),
-        box((0.05, 0, height + 0.3), (0.5, 0.55, 0.5), euler=(0, 0, rng.uniform(-0.5, 0.5))),
+        box((0.05, 0, height + 0.22), (0.5, 0.55, 0.5), euler=(0, 0, rng.uniform(-0.5, 0.5))),
         box((-0.45, 0, 0.6 * height), (0.4, 0.6 * width, 0.6 * height)),
     ]
     for side in (-1, 1):
@@ -154,16 +146,7 @@ def cactus(rng: np.random.Generator) -> list[Hull]:
         )
         root = np.array([0.0, 0.0, level * height])
         elbow = root + direction * rng.uniform(0.7, 1.0)
-        tip = elbow + (0, 0, rng.uniform(0.4, 0.8))
+        tip = elbow + vec(0, 0, rng.uniform(0.4, 0.8))
         parts += [rod(root, elbow, 0.62 * thick), rod(elbow, tip, 0.62 * thick, 0.55 * thick)]
     parts.append(ellipsoid((0.1, 0.1, height + thick), (0.22, 0.22, 0.16)))
     return parts
-
-
-HELD_OUT: dict[str, dict[str, Maker]] = {
-    "kitchen": {"mug": mug, "teapot": teapot, "pan": pan},
-    "furniture": {"chair": chair, "desk_lamp": desk_lamp},
-    "figures": {"robot": robot, "cactus": cactus},
-    "cameras": {"camera": camera},
-}
-"""Kinds by held-out family."""
