@@ -1,0 +1,192 @@
+"""The headless renderer: things are where the camera model says, in their colours, and files decode."""
+
+import time
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.objects.model import ObjectModel
+from vd.render import Camera, Renderer
+
+IDENTITY = [0.0, 0.0, 0.0, 1.0]
+FACES = [[0, 1, 2], [0, 2, 3], [4, 6, 5], [4, 7, 6], [0, 4, 5], [0, 5, 1]]
+FACES += [[1, 5, 6], [1, 6, 2], [2, 6, 7], [2, 7, 3], [3, 7, 4], [3, 4, 0]]
+
+
+def box(name, size):
+    half = 0.5 * np.asarray(size)
+    corners = np.array([[-1, -1, -1], [-1, 1, -1], [1, 1, -1], [1, -1, -1]], dtype=float)
+    vertices = np.concatenate([corners, corners * [1, 1, -1]]) * half
+    inertia = np.full(3, 1e-4)
+    return ObjectModel(name, vertices, np.array(FACES), (), 0.1, inertia, np.array(IDENTITY), vertices)
+
+
+def orange(picture):
+    """Pixels of the object's hue: red well above blue."""
+    picture = picture.astype(int)
+    return (picture[..., 0] - picture[..., 2] > 90) & (picture[..., 0] > picture[..., 1])
+
+
+def green(picture):
+    picture = picture.astype(int)
+    return (picture[..., 1] - picture[..., 0] > 25) & (picture[..., 1] - picture[..., 2] > 20)
+
+
+def pose(position, quat=IDENTITY):
+    return np.concatenate([position, quat])[None]
+
+
+@pytest.fixture(scope="module")
+def cube_renderer():
+    return Renderer(None, [box("cube", [0.04] * 3)], width=320, height=240, goal_size=80)
+
+
+def middle(mask):
+    rows, columns = np.nonzero(mask)
+    return np.array([columns.mean(), rows.mean()])
+
+
+@pytest.mark.parametrize(
+    "position", [(0.0, 0.0, 0.1), (0.08, 0.0, 0.03), (-0.05, 0.07, 0.12), (0.0, -0.1, 0.05)]
+)
+def test_object_is_drawn_where_the_camera_projects_it(cube_renderer, position):
+    (picture,) = cube_renderer.render(pose(position), np.array([IDENTITY]))
+    expected = cube_renderer.camera.project(np.array([position]), 320, 240)[0]
+    np.testing.assert_allclose(middle(orange(picture.scene)), expected, atol=2.5)
+    corners = np.array(position) + box("cube", [0.04] * 3).vertices
+    spots = cube_renderer.camera.project(corners, 320, 240)
+    rows, columns = np.nonzero(orange(picture.scene))
+    np.testing.assert_allclose(
+        [columns.min(), columns.max() + 1], [spots[:, 0].min(), spots[:, 0].max()], atol=1.5
+    )
+    np.testing.assert_allclose([rows.min(), rows.max() + 1], [spots[:, 1].min(), spots[:, 1].max()], atol=1.5)
+
+
+def test_goal_has_the_outline_of_the_object_in_the_same_orientation():
+    plate = box("plate", [0.10, 0.05, 0.01])
+    quat = Rotation.from_euler("xyz", [0.5, 0.9, 0.3]).as_quat()
+    camera = Camera()
+    renderer = Renderer(None, [plate], width=160, height=160, goal_size=160, camera=camera)
+    (same,) = renderer.render(pose(camera.target, quat), np.array([quat]))
+    (other,) = renderer.render(pose(camera.target, quat), np.array([IDENTITY]))
+
+    def shape(mask):
+        """Width over height of the outline: the same from the same side, whatever the distance."""
+        rows, columns = np.nonzero(mask)
+        return np.ptp(columns) / np.ptp(rows)
+
+    assert shape(green(same.goal)) == pytest.approx(shape(orange(same.scene)), rel=0.1)
+    assert shape(green(other.goal)) != pytest.approx(shape(orange(same.scene)), rel=0.2)
+
+
+def test_each_cell_shows_its_own_object_and_goal():
+    objects = [box("small", [0.02] * 3), box("large", [0.08] * 3)]
+    renderer = Renderer(None, objects, width=160, height=120, goal_size=60)
+    q = np.concatenate([pose((0.0, 0.0, 0.1)), pose((0.06, 0.0, 0.1))])
+    small, large = renderer.render(q, np.array([IDENTITY, IDENTITY]))
+    assert 8 < orange(large.scene).sum() / orange(small.scene).sum() < 32
+    assert middle(orange(large.scene))[0] > middle(orange(small.scene))[0] + 10
+    assert green(small.goal).sum() < green(large.goal).sum()
+
+
+def test_a_ball_that_the_camera_is_aimed_at_fills_the_picture():
+    camera = Camera().aimed_at((0.1, 0.2, 0.3), 0.05, fill=0.8)
+    np.testing.assert_allclose(camera.project(np.array([[0.1, 0.2, 0.3]]), 100, 100), [[50, 50]], atol=1e-6)
+    up = camera.rotation[:, 1]
+    edge = camera.project(np.array([0.1, 0.2, 0.3]) + 0.05 * up[None], 100, 100)[0]
+    assert edge[1] == pytest.approx(50 - 40, abs=1.5)
+
+
+def test_table_receives_the_shadow_of_the_object():
+    objects, q = [box("cube", [0.05] * 3)], pose((0.0, 0.0, 0.06))
+    with_shadow, without = (
+        Renderer(None, objects, width=160, height=120, shadows=shadows)
+        .render(q, np.array([IDENTITY]))[0]
+        .scene
+        for shadows in (True, False)
+    )
+    darker = with_shadow.astype(int).sum(axis=2) < without.astype(int).sum(axis=2) - 60
+    assert 50 < darker.sum() < 5000
+    assert middle(darker)[1] > middle(orange(with_shadow))[1]  # on the table, below the object in the picture
+
+
+@pytest.fixture(scope="module")
+def hand(tmp_path_factory):
+    from vd.assets_usd.hand_author import hand_usd
+    from vd.assets_usd.hand_model import read_hand
+
+    return {name: read_hand(hand_usd(name)) for name in ("dclaw3", "dclaw4")}
+
+
+@pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])
+def test_no_finger_hides_the_object(hand, name):
+    model = hand[name]
+    renderer = Renderer(model, [box("cube", [0.05] * 3)], width=320, height=240)
+    joints = np.tile([0.0, 0.8, -1.1], model.num_fingers)
+    q = np.concatenate([joints, [0.0, 0.0, 0.06], IDENTITY])[None]
+    picture = renderer.render(q, np.array([IDENTITY]))[0].scene
+    alone = Renderer(None, [box("cube", [0.05] * 3)], width=320, height=240, camera=renderer.camera)
+    free = alone.render(q[:, model.num_joints :], np.array([IDENTITY]))[0].scene
+    assert orange(picture).sum() > 0.95 * orange(free).sum()
+
+
+@pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])
+def test_fingertips_are_drawn_where_kinematics_puts_them(hand, name):
+    model, speck = hand[name], [box("speck", [1e-4] * 3)]
+    joints = np.random.default_rng(1).uniform(-0.1, 0.1, model.num_joints)
+    joints += np.tile([0.0, 0.8, -1.1], model.num_fingers)
+    q = np.concatenate([joints, [0.0, 0.0, -1.0], IDENTITY])[None]
+    renderer = Renderer(model, speck, width=320, height=240)
+    empty = Renderer(None, speck, width=320, height=240, camera=renderer.camera, shadows=False)
+    hands = renderer.render(q, np.array([IDENTITY]))[0].scene.astype(int)
+    none = empty.render(q[:, model.num_joints :], np.array([IDENTITY]))[0].scene.astype(int)
+    mount = Rotation.from_euler("y", np.pi)
+    inside = mount.apply(model.tip_poses(joints)[:, :3]) + np.array([0.0, 0.0, 0.25 + 0.012])
+    column, row = renderer.camera.project(inside, 320, 240).round().astype(int).T
+    assert (np.abs(hands - none).sum(axis=2)[row, column] > 20).all()
+
+
+def test_a_frame_takes_less_processor_time_than_it_lasts(hand):
+    model = hand["dclaw4"]
+    renderer = Renderer(model, [box("cube", [0.05] * 3)])
+    q = np.concatenate([np.tile([0.0, 0.8, -1.1], 4), [0.0, 0.0, 0.05], IDENTITY])[None]
+    renderer.render(q, np.array([IDENTITY]))
+    start = time.process_time()
+    for _ in range(5):
+        renderer.render(q, np.array([IDENTITY]))
+    assert (time.process_time() - start) / 5 < 0.25  # 0.05 s on an idle core; much slack for a shared one
+
+
+def frames(count, height=64, width=96):
+    ramp = np.linspace(0, 255, count).astype(np.uint8)
+    return (np.full((height, width, 3), value, np.uint8) for value in ramp)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_video_decodes_to_its_frames(tmp_path, suffix):
+    from vd.play.video import write_frames
+
+    path = tmp_path / f"clip{suffix}"
+    assert write_frames(path, frames(17), 12.0) == 17
+    decoded = iio.imread(path)
+    assert decoded.shape[:3] == (17, 64, 96)
+    np.testing.assert_allclose(decoded.reshape(17, -1).mean(axis=1), np.linspace(0, 255, 17), atol=6)
+
+
+def test_sheet_shows_six_moments(tmp_path):
+    from vd.play.video import write_frames
+
+    write_frames(tmp_path / "sheet.png", frames(30), 12.0)
+    assert iio.imread(tmp_path / "sheet.png").shape == (2 * 64, 3 * 96, 3)
+
+
+def test_unknown_suffix_and_empty_recordings_are_refused_and_leave_nothing(tmp_path):
+    from vd.play.video import write_frames
+
+    with pytest.raises(ValueError, match=r"cannot write '.webm' files; use .mp4"):
+        write_frames(tmp_path / "x.webm", frames(2), 12.0)
+    with pytest.raises(ValueError, match="no frames"):
+        write_frames(tmp_path / "x.mp4", iter(()), 12.0)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,335 @@
+"""Frames and video files: the picture, the goal beside it, and a strip of numbers, curve and reward bars."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import warp as wp
+from PIL import Image, ImageDraw, ImageFont
+
+from vd.files import atomic_path
+from vd.paper import PAPER
+from vd.render import Picture, Renderer
+
+STRIP_HEIGHT = 80
+MARGIN = 10
+# Share of a column of reward terms that their names take, and its width [pixel] from which 11 points fit.
+NAME_SHARE, FULL_COLUMN = 0.6, 140
+# Error curve: as long as an episode of the paper.
+CURVE_STEPS = round(PAPER.scene.episode_s * PAPER.scene.control_hz)
+# A reached goal or a drop colours the frame's edge for this many control steps, half a second.
+FLASH_STEPS = 6
+INK, SOFT, LINE, STRIP = (28, 35, 48), (110, 119, 134), (205, 211, 220), (250, 251, 252)
+GREEN, RED, BLUE = (0, 140, 100), (205, 70, 20), (0, 114, 178)
+GOAL_EDGE = (89, 173, 107)
+# H.264 quality of libx264 (0 lossless, 51 worst): no visible blocks at this size, about 0.5 MB for 10 s.
+VIDEO_CRF = 22
+# A PNG of a recording shows this many moments, evenly spaced, in rows of three.
+SHEET_FRAMES, SHEET_COLUMNS = 6, 3
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What is shown of one world after one control step."""
+
+    name: str
+    """Object name."""
+    time_s: float
+    """Since the recording began."""
+    joint_q: np.ndarray
+    """Hand joints [rad], object position [m] and quaternion xyzw, shape [D + 7]."""
+    goal_quat: np.ndarray
+    """Goal orientation xyzw, shape [4]."""
+    error_rad: float
+    """Orientation error of the step."""
+    success: bool
+    """A goal was reached in this step."""
+    fell: bool
+    """The object was dropped in this step."""
+    goals: int
+    """Goals reached since the recording began."""
+    drops: int
+    """Drops since the recording began."""
+    terms: np.ndarray
+    """Reward terms of the step, shape [T]."""
+
+
+class Watcher:
+    """Reads chosen worlds of an environment after every step, and counts goals and drops.
+
+    Args:
+        env: The environment.
+        worlds: Indices of the worlds to watch, length C.
+    """
+
+    def __init__(self, env: Any, worlds: Sequence[int]):
+        self.env, self.worlds = env, list(worlds)
+        self.steps = 0
+        self.goals = np.zeros(len(self.worlds), dtype=int)
+        self.drops = np.zeros(len(self.worlds), dtype=int)
+
+    def read(self, *, stepped: bool = True) -> list[Snapshot]:
+        """The present state of the watched worlds.
+
+        Args:
+            stepped: Whether a step was made since the last call; False after a reset.
+
+        Returns:
+            C snapshots.
+        """
+        env, worlds = self.env, self.worlds
+        success = (env.success.numpy()[worlds] != 0) & stepped
+        fell = (env.fell.numpy()[worlds] != 0) & stepped
+        self.goals += success
+        self.drops += fell
+        self.steps += stepped
+        q, goal = env.sim.joint_q.numpy()[worlds], env.goal_quat.numpy()[worlds]
+        error, terms = env.rotation_error.numpy()[worlds], env.reward_terms.numpy()[worlds]
+        return [
+            Snapshot(
+                name=env.objects[env.world_object[world]].name,
+                time_s=self.steps / env.cfg.sim.control_hz,
+                joint_q=q[i].copy(),
+                goal_quat=goal[i].copy(),
+                error_rad=float(error[i]),
+                success=bool(success[i]),
+                fell=bool(fell[i]),
+                goals=int(self.goals[i]),
+                drops=int(self.drops[i]),
+                terms=terms[i].copy(),
+            )
+            for i, world in enumerate(worlds)
+        ]
+
+
+def record(
+    env: Any, policy: Any, renderer: Renderer, worlds: Sequence[int], steps: int
+) -> Iterator[np.ndarray]:
+    """Reset, run a policy, and draw one frame after every control step.
+
+    Args:
+        env: The environment.
+        policy: With ``act(observation)``, torch in and out.
+        renderer: With one cell for each of ``worlds``.
+        worlds: Which worlds are drawn, length C.
+        steps: Control steps.
+
+    Yields:
+        Frames, RGB bytes [height, width, 3].
+    """
+    watcher = Watcher(env, worlds)
+    composer = Composer(env.reward_term_names, len(worlds))
+    env.reset()
+    for _ in range(steps):
+        act(env, policy)
+        snapshots = watcher.read()
+        pictures = renderer.render(
+            np.stack([one.joint_q for one in snapshots]), np.stack([one.goal_quat for one in snapshots])
+        )
+        yield composer.frame(pictures, snapshots)
+
+
+def act(env: Any, policy: Any) -> None:
+    """Make one control step with the policy's mean action."""
+    action = policy.act(wp.to_torch(env.observation))
+    env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
+
+
+class Composer:
+    """Puts pictures and numbers together, cell by cell, into frames.
+
+    Args:
+        term_names: Names of the reward terms, length T.
+        cells: C.
+    """
+
+    def __init__(self, term_names: Sequence[str], cells: int):
+        self.term_names = [name.replace("_", " ") for name in term_names]
+        self._largest = np.full(len(self.term_names), 1e-9)
+        self._errors: list[deque[float]] = [deque(maxlen=CURVE_STEPS) for _ in range(cells)]
+        self._flash = [(0, INK)] * cells
+
+    def frame(self, pictures: Sequence[Picture], snapshots: Sequence[Snapshot]) -> np.ndarray:
+        """One frame of all cells, in a grid that is as square as it gets.
+
+        Args:
+            pictures: C pictures.
+            snapshots: What they show.
+
+        Returns:
+            RGB bytes [height, width, 3], both even as video codecs want them.
+        """
+        self._largest = np.maximum(self._largest, np.max([np.abs(one.terms) for one in snapshots], axis=0))
+        cells = [self._cell(i, *pair) for i, pair in enumerate(zip(pictures, snapshots, strict=True))]
+        return _grid(cells, int(np.ceil(np.sqrt(len(cells)))))
+
+    def _cell(self, index: int, picture: Picture, shot: Snapshot) -> np.ndarray:
+        height, width = picture.scene.shape[:2]
+        canvas = Image.new("RGB", (width, height + STRIP_HEIGHT), STRIP)
+        canvas.paste(Image.fromarray(picture.scene), (0, 0))
+        draw = ImageDraw.Draw(canvas)
+        self._goal(canvas, draw, picture.goal)
+        self._edge(index, draw, shot, width, height)
+        self._errors[index].append(shot.error_rad)
+        top = height + MARGIN
+        third = (width - 4 * MARGIN) // 10
+        _numbers(draw, MARGIN, top, shot)
+        _curve(
+            draw,
+            (MARGIN + 3 * third, top, 2 * third + 2 * MARGIN, STRIP_HEIGHT - 2 * MARGIN),
+            self._errors[index],
+        )
+        self._bars(draw, 4 * MARGIN + 5 * third, top, width - MARGIN, shot)
+        return np.asarray(canvas)
+
+    def _goal(self, canvas: Image.Image, draw: ImageDraw.ImageDraw, goal: np.ndarray) -> None:
+        size = goal.shape[0]
+        left = canvas.width - size - MARGIN
+        canvas.paste(Image.fromarray(goal), (left, MARGIN))
+        draw.rectangle((left, MARGIN, left + size - 1, MARGIN + size - 1), outline=GOAL_EDGE, width=2)
+        draw.text((left + 7, MARGIN + 4), "goal", fill=GREEN, font=_font(13))
+
+    def _edge(self, index: int, draw: ImageDraw.ImageDraw, shot: Snapshot, width: int, height: int) -> None:
+        if shot.success or shot.fell:
+            self._flash[index] = (FLASH_STEPS, GREEN if shot.success else RED)
+        left, color = self._flash[index]
+        if left > 0:
+            draw.rectangle((0, 0, width - 1, height - 1), outline=color, width=5)
+            text = "goal reached" if color == GREEN else "dropped"
+            draw.text((MARGIN + 4, MARGIN), text, fill=color, font=_font(22))
+            self._flash[index] = (left - 1, color)
+
+    def _bars(self, draw: ImageDraw.ImageDraw, left: int, top: int, right: int, shot: Snapshot) -> None:
+        """Reward terms; each bar is relative to the largest value of its term so far."""
+        rows = max(1, (len(self.term_names) + 1) // 2)
+        pitch, column = (STRIP_HEIGHT - 2 * MARGIN) / rows, (right - left + MARGIN) // 2
+        font = _font(11 if column >= FULL_COLUMN else 9)
+        for i, (name, value) in enumerate(zip(self.term_names, shot.terms, strict=True)):
+            x, y = left + (i // rows) * column, top + (i % rows) * pitch
+            x0, x1 = x + int(NAME_SHARE * column), x + column - MARGIN
+            middle, half = (x0 + x1) / 2, (x1 - x0) / 2
+            draw.text((x, y), name, fill=SOFT, font=font)
+            draw.rectangle((x0, y + 3, x1, y + 11), fill=(236, 239, 243))
+            end = middle + half * float(np.clip(value / self._largest[i], -1.0, 1.0))
+            if abs(end - middle) >= 0.5:
+                color = BLUE if end > middle else RED
+                draw.rectangle((min(middle, end), y + 3, max(middle, end), y + 11), fill=color)
+            draw.line((middle, y + 2, middle, y + 12), fill=SOFT)
+
+
+def _numbers(draw: ImageDraw.ImageDraw, x: int, y: int, shot: Snapshot) -> None:
+    name = shot.name if len(shot.name) <= 22 else shot.name[:21] + "…"
+    within = shot.error_rad <= PAPER.success.rotation_rad
+    draw.text((x, y - 2), name, fill=INK, font=_font(14))
+    draw.text((x, y + 17), f"error {shot.error_rad:.2f} rad", fill=GREEN if within else INK, font=_font(18))
+    draw.text(
+        (x, y + 43),
+        f"{shot.time_s:.1f} s   goals {shot.goals}   drops {shot.drops}",
+        fill=SOFT,
+        font=_font(12),
+    )
+
+
+def _curve(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], errors: Sequence[float]) -> None:
+    """Error against time over the last episode length, from 0 to pi, with the success tolerance."""
+    x, y, width, height = box
+    draw.rectangle((x, y, x + width, y + height), fill=(255, 255, 255), outline=LINE)
+    tolerance = y + height * (1 - PAPER.success.rotation_rad / np.pi)
+    draw.line((x, tolerance, x + width, tolerance), fill=GOAL_EDGE)
+    points = [
+        (x + width * i / (CURVE_STEPS - 1), y + height * (1 - error / np.pi))
+        for i, error in enumerate(errors)
+    ]
+    if len(points) > 1:
+        draw.line(points, fill=BLUE, width=2)
+
+
+@lru_cache(maxsize=8)
+def _font(size: int) -> Any:
+    return ImageFont.load_default(size)
+
+
+def _grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
+    """Tile equal pictures in rows; the last row is filled with white, and the size made even."""
+    rows = -(-len(cells) // columns)
+    height, width = cells[0].shape[:2]
+    canvas = np.full(
+        (rows * height + rows * height % 2, columns * width + columns * width % 2, 3), 255, np.uint8
+    )
+    for i, cell in enumerate(cells):
+        y, x = (i // columns) * height, (i % columns) * width
+        canvas[y : y + height, x : x + width] = cell
+    return canvas
+
+
+def write_frames(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
+    """Write frames to a file, atomically, as they come.
+
+    Args:
+        path: ``.mp4`` (H.264, plays everywhere), ``.gif``, or ``.png`` for six moments side by side.
+        frames: RGB bytes [height, width, 3], all of one size.
+        fps: Frames per second.
+
+    Returns:
+        The number of frames taken.
+
+    Raises:
+        ValueError: Another suffix, or no frames.
+    """
+    path = Path(path)
+    writers = {".mp4": _write_mp4, ".gif": _write_gif, ".png": _write_sheet}
+    if path.suffix.lower() not in writers:
+        raise ValueError(f"{path}: cannot write '{path.suffix}' files; use {', '.join(writers)}")
+    with atomic_path(path) as temporary:
+        count = writers[path.suffix.lower()](temporary, frames, fps)
+        if count == 0:
+            raise ValueError(f"{path}: there are no frames to write")
+    return count
+
+
+def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
+    import imageio_ffmpeg
+
+    writer, count = None, 0
+    for frame in frames:
+        if writer is None:
+            writer = imageio_ffmpeg.write_frames(
+                str(path),
+                (frame.shape[1], frame.shape[0]),
+                fps=fps,
+                codec="libx264",
+                pix_fmt_out="yuv420p",
+                quality=None,
+                macro_block_size=2,
+                ffmpeg_log_level="error",
+                output_params=["-crf", str(VIDEO_CRF), "-movflags", "+faststart"],
+            )
+            writer.send(None)
+        writer.send(np.ascontiguousarray(frame))
+        count += 1
+    if writer is not None:
+        writer.close()
+    return count
+
+
+def _write_gif(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
+    images = [Image.fromarray(frame).quantize(dither=Image.Dither.NONE) for frame in frames]
+    if images:
+        images[0].save(
+            path, format="GIF", save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0
+        )
+    return len(images)
+
+
+def _write_sheet(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
+    taken = list(frames)
+    if taken:
+        chosen = np.unique(np.linspace(0, len(taken) - 1, SHEET_FRAMES).round().astype(int))
+        Image.fromarray(_grid([taken[i] for i in chosen], min(SHEET_COLUMNS, len(chosen)))).save(
+            path, format="PNG"
+        )
+    return len(taken)

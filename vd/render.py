@@ -1,0 +1,293 @@
+"""Pictures of the scene without a display or a GPU: Newton's ray-traced camera on a model of its own.
+
+The picture model is separate from the simulated one: it has the visual shapes, one *cell* for every world
+that is shown (hand, table, object), and for every cell a second world with the object alone in the goal's
+orientation. Joint positions are all it needs, so a recording can be drawn later, or elsewhere.
+
+World frame (z up, table top at z = 0), metres, radians, quaternions xyzw.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import newton
+import numpy as np
+import warp as wp
+from newton.sensors import SensorCamera
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_model import HandModel
+from vd.assets_usd.objects.model import ObjectModel
+from vd.paper import PAPER
+from vd.sim.cfg import SimCfg
+from vd.sim.scene import add_object, add_table, build_hand, hand_mount, new_builder
+
+# Packed as the renderer packs its bytes: A B G R.
+BACKGROUND = 0xFFEBE1D8
+GOAL_COLOR = (0.35, 0.68, 0.42)
+# Light direction in the camera's right, forward (level) and up: from the upper left behind the viewer, and
+# low enough to reach under the palm.
+LIGHT_DIRECTION = (0.35, 0.9, -0.8)
+SKY, GROUND = (0.42, 0.43, 0.46), (0.22, 0.21, 0.20)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera that looks at a point.
+
+    The default looks along +y and sees hand, table and object, a little from above.
+    """
+
+    eye: tuple[float, float, float] = (0.0, -0.5, 0.2)
+    """Position [m]."""
+    target: tuple[float, float, float] = (0.0, 0.0, 0.095)
+    """Point in the middle of the picture [m]."""
+    fov: float = math.radians(34.0)
+    """Vertical field of view [rad]."""
+
+    @staticmethod
+    def for_hand(hand: HandModel) -> "Camera":
+        """The default camera, turned about the vertical to look through the nearest gap between fingers."""
+        camera = Camera()
+        tips = hand.tip_poses(np.tile(PAPER.scene.reset_joint_rad, hand.num_fingers))[:, :3]
+        tips = Rotation.from_quat(hand_mount().q).apply(tips)
+        azimuth = np.sort(np.arctan2(tips[:, 1], tips[:, 0]))
+        gaps = azimuth + 0.5 * np.diff(azimuth, append=azimuth[0] + 2 * np.pi)
+        here = math.atan2(camera.eye[1], camera.eye[0])
+        turns = (gaps - here + np.pi) % (2 * np.pi) - np.pi
+        turn = Rotation.from_euler("z", turns[np.argmin(np.abs(turns))])
+        return replace(camera, eye=_vector(turn.apply(camera.eye)))
+
+    @cached_property
+    def rotation(self) -> np.ndarray:
+        """World from camera; the camera looks along -z, +x is right and +y is up. Shape [3, 3]."""
+        forward = np.asarray(self.target, dtype=float) - np.asarray(self.eye, dtype=float)
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(right, forward), -forward], axis=1)
+
+    @property
+    def transform(self) -> wp.transform:
+        """Pose in the world."""
+        return wp.transform(wp.vec3(*self.eye), wp.quat(*Rotation.from_matrix(self.rotation).as_quat()))
+
+    def project(self, points: np.ndarray, width: int, height: int) -> np.ndarray:
+        """Pixel coordinates (column, row) of world points, shape [n, 2].
+
+        Args:
+            points: World points [m], shape [n, 3], in front of the camera.
+            width: Picture width [pixel].
+            height: Picture height [pixel].
+        """
+        seen = (np.asarray(points, dtype=float) - np.asarray(self.eye)) @ self.rotation
+        scale = 0.5 * height / math.tan(0.5 * self.fov)
+        flat = seen[:, :2] / -seen[:, 2:]
+        return np.stack([0.5 * width + scale * flat[:, 0], 0.5 * height - scale * flat[:, 1]], axis=1)
+
+    def aimed_at(self, point: Sequence[float], radius: float, *, fill: float = 0.8) -> "Camera":
+        """A camera that looks in the same direction at a ball around ``point``, which fills the picture.
+
+        Args:
+            point: Centre [m].
+            radius: Of the ball [m].
+            fill: Share of the picture's height that the ball takes.
+        """
+        distance = radius / math.sin(math.atan(fill * math.tan(0.5 * self.fov)))
+        eye = np.asarray(point, dtype=float) + distance * self.rotation[:, 2]
+        return replace(self, eye=_vector(eye), target=_vector(point))
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What the camera saw of one cell, RGB bytes."""
+
+    scene: np.ndarray
+    """Hand and object, shape [height, width, 3]."""
+    goal: np.ndarray
+    """The object in the goal's orientation, seen from the same direction, shape [size, size, 3]."""
+
+
+class PictureModel:
+    """The model of what is shown: C cells, each with a hand (or none), a table and an object, and C goals.
+
+    Args:
+        hand: The hand; None shows objects alone.
+        objects: The object of each cell, length C.
+        device: Warp device.
+        ghost_in_scene: Put the goal's object into the cell, beside the hand, rather than in a world of
+            its own (for viewers that show one world).
+        ghost_offset: Where it stands then [m].
+    """
+
+    def __init__(
+        self,
+        hand: HandModel | None,
+        objects: Sequence[ObjectModel],
+        *,
+        device: str = "cpu",
+        ghost_in_scene: bool = False,
+        ghost_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ):
+        cfg = SimCfg()
+        self.cells, self.in_scene, self.ghost_offset = len(objects), ghost_in_scene, ghost_offset
+        self.hand_dofs = hand.num_joints if hand else 0
+        scene = new_builder()
+        ghosts = []
+        hand_builder = build_hand(hand, cfg, visuals=True) if hand else None
+        for item in objects:
+            world = new_builder()
+            if hand_builder:
+                world.add_builder(hand_builder)
+            add_table(world, cfg, visible=True)
+            add_object(world, item, cfg, scale=1.0, visuals=True)
+            ghost = world if ghost_in_scene else new_builder()
+            body = add_object(ghost, item, cfg, scale=1.0, visuals=True)
+            ghost.shape_color[ghost.body_shapes[body][-1]] = GOAL_COLOR
+            scene.add_world(world)
+            ghosts.append(ghost)
+        if not ghost_in_scene:
+            for ghost in ghosts:
+                scene.add_world(ghost)
+        self.model = scene.finalize(device=device)
+        self.state = self.model.state()
+
+    def pose(self, joint_q: np.ndarray, goal_quat: np.ndarray) -> None:
+        """Place hands, objects and goals.
+
+        Args:
+            joint_q: Hand joints [rad], object position [m] and quaternion xyzw, shape [C, D + 7].
+            goal_quat: Goal orientations xyzw, shape [C, 4].
+        """
+        goal = np.concatenate([np.tile(self.ghost_offset, (self.cells, 1)), goal_quat], axis=1)
+        if self.in_scene:
+            q = np.concatenate([joint_q, goal], axis=1)
+        else:
+            q = np.concatenate([np.ravel(joint_q), np.ravel(goal)])
+        self.state.joint_q.assign(np.ravel(q).astype(np.float32))
+        newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
+
+
+class Renderer:
+    """Draws cells of hand and object with the goal beside each.
+
+    Args:
+        hand: The hand; None shows objects alone.
+        objects: The object of each cell, length C.
+        width: Width of a cell's picture [pixel].
+        height: Height of a cell's picture [pixel].
+        goal_size: Side of the square picture of the goal [pixel].
+        camera: Where from.
+        samples: Rays a pixel; 4 smooths edges and takes about twice as long.
+        shadows: Cast shadows.
+        device: Warp device; the CPU is quick enough for video (see ``tests/test_render.py``).
+    """
+
+    def __init__(
+        self,
+        hand: HandModel | None,
+        objects: Sequence[ObjectModel],
+        *,
+        width: int = 640,
+        height: int = 400,
+        goal_size: int = 144,
+        camera: Camera | None = None,
+        samples: int = 1,
+        shadows: bool = True,
+        device: str = "cpu",
+    ):
+        self.width, self.height = width, height
+        self.camera = camera or (Camera.for_hand(hand) if hand else Camera())
+        self.pictured = PictureModel(hand, objects, device=device)
+        cells = len(objects)
+        self._sensor = SensorCamera(self.pictured.model)
+        self._sensor.create_default_light(enable_shadows=shadows, direction=_light(self.camera))
+        self._sensor.set_ambient_light(SKY, GROUND)
+        antialiasing = SensorCamera.AntiAliasing.MSAA if samples > 1 else SensorCamera.AntiAliasing.NONE
+        self._config = SensorCamera.RenderConfig(enable_shadows=shadows, anti_aliasing=antialiasing)
+        radius = max(float(np.linalg.norm(item.vertices, axis=1).max()) for item in objects)
+        goal_camera = self.camera.aimed_at((0.0, 0.0, 0.0), radius)
+        self._scene_view = _View(
+            self._sensor, self.camera, width, height, samples, range(cells), BACKGROUND, device
+        )
+        self._goal_view = _View(
+            self._sensor,
+            goal_camera,
+            goal_size,
+            goal_size,
+            samples,
+            range(cells, 2 * cells),
+            BACKGROUND,
+            device,
+        )
+
+    def render(self, joint_q: np.ndarray, goal_quat: np.ndarray) -> list[Picture]:
+        """Draw all cells.
+
+        Args:
+            joint_q: Hand joints [rad], object position [m] and quaternion xyzw, shape [C, D + 7].
+            goal_quat: Goal orientations xyzw, shape [C, 4].
+
+        Returns:
+            C pictures.
+        """
+        self.pictured.pose(joint_q, goal_quat)
+        state = self.pictured.state
+        self.pictured.model.bvh_refit_shapes(state)
+        scenes = self._scene_view.draw(state, self._config)
+        goals = self._goal_view.draw(state, self._config)
+        return [Picture(scene, goal) for scene, goal in zip(scenes, goals, strict=True)]
+
+
+def _vector(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _light(camera: Camera) -> wp.vec3:
+    right, backward = camera.rotation[:, 0], camera.rotation[:, 2] * [1.0, 1.0, 0.0]
+    forward = -backward / np.linalg.norm(backward)
+    direction = (
+        LIGHT_DIRECTION[0] * right + LIGHT_DIRECTION[1] * forward + LIGHT_DIRECTION[2] * np.array([0, 0, 1.0])
+    )
+    return wp.normalize(wp.vec3(*direction))
+
+
+class _View:
+    """One camera over several worlds, with its buffers."""
+
+    def __init__(
+        self,
+        sensor: SensorCamera,
+        camera: Camera,
+        width: int,
+        height: int,
+        samples: int,
+        worlds: Sequence[int],
+        background: int,
+        device: str,
+    ):
+        self._sensor = sensor
+        self._rays = SensorCamera.compute_camera_rays_pinhole(
+            width, height, camera_fov=camera.fov, sample_count=samples, device=device
+        )
+        self._transforms = wp.array([camera.transform] * len(worlds), dtype=wp.transformf, device=device)
+        self._worlds = wp.array(list(worlds), dtype=wp.int32, device=device)
+        self._image = sensor.allocate_image_color(len(worlds), width, height)
+        self._clear = SensorCamera.ClearData(clear_color=background)
+
+    def draw(self, state: newton.State, config: SensorCamera.RenderConfig) -> np.ndarray:
+        """RGB bytes of every world, shape [worlds, height, width, 3]."""
+        self._sensor.update(
+            state,
+            self._transforms,
+            self._rays,
+            color_image=self._image,
+            world_indices=self._worlds,
+            clear_data=self._clear,
+            render_config=config,
+        )
+        packed = self._image.numpy().copy()  # on the CPU a view of the buffer that the next frame overwrites
+        return packed.view(np.uint8).reshape(*packed.shape, 4)[..., :3]
