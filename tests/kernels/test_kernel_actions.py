@@ -3,7 +3,8 @@ import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, device_array, floats, settings_array, streams, unwritten
+from kernel_oracle import ALPHA, EXAMPLES, device_array, floats, settings_array, streams, unwritten
+from scipy import stats
 
 from vd.kernels.actions import (
     ActionParams,
@@ -74,6 +75,7 @@ def test_action_noise_has_the_moments_of_table_s3(device):
     )
     assert noise.mean() == pytest.approx(0.0, abs=5 * std / np.sqrt(noise.size))
     assert noise.std() == pytest.approx(std, rel=0.01)
+    assert stats.kstest(np.ravel(noise) / std, stats.norm.cdf).pvalue > ALPHA
     correlation = np.corrcoef(noise.T)
     assert np.abs(correlation - np.eye(9)).max() < 0.05, "joints share noise"
     assert np.abs(np.corrcoef(noise[:-1, 0], noise[1:, 0])[0, 1]) < 0.05, "neighbouring worlds share noise"

@@ -4,6 +4,7 @@ import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import (
+    ALPHA,
     EXAMPLES,
     device_array,
     floats,
@@ -16,6 +17,7 @@ from kernel_oracle import (
     transforms,
     unwritten,
 )
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from vd.kernels.observations import (
@@ -222,6 +224,7 @@ def test_noise_of_table_s3_on_measured_values_only(device, fingers):
     bound = 6 / np.sqrt(len(noise))
     np.testing.assert_allclose(noise.mean(axis=0), mean, atol=std * bound)
     np.testing.assert_allclose(noise.std(axis=0), std, rtol=bound)
+    assert stats.kstest((noise[:, 0] - mean) / std, stats.norm.cdf).pvalue > ALPHA
     assert np.abs(np.corrcoef(noise.T) - np.eye(mask.sum())).max() < bound, "values share noise"
     assert np.abs(np.corrcoef(noise[:50]) - np.eye(50)).max() < 0.7, "worlds share noise"
     assert not np.any(rng == streams(len(noise), 9, device).numpy()), "the streams did not advance"

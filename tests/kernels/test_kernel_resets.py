@@ -153,6 +153,8 @@ def test_starts_and_goals_are_uniform_and_independent(device):
     assert stats.kstest(after["error"], lambda a: ball_cdf(a, np.pi)).pvalue > ALPHA
     cross = np.corrcoef(np.hstack([start * np.sign(start[:, 3:]), goal * np.sign(goal[:, 3:])]).T)[:4, 4:]
     assert np.abs(cross).max() < 0.03, "goals depend on starts"
+    place_and_error = np.column_stack([after["q"][:, joints : joints + 3], after["error"]])
+    assert np.abs(np.corrcoef(place_and_error.T) - np.eye(4)).max() < 0.03, "the goal reuses numbers"
 
     again = World(device, worlds, seed=7).reset(everywhere, 0 * everywhere)
     assert all(after[name].tobytes() == again[name].tobytes() for name in after), (
