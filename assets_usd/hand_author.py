@@ -15,6 +15,7 @@ Units are USD's: limits in degrees, drive gains per degree, speed limits in degr
 The schemas of Newton are authored by name, so that no plug-in is needed.
 """
 
+import functools
 import hashlib
 import itertools
 import math
@@ -25,10 +26,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics, UsdShade, Vt
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.cache import assets_dir
-from vd.assets_usd.hand_meshes import Mesh, solid_mesh, surface_points
-from vd.assets_usd.hand_spec import (
-    HANDS,
-    TIP,
+from vd.assets_usd.hand_meshes import Mesh, place, solid_mesh, surface_points
+from vd.assets_usd.hand_schema import (
     Box,
     Capsule,
     Collider,
@@ -42,6 +41,7 @@ from vd.assets_usd.hand_spec import (
     SurfaceSpec,
     Visual,
 )
+from vd.assets_usd.hand_spec import HANDS, TIP
 from vd.files import atomic_path
 
 POINTS_PER_LINK = 500
@@ -119,9 +119,9 @@ def _author(spec: HandSpec) -> Usd.Stage:
         _colliders(stage, base_prim.GetPath(), f"f{finger}_", spec.motor.colliders, frame, spec)
         drawn[f"f{finger}_motor"] = (spec.motor.visuals, frame)
     for name, (visuals, frame) in drawn.items():
-        meshes = _visuals(stage, base_prim.GetPath(), f"{name}_", visuals, frame, spec)
+        _visuals(stage, base_prim.GetPath(), f"{name}_", visuals, frame, spec)
         if name != "palm":
-            _points(stage, base_prim.GetPath().AppendChild(f"{name}_points"), meshes)
+            _points(stage, base_prim.GetPath().AppendChild(f"{name}_points"), visuals, frame)
     _camera(stage, base_prim.GetPath().AppendChild("camera"), spec)
 
     for finger, frame in enumerate(spec.finger_frames):
@@ -144,8 +144,8 @@ def _finger(stage: Usd.Stage, spec: HandSpec, finger: int, frame: Pose) -> None:
         name = f"f{finger}_{link.name}"
         prim = _body(stage, root.AppendChild(name), pose, link.mass, link.com, np.diag(link.inertia))
         _colliders(stage, prim.GetPath(), "", link.colliders, Pose(), spec)
-        meshes = _visuals(stage, prim.GetPath(), "", link.visuals, Pose(), spec)
-        _points(stage, prim.GetPath().AppendChild("points"), meshes)
+        _visuals(stage, prim.GetPath(), "", link.visuals, Pose(), spec)
+        _points(stage, prim.GetPath().AppendChild("points"), link.visuals, Pose())
         _joint(stage, root, f"f{finger}_{joint.name}", joint, parent, name, anchor)
         parent, parent_frame = name, pose
     site = UsdGeom.Sphere.Define(stage, root.AppendPath(f"{parent}/f{finger}_tip"))
@@ -271,21 +271,24 @@ def _colliders(
         _bind(stage, prim, spec, "fingertip_surface" if collider.fingertip else "surface", physics=True)
 
 
+@functools.cache
+def _drawing(visuals: tuple[Visual, ...]) -> tuple[tuple[Mesh, ...], np.ndarray]:
+    """Meshes of a link's parts and its surface samples, in its own frame: the same for every finger."""
+    meshes = tuple(solid_mesh(visual.solid) for visual in visuals)
+    return meshes, surface_points(meshes, POINTS_PER_LINK)
+
+
 def _visuals(
     stage: Usd.Stage, link: Sdf.Path, prefix: str, visuals: tuple[Visual, ...], frame: Pose, spec: HandSpec
-) -> list[Mesh]:
-    """The drawing of a link placed in ``frame``: one mesh per material; returns the parts."""
+) -> None:
+    """The drawing of a link placed in ``frame``: one mesh per material."""
     group = UsdGeom.Scope.Define(stage, link.AppendChild("visual"))
-    turn, shift = Rotation.from_quat(frame.quaternion), np.asarray(frame.position)
-    parts = []
-    for visual in visuals:
-        mesh = solid_mesh(visual.solid)
-        parts.append((visual.material, Mesh(turn.apply(mesh.vertices) + shift, mesh.faces)))
-    for material in dict.fromkeys(name for name, _ in parts):
-        meshes = [mesh for name, mesh in parts if name == material]
+    parts, _ = _drawing(visuals)
+    for material in dict.fromkeys(visual.material for visual in visuals):
+        meshes = [mesh for mesh, visual in zip(parts, visuals, strict=True) if visual.material == material]
         starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
         faces = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=True)])
-        vertices = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32)
+        vertices = place(np.concatenate([mesh.vertices for mesh in meshes]), frame).astype(np.float32)
         prim = UsdGeom.Mesh.Define(stage, group.GetPath().AppendChild(prefix + material))
         prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(vertices))
         prim.CreateFaceVertexCountsAttr(Vt.IntArray(len(faces), 3))
@@ -293,14 +296,13 @@ def _visuals(
         prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         prim.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(prim.GetPointsAttr().Get()))
         _bind(stage, prim.GetPrim(), spec, material, physics=False)
-    return [mesh for _, mesh in parts]
 
 
-def _points(stage: Usd.Stage, path: Sdf.Path, meshes: list[Mesh]) -> None:
+def _points(stage: Usd.Stage, path: Sdf.Path, visuals: tuple[Visual, ...], frame: Pose) -> None:
     """Surface samples of a link, which no viewer draws and no simulator reads as particles."""
-    samples = surface_points(meshes, POINTS_PER_LINK).astype(np.float32)
+    _, samples = _drawing(visuals)
     prim = UsdGeom.Points.Define(stage, path)
-    prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(samples))
+    prim.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(place(samples, frame).astype(np.float32)))
     prim.CreateWidthsAttr([POINT_WIDTH])
     prim.SetWidthsInterpolation(UsdGeom.Tokens.constant)
     prim.CreatePurposeAttr(UsdGeom.Tokens.guide)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_spec import Box, Capsule, Cylinder, Pose, Solid, Sphere, Taper
+from vd.assets_usd.hand_schema import Box, Capsule, Cylinder, Pose, Solid, Sphere, Taper
 
 SEGMENTS = 24
 """Corners of a drawn circle: 1 % of the radius off at most."""

@@ -1,236 +1,37 @@
-"""The two D'Claw hands as typed data: the one place where hand numbers are written down.
+"""The two D'Claw hands as data: the one place where hand numbers are written down.
 
 Everything downstream (simulator, training, deployment) reads the USD that
-:mod:`vd.assets_usd.hand_author` writes from this description, never this description itself.
-
-Units are SI and radians, quaternions are xyzw. The **base frame** has its origin on the outer
-face of the palm and +z along the straight fingers. The **finger frame** of a finger sits on its
-first joint, z along base z and x along the finger's heading; the frames of its three links coincide
-with it in orientation when all joints are zero. +q1 (about +x) moves the tip clockwise about
-base +z, +q2 and +q3 (about +y) move it outward, for both hands.
+:mod:`vd.assets_usd.hand_author` writes from this description, never this description itself. Units
+and frames are those of :mod:`vd.assets_usd.hand_schema`. For both hands +q1 (about +x of the finger
+frame) moves the tip clockwise about base +z, +q2 and +q3 (about +y) move it outward.
 
 Tags: [U] four-finger URDF of a public fork of the released code, [R] ROBEL D'Claw, [C] released
 code, [P] paper, [D] derived here (the derivation is given), [A] our assumption, no source known.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from math import pi, radians
+from math import cos, pi, radians, sin
 from types import MappingProxyType
-from typing import Literal
 
-import numpy as np
-
-Axis = Literal["X", "Y", "Z"]
-Vec3 = tuple[float, float, float]
-Quat = tuple[float, float, float, float]
-
-IDENTITY: Quat = (0.0, 0.0, 0.0, 1.0)
-
-
-@dataclass(frozen=True)
-class Pose:
-    """A rigid transform: position [m] and unit quaternion xyzw."""
-
-    position: Vec3 = (0.0, 0.0, 0.0)
-    quaternion: Quat = IDENTITY
-
-
-@dataclass(frozen=True)
-class Box:
-    """A box of full extents ``size`` [m]; ``bevel`` [m] cuts its edges (drawing only)."""
-
-    size: Vec3
-    pose: Pose = Pose()
-    bevel: float = 0.0
-
-
-@dataclass(frozen=True)
-class Sphere:
-    """A sphere."""
-
-    radius: float
-    pose: Pose = Pose()
-
-
-@dataclass(frozen=True)
-class Capsule:
-    """A capsule; ``length`` [m] is the distance between the centres of its hemispheres."""
-
-    radius: float
-    length: float
-    pose: Pose = Pose()
-    axis: Axis = "Z"
-
-
-@dataclass(frozen=True)
-class Cylinder:
-    """A cylinder of full height ``length`` [m]; ``bevel`` [m] cuts its rims (drawing only)."""
-
-    radius: float
-    length: float
-    pose: Pose = Pose()
-    axis: Axis = "Z"
-    bevel: float = 0.0
-
-
-@dataclass(frozen=True)
-class Taper:
-    """A solid between a rectangle (``size`` [m], at z = 0) and a circle (``radius`` at z = ``length``)."""
-
-    size: tuple[float, float]
-    radius: float
-    length: float
-    pose: Pose = Pose()
-
-
-Primitive = Box | Sphere | Capsule | Cylinder
-Solid = Primitive | Taper
-
-
-@dataclass(frozen=True)
-class Collider:
-    """A collision primitive in its link's frame; ``fingertip`` marks the part that the variant swaps."""
-
-    name: str
-    shape: Primitive
-    fingertip: bool = False
-
-
-@dataclass(frozen=True)
-class Visual:
-    """A drawn solid in its link's frame, in one of the materials of :attr:`HandSpec.colors`."""
-
-    solid: Solid
-    material: str
-
-
-@dataclass(frozen=True)
-class LinkSpec:
-    """A rigid link: mass [kg], centre of mass [m] and diagonal inertia about it [kg m^2], link frame."""
-
-    name: str
-    mass: float
-    com: Vec3
-    inertia: Vec3
-    colliders: tuple[Collider, ...]
-    visuals: tuple[Visual, ...]
-
-
-@dataclass(frozen=True)
-class JointSpec:
-    """A revolute joint with a position drive.
-
-    Attributes:
-        name: Suffix of the joint's name, e.g. ``j1``.
-        axis: Axis of the link frame; positive by the right-hand rule.
-        offset: Joint origin in the parent link's frame [m].
-        lower: Lower limit [rad].
-        upper: Upper limit [rad].
-        kp: Drive stiffness [N m/rad].
-        kd: Drive damping [N m s/rad].
-        effort: Torque limit of the drive [N m].
-        velocity: Speed limit [rad/s].
-        armature: Inertia of the rotor about the joint axis [kg m^2].
-    """
-
-    name: str
-    axis: Axis
-    offset: Vec3
-    lower: float
-    upper: float
-    kp: float
-    kd: float
-    effort: float
-    velocity: float
-    armature: float
-
-
-@dataclass(frozen=True)
-class SurfaceSpec:
-    """Contact surface: friction and restitution coefficients, and contact compliance.
-
-    ``stiffness`` and ``damping`` are Newton's contact gains, which SolverMuJoCo turns into the
-    constraint's time constant 2/damping [s] and damping ratio damping/(2 sqrt(stiffness)).
-    """
-
-    friction: float
-    restitution: float
-    stiffness: float
-    damping: float
-
-
-@dataclass(frozen=True)
-class FingertipSpec:
-    """One kind of fingertip: its surface and its display colour (linear RGB)."""
-
-    surface: SurfaceSpec
-    color: Vec3
-
-
-@dataclass(frozen=True)
-class CameraSpec:
-    """A pinhole camera.
-
-    Attributes:
-        width: Image width [px].
-        height: Image height [px].
-        fx: Horizontal focal length [px].
-        fy: Vertical focal length [px].
-        cx: Principal point, from the left edge of the image [px].
-        cy: Principal point, from the top edge of the image [px].
-        near: Nearest depth [m].
-        far: Farthest depth [m].
-        pose: Optical frame (x right, y down, z forward) in the base frame.
-    """
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    near: float
-    far: float
-    pose: Pose
-
-
-@dataclass(frozen=True)
-class HandSpec:
-    """A hand of identical three-joint fingers.
-
-    Attributes:
-        name: Name of the hand and of its root prim.
-        palm: Colliders, drawing and inertia of the bare palm (link ``base``).
-        motor: The first motor of a finger, fixed to the palm; in the finger frame.
-        finger_frames: First-joint frame of each finger in the base frame.
-        joints: The three joints of a finger, from the palm.
-        links: The three links of a finger, from the palm.
-        tip: Position of the fingertip site in the last link's frame [m].
-        surface: Contact surface of everything but the fingertips.
-        fingertips: The kinds of fingertip, by name; the first is the default.
-        contact_gap: Distance at which contacts are looked for [m].
-        colors: Display colour of each drawn material, linear RGB.
-        camera: The depth camera.
-        unreachable: Pairs of links, by name, that are not neighbours and yet cannot touch within the limits.
-        note: What the description deviates in from its sources.
-    """
-
-    name: str
-    palm: LinkSpec
-    motor: LinkSpec
-    finger_frames: tuple[Pose, ...]
-    joints: tuple[JointSpec, JointSpec, JointSpec]
-    links: tuple[LinkSpec, LinkSpec, LinkSpec]
-    tip: Vec3
-    surface: SurfaceSpec
-    fingertips: Mapping[str, FingertipSpec]
-    contact_gap: float
-    colors: Mapping[str, Vec3]
-    camera: CameraSpec
-    unreachable: tuple[tuple[str, str], ...]
-    note: str
-
+from vd.assets_usd.hand_schema import (
+    Axis,
+    Box,
+    CameraSpec,
+    Capsule,
+    Collider,
+    Cylinder,
+    FingertipSpec,
+    HandSpec,
+    JointSpec,
+    LinkSpec,
+    Pose,
+    Quat,
+    Solid,
+    SurfaceSpec,
+    Taper,
+    Vec3,
+    Visual,
+)
 
 # --- Finger, common to both hands ([U] via task facts 2.1; L is the distance along the finger) ---
 
@@ -424,12 +225,12 @@ CAMERA = CameraSpec(
 
 def _about_z(angle: float) -> Quat:
     """Rotation by ``angle`` [rad] about z."""
-    return (0.0, 0.0, float(np.sin(angle / 2)), float(np.cos(angle / 2)))
+    return (0.0, 0.0, sin(angle / 2), cos(angle / 2))
 
 
 def _finger_frame(heading: float, offset: Vec3) -> Pose:
     """The frame at ``offset`` [m] of a frame that is turned by ``heading`` [rad] about base z."""
-    c, s = float(np.cos(heading)), float(np.sin(heading))
+    c, s = cos(heading), sin(heading)
     x, y, z = offset
     return Pose((c * x - s * y, s * x + c * y, z), _about_z(heading))
 
@@ -452,6 +253,16 @@ def _palm(mass: float, collider: Box, drawing: Solid) -> LinkSpec:
     )
 
 
+def _pairs(fingers: int, *relations: tuple[str, str, int]) -> tuple[tuple[str, str], ...]:
+    """Link pairs of all fingers: link ``a`` of finger k with link ``b`` of finger k + ``step``."""
+    names = [
+        tuple(sorted((f"f{k}_{a}", f"f{(k + step) % fingers}_{b}")))
+        for a, b, step in relations
+        for k in range(fingers)
+    ]
+    return tuple(dict.fromkeys((first, second) for first, second in names))
+
+
 PLATE_SIDE, PLATE_THICKNESS = 0.260, 0.00635  # [U]
 _PLATE = _box((-PLATE_SIDE / 2, PLATE_SIDE / 2), (-PLATE_SIDE / 2, PLATE_SIDE / 2), (0.0, PLATE_THICKNESS))
 _DCLAW4_HEADINGS = tuple(radians(d) for d in (-105.31, -15.31, 74.69, 164.69))  # [U] one, two, three, four
@@ -468,7 +279,18 @@ DCLAW4 = HandSpec(
     contact_gap=CONTACT_GAP,
     colors=COLORS,
     camera=CAMERA,
-    unreachable=(),
+    # [D] least distance of the colliders over the joint limits, by random search with refinement, in mm
+    unreachable=_pairs(
+        4,
+        ("l1", "l3", 0),  # 7.9
+        ("l1", "l1", 1),  # 57
+        ("l2", "l1", 1),  # 43: the pinwheel turns a finger away from one of its neighbours
+        ("l3", "l1", 1),  # 39
+        ("l1", "l1", 2),  # 145
+        ("l1", "l2", 2),  # 78
+        ("l1", "l3", 2),  # 8.3
+        ("l2", "l2", 2),  # 12
+    ),
     note="The URDF's residual tilt of 0.54 degrees per finger (rpy 1.5802 for 1.5708) is dropped.",
 )
 
@@ -493,7 +315,7 @@ DCLAW3 = HandSpec(
     contact_gap=CONTACT_GAP,
     colors=COLORS,
     camera=CAMERA,
-    unreachable=(),
+    unreachable=_pairs(3, ("l1", "l3", 0), ("l1", "l1", 1)),  # [D] 7.9 and 23 mm, as for dclaw4
     note=(
         "The paper's own three-finger model is not public: ROBEL's palm carries the fingers of dclaw4. "
         "Positive J2 and J3 move the tip outward as in dclaw4; ROBEL's own sign is the opposite, and its "

@@ -1,0 +1,217 @@
+"""A hand as its readers see it: arrays, names and kinematics, without USD.
+
+Units are SI and radians, quaternions are xyzw. Frames: the base frame is that of link ``base``; a
+pose is a row ``(x, y, z, qx, qy, qz, qw)``.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel:
+    """A pinhole camera fixed to the base.
+
+    Attributes:
+        width: Image width [px].
+        height: Image height [px].
+        fx: Horizontal focal length [px].
+        fy: Vertical focal length [px].
+        cx: Principal point, from the left edge of the image [px].
+        cy: Principal point, from the top edge of the image [px].
+        near: Nearest depth [m].
+        far: Farthest depth [m].
+        position: Origin of the optical frame in the base frame [3] [m].
+        quaternion: Optical frame (x right, y down, z forward) in the base frame, xyzw [4].
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    near: float
+    far: float
+    position: np.ndarray
+    quaternion: np.ndarray
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The intrinsic matrix [3, 3] [px]."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixel (u, v) and depth [m] of points [.., 3] [m] of the base frame, as [.., 3].
+
+        A point behind the camera has a negative depth, and pixels without a meaning.
+        """
+        points = np.asarray(points, dtype=float)
+        flat = (points - self.position).reshape(-1, 3)
+        optical = Rotation.from_quat(self.quaternion).inv().apply(flat)
+        image = optical @ self.matrix.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            pixels = image[:, :2] / image[:, 2:]
+        return np.concatenate([pixels, image[:, 2:]], axis=1).reshape(points.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class CollisionShape:
+    """A collision primitive.
+
+    Attributes:
+        path: Prim path, which is also the label of the shape in Newton.
+        link: Index of its link.
+        kind: ``box``, ``sphere``, ``capsule`` or ``cylinder``.
+        size: Half extents of a box; (radius,) of a sphere; (radius, half the length without the caps)
+            of a capsule; (radius, half height) of a cylinder [m]. The last two lie along z of ``frame``.
+        frame: Pose in the link frame [7].
+        friction: Coefficient of (dynamic) friction.
+        restitution: Coefficient of restitution.
+        stiffness: Newton's contact stiffness.
+        damping: Newton's contact damping.
+        gap: Distance at which contacts are looked for [m].
+        fingertip: Whether its material is that of the fingertip variant.
+    """
+
+    path: str
+    link: int
+    kind: str
+    size: tuple[float, ...]
+    frame: np.ndarray
+    friction: float
+    restitution: float
+    stiffness: float
+    damping: float
+    gap: float
+    fingertip: bool
+
+
+@dataclass(frozen=True, eq=False)
+class HandModel:
+    """A hand as read from USD; F fingers, D = 3F joints, L = D + 1 links (``base`` is link 0).
+
+    Joints and links are ordered by finger and from the palm: ``f0_j1, f0_j2, f0_j3, f1_j1, ...``.
+
+    Attributes:
+        name: Name of the hand.
+        fingertip: Selected kind of fingertip.
+        path: The file it was read from.
+        num_fingers: F.
+        link_names: Names of the links [L].
+        joint_names: Names of the joints [D].
+        joint_parent: Index of each joint's parent link [D].
+        joint_child: Index of each joint's child link [D].
+        joint_axis: Unit axis in both joint frames [D, 3].
+        joint_parent_frame: Pose of the joint frame in the parent link [D, 7].
+        joint_child_frame: Pose of the joint frame in the child link [D, 7].
+        lower: Lower limits [D] [rad].
+        upper: Upper limits [D] [rad].
+        kp: Drive stiffness [D] [N m/rad].
+        kd: Drive damping [D] [N m s/rad].
+        effort: Torque limits [D] [N m].
+        velocity_limit: Speed limits [D] [rad/s].
+        armature: Rotor inertia about each axis [D] [kg m^2].
+        link_mass: Masses [L] [kg].
+        link_com: Centres of mass in the link frames [L, 3] [m].
+        link_inertia: Inertia about the centre of mass in the link frames [L, 3, 3] [kg m^2].
+        tip_names: Names of the fingertip sites [F].
+        tip_link: Index of the link of each site [F].
+        tip_frame: Pose of each site in its link [F, 7].
+        camera: The depth camera.
+        point_names: What each set of surface samples covers [P]; ``f0_motor, f0_l1, f0_l2, f0_l3, ...``.
+            P = 4F: the palm itself is not sampled, as in the paper's released code.
+        point_link: Link whose frame each set is in [P]; the first motors are fixed to link 0.
+        link_points: Surface samples [P, 500, 3] [m].
+        shapes: Collision primitives.
+        filtered_pairs: Pairs of links (lower index first) that never collide.
+    """
+
+    name: str
+    fingertip: str
+    path: Path
+    num_fingers: int
+    link_names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    joint_parent: np.ndarray
+    joint_child: np.ndarray
+    joint_axis: np.ndarray
+    joint_parent_frame: np.ndarray
+    joint_child_frame: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    kp: np.ndarray
+    kd: np.ndarray
+    effort: np.ndarray
+    velocity_limit: np.ndarray
+    armature: np.ndarray
+    link_mass: np.ndarray
+    link_com: np.ndarray
+    link_inertia: np.ndarray
+    tip_names: tuple[str, ...]
+    tip_link: np.ndarray
+    tip_frame: np.ndarray
+    camera: CameraModel
+    point_names: tuple[str, ...]
+    point_link: np.ndarray
+    link_points: np.ndarray
+    shapes: tuple[CollisionShape, ...]
+    filtered_pairs: tuple[tuple[int, int], ...]
+
+    @property
+    def num_joints(self) -> int:
+        """D."""
+        return len(self.joint_names)
+
+    def forward_kinematics(self, q: np.ndarray) -> np.ndarray:
+        """Poses of all links in the base frame.
+
+        Args:
+            q: Joint positions [.., D] [rad].
+
+        Returns:
+            Poses [.., L, 7].
+
+        Raises:
+            ValueError: The last axis of ``q`` is not D long.
+        """
+        q = np.asarray(q, dtype=float)
+        if q.shape[-1:] != (self.num_joints,):
+            raise ValueError(
+                f"{self.name}: q has shape {q.shape}; its last axis must be {self.num_joints} joints"
+            )
+        batch = q.shape[:-1]
+        flat = q.reshape(-1, self.num_joints)
+        poses = np.empty((len(flat), len(self.link_names), 7))
+        poses[:, 0] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+        for joint in range(self.num_joints):  # parents come before their children
+            turn = Rotation.from_rotvec(flat[:, joint, None] * self.joint_axis[joint]).as_quat()
+            motion = np.concatenate([np.zeros((len(flat), 3)), turn], axis=1)
+            pose = compose(poses[:, self.joint_parent[joint]], self.joint_parent_frame[joint])
+            pose = compose(compose(pose, motion), invert(self.joint_child_frame[joint]))
+            poses[:, self.joint_child[joint]] = pose
+        return poses.reshape(*batch, len(self.link_names), 7)
+
+    def tip_poses(self, q: np.ndarray) -> np.ndarray:
+        """Poses of the fingertip sites in the base frame, [.., F, 7], for ``q`` [.., D] [rad]."""
+        return compose(self.forward_kinematics(q)[..., self.tip_link, :], self.tip_frame)
+
+
+def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Poses ``first * second``; [.., 7] each, broadcast against each other."""
+    first, second = np.broadcast_arrays(np.asarray(first, dtype=float), np.asarray(second, dtype=float))
+    a, b = first.reshape(-1, 7), second.reshape(-1, 7)
+    turn = Rotation.from_quat(a[:, 3:])
+    moved = turn.apply(b[:, :3]) + a[:, :3]
+    return np.concatenate([moved, (turn * Rotation.from_quat(b[:, 3:])).as_quat()], axis=1).reshape(
+        first.shape
+    )
+
+
+def invert(pose: np.ndarray) -> np.ndarray:
+    """The inverse of one pose [7]."""
+    turn = Rotation.from_quat(pose[3:]).inv()
+    return np.concatenate([-turn.apply(pose[:3]), turn.as_quat()])

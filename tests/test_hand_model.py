@@ -1,0 +1,370 @@
+"""The hands as read from USD, against numbers typed in here from the published tables."""
+
+from collections.abc import Callable
+from math import cos, radians, sin
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
+from scipy.optimize import minimize
+
+from vd.assets_usd.hand_author import hand_usd
+from vd.assets_usd.hand_model import HandError, HandModel, open_stage, read_hand
+
+HANDS = ("dclaw3", "dclaw4")
+FINGERTIPS = ("rigid", "soft")
+
+# First joint of each finger: heading [deg], and position in the finger's heading frame [m].
+HEADINGS = {"dclaw3": (-60.0, 60.0, 180.0), "dclaw4": (-105.31, -15.31, 74.69, 164.69)}
+FIRST_JOINT = {"dclaw3": (0.060, 0.0, 0.01725), "dclaw4": (0.0878, -0.0375, 0.0206)}
+SPACING, TIP = 0.0685, 0.075
+LOWER, UPPER = (-0.45, -2.0, -2.0), (1.35, 2.0, 2.0)
+RESET = (0.0, 0.8, -1.1)
+
+
+@pytest.fixture(scope="module", params=HANDS)
+def hand(request: pytest.FixtureRequest) -> HandModel:
+    return read_hand(hand_usd(request.param))
+
+
+@pytest.fixture(scope="module")
+def four_fingers() -> HandModel:
+    return read_hand(hand_usd("dclaw4"))
+
+
+def rot_x(a: float) -> np.ndarray:
+    return np.array([[1, 0, 0], [0, cos(a), -sin(a)], [0, sin(a), cos(a)]])
+
+
+def rot_y(a: float) -> np.ndarray:
+    return np.array([[cos(a), 0, sin(a)], [0, 1, 0], [-sin(a), 0, cos(a)]])
+
+
+def rot_z(a: float) -> np.ndarray:
+    return np.array([[cos(a), -sin(a), 0], [sin(a), cos(a), 0], [0, 0, 1]])
+
+
+def matrix(q: np.ndarray) -> np.ndarray:
+    x, y, z, w = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def table_tips(name: str, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [F, 3] and rotation matrices [F, 3, 3] of the tips from the tables."""
+    positions, rotations = [], []
+    for finger, heading in enumerate(HEADINGS[name]):
+        q1, q2, q3 = q[3 * finger : 3 * finger + 3]
+        turn = rot_z(radians(heading))
+        swing, bend, curl = rot_x(q1), rot_x(q1) @ rot_y(q2), rot_x(q1) @ rot_y(q2) @ rot_y(q3)
+        reach = swing @ (0, 0, SPACING) + bend @ (0, 0, SPACING) + curl @ (0, 0, TIP)
+        positions.append(turn @ (np.array(FIRST_JOINT[name]) + reach))
+        rotations.append(turn @ curl)
+    return np.array(positions), np.array(rotations)
+
+
+def assert_tips(hand: HandModel, q: np.ndarray) -> None:
+    positions, rotations = table_tips(hand.name, q)
+    poses = hand.tip_poses(q)
+    np.testing.assert_allclose(poses[:, :3], positions, atol=1e-7)
+    np.testing.assert_allclose([matrix(p[3:]) for p in poses], rotations, atol=2e-6)
+
+
+def test_names_and_order(hand: HandModel) -> None:
+    fingers = len(HEADINGS[hand.name])
+    assert hand.num_fingers == fingers
+    assert hand.joint_names == tuple(f"f{f}_j{j}" for f in range(fingers) for j in (1, 2, 3))
+    assert hand.link_names == ("base", *(f"f{f}_l{i}" for f in range(fingers) for i in (1, 2, 3)))
+    assert hand.tip_names == tuple(f"f{f}_tip" for f in range(fingers))
+    assert [hand.link_names[i] for i in hand.tip_link] == [f"f{f}_l3" for f in range(fingers)]
+
+
+def test_tips_at_reset_pose(hand: HandModel) -> None:
+    assert_tips(hand, np.tile(RESET, hand.num_fingers))
+
+
+def test_four_fingers_reset_as_in_released_code(four_fingers: HandModel) -> None:
+    """Radius 0.120 m and world height 0.0415 m; the dropped tilt of 0.54 degrees is worth about 1 mm."""
+    tips = four_fingers.tip_poses(np.tile(RESET, 4))
+    np.testing.assert_allclose(np.hypot(tips[:, 0], tips[:, 1]), 0.120, atol=0.0015)
+    np.testing.assert_allclose(0.25 - tips[:, 2], 0.0415, atol=0.0005)
+    straight = four_fingers.tip_poses(np.zeros(12))
+    np.testing.assert_allclose(0.25 - straight[:, 2], 0.0174, atol=0.0005)
+
+
+@settings(max_examples=30, deadline=None)
+@given(npst.arrays(float, 12, elements=st.floats(0.0, 1.0)))
+def test_tips_at_any_pose(hand: HandModel, unit: np.ndarray) -> None:
+    unit = unit.reshape(4, 3)[: hand.num_fingers]
+    q = (np.array(LOWER) + unit * (np.array(UPPER) - LOWER)).ravel()
+    assert_tips(hand, q)
+
+
+def test_kinematics_of_a_batch(hand: HandModel) -> None:
+    q = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 3, hand.num_joints))
+    poses = hand.forward_kinematics(q)
+    assert poses.shape == (2, 3, len(hand.link_names), 7)
+    np.testing.assert_allclose(poses[1, 2], hand.forward_kinematics(q[1, 2]), atol=1e-12)
+    with pytest.raises(ValueError, match="last axis must be"):
+        hand.forward_kinematics(np.zeros(hand.num_joints + 1))
+
+
+@pytest.mark.parametrize(("joint", "direction"), [(0, "clockwise"), (1, "outward"), (2, "outward")])
+def test_sign_of_each_joint(hand: HandModel, joint: int, direction: str) -> None:
+    reset = np.tile(RESET, hand.num_fingers)
+    before = hand.tip_poses(reset)[:, :3]
+    for finger in range(hand.num_fingers):
+        moved = reset.copy()
+        moved[3 * finger + joint] += 1e-4
+        step = hand.tip_poses(moved)[:, :3] - before
+        others = np.delete(np.arange(hand.num_fingers), finger)
+        assert not step[others].any()
+        # In the heading frame of the finger: x outward, y counter-clockwise about base +z.
+        outward, counterclockwise, _ = rot_z(-radians(HEADINGS[hand.name][finger])) @ step[finger] / 1e-4
+        if direction == "clockwise":
+            # tip below the axis by 68.5 + 68.5 cos 0.8 + 75 cos 0.3 mm
+            assert counterclockwise == pytest.approx(-0.18787, abs=1e-4)
+        else:
+            assert outward > 0.07
+            assert abs(counterclockwise) < 1e-6
+        radius = np.hypot(*before[finger, :2])
+        spin = np.cross(before[finger], step[finger])[2] / radius
+        gain = before[finger, :2] @ step[finger, :2] / radius
+        assert spin < 0 if direction == "clockwise" else gain > 0
+
+
+def test_limits_gains_and_masses(hand: HandModel) -> None:
+    fingers = hand.num_fingers
+    for values, per_finger in (
+        (hand.lower, LOWER),
+        (hand.upper, UPPER),
+        (hand.kp, (2.772, 3.559, 3.559)),
+        (hand.kd, (0.2739, 0.3824, 0.3824)),
+        (hand.effort, (2.6, 2.6, 2.6)),
+        (hand.velocity_limit, (6.552, 7.759, 7.759)),
+        (hand.armature, (0.001, 0.001, 0.001)),
+        (hand.link_mass[1:], (0.093, 0.093, 0.025)),
+        (hand.link_com[1:, 2], (0.0505, 0.0505, 0.0409)),
+    ):
+        np.testing.assert_allclose(values, np.tile(per_finger, fingers), rtol=1e-6)
+    np.testing.assert_array_equal(hand.link_com[1:, :2], 0.0)
+    # About the finger axis, about the joint axis of k2 and k3, and about the third.
+    inertia = np.array(
+        [(1.001e-5, 1.345e-5, 1.336e-5), (1.001e-5, 1.176e-5, 1.505e-5), (5.03e-6, 7.84e-6, 1.034e-5)]
+    )
+    got = hand.link_inertia[1:].reshape(fingers, 3, 3, 3)
+    np.testing.assert_allclose(
+        got, np.broadcast_to([np.diag(i[::-1]) for i in inertia], got.shape), rtol=1e-6
+    )
+    palm = {"dclaw3": 0.110, "dclaw4": 0.124}[hand.name]
+    assert hand.link_mass[0] == pytest.approx(palm + 0.093 * fingers, rel=1e-6)
+    assert np.all(np.linalg.eigvalsh(hand.link_inertia[0]) > 0)
+
+
+def test_base_is_symmetric_under_its_fingers(hand: HandModel) -> None:
+    """Turning the base by the angle between fingers changes neither its mass nor its inertia."""
+    turn = rot_z(2 * np.pi / hand.num_fingers)
+    np.testing.assert_allclose(turn @ hand.link_com[0], hand.link_com[0], atol=1e-9)
+    inertia = hand.link_inertia[0]
+    np.testing.assert_allclose(turn @ inertia @ turn.T, inertia, atol=1e-9)
+
+
+def test_fingertip_capsule(hand: HandModel) -> None:
+    tips = [s for s in hand.shapes if s.fingertip]
+    assert [s.link for s in tips] == hand.tip_link.tolist()
+    for shape in tips:
+        assert shape.kind == "capsule"
+        radius, half = shape.size
+        assert radius == pytest.approx(0.0101)
+        assert shape.frame[2] + half == pytest.approx(0.0737)
+        assert shape.frame[2] - half < 0.044  # round from the neck on
+        np.testing.assert_allclose(np.abs(matrix(shape.frame[3:])[:, 2]), (0, 0, 1), atol=1e-6)
+
+
+def highest_reach(hand: HandModel, radius: float) -> float:
+    """The greatest base z at which the tip of finger 0 gets within ``radius`` of the hand's axis."""
+
+    def tip(q: np.ndarray) -> np.ndarray:
+        return hand.tip_poses(np.concatenate([q, np.zeros(hand.num_joints - 3)]))[0, :3]
+
+    best = -np.inf
+    for start in ((0.0, -0.5, -0.5), (0.3, -1.0, 0.5), (-0.3, -0.3, -0.3)):
+        result = minimize(
+            lambda q: -tip(q)[2],
+            start,
+            bounds=list(zip(LOWER, UPPER, strict=True)),
+            constraints={"type": "ineq", "fun": lambda q: radius**2 - tip(q)[:2] @ tip(q)[:2]},
+            method="SLSQP",
+        )
+        if result.success:
+            best = max(best, -result.fun)
+    return best
+
+
+def test_tips_reach_under_the_palm(hand: HandModel) -> None:
+    height = highest_reach(hand, 0.020)
+    if hand.name == "dclaw4":
+        assert height >= 0.206  # at least as far as a coarse search of the URDF had found
+        straight = 2 * SPACING + TIP  # no finger is longer
+        bound = FIRST_JOINT["dclaw4"][2] + np.sqrt(
+            straight**2 - (np.hypot(*FIRST_JOINT["dclaw4"][:2]) - 0.02) ** 2
+        )
+        assert height < bound
+    assert height > 0.25 - 0.08  # the height of the goal position, 0.08 m above the table
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_fingertip_kinds(name: str) -> None:
+    rigid, soft = (read_hand(hand_usd(name), fingertip=kind) for kind in FINGERTIPS)
+    assert (rigid.fingertip, soft.fingertip) == FINGERTIPS
+    for hard, pad in zip(rigid.shapes, soft.shapes, strict=True):
+        assert hard.path == pad.path
+        assert hard.friction == pytest.approx(0.8)
+        if hard.fingertip:
+            assert pad.friction > hard.friction
+            assert pad.stiffness < hard.stiffness
+        else:
+            assert (pad.friction, pad.stiffness, pad.damping) == (hard.friction, hard.stiffness, hard.damping)
+
+
+def test_camera_against_the_published_pose(four_fingers: HandModel) -> None:
+    camera = four_fingers.camera
+    assert (camera.width, camera.height) == (320, 180)
+    assert camera.far == 1.5
+    np.testing.assert_allclose(
+        (camera.fx, camera.fy, camera.cx, camera.cy), (256.05, 256.05, 160, 90), rtol=1e-6
+    )
+    flip = np.diag([-1.0, 1.0, -1.0])  # base to world: pi about +y
+    turn = flip @ matrix(camera.quaternion)
+    np.testing.assert_allclose(flip @ camera.position + (0, 0, 0.25), (-0.574, 0.034, 0.285), atol=5e-4)
+    np.testing.assert_allclose(turn[:, 2], (0.902, 0.018, -0.431), atol=1e-3)  # optical axis
+    np.testing.assert_allclose(turn[:, 0], (0.016, -1.000, -0.007), atol=1e-3)  # right
+
+
+def test_camera_projects_as_usd_does(hand: HandModel) -> None:
+    """The UsdGeomCamera, through USD's own frustum, and the model agree on where points appear."""
+    stage = open_stage(hand.path)
+    prim = UsdGeom.Camera(stage.GetPrimAtPath(f"/{hand.name}/base/camera"))
+    frustum = prim.GetCamera(Usd.TimeCode.Default()).frustum
+    chain = np.array(frustum.ComputeViewMatrix() * frustum.ComputeProjectionMatrix())
+    points = np.random.default_rng(0).uniform((-0.1, -0.1, 0.05), (0.1, 0.1, 0.25), (50, 3))
+    clip = np.c_[points, np.ones(50)] @ chain  # base frame = world of the stage
+    ndc = clip[:, :3] / clip[:, 3:]
+    expected = np.c_[(ndc[:, 0] + 1) / 2 * 320, (1 - ndc[:, 1]) / 2 * 180]
+    got = hand.camera.project(points)
+    np.testing.assert_allclose(got[:, :2], expected, atol=1e-3)
+    np.testing.assert_allclose(got[:, 2], clip[:, 3], atol=1e-6)
+    assert np.all((got[:, 0] > 0) & (got[:, 0] < 320) & (got[:, 1] > 0) & (got[:, 1] < 180))
+
+
+def test_camera_sees_a_known_point(four_fingers: HandModel) -> None:
+    camera = four_fingers.camera
+    optical = np.array([0.05, -0.02, 0.6])
+    point = camera.position + matrix(camera.quaternion) @ optical
+    expected = (160 + 256.05 * 0.05 / 0.6, 90 - 256.05 * 0.02 / 0.6, 0.6)
+    np.testing.assert_allclose(camera.project(point), expected, rtol=1e-5)
+
+
+def edited(path: Path, folder: Path, change: Callable[[Usd.Stage, str], None]) -> Path:
+    """A copy of a hand's file with one change."""
+    copy = folder / "broken.usda"
+    copy.write_bytes(path.read_bytes())
+    stage = Usd.Stage.Open(str(copy))
+    change(stage, str(stage.GetDefaultPrim().GetPath()))
+    stage.Save()
+    return copy
+
+
+def setting(prim: str, attribute: str, value: object) -> Callable[[Usd.Stage, str], None]:
+    return lambda stage, root: stage.GetPrimAtPath(f"{root}/{prim}").GetAttribute(attribute).Set(value)
+
+
+def clearing(prim: str, attribute: str) -> Callable[[Usd.Stage, str], None]:
+    def change(stage: Usd.Stage, root: str) -> None:
+        stage.GetPrimAtPath(f"{root}/{prim}").RemoveProperty(attribute)
+
+    return change
+
+
+def removing(prim: str) -> Callable[[Usd.Stage, str], None]:
+    def change(stage: Usd.Stage, root: str) -> None:
+        stage.RemovePrim(f"{root}/{prim}")
+
+    return change
+
+
+def aiming(prim: str, relationship: str, target: str) -> Callable[[Usd.Stage, str], None]:
+    def change(stage: Usd.Stage, root: str) -> None:
+        found = stage.GetPrimAtPath(f"{root}/{prim}").GetRelationship(relationship)
+        found.SetTargets([Sdf.Path(f"{root}/{target}")])
+
+    return change
+
+
+def mesh_collider(stage: Usd.Stage, root: str) -> None:
+    UsdPhysics.CollisionAPI.Apply(stage.GetPrimAtPath(f"{root}/f0_l1/visual/servo"))
+
+
+@pytest.mark.parametrize(
+    ("change", "prim", "words"),
+    [
+        (removing("f1_j2"), "f1_j2", ("missing", "author the hand again")),
+        (removing("f1_l1"), "f1_l1", ("missing",)),
+        (removing("base/camera"), "base/camera", ("missing",)),
+        (removing("f0_l3/f0_tip"), "f0_tip", ("missing",)),
+        (clearing("f0_j1", "newton:velocityLimit"), "f0_j1", ("newton:velocityLimit", "not authored")),
+        (clearing("f0_l2", "physics:mass"), "f0_l2", ("physics:mass", "not authored")),
+        (setting("f0_l2", "physics:mass", 0.0), "f0_l2", ("physics:mass", "positive")),
+        (
+            setting("f0_l2", "physics:diagonalInertia", Gf.Vec3f(9, 1, 1)),
+            "f0_l2",
+            ("diagonalInertia", "sum of two"),
+        ),
+        (setting("f0_j3", "physics:lowerLimit", 200.0), "f0_j3", ("lowerLimit", "upperLimit")),
+        (
+            setting("f0_j3", "drive:angular:physics:stiffness", float("nan")),
+            "f0_j3",
+            ("stiffness", "positive"),
+        ),
+        (aiming("f0_j2", "physics:body1", "f1_l2"), "f0_j2", ("joins other links", "f0_l2")),
+        (aiming("f0_j2", "physics:body1", "camera"), "f0_j2", ("physics:body1", "one link")),
+        (aiming("f0_l1", "physics:filteredPairs", "nothing"), "f0_l1", ("filteredPairs", "another link")),
+        (setting("f0_l2/points", "points", [Gf.Vec3f(0)] * 3), "f0_l2/points", ("points", "(3, 3)")),
+        (mesh_collider, "f0_l1/visual/servo", ("Mesh", "Capsule")),
+        (lambda stage, root: UsdGeom.SetStageMetersPerUnit(stage, 0.01), "/", ("metersPerUnit", "metres")),
+        (lambda stage, root: UsdGeom.SetStageUpAxis(stage, "Y"), "/", ("upAxis", "z up")),
+    ],
+)
+def test_broken_hand_is_refused_with_the_reason(
+    tmp_path: Path,
+    four_fingers: HandModel,
+    change: Callable[[Usd.Stage, str], None],
+    prim: str,
+    words: tuple[str, ...],
+) -> None:
+    broken = edited(four_fingers.path, tmp_path, change)
+    with pytest.raises(HandError) as caught:
+        read_hand(broken)
+    message = str(caught.value)
+    for word in (str(broken), prim, *words):
+        assert word in message
+
+
+def test_missing_and_foreign_files_are_refused(tmp_path: Path, four_fingers: HandModel) -> None:
+    with pytest.raises(HandError, match=r"no such file.*hand_usd"):
+        read_hand(tmp_path / "absent.usda")
+    garbage = tmp_path / "garbage.usda"
+    garbage.write_text("solid not usd\n")
+    with pytest.raises(HandError, match=r"garbage\.usda: not a USD file"):
+        read_hand(garbage)
+    with pytest.raises(HandError, match=r"'velvet'.*rigid, soft"):
+        read_hand(four_fingers.path, fingertip="velvet")

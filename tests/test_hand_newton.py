@@ -1,0 +1,120 @@
+"""Newton's import of a hand equals what :func:`read_hand` says about it."""
+
+import itertools
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+
+from vd.assets_usd.hand_author import hand_usd
+from vd.assets_usd.hand_model import HandModel, open_stage, read_hand
+
+MOUNT = ((0.0, 0.0, 0.25), (0.0, 1.0, 0.0, 0.0))
+"""Base frame in the world: 0.25 m up, turned by pi about +y."""
+
+
+@pytest.fixture(
+    scope="module", params=[(n, t) for n in ("dclaw3", "dclaw4") for t in ("rigid", "soft")], ids="-".join
+)
+def imported(request: pytest.FixtureRequest) -> tuple[HandModel, newton.ModelBuilder]:
+    name, fingertip = request.param
+    path = hand_usd(name)
+    builder = newton.ModelBuilder()
+    builder.add_usd(
+        open_stage(path, fingertip),
+        xform=wp.transform(*MOUNT),
+        floating=False,
+        load_visual_shapes=False,
+    )
+    return read_hand(path, fingertip=fingertip), builder
+
+
+def test_joints(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
+    hand, builder = imported
+    types = [newton.JointType(t) for t in builder.joint_type]
+    assert types == [newton.JointType.FIXED] + [newton.JointType.REVOLUTE] * hand.num_joints
+    assert [label.rsplit("/")[-1] for label in builder.joint_label[1:]] == list(hand.joint_names)
+    assert [label.rsplit("/")[-1] for label in builder.body_label] == list(hand.link_names)
+    assert builder.joint_parent[1:] == hand.joint_parent.tolist()
+    assert builder.joint_child[1:] == hand.joint_child.tolist()
+    for values, expected in (
+        (builder.joint_limit_lower, hand.lower),
+        (builder.joint_limit_upper, hand.upper),
+        (builder.joint_target_ke, hand.kp),
+        (builder.joint_target_kd, hand.kd),
+        (builder.joint_effort_limit, hand.effort),
+        (builder.joint_velocity_limit, hand.velocity_limit),
+        (builder.joint_armature, hand.armature),
+    ):
+        np.testing.assert_allclose(values, expected, rtol=1e-6)
+    assert set(builder.joint_target_mode) == {int(newton.JointTargetMode.POSITION)}
+
+
+def test_bodies(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
+    hand, builder = imported
+    np.testing.assert_allclose(builder.body_mass, hand.link_mass, rtol=1e-6)
+    np.testing.assert_allclose(np.array(builder.body_com), hand.link_com, atol=1e-8)
+    inertia = np.array([np.array(i).reshape(3, 3) for i in builder.body_inertia])
+    np.testing.assert_allclose(inertia, hand.link_inertia, rtol=1e-5, atol=1e-10)
+
+
+def test_shapes(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
+    hand, builder = imported
+    kinds = {"box": newton.GeoType.BOX, "capsule": newton.GeoType.CAPSULE}
+    for shape in hand.shapes:
+        i = builder.shape_label.index(shape.path)
+        assert builder.shape_body[i] == shape.link
+        assert builder.shape_type[i] == kinds[shape.kind]
+        np.testing.assert_allclose(tuple(builder.shape_scale[i])[: len(shape.size)], shape.size, rtol=1e-6)
+        np.testing.assert_allclose(tuple(builder.shape_transform[i])[:3], shape.frame[:3], atol=1e-7)
+        assert abs(np.dot(tuple(builder.shape_transform[i])[3:], shape.frame[3:])) == pytest.approx(
+            1.0, abs=1e-6
+        )
+        for value, expected in (
+            (builder.shape_material_mu[i], shape.friction),
+            (builder.shape_material_restitution[i], shape.restitution),
+            (builder.shape_material_ke[i], shape.stiffness),
+            (builder.shape_material_kd[i], shape.damping),
+            (builder.shape_gap[i], shape.gap),
+        ):
+            assert value == pytest.approx(expected, rel=1e-6)
+        assert builder.shape_margin[i] == 0.0
+    colliding = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.COLLIDE_SHAPES]
+    assert len(colliding) == len(hand.shapes)
+
+
+def test_filtered_pairs(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
+    """All and only the authored pairs of links (shapes of one body never collide in Newton)."""
+    hand, builder = imported
+    filtered = {tuple(sorted(pair)) for pair in builder.shape_collision_filter_pairs}
+    index = [builder.shape_label.index(shape.path) for shape in hand.shapes]
+    for (a, i), (b, j) in itertools.combinations(zip(hand.shapes, index, strict=True), 2):
+        if a.link != b.link:
+            expected = (min(a.link, b.link), max(a.link, b.link)) in hand.filtered_pairs
+            assert (tuple(sorted((i, j))) in filtered) == expected, (a.path, b.path)
+
+
+def test_sites(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
+    hand, builder = imported
+    sites = [i for i, f in enumerate(builder.shape_flags) if f & newton.ShapeFlags.SITE]
+    assert [builder.shape_label[i].rsplit("/")[-1] for i in sites] == list(hand.tip_names)
+    for i, link, frame in zip(sites, hand.tip_link, hand.tip_frame, strict=True):
+        assert builder.shape_body[i] == link
+        np.testing.assert_allclose(tuple(builder.shape_transform[i]), frame, atol=1e-6)
+
+
+def test_kinematics(imported: tuple[HandModel, newton.ModelBuilder]) -> None:
+    hand, builder = imported
+    model = builder.finalize(device="cpu")
+    state = model.state()
+    q = np.random.default_rng(0).uniform(hand.lower, hand.upper)
+    state.joint_q.assign(q.astype(np.float32))
+    newton.eval_fk(model, state.joint_q, state.joint_qd, state)
+    got = state.body_q.numpy()
+    expected = hand.forward_kinematics(q)
+    # Mounting turns by pi about +y: x and z change sign, y stays.
+    np.testing.assert_allclose(got[:, :3], expected[:, :3] * (-1, 1, -1) + MOUNT[0], atol=1e-6)
+    x, y, z, w = expected[:, 3:].T
+    mounted = np.stack([z, w, -x, -y], axis=1)  # j * (w + xi + yj + zk)
+    np.testing.assert_allclose(np.abs(np.sum(got[:, 3:] * mounted, axis=1)), 1.0, atol=1e-6)
