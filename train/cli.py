@@ -122,7 +122,10 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
         FileExistsError: The run folder holds another run and ``resume`` is not set.
     """
     import torch
+    import warp as wp
 
+    # A line for each of some hundred kernels would scroll the progress away.
+    wp.config.quiet = True
     from vd.envs.reorient import ReorientEnv
     from vd.train.checkpoint import find_checkpoint, list_checkpoints
     from vd.train.runner import TeacherRunner
@@ -156,7 +159,7 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
 
 
 def resolve_device(name: str) -> str:
-    """The torch device for ``--device``: ``auto`` is this process's GPU (torchrun), the first GPU, or the CPU.
+    """The torch device for ``--device``: ``auto`` is this process's GPU (torchrun), the first, or the CPU.
 
     Raises:
         ValueError: The device does not exist here.
@@ -182,10 +185,11 @@ def resolve_device(name: str) -> str:
 def _teacher(arguments: list[str], started: float) -> int:
     cfg = parse_teacher(arguments)
 
+    from vd.train.progress import waiting
     from vd.train.runner import EXIT_INTERRUPTED, Interrupted
 
-    print("building the worlds (kernels are compiled at the first start, which takes a minute or two) ...")
-    runner = build_teacher(cfg, started=started)
+    with waiting("building the worlds (the first start compiles the kernels: a minute or two)"):
+        runner = build_teacher(cfg, started=started)
     folder = cfg.run.run_dir
     if runner.current_learning_iteration:
         print(f"resumed after iteration {runner.current_learning_iteration} of {runner.total_iterations}")

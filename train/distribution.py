@@ -41,6 +41,6 @@ class BoundedStdGaussian(HeteroscedasticGaussianDistribution):
         """Make the standard deviation ``init_std`` everywhere: zero weights, and the bias that gives it."""
         low, high = self.log_std_range
         share = (math.log(self.init_std) - low) / (high - low)
-        head = mlp[-2]  # type: ignore[index]  # the linear layer before the reshape to [2, D]
+        head = mlp[-2]  # the linear layer before the reshape to [2, D]
         torch.nn.init.zeros_(head.weight[self.output_dim :])
         torch.nn.init.constant_(head.bias[self.output_dim :], math.log(share / (1.0 - share)))

@@ -47,6 +47,9 @@ class TeacherPPO(PPO):
         **kwargs: rsl-rl's PPO arguments.
     """
 
+    optimizer: Any
+    learning_rate: float
+
     def __init__(
         self,
         actor: MLPModel,
@@ -104,7 +107,7 @@ class TeacherPPO(PPO):
             "advantages": storage.advantages.flatten(),
             "returns": storage.returns.flatten(),
         }
-        parameters = tuple(p.flatten(0, 1) for p in storage.distribution_params)  # type: ignore[union-attr]
+        parameters = tuple(p.flatten(0, 1) for p in storage.distribution_params)
         samples = storage.num_envs * storage.num_transitions_per_env
         size = samples // self.num_mini_batches
         for _ in range(self.num_learning_epochs):

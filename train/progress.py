@@ -1,15 +1,18 @@
 """The live progress of a run: one line in place on a terminal, a line now and then elsewhere."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
 
 from rich.console import Console, Group
 from rich.live import Live
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.spinner import Spinner
 from rich.text import Text
 
+FIRST = "first iteration ..."
 PLAIN_INTERVAL_S = 10.0
 """Time between lines when the output is a file or a pipe."""
 
@@ -58,6 +61,20 @@ def reward_line(row: Mapping[str, Any]) -> str:
     return "rewards per step: " + "  ".join(f"{name} {value:+.3f}" for name, value in terms.items())
 
 
+@contextmanager
+def waiting(message: str) -> Iterator[None]:
+    """Show ``message`` with the time passed while the block runs; without a terminal, the message once."""
+    console = Console()
+    if not console.is_terminal:
+        console.print(f"{message} ...", highlight=False)
+        yield
+        return
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as progress:
+        progress.add_task(message, total=None)
+        yield
+
+
 class ProgressLine:
     """Shows the latest iteration; a context manager.
 
@@ -81,10 +98,10 @@ class ProgressLine:
 
     def __enter__(self) -> "ProgressLine":
         if self._enabled and self._console.is_terminal:
-            self._live = Live(Text("first iteration ..."), console=self._console, refresh_per_second=4)
+            self._live = Live(Spinner("dots", FIRST), console=self._console, refresh_per_second=4)
             self._live.start()
         elif self._enabled:
-            self._console.print("first iteration ...")
+            self._console.print(FIRST)
         return self
 
     def __exit__(

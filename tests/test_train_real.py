@@ -1,0 +1,85 @@
+"""Training on the simulator itself: a run goes on bit for bit, and the command line ends cleanly."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from vd.policy import load_policy
+from vd.train.checkpoint import checkpoint_path
+from vd.train.cli import build_teacher, main
+from vd.train.metrics import PROGRESS_FILE, read_progress
+from vd.train.presets import smoke
+from vd.train.runner import TeacherRunner
+
+TIMING = ("elapsed_s", "steps_per_s", "collect_s", "learn_s")
+
+
+def _train(run_dir: Path, iterations: int, resume: str | None = None) -> TeacherRunner:
+    """A few iterations of a few worlds on the CPU, with randomisation and curriculum on."""
+    cfg = smoke()
+    task = replace(
+        cfg.env,
+        num_worlds=8,
+        randomisation=replace(cfg.env.randomisation, enabled=True),
+        curriculum=replace(cfg.env.curriculum, enabled=True, raise_at=0.0),
+    )
+    cfg = replace(
+        cfg,
+        resume=resume,
+        run=replace(cfg.run, run_dir=run_dir, max_minutes=None),
+        ppo=replace(cfg.ppo, rollout_steps=4, minibatch_size=16),
+        env=task,
+    )
+    runner = build_teacher(cfg)
+    runner.learn(iterations)
+    return runner
+
+
+@pytest.mark.slow
+def test_a_resumed_run_equals_one_that_never_stopped(tmp_path):
+    whole = _train(tmp_path / "whole", 4)
+    resumed = _train(tmp_path / "part", 2, resume=str(checkpoint_path(tmp_path / "whole", 2)))
+    for one, two in ((whole.alg.actor, resumed.alg.actor), (whole.alg.critic, resumed.alg.critic)):
+        weights, again = one.state_dict(), two.state_dict()
+        assert all(torch.equal(weights[name], again[name]) for name in weights)
+    rows = [
+        [
+            {k: v for k, v in row.items() if k not in TIMING}
+            for row in read_progress(tmp_path / name / PROGRESS_FILE)
+        ]
+        for name in ("whole", "part")
+    ]
+    assert rows[0][2:] == rows[1]
+    assert rows[1][-1]["task/difficulty"] > 0.0
+
+
+@pytest.mark.slow
+def test_the_command_trains_saves_on_sigterm_and_resumes(tmp_path):
+    command = [sys.executable, "-m", "vd.train.cli", "teacher", "--run-dir", str(tmp_path)]
+    run = subprocess.Popen(
+        [*command, "--smoke", "--num-worlds", "4", "--max-steps", "100000", "--max-minutes", "5"],
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )
+    progress = tmp_path / PROGRESS_FILE
+    deadline = time.monotonic() + 240
+    while not (progress.is_file() and progress.read_text().count("\n") >= 2) and time.monotonic() < deadline:
+        assert run.poll() is None, "training ended by itself"
+        time.sleep(0.2)
+    run.send_signal(signal.SIGTERM)
+    assert run.wait(timeout=60) == 130
+    done = read_progress(progress)[-1]["iteration"]
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert config["env"]["num_worlds"] == 4
+
+    steps = (done + 1) * 4 * config["ppo"]["rollout_steps"]
+    assert main(["teacher", "--run-dir", str(tmp_path), "--resume", "--max-steps", str(steps)]) == 0
+    assert [row["iteration"] for row in read_progress(progress)] == list(range(1, done + 2))
+    assert load_policy(tmp_path / "policy.pt").hand == "dclaw4"
