@@ -17,6 +17,8 @@ from vd.train.presets import PRESETS, TeacherCfg, smoke
 if TYPE_CHECKING:
     from vd.train.runner import TeacherRunner
 
+INTERRUPTED = 130
+"""Exit status after Ctrl-C or SIGTERM: 128 and the number of SIGINT, as shells do."""
 CONFIG_NAME = "config.json"
 """The resolved configuration, in the run's folder, written before training."""
 
@@ -86,6 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         print(f"vd-train: {error}\n(VD_DEBUG=1 shows where)", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("vd-train: stopped at once; --resume goes on from the last checkpoint", file=sys.stderr)
+        return INTERRUPTED
 
 
 def parse_teacher(arguments: Sequence[str]) -> TeacherCfg:
@@ -186,22 +191,24 @@ def _teacher(arguments: list[str], started: float) -> int:
     cfg = parse_teacher(arguments)
 
     from vd.train.progress import waiting
-    from vd.train.runner import EXIT_INTERRUPTED, Interrupted
+    from vd.train.runner import Interrupted
 
-    with waiting("building the worlds (the first start compiles the kernels: a minute or two)"):
+    main_process = os.environ.get("RANK", "0") == "0"
+    with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):
         runner = build_teacher(cfg, started=started)
     folder = cfg.run.run_dir
-    if runner.current_learning_iteration:
+    if runner.current_learning_iteration and main_process:
         print(f"resumed after iteration {runner.current_learning_iteration} of {runner.total_iterations}")
     try:
         runner.learn()
     except Interrupted:
-        print(f"saved in {folder}; go on with: vd-train teacher --run-dir {folder} --resume")
-        return EXIT_INTERRUPTED
+        if main_process:
+            print(f"saved in {folder}; go on with: vd-train teacher --run-dir {folder} --resume")
+        return INTERRUPTED
     finally:
         runner.env.close()
         runner.shutdown()
-    if runner.is_main:
+    if main_process:
         print(f"done: {folder}/policy.pt is the best policy, vd-train curves {folder} draws the curves")
     return 0
 

@@ -62,9 +62,9 @@ def reward_line(row: Mapping[str, Any]) -> str:
 
 
 @contextmanager
-def waiting(message: str) -> Iterator[None]:
+def waiting(message: str, enabled: bool = True) -> Iterator[None]:
     """Show ``message`` with the time passed while the block runs; without a terminal, the message once."""
-    console = Console()
+    console = Console(quiet=not enabled)
     if not console.is_terminal:
         console.print(f"{message} ...", highlight=False)
         yield

@@ -34,8 +34,6 @@ from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 
 POLICY_NAME = "policy.pt"
 """The best policy so far, in the run's folder: what vd-eval, vd-play and deployment read."""
-EXIT_INTERRUPTED = 130
-"""Exit status after Ctrl-C or SIGTERM, with everything saved."""
 LOWER_RATES = "lower --ppo.actor-learning-rate, --ppo.critic-learning-rate or --ppo.grad-norm"
 """Remedy for networks that diverge."""
 
