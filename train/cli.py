@@ -126,15 +126,7 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     Raises:
         FileExistsError: The run folder holds another run and ``resume`` is not set.
     """
-    import torch
-    import warp as wp
-
-    # A line for each of some hundred kernels would scroll the progress away.
-    wp.config.quiet = True
-    from vd.envs.reorient import ReorientEnv
     from vd.train.checkpoint import find_checkpoint, list_checkpoints
-    from vd.train.runner import TeacherRunner
-    from vd.train.vec_env import ReorientVecEnv
 
     rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
     cfg = replace(cfg, run=replace(cfg.run, device=device))
@@ -143,6 +135,16 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
         raise FileExistsError(
             f"{cfg.run.run_dir} holds a run; add --resume to go on with it, or choose another --run-dir"
         )
+
+    import torch
+    import warp as wp
+
+    # A line for each of some hundred kernels would scroll the progress away.
+    wp.config.quiet = True
+    from vd.envs.reorient import ReorientEnv
+    from vd.train.runner import TeacherRunner
+    from vd.train.vec_env import ReorientVecEnv
+
     task = to_dict(cfg.env)
     if rank == 0:
         # Before anything is built: a run that fails at once still says what it was.

@@ -13,10 +13,12 @@ from torch import nn
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2
 """Bounds of the adaptive schedule, as in rsl-rl."""
 KL_STEP = 1.5
-"""Factor by which the adaptive schedule changes the actor's learning rate, as in rsl-rl."""
+"""Factor by which the adaptive schedule changes the actor's learning rate, once an update."""
 KL_BAND = 2.0
 """The rate is left alone while the KL divergence is within this factor of the wanted one."""
 
+STATISTICS = ("surrogate", "value", "entropy", "kl", "clip_fraction", "grad_norm")
+"""What every minibatch reports."""
 ACTOR_GROUP, CRITIC_GROUP = 0, 1
 """Optimiser groups. rsl-rl reads the learning rate it reports from group 0, so the actor is first."""
 
@@ -28,7 +30,9 @@ class TeacherPPO(PPO):
 
     * actor and critic have their own learning rates (Table S1: 3e-4 and 1e-3) in one optimiser. rsl-rl's
       adaptive schedule writes one rate into every group; here it moves the actor's only, since the KL
-      divergence it follows says nothing about the critic;
+      divergence it follows says nothing about the critic. It moves once an update, by the divergence of
+      the last epoch: rsl-rl moves it in every minibatch, and since the divergence within an update only
+      accumulates, one large first step there sends the rate to its lower bound for the rest of it;
     * the gradient is clipped by the joint norm of actor and critic, as in the paper's code. The value
       coefficient acts through that norm alone, because Adam ignores the scale of a gradient;
     * samples are permuted in every epoch (rsl-rl repeats the same minibatches), and statistics stay on
@@ -82,20 +86,17 @@ class TeacherPPO(PPO):
             ``clip_fraction``, ``grad_norm`` (before clipping), and ``explained_variance`` of the returns by
             the values of the rollout.
         """
-        totals = torch.zeros(6, device=self.device)
-        batches = 0
-        for batch in self._minibatches():
-            totals += self._minibatch_step(batch)
-            batches += 1
+        steps = torch.stack([self._minibatch_step(batch) for batch in self._minibatches()])
+        if self.schedule == "adaptive":
+            self._adapt_learning_rate(steps[-self.num_mini_batches :, STATISTICS.index("kl")].mean())
         flat = self.storage.observations.flatten(0, 1)
         self.actor.update_normalization(flat)
         self.critic.update_normalization(flat)
         returns, values = self.storage.returns, self.storage.values
         explained = 1.0 - (returns - values).var() / returns.var().clamp_min(1e-8)
         self.storage.clear()
-        names = ("surrogate", "value", "entropy", "kl", "clip_fraction", "grad_norm", "explained_variance")
-        # The only wait for the device in the update.
-        return dict(zip(names, torch.cat((totals / batches, explained[None])).tolist(), strict=True))
+        names = (*STATISTICS, "explained_variance")
+        return dict(zip(names, torch.cat((steps.mean(dim=0), explained[None])).tolist(), strict=True))
 
     def _minibatches(self) -> Iterator[dict[str, Any]]:
         """Samples of the rollout, permuted anew in every epoch; a remainder is left out at random."""
@@ -120,16 +121,13 @@ class TeacherPPO(PPO):
         """One optimiser step.
 
         Returns:
-            The six statistics of :meth:`update`, on the device, detached.
+            :data:`STATISTICS`, shape [6], on the device.
         """
         self.actor(batch["observations"], stochastic_output=True)
         log_ratio = self.actor.get_output_log_prob(batch["actions"]) - batch["log_prob"]
         entropy = self.actor.output_entropy.mean()
         with torch.no_grad():
             kl = self.actor.get_kl_divergence(batch["old"], self.actor.output_distribution_params).mean()
-        if self.schedule == "adaptive":
-            self._adapt_learning_rate(kl)
-
         ratio = torch.exp(log_ratio)
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = -torch.minimum(batch["advantages"] * ratio, batch["advantages"] * clipped).mean()
