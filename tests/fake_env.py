@@ -6,6 +6,7 @@ chosen worlds drop their object. Everything evaluation and viewing read is there
 """
 
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
@@ -34,13 +35,17 @@ class FakeEnv:
         tolerance=0.4,
         fall_at=None,
         fingers=3,
+        hand=None,
     ):
         self.objects = list(objects)
-        self.hand = FakeHand(f"dclaw{fingers}")
+        self.hand = hand or FakeHand(f"dclaw{fingers}")
         self.device = "cpu"
         self.num_worlds = n = num_worlds
         self.num_actions, self.num_observations = 3 * fingers, 8
         self.max_episode_steps = max_episode_steps
+        self.cfg = SimpleNamespace(
+            sim=SimpleNamespace(control_hz=12.0), goal=SimpleNamespace(max_angle_rad=np.pi)
+        )
         self.control_dt = 1.0 / 12.0
         self.world_object = (np.arange(n) * len(self.objects)) // n
         self.reward_term_names = ("success", "rotation", "energy")
@@ -57,6 +62,7 @@ class FakeEnv:
         self.rotation_error, self.goal_quat = zeros(n), zeros(n, wp.quat)
         self.step_count, self.goals_reached = zeros(n, wp.int32), zeros(n, wp.int32)
         self.object_pose_end = zeros(n, wp.transform)
+        self.sim = SimpleNamespace(joint_q=zeros((n, self.num_actions + 7)))
         self._rng = np.random.default_rng(0)
         self.resets = 0
         self.reset()
@@ -116,6 +122,9 @@ class FakeEnv:
         return self._pose()
 
     def _publish(self):
+        q = self.sim.joint_q.numpy()
+        q[:, : self.num_actions] = np.tile([0.0, 0.8, -1.1], self.num_actions // 3)
+        q[:, self.num_actions :] = self._pose()
         self.observation.numpy()[:] = np.concatenate([self._quat, self.goal_quat.numpy()], axis=1)
 
     def close(self):

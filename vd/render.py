@@ -27,6 +27,7 @@ from vd.sim.scene import add_object, add_table, build_hand, hand_mount, new_buil
 # Packed as the renderer packs its bytes: A B G R.
 BACKGROUND = 0xFFEBE1D8
 GOAL_COLOR = (0.35, 0.68, 0.42)
+GHOST_OPACITY = 0.7
 # Light direction in the camera's right, forward (level) and up: from the upper left behind the viewer, and
 # low enough to reach under the palm.
 LIGHT_DIRECTION = (0.35, 0.9, -0.8)
@@ -117,9 +118,8 @@ class PictureModel:
         hand: The hand; None shows objects alone.
         objects: The object of each cell, length C.
         device: Warp device.
-        ghost_in_scene: Put the goal's object into the cell, beside the hand, rather than in a world of
-            its own (for viewers that show one world).
-        ghost_offset: Where it stands then [m].
+        ghost_in_scene: Put the goal's object, translucent, into the cell rather than in a world of its own
+            (for viewers that show one world).
     """
 
     def __init__(
@@ -129,10 +129,9 @@ class PictureModel:
         *,
         device: str = "cpu",
         ghost_in_scene: bool = False,
-        ghost_offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ):
         cfg = SimCfg()
-        self.cells, self.in_scene, self.ghost_offset = len(objects), ghost_in_scene, ghost_offset
+        self.cells, self.ghost_in_scene = len(objects), ghost_in_scene
         self.hand_dofs = hand.num_joints if hand else 0
         scene = new_builder()
         ghosts = []
@@ -145,7 +144,10 @@ class PictureModel:
             add_object(world, item, cfg, scale=1.0, visuals=True)
             ghost = world if ghost_in_scene else new_builder()
             body = add_object(ghost, item, cfg, scale=1.0, visuals=True)
-            ghost.shape_color[ghost.body_shapes[body][-1]] = GOAL_COLOR
+            visual = ghost.body_shapes[body][-1]
+            ghost.shape_color[visual] = GOAL_COLOR
+            if ghost_in_scene:
+                ghost.shape_opacity[visual] = GHOST_OPACITY
             scene.add_world(world)
             ghosts.append(ghost)
         if not ghost_in_scene:
@@ -154,15 +156,18 @@ class PictureModel:
         self.model = scene.finalize(device=device)
         self.state = self.model.state()
 
-    def pose(self, joint_q: np.ndarray, goal_quat: np.ndarray) -> None:
+    def pose(
+        self, joint_q: np.ndarray, goal_quat: np.ndarray, goal_position: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> None:
         """Place hands, objects and goals.
 
         Args:
             joint_q: Hand joints [rad], object position [m] and quaternion xyzw, shape [C, D + 7].
             goal_quat: Goal orientations xyzw, shape [C, 4].
+            goal_position: Where the goals' objects are drawn [m].
         """
-        goal = np.concatenate([np.tile(self.ghost_offset, (self.cells, 1)), goal_quat], axis=1)
-        if self.in_scene:
+        goal = np.concatenate([np.tile(goal_position, (self.cells, 1)), goal_quat], axis=1)
+        if self.ghost_in_scene:
             q = np.concatenate([joint_q, goal], axis=1)
         else:
             q = np.concatenate([np.ravel(joint_q), np.ravel(goal)])

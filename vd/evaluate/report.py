@@ -33,7 +33,7 @@ def number(interval: Interval | None, unit: str = "") -> str:
 
 def write_report(result: EvalResult, path: Path) -> None:
     """Write the page of an evaluation."""
-    page = Page(f"Evaluation of {Path(result.protocol.policy).name}", _lead(result))
+    page = Page(f"Evaluation of {result.protocol.policy}", _lead(result))
     add_summary(page, result)
     add_figures(page, result)
     page.section("Every object")

@@ -46,15 +46,28 @@ def draw_starts_and_goals(
         Starts and goals, quaternions xyzw, shapes [M, 4].
     """
     rng = np.random.default_rng([seed, zlib.crc32(name.encode())])
-    start = Rotation.random(episodes, rng=rng)
-    axis = rng.normal(size=(episodes, 3))
+    start = Rotation.random(episodes, rng=rng).as_quat()
+    return start, draw_goals(start, rng, max_goal_angle)
+
+
+def draw_goals(start: np.ndarray, rng: np.random.Generator, max_goal_angle: float) -> np.ndarray:
+    """Orientations uniform on the part of SO(3) within ``max_goal_angle`` [rad] of each of ``start``.
+
+    Args:
+        start: Quaternions xyzw, shape [n, 4].
+        rng: Where randomness comes from.
+        max_goal_angle: In (0, pi].
+
+    Returns:
+        Quaternions xyzw, shape [n, 4].
+    """
+    axis = rng.normal(size=(len(start), 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     # The angle of a uniform rotation has density (1 - cos)/pi: invert its cumulative distribution.
     grid = np.linspace(0.0, max_goal_angle, ANGLE_GRID)
     cumulative = grid - np.sin(grid)
-    angle = np.interp(rng.random(episodes) * cumulative[-1], cumulative, grid)
-    goal = Rotation.from_rotvec(axis * angle[:, None]) * start
-    return start.as_quat(), goal.as_quat()
+    angle = np.interp(rng.random(len(start)) * cumulative[-1], cumulative, grid)
+    return (Rotation.from_rotvec(axis * angle[:, None]) * Rotation.from_quat(start)).as_quat()
 
 
 def collect(
@@ -63,7 +76,7 @@ def collect(
     starts: np.ndarray,
     goals: np.ndarray,
     *,
-    on_step: Callable[[int, int], None] = lambda done, total: None,
+    on_step: Callable[[int, float], Any] = lambda done, time_s: None,
 ) -> tuple[Episode, ...]:
     """Run all episodes, in rounds of one episode a world.
 
@@ -75,7 +88,8 @@ def collect(
         policy: What to evaluate.
         starts: Initial orientations xyzw, shape [K, M, 4], objects in the order of ``env.objects``.
         goals: Goal orientations xyzw, shape [K, M, 4].
-        on_step: Called with the episodes done and their total after every control step.
+        on_step: Called after every control step with the episodes done so far and the time since the last
+            reset [s].
 
     Returns:
         K x M episodes, object by object.
@@ -110,9 +124,8 @@ def _run_round(
     goals: np.ndarray,
     world_episode: np.ndarray,
     recorded: dict[tuple[int, int], Episode],
-    on_step: Callable[[int, int], None],
+    on_step: Callable[[int, float], Any],
 ) -> None:
-    total = starts.shape[0] * starts.shape[1]
     world_object = np.asarray(env.world_object)
     # Worlds without an episode left repeat their object's first one, unread.
     start = starts[world_object, np.maximum(world_episode, 0)]
@@ -140,7 +153,7 @@ def _run_round(
                     fell=bool(fell[w]),
                 )
             running &= ~ended
-        on_step(len(recorded), total)
+        on_step(len(recorded), step / env.cfg.sim.control_hz)
         if not running.any():
             return
     raise RuntimeError(

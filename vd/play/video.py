@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 from PIL import Image, ImageDraw, ImageFont
 
+from vd.evaluate.statistics import rotation_angle
 from vd.files import atomic_path
 from vd.paper import PAPER
 from vd.render import Picture, Renderer
@@ -89,6 +90,8 @@ class Watcher:
         self.steps += stepped
         q, goal = env.sim.joint_q.numpy()[worlds], env.goal_quat.numpy()[worlds]
         error, terms = env.rotation_error.numpy()[worlds], env.reward_terms.numpy()[worlds]
+        if not stepped:  # what the environment holds is of the step before the reset
+            error, terms = rotation_angle(q[:, -4:].astype(float), goal.astype(float)), np.zeros_like(terms)
         return [
             Snapshot(
                 name=env.objects[env.world_object[world]].name,

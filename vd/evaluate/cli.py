@@ -1,0 +1,230 @@
+"""Command line of evaluation: ``vd-eval POLICY --objects SET --episodes M``."""
+
+import json
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.evaluate.result import EvalResult
+
+# Worlds simulated at once by default: enough to keep the device busy, few enough to fit anywhere.
+WORLDS_CPU, WORLDS_GPU = 64, 8192
+_PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
+
+
+@dataclass
+class EvalCfg:
+    """Evaluate a policy: every object from the same starts to the same goals, whatever the policy.
+
+    Writes eval.json (every episode) and eval.html (one page with figures) and prints a table. Errors are
+    measured at the end of an episode, or at the first step at which all success criteria hold.
+    """
+
+    policy: Annotated[str | None, tyro.conf.Positional] = None
+    """A policy.pt, a checkpoint, or a run's folder; or use --agent."""
+    agent: str | None = None
+    """zero, random, or the same as POLICY."""
+    objects: tuple[str, ...] = ("cube",)
+    """Object sets by name, folders or files (vd-assets makes them)."""
+    episodes: int = 20
+    """Starts and goals of every object."""
+    hand: str | None = None
+    """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
+    seed: int = 0
+    """Seed of starts, goals and everything else random."""
+    max_goal_angle: float = math.pi
+    """Goals are within this angle [rad] of the start; pi is all of SO(3)."""
+    stop_tolerance: float = PAPER.success.rotation_rad
+    """An episode stops, still and oriented, at this error [rad]; 0.1 for the paper's precise variant."""
+    episode_s: float = PAPER.scene.episode_s
+    """Time limit of an episode [s]."""
+    randomise: bool = False
+    """Randomise dynamics and add noise and disturbances as in training."""
+    resample: Literal["auto", "object", "episode"] = "auto"
+    """What the bootstrap intervals resample: objects (from 8 of them) or episodes within objects."""
+    num_worlds: int | None = None
+    """Worlds simulated at once; by default as many as episodes, up to 64 on a CPU and 8192 on a GPU."""
+    device: str = "auto"
+    """auto, cpu or cuda:N."""
+    output: Path = Path("runs/eval")
+    """Folder for eval.json and eval.html."""
+    json: bool = False
+    """Print protocol and summaries as JSON instead of the table."""
+
+    @property
+    def agent_name(self) -> str:
+        """Which agent is evaluated.
+
+        Raises:
+            ValueError: None or two are named.
+        """
+        if (self.policy is None) == (self.agent is None):
+            raise ValueError("name one agent: a policy file, --agent zero or --agent random")
+        return str(self.policy or self.agent)
+
+    def validate(self) -> None:
+        """Raise ValueError naming the flag and the remedy."""
+        if self.episodes < 1:
+            raise ValueError(f"--episodes is {self.episodes}; at least 1 is needed")
+        if not 0.0 < self.max_goal_angle <= math.pi + 1e-6:
+            raise ValueError(
+                f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
+            )
+        if not 0.0 < self.stop_tolerance <= math.pi:
+            raise ValueError(
+                f"--stop-tolerance is {self.stop_tolerance}; it must be above 0 and at most pi rad"
+            )
+        if self.num_worlds is not None and self.num_worlds < 1:
+            raise ValueError(
+                f"--num-worlds is {self.num_worlds}; at least one world for each object is needed"
+            )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``vd-eval``; returns the exit status."""
+    cfg = tyro.cli(EvalCfg, args=arguments, prog="vd-eval")
+    try:
+        cfg.validate()
+        cfg.agent_name  # noqa: B018  # before anything slow is imported
+        result = evaluate(cfg)
+    except (ValueError, FileNotFoundError, RuntimeError) as error:
+        print(f"vd-eval: {error}", file=sys.stderr)
+        return 1
+    from vd.config import to_dict
+    from vd.evaluate.report import terminal_table
+
+    if cfg.json:
+        summary = {key: value for key, value in to_dict(result).items() if key != "episodes"}
+        print(json.dumps(summary, indent=1))
+    else:
+        print(terminal_table(result))
+        print(f"\n{cfg.output / 'eval.json'}\n{cfg.output / 'eval.html'}")
+    return 0
+
+
+def evaluate(cfg: EvalCfg) -> "EvalResult":
+    """Run an evaluation and write its JSON and page into ``cfg.output``.
+
+    Raises:
+        ValueError: A setting, object set or policy cannot be used.
+        FileNotFoundError: There is no such policy.
+        vd.sim.simulator.SimulationError: Contacts were lost, or a world left the finite numbers.
+    """
+    import warp as wp
+    from tqdm import tqdm
+
+    wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would scroll the rest away
+    import numpy as np
+
+    from vd.assets_usd.objects.model import load_set
+    from vd.envs.reorient import ReorientEnv
+    from vd.evaluate.agents import built_in, open_policy, task_for
+    from vd.evaluate.report import write_report
+    from vd.evaluate.result import Protocol, summarise
+    from vd.evaluate.rollout import collect, draw_starts_and_goals
+
+    device = resolve_device(cfg.device)
+    trained = open_policy(cfg.agent_name, device)
+    count = len(load_set(list(cfg.objects)))
+    task = task_for(
+        trained,
+        hand=cfg.hand,
+        objects=cfg.objects,
+        num_worlds=cfg.num_worlds or worlds_for(count, cfg.episodes, device),
+        seed=cfg.seed,
+        stop_tolerance_rad=cfg.stop_tolerance,
+        max_goal_angle_rad=cfg.max_goal_angle,
+        episode_s=cfg.episode_s,
+        randomised=cfg.randomise,
+        success_ends_episode=True,
+    )
+    print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
+    env = ReorientEnv(task, device)
+    policy = trained or built_in(cfg.agent_name, env.num_actions, seed=cfg.seed, device=device)
+    drawn = [
+        draw_starts_and_goals(item.name, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle)
+        for item in env.objects
+    ]
+    starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
+    with tqdm(total=count * cfg.episodes, unit="episode", desc="vd-eval", mininterval=1.0) as bar:
+        episodes = collect(
+            env,
+            policy,
+            starts,
+            goals,
+            on_step=lambda done, time_s: (bar.update(done - bar.n), bar.set_postfix_str(f"{time_s:.1f} s")),
+        )
+    env.check()
+    env.close()
+    protocol = Protocol(
+        policy=cfg.agent_name,
+        objects=", ".join(cfg.objects),
+        hand=task.hand,
+        episodes=cfg.episodes,
+        seed=cfg.seed,
+        max_goal_angle_rad=cfg.max_goal_angle,
+        stop_tolerance_rad=cfg.stop_tolerance,
+        episode_s=cfg.episode_s,
+        control_hz=task.sim.control_hz,
+        randomised=cfg.randomise,
+    )
+    result = summarise(
+        protocol,
+        tuple(item.name for item in env.objects),
+        [item.symmetry for item in env.objects],
+        episodes,
+        resample=cfg.resample,
+        software=_software(device),
+    )
+    result.write(cfg.output / "eval.json")
+    write_report(result, cfg.output / "eval.html")
+    return result
+
+
+def resolve_device(name: str) -> str:
+    """The Warp and torch device that ``--device`` means.
+
+    Raises:
+        ValueError: It does not exist here.
+    """
+    import warp as wp
+
+    if name == "auto":
+        return "cuda:0" if wp.is_cuda_available() else "cpu"
+    known = ["cpu", *(device.alias for device in wp.get_cuda_devices())]
+    name = "cuda:0" if name == "cuda" else name
+    if name not in known:
+        raise ValueError(f"--device is '{name}', but this machine has {', '.join(known)}")
+    return name
+
+
+def worlds_for(num_objects: int, episodes: int, device: str) -> int:
+    """Worlds to simulate at once: the same number for every object, at most one for each episode."""
+    limit = WORLDS_CPU if device == "cpu" else WORLDS_GPU
+    return num_objects * max(1, min(episodes, limit // num_objects))
+
+
+def _software(device: str) -> dict[str, str]:
+    from importlib.metadata import PackageNotFoundError, version
+
+    import warp as wp
+
+    found = {"device": wp.get_device(device).name}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+if __name__ == "__main__":
+    sys.exit(main())

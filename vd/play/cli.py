@@ -1,0 +1,197 @@
+"""Command line of the viewer: ``vd-play POLICY``, in the browser or, with ``--video``, to a file."""
+
+import math
+import sys
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.play.session import Session
+
+# Size of a cell's picture in a video [pixel]: alone, and in a grid.
+SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)
+# Side of the goal's picture, as a share of the cell's height.
+GOAL_SHARE = 0.36
+VIDEO_SECONDS = 10.0
+
+
+@dataclass
+class PlayCfg:
+    """Watch a policy: in the browser, or as a video made without a display or GPU."""
+
+    policy: Annotated[str | None, tyro.conf.Positional] = None
+    """A policy.pt, a checkpoint, or a run's folder; or use --agent."""
+    agent: str | None = None
+    """zero, random, or the same as POLICY."""
+    hand: str | None = None
+    """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
+    objects: tuple[str, ...] = ("cube",)
+    """Object sets by name, folders or files; the viewer offers each object."""
+    video: Path | None = None
+    """Write this file and exit: .mp4, .gif, or .png for six moments."""
+    seconds: float = VIDEO_SECONDS
+    """Length of the video [s]."""
+    cells: int = 1
+    """Worlds side by side in the video, of different objects as far as there are."""
+    samples: int = 1
+    """Rays a pixel in the video; 4 smooths edges."""
+    port: int = 8080
+    """Port of the viewer."""
+    host: str = "127.0.0.1"
+    """Address of the viewer; 0.0.0.0 lets other machines look."""
+    seed: int = 0
+    """Seed of starts and goals."""
+    max_goal_angle: float = math.pi
+    """Goals are within this angle [rad] of the object's orientation; pi is all of SO(3)."""
+    stop_tolerance: float = PAPER.success.rotation_rad
+    """Error [rad] at which a goal counts as reached, with fingers and object still."""
+    episode_s: float = PAPER.scene.episode_s
+    """Time after which a world starts anew [s]."""
+    randomise: bool = False
+    """Randomise dynamics and add noise and disturbances as in training."""
+    device: str = "auto"
+    """auto, cpu or cuda:N."""
+
+    @property
+    def agent_name(self) -> str:
+        """Which agent begins."""
+        if (self.policy is None) == (self.agent is None):
+            raise ValueError("name one agent: a policy file, --agent zero or --agent random")
+        return str(self.policy or self.agent)
+
+    def validate(self) -> None:
+        """Raise ValueError naming the flag and the remedy."""
+        if self.cells < 1:
+            raise ValueError(f"--cells is {self.cells}; at least 1 is needed")
+        if not self.seconds > 0.0:
+            raise ValueError(f"--seconds is {self.seconds}; it must be positive")
+        if not 0.0 < self.max_goal_angle <= math.pi + 1e-6:
+            raise ValueError(
+                f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
+            )
+        if self.video is not None and self.video.suffix.lower() not in (".mp4", ".gif", ".png"):
+            raise ValueError(f"--video is {self.video}; use a name that ends in .mp4, .gif or .png")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``vd-play``; returns the exit status."""
+    cfg = tyro.cli(PlayCfg, args=arguments, prog="vd-play")
+    try:
+        cfg.validate()
+        print(f"vd-play: {cfg.agent_name}; building the worlds (the first start compiles kernels: minutes)")
+        if cfg.video is not None:
+            frames = record_video(cfg, cfg.video)
+            print(f"{cfg.video} ({frames} frames)")
+        else:
+            serve(cfg)
+    except (ValueError, FileNotFoundError, RuntimeError) as error:
+        print(f"vd-play: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print()
+    return 0
+
+
+def record_video(cfg: PlayCfg, path: Path) -> int:
+    """Run the agent and write a video; returns the number of frames.
+
+    Raises:
+        ValueError: A setting, object set or policy cannot be used.
+        FileNotFoundError: There is no such policy.
+    """
+    from tqdm import tqdm
+
+    from vd.evaluate.agents import built_in
+    from vd.play.video import record, write_frames
+    from vd.render import Renderer
+
+    env, trained, device = _open(cfg, num_worlds=cfg.cells)
+    policy = trained or built_in(cfg.agent_name, env.num_actions, seed=cfg.seed, device=device)
+    worlds = spread(env.world_object, cfg.cells)
+    width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
+    renderer = Renderer(
+        env.hand,
+        [env.objects[env.world_object[world]] for world in worlds],
+        width=width,
+        height=height,
+        goal_size=round(GOAL_SHARE * height),
+        samples=cfg.samples,
+        device=device,
+    )
+    rate = env.cfg.sim.control_hz
+    steps = max(1, round(cfg.seconds * rate))
+    frames: Iterable[Any] = record(env, policy, renderer, worlds, steps)
+    count = write_frames(path, tqdm(frames, total=steps, unit="frame", desc="vd-play", mininterval=1.0), rate)
+    env.check()
+    env.close()
+    return count
+
+
+def serve(cfg: PlayCfg) -> None:
+    """Serve the viewer until Ctrl-C."""
+    from vd.play.viewer import PlayViewer
+
+    viewer = PlayViewer(open_session(cfg), host=cfg.host, port=cfg.port)
+    print(f"open {viewer.url} in a browser; Ctrl-C ends it")
+    try:
+        viewer.run()
+    finally:
+        viewer.close()
+        viewer.session.env.close()
+
+
+def open_session(cfg: PlayCfg) -> "Session":
+    """The environment and agents behind the viewer."""
+    from vd.play.session import Session, agent_choices
+
+    env, trained, device = _open(cfg, num_worlds=1)
+    agents = agent_choices(cfg.agent_name, trained, env.num_actions, seed=cfg.seed, device=device)
+    return Session(env, agents, cfg.agent_name, seed=cfg.seed)
+
+
+def spread(world_object: Sequence[int], cells: int) -> list[int]:
+    """Worlds to show: of different objects first, then more of the same."""
+    seen: dict[int, int] = {}
+    rank = []
+    for world, index in enumerate(world_object):
+        rank.append((seen.get(index, 0), world))
+        seen[index] = seen.get(index, 0) + 1
+    return sorted(world for _, world in islice(sorted(rank), cells))
+
+
+def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
+    """Environment with at least one world for each object, trained policy if one is named, device."""
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would scroll the rest away
+    from vd.assets_usd.objects.model import load_set
+    from vd.envs.reorient import ReorientEnv
+    from vd.evaluate.agents import open_policy, task_for
+    from vd.evaluate.cli import resolve_device
+
+    device = resolve_device(cfg.device)
+    trained = open_policy(cfg.agent_name, device)
+    task = task_for(
+        trained,
+        hand=cfg.hand,
+        objects=cfg.objects,
+        num_worlds=max(num_worlds, len(load_set(list(cfg.objects)))),
+        seed=cfg.seed,
+        stop_tolerance_rad=cfg.stop_tolerance,
+        max_goal_angle_rad=cfg.max_goal_angle,
+        episode_s=cfg.episode_s,
+        randomised=cfg.randomise,
+        success_ends_episode=False,
+    )
+    return ReorientEnv(task, device), trained, device
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,207 @@
+"""The web viewer: Newton's viser viewer with goal ghost, reward bars and a choice of object and agent.
+
+Browser events arrive on viser's threads; they are queued and handled between steps on the thread that runs
+the simulation. Everything is served from this machine, so it works without a network.
+"""
+
+import math
+import queue
+import time
+from collections.abc import Callable
+from functools import partial
+from html import escape
+from typing import Any
+
+import numpy as np
+import warp as wp
+from newton.viewer import ViewerViser
+
+from vd.paper import PAPER
+from vd.play.session import Session
+from vd.play.video import Snapshot
+from vd.render import Camera, PictureModel
+
+# Where the goal's object floats, in the camera's right and up [m]: left of the hand, for panels are right.
+GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
+# The viewer's camera stands this much farther than that of videos: a browser window has panels around it.
+CAMERA_DISTANCE = 1.25
+BESIDE, ON_OBJECT, HIDDEN = "beside the hand", "on the object", "hidden"
+# Far below the table, where nothing is seen: viser has no cheaper way to hide one instance of a batch.
+UNSEEN = (0.0, 0.0, -100.0)
+POSITIVE, NEGATIVE, GROUND = "#3b82f6", "#e2683c", "rgba(128,128,128,.18)"
+
+
+class PlayViewer:
+    """Shows a session in the browser and lets it be steered from there.
+
+    Args:
+        session: What runs.
+        host: Address to serve on; ``127.0.0.1`` keeps it on this machine.
+        port: Port to serve on; the next free one is taken if it is in use.
+        paused: Start paused.
+        verbose: Print the address.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        host: str = "127.0.0.1",
+        port: int = 8080,
+        paused: bool = False,
+        verbose: bool = True,
+    ):
+        self.session = session
+        self.viewer = ViewerViser(host=host, port=port, paused=paused, label="vd-play", verbose=verbose)
+        self.camera = Camera.for_hand(session.env.hand)
+        self._events: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
+        self._models: dict[str, PictureModel] = {}
+        self._largest = np.full(len(session.env.reward_term_names), 1e-9)
+        self._ghost = BESIDE
+        self._show_object()
+        self._set_camera()
+        self._build_panel()
+        self.viewer.set_reset_callback(self.session.reset)
+        self.draw()
+
+    @property
+    def url(self) -> str:
+        """Address to open in a browser."""
+        return self.viewer.url
+
+    def run(self, *, steps: int | None = None) -> None:
+        """Step in real time until the viewer is closed, or ``steps`` control steps were made."""
+        period = 1.0 / self.session.env.cfg.sim.control_hz
+        done, due = 0, time.monotonic()
+        while self.viewer.is_running() and (steps is None or done < steps):
+            done += self.update()
+            due = max(due + period, time.monotonic() - period)  # after a pause, do not hurry to catch up
+            time.sleep(max(0.0, due - time.monotonic()))
+
+    def update(self) -> bool:
+        """Handle browser events, step unless paused, and draw; returns whether a step was made."""
+        while not self._events.empty():
+            self._events.get()()
+        step = self.viewer.should_step()
+        if step:
+            self.session.step()
+        self.draw()
+        return step
+
+    def draw(self) -> None:
+        """Send the present state to the browser."""
+        shot = self.session.snapshot
+        self._pictured.pose(shot.joint_q[None], shot.goal_quat[None], self._ghost_position(shot))
+        self.viewer.begin_frame(shot.time_s)
+        self.viewer.log_state(self._pictured.state)
+        self.viewer.log_scalar("orientation error [rad]", shot.error_rad)
+        self._status.content = status_html(shot)
+        self._largest = np.maximum(self._largest, np.abs(shot.terms))
+        self._bars.content = bars_html(self.session.env.reward_term_names, shot.terms, self._largest)
+        self.viewer.end_frame()
+
+    def close(self) -> None:
+        """Stop serving."""
+        self.viewer.close()
+
+    def _show_object(self) -> None:
+        """Show the model of the chosen object; models are kept, since building one takes a second."""
+        name = self.session.object_name
+        if name not in self._models:
+            env = self.session.env
+            item = env.objects[self.session.object_names.index(name)]
+            self._models[name] = PictureModel(env.hand, [item], device="cpu", ghost_in_scene=True)
+        self._pictured = self._models[name]
+        self.viewer.set_model(self._pictured.model)
+        self._largest[:] = 1e-9
+
+    def _set_camera(self) -> None:
+        eye, target = np.asarray(self.camera.eye), np.asarray(self.camera.target)
+        forward = (target - eye) / np.linalg.norm(target - eye)
+        self.viewer.set_camera(
+            wp.vec3(*(target + CAMERA_DISTANCE * (eye - target))),
+            pitch=math.degrees(math.asin(forward[2])),
+            yaw=math.degrees(math.atan2(forward[1], forward[0])),
+        )
+
+    def _ghost_position(self, shot: Snapshot) -> tuple[float, float, float]:
+        if self._ghost == HIDDEN:
+            return UNSEEN
+        if self._ghost == ON_OBJECT:
+            x, y, z = (float(value) for value in shot.joint_q[-7:-4])
+            return x, y, z
+        right = self.camera.rotation[:, 0]
+        return float(GHOST_RIGHT * right[0]), float(GHOST_RIGHT * right[1]), GHOST_HEIGHT
+
+    def _build_panel(self) -> None:
+        gui, session = self.viewer.server.gui, self.session
+        with gui.add_folder("Policy", order=-1.0):
+            self._status = gui.add_html(status_html(session.snapshot))
+            agent = gui.add_dropdown("Agent", session.agent_names, initial_value=session.agent)
+            chosen = gui.add_dropdown("Object", session.object_names, initial_value=session.object_name)
+            ghost = gui.add_dropdown("Goal", (BESIDE, ON_OBJECT, HIDDEN), initial_value=self._ghost)
+            new_goal = gui.add_button("New goal")
+        with gui.add_folder("Reward", order=-0.5):
+            self._bars = gui.add_html("")
+        self._agent_dropdown = agent
+
+        @agent.on_update
+        def _(event: Any) -> None:
+            if event.client_id is not None:  # not our own setting of the value
+                self._events.put(partial(self._choose_agent, agent.value))
+
+        @chosen.on_update
+        def _(event: Any) -> None:
+            if event.client_id is not None:
+                self._events.put(partial(self._choose_object, chosen.value))
+
+        @ghost.on_update
+        def _(_event: Any) -> None:
+            self._ghost = ghost.value
+
+        @new_goal.on_click
+        def _(_event: Any) -> None:
+            self._events.put(session.new_goal)
+
+    def _choose_object(self, name: str) -> None:
+        self.session.choose_object(name)
+        self._show_object()
+
+    def _choose_agent(self, name: str) -> None:
+        try:
+            self.session.choose_agent(name)
+        except (ValueError, FileNotFoundError) as error:
+            for client in self.viewer.server.get_clients().values():
+                client.add_notification("This agent cannot be used", str(error), color="red")
+            self._agent_dropdown.value = self.session.agent
+
+
+def status_html(shot: Snapshot) -> str:
+    """Error, time and counts as HTML."""
+    color = "#12a150" if shot.error_rad <= PAPER.success.rotation_rad else "inherit"
+    return (
+        '<div style="padding:.2em .8em;font-variant-numeric:tabular-nums">'
+        f"<b>{escape(shot.name)}</b>"
+        f'<div style="font-size:1.5em;color:{color}">{shot.error_rad:.2f} rad</div>'
+        f'<div style="opacity:.75">{shot.time_s:.1f} s &middot; goals reached {shot.goals}'
+        f" &middot; drops {shot.drops}</div></div>"
+    )
+
+
+def bars_html(names: tuple[str, ...], terms: np.ndarray, largest: np.ndarray) -> str:
+    """One bar for each reward term, relative to the largest value it had; negative ones to the left."""
+    rows = []
+    for name, value, top in zip(names, terms, largest, strict=True):
+        share = 50.0 * float(np.clip(value / top, -1.0, 1.0))
+        left, width = (50.0, share) if share >= 0 else (50.0 + share, -share)
+        rows.append(
+            f"<span>{escape(name.replace('_', ' '))}</span>"
+            f'<span style="position:relative;background:{GROUND};border-radius:2px;height:.8em">'
+            f'<span style="position:absolute;left:{left:.1f}%;width:{width:.1f}%;top:0;bottom:0;'
+            f'background:{POSITIVE if share >= 0 else NEGATIVE}"></span></span>'
+            f'<span style="text-align:right">{value:.3g}</span>'
+        )
+    return (
+        '<div style="display:grid;grid-template-columns:auto 1fr 4em;gap:.25em .6em;align-items:center;'
+        f'padding:.2em .8em;font-size:.85em;font-variant-numeric:tabular-nums">{"".join(rows)}</div>'
+    )
