@@ -140,7 +140,7 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     import warp as wp
 
     # A line for each of some hundred kernels would scroll the progress away.
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     from vd.envs.reorient import ReorientEnv
     from vd.train.runner import TeacherRunner
     from vd.train.vec_env import ReorientVecEnv

@@ -15,7 +15,8 @@ import torch
 from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
-from vd.policy import PolicySpec, policy_export, spec_dict
+from vd.config import to_dict
+from vd.policy import PolicySpec, policy_export
 from vd.train.checkpoint import (
     BEST_NAME,
     CHECKPOINT_FOLDER,
@@ -96,7 +97,6 @@ class TeacherRunner(OnPolicyRunner):
         self._score = (0.0, 0.0, -math.inf)
         self._best: tuple[float, ...] | None = None
         self._signal = 0
-        self._resumed = False
 
     @property
     def is_main(self) -> bool:
@@ -120,7 +120,7 @@ class TeacherRunner(OnPolicyRunner):
         first = self.current_learning_iteration
         total = self.total_iterations if num_learning_iterations is None else first + num_learning_iterations
         stagger = self.run.stagger if init_at_random_ep_len is None else init_at_random_ep_len
-        if stagger and not self._resumed:
+        if stagger and first == 0:
             steps = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(steps, high=int(self.env.max_episode_length))
         if self.is_distributed:
@@ -256,7 +256,6 @@ class TeacherRunner(OnPolicyRunner):
             mine = ranks[self.gpu_global_rank]
             self.env.load_state_dict(mine["env"])
             set_random_state(mine["random"], self.device)
-            self._resumed = True
         return state["infos"]
 
     def _state(self, infos: dict | None) -> dict[str, Any]:
@@ -282,7 +281,7 @@ class TeacherRunner(OnPolicyRunner):
             "best": list(self._best) if self._best is not None else None,
             "window": self._window.state_dict(),
             "ranks": ranks,
-            "policy": spec_dict(spec),
+            "policy": to_dict(spec),
             "task": self.task,
         }
 

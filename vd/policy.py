@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import torch
 from torch import nn
 
-from vd.config import from_dict, to_dict
+from vd.config import from_dict
 
 POLICY_FORMAT = "visual-dexterity policy 1"
 _ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "gelu": nn.GELU}
@@ -195,11 +195,6 @@ def policy_export(state: dict[str, Any]) -> dict[str, Any]:
         "env_steps": state["env_steps"],
         "actor_state_dict": {key: value.detach().cpu() for key, value in state["actor_state_dict"].items()},
     }
-
-
-def spec_dict(spec: PolicySpec) -> dict[str, Any]:
-    """``spec`` as plain values, for a checkpoint."""
-    return to_dict(spec)
 
 
 def _network(spec: PolicySpec) -> nn.Sequential:
