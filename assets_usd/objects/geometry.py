@@ -327,8 +327,8 @@ def _quadric_vertices(
 ) -> np.ndarray:
     """Vertex of each cluster: near its mean, on the planes of its triangles, at most a cell away."""
     count = int(cluster.max()) + 1
-    mean = np.stack([np.bincount(cluster, vertices[:, i], count) for i in range(3)], axis=1)
-    mean = mean / np.bincount(cluster, minlength=count)[:, None]
+    total = np.stack([np.bincount(cluster, vertices[:, i], count) for i in range(3)], axis=1)
+    mean = total / np.bincount(cluster, minlength=count)[:, None]
     corner = vertices[faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     length = np.linalg.norm(normal, axis=1, keepdims=True)

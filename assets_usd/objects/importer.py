@@ -17,11 +17,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vd.assets_usd.objects.decompose import DecomposeSettings, decompose, relative_volume_error
+from vd.assets_usd.objects.decompose import DecomposeSettings, decompose, relative_volume_error, tidy_hulls
 from vd.assets_usd.objects.geometry import Hull, cluster_vertices, surface_points
 from vd.assets_usd.objects.meshes import (
     MESH_SUFFIXES,
     MeshError,
+    check_file,
     choose_scale,
     load_mesh,
     repair_mesh,
@@ -30,7 +31,7 @@ from vd.assets_usd.objects.meshes import (
 from vd.assets_usd.objects.model import SURFACE_POINTS, build_model, read_hash, read_object, write_object
 from vd.files import atomic_path
 
-IMPORT_VERSION = 1
+IMPORT_VERSION = 2
 """Part of every content hash: raise it when the import computes something else."""
 
 MAX_VISUAL_FACES = 3000
@@ -214,7 +215,7 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     scale, note = choose_scale(float(np.ptp(mesh.vertices, axis=0).max()))
     if note:
         notes.append(note)
-    mesh = replace(mesh, vertices=mesh.vertices * scale)
+    mesh = mesh.scaled(scale)
     solid, method = solid_of(mesh)
     if not solid.volume > 0.0:
         raise MeshError("degenerate: encloses no volume")
@@ -222,8 +223,15 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     key = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes())
     key.update(json.dumps([IMPORT_VERSION, asdict(settings.decompose)], sort_keys=True).encode())
     cache = Path(settings.cache) / f"{key.hexdigest()}.npz" if settings.cache else None
-    cached = _cached_hulls(cache) if cache else None
-    if cached:
+    whole = 0 < len(mesh.pieces) <= settings.decompose.max_hulls
+    cached = None if whole or cache is None else _cached_hulls(cache)
+    hulls: tuple[Hull, ...]
+    way: str
+    more: tuple[str, ...] = ()
+    if whole:
+        limit = settings.decompose.max_hull_vertices
+        hulls, way = tidy_hulls([p.vertices for p in mesh.pieces], limit), "convex pieces"
+    elif cached:
         hulls, way, more = cached
     else:
         result = decompose(mesh.vertices, mesh.faces, settings.decompose)
@@ -263,7 +271,7 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
         hulls=len(hulls),
         volume_error=model.volume_error,
         longest_side_m=model.longest_side,
-        decomposed=cached is None,
+        decomposed=not whole and cached is None,
         notes=tuple(notes),
     )
 
@@ -364,6 +372,11 @@ def import_meshes(
     todo = []
     for job in plan:
         target = Path(job.target)
+        try:
+            check_file(Path(job.source))
+        except MeshError as error:
+            finish(ImportResult(job.source, job.name, "refused", str(error)))
+            continue
         if not force and target.is_file() and read_hash(target) == content_hash(job, settings):
             model = read_object(target)
             finish(

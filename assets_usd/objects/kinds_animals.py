@@ -26,11 +26,9 @@ def quadruped(rng: np.random.Generator) -> list[Hull]:
         for x in (-0.45 * length, 0.45 * length)
         for y in (-0.6 * girth, 0.6 * girth)
     ]
-    tail = rng.uniform(0.4, 0.9)
-    parts.append(
-        rod((-length / 2, 0, leg + 0.4), (-length / 2 - tail, 0, leg + rng.uniform(-0.1, 0.9)), 0.2, 0.12)
-    )
-    return parts
+    rump = np.array([-length / 2, 0.0, leg + 0.4])
+    tail = rod(rump, rump + vec(-rng.uniform(0.4, 0.9), 0, rng.uniform(-0.5, 0.5)), 0.2, 0.12)
+    return [*parts, *legs, tail]
 
 
 def bird(rng: np.random.Generator) -> list[Hull]:
@@ -92,11 +90,11 @@ def fish(rng: np.random.Generator) -> list[Hull]:
         ),
     ]
     droop = rng.uniform(-0.5, 0.2)
-    for side in (-1, 1):
-        parts.append(
-            rod((0.3, side * 0.5 * width, -0.2), (-0.2, side * (width + 0.5), -0.2 + droop), 0.2, 0.1)
-        )
-    return parts
+    fins = [
+        rod((0.3, side * 0.5 * width, -0.2), (-0.2, side * (width + 0.5), -0.2 + droop), 0.2, 0.1)
+        for side in (-1, 1)
+    ]
+    return parts + fins
 
 
 def dinosaur(rng: np.random.Generator) -> list[Hull]:

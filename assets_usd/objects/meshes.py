@@ -1,12 +1,21 @@
 """Reading foreign meshes: load, refuse what is none, repair, choose the scale."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vd.assets_usd.objects.geometry import Solid, solid_of_mesh, solid_of_voxels, voxelise_surface
+from vd.assets_usd.objects.geometry import (
+    Hull,
+    Solid,
+    convex_hull,
+    mesh_volume,
+    solid_of_hulls,
+    solid_of_mesh,
+    solid_of_voxels,
+    voxelise_surface,
+)
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 
@@ -15,6 +24,9 @@ LONGEST_SIDE_M = (0.095, 0.165)
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 """Units a mesh may be in; the first that needs the least rescaling is taken."""
+
+CONVEX = 0.99
+"""A closed piece that fills this share of its convex hull is taken as convex."""
 
 FLAT = 1e-3
 """A mesh thinner than this share of its longest side has no volume to simulate."""
@@ -32,13 +44,35 @@ class RepairedMesh:
         vertices: [V, 3] float64.
         faces: [T, 3] int32.
         watertight: Closed, consistently wound and of one piece.
+        pieces: Convex hulls of the closed pieces if all are convex, else empty: such a mesh is
+            decomposed as it stands.
         notes: What was done.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
     watertight: bool
+    pieces: tuple[Hull, ...]
     notes: tuple[str, ...]
+
+    def scaled(self, factor: float) -> "RepairedMesh":
+        """The mesh times a factor."""
+        pieces = tuple(Hull(p.vertices * factor, p.faces) for p in self.pieces)
+        return replace(self, vertices=self.vertices * factor, pieces=pieces)
+
+
+def check_file(path: Path) -> None:
+    """Refuse what needs no parser to be refused.
+
+    Raises:
+        MeshError: Unsupported type, missing or empty file.
+    """
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise MeshError(f"unsupported type {path.suffix or '(no suffix)'}; use {', '.join(MESH_SUFFIXES)}")
+    if not path.is_file():
+        raise MeshError("no such file")
+    if path.stat().st_size == 0:
+        raise MeshError("empty file")
 
 
 def load_mesh(path: Path) -> Any:
@@ -50,12 +84,7 @@ def load_mesh(path: Path) -> Any:
     import trimesh
 
     path = Path(path)
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise MeshError(f"unsupported type {path.suffix or '(no suffix)'}; use {', '.join(MESH_SUFFIXES)}")
-    if not path.is_file():
-        raise MeshError("no such file")
-    if path.stat().st_size == 0:
-        raise MeshError("empty file")
+    check_file(path)
     try:
         # Textures and materials are not needed, and missing ones must not stop the import.
         loaded = trimesh.load(path, process=False, skip_materials=True)
@@ -102,7 +131,10 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
     trimesh.repair.fix_normals(mesh)
     one_piece = mesh.body_count == 1
     watertight = bool(mesh.is_watertight and mesh.is_winding_consistent and one_piece and mesh.volume > 0.0)
-    if not mesh.is_watertight:
+    pieces = convex_pieces(mesh)
+    if pieces:
+        notes.append(f"{len(pieces)} convex piece{'s' if len(pieces) > 1 else ''}: nothing to decompose")
+    elif not mesh.is_watertight:
         notes.append("not watertight: volume and mass properties from a voxelised solid")
     elif not one_piece:
         notes.append(f"{mesh.body_count} pieces: volume and mass properties from a voxelised solid")
@@ -110,8 +142,25 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
         np.asarray(mesh.vertices, dtype=np.float64),
         np.asarray(mesh.faces, dtype=np.int32),
         watertight,
+        pieces,
         tuple(notes),
     )
+
+
+def convex_pieces(mesh: Any) -> tuple[Hull, ...]:
+    """Convex hulls of a ``trimesh.Trimesh``'s connected pieces; none unless all are closed and convex."""
+    hulls = []
+    for piece in mesh.split(only_watertight=False):
+        if not piece.is_watertight:
+            return ()
+        try:
+            hull = convex_hull(piece.vertices)
+        except ValueError:
+            return ()
+        if abs(mesh_volume(piece.vertices, piece.faces)) < CONVEX * mesh_volume(*hull):
+            return ()
+        hulls.append(hull)
+    return tuple(hulls)
 
 
 def choose_scale(longest: float) -> tuple[float, str]:
@@ -141,7 +190,9 @@ def choose_scale(longest: float) -> tuple[float, str]:
 
 
 def solid_of(mesh: RepairedMesh) -> tuple[Solid, str]:
-    """Mass properties of a mesh at density 1, and the method: exact if watertight, else voxels."""
+    """Mass properties of a mesh at density 1, and the method: exact if watertight, else by voxels."""
     if mesh.watertight:
         return solid_of_mesh(mesh.vertices, mesh.faces), "exact mesh volume"
+    if mesh.pieces:
+        return solid_of_hulls(mesh.pieces), "union of the pieces by voxels"
     return solid_of_voxels(*voxelise_surface(mesh.vertices, mesh.faces)), "voxelised solid"

@@ -1,0 +1,102 @@
+"""``vd-assets`` from end to end."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from vd.assets_usd import cli
+from vd.assets_usd.objects.model import load_set
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def run(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
+    """Exit status of ``vd-assets`` with these arguments."""
+    monkeypatch.setattr(sys, "argv", ["vd-assets", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    return int(end.value.code or 0)
+
+
+def picture(path: Path) -> np.ndarray:
+    from PIL import Image
+
+    return np.asarray(Image.open(path).convert("RGB"), dtype=float) / 255.0
+
+
+def test_import_then_show(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    folder = tmp_path / "things"
+    folder.mkdir()
+    trimesh.creation.box((0.12, 0.05, 0.03)).export(folder / "brick.stl")
+    (folder / "broken.obj").write_text("v 0 0 0\n")
+    assert run(monkeypatch, "import", folder, "--json") == 1
+    record = json.loads(capsys.readouterr().out)
+    status = {o["name"]: (o["status"], o["reason"]) for o in record["objects"]}
+    assert status["brick"] == ("imported", "")
+    assert status["broken"][0] == "refused" and status["broken"][1]
+    # Without --out, the set lies in the cache under the folder's name and can be loaded by it.
+    assert [m.name for m in load_set("things")] == ["brick"]
+
+    assert run(monkeypatch, "import", folder / "brick.stl", "--out", record["out"]) == 0
+    assert "0 imported, 1 unchanged, 0 refused" in capsys.readouterr().out
+    assert run(monkeypatch, "import", folder) == 1
+    out = capsys.readouterr().out
+    assert "1 refused" in out and "broken.obj: " in out and "volume error" in out
+
+    sheet = tmp_path / "sheet.png"
+    assert run(monkeypatch, "show", "things", "cube", "--out", sheet, "--tile", 80) == 0
+    image = picture(sheet)
+    drawn = np.abs(image - image[0, 0]).max(axis=2) > 0.1
+    assert 0.05 < drawn.mean() < 0.7
+    saturation = image.max(axis=2) - image.min(axis=2)
+    assert (saturation > 0.3).mean() > 0.02, "the coloured parts are missing"
+
+
+def test_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    assert run(monkeypatch, "objects", "--procedural", 3, "--seed", 4, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert Path(record["folder"]).name == "procedural-3-seed4"
+    assert sorted(o["name"] for o in record["objects"]) == [m.name for m in load_set("procedural-3-seed4")]
+    assert run(monkeypatch, "objects", "--symmetric", "--out", tmp_path / "solids") == 0
+    assert [m.name for m in load_set(tmp_path / "solids")] == ["cube", "cuboid"]
+    assert run(monkeypatch, "objects", "--procedural", 0) == 2
+
+
+def test_errors_are_one_line_and_status_2(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    assert run(monkeypatch, "show", "nothing-here") == 2
+    assert "no object set or path 'nothing-here'" in capsys.readouterr().err
+    assert run(monkeypatch, "import", "/nowhere/at/all") == 2
+    assert "no such file or folder" in capsys.readouterr().err
+    assert run(monkeypatch, "hand", "dclaw5") == 2
+    assert "dclaw3" in capsys.readouterr().err
+
+
+def test_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    assert run(monkeypatch, "hand", "dclaw3", "--out", tmp_path / "hands") == 0
+    path = Path(capsys.readouterr().out.strip())
+    assert path.is_file() and path.parent == tmp_path / "hands"
+
+
+def test_help_is_fast_and_names_the_commands():
+    code = (
+        "import sys; from vd.assets_usd import cli; sys.argv = ['vd-assets', '--help']\n"
+        "try: cli.main()\n"
+        "except SystemExit: pass\n"
+        "heavy = {'trimesh', 'pxr', 'scipy', 'coacd', 'torch', 'warp', 'newton'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert all(word in out for word in ("hand", "objects", "import", "show"))

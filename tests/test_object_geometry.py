@@ -1,0 +1,145 @@
+"""Hulls, volumes, mass properties and surface samples against closed forms."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.objects import geometry as g
+from vd.assets_usd.objects.primitives import box, cylinder, ellipsoid, rod
+
+
+def box_inertia(sides: np.ndarray, mass: float = 1.0) -> np.ndarray:
+    """Inertia of a box about its centre."""
+    square = np.asarray(sides) ** 2
+    return np.diag(square.sum() - square) * mass / 12.0
+
+
+def assert_convex_and_outward(hull: g.Hull) -> None:
+    """No vertex lies outside any face's plane, and the volume is positive."""
+    size = np.ptp(hull.vertices, axis=0).max()
+    assert g.hull_depth(hull, hull.vertices).max() < 1e-6 * size
+    assert g.mesh_volume(*hull) > 0.0
+
+
+def test_solid_of_a_turned_box_is_exact():
+    sides, rotation = np.array([0.03, 0.05, 0.11]), Rotation.from_euler("xyz", [0.3, -0.7, 1.1])
+    centre = np.array([0.2, -0.1, 0.4])
+    hull = box(centre, sides, euler=[0.3, -0.7, 1.1])
+    solid = g.solid_of_mesh(*hull)
+    turn = rotation.as_matrix()
+    assert solid.volume == pytest.approx(sides.prod(), rel=1e-12)
+    np.testing.assert_allclose(solid.centroid, centre, atol=1e-12)
+    np.testing.assert_allclose(
+        solid.inertia, turn @ box_inertia(sides, sides.prod()) @ turn.T, rtol=1e-9, atol=1e-15
+    )
+
+
+def test_solid_of_a_fine_sphere_matches_the_closed_form():
+    radius = 0.04
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+    solid = g.solid_of_mesh(ball.vertices, ball.faces)
+    volume = 4.0 / 3.0 * np.pi * radius**3
+    assert solid.volume == pytest.approx(volume, rel=2e-3)
+    np.testing.assert_allclose(solid.inertia, 0.4 * volume * radius**2 * np.eye(3), rtol=5e-3, atol=1e-12)
+
+
+def test_union_of_overlapping_boxes_counts_the_overlap_once():
+    parts = [box((0, 0, 0), (0.1, 0.04, 0.04)), box((0.03, 0, 0), (0.04, 0.04, 0.1))]
+    exact = 0.1 * 0.04 * 0.04 + 0.04 * 0.04 * 0.06
+    solid = g.solid_of_hulls(parts)
+    assert solid.volume == pytest.approx(exact, rel=0.02)
+    x = (0.0 * 0.1 * 0.04 * 0.04 + 0.03 * 0.04 * 0.04 * 0.06) / exact
+    np.testing.assert_allclose(solid.centroid, [x, 0, 0], atol=5e-4)
+
+
+@pytest.mark.parametrize("open_lid", [False, True])
+def test_voxelised_mesh_needs_no_closed_surface(open_lid: bool):
+    """A box with a hole of two voxels still encloses its volume."""
+    sides = np.array([0.12, 0.06, 0.05])
+    mesh = trimesh.creation.box(sides).subdivide_to_size(0.002)
+    faces = mesh.faces
+    if open_lid:
+        middle = mesh.triangles_center
+        faces = faces[~((middle[:, 2] > 0.0249) & (np.abs(middle[:, :2]) < 0.0012).all(axis=1))]
+        assert len(faces) < len(mesh.faces)
+    solid = g.solid_of_voxels(*g.voxelise_surface(mesh.vertices, faces))
+    assert solid.volume == pytest.approx(sides.prod(), rel=0.04)
+    np.testing.assert_allclose(np.diag(solid.inertia), np.diag(box_inertia(sides, sides.prod())), rtol=0.1)
+
+
+def test_principal_axes_rebuild_the_tensor():
+    turn = Rotation.from_euler("xyz", [0.4, 1.0, -2.0]).as_matrix()
+    tensor = turn @ np.diag([3.0, 1.0, 2.0]) @ turn.T
+    moments, quat = g.principal_axes(tensor)
+    axes = Rotation.from_quat(quat).as_matrix()
+    np.testing.assert_allclose(moments, [1, 2, 3], rtol=1e-12)
+    np.testing.assert_allclose(axes @ np.diag(moments) @ axes.T, tensor, atol=1e-12)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.integers(10, 200), st.integers(6, 32))
+def test_simplified_hull_is_convex_small_and_keeps_its_volume(seed: int, count: int, limit: int):
+    points = np.random.default_rng(seed).normal(size=(count, 3)) * [1.0, 0.5, 0.2]
+    full = g.convex_hull(points)
+    simple = g.simplify_hull(full, limit)
+    assert len(simple.vertices) <= limit
+    assert_convex_and_outward(simple)
+    assert g.mesh_volume(*simple) == pytest.approx(g.mesh_volume(*full), rel=1e-9)
+
+
+def test_simplifying_a_finely_meshed_box_gives_its_eight_corners():
+    fine = trimesh.creation.box((0.1, 0.05, 0.03)).subdivide().subdivide()
+    simple = g.simplify_hull(g.Hull(fine.vertices, fine.faces), 32)
+    corners = trimesh.creation.box((0.1, 0.05, 0.03)).vertices
+    assert len(simple.vertices) == 8
+    distance = np.linalg.norm(simple.vertices[:, None] - corners[None], axis=2)
+    assert distance.min(axis=1).max() < 1e-9
+
+
+def test_flat_or_too_few_points_have_no_hull():
+    grid = np.stack(np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0, 2.0], [0.5]), axis=-1).reshape(-1, 3)
+    with pytest.raises(ValueError, match="plane"):
+        g.convex_hull(grid)
+    with pytest.raises(ValueError, match="four points, got 3"):
+        g.convex_hull(np.eye(3))
+
+
+@pytest.mark.parametrize(
+    "hull",
+    [
+        box((1, 2, 3), (1, 2, 3), euler=(1, 2, 3), top=(0.5, 0.7)),
+        ellipsoid((0, 0, 1), (1, 0.5, 0.2)),
+        rod((0, 0, 0), (1, 1, 0), 0.2, 0.1),
+        cylinder((0, 0, 0), (0, 0, 1), 0.5, 0.3),
+    ],
+)
+def test_primitives_are_convex_and_small(hull: g.Hull):
+    assert_convex_and_outward(hull)
+    assert len(hull.vertices) <= 32
+
+
+def test_surface_points_lie_on_the_outer_surface_and_cover_it():
+    parts = [box((0, 0, 0), (0.1, 0.04, 0.04)), box((0.03, 0, 0.02), (0.04, 0.02, 0.1))]
+    vertices = np.concatenate([p.vertices for p in parts])
+    faces = np.concatenate([parts[0].faces, parts[1].faces + len(parts[0].vertices)])
+    points = g.surface_points(vertices, faces, 500, outside=parts)
+    assert points.shape == (500, 3)
+    assert np.abs(g.union_depth(parts, points)).max() < 1e-6
+    probes = g.random_surface_points(vertices, faces, 4000, np.random.default_rng(1))
+    probes = probes[g.union_depth(parts, probes) > -1e-9]
+    gap = np.linalg.norm(probes[:, None] - points[None], axis=2).min(axis=1).max()
+    assert gap < 0.01
+    np.testing.assert_array_equal(points, g.surface_points(vertices, faces, 500, outside=parts))
+
+
+def test_coarsened_mesh_keeps_its_box_and_shape():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.05)
+    vertices, faces = g.cluster_vertices(ball.vertices, ball.faces, 3000)
+    assert 1500 < len(faces) <= 3000
+    np.testing.assert_allclose(np.ptp(vertices, axis=0), np.ptp(ball.vertices, axis=0), rtol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 0.05, rtol=0.02)
+    same = g.cluster_vertices(ball.vertices, ball.faces, len(ball.faces))
+    assert same[1] is ball.faces

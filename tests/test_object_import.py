@@ -1,0 +1,311 @@
+"""Import of meshes: repair, scale, decomposition, refusals by name, and work that is not done twice."""
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from vd.assets_usd.objects import decompose as d
+from vd.assets_usd.objects import meshes as m
+from vd.assets_usd.objects.geometry import Hull, hull_depth, union_depth
+from vd.assets_usd.objects.importer import (
+    ImportSettings,
+    find_meshes,
+    import_meshes,
+    plan_jobs,
+    prim_name,
+)
+from vd.assets_usd.objects.model import read_object
+from vd.paper import PAPER
+
+FAST = d.DecomposeSettings(threshold=0.05, mcts_iterations=20, time_limit_s=60.0)
+
+
+def l_shape() -> trimesh.Trimesh:
+    """A closed, non-convex solid 0.12 m long: an L, extruded."""
+    outline = [(0, 0), (0.12, 0), (0.12, 0.03), (0.03, 0.03), (0.03, 0.08), (0, 0.08)]
+    low = np.array([(x, y, 0.0) for x, y in outline])
+    vertices = np.concatenate([low, low + np.array([0.0, 0.0, 0.03])])
+    caps = [(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 5)]
+    faces = [(a, c, b) for a, b, c in caps] + [(a + 6, b + 6, c + 6) for a, b, c in caps]
+    for i in range(6):
+        j = (i + 1) % 6
+        faces += [(i, j, j + 6), (i, j + 6, i + 6)]
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+L_VOLUME = (0.12 * 0.03 + 0.03 * 0.05) * 0.03
+
+
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory):
+    """A folder with good and bad meshes, imported once: (folder, out, settings, results by name)."""
+    root = tmp_path_factory.mktemp("import")
+    folder = root / "meshes"
+    (folder / "sub").mkdir(parents=True)
+    l_shape().export(folder / "bracket.stl")
+    box = trimesh.creation.box((120.0, 60.0, 40.0))
+    box.export(folder / "brick in mm.ply")
+    trimesh.creation.box((0.1, 0.05, 0.05)).export(folder / "sub" / "bracket.glb")
+    (folder / "empty.obj").write_text("")
+    (folder / "cloud.obj").write_text("".join(f"v {i} {i * i} 1\n" for i in range(9)))
+    (folder / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 1\nf 1 2 3\nf 1 2 4\n")
+    (folder / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3\nf 1 3 4\n")
+    (folder / "junk.stl").write_bytes(b"this is no stereolithography file")
+    notes = root / "notes.txt"
+    notes.write_text("hello")
+    with (folder / "objects.csv").open("w", newline="") as stream:
+        rows = csv.writer(stream)
+        rows.writerow(["name", "source", "split"])
+        rows.writerow(["bracket", "our workshop (CC0-1.0)", "train"])
+    settings = ImportSettings(FAST, licence="MIT", cache=str(root / "cache"))
+    seen = []
+    results = import_meshes(
+        [folder, notes], root / "out", settings, jobs=2, progress=lambda r, i, n: seen.append((r.name, i, n))
+    )
+    assert [i for _, i, _ in seen] == list(range(1, len(results) + 1))
+    return folder, root / "out", settings, {r.name: r for r in results}
+
+
+REFUSALS = {
+    "empty": "empty file",
+    "cloud": "not a mesh: 9 points and no faces|empty: no faces",
+    "nan": "1 of 4 vertices are NaN or infinite",
+    "flat": "degenerate: flat",
+    "junk": "not a mesh|empty",
+    "notes": r"unsupported type \.txt; use \.obj, \.stl, \.ply, \.glb",
+}
+
+
+@pytest.mark.parametrize("name", sorted(REFUSALS))
+def test_bad_meshes_are_refused_with_the_reason(imported, name: str):
+    _, out, _, results = imported
+    assert results[name].status == "refused"
+    assert re.search(REFUSALS[name], results[name].reason), results[name].reason
+    assert not (out / f"{name}.usd").exists()
+
+
+def test_the_rest_still_imports(imported):
+    _, out, _, results = imported
+    good = {name for name, r in results.items() if r.status == "imported"}
+    assert good == {"bracket", "bracket_2", "brick_in_mm"}
+    assert {p.stem for p in out.glob("*.usd")} == good
+
+
+def test_hulls_are_convex_contain_the_mesh_and_keep_its_volume(imported):
+    model = read_object(imported[1] / "bracket.usd")
+    assert 2 <= len(model.hulls) <= 8
+    for hull in model.hulls:
+        assert len(hull.vertices) <= 32
+        assert hull_depth(hull, hull.vertices).max() < 1e-6
+    assert union_depth(model.hulls, model.surface_points.astype(float)).max() < 1e-3
+    assert model.volume_error < 0.05
+    assert imported[3]["bracket"].decomposed
+
+
+def test_mass_properties_are_those_of_the_solid(imported):
+    model = read_object(imported[1] / "bracket.usd")
+    mesh = l_shape()
+    np.testing.assert_allclose(np.ptp(model.vertices, axis=0), [0.12, 0.08, 0.03], atol=1e-6)
+    # The corner of the L lies at minus its centre of mass.
+    arms = np.array([0.12 * 0.03, 0.03 * 0.05])
+    centre = (arms @ np.array([[0.06, 0.015, 0.015], [0.015, 0.055, 0.015]])) / arms.sum()
+    np.testing.assert_allclose(model.vertices.min(axis=0), -centre, atol=1e-6)
+    mass = PAPER.materials.object_mass_kg
+    np.testing.assert_allclose(
+        model.inertia_matrix, mesh.moment_inertia * mass / mesh.volume, rtol=1e-5, atol=1e-10
+    )
+    assert mesh.volume == pytest.approx(L_VOLUME)
+    assert model.mass_kg == pytest.approx(mass)
+
+
+def test_millimetres_are_recognised(imported):
+    model = read_object(imported[1] / "brick_in_mm.usd")
+    np.testing.assert_allclose(np.ptp(model.vertices, axis=0), [0.12, 0.06, 0.04], atol=1e-6)
+    assert model.scale == pytest.approx(1e-3)
+    assert any("taken as mm" in note for note in model.notes)
+    assert not imported[3]["brick_in_mm"].decomposed
+    assert len(model.hulls) == 1 and len(model.hulls[0].vertices) == 8
+
+
+def test_licence_and_source_come_from_the_sidecar(imported):
+    bracket, brick = (read_object(imported[1] / f"{n}.usd") for n in ("bracket", "brick_in_mm"))
+    assert (bracket.licence, bracket.split) == ("CC0-1.0", "train")
+    assert bracket.source == "our workshop (CC0-1.0): bracket.stl"
+    assert (brick.licence, brick.source, brick.family) == ("MIT", "brick in mm.ply", "imported")
+
+
+def test_a_second_run_does_no_work(imported):
+    folder, out, settings, first = imported
+    before = {p: p.stat().st_mtime_ns for p in out.glob("*.usd")}
+    again = {r.name: r for r in import_meshes([folder], out, settings, jobs=2)}
+    assert {p: p.stat().st_mtime_ns for p in out.glob("*.usd")} == before
+    for name in ("bracket", "bracket_2", "brick_in_mm"):
+        assert again[name].status == "cached"
+        assert again[name].hulls == first[name].hulls
+        assert again[name].volume_error == pytest.approx(first[name].volume_error)
+
+
+def test_a_finished_decomposition_is_reused_and_another_setting_is_not(imported, tmp_path: Path):
+    folder, _, settings, first = imported
+    mesh = folder / "bracket.stl"
+    reused = import_meshes([mesh], tmp_path / "a", settings)[0]
+    assert (reused.status, reused.decomposed) == ("imported", False)
+    assert reused.volume_error == pytest.approx(first["bracket"].volume_error)
+    finer = replace(settings, decompose=replace(FAST, seed=1))
+    assert import_meshes([mesh], tmp_path / "a", finer)[0].decomposed
+
+
+def test_interrupted_import_leaves_no_part_and_no_process(tmp_path: Path):
+    """Ctrl-C ends the children; no half-written file stays."""
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for i in range(4):
+        mesh = trimesh.creation.torus(0.05, 0.02, major_sections=96, minor_sections=48)
+        mesh.apply_scale(1.0 + 0.01 * i)
+        mesh.export(folder / f"ring{i}.stl")
+    command = [
+        sys.executable,
+        "-m",
+        "vd.assets_usd.cli",
+        "import",
+        str(folder),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    environment = os.environ | {"VD_ASSETS": str(tmp_path / "assets")}
+    child = subprocess.Popen(
+        [*command, "--mcts-iterations", "500", "--threshold", "0.01"],
+        env=environment, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    marker = str(folder)
+    deadline = time.monotonic() + 20
+    while not _workers(child.pid) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    workers = _workers(child.pid)
+    assert workers
+    time.sleep(1.0)
+    child.send_signal(signal.SIGINT)
+    _, errors = child.communicate(timeout=20)
+    assert child.returncode == 130
+    assert "goes on from there" in errors
+    assert not any(Path(f"/proc/{pid}").exists() for pid in workers), marker
+    assert not [p for p in (tmp_path / "out").iterdir() if p.suffix != ".usd" or p.name.startswith(".")]
+
+
+def _workers(parent: int) -> list[int]:
+    """Child processes of a process."""
+    tasks = Path(f"/proc/{parent}/task").glob("*/children")
+    return [int(pid) for task in tasks for pid in task.read_text().split()]
+
+
+@pytest.mark.parametrize(
+    ("longest", "side", "note"),
+    [
+        (0.12, 0.12, ""),
+        (0.095, 0.095, ""),
+        (0.05, 0.095, "scaled by 1.9"),
+        (0.33, 0.165, "scaled by 0.5"),
+        (120.0, 0.12, "taken as mm"),
+        (12.0, 0.12, "taken as cm"),
+        (250.0, 0.165, "taken as mm, scaled"),
+        (2.0, 0.095, "taken as cm, scaled"),
+    ],
+)
+def test_scaling_rule(longest: float, side: float, note: str):
+    factor, words = m.choose_scale(longest)
+    assert longest * factor == pytest.approx(side)
+    assert words.startswith(note) and bool(words) == bool(note)
+
+
+def test_repair_closes_and_turns_a_mesh():
+    mesh = l_shape()
+    mesh.invert()
+    faces = np.concatenate([mesh.faces[:-1], mesh.faces[:1], [[0, 0, 1]]])
+    repaired = m.repair_mesh(trimesh.Trimesh(mesh.vertices, faces, process=False))
+    assert repaired.watertight
+    assert m.solid_of(repaired)[0].volume == pytest.approx(L_VOLUME)
+    assert any("filled holes" in n for n in repaired.notes)
+    assert any("removed 2" in n for n in repaired.notes)
+
+
+def test_convex_pieces_need_no_decomposition():
+    pieces = [trimesh.creation.box((0.1, 0.03, 0.03)), trimesh.creation.box((0.03, 0.03, 0.1))]
+    repaired = m.repair_mesh(trimesh.util.concatenate(pieces))
+    assert len(repaired.pieces) == 2
+    solid, method = m.solid_of(repaired)
+    assert solid.volume == pytest.approx(0.03**2 * 0.17, rel=0.02)
+    assert method == "union of the pieces by voxels"
+    assert m.repair_mesh(l_shape()).pieces == ()
+
+
+def test_open_mesh_is_tolerated_with_a_note():
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.06)
+    cut = mesh.triangles_center[:, 2] < 0.05
+    repaired = m.repair_mesh(trimesh.Trimesh(mesh.vertices, mesh.faces[cut], process=False))
+    assert not repaired.watertight
+    assert any("not watertight" in n for n in repaired.notes)
+
+
+def test_a_decomposition_that_hangs_or_dies_falls_back(monkeypatch: pytest.MonkeyPatch):
+    mesh = l_shape()
+    monkeypatch.setattr(d, "_coacd_child", lambda *_: time.sleep(60))
+    result = d.decompose(mesh.vertices, mesh.faces, replace(FAST, time_limit_s=0.5))
+    assert result.method == "one hull" and len(result.hulls) == 1
+    assert "no result after 0.5 s" in result.notes[0]
+    assert hull_depth(result.hulls[0], mesh.vertices).max() < 1e-9
+    monkeypatch.setattr(d, "_coacd_child", lambda *_: os._exit(11))
+    result = d.decompose(mesh.vertices, mesh.faces, FAST)
+    assert "exit code 11" in result.notes[0]
+
+
+def test_slivers_are_dropped():
+    block = trimesh.creation.box((0.1, 0.05, 0.05)).vertices
+    sheet = trimesh.creation.box((0.1, 0.05, 1e-5)).vertices
+    crumb = trimesh.creation.box((0.002, 0.002, 0.002)).vertices
+    line = np.linspace([0, 0, 0], [0.1, 0, 0], 5)
+    hulls = d.tidy_hulls([block, sheet, crumb, line], 32)
+    assert len(hulls) == 1
+    assert isinstance(hulls[0], Hull)
+    assert d.relative_volume_error(hulls, 0.1 * 0.05 * 0.05) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_names_and_order(tmp_path: Path):
+    assert prim_name("3d-print (final)") == "o_3d_print_final"
+    for name in ("b/a.obj", "a/a.STL", "a/A.ply"):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("x")
+    found = find_meshes([tmp_path / "b", tmp_path, tmp_path / "a" / "a.STL"])
+    assert [p.name for p in found] == ["a.obj", "A.ply", "a.STL"]
+    names = [job.name for job in plan_jobs(found, tmp_path / "out", ImportSettings())]
+    assert names == ["a", "A_2", "a_3"]
+    with pytest.raises(m.MeshError, match="no such file or folder"):
+        find_meshes([tmp_path / "nowhere"])
+    (tmp_path / "none").mkdir()
+    with pytest.raises(m.MeshError, match="no mesh in"):
+        find_meshes([tmp_path / "none"])
+
+
+def test_a_real_mesh(shared_dir: Path, tmp_path: Path):
+    duck = shared_dir / "objects" / "test" / "duck.stl"
+    if not duck.is_file():
+        pytest.skip(f"no {duck}")
+    result = import_meshes([duck], tmp_path, ImportSettings(d.DecomposeSettings(mcts_iterations=5)))[0]
+    assert result.status == "imported", result.reason
+    assert result.volume_error < 0.15
+    model = read_object(Path(result.target))
+    assert model.licence.startswith("Apache-2.0") and model.split == "test"
+    assert model.longest_side == pytest.approx(0.096, abs=1e-3)
+    assert Path(result.target).stat().st_size < 60_000
+    assert json.dumps(result.notes)

@@ -1,0 +1,132 @@
+"""The object file: round trip, what other USD readers see, and errors that say what to do."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vd.assets_usd.objects import procedural, sets
+from vd.assets_usd.objects.geometry import Hull
+from vd.assets_usd.objects.model import ObjectError, load_set, read_object, write_object
+from vd.paper import PAPER
+
+
+@pytest.fixture(scope="module")
+def example() -> procedural.ObjectModel:
+    return replace(
+        procedural.procedural_set(2, 3)[1],
+        symmetry=procedural.brick_rotations(),
+        licence="CC0-1.0",
+        notes=("one", "two"),
+        volume_error=0.125,
+    )
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.mark.parametrize("suffix", [".usd", ".usda", ".usdc"])
+def test_round_trip(tmp_path: Path, example: procedural.ObjectModel, suffix: str):
+    path = write_object(tmp_path / f"x{suffix}", example)
+    back = read_object(path)
+    for item in fields(example):
+        mine, theirs = getattr(example, item.name), getattr(back, item.name)
+        if item.name == "hulls":
+            assert len(mine) == len(theirs)
+            for a, b in zip(mine, theirs, strict=True):
+                assert isinstance(b, Hull)
+                np.testing.assert_array_equal(a.vertices, b.vertices)
+                np.testing.assert_array_equal(a.faces, b.faces)
+        elif isinstance(mine, np.ndarray):
+            # Masses and quaternions are single precision in UsdPhysics.
+            np.testing.assert_allclose(mine, theirs, rtol=1e-6, atol=1e-7, err_msg=item.name)
+        elif isinstance(mine, float):
+            assert mine == pytest.approx(theirs, rel=1e-6), item.name
+        else:
+            assert mine == theirs, item.name
+
+
+def test_usd_physics_says_what_the_model_says(tmp_path: Path, example: procedural.ObjectModel):
+    from pxr import Usd, UsdGeom, UsdPhysics
+
+    stage = Usd.Stage.Open(str(write_object(tmp_path / "x.usda", example)))
+    root = stage.GetDefaultPrim()
+    assert root.GetName() == example.name
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert UsdGeom.GetStageUpAxis(stage) == "Z"
+    assert root.HasAPI(UsdPhysics.RigidBodyAPI)
+    mass = UsdPhysics.MassAPI(root)
+    assert mass.GetMassAttr().Get() == pytest.approx(PAPER.materials.object_mass_kg)
+    assert tuple(mass.GetCenterOfMassAttr().Get()) == (0.0, 0.0, 0.0)
+    colliders = [p for p in stage.Traverse() if p.HasAPI(UsdPhysics.CollisionAPI)]
+    assert len(colliders) == len(example.hulls)
+    for prim in colliders:
+        assert UsdPhysics.MeshCollisionAPI(prim).GetApproximationAttr().Get() == "convexHull"
+    visual = stage.GetPrimAtPath(root.GetPath().AppendChild("visual"))
+    assert not visual.HasAPI(UsdPhysics.CollisionAPI)
+
+
+def test_inertia_of_a_cuboid_is_the_closed_form():
+    model = procedural.cuboid((0.04, 0.06, 0.1))
+    square = np.array([0.04, 0.06, 0.1]) ** 2
+    expected = np.diag(PAPER.materials.object_mass_kg * (square.sum() - square) / 12.0)
+    np.testing.assert_allclose(model.inertia_matrix, expected, rtol=1e-6, atol=1e-12)
+    assert model.longest_side == pytest.approx(0.1)
+    assert model.diameter == pytest.approx(np.sqrt(square.sum()))
+    np.testing.assert_allclose(np.ptp(model.vertices, axis=0) / 2, model.vertices.max(axis=0), atol=1e-7)
+
+
+def test_rewritten_file_is_read_anew(tmp_path: Path, example: procedural.ObjectModel):
+    path = write_object(tmp_path / "x.usd", example)
+    read_object(path)
+    write_object(path, replace(example, licence="other"))
+    assert read_object(path).licence == "other"
+
+
+def test_bad_files_are_named(tmp_path: Path, example: procedural.ObjectModel):
+    with pytest.raises(ObjectError, match=r"gone\.usd: no such object file"):
+        read_object(tmp_path / "gone.usd")
+    junk = tmp_path / "junk.usd"
+    junk.write_text("not a stage")
+    with pytest.raises(ObjectError, match=r"junk\.usd: not a USD file"):
+        read_object(junk)
+    foreign = tmp_path / "foreign.usda"
+    foreign.write_text('#usda 1.0\n(defaultPrim = "a")\ndef Xform "a" {}\n')
+    with pytest.raises(ObjectError, match=r"foreign\.usda: formatVersion is None.*vd-assets import"):
+        read_object(foreign)
+    with pytest.raises(ObjectError, match="no valid prim name"):
+        write_object(tmp_path / "x.usd", replace(example, name="1 2"))
+    with pytest.raises(ObjectError, match="suffix"):
+        write_object(tmp_path / "x.obj", example)
+
+
+def test_load_set_takes_files_folders_and_names(tmp_path: Path, cache: Path, example: procedural.ObjectModel):
+    folder = tmp_path / "mine"
+    sets.write_set(folder, [example])
+    models = load_set([folder, "cube"])
+    assert [m.name for m in models] == [example.name, "cube"]
+    assert (cache / "objects" / "cube" / "cube.usd").is_file()
+    assert [m.name for m in load_set("symmetric")] == ["cube", "cuboid"]
+    assert len(load_set("procedural-2-seed5")) == 2
+    assert load_set(folder / f"{example.name}.usd")[0].name == example.name
+    sets.write_set(cache / "objects" / "shelf", [example])
+    assert load_set("shelf")[0].name == example.name
+
+
+def test_unknown_set_says_what_there_is(tmp_path: Path, cache: Path, example: procedural.ObjectModel):
+    sets.write_set(cache / "objects" / "shelf", [example])
+    with pytest.raises(ObjectError) as error:
+        load_set("shelves")
+    for word in ("'shelves'", "shelf", "cube", "procedural-heldout", "vd-assets import", "vd-assets objects"):
+        assert word in str(error.value)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ObjectError, match=r"empty: no object file"):
+        load_set(tmp_path / "empty")
+    with pytest.raises(ObjectError, match="cube is also in"):
+        load_set(["cube", "symmetric"])
+    with pytest.raises(ObjectError, match="no object set was named"):
+        load_set([])
