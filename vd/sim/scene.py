@@ -83,7 +83,7 @@ def new_builder() -> newton.ModelBuilder:
 
 def contact_attributes(cfg: SimCfg, priority: int, condim: int = CONDIM_SLIDING) -> dict[str, object]:
     """MuJoCo attributes of a collision shape."""
-    d0, dmax = cfg.contact_impedance
+    d0, dmax = cfg.table_impedance if priority == PRIORITY_TABLE else cfg.contact_impedance
     return {
         "mujoco:condim": condim,
         "mujoco:geom_priority": priority,
@@ -143,21 +143,35 @@ def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBu
 
 
 def add_table(builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool) -> None:
-    """Add the table as a static box of this world."""
+    """Add the table of this world: a plane to the physics, a box to the eye.
+
+    The paper's table reaches 0.3 m to each side and an object counts as lost at half of that, so
+    nothing can tell a plane from it, except that contacts with a plane are exact: against a box, a
+    quarter of the imported objects never come to rest.
+    """
     size = PAPER.scene.table_size_m
-    config = shape_cfg(cfg, PAPER.materials.table_friction)
-    config.is_visible = visible
-    builder.add_shape_box(
+    builder.add_shape_plane(
+        plane=(0.0, 0.0, 1.0, -PAPER.scene.table_top_m),
+        width=0.0,
+        length=0.0,
         body=-1,
-        xform=wp.transform(wp.vec3(0.0, 0.0, PAPER.scene.table_top_m - 0.5 * size[2]), wp.quat_identity()),
-        hx=0.5 * size[0],
-        hy=0.5 * size[1],
-        hz=0.5 * size[2],
-        cfg=config,
+        cfg=shape_cfg(cfg, PAPER.materials.table_friction),
         label=TABLE_LABEL,
-        color=TABLE_COLOR,
         custom_attributes=contact_attributes(cfg, PRIORITY_TABLE),
     )
+    if visible:
+        builder.add_shape_box(
+            body=-1,
+            xform=wp.transform(
+                wp.vec3(0.0, 0.0, PAPER.scene.table_top_m - 0.5 * size[2]), wp.quat_identity()
+            ),
+            hx=0.5 * size[0],
+            hy=0.5 * size[1],
+            hz=0.5 * size[2],
+            cfg=shape_cfg(cfg, PAPER.materials.table_friction, visual=True),
+            label=f"{TABLE_LABEL}/visual",
+            color=TABLE_COLOR,
+        )
 
 
 def scaled_mesh(vertices: np.ndarray, faces: np.ndarray, scale: float) -> newton.Mesh:

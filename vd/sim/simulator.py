@@ -47,6 +47,26 @@ class NanDump:
     """Joint targets of the step [rad], shape [D]."""
 
 
+def make_solver(model: newton.Model, cfg: SimCfg) -> SolverMuJoCo:
+    """The solver with the project's settings; overflow is left to the guards, which need no prints."""
+    solver = SolverMuJoCo(
+        model,
+        solver="newton",
+        integrator="implicitfast",
+        cone=cfg.cone,
+        impratio=cfg.impratio,
+        iterations=cfg.iterations,
+        ls_iterations=cfg.ls_iterations,
+        tolerance=cfg.tolerance,
+        njmax=cfg.njmax,
+        nconmax=cfg.nconmax,
+        enable_multiccd=cfg.multiccd,
+        kinematic_switchable_roots=False,
+    )
+    solver.mjw_model.opt.warn_overflow = False
+    return solver
+
+
 class Simulator:
     """N worlds in Newton; one call simulates one control step without touching the host.
 
@@ -66,21 +86,7 @@ class Simulator:
         self.model = scene.model
         self.device = self.model.device
         self.num_worlds = n = scene.num_worlds
-        self.solver = SolverMuJoCo(
-            self.model,
-            solver="newton",
-            integrator="implicitfast",
-            cone=cfg.cone,
-            impratio=cfg.impratio,
-            iterations=cfg.iterations,
-            ls_iterations=cfg.ls_iterations,
-            tolerance=cfg.tolerance,
-            njmax=cfg.njmax,
-            nconmax=cfg.nconmax,
-            enable_multiccd=cfg.multiccd,
-            kinematic_switchable_roots=False,
-        )
-        self.solver.mjw_model.opt.warn_overflow = False  # detected below, on the device, without prints
+        self.solver = make_solver(self.model, cfg)
         self.state, self._next = self.model.state(), self.model.state()
         self.control = self.model.control()
         self._observables = self.solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW})
