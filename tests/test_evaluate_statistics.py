@@ -100,8 +100,7 @@ def test_resampling_objects_covers_new_objects_and_resampling_episodes_does_not(
 @pytest.mark.parametrize("outcome", [False, True])
 def test_a_sample_without_spread_has_an_exact_interval(unit, outcome):
     (interval,) = rate_intervals(np.full((1, 10, 30), outcome), unit)
-    size = 10 if unit == "object" else 300
-    width = 1 - 0.025 ** (1 / size)
+    width = 1 - 0.025 ** (1 / 300)
     assert interval.method == "clopper-pearson"
     assert (interval.low, interval.high) == pytest.approx((1 - width, 1.0) if outcome else (0.0, width))
 
@@ -110,7 +109,16 @@ def test_equal_rates_of_all_objects_do_not_look_certain():
     outcomes = np.tile([True, False], (1, 10, 5))
     (interval,) = rate_intervals(outcomes, "object")
     assert interval.value == 0.5
-    assert interval.low < 0.3 and interval.high > 0.7
+    assert interval.method == "clopper-pearson"
+    assert interval.low < 0.41 and interval.high > 0.59
+
+
+def test_one_success_is_never_less_certain_than_none():
+    """The exact interval without a success joins the bootstrap's with one."""
+    none, one = np.zeros((2, 1, 10, 6), dtype=bool)
+    one[0, 3, 2] = True
+    (without,), (with_one,) = rate_intervals(none, "object"), rate_intervals(one, "object")
+    assert without.high < with_one.high + 0.02
 
 
 @pytest.mark.parametrize("shape", list(itertools.product([1, 2, 9], [1, 2, 7])))

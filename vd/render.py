@@ -41,7 +41,7 @@ class Camera:
     The default looks along +y and sees hand, table and object, a little from above.
     """
 
-    eye: tuple[float, float, float] = (0.0, -0.5, 0.2)
+    eye: tuple[float, float, float] = (0.0, -0.55, 0.21)
     """Position [m]."""
     target: tuple[float, float, float] = (0.0, 0.0, 0.095)
     """Point in the middle of the picture [m]."""

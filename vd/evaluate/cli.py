@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 # Worlds simulated at once by default: enough to keep the device busy, few enough to fit anywhere.
 WORLDS_CPU, WORLDS_GPU = 64, 8192
+# Seconds between progress lines where they go to a file.
+LOG_EVERY_S = 10.0
 _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
 
 
@@ -154,13 +156,20 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         for item in env.objects
     ]
     starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
-    with tqdm(total=count * cfg.episodes, unit="episode", desc="vd-eval", mininterval=1.0) as bar:
+    rounds = math.ceil(cfg.episodes / (env.num_worlds // count))
+    refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
+    with tqdm(total=rounds * env.max_episode_steps, unit="step", desc="vd-eval", mininterval=refresh) as bar:
+
+        def show(done: int) -> None:
+            bar.set_postfix_str(f"{done} of {count * cfg.episodes} episodes", refresh=False)
+            bar.update()
+
         episodes = collect(
             env,
             policy,
             starts,
             goals,
-            on_step=lambda done, time_s: (bar.update(done - bar.n), bar.set_postfix_str(f"{time_s:.1f} s")),
+            on_step=show,
         )
     env.check()
     env.close()

@@ -125,8 +125,8 @@ def method_note(result: EvalResult) -> str:
         f"orientation drawn uniformly from SO(3): mean error {CHANCE_MEAN_RAD:.2f} rad for an asymmetric "
         f"object; the mean measured here, drops included, is {result.overall.mean_error_rad:.2f} rad. "
         f"{_UNIT_NOTE[result.overall.unit]} Those of a single object resample its episodes. Where all "
-        "outcomes agree the interval is Clopper and Pearson's exact one for the number of resampled units. "
-        "Times have distribution-free intervals between order statistics."
+        "outcomes agree the interval is Clopper and Pearson's exact one, which takes episodes as "
+        "independent. Times have distribution-free intervals between order statistics."
     )
 
 

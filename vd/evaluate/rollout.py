@@ -76,7 +76,7 @@ def collect(
     starts: np.ndarray,
     goals: np.ndarray,
     *,
-    on_step: Callable[[int, float], Any] = lambda done, time_s: None,
+    on_step: Callable[[int], object] = lambda done: None,
 ) -> tuple[Episode, ...]:
     """Run all episodes, in rounds of one episode a world.
 
@@ -88,8 +88,7 @@ def collect(
         policy: What to evaluate.
         starts: Initial orientations xyzw, shape [K, M, 4], objects in the order of ``env.objects``.
         goals: Goal orientations xyzw, shape [K, M, 4].
-        on_step: Called after every control step with the episodes done so far and the time since the last
-            reset [s].
+        on_step: Called after every control step with the number of episodes done so far.
 
     Returns:
         K x M episodes, object by object.
@@ -124,7 +123,7 @@ def _run_round(
     goals: np.ndarray,
     world_episode: np.ndarray,
     recorded: dict[tuple[int, int], Episode],
-    on_step: Callable[[int, float], Any],
+    on_step: Callable[[int], object],
 ) -> None:
     world_object = np.asarray(env.world_object)
     # Worlds without an episode left repeat their object's first one, unread.
@@ -153,7 +152,7 @@ def _run_round(
                     fell=bool(fell[w]),
                 )
             running &= ~ended
-        on_step(len(recorded), step / env.cfg.sim.control_hz)
+        on_step(len(recorded))
         if not running.any():
             return
     raise RuntimeError(

@@ -115,9 +115,9 @@ def choose_unit(num_objects: int, requested: Literal["auto", "object", "episode"
 def rate_intervals(outcomes: np.ndarray, unit: Unit, *, seed: int = 0) -> list[Interval]:
     """Rates of yes/no outcomes with 95 % intervals.
 
-    Where the bootstrap cannot say anything, since every resample is equal (no success at all, say), the
-    interval is Clopper-Pearson's exact binomial one with the number of resampled units as the sample size:
-    for unit ``object`` that is the number of objects, which is wide, and rightly so.
+    Where the bootstrap cannot say anything, since every resample is equal (no success at all, say), nothing
+    is known of how objects differ, and the interval is Clopper and Pearson's exact binomial one over all
+    episodes, taken as independent.
 
     Args:
         outcomes: Booleans, shape [R, K, M]: R rates, K objects, M episodes each.
@@ -131,11 +131,12 @@ def rate_intervals(outcomes: np.ndarray, unit: Unit, *, seed: int = 0) -> list[I
     units = outcomes.mean(axis=2)[:, None, :] if unit == "object" else outcomes
     low, high = _bca(units, _mean, seed)
     intervals = []
-    for rate, lower, upper, group in zip(outcomes.mean(axis=(1, 2)), low, high, units, strict=True):
+    for group, lower, upper in zip(outcomes, low, high, strict=True):
+        rate = group.mean()
         if np.isfinite(lower) and np.isfinite(upper):
             intervals.append(Interval(float(rate), float(lower), float(upper), "bca"))
         else:
-            exact = stats.binomtest(round(rate * group.size), group.size).proportion_ci(CONFIDENCE, "exact")
+            exact = stats.binomtest(round(group.sum()), group.size).proportion_ci(CONFIDENCE, "exact")
             intervals.append(Interval(float(rate), float(exact.low), float(exact.high), "clopper-pearson"))
     return intervals
 

@@ -20,6 +20,8 @@ SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)
 # Side of the goal's picture, as a share of the cell's height.
 GOAL_SHARE = 0.36
 VIDEO_SECONDS = 10.0
+# A CPU simulates this many worlds about in real time.
+FAST_WORLDS_CPU = 16
 
 
 @dataclass
@@ -109,6 +111,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     from tqdm import tqdm
 
     from vd.evaluate.agents import built_in
+    from vd.evaluate.cli import LOG_EVERY_S
     from vd.play.video import record, write_frames
     from vd.render import Renderer
 
@@ -128,7 +131,9 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     rate = env.cfg.sim.control_hz
     steps = max(1, round(cfg.seconds * rate))
     frames: Iterable[Any] = record(env, policy, renderer, worlds, steps)
-    count = write_frames(path, tqdm(frames, total=steps, unit="frame", desc="vd-play", mininterval=1.0), rate)
+    refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
+    frames = tqdm(frames, total=steps, unit="frame", desc="vd-play", mininterval=refresh)
+    count = write_frames(path, frames, rate)
     env.check()
     env.close()
     return count
@@ -177,12 +182,15 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
     from vd.evaluate.cli import resolve_device
 
     device = resolve_device(cfg.device)
+    count = len(load_set(list(cfg.objects)))
+    if device == "cpu" and count > FAST_WORLDS_CPU:
+        print(f"vd-play: {count} objects are {count} worlds, slow on a CPU; name fewer with --objects")
     trained = open_policy(cfg.agent_name, device)
     task = task_for(
         trained,
         hand=cfg.hand,
         objects=cfg.objects,
-        num_worlds=max(num_worlds, len(load_set(list(cfg.objects)))),
+        num_worlds=max(num_worlds, count),
         seed=cfg.seed,
         stop_tolerance_rad=cfg.stop_tolerance,
         max_goal_angle_rad=cfg.max_goal_angle,

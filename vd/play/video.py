@@ -19,7 +19,7 @@ from vd.render import Picture, Renderer
 STRIP_HEIGHT = 80
 MARGIN = 10
 # Share of a column of reward terms that their names take, and its width [pixel] from which 11 points fit.
-NAME_SHARE, FULL_COLUMN = 0.6, 140
+NAME_SHARE, FULL_COLUMN = 0.66, 140
 # Error curve: as long as an episode of the paper.
 CURVE_STEPS = round(PAPER.scene.episode_s * PAPER.scene.control_hz)
 # A reached goal or a drop colours the frame's edge for this many control steps, half a second.

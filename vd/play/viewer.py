@@ -199,7 +199,7 @@ def bars_html(names: tuple[str, ...], terms: np.ndarray, largest: np.ndarray) ->
             f'<span style="position:relative;background:{GROUND};border-radius:2px;height:.8em">'
             f'<span style="position:absolute;left:{left:.1f}%;width:{width:.1f}%;top:0;bottom:0;'
             f'background:{POSITIVE if share >= 0 else NEGATIVE}"></span></span>'
-            f'<span style="text-align:right">{value:.3g}</span>'
+            f'<span style="text-align:right">{value + 0.0:.3g}</span>'
         )
     return (
         '<div style="display:grid;grid-template-columns:auto 1fr 4em;gap:.25em .6em;align-items:center;'
