@@ -26,7 +26,14 @@ def ecdf_figure(result: EvalResult) -> Figure:
     _ecdf(axes, errors.ravel(), color=BLUE, linewidth=2.2, label="all episodes")
     _ecdf(axes, starts.ravel(), color=ORANGE, linewidth=1.4, linestyle="--", label="object left at its start")
     angle = np.linspace(0.0, np.pi, 200)
-    axes.plot(angle, chance_cdf(angle), color=GREY, linewidth=1.4, linestyle=":", label="uniform on SO(3)")
+    axes.plot(
+        angle,
+        chance_cdf(angle),
+        color=GREY,
+        linewidth=1.4,
+        linestyle=":",
+        label="uniform on SO(3), no symmetry",
+    )
     for tolerance in TOLERANCES_RAD:
         axes.axvline(tolerance, color=GREY, linewidth=0.6, alpha=0.6)
         axes.text(tolerance, 1.015, f"{tolerance:g}", ha="center", fontsize=8, color=GREY)
