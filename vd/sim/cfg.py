@@ -33,8 +33,8 @@ class SimCfg:
     contact_time_constant_s: float = 2.0 / 120.0
     """Contact ``solref`` time constant [s]: two physics steps, the stiffest that is stable."""
     contact_impedance: tuple[float, float] = (0.99, 0.995)
-    """Contact ``solimp`` d0 and dmax of hand and object. Contact stiffness scales with the object's mass, so the default
-    (0.9, 0.95) lets fingers sink more than a millimetre into a 0.1 kg object."""
+    """Contact ``solimp`` d0 and dmax of hand and object. Contact stiffness scales with the object's mass,
+    so the default (0.9, 0.95) lets fingers sink more than a millimetre into a 0.1 kg object."""
     table_impedance: tuple[float, float] = (0.97, 0.99)
     """The same for contacts with the table: stiffer ones keep some light, slim objects rocking, softer ones
     let more of them roll on."""

@@ -149,9 +149,9 @@ def add_table(builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool) -> No
     nothing can tell a plane from it, except that contacts with a plane are exact: against a box, a
     quarter of the imported objects never come to rest.
     """
-    size = PAPER.scene.table_size_m
+    size, top = PAPER.scene.table_size_m, PAPER.scene.table_top_m
     builder.add_shape_plane(
-        plane=(0.0, 0.0, 1.0, -PAPER.scene.table_top_m),
+        plane=(0.0, 0.0, 1.0, -top),
         width=0.0,
         length=0.0,
         body=-1,
@@ -162,9 +162,7 @@ def add_table(builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool) -> No
     if visible:
         builder.add_shape_box(
             body=-1,
-            xform=wp.transform(
-                wp.vec3(0.0, 0.0, PAPER.scene.table_top_m - 0.5 * size[2]), wp.quat_identity()
-            ),
+            xform=wp.transform(wp.vec3(0.0, 0.0, top - 0.5 * size[2]), wp.quat_identity()),
             hx=0.5 * size[0],
             hy=0.5 * size[1],
             hz=0.5 * size[2],

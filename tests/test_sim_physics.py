@@ -1,0 +1,169 @@
+"""Physics against what can be known: closed forms, Coulomb, energy, rest and grip."""
+
+import dataclasses
+
+import newton
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.objects.model import load_set
+from vd.bench.physics import GRAVITY, SmallScene, pinch, rest, slide
+from vd.envs.reorient import load_hand
+from vd.paper import PAPER
+from vd.sim.cfg import SimCfg
+from vd.sim.scene import add_object, build_hand, build_scene, new_builder
+from vd.sim.simulator import Simulator
+
+CFG = SimCfg()
+
+
+@pytest.fixture(scope="module")
+def cube():
+    return load_set("cube")[0]
+
+
+def test_free_fall(cube):
+    builder, world = new_builder(), new_builder()
+    add_object(world, cube, CFG, scale=1.0, visuals=False)
+    builder.add_world(world)
+    scene = SmallScene(builder, CFG, "cpu")
+    seconds = 0.5
+    scene.run(seconds)
+    pose, velocity = scene.body(0)
+    fallen = PAPER.scene.object_start_m[2] - pose[0, 2]
+    # Semi-implicit Euler falls one half step further than the closed form.
+    assert fallen == pytest.approx(0.5 * GRAVITY * seconds**2, rel=2.0 * CFG.physics_dt / seconds)
+    assert velocity[0, 2] == pytest.approx(-GRAVITY * seconds, rel=1e-4)
+    assert np.abs(pose[0, :2]).max() < 1e-6
+    assert np.abs(velocity[0, 3:]).max() < 1e-6
+
+
+def inertia_about(hand, q: np.ndarray, joint: int) -> float:
+    """Inertia of all that a joint moves about its axis, rotor included [kg m^2]: sum of I + m r^2."""
+    poses = hand.forward_kinematics(q)
+    parent, frame = poses[hand.joint_parent[joint]], hand.joint_parent_frame[joint]
+    turn = Rotation.from_quat(parent[3:])
+    origin = parent[:3] + turn.apply(frame[:3])
+    axis = (turn * Rotation.from_quat(frame[3:])).apply(hand.joint_axis[joint])
+    total = float(hand.armature[joint])
+    for link in range(hand.joint_child[joint], 3 * (joint // 3) + 4):
+        rotation = Rotation.from_quat(poses[link, 3:])
+        arm = poses[link, :3] + rotation.apply(hand.link_com[link]) - origin
+        local_axis = rotation.inv().apply(axis)
+        total += local_axis @ hand.link_inertia[link] @ local_axis
+        total += hand.link_mass[link] * np.sum(np.cross(axis, arm) ** 2)
+    return total
+
+
+@pytest.mark.parametrize("joint", [0, 1, 2])
+def test_step_response_of_a_joint_is_the_pd_closed_form(joint):
+    """A joint with inertia J follows J q'' + kd q' + kp q = kp target; gravity off, the others hold."""
+    hand = load_hand("dclaw4")
+    world = build_hand(hand, CFG, visuals=False)
+    world.gravity = (0.0, 0.0, 0.0)
+    builder = new_builder()
+    builder.add_world(world)
+    scene = SmallScene(builder, CFG, "cpu")
+    start = np.tile(PAPER.scene.reset_joint_rad, 4).astype(np.float32)
+    scene.state.joint_q.assign(start)
+    target = start.copy()
+    step = 0.2
+    target[joint] += step
+    scene.control.joint_target_q.assign(target)
+    times = np.arange(1, 37) * CFG.physics_dt
+    measured = []
+    for _ in times:
+        scene.run(CFG.physics_dt)
+        measured.append(scene.state.joint_q.numpy()[joint] - start[joint])
+    kp, kd, inertia = float(hand.kp[joint]), float(hand.kd[joint]), inertia_about(hand, start, joint)
+    slow, fast = sorted(-np.roots([inertia, kd, kp]).real)
+    closed = step * (1.0 + (slow * np.exp(-fast * times) - fast * np.exp(-slow * times)) / (fast - slow))
+    # The implicit integrator blurs the start by about one physics step.
+    assert np.abs(np.array(measured) - closed).max() < 0.05 * step
+    assert np.abs(np.array(measured) - closed)[len(times) // 2 :].max() < 0.02 * step
+
+
+def test_sliding_follows_coulomb():
+    measured, coulomb = slide(CFG)
+    # The integrator's velocity is half a step ahead: v dt / 2 less.
+    assert measured == pytest.approx(coulomb - 0.5 * CFG.physics_dt, rel=0.02)
+
+
+def test_a_pinched_object_stays(cube):
+    result = pinch(cube, CFG, force=10.0)
+    assert result.creep <= 0.2e-3
+    assert result.penetration <= 0.5e-3
+
+
+def test_a_slippery_pinch_lets_go(cube):
+    """The pinch test can fail: less friction force than weight."""
+    weak = pinch(cube, CFG, force=0.2)
+    assert weak.creep > 0.05
+
+
+def test_procedural_objects_come_to_rest():
+    objects = load_set("procedural-150-seed0")[::10]
+    results = rest(objects, CFG)
+    resting = [r for r in results if r.rests]
+    assert len(resting) >= 0.9 * len(results), [r for r in results if not r.rests]
+    assert max(r.penetration for r in results) < 1e-3
+
+
+def test_energy_does_not_grow(cube):
+    """A cube tumbling on the table only loses mechanical energy (samples may ripple by contact springs)."""
+    from vd.sim.scene import add_table
+
+    world, builder = new_builder(), new_builder()
+    add_table(world, CFG, visible=False)
+    body = add_object(world, cube, CFG, scale=1.0, visuals=False)
+    start = world.joint_qd_start[world.joint_child.index(body)]
+    world.joint_qd[start : start + 6] = [0.3, 0.1, 0.0, 3.0, -6.0, 2.0]
+    builder.add_world(world)
+    scene = SmallScene(builder, CFG, "cpu")
+    mass, inertia = cube.mass_kg, float(cube.inertia.mean())
+
+    def energy() -> float:
+        pose, velocity = scene.body(0)
+        linear, angular = velocity[0, :3], velocity[0, 3:]
+        kinetic = 0.5 * mass * linear @ linear + 0.5 * inertia * angular @ angular
+        return float(kinetic + mass * GRAVITY * pose[0, 2])
+
+    first = energy()
+    history = [first]
+    for _ in range(180):
+        scene.run(CFG.physics_dt)
+        history.append(energy())
+    lowest = np.minimum.accumulate(history)
+    assert np.max(np.array(history) - lowest) < 0.02 * first
+    assert history[-1] < 0.5 * first
+
+
+def test_velocity_limits_hold(device):
+    """A hand told to jump exceeds no joint's speed limit; without the kernel it would."""
+    hand = load_hand("dclaw4")
+    fast = dataclasses.replace(hand, velocity_limit=np.full_like(hand.velocity_limit, 1.0))
+    scene = build_scene(hand=fast, objects=load_set("cube"), num_worlds=2, cfg=CFG, device=device)
+    sim = Simulator(scene, CFG)
+    target = sim.joint_q.numpy().copy()
+    target[:, :12] += 1.0
+    sim.target.assign(target)
+    sim.step()
+    assert np.abs(sim.joint_qd.numpy()[:, :12]).max() <= 1.0 + 1e-5
+    sim.physics_only()
+    assert np.abs(sim.joint_qd.numpy()[:, :12]).max() > 1.0
+
+
+def test_importing_keeps_every_collider_and_mount():
+    hand = load_hand("dclaw3")
+    builder = build_hand(hand, CFG, visuals=False)
+    colliding = [f for f in builder.shape_flags if f & newton.ShapeFlags.COLLIDE_SHAPES]
+    assert len(colliding) == len(hand.shapes)
+    model = builder.finalize(device="cpu")
+    state = model.state()
+    newton.eval_fk(model, model.joint_q, model.joint_qd, state)
+    base = state.body_q.numpy()[0]
+    assert base[:3] == pytest.approx([0.0, 0.0, PAPER.scene.hand_height_m])
+    down = wp.quat_rotate(wp.quat(*base[3:]), wp.vec3(0.0, 0.0, 1.0))
+    assert down[2] == pytest.approx(-1.0)
