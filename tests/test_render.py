@@ -148,7 +148,7 @@ def test_fingertips_are_drawn_where_kinematics_puts_them(hand, name):
     assert (np.abs(hands - none).sum(axis=2)[row, column] > 20).all()
 
 
-def test_a_frame_takes_less_processor_time_than_it_lasts(hand):
+def test_a_frame_takes_a_fraction_of_a_second_of_processor_time(hand):
     model = hand["dclaw4"]
     renderer = Renderer(model, [box("cube", [0.05] * 3)])
     q = np.concatenate([np.tile([0.0, 0.8, -1.1], 4), [0.0, 0.0, 0.05], IDENTITY])[None]
@@ -156,7 +156,7 @@ def test_a_frame_takes_less_processor_time_than_it_lasts(hand):
     start = time.process_time()
     for _ in range(5):
         renderer.render(q, np.array([IDENTITY]))
-    assert (time.process_time() - start) / 5 < 0.25  # 0.05 s on an idle core; much slack for a shared one
+    assert (time.process_time() - start) / 5 < 0.25  # 0.09 s was measured; the rest is slack
 
 
 def frames(count, height=64, width=96):
