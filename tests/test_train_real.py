@@ -29,7 +29,7 @@ def _train(run_dir: Path, iterations: int, resume: str | None = None) -> Teacher
         cfg.env,
         num_worlds=8,
         randomisation=replace(cfg.env.randomisation, enabled=True),
-        curriculum=replace(cfg.env.curriculum, enabled=True, raise_at=0.0),
+        curriculum=replace(cfg.env.curriculum, enabled=True, raise_at=0.0, lower_at=0.0),
     )
     cfg = replace(
         cfg,
