@@ -117,6 +117,19 @@ def test_load_set_takes_files_folders_and_names(tmp_path: Path, cache: Path, exa
     assert load_set("shelf")[0].name == example.name
 
 
+def test_a_built_in_set_of_an_older_version_is_authored_anew(
+    cache: Path, example: procedural.ObjectModel, monkeypatch: pytest.MonkeyPatch
+):
+    load_set("cube")
+    path = cache / "objects" / "cube" / "cube.usd"
+    before = path.stat().st_mtime_ns
+    load_set("cube")
+    assert path.stat().st_mtime_ns == before
+    monkeypatch.setattr(procedural, "PROCEDURAL_VERSION", procedural.PROCEDURAL_VERSION + 1)
+    load_set("cube")
+    assert path.stat().st_mtime_ns > before
+
+
 def test_unknown_set_says_what_there_is(tmp_path: Path, cache: Path, example: procedural.ObjectModel):
     sets.write_set(cache / "objects" / "shelf", [example])
     with pytest.raises(ObjectError) as error:

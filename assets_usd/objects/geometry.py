@@ -22,6 +22,9 @@ SIMPLIFY_TOLERANCE = 1e-3
 """Simplifying a hull stops once every vertex left out is this close to it, relative to its size."""
 
 
+GRID_TURN = Rotation.from_euler("xyz", [0.37, 0.61, 0.23])
+"""Orientation of the grid on which unions of hulls are measured: no plane a part is likely to have."""
+
 FINEST_GRID, COARSEST_GRID, GRID_BISECTIONS = 512.0, 8.0, 12
 """Grids tried when a mesh is coarsened: cells along its longest side, and bisection steps."""
 
@@ -206,10 +209,15 @@ def solid_of_voxels(mask: np.ndarray, origin: np.ndarray, pitch: float) -> Solid
 
 
 def solid_of_hulls(hulls: Sequence[Hull]) -> Solid:
-    """Mass properties of the union of hulls (density 1): exact for one hull, else from voxels."""
+    """Mass properties of the union of hulls (density 1): exact for one hull, else from voxels.
+
+    The grid is turned against the object: a plate along a grid plane could gain or lose a whole layer.
+    """
     if len(hulls) == 1:
         return solid_of_mesh(*hulls[0])
-    return solid_of_voxels(*voxelise_hulls(hulls))
+    turn = GRID_TURN.as_matrix()
+    solid = solid_of_voxels(*voxelise_hulls([Hull(h.vertices @ turn.T, h.faces) for h in hulls]))
+    return Solid(solid.volume, turn.T @ solid.centroid, turn.T @ solid.inertia @ turn)
 
 
 def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

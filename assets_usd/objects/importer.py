@@ -22,6 +22,7 @@ from vd.assets_usd.objects.geometry import Hull, cluster_vertices, surface_point
 from vd.assets_usd.objects.meshes import (
     MESH_SUFFIXES,
     MeshError,
+    RepairedMesh,
     check_file,
     choose_scale,
     load_mesh,
@@ -31,14 +32,17 @@ from vd.assets_usd.objects.meshes import (
 from vd.assets_usd.objects.model import SURFACE_POINTS, build_model, read_hash, read_object, write_object
 from vd.files import atomic_path
 
-IMPORT_VERSION = 2
+IMPORT_VERSION = 3
 """Part of every content hash: raise it when the import computes something else."""
 
 MAX_VISUAL_FACES = 3000
 """Faces of the visual mesh: files stay below 40 kB, and no picture here shows more."""
 
-WORKER_OVERHEAD_S = 120.0
-"""Time a child gets beside its two attempts at CoACD before it is killed."""
+FINER_ABOVE, FINER_THRESHOLD = 0.25, 0.4
+"""Above this volume error (thin walls, mostly), CoACD runs again with its threshold times this factor."""
+
+WORKER_ATTEMPTS, WORKER_OVERHEAD_S = 4, 120.0
+"""Runs of CoACD a child may need, and the time it gets beside them before it is killed."""
 
 Status = Literal["imported", "cached", "refused"]
 
@@ -204,6 +208,20 @@ def _cached_hulls(path: Path) -> tuple[tuple[Hull, ...], str, tuple[str, ...]] |
         return hulls, str(data["method"]), tuple(map(str, data["notes"]))
 
 
+def _best_decomposition(
+    mesh: RepairedMesh, volume: float, settings: DecomposeSettings
+) -> tuple[tuple[Hull, ...], str, tuple[str, ...]]:
+    """Hulls, method and notes; a bad volume error earns a second try at a finer threshold."""
+    first = decompose(mesh.vertices, mesh.faces, settings)
+    error = relative_volume_error(first.hulls, volume)
+    if error > FINER_ABOVE:
+        finer = replace(settings, threshold=settings.threshold * FINER_THRESHOLD)
+        second = decompose(mesh.vertices, mesh.faces, finer)
+        if relative_volume_error(second.hulls, volume) < error:
+            return second.hulls, f"{second.method}, threshold {finer.threshold:g}", second.notes
+    return first.hulls, first.method, first.notes
+
+
 def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     """Import one mesh in this process (CoACD runs in a child).
 
@@ -234,8 +252,7 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     elif cached:
         hulls, way, more = cached
     else:
-        result = decompose(mesh.vertices, mesh.faces, settings.decompose)
-        hulls, way, more = result.hulls, result.method, result.notes
+        hulls, way, more = _best_decomposition(mesh, solid.volume, settings.decompose)
         # A fallback forced by the clock may not be needed next time: only full results are kept.
         if cache and not more:
             arrays: dict[str, Any] = {"count": len(hulls), "method": way, "notes": np.array(more, dtype=str)}
@@ -287,7 +304,7 @@ def _run_child(
     def refused(reason: str) -> ImportResult:
         return ImportResult(job.source, job.name, "refused", reason, seconds=time.monotonic() - start)
 
-    limit = 2.0 * settings.decompose.time_limit_s + WORKER_OVERHEAD_S
+    limit = WORKER_ATTEMPTS * settings.decompose.time_limit_s + WORKER_OVERHEAD_S
     environment = os.environ | {"OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": "1"}
     request = json.dumps({"job": asdict(job), "settings": asdict(settings)})
     with tempfile.TemporaryFile("w+") as errors:

@@ -6,7 +6,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from vd.assets_usd.objects.model import ObjectError, ObjectModel, object_files, write_object
+from vd.assets_usd.objects import procedural
+from vd.assets_usd.objects.model import ObjectError, ObjectModel, object_files, read_hash, write_object
 
 HELD_OUT_COUNT = 30
 """Objects of ``procedural-heldout``: a dozen worlds each in an evaluation of a few hundred."""
@@ -25,8 +26,6 @@ def objects_dir() -> Path:
 
 def built_in_models(name: str) -> Callable[[], list[ObjectModel]] | None:
     """The function that makes a built-in set, or None if the name is no built-in one."""
-    from vd.assets_usd.objects import procedural
-
     if name == "cube":
         return lambda: [procedural.cube()]
     if name == "cuboid":
@@ -59,9 +58,11 @@ def set_folder(name: str) -> Path:
     root = objects_dir()
     plain = re.fullmatch(r"[\w.-]+", name) is not None and name not in (".", "..")
     folder = root / name
-    if plain and folder.is_dir() and object_files(folder):
-        return folder
     make = built_in_models(name) if plain else None
+    if plain and folder.is_dir() and (files := object_files(folder)):
+        if make is None or procedural.is_current(read_hash(files[0])):
+            return folder
+        shutil.rmtree(folder)  # of an older version of our families
     if make is None:
         there = (
             sorted(p.name for p in root.iterdir() if p.is_dir() and object_files(p)) if root.is_dir() else []
