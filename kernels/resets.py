@@ -7,7 +7,13 @@ Order in a control step: after the reward, :func:`episode_kernel` decides what e
 import warp as wp
 
 from vd.kernels.rng import next_stream
-from vd.kernels.transforms import random_rotation, random_rotation_within, rotation_angle, rotation_difference
+from vd.kernels.transforms import (
+    PI,
+    random_rotation,
+    random_rotation_within,
+    rotation_angle,
+    rotation_difference,
+)
 
 wp.set_module_options({"enable_backward": False})
 
@@ -29,9 +35,11 @@ class GoalParams:
     """How goals are drawn; an array of length 1 in device memory.
 
     max_angle: Largest angle between the object's orientation and its goal [rad]; all of SO(3) at >= pi.
+    about_vertical: 1 if goals only turn the object about the vertical, uniform in the angle; 0 for any axis.
     """
 
     max_angle: float
+    about_vertical: int
 
 
 @wp.kernel
@@ -90,6 +98,7 @@ def reset_kernel(
     reset_q: wp.array[float],
     start_params: wp.array[StartParams],
     goal_params: wp.array[GoalParams],
+    rest_poses: wp.array2d[wp.transform],
     # In:
     reset_in: wp.array[int],
     new_goal_in: wp.array[int],
@@ -111,13 +120,16 @@ def reset_kernel(
     """Reset the worlds of one mask; draw a goal for those of either mask. Launch: [N].
 
     A reset puts the hand to ``reset_q``, the object to position + U(-noise, noise) on each axis with a
-    uniform random orientation, all velocities and counters to zero. A goal is uniform among the
-    orientations within max_angle of the object's; the smoothed action starts at zero with each goal.
+    uniform random orientation, all velocities and counters to zero. Where poses at rest are given, the
+    object starts in one of them instead, turned by a random angle about the vertical through its origin.
+    A goal is uniform among the orientations within max_angle of the object's (or turns it about the
+    vertical only); the smoothed action starts at zero with each goal.
 
     Args:
         reset_q: Hand joints after a reset [rad], shape [D].
         start_params: Start of the object, shape [1].
         goal_params: Draw of the goal, shape [1].
+        rest_poses: Poses in which each world's object lies at rest, world frame, shape [N, K]; K = 0: none.
         reset_in: 1 where the world is reset, shape [N].
         new_goal_in: 1 where only the goal is drawn anew, shape [N].
         start_quat_in: Start orientation of the object, read if ``use_start_quat`` is not 0, shape [N] or [0].
@@ -149,6 +161,12 @@ def reset_kernel(
             noise = wp.randf(state, -start.noise, start.noise)
             joint_q[world, joints + axis] = start.position[axis] + noise
         state, start_quat = random_rotation(state)
+        if rest_poses.shape[1] > 0:
+            rest = rest_poses[world, wp.randi(state, 0, rest_poses.shape[1])]
+            for axis in range(3):
+                joint_q[world, joints + axis] = wp.transform_get_translation(rest)[axis]
+            yaw = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), wp.randf(state, -PI, PI))
+            start_quat = wp.normalize(yaw * wp.transform_get_rotation(rest))
         if use_start_quat != 0:
             start_quat = start_quat_in[world]
         for i in range(4):
@@ -166,7 +184,11 @@ def reset_kernel(
         joint_q[world, joints + 5],
         joint_q[world, joints + 6],
     )
-    state, turn = random_rotation_within(state, goal_params[0].max_angle)
+    draw = goal_params[0]
+    state, turn = random_rotation_within(state, draw.max_angle)
+    if draw.about_vertical != 0:
+        angle = wp.randf(state, -draw.max_angle, draw.max_angle)
+        turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle)
     goal = wp.normalize(turn * orientation)
     if use_given_goal != 0:
         goal = given_goal_in[world]

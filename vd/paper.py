@@ -73,7 +73,7 @@ class RewardConstants:
     rotation: float = source(1.0, "P", "c2, eq. 2, Table S1")
     rotation_epsilon_rad: float = source(0.4, "P", "epsilon_theta, eq. 2, Table S1")
     rotation_epsilon_rad_code: float = source(0.1, "C", "0.4 is the success tolerance in the code")
-    fingertip: float = source(-1.0, "P", "c3, eq. 3: sum of squared distances; the code takes the mean distance")
+    fingertip: float = source(-1.0, "P", "c3, eq. 3: summed squared distances; code: mean distance")
     energy: float = source(-20.0, "P", "c4, eq. 4")
     energy_clip_w_code: float = source(10.0, "C", "the code clips sum |qd tau| at 10 W; the paper does not")
     fall: float = source(-100.0, "P", "c5, eq. 5")
@@ -92,7 +92,7 @@ class SuccessConstants:
     object_speed_m_s: float = source(0.04, "P", "norm of v")
     object_spin_rad_s: float = source(0.5, "P", "norm of omega")
     action_norm: float = source(1.0, "C", "norm of the smoothed action; threshold only in the code")
-    fall_m: float = source(0.15, "P", "p-bar, eq. 5; distance from goal_position_m as in the code, not squared")
+    fall_m: float = source(0.15, "P", "p-bar, eq. 5; distance from goal_position_m, not squared")
 
 
 @dataclass(frozen=True)

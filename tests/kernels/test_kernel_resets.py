@@ -19,6 +19,7 @@ from kernel_oracle import (
     unwritten,
 )
 from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from vd.kernels.resets import GoalParams, StartParams, episode_kernel, reset_kernel
 from vd.paper import PAPER
@@ -70,18 +71,32 @@ class World:
             "error": np.full(worlds, np.nan, np.float32),
         }
 
-    def reset(self, mask, new_goal, max_angle=np.pi, noise=NOISE, start_quat=None, goal_quat=None):
+    def reset(
+        self,
+        mask,
+        new_goal,
+        max_angle=np.pi,
+        noise=NOISE,
+        start_quat=None,
+        goal_quat=None,
+        vertical=0,
+        rest=None,
+    ):
         """Launch; returns every array by name."""
         types = {"rng": wp.uint32, "steps": int, "goals": int, "goal": wp.quat}
         state = {n: device_array(a, types.get(n, float), self.device) for n, a in self.before.items()}
         none = np.zeros((0, 4), np.float32)
+        rest = np.zeros((len(mask), 0, 7)) if rest is None else rest
         wp.launch(
             reset_kernel,
             dim=len(mask),
             inputs=[
                 device_array(self.reset_q, float, self.device),
                 settings_array(StartParams, self.device, position=wp.vec3(*START), noise=noise),
-                settings_array(GoalParams, self.device, max_angle=max_angle),
+                settings_array(GoalParams, self.device, max_angle=max_angle, about_vertical=vertical),
+                device_array(
+                    np.zeros((len(mask), 0, 7)) if rest is None else rest, wp.transform, self.device
+                ),
                 device_array(mask, int, self.device),
                 device_array(new_goal, int, self.device),
                 device_array(none if start_quat is None else start_quat, wp.quat, self.device),
@@ -177,3 +192,33 @@ def test_new_goals_stay_within_their_angle_of_the_present_orientation(device, ma
 def test_no_noise_puts_the_object_exactly_at_its_start(device):
     after = World(device, 4).reset(np.ones(4, int), np.zeros(4, int), noise=0.0)
     np.testing.assert_array_equal(after["q"][:, 9:12], np.tile(START.astype(np.float32), (4, 1)))
+
+
+def test_goals_about_the_vertical_turn_nothing_else(device):
+    worlds = 20_000
+    everywhere = np.ones(worlds, int)
+    world = World(device, worlds, seed=9)
+    after = world.reset(0 * everywhere, everywhere, max_angle=1.0, vertical=1)
+    before = Rotation.from_quat(world.before["q"][:, world.joints + 3 :])
+    turn = (Rotation.from_quat(after["goal"]) * before.inv()).as_rotvec()
+    assert np.abs(turn[:, :2]).max() < 1e-5
+    assert stats.kstest(turn[:, 2], stats.uniform(-1.0, 2.0).cdf).pvalue > ALPHA
+
+
+def test_starts_at_rest_keep_place_and_tilt(device):
+    worlds, poses = 3000, 3
+    everywhere = np.ones(worlds, int)
+    random = np.random.default_rng(4)
+    rest = np.zeros((worlds, poses, 7), np.float32)
+    rest[..., :3] = random.normal(size=(worlds, poses, 3))
+    rest[..., 3:] = Rotation.random(worlds * poses, rng=5).as_quat().reshape(worlds, poses, 4)
+    world = World(device, worlds, seed=10)
+    after = world.reset(everywhere, 0 * everywhere, rest=rest)
+    position = after["q"][:, world.joints : world.joints + 3]
+    chosen = np.argmin(np.linalg.norm(rest[..., :3] - position[:, None], axis=2), axis=1)
+    picked = rest[np.arange(worlds), chosen]
+    np.testing.assert_array_equal(position, picked[:, :3])
+    assert np.bincount(chosen, minlength=poses).min() > 0.8 * worlds / poses
+    turn = Rotation.from_quat(after["q"][:, world.joints + 3 :]) * Rotation.from_quat(picked[:, 3:]).inv()
+    assert np.abs(turn.as_rotvec()[:, :2]).max() < 1e-5
+    assert stats.kstest(turn.as_rotvec()[:, 2], stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > ALPHA

@@ -73,6 +73,21 @@ class GoalCfg:
 
     max_angle_rad: float = pi
     """Goals lie within this angle of the object's present orientation, uniform (Haar); pi is all of SO(3)."""
+    about_vertical: bool = False
+    """Goals only turn the object about the vertical, uniform in the angle (an easier task)."""
+
+
+@dataclass(frozen=True)
+class StartCfg:
+    """How the object starts."""
+
+    at_rest: bool = False
+    """Start at rest on the table, turned about the vertical at random, rather than falling (paper). Goals
+    near the start are then near a pose that lasts."""
+    poses: int = 4
+    """Poses at rest that each world keeps to choose from; found by dropping the object at the beginning."""
+    settle_s: float = 1.5
+    """Time an object has to come to rest [s]."""
 
 
 @dataclass(frozen=True)
@@ -154,6 +169,7 @@ class ReorientCfg:
     action: ActionCfg = field(default_factory=ActionCfg)
     reward: RewardCfg = field(default_factory=RewardCfg)
     success: SuccessCfg = field(default_factory=SuccessCfg)
+    start: StartCfg = field(default_factory=StartCfg)
     goal: GoalCfg = field(default_factory=GoalCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
@@ -166,6 +182,11 @@ class ReorientCfg:
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         self.sim.validate()
+        if self.start.at_rest and (self.start.poses < 1 or self.start.settle_s <= 0.0):
+            raise ValueError(
+                f"start.at_rest needs start.poses >= 1 (now {self.start.poses}) and start.settle_s > 0 "
+                f"(now {self.start.settle_s})"
+            )
         if self.num_worlds < 1:
             raise ValueError(f"num_worlds = {self.num_worlds}; at least 1 world is needed")
         if self.max_episode_steps < 1:

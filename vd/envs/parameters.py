@@ -113,7 +113,11 @@ class TaskParameters:
             fall_distance=success.fall_m,
             fall_center=np.array(PAPER.scene.goal_position_m, dtype=np.float32),
         )
-        self._write("goal", max_angle=start + (cfg.goal.max_angle_rad - start) * difficulty)
+        self._write(
+            "goal",
+            max_angle=start + (cfg.goal.max_angle_rad - start) * difficulty,
+            about_vertical=int(cfg.goal.about_vertical),
+        )
 
     def _write(self, name: str, **values: Any) -> None:
         staging = self._staging[name]

@@ -140,6 +140,9 @@ class ReorientEnv:
         self.parameters.set_difficulty(self.difficulty)
         self._graph: Any = None
         self._steps = 0
+        self._rest_poses = zeros(n, 0, dtype=wp.transform)
+        if cfg.start.at_rest:
+            self._rest_poses = self._find_rest_poses()
         self.reset()
 
     # Stepping
@@ -165,6 +168,30 @@ class ReorientEnv:
         self._reset_worlds(use_start=object_quat is not None, use_goal=goal_quat is not None)
         self.randomiser.push()
         self._observe()
+
+    def _find_rest_poses(self) -> wp.array:
+        """Drop every object a few times and keep where it came to lie, shape [N, K].
+
+        A drop that leaves the claw is replaced by one that did not.
+        """
+        count = self.cfg.start.poses
+        poses = np.zeros((self.num_worlds, count, 7), dtype=np.float32)
+        inside = np.zeros((self.num_worlds, count), dtype=bool)
+        for k in range(count):
+            self.reset()
+            for _ in range(round(self.cfg.start.settle_s * self.cfg.sim.control_hz)):
+                wp.copy(self.sim.target, self.sim.joint_q)
+                self.sim.step()
+            self.check()
+            poses[:, k] = self.object_pose()
+            distance = np.linalg.norm(poses[:, k, :3] - PAPER.scene.goal_position_m, axis=1)
+            inside[:, k] = distance < self.cfg.success.fall_m
+        # Choose, for every slot, the slot itself or the first good one of the world.
+        slot = np.where(inside, np.arange(count), np.argmax(inside, axis=1)[:, None])
+        poses = np.take_along_axis(poses, slot[:, :, None], axis=1)
+        lost = ~inside.any(axis=1)
+        poses[lost] = [*PAPER.scene.object_start_m, 0.0, 0.0, 0.0, 1.0]
+        return wp.array(poses, dtype=wp.transform, device=self.device)
 
     def step(self, action: Any) -> None:
         """Simulate one control step; worlds that end are reset, and the observation is fresh.
@@ -283,6 +310,7 @@ class ReorientEnv:
                 self._reset_q,
                 p.start,
                 p.goal,
+                self._rest_poses,
                 self._reset,
                 self._new_goal,
                 self._given_start,
@@ -351,7 +379,7 @@ class ReorientEnv:
 
     def object_pose(self) -> np.ndarray:
         """Present object poses, position [m] and quaternion xyzw, shape [N, 7] (host copy)."""
-        return self.sim.joint_q.numpy()[:, self.num_actions : self.num_actions + 7]
+        return self.sim.joint_q.numpy()[:, self.num_actions : self.num_actions + 7].copy()
 
     def check(self) -> None:
         """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or a state went bad."""
@@ -398,7 +426,7 @@ class ReorientEnv:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue exactly: simulation, episodes, randomisation, curriculum, RNG."""
-        arrays = {name: array.numpy() for name, array in self._stateful().items()}
+        arrays = {name: array.numpy().copy() for name, array in self._stateful().items()}
         return {"arrays": arrays, "difficulty": self.difficulty, "steps": self._steps}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

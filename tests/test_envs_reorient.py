@@ -1,0 +1,213 @@
+"""Behaviour of the environment: determinism, fresh observations, goals, guards, curriculum, randomisation."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, StartCfg, SuccessCfg
+from vd.envs.reorient import ReorientEnv
+from vd.kernels.observations import teacher_observation_slices
+from vd.sim.cfg import SimCfg
+from vd.sim.simulator import SimulationError
+
+WORLDS = 4
+STILL = RandomisationCfg(enabled=False)
+
+
+def make(device: str = "cpu", **changes) -> ReorientEnv:
+    cfg = ReorientCfg(hand="dclaw3", objects=("cube",), num_worlds=WORLDS, randomisation=STILL)
+    return ReorientEnv(dataclasses.replace(cfg, **changes), device)
+
+
+def run(env: ReorientEnv, steps: int, seed: int = 0) -> np.ndarray:
+    """Random actions; returns the observations of every step, [steps, N, O]."""
+    rng = np.random.default_rng(seed)
+    seen = []
+    for _ in range(steps):
+        env.action.assign(rng.uniform(-1, 1, (env.num_worlds, env.num_actions)).astype(np.float32))
+        env.step(env.action)
+        seen.append(env.observation.numpy().copy())
+    env.check()
+    return np.array(seen)
+
+
+def test_the_same_seed_gives_the_same_rollout_on_the_cpu():
+    cfg = {"randomisation": RandomisationCfg(enabled=True), "seed": 3}
+    first, second = run(make(**cfg), 30), run(make(**cfg), 30)
+    assert np.array_equal(first, second)
+    assert not np.array_equal(first, run(make(**{**cfg, "seed": 4}), 30))
+
+
+def test_shapes_and_ranges(device):
+    env = make(device)
+    seen = run(env, 20)
+    assert seen.shape == (20, WORLDS, 22 * 3 + 21)
+    assert np.isfinite(seen).all()
+    assert env.reward_terms.numpy().shape == (WORLDS, len(env.reward_term_names))
+    quats = seen[..., teacher_observation_slices(3)["object_orientation"]]
+    assert np.linalg.norm(quats, axis=-1) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_success_gives_a_new_goal_without_a_reset():
+    anything = SuccessCfg(
+        rotation_rad=4.0, joint_speed_rad_s=0.0, object_speed_m_s=0.0, object_spin_rad_s=0.0, action_norm=0.0
+    )
+    env = make(success=anything)
+    before = env.goal_quat.numpy().copy()
+    run(env, 3)
+    assert (env.success.numpy() == 1).all() and (env.done.numpy() == 1).all()
+    assert (env.step_count.numpy() == 3).all(), "the episode goes on"
+    assert (env.goals_reached.numpy() == 3).all()
+    after = env.goal_quat.numpy()
+    assert not np.allclose(before, after)
+    columns = teacher_observation_slices(3)["goal_orientation"]
+    assert np.allclose(env.observation.numpy()[:, columns], after), "the observation shows the new goal"
+
+
+def test_evaluation_stops_at_success():
+    anything = SuccessCfg(
+        rotation_rad=4.0, joint_speed_rad_s=0.0, object_speed_m_s=0.0, object_spin_rad_s=0.0, action_norm=0.0
+    )
+    env = make(success=anything, success_ends_episode=True)
+    run(env, 1)
+    assert (env.step_count.numpy() == 0).all()
+    start = env.object_pose()[:, :3]
+    assert np.abs(start - [0.0, 0.0, 0.12]).max() <= 0.01 + 1e-6
+    ended = env.object_pose_end.numpy()
+    assert not np.allclose(ended[:, :3], start), "the pose at the end is kept"
+
+
+def test_time_out_resets_and_says_so():
+    env = make(episode_s=0.5)
+    assert env.max_episode_steps == 6
+    run(env, 5)
+    assert not env.timed_out.numpy().any()
+    run(env, 1)
+    assert env.timed_out.numpy().all() and env.done.numpy().all()
+    assert (env.step_count.numpy() == 0).all()
+    columns = teacher_observation_slices(3)["joint_velocity"]
+    assert np.abs(env.observation.numpy()[:, columns]).max() == 0.0, "the observation is of the new episode"
+
+
+def test_given_starts_and_goals_are_used():
+    env = make()
+    start = np.tile([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], (WORLDS, 1))
+    goal = np.tile([1.0, 0.0, 0.0, 0.0], (WORLDS, 1))
+    env.reset(start, goal)
+    assert np.allclose(env.object_pose()[:, 3:], start, atol=1e-6)
+    assert np.allclose(env.goal_quat.numpy(), goal)
+    with pytest.raises(ValueError, match=r"shape \(4, 4\)"):
+        env.reset(start[:2])
+
+
+def test_objects_can_start_at_rest():
+    env = make(start=StartCfg(at_rest=True, poses=2))
+    first = env.object_pose()
+    run(env, 1)
+    moved = np.linalg.norm(env.object_pose_end.numpy()[:, :3] - first[:, :3], axis=1)
+    assert (first[:, 2] < 0.06).all() and moved.max() < 2e-3
+    env.reset()
+    assert not np.allclose(env.object_pose()[:, 3:], first[:, 3:]), "every start is turned anew"
+
+
+def test_goals_stay_within_their_angle():
+    env = make(goal=GoalCfg(max_angle_rad=0.5))
+    pose, goal = env.object_pose()[:, 3:], env.goal_quat.numpy()
+    angle = 2.0 * np.arccos(np.clip(np.abs(np.sum(pose * goal, axis=1)), 0.0, 1.0))
+    assert (angle <= 0.5 + 1e-3).all() and (angle > 0.0).all()
+
+
+def test_lost_contacts_stop_the_run_and_name_the_setting():
+    env = make(sim=dataclasses.replace(SimCfg(), njmax=8))
+    with pytest.raises(SimulationError, match=r"raise sim\.njmax \(now 8\)"):
+        run(env, 30)
+
+
+def test_a_state_that_is_not_finite_stops_the_run_and_can_be_replayed():
+    env = make()
+    run(env, 5)
+    good = env.sim.joint_q.numpy().copy()
+    env.sim.joint_qd.numpy()[2, 0] = np.nan
+    with pytest.raises(SimulationError, match=r"world 2, object cube"):
+        run(env, 3)
+    (dump,) = env.sim.dumps()
+    assert dump.world == 2 and dump.object_name == "cube"
+    assert np.allclose(dump.joint_q, good[2])
+    assert np.isnan(dump.joint_qd[0]), "the dump is of the step that went bad"
+
+
+def test_saved_state_continues_exactly():
+    cfg = {"randomisation": RandomisationCfg(enabled=True)}
+    env = make(**cfg)
+    run(env, 10, seed=1)
+    state = env.state_dict()
+    expected = run(env, 10, seed=2)
+    other = make(**cfg)
+    run(other, 3, seed=9)
+    other.load_state_dict(state)
+    assert np.array_equal(run(other, 10, seed=2), expected)
+
+
+def test_state_of_another_size_is_refused():
+    state = make().state_dict()
+    with pytest.raises(ValueError, match="num_worlds"):
+        make(num_worlds=2).load_state_dict(state)
+
+
+def test_curriculum_tightens_only_while_goals_are_reached():
+    curriculum = CurriculumCfg(enabled=True, rate=0.25, stillness_start=8.0, goal_start_rad=0.5)
+    env = make(curriculum=curriculum, goal=GoalCfg(max_angle_rad=1.5))
+    limits = SuccessCfg()
+
+    def present() -> tuple[float, float]:
+        return (
+            float(env.parameters.success.numpy()["joint_speed"][0]),
+            float(env.parameters.goal.numpy()["max_angle"][0]),
+        )
+
+    assert present() == pytest.approx((8.0 * limits.joint_speed_rad_s, 0.5))
+    env.goal_counts.assign(np.array([10.0, 9.0, 0.0], dtype=np.float32))
+    assert env.update_curriculum()["difficulty"] == 0.25
+    assert present()[0] < 8.0 * limits.joint_speed_rad_s and present()[1] > 0.5
+    for _ in range(5):
+        env.goal_counts.assign(np.array([10.0, 9.0, 0.0], dtype=np.float32))
+        env.update_curriculum()
+    assert present() == pytest.approx((limits.joint_speed_rad_s, 1.5)), "difficulty 1 is the configured task"
+    env.goal_counts.assign(np.array([10.0, 1.0, 3.0], dtype=np.float32))
+    numbers = env.update_curriculum()
+    assert numbers["difficulty"] == 0.75
+    assert numbers["success_per_goal"] == pytest.approx(0.1)
+    assert numbers["drop_per_goal"] == pytest.approx(0.3)
+
+
+def test_randomisation_reaches_the_solver():
+    env = make(num_worlds=16, randomisation=RandomisationCfg(enabled=True))
+    model, mujoco = env.sim.model, env.sim.solver.mjw_model
+    mass = model.body_mass.numpy().reshape(16, -1)[:, env.scene.object_body]
+    low, high = env.cfg.randomisation.object_mass_kg
+    assert len(np.unique(mass)) == 16 and (mass >= low).all() and (mass <= high).all()
+    assert np.allclose(mujoco.body_mass.numpy()[:, -1], mass)
+    gains = mujoco.actuator_gainprm.numpy()[:, :, 0]
+    assert np.allclose(gains, env.randomiser.kp.numpy())
+    ratio = gains / env.hand.kp
+    assert ratio.min() >= 0.8 and ratio.max() <= 1.2 and len(np.unique(ratio)) > 100
+    assert env.sim.joint_q.numpy().shape == (16, 9 + 7)
+
+
+def test_bad_configurations_name_the_field():
+    with pytest.raises(ValueError, match="fewer than the"):
+        make(objects=("symmetric",), num_worlds=1)
+    with pytest.raises(ValueError, match="fingertip = 'wet'"):
+        make(fingertip="wet")
+    with pytest.raises(ValueError, match=r"sim\.physics_hz"):
+        make(sim=dataclasses.replace(SimCfg(), physics_hz=100.0))
+
+
+@pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device: graphs exist only there")
+def test_a_captured_step_equals_a_launched_one_in_what_is_deterministic():
+    env = make("cuda:0")
+    run(env, 4)
+    assert env._graph is not None
+    assert (env.step_count.numpy() == 4).all()
