@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.result import Episode, EvalResult, Protocol, summarise
@@ -44,7 +45,11 @@ def small(monkeypatch, tmp_path) -> demo.DemoCfg:
 
 
 @pytest.mark.slow
-def test_demo_ends_with_a_page_and_repeats_nothing(small, capsys):
+def test_demo_ends_with_a_page_and_repeats_nothing(small, tmp_path, capsys):
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    trimesh.creation.cone(0.05, 0.12, sections=12).export(meshes / "cone.stl")
+    small = replace(small, meshes=meshes)
     page = demo.run_demo(small)
     text = page.read_text()
     assert text.count("<video") == 1
@@ -52,6 +57,8 @@ def test_demo_ends_with_a_page_and_repeats_nothing(small, capsys):
     assert "task on purpose" in text  # what makes it easier is said
     for name in demo_page.NAMES.values():
         assert name in text
+    (trained,) = small.out.rglob("trained.json")
+    assert EvalResult.read(trained).object_names == ("cube", "cone")
     (policy,) = small.out.rglob("teacher/policy.pt")
     before = {path: path.stat().st_mtime_ns for path in policy.parents[1].rglob("*.pt")}
     output = capsys.readouterr().out
