@@ -11,7 +11,7 @@ from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, R
 from vd.paper import PAPER
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 
-PresetName = Literal["paper", "cpu-demo", "gpu", "multi-gpu"]
+PresetName = Literal["paper", "cpu-demo", "cube", "gpu", "multi-gpu"]
 
 
 @dataclass
@@ -40,21 +40,67 @@ def paper() -> TeacherCfg:
 
 
 def gpu() -> TeacherCfg:
-    """One GPU: half the paper's worlds, rollouts twice as long, a state-dependent bounded std."""
+    """One GPU: the paper's task, reached by a curriculum and a reward that shows the way.
+
+    In short runs many optimiser steps per sample (short rollouts, small minibatches) helped most, then a
+    large divergence for the actor's rate to follow and a reward for turning towards the goal.
+    """
     return TeacherCfg(
         preset="gpu",
         run=RunCfg(run_dir=Path("runs/gpu")),
         ppo=PpoCfg(
-            rollout_steps=16,
-            minibatch_size=65536,
+            rollout_steps=8,
+            minibatch_size=16384,
             epochs=5,
             schedule="adaptive",
+            desired_kl=0.02,
             clip=0.2,
+            gamma=0.97,
             value_coefficient=1.0,
             entropy_coefficient=1e-3,
         ),
-        policy=PolicyCfg(distribution="state-dependent", initial_std=0.5, std_range=(0.02, 1.0)),
-        env=ReorientCfg(num_worlds=16384),
+        policy=PolicyCfg(
+            distribution="state-dependent",
+            initial_std=0.8,
+            std_range=(0.02, 1.0),
+            # Positions and velocities of the object vary by 0.02, those of the goal by 0.5.
+            normalise_observations=True,
+        ),
+        env=ReorientCfg(
+            num_worlds=16384,
+            reward=RewardCfg(
+                rotation_epsilon_rad=PAPER.reward.rotation_epsilon_rad_code,
+                fingertip=-10.0,
+                fingertip_mean_distance=True,
+                energy=-1.0,
+                energy_clip_w=PAPER.reward.energy_clip_w_code,
+                fall=-300.0,
+                table_contact=0.0,
+                progress=300.0,
+                scale=0.01,
+            ),
+            curriculum=CurriculumCfg(enabled=True, raise_at=0.5, lower_at=0.25),
+        ),
+    )
+
+
+def cube() -> TeacherCfg:
+    """The first thing to learn on one GPU: near goals of a cube on the table, nothing randomised."""
+    base = gpu()
+    return replace(
+        base,
+        preset="cube",
+        run=RunCfg(run_dir=Path("runs/cube")),
+        ppo=replace(base.ppo, minibatch_size=8192),
+        # As measured: a std that is the same in all states.
+        policy=replace(base.policy, distribution="gaussian", initial_std=0.8, std_range=(0.02, 1.5)),
+        env=replace(
+            base.env,
+            objects=("cube",),
+            num_worlds=8192,
+            goal=GoalCfg(max_angle_rad=1.0),
+            randomisation=RandomisationCfg(enabled=False),
+        ),
     )
 
 
@@ -98,6 +144,7 @@ def cpu_demo() -> TeacherCfg:
 PRESETS: dict[str, Callable[[], TeacherCfg]] = {
     "paper": paper,
     "cpu-demo": cpu_demo,
+    "cube": cube,
     "gpu": gpu,
     "multi-gpu": multi_gpu,
 }
