@@ -2,17 +2,18 @@
 
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vd.evaluate.result import EvalResult
+    from vd.evaluate.result import Episode, EvalResult
 
 AGENTS = ("trained", "random", "zero")
 
 VIDEO_SECONDS, VIDEO_CELLS = 8.0, 4
+IDENTITY = (0.0, 0.0, 0.0, 1.0)
 # Time between progress lines where the output is no terminal.
 PLAIN_INTERVAL_S = 15.0
 
@@ -47,8 +48,9 @@ def compare_agents(
 ) -> "Iterator[tuple[str, EvalResult, GoalCount]]":
     """Evaluate the trained policy, random and zero actions in the very task of the training.
 
-    All three start from the same orientations and get the same first goals. As in training, a reached goal
-    gives the next one; the result is that of each episode's first goal, the count that of all its goals.
+    All three begin in the same state with the same first goals. As in training, a reached goal gives the
+    next one; the result is that of each episode's first goal, the count that of all its goals. Errors are
+    plain angles, as the training has them, also for symmetric objects.
 
     Args:
         run_dir: Folder of the training.
@@ -65,22 +67,17 @@ def compare_agents(
     from vd.assets_usd.objects.model import load_set
     from vd.evaluate.agents import built_in
     from vd.evaluate.result import Protocol, summarise
-    from vd.evaluate.rollout import collect, draw_starts_and_goals
 
     count = len(load_set(list(objects)))
     each = math.ceil(episodes / count)
     env, trained = _open_task(run_dir, objects, count * each, seed=seed, device=device)
-    task, torch_device = env.cfg, env.device
-    angle = task.goal.max_angle_rad
-    drawn = [draw_starts_and_goals(o.name, each, seed=seed, max_goal_angle=angle) for o in env.objects]
-    starts, goals = np.stack([start for start, _ in drawn]), np.stack([goal for _, goal in drawn])
+    task, start = env.cfg, env.state_dict()
     for agent in AGENTS:
         policy = trained
         if agent != "trained":
-            policy = built_in(agent, env.num_actions, seed=seed, device=torch_device)
-        with _bar(f"  {agent}", env.max_episode_steps, "step") as bar:
-            env.goal_counts.zero_()
-            recorded = collect(env, policy, starts, goals, on_step=_advance(bar))
+            policy = built_in(agent, env.num_actions, seed=seed, device=env.device)
+        env.load_state_dict(start)
+        recorded = first_goals(env, policy, title=f"  {agent}")
         env.check()
         ended, reached = (float(value) for value in env.goal_counts.numpy()[:2])
         protocol = Protocol(
@@ -89,16 +86,65 @@ def compare_agents(
             hand=task.hand,
             episodes=each,
             seed=seed,
-            max_goal_angle_rad=angle,
+            max_goal_angle_rad=task.goal.max_angle_rad,
             stop_tolerance_rad=task.success.rotation_rad,
             episode_s=task.episode_s,
             control_hz=task.sim.control_hz,
             randomised=task.randomisation.enabled,
         )
         names = tuple(item.name for item in env.objects)
-        result = summarise(protocol, names, [item.symmetry for item in env.objects], recorded)
+        result = summarise(protocol, names, [np.array([IDENTITY])] * count, recorded)
         yield agent, result, GoalCount(env.num_worlds, ended, reached)
     env.close()
+
+
+def first_goals(env: Any, policy: Any, *, title: str = "") -> "tuple[Episode, ...]":
+    """Simulate one episode of every world from the present state, and keep how the first goals ended.
+
+    Args:
+        env: The environment, just reset; worlds of an object are neighbours.
+        policy: With ``act(observation)``, torch in and out.
+        title: Of the progress bar.
+
+    Returns:
+        N episodes in the order of the worlds: to the goal, the drop, or the end.
+    """
+    import numpy as np
+
+    from vd.evaluate.result import Episode
+    from vd.evaluate.statistics import symmetric_error
+    from vd.play.video import act
+
+    env.goal_counts.zero_()
+    starts, goals = env.object_pose()[:, 3:7], env.goal_quat.numpy().copy()
+    errors = symmetric_error(starts, goals, np.array([IDENTITY]))
+    episodes: dict[int, Episode] = {}
+    with _bar(title, env.max_episode_steps, "step") as bar:
+        for step in range(1, env.max_episode_steps + 1):
+            act(env, policy)
+            done, angle = env.done.numpy() != 0, env.rotation_error.numpy()
+            reached, fell = env.success.numpy() != 0, env.fell.numpy() != 0
+            for world in np.flatnonzero(done):
+                episodes.setdefault(
+                    int(world),
+                    Episode(
+                        object_index=int(env.world_object[world]),
+                        start_quat=_quat(starts[world]),
+                        goal_quat=_quat(goals[world]),
+                        start_error_rad=float(errors[world]),
+                        error_rad=float(angle[world]),
+                        steps=step,
+                        stopped=bool(reached[world] and not fell[world]),
+                        fell=bool(fell[world]),
+                    ),
+                )
+            bar.update()
+    return tuple(episodes[world] for world in range(env.num_worlds))
+
+
+def _quat(values: Iterable[float]) -> tuple[float, float, float, float]:
+    x, y, z, w = (float(value) for value in values)
+    return x, y, z, w
 
 
 def _bar(title: str, total: int, unit: str) -> Any:
@@ -113,15 +159,6 @@ def _counted(items: Iterable[Any], bar: Any) -> Iterator[Any]:
     for item in items:
         yield item
         bar.update()
-
-
-def _advance(bar: Any) -> Callable[[int], None]:
-    """A callback that counts steps, whatever number it is called with."""
-
-    def step(_episodes: int) -> None:
-        bar.update()
-
-    return step
 
 
 def _open_task(

@@ -81,11 +81,17 @@ def task_sentences(task: ReorientCfg) -> list[str]:
     """The task in words, with what makes it easier than the paper's said plainly."""
     paper = ReorientCfg()
     wanted = (
-        "An object drops between the fingers, and a policy that sees the simulator's state has to turn it "
-        f"to a goal orientation within {task.episode_s:g} s."
+        "An object lies or falls between the fingers, and a policy that sees the simulator's state has to "
+        f"turn it to goal orientations, one after the other, for {task.episode_s:g} s."
     )
     easier = []
-    if task.goal.max_angle_rad < paper.goal.max_angle_rad:
+    if task.start.at_rest:
+        easier.append("the object starts at rest on the table instead of falling")
+    if task.goal.about_vertical:
+        easier.append(
+            f"goals turn the object about the vertical only, by up to {task.goal.max_angle_rad:.2g} rad"
+        )
+    elif task.goal.max_angle_rad < paper.goal.max_angle_rad:
         easier.append(
             f"goals lie within {task.goal.max_angle_rad:.2g} rad of the object's orientation, not in all "
             "of SO(3)"
@@ -296,8 +302,8 @@ def _paper_criteria(page: Page, results: "DemoResults") -> None:
 _MEANINGS = (
     "Error: the angle of the rotation from the object's orientation to the goal's, 0 to pi. "
     f"{PAPER.success.rotation_rad} rad is about {round(PAPER.success.rotation_rad * 57.3)} degrees. For a "
-    "symmetric object such as the cube, the evaluation takes the smallest angle over its symmetries; the "
-    "training does not.",
+    "symmetric object such as the cube, the evaluation by the paper's criteria takes the smallest angle over "
+    "its symmetries; training and comparison do not.",
     "Goal reached: all criteria of the task held in one step. The hand then gets a new goal without a "
     "reset. Some goals are reached by luck, since a new goal may lie within the tolerance at once: "
     "compare with the random agent.",
