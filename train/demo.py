@@ -8,6 +8,7 @@ page. Most stages are calls of the public commands; what is finished is not repe
 import hashlib
 import json
 import math
+import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -60,8 +61,8 @@ class DemoCfg:
     """Folder of OBJ, STL, PLY or GLB files to import and to train on as well."""
     objects: tuple[str, ...] = OBJECTS
     """Built-in object sets to train on."""
-    preset: Literal["auto", "cpu-demo", "gpu"] = "auto"
-    """Preset of vd-train; auto takes gpu where there is a GPU."""
+    preset: Literal["auto", "cpu-demo", "cube", "gpu"] = "auto"
+    """Preset of vd-train; auto takes cube where there is a GPU, which learns within minutes there."""
     num_worlds: int | None = None
     """Worlds of the training; the preset's by default."""
     max_steps: int | None = None
@@ -89,7 +90,7 @@ class DemoResults:
     Attributes:
         cfg: Settings of the demo.
         preset: Preset that was trained.
-        device: Name of the device.
+        machine: What it ran on.
         hand: Name of the hand.
         objects: Sets or folders that were trained on.
         run_dir: Folder of the training.
@@ -103,7 +104,7 @@ class DemoResults:
 
     cfg: DemoCfg
     preset: str
-    device: str
+    machine: str
     hand: str
     objects: tuple[str, ...]
     run_dir: Path
@@ -166,14 +167,13 @@ def run_demo(cfg: DemoCfg, *, started: float | None = None) -> Path:
     started = time.monotonic() if started is None else started
     cfg.validate()
     gpu = wp.is_cuda_available()
-    preset = cfg.preset if cfg.preset != "auto" else ("gpu" if gpu else "cpu-demo")
+    preset = cfg.preset if cfg.preset != "auto" else ("cube" if gpu else "cpu-demo")
     device = "cuda" if gpu and preset != "cpu-demo" else "cpu"
     folder = cfg.out / _label(cfg, preset)
     stages = _Stages(folder / "stages.json")
     stages.load()
-    print(
-        f"preset {preset} on {wp.get_device('cuda:0' if device == 'cuda' else 'cpu').name}, files in {folder}"
-    )
+    machine = wp.get_device("cuda:0").name if device == "cuda" else f"{os.cpu_count()} CPU cores"
+    print(f"preset {preset} on {machine}, files in {folder}")
 
     commands: list[str] = []
     hand, models = _author(cfg, preset, stages, commands)
@@ -191,7 +191,7 @@ def run_demo(cfg: DemoCfg, *, started: float | None = None) -> Path:
         results = DemoResults(
             cfg=cfg,
             preset=preset,
-            device=wp.get_device("cuda:0" if device == "cuda" else "cpu").name,
+            machine=machine,
             hand=hand,
             objects=objects,
             run_dir=run_dir,
