@@ -41,8 +41,8 @@ def write_page(results: "DemoResults", path: Path) -> None:
     rows = read_progress(results.run_dir / PROGRESS_FILE)
     page = Page(
         "Visual Dexterity: the demo",
-        f"A teacher for the hand {results.hand}, trained with the preset {results.preset} on {results.machine} "
-        f"for {rows[-1]['env_steps']:,} control steps in {rows[-1]['elapsed_s'] / 60.0:.0f} min.",
+        f"A teacher for the hand {results.hand}, trained with the preset {results.preset} on {results.machine}"
+        f" for {rows[-1]['env_steps']:,} control steps in {rows[-1]['elapsed_s'] / 60.0:.0f} min.",
     )
     _outcome(page, results, task)
     page.section("What was asked")
