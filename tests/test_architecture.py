@@ -27,7 +27,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.files": (),
     "vd.kernels": ("vd.kernels",),
     "vd.assets_usd": (*LEAVES, "vd.kernels", "vd.assets_usd"),
-    "vd.sim": (*LEAVES, "vd.kernels", "vd.assets_usd", "vd.sim"),
+    "vd.sim": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim"),
     "vd.envs": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim", "vd.envs"),
     "vd": ("vd",),
     "vd.train": ("vd",),
