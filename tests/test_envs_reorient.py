@@ -10,6 +10,7 @@ from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, S
 from vd.envs.reorient import ReorientEnv
 from vd.kernels.observations import teacher_observation_slices
 from vd.sim.cfg import SimCfg
+from vd.sim.replay import replay
 from vd.sim.simulator import SimulationError
 
 WORLDS = 4
@@ -105,7 +106,8 @@ def test_given_starts_and_goals_are_used():
 def test_objects_can_start_at_rest():
     env = make(start=StartCfg(at_rest=True, poses=2))
     first = env.object_pose()
-    run(env, 1)
+    env.action.zero_()
+    env.step(env.action)
     moved = np.linalg.norm(env.object_pose_end.numpy()[:, :3] - first[:, :3], axis=1)
     assert (first[:, 2] < 0.06).all() and moved.max() < 2e-3
     env.reset()
@@ -125,8 +127,9 @@ def test_lost_contacts_stop_the_run_and_name_the_setting():
         run(env, 30)
 
 
-def test_a_state_that_is_not_finite_stops_the_run_and_can_be_replayed():
+def test_a_state_that_is_not_finite_stops_the_run_and_can_be_replayed(tmp_path):
     env = make()
+    env.dump_dir = tmp_path
     run(env, 5)
     good = env.sim.joint_q.numpy().copy()
     env.sim.joint_qd.numpy()[2, 0] = np.nan
@@ -136,6 +139,11 @@ def test_a_state_that_is_not_finite_stops_the_run_and_can_be_replayed():
     assert dump.world == 2 and dump.object_name == "cube"
     assert np.allclose(dump.joint_q, good[2])
     assert np.isnan(dump.joint_qd[0]), "the dump is of the step that went bad"
+    lines = list(replay(tmp_path / "dump_cube_2.json"))
+    assert "cube" in lines[0] and "NOT FINITE" in lines[1]
+    (tmp_path / "bad.json").write_text("{}")
+    with pytest.raises(ValueError, match="bad.json is not a dump"):
+        list(replay(tmp_path / "bad.json"))
 
 
 def test_saved_state_continues_exactly():

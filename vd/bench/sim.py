@@ -6,6 +6,8 @@ network and noise. States come from that policy's own actions in contact.
 """
 
 import dataclasses
+import importlib
+import pkgutil
 import time
 from dataclasses import dataclass
 from itertools import pairwise
@@ -36,7 +38,7 @@ class SimRow:
     with_policy: float
     """Control steps/s with a policy network and its exploration noise."""
     own_kernels: float
-    """Share of our kernels in the environment's step, in [0, 1]."""
+    """Share of our kernels in the device time of a control step, in [0, 1]; 0 on the CPU, not measured."""
     memory_gb: float
     """Device memory of simulation and environment [GB]; 0 on the CPU."""
     start_s: float
@@ -98,9 +100,32 @@ def reaching_policy(env: ReorientEnv, seed: int) -> Any:
     return act
 
 
-def measure(
-    cfg: ReorientCfg, device: str, *, calls: int = 24, seed: int = 0, label: str = "mixed objects"
-) -> SimRow:
+def own_share(env: ReorientEnv) -> float:
+    """Share of our kernels in the device time of one control step, by a timer around every kernel.
+
+    Launched without the graph, so that kernels can be told apart; idle gaps do not count.
+    """
+    with wp.ScopedTimer("step", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True) as timer:
+        env.launch_step()
+    # Warp reports "forward kernel NAME_HASH".
+    own = tuple(f"{name}_" for name in own_kernel_names())
+    times = [(result.name.split()[-1], result.elapsed) for result in timer.timing_results]
+    total = sum(elapsed for _, elapsed in times)
+    return sum(elapsed for name, elapsed in times if name.startswith(own)) / total if total else 0.0
+
+
+def own_kernel_names() -> set[str]:
+    """Names of all kernels of :mod:`vd.kernels`."""
+    import vd.kernels
+
+    names = set()
+    for info in pkgutil.iter_modules(vd.kernels.__path__):
+        module = importlib.import_module(f"vd.kernels.{info.name}")
+        names |= {value.key for value in vars(module).values() if isinstance(value, wp.Kernel)}
+    return names
+
+
+def measure(cfg: ReorientCfg, device: str, *, calls: int = 24, seed: int = 0, label: str = "mixed") -> SimRow:
     """Measure one configuration; raises if any contact was lost."""
     begin = time.perf_counter()
     on_gpu = device != "cpu"
@@ -110,33 +135,41 @@ def measure(
     env.step(env.action)
     wp.synchronize_device(device)
     start_s = time.perf_counter() - begin
-    memory = (before - free_memory(device)) / 1e9 if on_gpu else 0.0
     for _ in range(WARM_UP_STEPS):
         policy()
         env.step(env.action)
     env.check()
+    memory = (before - free_memory(device)) / 1e9 if on_gpu else 0.0
 
     def with_policy() -> None:
         policy()
         env.step(env.action)
 
-    policy_time = seconds_per_call(with_policy, calls, device)
-    step_time = seconds_per_call(lambda: env.step(env.action), calls, device)
-    physics_time = seconds_per_call(captured(env.sim.physics_only, device), calls, device)
+    physics = captured(env.launch_physics, device)
+
+    def policy_and_physics() -> None:
+        policy()
+        physics()
+
+    # The same policy acts in all three, so that the hand moves and pushes alike; its own time is taken off.
+    policy_s = seconds_per_call(policy, calls, device)
+    whole_s = seconds_per_call(with_policy, calls, device)
+    physics_s = seconds_per_call(policy_and_physics, calls, device) - policy_s
     env.check()
     data = env.sim.solver.mjw_data
+    contacts, rows = float(data.nacon.numpy()[0]), int(np.max(data.nefc.numpy()))
     n = cfg.num_worlds
     return SimRow(
         scene=label,
         worlds=n,
-        physics_only=n / physics_time,
-        whole_step=n / step_time,
-        with_policy=n / policy_time,
-        own_kernels=max(0.0, 1.0 - physics_time / step_time),
+        physics_only=n / physics_s,
+        whole_step=n / (whole_s - policy_s),
+        with_policy=n / whole_s,
+        own_kernels=own_share(env) if on_gpu else 0.0,
         memory_gb=memory,
         start_s=start_s,
-        contacts_mean=float(data.nacon.numpy()[0]) / n,
-        rows_max=int(np.max(data.nefc.numpy())),
+        contacts_mean=contacts / n,
+        rows_max=rows,
     )
 
 

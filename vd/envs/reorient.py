@@ -24,8 +24,9 @@ from vd.kernels.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.worlds import count_goals_kernel, record_step_kernel, world_mask_kernel
 from vd.paper import PAPER
+from vd.sim.replay import save_dump
 from vd.sim.scene import build_scene
-from vd.sim.simulator import Simulator
+from vd.sim.simulator import SimulationError, Simulator
 
 
 def load_hand(name: str, fingertip: str = "rigid") -> HandModel:
@@ -138,6 +139,8 @@ class ReorientEnv:
         self.difficulty = 0.0 if cfg.curriculum.enabled else 1.0
         """Curriculum difficulty in [0, 1]; 1 is the configured task."""
         self.parameters.set_difficulty(self.difficulty)
+        self.dump_dir = Path()
+        """Where :meth:`check` saves the step of a state that went bad."""
         self._graph: Any = None
         self._steps = 0
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
@@ -202,24 +205,28 @@ class ReorientEnv:
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
         if self.device == "cpu":
-            self._step()
+            self.launch_step()
         elif self._graph is None and self._steps < 1:
-            self._step()  # loads every kernel before the capture
+            self.launch_step()  # loads every kernel before the capture
         else:
             if self._graph is None:
                 with wp.ScopedCapture(device=self.device) as capture:
-                    self._step()
+                    self.launch_step()
                 self._graph = capture.graph
             wp.capture_launch(self._graph)
         self._steps += 1
         self.randomiser.after_step(self._steps)
 
-    def _step(self) -> None:
-        n, d, p = self.num_worlds, self.num_actions, self.parameters
-        sim = self.sim
+    def launch_physics(self) -> None:
+        """Apply the action and run the solver's steps, nothing else (for benchmarks)."""
+        self._apply_action()
+        self.sim.physics_only()
+
+    def _apply_action(self) -> None:
+        p, sim = self.parameters, self.sim
         wp.launch(
             apply_action_kernel,
-            dim=n,
+            dim=self.num_worlds,
             inputs=[
                 self._lower,
                 self._upper,
@@ -233,6 +240,12 @@ class ReorientEnv:
             outputs=[sim.target],
             device=self.device,
         )
+
+    def launch_step(self) -> None:
+        """Launch every kernel of a control step; :meth:`step` replays them as one graph on CUDA."""
+        n, d, p = self.num_worlds, self.num_actions, self.parameters
+        sim = self.sim
+        self._apply_action()
         self.randomiser.disturb()
         sim.step()
         self._fingertips()
@@ -382,8 +395,26 @@ class ReorientEnv:
         return self.sim.joint_q.numpy()[:, self.num_actions : self.num_actions + 7].copy()
 
     def check(self) -> None:
-        """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or a state went bad."""
-        self.sim.check()
+        """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or a state went bad.
+
+        The control step of a state that went bad is saved in ``dump_dir`` for ``vd-bench replay``.
+        """
+        try:
+            self.sim.check()
+        except SimulationError as error:
+            dumps = self.sim.dumps()
+            if not dumps:
+                raise
+            cfg, dump = self.cfg, dumps[0]
+            path = save_dump(
+                self.dump_dir / f"dump_{dump.object_name}_{dump.world}.json",
+                dump,
+                hand=cfg.hand,
+                fingertip=cfg.fingertip,
+                objects=cfg.objects,
+                sim=cfg.sim,
+            )
+            raise SimulationError(f"{error} (dump: {path})") from error
 
     # Curriculum and checkpoints
 

@@ -1,0 +1,150 @@
+"""``vd-bench``: measure speed and physics; figures are ratios and rates within one run."""
+
+import dataclasses
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+
+@dataclass(frozen=True)
+class SimCommand:
+    """Control steps per second, memory and start-up of the simulation under a policy's actions."""
+
+    worlds: tuple[int, ...] = (4096, 8192, 16384)
+    """World counts to measure."""
+    objects: tuple[str, ...] = ("procedural-150-seed0",)
+    """Object sets, mixed over the worlds."""
+    hand: str = "dclaw4"
+    """Hand."""
+    device: str = "auto"
+    """Warp device; auto is the first GPU, or else the CPU."""
+    randomise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    """Domain randomisation on."""
+    allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
+    """Also step Newton's own Allegro example at the same world counts (needs its asset)."""
+    json: Path | None = None
+    """Write the rows to this file as JSON."""
+
+    def run(self) -> int:
+        """Measure and print."""
+        import warp as wp
+
+        from vd.bench.allegro import allegro_rate
+        from vd.bench.sim import measure, task
+
+        wp.config.log_level = wp.LOG_WARNING
+        device = choose_device(self.device)
+        rows: list[dict[str, Any]] = []
+        for worlds in self.worlds:
+            row = measure(task(self.objects, worlds, self.hand, self.randomise), device)
+            record: dict[str, Any] = dataclasses.asdict(row)
+            substeps = round(task(self.objects, worlds, self.hand, True).sim.physics_hz / 12.0)
+            if self.allegro:
+                try:
+                    rate, dt = allegro_rate(worlds, device)
+                    record["allegro_physics_steps_s"] = rate
+                    record["allegro_dt_s"] = dt
+                    record["physics_steps_over_allegro"] = row.physics_only * substeps / rate
+                except RuntimeError as error:
+                    record["allegro"] = str(error)
+            rows.append(record)
+            print(json.dumps(record), flush=True)
+        if self.json:
+            from vd.files import write_json
+
+            write_json(self.json, {"device": str(wp.get_device(device).name), "rows": rows})
+        return 0
+
+
+@dataclass(frozen=True)
+class PhysicsCommand:
+    """Contact quality: objects at rest, a pinched cube, sliding against Coulomb's law."""
+
+    objects: tuple[str, ...] = ("procedural-150-seed0",)
+    """Object sets to drop on the table."""
+    seed: int = 0
+    """Of the orientations they are dropped in."""
+    device: str = "cpu"
+    """Warp device."""
+    json: Path | None = None
+    """Write everything to this file as JSON."""
+
+    def run(self) -> int:
+        """Measure and print."""
+        import warp as wp
+
+        from vd.assets_usd.objects.model import load_set
+        from vd.bench.physics import pinch, rest, slide
+        from vd.sim.cfg import SimCfg
+
+        wp.config.log_level = wp.LOG_WARNING
+        cfg = SimCfg()
+        results = rest(load_set(list(self.objects)), cfg, device=self.device, seed=self.seed)
+        moving = [r for r in results if not r.rests]
+        held = pinch(load_set("cube")[0], cfg, device=self.device)
+        measured, coulomb = slide(cfg, device=self.device)
+        report = {
+            "objects": len(results),
+            "at_rest_share": 1.0 - len(moving) / len(results),
+            "deepest_contact_m": max(r.penetration for r in results),
+            "moving": [dataclasses.asdict(r) for r in moving],
+            "pinch": dataclasses.asdict(held),
+            "slide_m": measured,
+            "slide_coulomb_m": coulomb,
+        }
+        print(json.dumps(report, indent=1))
+        if self.json:
+            from vd.files import write_json
+
+            write_json(self.json, report)
+        return 0
+
+
+@dataclass(frozen=True)
+class ReplayCommand:
+    """Replay the control step in which a state left the finite numbers, physics step by physics step."""
+
+    dump: Annotated[Path, tyro.conf.Positional]
+    """File written when the run stopped."""
+    device: str = "cpu"
+    """Warp device."""
+
+    def run(self) -> int:
+        """Replay and print."""
+        import warp as wp
+
+        from vd.sim.replay import replay
+
+        wp.config.log_level = wp.LOG_WARNING
+        for line in replay(self.dump, device=self.device):
+            print(line)
+        return 0
+
+
+def choose_device(name: str) -> str:
+    """The Warp device of ``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
+    import warp as wp
+
+    if name == "auto":
+        return "cuda:0" if wp.is_cuda_available() else "cpu"
+    return str(wp.get_device(name))
+
+
+Command = (
+    Annotated[SimCommand, tyro.conf.subcommand("sim")]
+    | Annotated[PhysicsCommand, tyro.conf.subcommand("physics")]
+    | Annotated[ReplayCommand, tyro.conf.subcommand("replay")]
+)
+
+
+def main() -> None:
+    """Entry point of ``vd-bench``."""
+    command = tyro.cli(Command, prog="vd-bench", description=__doc__)  # type: ignore[arg-type]
+    try:
+        sys.exit(command.run())
+    except (ValueError, OSError) as error:
+        sys.exit(f"vd-bench: {error}")
