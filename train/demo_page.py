@@ -41,8 +41,9 @@ def write_page(results: "DemoResults", path: Path) -> None:
     rows = read_progress(results.run_dir / PROGRESS_FILE)
     page = Page(
         "Visual Dexterity: the demo",
-        f"A teacher for the hand {results.hand}, trained with the preset {results.preset} on {results.machine}"
-        f" for {rows[-1]['env_steps']:,} control steps in {rows[-1]['elapsed_s'] / 60.0:.0f} min.",
+        f"A teacher for the hand {results.hand}, trained with the preset {results.preset} on "
+        f"{results.machine} for {rows[-1]['env_steps']:,} control steps, "
+        f"{rows[-1]['elapsed_s'] / 60.0:.0f} min.",
     )
     _outcome(page, results, task)
     page.section("What was asked")
@@ -172,15 +173,11 @@ def _outcome(page: Page, results: "DemoResults", task: ReorientCfg) -> None:
         )
         for name, result in agents.items()
     ]
-    header = [
-        "agent",
-        "first goal reached",
-        "goals an episode",
-        "median time [s]",
-        "median error [rad]",
-        "dropped",
-    ]
+    header = ["agent", "first goal", "goals an episode", "time [s]", "error [rad]", "dropped"]
     page.table(header, rows)
+    page.text(
+        "Time to the first goal and error at its end are medians; brackets are 95 % intervals.", small=True
+    )
 
 
 def verdict(agents: "Mapping[str, EvalResult]") -> str:
