@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import warp as wp
 
-wp.config.quiet = True
+wp.config.log_level = wp.LOG_WARNING
 
 
 def devices() -> list[str]:

@@ -49,6 +49,7 @@ class DummyEnv:
         self.timed_out = wp.zeros(n, dtype=wp.int32, device=device)
         self.done = wp.zeros(n, dtype=wp.int32, device=device)
         self.step_count = wp.zeros(n, dtype=wp.int32, device=device)
+        self.goal_counts = wp.zeros(3, dtype=float, device=device)
         self.difficulty = 0.0
         self.updates = 0
         self.checks = 0

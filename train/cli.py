@@ -155,7 +155,9 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     torch.manual_seed(cfg.env.seed + rank)
     # TF32 halves the update on a GPU; the simulator is not touched by it.
     torch.set_float32_matmul_precision("high")
-    env = ReorientVecEnv(ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank), device))
+    simulation = ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank), device)
+    simulation.dump_dir = cfg.run.run_dir
+    env = ReorientVecEnv(simulation)
     deadline = None
     if cfg.run.max_minutes is not None:
         deadline = (time.monotonic() if started is None else started) + 60.0 * cfg.run.max_minutes

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, RewardCfg, SuccessCfg
+from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, RewardCfg, StartCfg, SuccessCfg
 from vd.paper import PAPER
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 
@@ -98,6 +98,7 @@ def cube() -> TeacherCfg:
             base.env,
             objects=("cube",),
             num_worlds=8192,
+            start=StartCfg(at_rest=True),
             goal=GoalCfg(max_angle_rad=1.0),
             randomisation=RandomisationCfg(enabled=False),
         ),

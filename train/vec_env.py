@@ -134,6 +134,9 @@ class ReorientVecEnv(VecEnv):
             SimulationError: NaN or lost contacts, with the numbers and the setting to change.
         """
         self.env.check()
+        if torch.distributed.is_initialized():
+            # Every process counts all goals, and so moves to the same difficulty.
+            torch.distributed.all_reduce(wp.to_torch(self.env.goal_counts))
         return {"task/difficulty": self.env.update_curriculum()["difficulty"]}
 
     def state_dict(self) -> dict[str, Any]:
