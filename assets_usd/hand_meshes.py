@@ -137,8 +137,8 @@ def _corners(solid: Solid) -> np.ndarray:
             points = [_ring(radius, sign * height) for radius, height in rings for sign in (1.0, -1.0)]
             return _AXIS_ROTATION[solid.axis].apply(np.concatenate(points))
         case Taper():
-            half = np.asarray(solid.size) / 2
-            rectangle = np.array([(x, y, 0.0) for x in (-half[0], half[0]) for y in (-half[1], half[1])])
+            hx, hy = (0.5 * side for side in solid.size)
+            rectangle = np.array([(x, y, 0.0) for x in (-hx, hx) for y in (-hy, hy)])
             return np.concatenate([rectangle, _ring(solid.radius, solid.length)])
     raise TypeError(f"cannot draw a {type(solid).__name__}: use Box, Sphere, Capsule, Cylinder or Taper")
 

@@ -142,7 +142,7 @@ def test_a_state_that_is_not_finite_stops_the_run_and_can_be_replayed(tmp_path):
     lines = list(replay(tmp_path / "dump_cube_2.json"))
     assert "cube" in lines[0] and "NOT FINITE" in lines[1]
     (tmp_path / "bad.json").write_text("{}")
-    with pytest.raises(ValueError, match="bad.json is not a dump"):
+    with pytest.raises(ValueError, match=r"bad\.json is not a dump"):
         list(replay(tmp_path / "bad.json"))
 
 

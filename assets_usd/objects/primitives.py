@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.geometry import Hull, convex_hull
@@ -93,7 +94,7 @@ def cylinder(
     )
 
 
-def prism(outline: Sequence[Sequence[float]], low: float, high: float, *, axis: str = "y") -> Hull:
+def prism(outline: npt.ArrayLike, low: float, high: float, *, axis: str = "y") -> Hull:
     """Convex outline [n, 2] extruded from ``low`` to ``high`` along an axis.
 
     The outline lies in the plane of the two other axes in their alphabetical order (x-z for ``y``).
@@ -103,7 +104,7 @@ def prism(outline: Sequence[Sequence[float]], low: float, high: float, *, axis: 
     return convex_hull(np.concatenate([np.insert(flat, index, h, axis=1) for h in (low, high)]))
 
 
-def beam(start: Sequence[float], end: Sequence[float], width: float, depth: float) -> Hull:
+def beam(start: npt.ArrayLike, end: npt.ArrayLike, width: float, depth: float) -> Hull:
     """Flat stroke between two points of the x-z plane, ``width`` wide in it and ``depth`` thick along y."""
     a, b = np.asarray(start, dtype=float), np.asarray(end, dtype=float)
     along = (b - a) / np.linalg.norm(b - a)

@@ -1,6 +1,7 @@
 """Procedural object sets: our own shapes, deterministic from a seed, with exact convex parts."""
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -108,7 +109,7 @@ def is_connected(hulls: Sequence[Hull]) -> bool:
 
 
 def model_of_parts(
-    name: str, hulls: Sequence[Hull], longest_side: float | None = None, **fields: object
+    name: str, hulls: Sequence[Hull], longest_side: float | None = None, **fields: Any
 ) -> ObjectModel:
     """A model whose collision parts are its shape: scale, mass properties and surface points.
 
@@ -144,7 +145,7 @@ def deformed(hulls: Sequence[Hull], rng: np.random.Generator) -> list[Hull]:
     return [Hull(h.vertices @ matrix.T, h.faces) for h in hulls]
 
 
-def draw_object(name: str, make: Maker, seed: Sequence[int], **fields: object) -> ObjectModel:
+def draw_object(name: str, make: Maker, seed: Sequence[int], **fields: Any) -> ObjectModel:
     """One object of a kind: the first draw that is one piece and not rotationally symmetric.
 
     Args:

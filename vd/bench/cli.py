@@ -143,7 +143,7 @@ Command = (
 
 def main() -> None:
     """Entry point of ``vd-bench``."""
-    command = tyro.cli(Command, prog="vd-bench", description=__doc__)  # type: ignore[arg-type]
+    command = tyro.cli(Command, prog="vd-bench", description=__doc__)
     try:
         sys.exit(command.run())
     except (ValueError, OSError) as error:

@@ -252,7 +252,7 @@ def build_scene(
     scene = new_builder()
     for index, item in enumerate(objects):
         count = int(np.count_nonzero(world_object == index))
-        per_scale = np.bincount(assign_objects(count, len(scales)), minlength=len(scales)) if count else []
+        per_scale = np.bincount(assign_objects(count, len(scales)), minlength=len(scales))
         for scale, copies in zip(scales, per_scale, strict=False):
             if copies == 0:
                 continue
