@@ -146,7 +146,7 @@ class Still:
 
 @pytest.fixture
 def player():
-    from vd.envs.reorient import load_hand
+    from vd.assets_usd.hands import load_hand
     from vd.play.viewer import PlayViewer
 
     objects = [box("brick", [0.09, 0.05, 0.03]), box("stick", [0.14, 0.02, 0.02])]

@@ -8,9 +8,9 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
 from vd.bench.physics import GRAVITY, SmallScene, pinch, rest, slide
-from vd.envs.reorient import load_hand
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import add_object, build_hand, build_scene, new_builder

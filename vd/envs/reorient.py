@@ -11,8 +11,8 @@ import newton
 import numpy as np
 import warp as wp
 
-from vd.assets_usd.hand_author import hand_usd
-from vd.assets_usd.hand_model import HandModel, read_hand
+from vd.assets_usd.hand_model import HandModel
+from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.envs.cfg import ReorientCfg
 from vd.envs.parameters import TaskParameters
@@ -27,12 +27,6 @@ from vd.paper import PAPER
 from vd.sim.replay import save_dump
 from vd.sim.scene import build_scene
 from vd.sim.simulator import SimulationError, Simulator
-
-
-def load_hand(name: str, fingertip: str = "rigid") -> HandModel:
-    """Read a hand by name (authored on demand) or by the path of its USD."""
-    path = Path(name) if name.endswith((".usd", ".usda", ".usdc")) else hand_usd(name)
-    return read_hand(path, fingertip=fingertip)
 
 
 class ReorientEnv:

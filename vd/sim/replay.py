@@ -50,8 +50,8 @@ def replay(path: Path, *, device: str = "cpu") -> Iterator[str]:
     Raises:
         ValueError: The file is not a dump; says what is missing.
     """
+    from vd.assets_usd.hands import load_hand
     from vd.assets_usd.objects.model import load_set
-    from vd.envs.reorient import load_hand
     from vd.sim.scene import build_scene
 
     try:
