@@ -127,5 +127,25 @@ class FakeEnv:
         q[:, self.num_actions :] = self._pose()
         self.observation.numpy()[:] = np.concatenate([self._quat, self.goal_quat.numpy()], axis=1)
 
+    def state_dict(self):
+        """Everything that :meth:`load_state_dict` needs to go on as from here."""
+        arrays = {name: array.numpy().copy() for name, array in self._stateful().items()}
+        return {"arrays": arrays, "quat": self._quat.copy(), "rng": self._rng.bit_generator.state}
+
+    def load_state_dict(self, state):
+        """Go on from :meth:`state_dict`."""
+        for name, array in self._stateful().items():
+            array.numpy()[:] = state["arrays"][name]
+        self._quat = state["quat"].copy()
+        self._rng.bit_generator.state = state["rng"]
+        self._publish()
+
+    def _stateful(self):
+        return {
+            "goal": self.goal_quat,
+            "steps": self.step_count,
+            "goals": self.goals_reached,
+        }
+
     def close(self):
         """Nothing to release."""

@@ -2,6 +2,7 @@
 
 import base64
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -71,6 +72,20 @@ def test_report_prints_rates_with_their_intervals_and_escapes_names(tmp_path, re
     assert "b&lt;i&gt;" in text and "<i>" not in text
     assert f"chance {100 * result.overall.chance['0.4']:.2f}" in text
     assert "resample the episodes of each object" in text
+
+
+def test_report_says_which_task_it_was(tmp_path, result):
+    def text_of(**changes):
+        changed = replace(result, protocol=replace(result.protocol, **changes))
+        write_report(changed, tmp_path / "task.html")
+        return read_page(tmp_path / "task.html")[0]
+
+    dropped = text_of()
+    assert "dropped into the hand" in dropped and "at rest" not in dropped
+    resting = text_of(at_rest=True, max_goal_angle_rad=1.0)
+    assert "at rest on the table" in resting and "within 1 rad of the start" in resting
+    turned = text_of(at_rest=True, max_goal_angle_rad=1.0, goals_about_vertical=True)
+    assert "turned about the vertical by at most 1 rad" in turned
 
 
 def test_ecdf_ends_at_one_minus_the_drop_rate(result):

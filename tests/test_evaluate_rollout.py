@@ -7,7 +7,7 @@ from fake_env import FakeEnv, FakeObject
 from scipy.spatial.transform import Rotation
 
 from vd.evaluate.result import TOLERANCES_RAD, EvalResult, Protocol, summarise
-from vd.evaluate.rollout import collect, draw_starts_and_goals
+from vd.evaluate.rollout import collect, collect_drawn, draw_starts_and_goals
 from vd.evaluate.statistics import rotation_angle
 
 CONTROL_HZ = 12.0
@@ -85,6 +85,29 @@ def test_every_start_and_goal_is_run_once_whatever_the_number_of_worlds(worlds):
     plain = rotation_angle(starts[1], goals[1])
     assert all(e.error_rad <= a + 1e-3 for e, a in zip(episodes[4:8], plain, strict=True))
     assert max(e.error_rad for e in episodes[4:8]) < 1.1 < plain.max()
+
+
+def test_episodes_the_environment_draws_are_recorded_as_they_were_run():
+    env = FakeEnv([FakeObject("a"), FakeObject("b", CUBE)], num_worlds=4, max_episode_steps=2)
+    # Nothing moves: the error at the end is the angle between the start and the goal that are recorded.
+    episodes = collect_drawn(env, Turn(0.0), 5)
+    assert [e.object_index for e in episodes] == [0] * 5 + [1] * 5
+    ends = [rotation_angle(np.array(e.start_quat), np.array(e.goal_quat)) for e in episodes[:5]]
+    np.testing.assert_allclose([e.error_rad for e in episodes[:5]], ends, atol=2e-3)
+    starts = np.array([e.start_quat for e in episodes])
+    apart = rotation_angle(starts[:, None], starts[None]) + 4.0 * np.eye(len(starts))
+    assert apart.min() > 1e-3, "a start was used twice"
+
+
+def test_starts_and_goals_the_environment_draws_do_not_depend_on_the_policy():
+    def run(speed, fall_at):
+        # Worlds that drop their object reset, and so draw, more often before the second round begins.
+        env = FakeEnv([FakeObject("a")], num_worlds=3, max_episode_steps=6, fall_at=fall_at)
+        return collect_drawn(env, Turn(speed), 9)
+
+    first, second = run(0.0, {0: 1}), run(2.0, {1: 2, 2: 3})
+    assert [e.error_rad for e in first] != [e.error_rad for e in second]
+    assert [(e.start_quat, e.goal_quat) for e in first] == [(e.start_quat, e.goal_quat) for e in second]
 
 
 def test_fewer_worlds_than_objects_is_refused():

@@ -10,6 +10,7 @@ from fake_env import FakeEnv, FakeObject
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.evaluate.statistics import rotation_angle
 from vd.play.cli import PlayCfg, spread
 from vd.play.session import Session, agent_choices
@@ -175,9 +176,8 @@ def test_bad_settings_are_refused_by_flag(fields, message):
         PlayCfg(agent="zero", **fields).validate()
 
 
-def test_one_agent_has_to_be_named():
-    with pytest.raises(ValueError, match="name one agent"):
-        _ = PlayCfg().agent_name
+def test_the_installed_policy_is_shown_unless_one_agent_is_named():
+    assert PlayCfg().agent_name in SHIPPED_POLICIES
     with pytest.raises(ValueError, match="name one agent"):
         _ = PlayCfg(policy="a.pt", agent="zero").agent_name
     assert PlayCfg(policy="a.pt").agent_name == "a.pt"

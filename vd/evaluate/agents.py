@@ -10,20 +10,33 @@ from vd.envs.cfg import CurriculumCfg, ReorientCfg, SuccessCfg
 BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
 
+SHIPPED_POLICIES = {path.stem: path for path in sorted((Path(__file__).parents[1] / "policies").glob("*.pt"))}
+"""Trained policies that are installed with the package, by name: ``<hand>-<task>``."""
+
+DEFAULT_POLICY = "dclaw4-cube"
 DEFAULT_HAND = "dclaw4"
 # What a run's folder holds, best first.
 _RUN_FILES = ("policy.pt", "checkpoints/best.pt")
 
 
 def find_policy(name: str | Path) -> Path:
-    """The policy file that ``name`` means: a file, or the best one of a run's folder.
+    """The policy file that ``name`` means: one that is installed, a file, or the best one of a run's folder.
+
+    The name of an installed policy means that one; write ``./name`` for a folder called the same.
 
     Raises:
         FileNotFoundError: There is none.
     """
+    if str(name) in SHIPPED_POLICIES:
+        return SHIPPED_POLICIES[str(name)]
     path = Path(name)
-    if not path.is_dir():
+    if path.is_file():
         return path
+    if not path.is_dir():
+        raise FileNotFoundError(
+            f"no policy at {path}; give a policy.pt, a file of a run's checkpoints folder, a run's folder, "
+            f"or the name of an installed policy: {', '.join(SHIPPED_POLICIES)}"
+        )
     for candidate in _RUN_FILES:
         if (path / candidate).is_file():
             return path / candidate
@@ -39,7 +52,7 @@ def open_policy(name: str, device: str) -> Any | None:
     """Load a trained policy; None for a built-in agent, which needs the number of actions first.
 
     Args:
-        name: ``zero``, ``random``, a policy file, or a run's folder.
+        name: ``zero``, ``random``, the name of an installed policy, a policy file, or a run's folder.
         device: Torch device.
 
     Raises:
@@ -51,6 +64,17 @@ def open_policy(name: str, device: str) -> Any | None:
     from vd.policy import load_policy
 
     return load_policy(find_policy(name), device=device)
+
+
+def start_at_rest(yes: bool, no: bool) -> bool | None:
+    """What the flags ``--at-rest`` and ``--no-at-rest`` ask for; None: as trained.
+
+    Raises:
+        ValueError: Both are given.
+    """
+    if yes and no:
+        raise ValueError("--at-rest and --no-at-rest exclude each other; give one of them, or none")
+    return yes if yes or no else None
 
 
 def built_in(name: str, num_actions: int, *, seed: int, device: str) -> Any:
@@ -70,10 +94,11 @@ def task_for(
     num_worlds: int,
     seed: int,
     stop_tolerance_rad: float,
-    max_goal_angle_rad: float,
+    max_goal_angle_rad: float | None,
     episode_s: float,
     randomised: bool,
     success_ends_episode: bool,
+    at_rest: bool | None = None,
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
 
@@ -87,10 +112,12 @@ def task_for(
         num_worlds: N.
         seed: Of the environment.
         stop_tolerance_rad: Orientation tolerance of success [rad].
-        max_goal_angle_rad: Largest angle from an object to a goal the environment draws [rad].
+        max_goal_angle_rad: Largest angle from an object to a goal the environment draws [rad]; None: as
+            trained.
         episode_s: Time limit [s].
         randomised: Domain randomisation, noise and disturbances.
         success_ends_episode: End at success, or give a new goal.
+        at_rest: Start at rest on the table rather than from a drop; None: as trained.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     return replace(
@@ -102,7 +129,10 @@ def task_for(
         episode_s=episode_s,
         success_ends_episode=success_ends_episode,
         success=replace(SuccessCfg(), rotation_rad=stop_tolerance_rad),
-        goal=replace(base.goal, max_angle_rad=max_goal_angle_rad),
+        start=base.start if at_rest is None else replace(base.start, at_rest=at_rest),
+        goal=base.goal
+        if max_goal_angle_rad is None
+        else replace(base.goal, max_angle_rad=max_goal_angle_rad),
         curriculum=CurriculumCfg(),
         randomisation=replace(base.randomisation, enabled=randomised),
     )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from vd.evaluate.agents import SHIPPED_POLICIES, start_at_rest
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -19,6 +20,11 @@ if TYPE_CHECKING:
 WORLDS_CPU, WORLDS_GPU = 64, 8192
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0
+POLICY_HELP = (
+    "A policy.pt, a checkpoint, a run's folder, or the name of an installed policy: "
+    f"{', '.join(SHIPPED_POLICIES)}."
+)
+"""What names a policy on a command line."""
 _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
 
 
@@ -26,12 +32,13 @@ _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
 class EvalCfg:
     """Evaluate a policy: every object from the same starts to the same goals, whatever the policy.
 
+    Objects fall into the hand from orientations uniform on SO(3), or, with --at-rest, lie on the table.
+
     Writes eval.json (every episode) and eval.html (one page with figures) and prints a table. Errors are
     measured at the end of an episode, or at the first step at which all success criteria hold.
     """
 
-    policy: Annotated[str | None, tyro.conf.Positional] = None
-    """A policy.pt, a checkpoint, or a run's folder; or use --agent."""
+    policy: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = None
     agent: str | None = None
     """zero, random, or the same as POLICY."""
     objects: tuple[str, ...] = ("cube",)
@@ -44,6 +51,11 @@ class EvalCfg:
     """Seed of starts, goals and everything else random."""
     max_goal_angle: float = math.pi
     """Goals are within this angle [rad] of the start; pi is all of SO(3)."""
+    at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Start at rest on the table; the default is as trained, and a drop for --agent zero and random. The
+    environment draws such starts and their goals; they depend on --num-worlds too."""
+    no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Start from a drop, whatever the training."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """An episode stops, still and oriented, at this error [rad]; 0.1 for the paper's precise variant."""
     episode_s: float = PAPER.scene.episode_s
@@ -69,7 +81,10 @@ class EvalCfg:
             ValueError: None or two are named.
         """
         if (self.policy is None) == (self.agent is None):
-            raise ValueError("name one agent: a policy file, --agent zero or --agent random")
+            raise ValueError(
+                "name one agent: a policy file, --agent zero, --agent random, or an installed policy "
+                f"({', '.join(SHIPPED_POLICIES)})"
+            )
         return str(self.policy or self.agent)
 
     def validate(self) -> None:
@@ -84,6 +99,7 @@ class EvalCfg:
             raise ValueError(
                 f"--stop-tolerance is {self.stop_tolerance}; it must be above 0 and at most pi rad"
             )
+        start_at_rest(self.at_rest, self.no_at_rest)
         if self.num_worlds is not None and self.num_worlds < 1:
             raise ValueError(
                 f"--num-worlds is {self.num_worlds}; at least one world for each object is needed"
@@ -101,14 +117,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"vd-eval: {error}", file=sys.stderr)
         return 1
     from vd.config import to_dict
-    from vd.evaluate.report import terminal_table
+    from vd.evaluate.report import task_line, terminal_table
 
     if cfg.json:
         summary = {key: value for key, value in to_dict(result).items() if key != "episodes"}
         print(json.dumps(summary, indent=1))
     else:
         print(terminal_table(result))
-        print(f"\n{cfg.output / 'eval.json'}\n{cfg.output / 'eval.html'}")
+        print(f"\n{task_line(result)}\n{cfg.output / 'eval.json'}\n{cfg.output / 'eval.html'}")
     return 0
 
 
@@ -131,7 +147,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
     from vd.evaluate.agents import built_in, open_policy, task_for
     from vd.evaluate.report import write_report
     from vd.evaluate.result import Protocol, summarise
-    from vd.evaluate.rollout import collect, draw_starts_and_goals
+    from vd.evaluate.rollout import collect, collect_drawn, draw_starts_and_goals
 
     device = resolve_device(cfg.device)
     trained = open_policy(cfg.agent_name, device)
@@ -147,15 +163,11 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         episode_s=cfg.episode_s,
         randomised=cfg.randomise,
         success_ends_episode=True,
+        at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
     )
     print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
     env = ReorientEnv(task, device)
     policy = trained or built_in(cfg.agent_name, env.num_actions, seed=cfg.seed, device=device)
-    drawn = [
-        draw_starts_and_goals(item.name, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle)
-        for item in env.objects
-    ]
-    starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
     rounds = math.ceil(cfg.episodes / (env.num_worlds // count))
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
     with tqdm(total=rounds * env.max_episode_steps, unit="step", desc="vd-eval", mininterval=refresh) as bar:
@@ -164,13 +176,17 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
             bar.set_postfix_str(f"{done} of {count * cfg.episodes} episodes", refresh=False)
             bar.update()
 
-        episodes = collect(
-            env,
-            policy,
-            starts,
-            goals,
-            on_step=show,
-        )
+        if task.start.at_rest:
+            episodes = collect_drawn(env, policy, cfg.episodes, on_step=show)
+        else:
+            drawn = [
+                draw_starts_and_goals(
+                    item.name, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle
+                )
+                for item in env.objects
+            ]
+            starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
+            episodes = collect(env, policy, starts, goals, on_step=show)
     env.check()
     env.close()
     protocol = Protocol(
@@ -184,6 +200,8 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         episode_s=cfg.episode_s,
         control_hz=task.sim.control_hz,
         randomised=cfg.randomise,
+        at_rest=task.start.at_rest,
+        goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
     )
     result = summarise(
         protocol,

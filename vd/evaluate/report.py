@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from vd.evaluate import plots
-from vd.evaluate.result import TOLERANCES_RAD, EvalResult, Summary
+from vd.evaluate.result import TOLERANCES_RAD, EvalResult, Protocol, Summary
 from vd.evaluate.statistics import CHANCE_MEAN_RAD, Interval
 from vd.page import Page
 
@@ -97,18 +97,13 @@ def add_figures(page: Page, result: EvalResult) -> None:
 def protocol_rows(result: EvalResult) -> list[tuple[str, str]]:
     """Setting and value pairs that say how the numbers were made."""
     protocol = result.protocol
-    full = protocol.max_goal_angle_rad >= np.pi - 1e-6
     rows = [
         ("policy", protocol.policy),
         ("objects", f"{protocol.objects} ({len(result.object_names)})"),
         ("hand", protocol.hand),
         ("starts and goals", f"{protocol.episodes} each for every object, seed {protocol.seed}"),
-        (
-            "goals",
-            "uniform on SO(3)"
-            if full
-            else f"uniform within {protocol.max_goal_angle_rad:g} rad of the start",
-        ),
+        ("starts", _starts(protocol)),
+        ("goals", _goals(protocol)),
         ("stop", f"error at most {protocol.stop_tolerance_rad:g} rad, fingers and object still"),
         ("time limit", f"{protocol.episode_s:g} s at {protocol.control_hz:g} Hz"),
         ("randomisation, noise, disturbances", "on" if protocol.randomised else "off"),
@@ -116,12 +111,38 @@ def protocol_rows(result: EvalResult) -> list[tuple[str, str]]:
     return rows + [(name, version) for name, version in result.software.items()]
 
 
+def task_line(result: EvalResult) -> str:
+    """One line that says what was asked: starts, goals, stop and randomisation."""
+    protocol = result.protocol
+    randomisation = "on" if protocol.randomised else "off"
+    return (
+        f"starts {_starts(protocol)}; goals {_goals(protocol)}; stop within "
+        f"{protocol.stop_tolerance_rad:g} rad and still; randomisation {randomisation}"
+    )
+
+
+def _starts(protocol: Protocol) -> str:
+    if protocol.at_rest:
+        return "at rest on the table, as the environment draws them"
+    return "dropped into the hand, uniform on SO(3)"
+
+
+def _goals(protocol: Protocol) -> str:
+    angle = protocol.max_goal_angle_rad
+    if protocol.goals_about_vertical:
+        return f"turned about the vertical by at most {angle:g} rad"
+    return "uniform on SO(3)" if angle >= np.pi - 1e-6 else f"uniform within {angle:g} rad of the start"
+
+
 def method_note(result: EvalResult) -> str:
     """How errors and intervals are to be read."""
     return (
         "Actions are the policy's means. Errors are measured at the end of an episode or at the first step "
         "at which all success criteria hold, never as the least error on the way; for a symmetric object the "
-        "least over its symmetry rotations counts. A dropped object fails at every tolerance. Chance is an "
+        "least over its symmetry rotations counts. The stop itself knows no symmetry: an object in an "
+        "orientation that only looks like the goal is not stopped there, and where it ends counts, so that "
+        "for a symmetric object the share within a tolerance and the share that stopped may differ either "
+        "way. A dropped object fails at every tolerance. Chance is an "
         f"orientation drawn uniformly from SO(3): mean error {CHANCE_MEAN_RAD:.2f} rad for an asymmetric "
         f"object; the mean measured here, drops included, is {result.overall.mean_error_rad:.2f} rad. "
         f"{_UNIT_NOTE[result.overall.unit]} Those of a single object resample its episodes. Where all "
@@ -168,5 +189,5 @@ def _lead(result: EvalResult) -> str:
     protocol = result.protocol
     return (
         f"{len(result.episodes)} episodes: {len(result.object_names)} objects of {protocol.objects}, "
-        f"{protocol.episodes} starts and goals each, {protocol.hand}"
+        f"{protocol.episodes} starts and goals each, {protocol.hand}; {task_line(result)}"
     )

@@ -79,6 +79,11 @@ class Protocol:
     """Policy rate."""
     randomised: bool
     """Domain randomisation, noise and disturbances as in training."""
+    at_rest: bool = False
+    """Objects start at rest on the table, and starts and goals are those the environment draws; otherwise
+    they fall, with starts uniform on SO(3), the same for any environment."""
+    goals_about_vertical: bool = False
+    """Goals only turn the object about the vertical."""
 
 
 @dataclass(frozen=True)

@@ -97,8 +97,52 @@ def collect(
         RuntimeError: An episode outlived the environment's own limit.
     """
     objects, episodes = starts.shape[:2]
+    world_object = np.asarray(env.world_object)
     recorded: dict[tuple[int, int], Episode] = {}
-    for world_episode in _rounds(np.asarray(env.world_object), objects, episodes):
+    for world_episode in _rounds(world_object, objects, episodes):
+        # Worlds without an episode left repeat their object's first one, unread.
+        index = world_object, np.maximum(world_episode, 0)
+        env.reset(object_quat=starts[index].astype(np.float32), goal_quat=goals[index].astype(np.float32))
+        _run_round(env, policy, starts[index], goals[index], world_episode, recorded, on_step)
+    return tuple(recorded[k, m] for k in range(objects) for m in range(episodes))
+
+
+def collect_drawn(
+    env: Any,
+    policy: Policy,
+    episodes: int,
+    *,
+    on_step: Callable[[int], object] = lambda done: None,
+) -> tuple[Episode, ...]:
+    """Run episodes whose starts and goals are those the environment draws, for example at rest on the table.
+
+    All rounds are drawn before the first step, since how often worlds reset depends on the policy and moves
+    the random streams: so starts and goals depend on the environment's configuration (its seed and number
+    of worlds included), never on the policy.
+
+    Args:
+        env: A new environment whose episodes end at success.
+        policy: What to evaluate.
+        episodes: M, of every object.
+        on_step: Called after every control step with the number of episodes done so far.
+
+    Returns:
+        K x M episodes, object by object.
+
+    Raises:
+        RuntimeError: An episode outlived the environment's own limit.
+    """
+    objects = len(env.objects)
+    recorded: dict[tuple[int, int], Episode] = {}
+    rounds = _rounds(np.asarray(env.world_object), objects, episodes)
+    states = []
+    for _ in rounds:
+        env.reset()
+        states.append(env.state_dict())
+    for world_episode, state in zip(rounds, states, strict=True):
+        env.load_state_dict(state)
+        starts = _unit(env.object_pose()[:, 3:7])
+        goals = _unit(env.goal_quat.numpy())
         _run_round(env, policy, starts, goals, world_episode, recorded, on_step)
     return tuple(recorded[k, m] for k in range(objects) for m in range(episodes))
 
@@ -119,17 +163,24 @@ def _rounds(world_object: np.ndarray, objects: int, episodes: int) -> list[np.nd
 def _run_round(
     env: Any,
     policy: Policy,
-    starts: np.ndarray,
-    goals: np.ndarray,
+    start: np.ndarray,
+    goal: np.ndarray,
     world_episode: np.ndarray,
     recorded: dict[tuple[int, int], Episode],
     on_step: Callable[[int], object],
 ) -> None:
+    """Run every world, just reset, to the end of its episode.
+
+    Args:
+        env: The environment.
+        policy: What to evaluate.
+        start: Orientations the objects have, shape [N, 4].
+        goal: Goals of the worlds, shape [N, 4].
+        world_episode: Number of each world's episode, -1 for none, shape [N].
+        recorded: Gets the episodes by object and number.
+        on_step: See :func:`collect`.
+    """
     world_object = np.asarray(env.world_object)
-    # Worlds without an episode left repeat their object's first one, unread.
-    start = starts[world_object, np.maximum(world_episode, 0)]
-    goal = goals[world_object, np.maximum(world_episode, 0)]
-    env.reset(object_quat=start.astype(np.float32), goal_quat=goal.astype(np.float32))
     running = world_episode >= 0
     for step in range(1, env.max_episode_steps + 1):
         action = policy.act(wp.to_torch(env.observation))
@@ -162,7 +213,7 @@ def _run_round(
 
 def _unit(quat: np.ndarray) -> np.ndarray:
     quat = quat.astype(float)
-    return quat / np.linalg.norm(quat)
+    return quat / np.linalg.norm(quat, axis=-1, keepdims=True)
 
 
 def _quat(values: Sequence[float] | np.ndarray) -> tuple[float, float, float, float]:

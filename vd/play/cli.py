@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from vd.evaluate.agents import DEFAULT_POLICY, start_at_rest
+from vd.evaluate.cli import POLICY_HELP
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -26,10 +28,12 @@ FAST_WORLDS_CPU = 16
 
 @dataclass
 class PlayCfg:
-    """Watch a policy: in the browser, or as a video made without a display or GPU."""
+    """Watch a policy: in the browser, or as a video made without a display or GPU.
 
-    policy: Annotated[str | None, tyro.conf.Positional] = None
-    """A policy.pt, a checkpoint, or a run's folder; or use --agent."""
+    Without arguments it shows the installed policy that turns a cube.
+    """
+
+    policy: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = None
     agent: str | None = None
     """zero, random, or the same as POLICY."""
     hand: str | None = None
@@ -50,8 +54,13 @@ class PlayCfg:
     """Address of the viewer; 0.0.0.0 lets other machines look."""
     seed: int = 0
     """Seed of starts and goals."""
-    max_goal_angle: float = math.pi
-    """Goals are within this angle [rad] of the object's orientation; pi is all of SO(3)."""
+    max_goal_angle: float | None = None
+    """Goals are within this angle [rad] of the object's orientation; pi is all of SO(3). By default as
+    trained, and pi without a policy."""
+    at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Start at rest on the table; the default is as trained, and a drop for --agent zero and random."""
+    no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Start from a drop, whatever the training."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float = PAPER.scene.episode_s
@@ -63,18 +72,23 @@ class PlayCfg:
 
     @property
     def agent_name(self) -> str:
-        """Which agent begins."""
-        if (self.policy is None) == (self.agent is None):
-            raise ValueError("name one agent: a policy file, --agent zero or --agent random")
-        return str(self.policy or self.agent)
+        """Which agent begins.
+
+        Raises:
+            ValueError: Two are named.
+        """
+        if self.policy is not None and self.agent is not None:
+            raise ValueError("name one agent: a policy, or --agent zero or --agent random")
+        return self.policy or self.agent or DEFAULT_POLICY
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
+        start_at_rest(self.at_rest, self.no_at_rest)
         if self.cells < 1:
             raise ValueError(f"--cells is {self.cells}; at least 1 is needed")
         if not self.seconds > 0.0:
             raise ValueError(f"--seconds is {self.seconds}; it must be positive")
-        if not 0.0 < self.max_goal_angle <= math.pi + 1e-6:
+        if self.max_goal_angle is not None and not 0.0 < self.max_goal_angle <= math.pi + 1e-6:
             raise ValueError(
                 f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
             )
@@ -197,6 +211,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         episode_s=cfg.episode_s,
         randomised=cfg.randomise,
         success_ends_episode=False,
+        at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
     )
     return ReorientEnv(task, device), trained, device
 

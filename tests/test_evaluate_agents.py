@@ -1,0 +1,109 @@
+"""Which policy a name means, and the task it is evaluated in."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy, start_at_rest, task_for
+from vd.evaluate.cli import main
+from vd.policy import load_policy
+
+
+def task_of(policy, **changes):
+    values = dict(
+        hand=None,
+        objects=("cube",),
+        num_worlds=2,
+        seed=0,
+        stop_tolerance_rad=0.4,
+        max_goal_angle_rad=None,
+        episode_s=10.0,
+        randomised=False,
+        success_ends_episode=True,
+    )
+    return task_for(policy, **{**values, **changes})
+
+
+@pytest.mark.parametrize("name", SHIPPED_POLICIES)
+def test_installed_policies_load_and_act(name):
+    policy = open_policy(name, "cpu")
+    assert name.startswith(f"{policy.hand}-"), "the name begins with the hand"
+    action = policy.act(torch.zeros(3, policy.num_observations))
+    assert action.shape == (3, policy.num_actions) and torch.isfinite(action).all()
+    assert not any("/" in item for item in policy.task["objects"]), "a path of the machine it was trained on"
+
+
+def test_there_is_an_installed_policy():
+    assert "dclaw4-cube" in SHIPPED_POLICIES
+    assert find_policy("dclaw4-cube") == SHIPPED_POLICIES["dclaw4-cube"]
+
+
+def test_a_run_folder_means_its_best_policy(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"holds no policy\.pt"):
+        find_policy(tmp_path)
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "checkpoints/best.pt").touch()
+    assert find_policy(tmp_path) == tmp_path / "checkpoints/best.pt"
+    (tmp_path / "policy.pt").touch()
+    assert find_policy(tmp_path) == find_policy(tmp_path / "policy.pt") == tmp_path / "policy.pt"
+
+
+def test_an_unknown_policy_is_refused_with_the_names_there_are(capsys):
+    assert main(["dclaw4-cubes", "--device", "cpu"]) == 1
+    error = capsys.readouterr().err
+    assert "dclaw4-cubes" in error and "dclaw4-cube" in error.replace("dclaw4-cubes", "")
+    assert main([]) == 1
+    assert "dclaw4-cube" in capsys.readouterr().err
+
+
+def test_the_start_is_as_trained_unless_asked_otherwise():
+    trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
+    assert task_of(trained).start.at_rest and not task_of(None).start.at_rest
+    assert not task_of(trained, at_rest=False).start.at_rest
+    assert task_of(None, at_rest=True).start.at_rest
+
+
+def test_goals_are_as_trained_unless_an_angle_is_given():
+    trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
+    assert task_of(trained).goal.max_angle_rad == pytest.approx(1.0)
+    assert task_of(None).goal.max_angle_rad == pytest.approx(math.pi)
+    assert task_of(trained, max_goal_angle_rad=0.5).goal.max_angle_rad == 0.5
+
+
+def test_flags_of_the_start_exclude_each_other(capsys):
+    assert [start_at_rest(*flags) for flags in ((False, False), (True, False), (False, True))] == [
+        None,
+        True,
+        False,
+    ]
+    assert main(["--agent", "zero", "--at-rest", "--no-at-rest"]) == 1
+    assert "exclude each other" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("module", ["vd.evaluate.cli", "vd.play.cli"])
+def test_help_lists_the_installed_policies(module):
+    done = subprocess.run(
+        [sys.executable, "-m", module, "--help"], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 0 and "dclaw4-cube" in done.stdout
+
+
+@pytest.mark.slow
+def test_evaluation_at_rest_of_the_installed_policy_beats_doing_nothing(tmp_path):
+    from vd.evaluate.result import EvalResult
+
+    flags = ["--objects", "cube", "--episodes", "8", "--max-goal-angle", "1.0", "--episode-s", "3"]
+    flags += ["--device", "cpu"]
+    assert main(["dclaw4-cube", *flags, "--output", str(tmp_path / "trained")]) == 0
+    assert main(["--agent", "zero", "--at-rest", *flags, "--output", str(tmp_path / "zero")]) == 0
+    trained, zero = (EvalResult.read(tmp_path / name / "eval.json") for name in ("trained", "zero"))
+    assert trained.protocol.at_rest and zero.protocol.at_rest
+    for one, other in zip(trained.episodes, zero.episodes, strict=True):
+        np.testing.assert_allclose(one.start_quat, other.start_quat, atol=1e-3)
+        np.testing.assert_allclose(one.goal_quat, other.goal_quat, atol=1e-3)
+    assert all(e.start_error_rad <= 1.0 + 1e-3 for e in trained.episodes)
+    assert sum(e.stopped for e in trained.episodes) >= 6 > sum(e.stopped for e in zero.episodes)
