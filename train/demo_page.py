@@ -143,9 +143,9 @@ def _outcome(page: Page, results: "DemoResults", task: ReorientCfg) -> None:
         rate = result.overall.stop_rate
         tiles.append(
             (
-                f"{100 * rate.value:.0f} %",
-                f"of first goals reached, {NAMES[name]}",
-                f"95 %: {100 * rate.low:.0f} to {100 * rate.high:.0f}",
+                f"{results.agents[name][1].per_episode:.1f}",
+                f"goals an episode, {NAMES[name]}",
+                f"first goal: {100 * rate.value:.0f} % ({100 * rate.low:.0f} to {100 * rate.high:.0f})",
             )
         )
     page.tiles(tiles)
