@@ -187,6 +187,8 @@ def test_interrupted_import_leaves_no_part_and_no_process(tmp_path: Path):
     child = subprocess.Popen(
         [*command, "--mcts-iterations", "500", "--threshold", "0.01"],
         env=environment, stderr=subprocess.PIPE, text=True,
+        # A shell that runs tests in the background makes its children deaf to Ctrl-C.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     marker = str(folder)
     deadline = time.monotonic() + 20
