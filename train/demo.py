@@ -311,7 +311,7 @@ def _evaluate(
     each = math.ceil(PAPER_EPISODES[device] / len(load_set(list(objects))))
     flags = [str(run_dir / "policy.pt"), "--objects", *objects, "--episodes", str(each)]
     flags += ["--seed", str(cfg.seed), "--device", device, "--output", str(official)]
-    flags += ["--episode-s", f"{PRESETS[preset]().env.episode_s:g}"]
+    flags += ["--episode-s", f"{PRESETS[preset]().env.episode_s:g}", "--no-at-rest"]
     commands.append(f"vd-eval {' '.join(flags)}")
     products = [*files.values(), official / "eval.json"]
     with stages.run("evaluate", "evaluate it beside a random and a zero agent", products=products) as needed:

@@ -91,6 +91,8 @@ def compare_agents(
             episode_s=task.episode_s,
             control_hz=task.sim.control_hz,
             randomised=task.randomisation.enabled,
+            at_rest=task.start.at_rest,
+            goals_about_vertical=task.goal.about_vertical,
         )
         names = tuple(item.name for item in env.objects)
         result = summarise(protocol, names, [np.array([IDENTITY])] * count, recorded)

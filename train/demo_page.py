@@ -66,6 +66,8 @@ def write_page(results: "DemoResults", path: Path) -> None:
     page.text("The same by hand, stage by stage:")
     for command in results.commands:
         page.code(command)
+    page.text("A policy that was trained on a GPU and comes with the package, in the browser:")
+    page.code("vd-play dclaw4-cube")
     page.text("The paper's task on a GPU, with our 150 procedural objects:")
     page.code("vd-assets objects --procedural 150 --seed 0")
     page.code("vd-train teacher --preset gpu --objects procedural-150-seed0 --run-dir runs/first")
@@ -277,8 +279,9 @@ def _paper_criteria(page: Page, results: "DemoResults") -> None:
     overall = results.paper.overall
     page.section("The same policy, judged as in the paper")
     page.text(
-        "Goals from all of SO(3), and a goal counts only when fingers and object are still. A demo of "
-        "this length is not expected to do well here; the table shows how far there is to go."
+        "Objects fall into the hand, goals are from all of SO(3), and a goal counts only when fingers and "
+        "object are still. A demo of this length is not expected to do well here; the table shows how far "
+        "there is to go."
     )
     rows = [
         (
@@ -299,8 +302,8 @@ def _paper_criteria(page: Page, results: "DemoResults") -> None:
 _MEANINGS = (
     "Error: the angle of the rotation from the object's orientation to the goal's, 0 to pi. "
     f"{PAPER.success.rotation_rad} rad is about {round(PAPER.success.rotation_rad * 57.3)} degrees. For a "
-    "symmetric object such as the cube, the evaluation by the paper's criteria takes the smallest angle over "
-    "its symmetries; training and comparison do not.",
+    "symmetric object such as the cube, the evaluation by the paper's criteria takes the smallest angle "
+    "over its symmetries; training and comparison do not.",
     "Goal reached: all criteria of the task held in one step. The hand then gets a new goal without a "
     "reset. Some goals are reached by luck, since a new goal may lie within the tolerance at once: "
     "compare with the random agent.",
