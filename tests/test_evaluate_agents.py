@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy, start_at_rest, task_for
+from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, start_at_rest, task_for
 from vd.evaluate.cli import main
 from vd.policy import load_policy
 
@@ -30,7 +30,7 @@ def task_of(policy, **changes):
 
 @pytest.mark.parametrize("name", SHIPPED_POLICIES)
 def test_installed_policies_load_and_act(name):
-    policy = open_policy(name, "cpu")
+    policy = load_policy(find_policy(name))
     assert name.startswith(f"{policy.hand}-"), "the name begins with the hand"
     action = policy.act(torch.zeros(3, policy.num_observations))
     assert action.shape == (3, policy.num_actions) and torch.isfinite(action).all()
