@@ -88,7 +88,7 @@ def test_other_meshes_seeds_and_objects_get_their_own_folder(tmp_path):
     base = demo.DemoCfg(out=tmp_path)
     labels = [
         demo._label(cfg, "cpu-demo")
-        for cfg in (base, replace(base, seed=1), replace(base, objects=("cube",)))
+        for cfg in (base, replace(base, seed=1), replace(base, objects=("cuboid",)))
     ]
     labels.append(demo._label(replace(base, meshes=meshes), "cpu-demo"))
     (meshes / "b.obj").write_text("o b\n")
@@ -137,7 +137,7 @@ def test_a_stage_that_fails_is_run_again(tmp_path, capsys):
 def test_the_page_says_what_makes_the_task_easier():
     task = PRESETS["cpu-demo"]().env
     text = " ".join(demo_page.task_sentences(task))
-    assert f"within {task.goal.max_angle_rad:.2g} rad" in text
+    assert f"vertical only, by up to {task.goal.max_angle_rad:.2g} rad" in text
     assert "must not be compared" in text
     assert "easier" not in " ".join(demo_page.task_sentences(ReorientCfg()))
 
