@@ -30,7 +30,7 @@ OBJECTS = ("cube",)
 """Built-in sets that the demo trains on. On two cores a second shape needs more time than there is."""
 
 SHOWN = ("procedural-3-seed0",)
-"""Built-in sets that are authored and drawn beside them."""
+"""Built-in sets that are authored beside them, and only appear in the evaluation."""
 
 STAGES = 6
 
@@ -313,8 +313,9 @@ def _evaluate(
 
     files = {name: folder / f"{name}.json" for name in (*AGENTS, "goals")}
     official = folder / "evaluation"
-    each = math.ceil(PAPER_EPISODES[device] / len(load_set(list(objects))))
-    flags = [str(run_dir / "policy.pt"), "--objects", *objects, "--episodes", str(each)]
+    judged = tuple(dict.fromkeys((*objects, *SHOWN)))
+    each = math.ceil(PAPER_EPISODES[device] / len(load_set(list(judged))))
+    flags = [str(run_dir / "policy.pt"), "--objects", *judged, "--episodes", str(each)]
     flags += ["--seed", str(cfg.seed), "--device", device, "--output", str(official)]
     flags += ["--episode-s", f"{PRESETS[preset]().env.episode_s:g}", "--no-at-rest"]
     commands.append(f"vd-eval {' '.join(flags)}")

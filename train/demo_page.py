@@ -55,8 +55,9 @@ def write_page(results: "DemoResults", path: Path) -> None:
     page.section("The objects")
     page.figure(
         results.sheet,
-        "The objects of this demo. Left of each pair the mesh, right the convex parts that collide, with "
-        "the relative error of their volume.",
+        f"The objects of this demo; it was trained on {results.agents['trained'][0].protocol.objects}. "
+        "Left of each pair the mesh, right the convex parts that collide, with the relative error of "
+        "their volume.",
     )
     _paper_criteria(page, results)
     page.section("What the numbers mean")
@@ -294,8 +295,10 @@ def _paper_criteria(page: Page, results: "DemoResults") -> None:
     rows.append(("stopped by itself: oriented and still", percent(overall.stop_rate), ""))
     rows.append(("dropped", percent(overall.drop_rate), ""))
     page.table([f"{overall.episodes} episodes", "this policy", "a random orientation"], rows)
+    names = ", ".join(results.paper.object_names)
     page.text(
-        "Every object and figure of this evaluation: evaluation/eval.html in the demo's folder.", small=True
+        f"Objects: {names}. Every figure of this evaluation: evaluation/eval.html in the demo's folder.",
+        small=True,
     )
 
 
