@@ -40,8 +40,8 @@ def test_paper_preset_is_the_paper():
     assert (cfg.ppo.schedule, cfg.ppo.optimizer) == ("fixed", "adam")
     assert cfg.policy.hidden == (512, 256, 256) and cfg.policy.activation == "elu"
     assert cfg.policy.distribution == "gaussian" and not cfg.policy.normalise_observations
-    assert cfg.env == type(cfg.env)(num_worlds=32000), (
-        "the task is the paper's, by the environment's defaults"
+    assert cfg.env == type(cfg.env)(num_worlds=32000, objects=("procedural-150-seed0",)), (
+        "the task is the paper's, by the environment's defaults, on as many objects"
     )
 
 

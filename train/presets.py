@@ -13,6 +13,9 @@ from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 
 PresetName = Literal["paper", "cpu-demo", "cube", "gpu", "multi-gpu"]
 
+TRAINING_SET = ("procedural-150-seed0",)
+"""Objects of the paper's task: as many as the paper trained on, and authored on first use."""
+
 
 @dataclass
 class TeacherCfg:
@@ -35,7 +38,7 @@ def paper() -> TeacherCfg:
     return TeacherCfg(
         preset="paper",
         run=RunCfg(run_dir=Path("runs/paper")),
-        env=ReorientCfg(num_worlds=PAPER.teacher.num_worlds),
+        env=ReorientCfg(num_worlds=PAPER.teacher.num_worlds, objects=TRAINING_SET),
     )
 
 
@@ -68,6 +71,7 @@ def gpu() -> TeacherCfg:
         ),
         env=ReorientCfg(
             num_worlds=16384,
+            objects=TRAINING_SET,
             reward=RewardCfg(
                 rotation_epsilon_rad=PAPER.reward.rotation_epsilon_rad_code,
                 fingertip=-10.0,
