@@ -6,6 +6,7 @@ the paper's 19 G + 21 and the previous action.
 
 import warp as wp
 
+from vd.kernels.columns import read_quat, read_vec3, write_quat, write_vec3
 from vd.kernels.rng import next_stream
 from vd.kernels.transforms import rotation_difference
 
@@ -61,22 +62,6 @@ class ObservationParams:
 def fingertip_pose(body_q: wp.transform, tip_offset: wp.transform) -> wp.transform:
     """Pose of a fingertip frame in the world frame."""
     return wp.transform_multiply(body_q, tip_offset)
-
-
-@wp.func
-def write_vec3(row: int, column: int, value: wp.vec3, out: wp.array2d[float]) -> int:
-    """Write three values to ``out[row, column:]``; returns the next free column."""
-    for i in range(3):
-        out[row, column + i] = value[i]
-    return column + 3
-
-
-@wp.func
-def write_quat(row: int, column: int, value: wp.quat, out: wp.array2d[float]) -> int:
-    """Write xyzw to ``out[row, column:]``; returns the next free column."""
-    for i in range(4):
-        out[row, column + i] = value[i]
-    return column + 4
 
 
 @wp.kernel
@@ -158,21 +143,10 @@ def teacher_observation_kernel(
         observation_out[world, joint] = 2.0 * above / span - 1.0
         observation_out[world, joints + joint] = settings.velocity_scale * joint_qd_in[world, joint]
 
-    position = wp.vec3(
-        joint_q_in[world, joints], joint_q_in[world, joints + 1], joint_q_in[world, joints + 2]
-    )
-    orientation = wp.quat(
-        joint_q_in[world, joints + 3],
-        joint_q_in[world, joints + 4],
-        joint_q_in[world, joints + 5],
-        joint_q_in[world, joints + 6],
-    )
-    velocity = wp.vec3(
-        joint_qd_in[world, joints], joint_qd_in[world, joints + 1], joint_qd_in[world, joints + 2]
-    )
-    spin = wp.vec3(
-        joint_qd_in[world, joints + 3], joint_qd_in[world, joints + 4], joint_qd_in[world, joints + 5]
-    )
+    position = read_vec3(world, joints, joint_q_in)
+    orientation = read_quat(world, joints + 3, joint_q_in)
+    velocity = read_vec3(world, joints, joint_qd_in)
+    spin = read_vec3(world, joints + 3, joint_qd_in)
     goal = goal_quat_in[world]
 
     column = write_vec3(world, 2 * joints, position, observation_out)

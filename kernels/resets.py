@@ -6,6 +6,7 @@ Order in a control step: after the reward, :func:`episode_kernel` decides what e
 
 import warp as wp
 
+from vd.kernels.columns import read_quat
 from vd.kernels.rng import next_stream
 from vd.kernels.transforms import (
     PI,
@@ -178,12 +179,7 @@ def reset_kernel(
 
     for joint in range(joints):
         smoothed_out[world, joint] = 0.0
-    orientation = wp.quat(
-        joint_q[world, joints + 3],
-        joint_q[world, joints + 4],
-        joint_q[world, joints + 5],
-        joint_q[world, joints + 6],
-    )
+    orientation = read_quat(world, joints + 3, joint_q)
     draw = goal_params[0]
     state, turn = random_rotation_within(state, draw.max_angle)
     if draw.about_vertical != 0:

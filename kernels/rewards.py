@@ -5,6 +5,7 @@ World frame (z up, table top at z = 0), SI units, radians, quaternions xyzw.
 
 import warp as wp
 
+from vd.kernels.columns import read_quat, read_vec3
 from vd.kernels.transforms import rotation_angle, rotation_difference
 
 wp.set_module_options({"enable_backward": False})
@@ -150,21 +151,10 @@ def reward_kernel(
     joints = effort_in.shape[1]
     fingers = tip_pos_in.shape[1]
 
-    position = wp.vec3(
-        joint_q_in[world, joints], joint_q_in[world, joints + 1], joint_q_in[world, joints + 2]
-    )
-    orientation = wp.quat(
-        joint_q_in[world, joints + 3],
-        joint_q_in[world, joints + 4],
-        joint_q_in[world, joints + 5],
-        joint_q_in[world, joints + 6],
-    )
-    velocity = wp.vec3(
-        joint_qd_in[world, joints], joint_qd_in[world, joints + 1], joint_qd_in[world, joints + 2]
-    )
-    spin = wp.vec3(
-        joint_qd_in[world, joints + 3], joint_qd_in[world, joints + 4], joint_qd_in[world, joints + 5]
-    )
+    position = read_vec3(world, joints, joint_q_in)
+    orientation = read_quat(world, joints + 3, joint_q_in)
+    velocity = read_vec3(world, joints, joint_qd_in)
+    spin = read_vec3(world, joints + 3, joint_qd_in)
 
     power = wp.float32(0.0)
     joint_speed = wp.float32(0.0)

@@ -2,6 +2,8 @@
 
 import warp as wp
 
+from vd.kernels.columns import read_quat, read_vec3
+
 wp.set_module_options({"enable_backward": False})
 
 
@@ -131,10 +133,8 @@ def record_step_kernel(
 ):
     """Copy the object's pose (world frame) out of the joint positions, shape [N]."""
     world = wp.tid()
-    c = object_column
     object_pose_out[world] = wp.transform(
-        wp.vec3(joint_q[world, c], joint_q[world, c + 1], joint_q[world, c + 2]),
-        wp.quat(joint_q[world, c + 3], joint_q[world, c + 4], joint_q[world, c + 5], joint_q[world, c + 6]),
+        read_vec3(world, object_column, joint_q), read_quat(world, object_column + 3, joint_q)
     )
 
 

@@ -1,0 +1,35 @@
+"""Vectors and quaternions in consecutive columns of a row: how joint states and observations are laid out."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def read_vec3(row: int, column: int, values: wp.array2d[float]) -> wp.vec3:
+    """Three values from ``values[row, column:]``."""
+    return wp.vec3(values[row, column], values[row, column + 1], values[row, column + 2])
+
+
+@wp.func
+def read_quat(row: int, column: int, values: wp.array2d[float]) -> wp.quat:
+    """A quaternion xyzw from ``values[row, column:]``."""
+    return wp.quat(
+        values[row, column], values[row, column + 1], values[row, column + 2], values[row, column + 3]
+    )
+
+
+@wp.func
+def write_vec3(row: int, column: int, value: wp.vec3, out: wp.array2d[float]) -> int:
+    """Write three values to ``out[row, column:]``; returns the next free column."""
+    for i in range(3):
+        out[row, column + i] = value[i]
+    return column + 3
+
+
+@wp.func
+def write_quat(row: int, column: int, value: wp.quat, out: wp.array2d[float]) -> int:
+    """Write xyzw to ``out[row, column:]``; returns the next free column."""
+    for i in range(4):
+        out[row, column + i] = value[i]
+    return column + 4
