@@ -20,22 +20,15 @@ PLAIN_INTERVAL_S = 15.0
 
 @dataclass(frozen=True)
 class GoalCount:
-    """All goals of one episode of every world, as the curve of a training counts them.
+    """All goals of one episode of every world.
 
     Attributes:
         worlds: Episodes.
-        ended: Goals that ended, by success, drop or the end of the episode.
-        reached: Those that were reached.
+        reached: Goals that were reached in them.
     """
 
     worlds: int
-    ended: float
     reached: float
-
-    @property
-    def per_goal(self) -> float:
-        """Share of the goals that were reached."""
-        return self.reached / max(self.ended, 1.0)
 
     @property
     def per_episode(self) -> float:
@@ -79,7 +72,7 @@ def compare_agents(
         env.load_state_dict(start)
         recorded = first_goals(env, policy, title=f"  {agent}")
         env.check()
-        ended, reached = (float(value) for value in env.goal_counts.numpy()[:2])
+        reached = float(env.goal_counts.numpy()[1])
         protocol = Protocol(
             policy=agent,
             objects=", ".join(objects),
@@ -96,7 +89,7 @@ def compare_agents(
         )
         names = tuple(item.name for item in env.objects)
         result = summarise(protocol, names, [np.array([IDENTITY])] * count, recorded)
-        yield agent, result, GoalCount(env.num_worlds, ended, reached)
+        yield agent, result, GoalCount(env.num_worlds, reached)
     env.close()
 
 

@@ -51,7 +51,7 @@ def write_page(results: "DemoResults", path: Path) -> None:
         page.text(sentence)
     page.table(["setting", "paper (default)", "this demo"], list(differences(task)))
     page.text("Settings that are not in the table are the paper's, as in vd/paper.py.", small=True)
-    _learning(page, results, rows)
+    _learning(page, results, task, rows)
     page.section("The objects")
     page.figure(
         results.sheet,
@@ -236,41 +236,47 @@ def comparison_figure(agents: "Mapping[str, EvalResult]") -> "Figure":
     return figure
 
 
-def _learning(page: Page, results: "DemoResults", rows: list[dict[str, Any]]) -> None:
+def _learning(page: Page, results: "DemoResults", task: ReorientCfg, rows: list[dict[str, Any]]) -> None:
     from vd.train.curves import plot_curves
 
     page.section("Learning")
-    counts = {name: count.per_goal for name, (_, count) in results.agents.items()}
+    counts = {name: count.per_episode for name, (_, count) in results.agents.items()}
     page.figure(
-        learning_figure(rows, counts),
-        "Share of goals reached in training, with exploration noise, over the last episode's length. Line "
-        "and dot: random actions and the trained policy without noise, counted alike (all goals of an "
-        "episode, not only the first as above).",
+        learning_figure(rows, counts, first=task.num_worlds * task.max_episode_steps),
+        "Goals reached in an episode during training, with exploration noise, from the first whole "
+        "episode of all worlds on. Line and dot: random actions and the trained policy without noise, as "
+        "in the table.",
     )
     curves = results.run_dir / "curves.png"
     plot_curves(results.run_dir / PROGRESS_FILE, curves)
     page.figure(curves, "Everything that was logged, against control steps of all worlds together.")
 
 
-def learning_figure(rows: list[dict[str, Any]], per_goal: Mapping[str, float]) -> "Figure":
+def learning_figure(rows: list[dict[str, Any]], per_episode: Mapping[str, float], *, first: int) -> "Figure":
     """The curve of the training beside the random agent.
 
     Args:
         rows: Rows of ``progress.jsonl``.
-        per_goal: Share of goals reached by the ``random`` and the ``trained`` agent.
+        per_episode: Goals that the ``random`` and the ``trained`` agent reached in an episode.
+        first: Control steps before which only episodes with early ends are counted; left out.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.5, 3.4), layout="constrained")
     axes = figure.subplots()
-    points = [(row["env_steps"] / 1e3, row["success_per_goal"]) for row in rows]
-    steps, rate = zip(*[(x, 100 * y) for x, y in points if y is not None] or [(0.0, 0.0)], strict=True)
-    axes.plot(steps, rate, color=COLORS["trained"], label="in training")
-    axes.axhline(100 * per_goal["random"], color=COLORS["random"], linewidth=1.4, label=NAMES["random"])
-    last = points[-1][0]
-    axes.plot(last, 100 * per_goal["trained"], "o", color=COLORS["trained"], label="trained policy, no noise")
-    axes.set(xlabel="control steps [thousand]", ylabel="goals reached [%]", ylim=(0.0, 100.0))
+    last = rows[-1]["env_steps"] / 1e3
+    points = [
+        (row["env_steps"] / 1e3, row["goals_per_episode"])
+        for row in rows
+        if row["env_steps"] >= first and row["goals_per_episode"] is not None
+    ]
+    if points:
+        axes.plot(*zip(*points, strict=True), color=COLORS["trained"], label="in training")
+    axes.axhline(per_episode["random"], color=COLORS["random"], linewidth=1.4, label=NAMES["random"])
+    axes.plot(last, per_episode["trained"], "o", color=COLORS["trained"], label="trained policy, no noise")
+    axes.set(xlabel="control steps [thousand]", ylabel="goals an episode")
     axes.set_xlim(0.0, 1.03 * last)
+    axes.set_ylim(bottom=0.0)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, loc="upper left")
     return figure
