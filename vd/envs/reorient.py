@@ -136,6 +136,7 @@ class ReorientEnv:
         self.dump_dir = Path()
         """Where :meth:`check` saves the step of a state that went bad."""
         self._graph: Any = None
+        self._kernels_loaded = False
         self._steps = 0
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         if cfg.start.at_rest:
@@ -200,8 +201,9 @@ class ReorientEnv:
             wp.copy(self.action, action)
         if self.device == "cpu":
             self.launch_step()
-        elif self._graph is None and self._steps < 1:
-            self.launch_step()  # loads every kernel before the capture
+        elif not self._kernels_loaded:
+            self.launch_step()  # before the capture, also in a run that resumes at a later step
+            self._kernels_loaded = True
         else:
             if self._graph is None:
                 with wp.ScopedCapture(device=self.device) as capture:
