@@ -148,3 +148,7 @@ def main() -> None:
         sys.exit(command.run())
     except (ValueError, OSError) as error:
         sys.exit(f"vd-bench: {error}")
+
+
+if __name__ == "__main__":
+    main()
