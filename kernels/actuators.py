@@ -1,0 +1,290 @@
+"""The servo of one joint and everything that can be missing from its model, one function per stage.
+
+The plain model is the paper's: torque = kp (command - q) - kd qd, a velocity limit, the drive's
+armature. Every effect of :data:`vd.kernels.effects.EFFECTS` changes one stage of it and is off at its
+neutral value; with all off, :func:`servo` returns the command itself, gain 1, no friction and no
+torque, bit for bit. The same functions run in the gap workflow's rollouts and in the simulator: both
+apply ``torque = gain (kp (reference - q) - kd qd) + torque`` with the gains treated implicitly, and
+``friction`` as the bound of a dry friction force, so that a light joint holds still at coarse steps.
+
+Parameters and states are rows of columns (``PARAMETER_*``, ``STATE_*``) of one joint in one world.
+SI units, radians; time in seconds since the joint was switched on.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+# Columns of a parameter row. The baseline first; neutral values are in vd.kernels.effects.
+KP = 0
+KD = 1
+VELOCITY_LIMIT = 2
+INERTIA = 3
+COMMAND_DELAY = 4
+READ_DELAY = 5
+JITTER_SIGMA = 6
+JITTER_DROP = 7
+FILTER_TAU = 8
+ACCELERATION_LIMIT = 9
+TORQUE_LIMIT = 10
+STALL_TORQUE = 11
+NO_LOAD_SPEED = 12
+SATURATION_TORQUE = 13
+SUPPLY_SAG = 14
+THERMAL_RATE = 15
+COULOMB_TORQUE = 16
+STRIBECK_STATIC = 17
+STRIBECK_SLIDING = 18
+STRIBECK_SPEED = 19
+LOAD_FRICTION = 20
+FRICTION_PLUS = 21
+FRICTION_MINUS = 22
+BACKLASH_WIDTH = 23
+DEAD_ZONE_WIDTH = 24
+INTEGRAL_GAIN = 25
+ENCODER_BIAS = 26
+GRAVITY_TORQUE = 27
+GRAVITY_PHASE = 28
+PAYLOAD_INERTIA = 29
+ELASTIC_STIFFNESS = 30
+ELASTIC_DAMPING = 31
+ELASTIC_INERTIA = 32
+COUPLING_0 = 33
+COUPLING_1 = 34
+COUPLING_2 = 35
+PARAMETER_COLUMNS = 36
+
+# Columns of a state row.
+STATE_FILTERED = 0
+STATE_PROFILE = 1
+STATE_PROFILE_SPEED = 2
+STATE_PLAY = 3
+STATE_INTEGRAL = 4
+STATE_ELASTIC = 5
+STATE_ELASTIC_SPEED = 6
+STATE_TIME = 7
+STATE_COLUMNS = 8
+
+SMALLEST_TORQUE = 1.0e-9
+"""Below this torque [N m] a ratio of torques says nothing."""
+STANDSTILL = 1.0e-3
+"""Speed [rad/s] below which the direction of motion is that of the driving torque."""
+
+
+@wp.struct
+class Servo:
+    """What the servo asks of the joint in one time step.
+
+    reference: Position that the drive pulls to [rad].
+    gain: Factor on the drive's stiffness and damping, in [0, 1].
+    torque: Torque besides the drive's [N m].
+    friction: Bound of the dry friction torque [N m].
+    """
+
+    reference: float
+    gain: float
+    torque: float
+    friction: float
+
+
+@wp.func
+def low_pass(value: float, target: float, tau: float, dt: float) -> float:
+    """First-order low-pass, exact over a step in which ``target`` is constant; tau = 0 passes through."""
+    if tau <= 0.0:
+        return target
+    return target + (value - target) * wp.exp(-dt / tau)
+
+
+@wp.func
+def accelerate(position: float, speed: float, target: float, limit: float, dt: float) -> wp.vec2:
+    """One step of a profile to ``target`` with bounded acceleration, braking in time; limit <= 0: none.
+
+    Returns the new position and speed of the profile.
+    """
+    if limit <= 0.0:
+        return wp.vec2(target, 0.0)
+    error = target - position
+    # The speed from which the rest of the way is enough to stop, in steps of dt.
+    brake = limit * dt * (wp.sqrt(0.25 + 2.0 * wp.abs(error) / (limit * dt * dt)) - 0.5)
+    wanted = wp.sign(error) * wp.min(brake, wp.abs(error) / dt)
+    speed = speed + wp.clamp(wanted - speed, -limit * dt, limit * dt)
+    return wp.vec2(position + speed * dt, speed)
+
+
+@wp.func
+def play(value: float, target: float, width: float) -> float:
+    """Backlash: ``value`` follows ``target`` only when the play of ``width`` [rad] is used up."""
+    return wp.clamp(value, target - 0.5 * width, target + 0.5 * width)
+
+
+@wp.func
+def dead_zone(error: float, width: float) -> float:
+    """The error beyond a zone of ``width`` [rad] around zero that the controller ignores."""
+    return error - wp.clamp(error, -0.5 * width, 0.5 * width)
+
+
+@wp.func
+def motor_torque(wanted: float, speed: float, time: float, parameters: wp.array2d[float], row: int) -> float:
+    """Torque that the motor gives when the controller wants ``wanted`` [N m] at ``speed`` [rad/s].
+
+    In the order of the signal: supply sag (tau / (1 + r |tau|): voltage falls with current), warming
+    (exp(-rate t)), soft loss (tau_s tanh(tau / tau_s)), hard limit, and the torque-speed line
+    tau_stall (1 - |speed| / omega_0), which bounds driving, not braking.
+    """
+    torque = wanted
+    sag = parameters[row, SUPPLY_SAG]
+    if sag > 0.0:
+        torque = torque / (1.0 + sag * wp.abs(torque))
+    rate = parameters[row, THERMAL_RATE]
+    if rate > 0.0:
+        torque = torque * wp.exp(-rate * time)
+    soft = parameters[row, SATURATION_TORQUE]
+    if soft > 0.0:
+        torque = soft * wp.tanh(torque / soft)
+    limit = parameters[row, TORQUE_LIMIT]
+    if limit > 0.0:
+        torque = wp.clamp(torque, -limit, limit)
+    stall = parameters[row, STALL_TORQUE]
+    if stall > 0.0:
+        bound = stall
+        if torque * speed > 0.0:
+            bound = stall * wp.max(0.0, 1.0 - wp.abs(speed) / parameters[row, NO_LOAD_SPEED])
+        torque = wp.clamp(torque, -bound, bound)
+    return torque
+
+
+@wp.func
+def dry_friction(motor: float, speed: float, parameters: wp.array2d[float], row: int) -> float:
+    """Bound of the friction torque [N m]: Coulomb, Stribeck, load-dependent and asymmetric, added up.
+
+    Args:
+        motor: Torque of the motor [N m], which the transmission carries.
+        speed: Joint velocity [rad/s].
+        parameters: Parameter rows.
+        row: The joint's row.
+    """
+    friction = parameters[row, COULOMB_TORQUE] + parameters[row, LOAD_FRICTION] * wp.abs(motor)
+    sliding = parameters[row, STRIBECK_SLIDING]
+    static = parameters[row, STRIBECK_STATIC]
+    if static > 0.0 or sliding > 0.0:
+        ratio = speed / parameters[row, STRIBECK_SPEED]
+        friction += sliding + (static - sliding) * wp.exp(-ratio * ratio)
+    direction = speed
+    if wp.abs(speed) < STANDSTILL:
+        direction = motor
+    if direction >= 0.0:
+        friction += parameters[row, FRICTION_PLUS]
+    else:
+        friction += parameters[row, FRICTION_MINUS]
+    return wp.max(friction, 0.0)
+
+
+@wp.func
+def elastic_load(
+    position: float,
+    speed: float,
+    dt: float,
+    parameters: wp.array2d[float],
+    row: int,
+    state: wp.array2d[float],
+) -> float:
+    """Advance the second mass behind its spring (implicit Euler); returns its torque on the joint [N m]."""
+    stiffness = parameters[row, ELASTIC_STIFFNESS]
+    if stiffness <= 0.0:
+        return 0.0
+    damping = parameters[row, ELASTIC_DAMPING]
+    inertia = parameters[row, ELASTIC_INERTIA]
+    angle = state[row, STATE_ELASTIC]
+    rate = state[row, STATE_ELASTIC_SPEED]
+    # Displacement from the joint, as the joint moves on at its present speed.
+    stretch = angle - (position + speed * dt)
+    new_rate = (inertia * rate - dt * stiffness * stretch + dt * damping * speed) / (
+        inertia + dt * damping + dt * dt * stiffness
+    )
+    state[row, STATE_ELASTIC_SPEED] = new_rate
+    state[row, STATE_ELASTIC] = angle + dt * new_rate
+    return -inertia * (new_rate - rate) / dt
+
+
+@wp.func
+def start_servo(command: float, position: float, row: int, state: wp.array2d[float]):
+    """Reset a joint's state: profile and filter at the command, the second mass at rest on the joint."""
+    state[row, STATE_FILTERED] = command
+    state[row, STATE_PROFILE] = command
+    state[row, STATE_PROFILE_SPEED] = 0.0
+    state[row, STATE_PLAY] = command
+    state[row, STATE_INTEGRAL] = 0.0
+    state[row, STATE_ELASTIC] = position
+    state[row, STATE_ELASTIC_SPEED] = 0.0
+    state[row, STATE_TIME] = 0.0
+
+
+@wp.func
+def servo(
+    command: float,
+    coupled: float,
+    position: float,
+    speed: float,
+    power: float,
+    dt: float,
+    parameters: wp.array2d[float],
+    row: int,
+    state: wp.array2d[float],
+) -> Servo:
+    """One time step of a joint's servo.
+
+    Args:
+        command: Commanded position, already delayed [rad].
+        coupled: Sum of the other joints' positions times this joint's coupling row [rad].
+        position: True joint position [rad].
+        speed: Joint velocity [rad/s].
+        power: Factor on the controller's gains: 0 with the torque off, or a gain set on purpose.
+        dt: Time step [s].
+        parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
+        row: The joint's row.
+        state: State rows, shape [R, STATE_COLUMNS]; the joint's row is advanced.
+    """
+    result = Servo()
+    time = state[row, STATE_TIME]
+    state[row, STATE_TIME] = time + dt
+
+    reference = low_pass(state[row, STATE_FILTERED], command, parameters[row, FILTER_TAU], dt)
+    state[row, STATE_FILTERED] = reference
+    profile = accelerate(
+        state[row, STATE_PROFILE],
+        state[row, STATE_PROFILE_SPEED],
+        reference,
+        parameters[row, ACCELERATION_LIMIT],
+        dt,
+    )
+    reference = profile[0]
+    state[row, STATE_PROFILE] = profile[0]
+    state[row, STATE_PROFILE_SPEED] = profile[1]
+    reference = play(state[row, STATE_PLAY], reference, parameters[row, BACKLASH_WIDTH])
+    state[row, STATE_PLAY] = reference
+    reference += coupled
+    width = parameters[row, DEAD_ZONE_WIDTH]
+    if width > 0.0:
+        reference = position + dead_zone(reference - position, width)
+
+    kp = parameters[row, KP]
+    integral = 0.0
+    if parameters[row, INTEGRAL_GAIN] > 0.0 and power > 0.0:
+        integral = state[row, STATE_INTEGRAL] + (reference - position) * dt
+        state[row, STATE_INTEGRAL] = integral
+    wanted = power * (
+        kp * (reference - position) - parameters[row, KD] * speed + parameters[row, INTEGRAL_GAIN] * integral
+    )
+    motor = motor_torque(wanted, speed, time, parameters, row)
+    gain = float(1.0)
+    if wp.abs(wanted) > SMALLEST_TORQUE:
+        gain = motor / wanted
+    result.reference = reference
+    result.gain = gain * power
+    result.torque = (
+        result.gain * parameters[row, INTEGRAL_GAIN] * integral
+        - parameters[row, GRAVITY_TORQUE] * wp.sin(position + parameters[row, GRAVITY_PHASE])
+        + elastic_load(position, speed, dt, parameters, row, state)
+    )
+    result.friction = dry_friction(motor, speed, parameters, row)
+    return result
