@@ -276,7 +276,7 @@ def servo(
         kp * (reference - position) - parameters[row, KD] * speed + parameters[row, INTEGRAL_GAIN] * integral
     )
     motor = motor_torque(wanted, speed, time, parameters, row)
-    gain = float(1.0)
+    gain = 1.0
     if wp.abs(wanted) > SMALLEST_TORQUE:
         gain = motor / wanted
     result.reference = reference
