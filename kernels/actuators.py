@@ -2,9 +2,9 @@
 
 The plain model is the paper's: torque = kp (command - q) - kd qd, a velocity limit, the drive's
 armature. Every effect of :data:`vd.kernels.effects.EFFECTS` changes one stage of it and is off at its
-neutral value; with all off, :func:`servo` returns the command itself, gain 1, no friction and no
+neutral value; with all off, :func:`servo` returns the command itself, kp, kd, no friction and no
 torque, bit for bit. The same functions run in the gap workflow's rollouts and in the simulator: both
-apply ``torque = gain (kp (reference - q) - kd qd) + torque`` with the gains treated implicitly, and
+apply ``stiffness (reference - q) - damping qd + torque`` with the damping treated implicitly, and
 ``friction`` as the bound of a dry friction force, so that a light joint holds still at coarse steps.
 
 Parameters and states are rows of columns (``PARAMETER_*``, ``STATE_*``) of one joint in one world.
@@ -76,13 +76,15 @@ class Servo:
     """What the servo asks of the joint in one time step.
 
     reference: Position that the drive pulls to [rad].
-    gain: Factor on the drive's stiffness and damping, in [0, 1].
+    stiffness: Stiffness of the drive [N m/rad].
+    damping: Damping of the drive [N m s/rad].
     torque: Torque besides the drive's [N m].
     friction: Bound of the dry friction torque [N m].
     """
 
     reference: float
-    gain: float
+    stiffness: float
+    damping: float
     torque: float
     friction: float
 
@@ -238,7 +240,8 @@ def servo(
         coupled: Sum of the other joints' positions times this joint's coupling row [rad].
         position: True joint position [rad].
         speed: Joint velocity [rad/s].
-        power: Factor on the controller's gains: 0 with the torque off, or a gain set on purpose.
+        power: Factor on the controller's position and integral gains: 0 with the torque off, or a gain
+            that was set on purpose; the damping, mostly the motor's own, stays.
         dt: Time step [s].
         parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
         row: The joint's row.
@@ -272,17 +275,18 @@ def servo(
     if parameters[row, INTEGRAL_GAIN] > 0.0 and power > 0.0:
         integral = state[row, STATE_INTEGRAL] + (reference - position) * dt
         state[row, STATE_INTEGRAL] = integral
-    wanted = power * (
-        kp * (reference - position) - parameters[row, KD] * speed + parameters[row, INTEGRAL_GAIN] * integral
-    )
+    damping = parameters[row, KD]
+    steady = power * parameters[row, INTEGRAL_GAIN] * integral
+    wanted = power * kp * (reference - position) - damping * speed + steady
     motor = motor_torque(wanted, speed, time, parameters, row)
     gain = 1.0
     if wp.abs(wanted) > SMALLEST_TORQUE:
         gain = motor / wanted
     result.reference = reference
-    result.gain = gain * power
+    result.stiffness = gain * power * kp
+    result.damping = gain * damping
     result.torque = (
-        result.gain * parameters[row, INTEGRAL_GAIN] * integral
+        gain * steady
         - parameters[row, GRAVITY_TORQUE] * wp.sin(position + parameters[row, GRAVITY_PHASE])
         + elastic_load(position, speed, dt, parameters, row, state)
     )
