@@ -118,6 +118,9 @@ def test_resume_starts_from_the_runs_own_configuration(tmp_path):
     assert cfg.resume == "latest" and cfg.run.save_every == 17 and cfg.run.max_steps == 123
     assert cfg.env == saved.env and cfg.run.run_dir == tmp_path
     assert parse_teacher(["--run-dir", str(tmp_path), "--resume", "best"]).resume == "best"
+    auto = ["--preset", "gpu", "--resume", "auto", "--run-dir"]
+    assert parse_teacher([*auto, str(tmp_path)]).run.save_every == 17
+    assert parse_teacher([*auto, str(tmp_path / "new")]).ppo == PRESETS["gpu"]().ppo
     with pytest.raises(FileNotFoundError, match="--run-dir"):
         parse_teacher(["--run-dir", str(tmp_path / "none"), "--resume"])
     (tmp_path / "config.json").write_text('{"ppo": {"epoch": 3}}')
@@ -145,7 +148,7 @@ def test_unknown_commands_devices_and_missing_files_are_explained(tmp_path, caps
     assert resolve_device("cpu") == "cpu"
 
 
-def test_export_and_curves_commands(tmp_path):
+def test_export_and_curves_commands(tmp_path, capsys):
     from train_dummy import make_runner
 
     from vd.policy import load_policy
@@ -155,6 +158,13 @@ def test_export_and_curves_commands(tmp_path):
     assert main(["export", str(whole), str(tmp_path / "out.pt")]) == 0
     assert load_policy(tmp_path / "out.pt").iteration == 1
     assert (tmp_path / "out.pt").stat().st_size < whole.stat().st_size
+    small = tmp_path / "small.pt"
+    assert main(["export", "--resumable", str(whole), str(small)]) == 0
+    resumed = make_runner(tmp_path)
+    resumed.load(str(small))
+    assert resumed.current_learning_iteration == 1 and resumed.new_episodes
+    assert main(["export", "--resumable", str(tmp_path / "out.pt"), str(small)]) == 1
+    assert "not a checkpoint" in capsys.readouterr().err
     assert main(["curves", str(tmp_path)]) == 0
     assert (tmp_path / "curves.png").is_file()
 

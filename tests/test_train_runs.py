@@ -22,6 +22,7 @@ from vd.train.checkpoint import (
     random_state,
     save_checkpoint,
     set_random_state,
+    without_worlds,
 )
 from vd.train.metrics import read_progress
 from vd.train.runner import Interrupted, TrainingDivergedError
@@ -279,6 +280,47 @@ def test_tensorboard_files_hold_the_curve(tmp_path):
     assert "run/success_per_goal" in events.Tags()["scalars"]
 
 
+def test_a_checkpoint_without_worlds_goes_on_with_new_episodes(tmp_path):
+    whole = make_runner(tmp_path)
+    whole.learn(3)
+    path = find_checkpoint(tmp_path, "latest")
+    save_checkpoint(tmp_path / "slim.pt", without_worlds(load_checkpoint(path)))
+    assert (tmp_path / "slim.pt").stat().st_size < path.stat().st_size
+
+    env = DummyEnv(num_worlds=16, seed=5)
+    resumed = make_runner(tmp_path, env=env, seed=5)
+    resumed.load(str(tmp_path / "slim.pt"))
+    assert resumed.new_episodes == "it holds no worlds"
+    one, two = whole.alg.save(), resumed.alg.save()
+    assert str(one["optimizer_state_dict"]) == str(two["optimizer_state_dict"])
+    before, after = _weights(whole), _weights(resumed)
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    assert resumed.alg.learning_rate == whole.alg.learning_rate
+    assert env.difficulty == whole.env.env.difficulty > 0.0
+    assert not env.step_count.numpy().any(), "an episode went on"
+    assert resumed.env_steps == whole.env_steps
+    resumed.learn(2)
+    assert [row["iteration"] for row in _rows(tmp_path)] == [1, 2, 3, 4, 5]
+    assert _rows(tmp_path)[-1]["task/difficulty"] == pytest.approx(0.05)
+
+
+def test_a_run_goes_on_with_another_number_of_worlds_to_the_same_steps(tmp_path):
+    make_runner(tmp_path).learn(3)  # 16 worlds x 8 steps = 128 an iteration
+    resumed = make_runner(tmp_path, env=DummyEnv(num_worlds=8), max_steps=600)
+    resumed.load(str(find_checkpoint(tmp_path, "latest")))
+    assert resumed.new_episodes == "it is of 16 worlds a process, this run has 8"
+    assert resumed.total_iterations == 3 + 4  # 600 - 384 steps, 64 an iteration
+    resumed.learn()
+    assert _rows(tmp_path)[-1]["env_steps"] == 384 + 4 * 64
+
+
+def test_an_exact_checkpoint_starts_no_new_episodes(tmp_path):
+    make_runner(tmp_path).learn(1)
+    resumed = make_runner(tmp_path)
+    resumed.load(str(find_checkpoint(tmp_path, "latest")))
+    assert resumed.new_episodes == ""
+
+
 DISTRIBUTED = """
 import json, sys
 from pathlib import Path
@@ -303,24 +345,82 @@ runner.shutdown()
 """
 
 
-@pytest.mark.slow
-def test_two_processes_keep_the_same_parameters_and_their_own_worlds(tmp_path):
+def _two_processes(code: str, **options) -> list[subprocess.Popen]:
     import socket
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
-    code = DISTRIBUTED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
     # No PATH: nothing may depend on a git binary, which rsl-rl's logger looks for.
     shared = os.environ | {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "PATH": ""}
-    processes = [
-        subprocess.Popen([sys.executable, "-c", code], env=shared | {"RANK": str(r), "LOCAL_RANK": str(r)})
+    return [
+        subprocess.Popen(
+            [sys.executable, "-c", code], env=shared | {"RANK": str(r), "LOCAL_RANK": str(r)}, **options
+        )
         for r in range(2)
     ]
-    assert [p.wait(timeout=120) for p in processes] == [0, 0]
+
+
+@pytest.mark.slow
+def test_two_processes_keep_the_same_parameters_and_their_own_worlds(tmp_path):
+    code = DISTRIBUTED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    assert [p.wait(timeout=120) for p in _two_processes(code)] == [0, 0]
     one, two = (json.loads((tmp_path / f"rank{r}.json").read_text()) for r in range(2))
     assert one["weights"] == two["weights"]
     assert one["draw"] != two["draw"] and one["target"] != two["target"]
     assert one["steps"] == two["steps"] == 2 * 8 * 8 * 2
     assert one["main"] and not two["main"]
     assert [row["iteration"] for row in _rows(tmp_path)] == [1, 2]
+
+    # One process goes on with what two have begun.
+    alone = make_runner(tmp_path, env=DummyEnv(num_worlds=8))
+    alone.load(str(find_checkpoint(tmp_path, "latest")))
+    assert alone.new_episodes == "it is of 2 processes, this run has 1"
+    assert alone.env_steps == one["steps"] and alone.env.env.difficulty == pytest.approx(0.02)
+    networks = (alone.alg.actor, alone.alg.critic)
+    weights = torch.cat([p.detach().flatten() for network in networks for p in network.parameters()])
+    assert weights.tolist() == one["weights"]
+    alone.learn(1)
+    assert [row["env_steps"] for row in _rows(tmp_path)] == [128, 256, 256 + 64]
+
+
+FAILING = """
+import os, sys
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+sys.path.insert(0, {tests!r})
+from train_dummy import DummyEnv, make_runner
+from vd.train.distributed import ending_together
+rank = int(os.environ["RANK"])
+env = DummyEnv(num_worlds=8, seed=rank)
+runner = make_runner(Path({folder!r}), env=env, seed=rank)
+def check():
+    if rank == 0 and env.steps >= 16:
+        raise RuntimeError("a world went bad")
+env.check = check
+def hang():
+    import time
+    time.sleep(600)
+runner.shutdown = hang  # with NCCL, leaving the group waits for the others
+try:
+    with ending_together():
+        runner.learn(5)
+finally:
+    runner.shutdown()
+"""
+
+
+@pytest.mark.slow
+def test_the_error_of_one_process_is_told_and_ends_it_at_once(tmp_path):
+    code = FAILING.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    processes = _two_processes(code, stderr=subprocess.PIPE, text=True)
+    try:
+        _, error = processes[0].communicate(timeout=60)
+        assert processes[0].returncode == 1
+        assert "process 0 failed" in error and "a world went bad" in error
+        # The other one was waiting for it in a collective.
+        assert processes[1].wait(timeout=60) != 0
+    finally:
+        for process in processes:
+            process.kill()

@@ -98,6 +98,21 @@ class DummyEnv:
         self.difficulty = min(1.0, self.difficulty + 0.01)
         return {"difficulty": self.difficulty}
 
+    @property
+    def parameters(self) -> "DummyEnv":
+        """Holder of the difficulty: this."""
+        return self
+
+    def set_difficulty(self, difficulty: float) -> None:
+        """Nothing depends on it."""
+        self.difficulty = difficulty
+
+    def reset(self) -> None:
+        """New episodes everywhere."""
+        self.step_count.zero_()
+        self._target = self._draw(self.num_worlds)
+        self._observe()
+
     def state_dict(self) -> dict[str, Any]:
         """Everything."""
         return {

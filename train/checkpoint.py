@@ -15,6 +15,8 @@ CHECKPOINT_FOLDER = "checkpoints"
 BEST_NAME = "best.pt"
 _NAME = re.compile(r"model_(\d+)\.pt")
 _ARRAY = "__numpy__"
+# Key in the environment's state under which that of its worlds lies.
+_WORLDS = "arrays"
 
 
 def checkpoint_path(run_dir: Path, iteration: int) -> Path:
@@ -85,6 +87,21 @@ def load_checkpoint(path: Path, device: str = "cpu") -> dict[str, Any]:
             f"{path} holds no actor; give --resume a file that vd-train wrote in {CHECKPOINT_FOLDER}/"
         )
     return _restored(state)
+
+
+def without_worlds(state: dict[str, Any]) -> dict[str, Any]:
+    """A checkpoint without what each process simulates: a tenth in size, and of any number of processes.
+
+    Networks, optimiser, curriculum and counters stay; a run that goes on from it starts its episodes anew.
+    """
+    kept = [{"env": {key: v for key, v in rank["env"].items() if key != _WORLDS}} for rank in state["ranks"]]
+    return state | {"ranks": kept}
+
+
+def saved_worlds(rank: dict[str, Any]) -> int:
+    """Worlds in one process's part of a checkpoint (an item of ``ranks``); 0 if it was left out."""
+    arrays = rank["env"].get(_WORLDS)
+    return 0 if arrays is None else len(arrays["step_count"])
 
 
 def random_state(device: str) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C or SIGTERM: 128 and the number of SIGINT, as shells do."""
+AUTO = "auto"
+"""``--resume auto`` goes on with a run where there is one, and starts it otherwise."""
 CONFIG_NAME = "config.json"
 """The resolved configuration, in the run's folder, written before training."""
 
@@ -27,11 +30,16 @@ USAGE = """usage: vd-train COMMAND [flags]
 commands:
   teacher   train the teacher with PPO           vd-train teacher --preset gpu --run-dir runs/first
   export    write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
+            or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
   curves    draw the curves of a run             vd-train curves runs/first
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset multi-gpu
 Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
                -m vd.train.cli teacher --preset multi-gpu --run-dir SHARED/FOLDER
+Restart by itself after a failure: torchrun --max-restarts 3 ... teacher --run-dir FOLDER --resume auto
+
+A run goes on with any number of GPUs and worlds (--resume); on another machine it needs its config.json and a
+checkpoint, progress.jsonl for the curve so far: vd-train teacher --run-dir FOLDER --resume small.pt
 
 vd-train COMMAND --help lists the flags of a command."""
 
@@ -46,12 +54,15 @@ SHORT_FORMS = ("hand", "objects", "num-worlds", "seed")
 
 @dataclass
 class ExportCfg:
-    """Write the policy of a checkpoint, without optimiser and training state."""
+    """Write the policy of a checkpoint without optimiser and training state, or a small checkpoint."""
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
     """Checkpoint of vd-train teacher."""
     output: Annotated[Path, tyro.conf.Positional] = Path("policy.pt")
     """File to write."""
+    resumable: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Write a checkpoint for --resume instead, all but the state of the worlds: a run that moves to another
+    machine or number of GPUs starts its episodes anew anyway."""
 
 
 @dataclass
@@ -130,8 +141,10 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
 
     rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
     cfg = replace(cfg, run=replace(cfg.run, device=device))
-    checkpoint = find_checkpoint(cfg.run.run_dir, cfg.resume) if cfg.resume else None
-    if checkpoint is None and list_checkpoints(cfg.run.run_dir):
+    present = list_checkpoints(cfg.run.run_dir)
+    resume = cfg.resume if cfg.resume != AUTO else "latest" if present else None
+    checkpoint = find_checkpoint(cfg.run.run_dir, resume) if resume else None
+    if checkpoint is None and present:
         raise FileExistsError(
             f"{cfg.run.run_dir} holds a run; add --resume to go on with it, or choose another --run-dir"
         )
@@ -194,6 +207,7 @@ def resolve_device(name: str) -> str:
 def _teacher(arguments: list[str], started: float) -> int:
     cfg = parse_teacher(arguments)
 
+    from vd.train.distributed import ending_together
     from vd.train.progress import waiting
     from vd.train.runner import Interrupted
 
@@ -203,15 +217,21 @@ def _teacher(arguments: list[str], started: float) -> int:
     folder = cfg.run.run_dir
     if runner.current_learning_iteration and main_process:
         print(f"resumed after iteration {runner.current_learning_iteration} of {runner.total_iterations}")
+        if runner.new_episodes:
+            print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
+    interrupted = False
     try:
-        runner.learn()
+        with ending_together(Interrupted) if runner.is_distributed else nullcontext():
+            runner.learn()
     except Interrupted:
+        interrupted = True
+    finally:
+        runner.env.close()
+    runner.shutdown()
+    if interrupted:
         if main_process:
             print(f"saved in {folder}; go on with: vd-train teacher --run-dir {folder} --resume")
         return INTERRUPTED
-    finally:
-        runner.env.close()
-        runner.shutdown()
     if main_process:
         print(f"done: {folder}/policy.pt is the best policy, vd-train curves {folder} draws the curves")
     return 0
@@ -221,9 +241,12 @@ def _export(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(ExportCfg, args=arguments, prog="vd-train export")
 
     from vd.policy import policy_export
-    from vd.train.checkpoint import load_checkpoint, save_checkpoint
+    from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
 
-    save_checkpoint(cfg.output, policy_export(load_checkpoint(cfg.checkpoint)))
+    state = load_checkpoint(cfg.checkpoint)
+    if cfg.resumable and "optimizer_state_dict" not in state:
+        raise ValueError(f"{cfg.checkpoint} is a policy, not a checkpoint; nothing can go on from it")
+    save_checkpoint(cfg.output, without_worlds(state) if cfg.resumable else policy_export(state))
     print(cfg.output)
     return 0
 
@@ -274,6 +297,8 @@ def _saved_config(arguments: list[str], preset: str) -> TeacherCfg:
     run_dir = Path(_value_of(arguments, "--run-dir") or start.run.run_dir)
     path = run_dir / CONFIG_NAME
     if not path.is_file():
+        if _value_of(arguments, "--resume") == AUTO:
+            return start
         raise FileNotFoundError(f"--resume: no {path}; give the --run-dir of the run to go on with")
     try:
         cfg = from_dict(TeacherCfg, json.loads(path.read_text()))

@@ -24,7 +24,8 @@ class TeacherCfg:
     preset: PresetName = "paper"
     """Settings to start from; every other flag overrides one of them."""
     resume: str | None = None
-    """Go on from a checkpoint of --run-dir: latest (a bare --resume), best, or a file."""
+    """Go on from a checkpoint of --run-dir: latest (a bare --resume), best, a file, or auto: the latest, and
+    a new run where there is none."""
     smoke: bool = False
     """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)

@@ -25,9 +25,11 @@ from vd.train.checkpoint import (
     prune_checkpoints,
     random_state,
     save_checkpoint,
+    saved_worlds,
     set_random_state,
 )
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg, rsl_rl_config, validate
+from vd.train.distributed import Processes, join_processes, watch_iteration
 from vd.train.metrics import GoalWindow, ProgressFile, StepMeans
 from vd.train.ppo import TeacherPPO
 from vd.train.progress import ProgressLine
@@ -65,6 +67,7 @@ class TeacherRunner(OnPolicyRunner):
     Attributes:
         current_learning_iteration: Iterations completed, over all resumed runs.
         env_steps: Control steps completed, over all worlds and processes.
+        new_episodes: Why the checkpoint that was loaded could not restore the worlds; empty if it did.
     """
 
     alg: TeacherPPO
@@ -89,7 +92,6 @@ class TeacherRunner(OnPolicyRunner):
             super().__init__(env, rsl_rl_config(ppo, policy, env.num_envs), log_dir=None, device=device)
         self.env_steps = 0
         self._steps_per_iteration = ppo.rollout_steps * env.num_envs * self.gpu_world_size
-        self.total_iterations = math.ceil(run.max_steps / self._steps_per_iteration)
         self._elapsed_s = 0.0
         self._means = StepMeans()
         # Two episodes, so that a window never misses the time-outs of worlds that run in step.
@@ -97,6 +99,14 @@ class TeacherRunner(OnPolicyRunner):
         self._score = (0.0, 0.0, -math.inf)
         self._best: tuple[float, ...] | None = None
         self._signal = 0
+        self._stagger_due = True
+        self.new_episodes = ""
+
+    @property
+    def total_iterations(self) -> int:
+        """Iterations at the end of the run, those done included."""
+        left = max(0, self.run.max_steps - self.env_steps)
+        return self.current_learning_iteration + math.ceil(left / self._steps_per_iteration)
 
     @property
     def is_main(self) -> bool:
@@ -111,7 +121,7 @@ class TeacherRunner(OnPolicyRunner):
         Args:
             num_learning_iterations: Iterations to do now; up to ``run.max_steps`` if ``None``.
             init_at_random_ep_len: Stagger the first episodes; as ``run.stagger`` says if ``None``, and
-                never in a resumed run.
+                never where a checkpoint restored the worlds.
 
         Raises:
             Interrupted: Ctrl-C or SIGTERM, after saving.
@@ -120,9 +130,10 @@ class TeacherRunner(OnPolicyRunner):
         first = self.current_learning_iteration
         total = self.total_iterations if num_learning_iterations is None else first + num_learning_iterations
         stagger = self.run.stagger if init_at_random_ep_len is None else init_at_random_ep_len
-        if stagger and first == 0:
+        if stagger and self._stagger_due:
             steps = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(steps, high=int(self.env.max_episode_length))
+        self._stagger_due = False
         if self.is_distributed:
             self.alg.broadcast_parameters()
         self.alg.train_mode()
@@ -137,6 +148,8 @@ class TeacherRunner(OnPolicyRunner):
             with self._signals(progress.note), progress:
                 observation = self.env.get_observations()
                 while self.current_learning_iteration < total:
+                    if self.is_distributed:
+                        watch_iteration()
                     row, observation = self._iterate(observation)
                     if row is None:
                         break
@@ -222,7 +235,10 @@ class TeacherRunner(OnPolicyRunner):
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
     ) -> dict:
-        """Go on from a checkpoint: networks, optimiser, iteration, curriculum and every random state.
+        """Go on from a checkpoint: networks, optimiser, iteration, curriculum, worlds and random states.
+
+        With the processes and worlds of the checkpoint the run goes on exactly. With others, or from a
+        checkpoint without worlds, all but worlds and random states is restored, and episodes start anew.
 
         Args:
             path: The checkpoint.
@@ -231,7 +247,7 @@ class TeacherRunner(OnPolicyRunner):
             map_location: Device to read to.
 
         Raises:
-            ValueError: The file is damaged, or of another network or number of processes.
+            ValueError: The file is damaged, or of another network.
         """
         state = load_checkpoint(Path(path), map_location or self.device)
         try:
@@ -247,16 +263,27 @@ class TeacherRunner(OnPolicyRunner):
             self._elapsed_s = state["elapsed_s"]
             self._best = tuple(state["best"]) if state["best"] is not None else None
             self._window.load_state_dict(state["window"])
-            ranks = state["ranks"]
-            if len(ranks) != self.gpu_world_size:
-                raise ValueError(
-                    f"{path} is from a run of {len(ranks)} processes, this one has {self.gpu_world_size}; "
-                    f"start torchrun with as many"
-                )
-            mine = ranks[self.gpu_global_rank]
-            self.env.load_state_dict(mine["env"])
-            set_random_state(mine["random"], self.device)
+            self._load_worlds(state["ranks"])
         return state["infos"]
+
+    def _load_worlds(self, ranks: list[dict[str, Any]]) -> None:
+        """Restore worlds and random state, or else the curriculum alone. All processes decide alike."""
+        worlds = {saved_worlds(rank) for rank in ranks}
+        if worlds == {0}:
+            self.new_episodes = "it holds no worlds"
+        elif len(ranks) != self.gpu_world_size:
+            self.new_episodes = f"it is of {len(ranks)} processes, this run has {self.gpu_world_size}"
+        elif worlds != {self.env.num_envs}:
+            self.new_episodes = f"it is of {max(worlds)} worlds a process, this run has {self.env.num_envs}"
+        else:
+            self.new_episodes = ""
+        self._stagger_due = bool(self.new_episodes)
+        if self.new_episodes:
+            self.env.start_anew(ranks[0]["env"]["difficulty"])
+            return
+        mine = ranks[self.gpu_global_rank]
+        self.env.load_state_dict(mine["env"])
+        set_random_state(mine["random"], self.device)
 
     def _state(self, infos: dict | None) -> dict[str, Any]:
         """Everything a checkpoint holds."""
@@ -388,24 +415,25 @@ class TeacherRunner(OnPolicyRunner):
                 signal.signal(number, handler)
 
     def _configure_multi_gpu(self) -> None:
-        """As rsl-rl, and with gloo where the device is the CPU (tests, smoke runs)."""
-        if int(os.environ.get("WORLD_SIZE", "1")) == 1 or self.device.startswith("cuda"):
-            super()._configure_multi_gpu()
-            return
-        self.is_distributed = True
-        self.gpu_world_size = int(os.environ["WORLD_SIZE"])
-        self.gpu_local_rank = int(os.environ.get("LOCAL_RANK", "0"))
-        self.gpu_global_rank = int(os.environ["RANK"])
-        self.cfg["multi_gpu"] = {
-            "global_rank": self.gpu_global_rank,
-            "local_rank": self.gpu_local_rank,
-            "world_size": self.gpu_world_size,
-        }
-        torch.distributed.init_process_group(
-            "gloo", rank=self.gpu_global_rank, world_size=self.gpu_world_size
-        )
+        """As rsl-rl, but with our limits of time, and with gloo where the device is the CPU."""
+        self.is_distributed = int(os.environ.get("WORLD_SIZE", "1")) > 1
+        processes = join_processes(self.device) if self.is_distributed else Processes(0, 0, 1)
+        self.gpu_world_size = processes.world_size
+        self.gpu_local_rank = processes.local_rank
+        self.gpu_global_rank = processes.rank
+        self.cfg["multi_gpu"] = None
+        if self.is_distributed:
+            self.cfg["multi_gpu"] = {
+                "global_rank": processes.rank,
+                "local_rank": processes.local_rank,
+                "world_size": processes.world_size,
+            }
 
     def shutdown(self) -> None:
-        """Leave the process group, so that torchrun ends without a warning."""
+        """Leave the process group, so that torchrun ends without a warning.
+
+        All processes have to call it, so not after an error of one: see
+        :func:`vd.train.distributed.ending_together`.
+        """
         if self.is_distributed:
             torch.distributed.destroy_process_group()

@@ -147,6 +147,16 @@ class ReorientVecEnv(VecEnv):
         """Restore what :meth:`state_dict` gave."""
         self.env.load_state_dict(state)
 
+    def start_anew(self, difficulty: float) -> None:
+        """Begin new episodes in all worlds.
+
+        Args:
+            difficulty: That of the curriculum, 0 to 1.
+        """
+        self.env.difficulty = difficulty
+        self.env.parameters.set_difficulty(difficulty)
+        self.env.reset()
+
     def close(self) -> None:
         """Release the simulation."""
         self.env.close()

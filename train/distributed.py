@@ -1,0 +1,112 @@
+"""Several processes as one run: joining them, and ending all of them when one fails or hangs."""
+
+import contextlib
+import faulthandler
+import io
+import os
+import sys
+import traceback
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import timedelta
+from typing import NoReturn
+
+import torch
+from torch.distributed.rendezvous import rendezvous
+
+START_TIMEOUT = timedelta(minutes=20)
+"""Longest wait for the slowest process to build its worlds; with a cold kernel cache alone over 3 minutes."""
+COLLECTIVE_TIMEOUT = timedelta(minutes=2)
+"""Longest wait in a collective: an iteration takes about a second and a checkpoint a few. NCCL's default of
+10 minutes is that much of every GPU lost when one process hangs."""
+REPORT_AFTER_S = 90.0
+"""An iteration that takes this long reports where it is, before the others' wait in a collective ends."""
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Place of this process in the run.
+
+    Attributes:
+        rank: Number among all processes; 0 logs and saves.
+        local_rank: Number among those of this machine, and of its GPU.
+        world_size: Processes of the run.
+    """
+
+    rank: int
+    local_rank: int
+    world_size: int
+
+
+def join_processes(device: str) -> Processes:
+    """Meet the other processes that ``torchrun`` started; NCCL on GPUs, gloo on CPUs.
+
+    Args:
+        device: Torch device of this process.
+
+    Raises:
+        ValueError: The device is not the GPU that belongs to this process.
+    """
+    local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+    cuda = device.startswith("cuda")
+    if cuda and device != f"cuda:{local_rank}":
+        raise ValueError(
+            f"--device is {device}, but this is process {local_rank} of its machine; leave --device out, "
+            "then each process takes its own GPU"
+        )
+    # Worlds are built by now, on some machines minutes later than on others. All wait here, so that the
+    # short limit below is one of collectives alone.
+    store, rank, world_size = next(iter(rendezvous("env://", timeout=START_TIMEOUT)))
+    store.set(f"built/{rank}", "1")
+    store.wait([f"built/{other}" for other in range(world_size)], START_TIMEOUT)
+    if cuda:
+        torch.cuda.set_device(local_rank)
+    torch.distributed.init_process_group(
+        "nccl" if cuda else "gloo",
+        store=store,
+        rank=rank,
+        world_size=world_size,
+        timeout=COLLECTIVE_TIMEOUT,
+    )
+    return Processes(rank, local_rank, world_size)
+
+
+def watch_iteration() -> None:
+    """Print every thread's stack on stderr if :data:`REPORT_AFTER_S` pass before the next call of this.
+
+    A process that hangs outside of a collective says nothing otherwise: only those that wait for it do.
+    """
+    # A stderr without a file, as in a notebook, cannot be written to by the watching thread.
+    with contextlib.suppress(AttributeError, ValueError, io.UnsupportedOperation):
+        faulthandler.dump_traceback_later(REPORT_AFTER_S, file=sys.stderr)
+
+
+@contextlib.contextmanager
+def ending_together(*agreed: type[BaseException]) -> Iterator[None]:
+    """End this process at once when the block fails, and with it, through ``torchrun``, all others.
+
+    The others wait in a collective that this process will never enter. Leaving the process group, as at
+    a regular end, waits for them in turn: the error would be held back until the time limit, or for ever.
+
+    Args:
+        *agreed: Exceptions that all processes raise together; they pass.
+    """
+    try:
+        yield
+    except agreed:
+        raise
+    except BaseException as error:
+        _abandon(error)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def _abandon(error: BaseException) -> NoReturn:
+    """Print the error and end without any clean-up that could wait for other processes."""
+    rank = os.environ.get("RANK", "0")
+    print(f"vd-train: process {rank} failed and ends the run", file=sys.stderr)
+    traceback.print_exception(error)
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(1)
