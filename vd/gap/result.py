@@ -1,0 +1,386 @@
+"""What ``vd-gap`` found: the contents of ``report.json`` (format ``vd-gap-report/1``), typed and checked.
+
+``explain`` writes a :class:`Report` without a closing to ``DIR/explain.json`` and its curves
+(:class:`Predictions`) to ``DIR/predictions.npz``; ``close`` adds the closing simulation
+(``DIR/close.json``, ``DIR/closing.npz``); ``report`` writes ``DIR/report.json`` and the page. Angles are
+radians, errors are of the recorded joint position, intervals are 95 %.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from vd.config import from_dict, to_dict
+from vd.files import atomic_path, write_json
+from vd.kernels.effects import BASELINE, EFFECTS
+
+FORMAT = "vd-gap-report/1"
+
+Verdict = Literal["effects", "no_gap", "ambiguous", "under_excited", "unknown"]
+Decision = Literal["named", "tied", "rejected"]
+Interval = tuple[float, float]
+
+# The baseline's gravity load of a pendulum is the effect's parameter, fitted without being named.
+GRAVITY = EFFECTS["gravity_load"].parameters[0]
+UNITS: dict[str, str] = {p.name: p.unit for p in (*BASELINE, GRAVITY)}
+"""Units of what a baseline can fit."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An identified number."""
+
+    value: float
+    ci95: Interval
+    unit: str
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another effect in the place of the named one, everything refitted."""
+
+    name: str
+    held_out_rmse_rad: float
+    difference_ci95: Interval
+    """Of its held-out RMSE minus the named effect's [rad]; an interval that covers 0 is a tie."""
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """An accepted effect on joints that share its parameters."""
+
+    name: str
+    """Name in :data:`vd.kernels.effects.EFFECTS`."""
+    joints: tuple[str, ...]
+    confidence: float
+    """Share of bootstrap repetitions, choice included, that name it."""
+    parameters: dict[str, Estimate]
+    alternatives: tuple[Alternative, ...] = ()
+    at_bound: bool = False
+    """A parameter ended at its bound, so that its value is no estimate."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Where measurement and baseline disagree."""
+
+    joint: str
+    where: str
+    """Plain words: when and in what motion."""
+    signature: dict[str, float] = field(default_factory=dict)
+    """The numbers behind the words."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model and its error on all trajectories."""
+
+    rmse_rad: float
+    per_joint: dict[str, float]
+    """RMSE of each joint [rad]."""
+    mae_rad: float = math.nan
+    parameters: dict[str, dict[str, float]] = field(default_factory=dict)
+    """The baseline's parameters of each joint (:data:`UNITS` has their units)."""
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors on trajectories that the fit has not seen; with cross-validation every one is such once."""
+
+    trajectories: tuple[str, ...]
+    """Their files."""
+    baseline_rmse_rad: float
+    identified_rmse_rad: float
+    reduction: float
+    """1 - identified / baseline."""
+    ci95: Interval
+    """Of the reduction, trajectories resampled."""
+
+
+@dataclass(frozen=True)
+class JointGap:
+    """The gap of one joint on held-out trajectories."""
+
+    joint: str
+    noise_floor_rad: float
+    baseline_rmse_rad: float
+    baseline_ci95: Interval
+    identified_rmse_rad: float
+    identified_ci95: Interval
+    verdict: Verdict
+    reason: str
+    """One sentence: why this verdict."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A row of the evidence table: one effect tried on some joints in one round of the selection."""
+
+    joints: tuple[str, ...]
+    round: int
+    """1 for the first effect that is added."""
+    name: str
+    held_out_rmse_rad: float
+    """With it added and everything refitted."""
+    gain: float
+    """Share of the held-out RMSE before the round that it removes; negative if worse."""
+    gain_ci95: Interval
+    decision: Decision
+    reason: str
+    """Why, in a few words."""
+    parameters: dict[str, float] = field(default_factory=dict)
+    placebo: bool = False
+    """A negative control (an effect driven by shuffled time), which must be rejected."""
+
+
+@dataclass(frozen=True)
+class TrajectoryError:
+    """Errors of one joint in one trajectory, by models that were fitted without it where ``held_out``."""
+
+    file: str
+    excitation: str
+    joint: str
+    held_out: bool
+    baseline_rmse_rad: float
+    identified_rmse_rad: float
+
+
+@dataclass(frozen=True)
+class Closing:
+    """The identified layer simulated again."""
+
+    simulator: Literal["newton", "rollout"]
+    """``rollout`` for a bare servo or pendulum, whose model is the joint itself."""
+    layer: str
+    """File beside the report."""
+    baseline_rmse_rad: float
+    """Held-out trajectories, before, by the same simulator."""
+    identified_rmse_rad: float
+    """The same with the layer."""
+    per_joint: dict[str, Interval]
+    """(baseline, identified) RMSE [rad] of each joint."""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What was analysed."""
+
+    path: str
+    model: str
+    joints: tuple[str, ...]
+    trajectories: int
+    samples: int
+    seconds: float
+    servo: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """``report.json``; the contract's keys first, what the page needs besides after them."""
+
+    verdict: Verdict
+    noise_floor_rad: float
+    baseline: Fit
+    findings: tuple[Finding, ...]
+    effects: tuple[NamedEffect, ...]
+    ambiguous: tuple[tuple[str, ...], ...]
+    """Sets of effects that the recording cannot tell apart."""
+    identified: Fit
+    held_out: HeldOut
+    next_experiment: str
+    """What to record next, in one sentence; empty if nothing is open."""
+    seconds: float
+    recording: Source
+    format: str = FORMAT
+    hand: str | None = None
+    hand_layer: str | None = None
+    """Identified model that the analysis started from."""
+    joints: tuple[JointGap, ...] = ()
+    evidence: tuple[Candidate, ...] = ()
+    trajectories: tuple[TrajectoryError, ...] = ()
+    closing: Closing | None = None
+    warnings: tuple[str, ...] = ()
+    """What a reader should know about the data or the fit, in plain sentences."""
+    rollouts: int = 0
+    """Simulated trajectories."""
+    rollouts_per_s: float = 0.0
+    seed: int = 0
+    command: str = ""
+    """Command that repeats the analysis."""
+    software: dict[str, str] = field(default_factory=dict)
+
+    def validate(self) -> "Report":
+        """Return the report itself.
+
+        Raises:
+            ValueError: Something contradicts the format or the rest, with the field named.
+        """
+        if self.format != FORMAT:
+            raise ValueError(f"format is {self.format!r}; this version reads {FORMAT!r}: run vd-gap again")
+        if self.verdict not in get_args(Verdict):
+            raise ValueError(f"verdict is {self.verdict!r}, not one of {', '.join(get_args(Verdict))}")
+        if (self.verdict == "effects") != bool(self.effects):
+            raise ValueError(f"verdict is {self.verdict!r}, but effects names {len(self.effects)}")
+        if self.verdict == "ambiguous" and not self.ambiguous:
+            raise ValueError("verdict is 'ambiguous', but the list ambiguous is empty")
+        named = {name for group in self.ambiguous for name in group} | {e.name for e in self.effects}
+        if unknown := sorted(named - set(EFFECTS)):
+            raise ValueError(f"no effects are called {', '.join(unknown)}; there are {', '.join(EFFECTS)}")
+        for effect in self.effects:
+            wanted = {parameter.name for parameter in EFFECTS[effect.name].parameters}
+            if extra := sorted(set(effect.parameters) - wanted):
+                raise ValueError(f"effects: {effect.name} has no parameter {', '.join(extra)}")
+            if stray := sorted(set(effect.joints) - set(self.recording.joints)):
+                raise ValueError(f"effects: {effect.name} is on joints not recorded: {', '.join(stray)}")
+        return self
+
+    def to_dict(self) -> dict[str, Any]:
+        """Dictionary for JSON; numbers that are not finite become None."""
+        return _finite(to_dict(self))
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> "Report":
+        """The report that :meth:`to_dict` wrote.
+
+        Raises:
+            ValueError: A field is unknown, of a wrong type, or contradicts another.
+        """
+        values = dict(values)
+        values["effects"] = [
+            {
+                **effect,
+                "parameters": {n: from_dict(Estimate, _nan(p)) for n, p in effect["parameters"].items()},
+            }
+            for effect in values.get("effects", [])
+        ]
+        if "closing" in values and values["closing"] is not None:
+            closing = dict(values["closing"])
+            closing["per_joint"] = {n: tuple(pair) for n, pair in closing["per_joint"].items()}
+            values["closing"] = closing
+        optional = {name: values.pop(name) for name in ("hand", "hand_layer", "closing") if name in values}
+        return from_dict(Report, {**_nan(values), **optional}).validate()
+
+    def write(self, path: Path) -> None:
+        """Write it as JSON, atomically, after :meth:`validate`."""
+        write_json(path, self.validate().to_dict())
+
+    @staticmethod
+    def read(path: Path) -> "Report":
+        """Read what :meth:`write` wrote.
+
+        Raises:
+            ValueError: Not such a file; the message names it.
+        """
+        try:
+            values = json.loads(Path(path).read_text())
+            return Report.from_dict(values)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise ValueError(f"{path}: not a report of vd-gap ({error})") from error
+
+    def with_closing(self, closing: Closing) -> "Report":
+        """The same report with what the closing simulation showed."""
+        return replace(self, closing=closing)
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Curves of the figures: S samples of all trajectories one after another, J recorded joints."""
+
+    time: np.ndarray
+    """Time from the start of the trajectory [s], shape [S]."""
+    trajectory: np.ndarray
+    """Index of the recording's trajectory, shape [S]."""
+    command: np.ndarray
+    """[rad], shape [S, J]."""
+    measured: np.ndarray
+    """[rad], shape [S, J]."""
+    baseline: np.ndarray
+    """Baseline's position [rad], shape [S, J]; NaN where a joint was not simulated."""
+    identified: np.ndarray
+    """Identified model's position [rad], shape [S, J]; NaN where a joint was not simulated."""
+    joints: tuple[str, ...]
+    files: tuple[str, ...]
+    """Of each trajectory."""
+
+    def write(self, path: Path) -> None:
+        """Write a compressed .npz, atomically."""
+        with atomic_path(path) as temporary:
+            np.savez_compressed(
+                temporary,
+                time=self.time,
+                trajectory=self.trajectory,
+                command=self.command,
+                measured=self.measured,
+                baseline=self.baseline,
+                identified=self.identified,
+                joints=np.array(self.joints),
+                files=np.array(self.files),
+            )
+
+    @staticmethod
+    def read(path: Path) -> "Predictions":
+        """Read what :meth:`write` wrote.
+
+        Raises:
+            ValueError: Not such a file, or arrays that do not belong together.
+        """
+        try:
+            with np.load(path) as data:
+                arrays = {name: data[name] for name in ("time", "trajectory", *_CURVES)}
+                joints, files = (tuple(str(n) for n in data[key]) for key in ("joints", "files"))
+        except (KeyError, OSError, ValueError) as error:
+            raise ValueError(f"{path}: not curves of vd-gap ({error}); run vd-gap explain again") from error
+        shape = (len(arrays["time"]), len(joints))
+        for name in _CURVES:
+            if arrays[name].shape != shape:
+                raise ValueError(f"{path}: {name} has shape {arrays[name].shape}, expected {shape}")
+        return Predictions(**arrays, joints=joints, files=files)
+
+
+_CURVES = ("command", "measured", "baseline", "identified")
+
+
+def parameter_columns(report: Report, joint: str) -> dict[int, float]:
+    """Columns of the joint's parameter row (:mod:`vd.kernels.actuators`) that the report identified."""
+    known = {p.name: p.column for p in (*BASELINE, GRAVITY)}
+    columns = {known[name]: value for name, value in report.identified.parameters.get(joint, {}).items()}
+    for effect in report.effects:
+        if joint in effect.joints:
+            for parameter in EFFECTS[effect.name].parameters:
+                if parameter.name in effect.parameters:
+                    columns[parameter.column] = effect.parameters[parameter.name].value
+    return columns
+
+
+def effect_values(
+    effects: Sequence[NamedEffect], joint: str
+) -> dict[str, dict[str, tuple[float, float, float]]]:
+    """Effect -> parameter -> (value, low, high) of one joint, as the hand's layer stores them."""
+    return {
+        effect.name: {name: (p.value, *p.ci95) for name, p in effect.parameters.items()}
+        for effect in effects
+        if joint in effect.joints
+    }
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _nan(value: Any) -> Any:
+    """None back to NaN, the only thing it can have been here."""
+    if isinstance(value, Mapping):
+        return {name: _nan(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_nan(item) for item in value]
+    return math.nan if value is None else value
