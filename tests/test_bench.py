@@ -1,6 +1,7 @@
 """The benchmarks measure what they say and write what scripts read."""
 
 import json
+import sys
 
 import pytest
 
@@ -38,6 +39,15 @@ def test_the_allegro_example_that_cannot_be_fetched_is_reported(monkeypatch):
     monkeypatch.setattr("newton.utils.download_asset", offline)
     with pytest.raises(RuntimeError, match="no network"):
         allegro_rate(1, "cpu")
+
+
+def test_a_missing_allegro_example_is_reported_in_the_row(monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "newton.examples.robot.example_robot_allegro_hand", None)
+    out = tmp_path / "rows.json"
+    SimCommand(worlds=(2,), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["physics_only"] > 0.0 and "cannot run here" in row["allegro"]
+    assert "allegro_physics_steps_s" not in row
 
 
 def test_physics_report_names_what_moves(tmp_path):
