@@ -13,9 +13,12 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from vd.evaluate.agents import SHIPPED_POLICIES
+
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PACKAGE_DIRS: dict[str, str] = PROJECT["tool"]["setuptools"]["package-dir"]
+MAX_POLICY_BYTES = 2**21
 # One module of every top-level package, among them the ones whose folder lies outside vd/.
 IMPORTED = ["vd.paper", "vd.kernels", "vd.assets_usd", "vd.assets_usd.hand_spec", "vd.train", "vd.deploy"]
 
@@ -92,6 +95,16 @@ def test_wheel_holds_every_module_below_vd(wheel):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {name for name in names if name.endswith(".py")} == installed_names()
     assert {name.split("/")[0] for name in names if ".dist-info/" not in name} == {"vd"}
+
+
+def test_wheel_ships_every_policy_that_has_a_name(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        sizes = {name: archive.getinfo(name).file_size for name in archive.namelist() if name.endswith(".pt")}
+    assert set(sizes) == {f"vd/policies/{path.name}" for path in SHIPPED_POLICIES.values()}
+    assert {"dclaw4-cube", "dclaw3-table", "dclaw4-table"} <= set(SHIPPED_POLICIES)
+    for name, path in SHIPPED_POLICIES.items():
+        # An export, not a checkpoint: those hold optimiser and worlds, and are larger.
+        assert sizes[f"vd/policies/{name}.pt"] == path.stat().st_size < MAX_POLICY_BYTES
 
 
 def test_wheel_ships_types_and_licence(wheel):

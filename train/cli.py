@@ -67,7 +67,7 @@ class ExportCfg:
 
 @dataclass
 class CurvesCfg:
-    """Draw success, reward, terms, std, error and speed of runs against control steps."""
+    """Draw success, reward, terms, difficulty, error, std, falls and speed of runs against control steps."""
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs, or progress.jsonl files."""

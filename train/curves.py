@@ -17,7 +17,7 @@ SMOOTHING = 1 / 40
 
 
 def plot_curves(progress: Path | Sequence[Path], output: Path) -> None:
-    """Draw success, reward, terms, rotation error, std and speed against control steps.
+    """Draw success, reward, terms, difficulty, error, std, falls and speed against control steps.
 
     Args:
         progress: One or several ``progress.jsonl`` files; with several, reward terms are the first's.
@@ -44,13 +44,15 @@ def plot_curves(progress: Path | Sequence[Path], output: Path) -> None:
     steps_max = max(rows[-1]["env_steps"] for rows in runs.values())
     scale, unit = (1e6, "million") if steps_max >= 1e6 else (1e3, "thousand")
 
-    figure, axes = plt.subplots(2, 3, figsize=(15, 8), constrained_layout=True)
+    figure, axes = plt.subplots(2, 4, figsize=(19, 8), constrained_layout=True)
     panels: list[tuple[Any, str, str, float]] = [
         (axes[0, 0], "success_per_goal", "goals reached [%]", 100.0),
         (axes[0, 1], "mean_reward", "mean reward per control step", 1.0),
         (axes[1, 0], "task/rotation_error", "mean rotation error [rad]", 1.0),
         (axes[1, 1], "action_std", "mean std of the actions", 1.0),
-        (axes[1, 2], "steps_per_s", "control steps per second, learning included", 1.0),
+        (axes[0, 3], "task/difficulty", "difficulty of the curriculum (1: the configured task)", 1.0),
+        (axes[1, 2], "drop_rate", "episodes that end in a fall [%]", 100.0),
+        (axes[1, 3], "steps_per_s", "control steps per second, learning included", 1.0),
     ]
     for axis, key, title, factor in panels:
         for index, (name, rows) in enumerate(runs.items()):
@@ -70,7 +72,7 @@ def plot_curves(progress: Path | Sequence[Path], output: Path) -> None:
         axis.grid(alpha=0.3)
         if len(axis.get_legend_handles_labels()[0]) > (0 if axis in (axes[0, 2], axes[1, 0]) else 1):
             axis.legend(fontsize="small", framealpha=0.5)
-    for axis in (axes[0, 0], axes[1, 1], axes[1, 2]):
+    for axis in (axes[0, 0], axes[0, 3], axes[1, 1], axes[1, 2], axes[1, 3]):
         axis.set_ylim(bottom=0.0)
     with atomic_path(Path(output)) as temporary:
         figure.savefig(temporary, dpi=110)
