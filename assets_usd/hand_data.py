@@ -11,6 +11,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 
+class HandError(ValueError):
+    """A USD file that is not a hand, or no layer of it; says which file, prim, attribute, and what to do."""
+
+
 @dataclass(frozen=True, eq=False)
 class CameraModel:
     """A pinhole camera fixed to the base.
@@ -100,6 +104,7 @@ class HandModel:
         name: Name of the hand.
         fingertip: Selected kind of fingertip.
         path: The file it was read from.
+        layer: The layer over it with an identified servo model, if any (:mod:`vd.assets_usd.hand_layer`).
         num_fingers: F.
         link_names: Names of the links [L].
         joint_names: Names of the joints [D].
@@ -115,6 +120,10 @@ class HandModel:
         effort: Torque limits [D] [N m].
         velocity_limit: Speed limits [D] [rad/s].
         armature: Rotor inertia about each axis [D] [kg m^2].
+        servo: Servo model of each joint [D, P], P = PARAMETER_COLUMNS of :mod:`vd.kernels.actuators`: drive,
+            speed limit, armature, and every effect that the USD authors; SI units, radians.
+        servo_interval: 95 % interval (low, high) of each number of ``servo`` [D, P, 2], NaN where none is
+            known.
         link_mass: Masses [L] [kg].
         link_com: Centres of mass in the link frames [L, 3] [m].
         link_inertia: Inertia about the centre of mass in the link frames [L, 3, 3] [kg m^2].
@@ -133,6 +142,7 @@ class HandModel:
     name: str
     fingertip: str
     path: Path
+    layer: Path | None
     num_fingers: int
     link_names: tuple[str, ...]
     joint_names: tuple[str, ...]
@@ -148,6 +158,8 @@ class HandModel:
     effort: np.ndarray
     velocity_limit: np.ndarray
     armature: np.ndarray
+    servo: np.ndarray
+    servo_interval: np.ndarray
     link_mass: np.ndarray
     link_com: np.ndarray
     link_inertia: np.ndarray

@@ -16,7 +16,8 @@ import numpy as np
 from pxr import Gf, Tf, Usd, UsdGeom, UsdPhysics, UsdShade
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import CameraModel, CollisionShape, HandModel
+from vd.assets_usd.hand_data import CameraModel, CollisionShape, HandError, HandModel
+from vd.assets_usd.hand_layer import add_layer, read_servo
 
 __all__ = ["CameraModel", "CollisionShape", "HandError", "HandModel", "open_stage", "read_hand"]
 
@@ -29,17 +30,18 @@ ORTHONORMAL_TOLERANCE = 1e-5
 """Allowed scale or shear in the transform of a link, above the rounding of single precision."""
 
 
-class HandError(ValueError):
-    """A USD file that is not a hand; says which file, prim and attribute, and what to do."""
+def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) -> Usd.Stage:
+    """The stage of a hand with a kind of fingertip selected, and a layer on top, in the session layer.
 
+    Pass the stage itself, not the path, to ``newton.ModelBuilder.add_usd``: neither is in the file.
 
-def open_stage(path: Path, fingertip: str = "rigid") -> Usd.Stage:
-    """The stage of a hand with a kind of fingertip selected in the session layer.
-
-    Pass the stage itself, not the path, to ``newton.ModelBuilder.add_usd``: the selection is not in the file.
+    Args:
+        path: The hand's file.
+        fingertip: Kind of fingertip, a variant of the file.
+        layer: Layer over the hand (:func:`vd.assets_usd.hand_layer.write_layer`).
 
     Raises:
-        HandError: The file is missing, no USD, or has no such fingertip.
+        HandError: A file is missing or no USD, the hand lacks the fingertip, or the layer is of another hand.
     """
     path = Path(path)
     if not path.is_file():
@@ -61,36 +63,41 @@ def open_stage(path: Path, fingertip: str = "rigid") -> Usd.Stage:
         )
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         variants.SetVariantSelection(fingertip)
+    if layer is not None:
+        add_layer(stage, Path(layer))
     return stage
 
 
-def read_hand(path: Path, *, fingertip: str = "rigid") -> HandModel:
+def read_hand(path: Path, *, fingertip: str = "rigid", layer: Path | None = None) -> HandModel:
     """Read a hand from USD.
 
     Args:
         path: File in the layout of :mod:`vd.assets_usd.hand_author`.
         fingertip: Kind of fingertip, a variant of the file (``rigid`` or ``soft``).
+        layer: Layer over the hand with an identified servo model.
 
     Raises:
-        HandError: The file is not a hand; names the prim and the attribute.
+        HandError: The file is not a hand, or the layer not one of it; names the prim and the attribute.
     """
-    return _Reader(Path(path), fingertip).read()
+    return _Reader(Path(path), fingertip, None if layer is None else Path(layer)).read()
 
 
 class _Reader:
     """One reading of one file; every method raises :class:`HandError`."""
 
-    def __init__(self, path: Path, fingertip: str):
+    def __init__(self, path: Path, fingertip: str, layer: Path | None):
         self.path = path
         self.fingertip = fingertip
-        self.stage = open_stage(path, fingertip)
+        self.layer = layer
+        self.stage = open_stage(path, fingertip, layer)
         self.root = self.stage.GetDefaultPrim()
         self.cache = UsdGeom.XformCache()
 
     def fail(self, where: Any, what: str, remedy: str) -> HandError:
         """The error to raise for a prim or a path."""
         prim = where.GetPath() if isinstance(where, Usd.Prim) else where
-        return HandError(f"{self.path}: {prim}: {what}; {remedy}")
+        file = f"{self.path} with the layer {self.layer}" if self.layer else str(self.path)
+        return HandError(f"{file}: {prim}: {what}; {remedy}")
 
     def prim(self, relative: str) -> Usd.Prim:
         """The prim at a path below the root."""
@@ -129,6 +136,8 @@ class _Reader:
         masses = [self._mass(body) for body in bodies]
         frames = [self._joint_frames(joint, index) for joint in joints]
         drives = np.array([self._drive(joint) for joint in joints])
+        baseline = dict(zip(("kp", "kd", "velocity_limit", "inertia"), drives.T[[2, 3, 5, 6]], strict=True))
+        servo, servo_interval = read_servo(joints, baseline, self.layer or self.path)
         tips = [f"f{f}_tip" for f in range(fingers)]
         tip_prims = [self.prim(f"f{f}_l{JOINTS_PER_FINGER}/{tip}") for f, tip in enumerate(tips)]
         points = [(f"f{f}_motor", self.prim(f"base/f{f}_motor_points"), 0) for f in range(fingers)]
@@ -138,6 +147,7 @@ class _Reader:
             name=self.root.GetName(),
             fingertip=self.fingertip,
             path=self.path,
+            layer=self.layer,
             num_fingers=fingers,
             link_names=links,
             joint_names=tuple(joint.GetName() for joint in joints),
@@ -153,6 +163,8 @@ class _Reader:
             effort=drives[:, 4],
             velocity_limit=drives[:, 5],
             armature=drives[:, 6],
+            servo=servo,
+            servo_interval=servo_interval,
             link_mass=np.array([mass for mass, _, _ in masses]),
             link_com=np.array([com for _, com, _ in masses]),
             link_inertia=np.array([inertia for _, _, inertia in masses]),
