@@ -110,7 +110,10 @@ def add_layer(stage: Usd.Stage, path: Path) -> None:
         HandError: The file is missing or no USD, or changes prims that the hand does not have.
     """
     if not path.is_file():
-        raise HandError(f"{path}: no such hand layer; vd-gap writes one as identified.usda")
+        raise HandError(
+            f"{path}: no such hand layer; name the identified.usda that vd-gap wrote, or, for a policy that was "
+            "trained with one that is not here, --hand-layer none"
+        )
     try:
         layer = Sdf.Layer.FindOrOpen(str(path.resolve()))
     except Tf.ErrorException as error:

@@ -74,6 +74,24 @@ def test_goals_are_as_trained_unless_an_angle_is_given():
     assert task_of(trained, max_goal_angle_rad=0.5).goal.max_angle_rad == 0.5
 
 
+def test_the_layer_over_the_hand_is_as_trained_unless_asked_otherwise():
+    trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
+    assert task_of(trained).hand_layer is None
+    trained.task["hand_layer"] = "bench/identified.usda"
+    assert task_of(trained).hand_layer == "bench/identified.usda"
+    assert task_of(trained, hand_layer="other.usda").hand_layer == "other.usda"
+    assert task_of(trained, hand_layer="none").hand_layer is None
+
+
+def test_a_missing_layer_is_named_by_both_commands(tmp_path, capsys):
+    from vd.play.cli import main as play
+
+    missing = str(tmp_path / "identified.usda")
+    for command in (main, play):
+        assert command(["--agent", "zero", "--hand-layer", missing, "--device", "cpu"]) == 1
+        assert f"{missing}: no such hand layer" in capsys.readouterr().err
+
+
 def test_flags_of_the_start_exclude_each_other(capsys):
     assert [start_at_rest(*flags) for flags in ((False, False), (True, False), (False, True))] == [
         None,

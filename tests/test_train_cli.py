@@ -93,9 +93,11 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
         [
             *("--preset", "gpu", "--hand", "dclaw3", "--objects", "cube", "cuboid", "--num_worlds=128"),
             *("--seed", "7", "--ppo.epochs", "3", "--env.reward.energy=-1.5", "--run-dir", "runs/x"),
-            *("--max-minutes", "2.5"),
+            *("--max-minutes", "2.5", "--hand-layer", "bench/identified.usda"),
         ]
     )
+    assert cfg.env.hand_layer == "bench/identified.usda"
+    assert from_dict(TeacherCfg, json.loads(json.dumps(to_dict(cfg)))) == cfg
     assert (cfg.env.hand, cfg.env.objects) == ("dclaw3", ("cube", "cuboid"))
     assert (cfg.env.num_worlds, cfg.env.seed) == (128, 7)
     assert cfg.env.reward.energy == -1.5 and cfg.ppo.epochs == 3

@@ -45,10 +45,10 @@ vd-train COMMAND --help lists the flags of a command."""
 
 TEACHER_HELP = """Train the teacher: PPO on the simulator's state.
 
-Flags start from --preset, or with --resume from the run's config.json. Short forms: --hand, --objects,
---num-worlds and --seed stand for --env.hand, --env.objects, --env.num-worlds and --env.seed. Ctrl-C saves."""
+Flags start from --preset, or with --resume from the run's config.json. Short forms: --hand, --hand-layer,
+--objects, --num-worlds and --seed stand for --env.hand and so on. Ctrl-C saves."""
 
-SHORT_FORMS = ("hand", "objects", "num-worlds", "seed")
+SHORT_FORMS = ("hand", "hand-layer", "objects", "num-worlds", "seed")
 """Fields of the environment that are common enough to be flags without the ``--env.`` prefix."""
 
 

@@ -153,6 +153,8 @@ class ReorientCfg:
     """Name of a hand (dclaw3, dclaw4) or path of a hand's USD."""
     fingertip: str = "rigid"
     """Fingertip variant: rigid or soft."""
+    hand_layer: str | None = None
+    """Layer over the hand with an identified servo model: identified.usda of vd-gap."""
     objects: tuple[str, ...] = ("cube",)
     """Object sets: names or folders of object USDs."""
     num_worlds: int = 4096

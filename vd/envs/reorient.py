@@ -48,7 +48,7 @@ class ReorientEnv:
         cfg.validate()
         self.cfg = cfg
         self.device = str(wp.get_device(device or ("cuda:0" if wp.is_cuda_available() else "cpu")))
-        self.hand: HandModel = load_hand(cfg.hand, cfg.fingertip)
+        self.hand: HandModel = load_hand(cfg.hand, cfg.fingertip, cfg.hand_layer)
         self.objects: list[ObjectModel] = load_set(list(cfg.objects))
         random = cfg.randomisation
         scales = np.linspace(*random.object_scale, random.object_scale_count) if random.enabled else [1.0]
@@ -407,6 +407,7 @@ class ReorientEnv:
                 dump,
                 hand=cfg.hand,
                 fingertip=cfg.fingertip,
+                hand_layer=cfg.hand_layer,
                 objects=cfg.objects,
                 sim=cfg.sim,
             )

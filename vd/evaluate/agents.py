@@ -15,6 +15,13 @@ SHIPPED_POLICIES = {path.stem: path for path in sorted((Path(__file__).parents[1
 
 DEFAULT_POLICY = "dclaw4-cube"
 DEFAULT_HAND = "dclaw4"
+NO_LAYER = "none"
+"""What --hand-layer is to be for the hand as it is, whatever the training."""
+LAYER_HELP = (
+    "Layer over the hand with a servo model, identified.usda of vd-gap; by default the policy's, "
+    f"{NO_LAYER} for the hand as it is."
+)
+"""What --hand-layer means on the command lines of vd-eval and vd-play."""
 # What a run's folder holds, best first.
 _RUN_FILES = ("policy.pt", "checkpoints/best.pt")
 
@@ -99,6 +106,7 @@ def task_for(
     randomised: bool,
     success_ends_episode: bool,
     at_rest: bool | None = None,
+    hand_layer: str | None = None,
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
 
@@ -118,11 +126,14 @@ def task_for(
         randomised: Domain randomisation, noise and disturbances.
         success_ends_episode: End at success, or give a new goal.
         at_rest: Start at rest on the table rather than from a drop; None: as trained.
+        hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is, None: as
+            trained.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     return replace(
         base,
         hand=hand or base.hand,
+        hand_layer=base.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer,
         objects=objects,
         num_worlds=num_worlds,
         seed=seed,

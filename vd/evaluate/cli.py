@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from vd.evaluate.agents import SHIPPED_POLICIES, start_at_rest
+from vd.evaluate.agents import LAYER_HELP, SHIPPED_POLICIES, start_at_rest
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ class EvalCfg:
     """Starts and goals of every object."""
     hand: str | None = None
     """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
+    hand_layer: Annotated[str | None, tyro.conf.arg(help=LAYER_HELP)] = None
     seed: int = 0
     """Seed of starts, goals and everything else random."""
     max_goal_angle: float = math.pi
@@ -164,6 +165,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         randomised=cfg.randomise,
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
+        hand_layer=cfg.hand_layer,
     )
     print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
     env = ReorientEnv(task, device)
@@ -193,6 +195,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         policy=cfg.agent_name,
         objects=", ".join(cfg.objects),
         hand=task.hand,
+        hand_layer=task.hand_layer,
         episodes=cfg.episodes,
         seed=cfg.seed,
         max_goal_angle_rad=cfg.max_goal_angle,

@@ -100,7 +100,7 @@ def protocol_rows(result: EvalResult) -> list[tuple[str, str]]:
     rows = [
         ("policy", protocol.policy),
         ("objects", f"{protocol.objects} ({len(result.object_names)})"),
-        ("hand", protocol.hand),
+        ("hand", protocol.hand_name),
         ("starts and goals", f"{protocol.episodes} each for every object, seed {protocol.seed}"),
         ("starts", _starts(protocol)),
         ("goals", _goals(protocol)),
@@ -189,5 +189,5 @@ def _lead(result: EvalResult) -> str:
     protocol = result.protocol
     return (
         f"{len(result.episodes)} episodes: {len(result.object_names)} objects of {protocol.objects}, "
-        f"{protocol.episodes} starts and goals each, {protocol.hand}; {task_line(result)}"
+        f"{protocol.episodes} starts and goals each, {protocol.hand_name}; {task_line(result)}"
     )

@@ -84,6 +84,13 @@ class Protocol:
     they fall, with starts uniform on SO(3), the same for any environment."""
     goals_about_vertical: bool = False
     """Goals only turn the object about the vertical."""
+    hand_layer: str | None = None
+    """Layer over the hand with an identified servo model, if any."""
+
+    @property
+    def hand_name(self) -> str:
+        """The hand, and the layer over it."""
+        return self.hand if self.hand_layer is None else f"{self.hand} with {self.hand_layer}"
 
 
 @dataclass(frozen=True)
@@ -158,11 +165,6 @@ class EvalResult:
             raise ValueError(
                 f"{path}: format_version is {version}, this version reads {FORMAT_VERSION}; run vd-eval again"
             )
-        # Dictionaries keep their values as they are in the file: turn those of intervals back by hand.
-        for summary in (values["overall"], *values["per_object"]):
-            summary["success"] = {
-                name: from_dict(Interval, interval) for name, interval in summary["success"].items()
-            }
         return from_dict(EvalResult, values)
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from vd.evaluate.agents import DEFAULT_POLICY, start_at_rest
+from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, start_at_rest
 from vd.evaluate.cli import POLICY_HELP
 from vd.paper import PAPER
 
@@ -38,6 +38,7 @@ class PlayCfg:
     """zero, random, or the same as POLICY."""
     hand: str | None = None
     """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
+    hand_layer: Annotated[str | None, tyro.conf.arg(help=LAYER_HELP)] = None
     objects: tuple[str, ...] = ("cube",)
     """Object sets by name, folders or files; the viewer offers each object."""
     video: Path | None = None
@@ -212,6 +213,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         randomised=cfg.randomise,
         success_ends_episode=False,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
+        hand_layer=cfg.hand_layer,
     )
     return ReorientEnv(task, device), trained, device
 

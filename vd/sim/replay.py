@@ -23,7 +23,14 @@ def _numbers(array: np.ndarray) -> list[float | None]:
 
 
 def save_dump(
-    path: Path, dump: NanDump, *, hand: str, fingertip: str, objects: tuple[str, ...], sim: SimCfg
+    path: Path,
+    dump: NanDump,
+    *,
+    hand: str,
+    fingertip: str,
+    hand_layer: str | None = None,
+    objects: tuple[str, ...],
+    sim: SimCfg,
 ) -> Path:
     """Write ``dump`` with what is needed to build its world again. Values that are not finite become null."""
     write_json(
@@ -32,6 +39,7 @@ def save_dump(
             "format": "vd-dump/1",
             "hand": hand,
             "fingertip": fingertip,
+            "hand_layer": hand_layer,
             "objects": list(objects),
             "object": dump.object_name,
             "world": dump.world,
@@ -68,7 +76,7 @@ def replay(path: Path, *, device: str = "cpu") -> Iterator[str]:
     item = next((o for o in load_set(record["objects"]) if o.name == record["object"]), None)
     if item is None:
         raise ValueError(f"{path}: object {record['object']} is not in {record['objects']}; restore that set")
-    hand = load_hand(record["hand"], record["fingertip"])
+    hand = load_hand(record["hand"], record["fingertip"], record.get("hand_layer"))
     # One physics step a call: the control rate is raised to half the physics rate, an even multiple.
     cfg = dataclasses.replace(sim, control_hz=sim.physics_hz / 2.0)
     scene = build_scene(hand=hand, objects=[item], num_worlds=1, cfg=cfg, device=device)
