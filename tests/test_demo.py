@@ -1,14 +1,18 @@
 """The demo from end to end, tiny, and what its page says about what it cannot know beforehand."""
 
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
 
+from vd.assets_usd.objects import importer
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.result import Episode, EvalResult, Protocol, summarise
-from vd.train import demo, demo_agents, demo_page
+from vd.train import cli, demo, demo_agents, demo_page
+from vd.train.demo_stages import Budget, Stages, TimeUp, time_limit
 from vd.train.presets import PRESETS
 
 EPISODE_S = 0.5
@@ -26,6 +30,21 @@ def result(agent: str, reached: int, episodes: int = 40) -> EvalResult:
     return summarise(protocol, ("cube",), [np.array([unit])], rows)
 
 
+class Clock:
+    """A clock that moves only when told to."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        """What it says [s]."""
+        return self.now
+
+
+def stages_in(folder: Path, minutes: float = 1.0, clock: Clock | None = None) -> Stages:
+    clock = clock or Clock()
+    return Stages(folder / "stages.json", 1, Budget(minutes, clock, clock()))
+
+
 @pytest.fixture
 def small(monkeypatch, tmp_path) -> demo.DemoCfg:
     """Settings under which every stage is short, with assets of its own."""
@@ -36,40 +55,121 @@ def small(monkeypatch, tmp_path) -> demo.DemoCfg:
     )
     monkeypatch.setitem(demo.EPISODES_RANGE, "cpu", (4, 4))
     monkeypatch.setitem(demo.PAPER_EPISODES, "cpu", 4)
-    monkeypatch.setattr(demo, "LEAST_TRAINING_MIN", 5.0)
+    monkeypatch.setitem(demo.MESH_EPISODES, "cpu", 4)
     monkeypatch.setattr(demo_agents, "VIDEO_SECONDS", 0.5)
     monkeypatch.setattr(demo_agents, "VIDEO_CELLS", 1)
     return demo.DemoCfg(
-        out=tmp_path / "demo", minutes=1.0, objects=("cube",), preset="cpu-demo", num_worlds=4, max_steps=128
+        out=tmp_path / "demo", minutes=20.0, objects=("cube",), preset="cpu-demo", num_worlds=4, max_steps=128
     )
 
 
-@pytest.mark.slow
-def test_demo_ends_with_a_page_and_repeats_nothing(small, tmp_path, capsys):
+@pytest.fixture
+def cone(tmp_path) -> Path:
+    """A folder with one mesh."""
     meshes = tmp_path / "meshes"
     meshes.mkdir()
     trimesh.creation.cone(0.05, 0.12, sections=12).export(meshes / "cone.stl")
-    small = replace(small, meshes=meshes)
+    return meshes
+
+
+@pytest.mark.slow
+def test_demo_ends_with_a_page_and_repeats_nothing(small, cone, capsys):
+    small = replace(small, meshes=cone)
     page = demo.run_demo(small)
     text = page.read_text()
-    assert text.count("<video") == 1
+    assert text.count("<video") == 2
     assert text.count("<img") >= 4  # comparison, learning, curves, contact sheet
     assert "task on purpose" in text  # what makes it easier is said
+    assert "not trained" in text and "no time" not in text
     for name in demo_page.NAMES.values():
-        assert name in text
-    (trained,) = small.out.rglob("trained.json")
-    assert EvalResult.read(trained).object_names == ("cube", "cone")
-    (policy,) = small.out.rglob("teacher/policy.pt")
-    before = {path: path.stat().st_mtime_ns for path in policy.parents[1].rglob("*.pt")}
+        assert text.count(name) >= 2  # on its own objects and on imported ones
+    (folder,) = (path.parent for path in small.out.rglob("stages.json"))
+    assert EvalResult.read(folder / "trained.json").object_names == ("cube",)
+    assert EvalResult.read(folder / "imported" / "zero.json").object_names == ("cone",)
+    assert "cone" in EvalResult.read(folder / "evaluation" / "eval.json").object_names
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.pt")}
     output = capsys.readouterr().out
-    assert [f"[{i}/{demo.STAGES}]" in output for i in range(1, demo.STAGES + 1)] == [True] * demo.STAGES
+    total = demo.STAGES + 1 + demo.MESH_STAGES
+    assert all(f"[{number}/{total}, " in output for number in range(1, total + 1))
     assert "done before" not in output
 
     page.unlink()
     assert demo.run_demo(small) == page
     assert page.is_file()
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    assert capsys.readouterr().out.count("done before") == 4  # import, train, evaluate, video
+    # Import, objects, training, comparison, video, both again with meshes, evaluation.
+    assert capsys.readouterr().out.count("done before") == total - 2
+
+
+@pytest.mark.slow
+def test_a_used_up_budget_still_ends_with_a_page_that_says_what_is_missing(small, cone, monkeypatch, capsys):
+    monkeypatch.setattr(demo, "PAGE_MIN", 10.0)  # all that is left when training ends
+    monkeypatch.setattr(demo, "IMPORT_SHARE", 0.0)
+    page = demo.run_demo(replace(small, minutes=10.0, meshes=cone))
+    text, output = page.read_text(), capsys.readouterr().out
+    assert "<video" not in text
+    for name in demo_page.NAMES.values():
+        assert name in text
+    for command in ("vd-assets import", "vd-play", "vd-eval"):
+        assert f"by hand: {command}" in output
+        assert command in text.partition("Left out")[2]
+    assert "cone.stl" in text
+    assert "[8/8, " in output  # nothing is announced for meshes that are not there
+
+
+def test_training_gets_what_the_other_stages_leave(tmp_path, monkeypatch):
+    clock, asked = Clock(), []
+
+    def teacher(arguments):
+        asked.append(float(arguments[arguments.index("--max-minutes") + 1]))
+        (tmp_path / "teacher").mkdir(exist_ok=True)
+        (tmp_path / "teacher" / "policy.pt").touch()
+        return 0
+
+    monkeypatch.setattr(cli, "main", teacher)
+    for meshes, used_min in ((None, 0.0), (None, 3.0), (tmp_path, 3.0), (None, 13.0)):
+        clock.now = 60.0 * used_min
+        cfg = demo.DemoCfg(out=tmp_path, meshes=meshes)
+        stages = Stages(tmp_path / "stages.json", 1, Budget(cfg.minutes, clock, 0.0))
+        demo._Demo(cfg, "cpu-demo", "cpu", tmp_path, stages).train()
+    end = demo.DemoCfg().minutes - demo.RESERVE_MIN
+    assert asked == [end, end - 3.0, end - 3.0 - demo.RESERVE_MESHES_MIN, demo.LEAST_TRAINING_MIN]
+
+
+def test_the_plan_of_fifteen_minutes_leaves_time_to_learn():
+    minutes = demo.DemoCfg().minutes
+    assert minutes < 15.0
+    reserve = demo.RESERVE_MIN + demo.RESERVE_MESHES_MIN
+    assert minutes * (1.0 - demo.IMPORT_SHARE) - reserve > 5.0
+
+
+def test_an_import_ends_with_its_share_and_goes_on_with_the_smallest_first(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "assets"))
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for size, name in enumerate(("c", "b", "a"), start=1):
+        (meshes / f"{name}.obj").write_text("o\n" * size)
+    order = []
+
+    def slow(job, *_):
+        order.append(job.name)
+        time.sleep(0.0 if job.name == "c" else 0.7)
+        Path(job.target).write_text("")
+        return importer.ImportResult(job.source, job.name, "imported", target=job.target)
+
+    monkeypatch.setattr(importer, "_run_child", slow)
+    monkeypatch.setattr(importer, "check_file", lambda path: None)
+    monkeypatch.setattr(importer.os, "cpu_count", lambda: 1)
+    cfg = demo.DemoCfg(out=tmp_path, meshes=meshes, minutes=1.0)
+    monkeypatch.setattr(demo, "IMPORT_SHARE", 0.3 / 60.0)
+    stages = stages_in(tmp_path)
+    it = demo._Demo(cfg, "cpu-demo", "cpu", tmp_path, stages)
+    it.import_meshes()
+    assert order == ["c", "b"]  # b was under way when the time was over
+    ((what, command),) = stages.left_out
+    assert "2 of 3 meshes: b.obj, a.obj" in what
+    assert command == f"vd-assets import {meshes} --out {tmp_path / 'meshes'}"
+    assert command in capsys.readouterr().out
 
 
 def test_meshes_that_cannot_be_imported_end_the_demo_with_the_reason(small, tmp_path, capfd):
@@ -116,7 +216,7 @@ def test_wrong_settings_are_refused_by_flag(tmp_path, changes, flag):
 
 def test_a_stage_that_fails_is_run_again(tmp_path, capsys):
     product = tmp_path / "product"
-    stages = demo._Stages(tmp_path / "stages.json")
+    stages = stages_in(tmp_path)
     with pytest.raises(RuntimeError), stages.run("work", "work", products=[product]) as needed:
         assert needed
         product.write_text("half")
@@ -124,7 +224,7 @@ def test_a_stage_that_fails_is_run_again(tmp_path, capsys):
     stages.load()
     with stages.run("work", "work", products=[product]) as needed:
         assert needed
-    again = demo._Stages(tmp_path / "stages.json")
+    again = stages_in(tmp_path)
     again.load()
     with again.run("work", "work", products=[product]) as needed:
         assert not needed
@@ -132,6 +232,33 @@ def test_a_stage_that_fails_is_run_again(tmp_path, capsys):
     with again.run("work", "work", products=[product]) as needed:
         assert needed
     assert capsys.readouterr().out.count("done before") == 1
+
+
+def test_the_alarm_ends_a_block_and_leaves_no_alarm_behind():
+    started = time.monotonic()
+    with pytest.raises(TimeUp), time_limit(0.05):
+        time.sleep(5.0)
+    assert time.monotonic() - started < 2.0
+    with time_limit(0.05):
+        pass
+    time.sleep(0.1)
+    with pytest.raises(TimeUp), time_limit(0.0):
+        pytest.fail("there was no time to begin")
+
+
+def test_a_stage_without_time_is_left_out_and_run_by_the_next_call(tmp_path, capsys):
+    clock, product = Clock(), tmp_path / "product"
+    keep = {"products": [product], "keep_min": 0.5, "command": "vd-eval policy.pt"}
+    stages = stages_in(tmp_path, 1.0, clock)
+    clock.now = 31.0
+    assert not stages.run_if_time("work", "do the work", product.touch, **keep)
+    assert stages.left_out == [("do the work", "vd-eval policy.pt")]
+    assert "by hand: vd-eval policy.pt" in capsys.readouterr().out
+    again = stages_in(tmp_path, 1.0, clock)
+    again.load()
+    assert again.run_if_time("work", "do the work", product.touch, **keep)
+    assert not again.left_out
+    assert product.exists()
 
 
 def test_the_page_says_what_makes_the_task_easier():

@@ -3,6 +3,10 @@
 Authors the hand and a few objects, imports meshes if a folder is given, trains a teacher with the preset
 that fits the machine, evaluates it beside a random and a zero agent, records a video and writes one HTML
 page. Most stages are calls of the public commands; what is finished is not repeated by the next call.
+
+It ends in time whatever the machine: the import has a share of the time, training ends where the stages
+after it need the rest, the comparison is sized by the speed measured in training, and every other stage is
+stopped by the clock, with the command that does it by hand.
 """
 
 import hashlib
@@ -11,19 +15,20 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from vd.config import to_dict
 from vd.files import write_json
-from vd.train.demo_agents import AGENTS, GoalCount, compare_agents, record_training_task
+from vd.train.demo_agents import AGENTS, GoalCount, compare_agents, progress_bar, record_training_task
+from vd.train.demo_stages import Budget, Stages, TimeUp, time_limit
 
 if TYPE_CHECKING:
+    from vd.assets_usd.objects.importer import ImportResult
     from vd.evaluate.result import EvalResult
 
 OBJECTS = ("cube",)
@@ -32,15 +37,23 @@ OBJECTS = ("cube",)
 SHOWN = ("procedural-3-seed0",)
 """Built-in sets that are authored beside them, and only appear in the evaluation."""
 
-STAGES = 6
+STAGES, MESH_STAGES = 7, 2
+"""Stages of every demo, and those that imported meshes add after their import."""
 
-# Time kept back from training for what follows it on two cores: comparison, evaluation, video, page.
-RESERVE_MIN = 4.5
+# Share of the time for importing meshes: enough for several, and training still gets past random actions.
+IMPORT_SHARE = 0.15
+# Time kept back from training for what follows it on two cores: comparison, video, evaluation, page;
+# and for comparison and video with the imported meshes.
+RESERVE_MIN, RESERVE_MESHES_MIN = 4.5, 1.5
+# Time kept back for the page alone.
+PAGE_MIN = 0.3
 # Training is worth starting with at least this much time left.
 LEAST_TRAINING_MIN = 1.0
 # Wanted duration of an agent's episodes in the comparison; their number follows from the speed of training.
 SECONDS_PER_AGENT = 35.0
 EPISODES_RANGE = {"cpu": (24, 256), "cuda": (512, 2048)}
+# Episodes of all imported objects together in the same comparison; parts make them slower than a cube.
+MESH_EPISODES = {"cpu": 48, "cuda": 1024}
 # Episodes of all objects together under the paper's criteria.
 PAPER_EPISODES = {"cpu": 64, "cuda": 2048}
 EXIT_INTERRUPTED = 130
@@ -57,11 +70,11 @@ class DemoCfg:
     out: Path = Path("demo")
     """Folder of everything the demo writes; the page is index.html."""
     minutes: float = 14.0
-    """Time for everything [min]; training gets what the other stages leave."""
+    """Time for everything [min]; training gets what the other stages leave, from about 6 on."""
     seed: int = 0
     """Seed of assets, training and evaluation."""
     meshes: Path | None = None
-    """Folder of OBJ, STL, PLY or GLB files to import and to train on as well."""
+    """Folder of OBJ, STL, PLY or GLB files to import, smallest first, and to try the policy on."""
     objects: tuple[str, ...] = OBJECTS
     """Built-in object sets to train on."""
     preset: Literal["auto", "cpu-demo", "cube", "gpu"] = "auto"
@@ -82,8 +95,8 @@ class DemoCfg:
         for flag, value in {"--num-worlds": self.num_worlds, "--max-steps": self.max_steps}.items():
             if value is not None and value < 1:
                 raise ValueError(f"{flag} is {value}; it has to be positive")
-        if not self.objects and self.meshes is None:
-            raise ValueError("--objects is empty; name a set, or give --meshes")
+        if not self.objects:
+            raise ValueError("--objects is empty; name a set, such as cube")
 
 
 @dataclass
@@ -95,61 +108,251 @@ class DemoResults:
         preset: Preset that was trained.
         machine: What it ran on.
         hand: Name of the hand.
-        objects: Sets or folders that were trained on.
         run_dir: Folder of the training.
         sheet: Contact sheet of the objects.
         agents: Result of each agent in the task of the training: first goals, and all goals of an episode.
+        imported: The same on the imported meshes; empty if there are none or there was no time.
         paper: Result of the trained policy under the paper's criteria and goals.
         video: Recording of the trained policy.
+        imported_video: The same with imported meshes.
         seconds: Duration of each stage.
-        commands: The same by hand, in order.
+        left_out: What there was no time for, and the command that does it by hand.
+        commands: The whole demo by hand, in order.
     """
 
     cfg: DemoCfg
     preset: str
     machine: str
     hand: str
-    objects: tuple[str, ...]
     run_dir: Path
-    sheet: Path
+    sheet: Path | None
     agents: "dict[str, tuple[EvalResult, GoalCount]]"
-    paper: "EvalResult"
-    video: Path
+    imported: "dict[str, tuple[EvalResult, GoalCount]]"
+    paper: "EvalResult | None"
+    video: Path | None
+    imported_video: Path | None
     seconds: dict[str, float]
+    left_out: list[tuple[str, str]]
     commands: list[str]
 
 
 @dataclass
-class _Stages:
-    """Numbered stages with their durations, remembered in a file so that a later call skips them."""
+class _Demo:
+    """A demo under way: its settings, its files, and the commands that do the same by hand."""
 
-    path: Path
-    seconds: dict[str, float] = field(default_factory=dict)
-    number: int = 0
+    cfg: DemoCfg
+    preset: str
+    device: str
+    folder: Path
+    stages: Stages
+    commands: list[str] = field(default_factory=list)
 
-    def load(self) -> None:
-        """Read what earlier calls finished."""
-        if self.path.is_file():
-            try:
-                self.seconds = json.loads(self.path.read_text())
-            except json.JSONDecodeError as error:
-                raise ValueError(f"{self.path} is damaged ({error}); delete it") from error
+    @property
+    def run_dir(self) -> Path:
+        """Folder of the training."""
+        return self.folder / "teacher"
 
-    @contextmanager
-    def run(self, name: str, title: str, *, products: Sequence[Path] = ()) -> Iterator[bool]:
-        """Announce a stage; yields whether it has to run, and records its duration if it does not raise.
+    @property
+    def imported(self) -> tuple[str, ...]:
+        """The set of imported meshes; empty if there is none."""
+        from vd.assets_usd.objects.model import object_files
 
-        Without ``products``, files that show that it was finished, it always has to.
+        if self.cfg.meshes is None:
+            return ()
+        folder = self.folder / self.cfg.meshes.resolve().name
+        return (str(folder),) if folder.is_dir() and object_files(folder) else ()
+
+    @property
+    def reserve_min(self) -> float:
+        """Time that the stages after training need [min]."""
+        return RESERVE_MIN + (RESERVE_MESHES_MIN if self.cfg.meshes is not None else 0.0)
+
+    def author(self) -> str:
+        """Author hand and objects; returns the hand's name."""
+        from vd.assets_usd.hand_author import hand_usd
+        from vd.assets_usd.objects.model import load_set
+        from vd.train.presets import PRESETS
+
+        hand = PRESETS[self.preset]().env.hand
+        self.commands.append(f"vd-assets hand {hand}")
+        sets = dict.fromkeys((*self.cfg.objects, *SHOWN))
+        with self.stages.run("assets", f"author the hand {hand} and the objects {', '.join(sets)}"):
+            print(f"  {hand_usd(hand)}")
+            # Sets that are in the cache already are read from it.
+            models = load_set(list(sets))
+            print(f"  {len(models)} objects: {', '.join(model.name for model in models)}")
+        return hand
+
+    def import_meshes(self) -> None:
+        """Import meshes, the smallest first, until the import's share of the time is used.
+
+        Raises:
+            DemoError: None could be imported, and not for want of time.
         """
-        self.number += 1
-        done = name in self.seconds and bool(products) and all(path.exists() for path in products)
-        note = f"   (done before, {self.seconds[name]:.0f} s)" if done else ""
-        print(f"\n[{self.number}/{STAGES}] {title}{note}", flush=True)
-        started = time.monotonic()
-        yield not done
-        if not done:
-            self.seconds[name] = time.monotonic() - started
-            write_json(self.path, self.seconds)
+        from vd.assets_usd.objects.importer import find_meshes
+
+        assert self.cfg.meshes is not None
+        # The finer a mesh, the longer its decomposition takes.
+        meshes = sorted(find_meshes([self.cfg.meshes]), key=lambda path: (path.stat().st_size, path))
+        out = self.folder / self.cfg.meshes.resolve().name
+        command = f"vd-assets import {self.cfg.meshes} --out {out}"
+        self.commands.append(command)
+        share_s = min(IMPORT_SHARE * 60.0 * self.cfg.minutes, self.stages.budget.left_s())
+        title = f"import {len(meshes)} meshes of {self.cfg.meshes} for at most {share_s / 60.0:.1f} min"
+        rest = self.folder / "not-imported.json"
+        with self.stages.run("import", title, products=[rest]) as needed:
+            if needed:
+                done = _import_for(meshes, out, share_s)
+                missing = [path.name for path in meshes if str(path) not in done]
+                if not missing and not self.imported:
+                    raise DemoError(
+                        f"none of the meshes in {self.cfg.meshes} could be imported; the reasons are above"
+                    )
+                write_json(rest, missing)
+        if missing := json.loads(rest.read_text()):
+            self.stages.leave_out(
+                f"import {len(missing)} of {len(meshes)} meshes: {', '.join(missing)}", command
+            )
+
+    def draw(self) -> Path | None:
+        """Draw the contact sheet."""
+        from vd.assets_usd.objects.model import load_set
+        from vd.assets_usd.objects.sheet import SheetStyle, contact_sheet
+
+        sheet, sets = self.folder / "objects.png", self._everything()
+        command = f"vd-assets show {' '.join(sets)} --out {sheet}"
+        self.commands.append(command)
+
+        def work() -> None:
+            contact_sheet(
+                load_set(list(sets)), sheet, style=SheetStyle(tile=150), title="Objects of the demo"
+            )
+
+        keep = self.reserve_min + LEAST_TRAINING_MIN
+        there = self.stages.run_if_time(
+            "sheet", "draw the objects", work, products=[sheet], keep_min=keep, command=command
+        )
+        return sheet if there else None
+
+    def train(self) -> None:
+        """Train for the time that the later stages leave.
+
+        Raises:
+            DemoError: The training failed.
+            KeyboardInterrupt: It was interrupted, and has saved.
+        """
+        from vd.train import cli
+        from vd.train.checkpoint import list_checkpoints
+
+        cfg, run_dir = self.cfg, self.run_dir
+        minutes = max(self.stages.budget.left_s(keep_min=self.reserve_min) / 60.0, LEAST_TRAINING_MIN)
+        flags = ["--preset", self.preset, "--run-dir", str(run_dir), "--seed", str(cfg.seed)]
+        flags += ["--objects", *cfg.objects]
+        flags += ["--num-worlds", str(cfg.num_worlds)] if cfg.num_worlds else []
+        flags += ["--max-steps", str(cfg.max_steps)] if cfg.max_steps else []
+        self.commands.append(f"vd-train teacher {' '.join(flags)}")
+        title = f"train a teacher for at most {minutes:.1f} min (Ctrl-C saves, the next call goes on)"
+        with self.stages.run("train", title, products=[run_dir / "policy.pt"]) as needed:
+            if not needed:
+                return
+            resume = ["--resume"] if list_checkpoints(run_dir) else []
+            status = cli.main(["teacher", *flags, "--max-minutes", f"{minutes:.2f}", *resume])
+            if status == EXIT_INTERRUPTED:
+                raise KeyboardInterrupt
+            if status != 0 or not (run_dir / "policy.pt").is_file():
+                raise DemoError(f"the training in {run_dir} failed; the reason is above")
+
+    def compare(self) -> "dict[str, tuple[EvalResult, GoalCount]]":
+        """Judge the trained policy beside random and no actions, in the task of the training."""
+        title = "compare it with random and no actions, in the task of its training"
+        with self.stages.run("compare", title, products=_comparison_files(self.folder)) as needed:
+            if needed:
+                self._compare(self.cfg.objects, self._episodes(), self.folder)
+        return _read_comparison(self.folder)
+
+    def compare_imported(self) -> "dict[str, tuple[EvalResult, GoalCount]]":
+        """The same on the imported meshes; empty if there is no time."""
+        folder = self.folder / "imported"
+        there = self.stages.run_if_time(
+            "imported",
+            "the same on the imported meshes, on which it was not trained",
+            lambda: self._compare(self.imported, MESH_EPISODES[self.device], folder),
+            products=_comparison_files(folder),
+            keep_min=PAGE_MIN,
+            command=f"vd-eval {self.run_dir / 'policy.pt'} --objects {' '.join(self.imported)}",
+        )
+        return _read_comparison(folder) if there else {}
+
+    def record(self, objects: tuple[str, ...], name: str, title: str) -> Path | None:
+        """Film the trained policy."""
+        video = self.folder / f"{name}.mp4"
+        flags = [str(self.run_dir / "policy.pt"), "--objects", *objects, "--seed", str(self.cfg.seed)]
+        command = f"vd-play {' '.join(flags)}"
+        self.commands.append(command)
+
+        def work() -> None:
+            record_training_task(self.run_dir, objects, video, seed=self.cfg.seed, device=self.device)
+
+        there = self.stages.run_if_time(
+            name, title, work, products=[video], keep_min=PAGE_MIN, command=command
+        )
+        return video if there else None
+
+    def judge_as_paper(self) -> "EvalResult | None":
+        """Judge the trained policy by the paper's criteria, with goals from all of SO(3)."""
+        from vd.assets_usd.objects.model import load_set
+        from vd.evaluate import cli
+        from vd.evaluate.result import EvalResult
+        from vd.train.presets import PRESETS
+
+        out, objects = self.folder / "evaluation", self._everything()
+        each = math.ceil(PAPER_EPISODES[self.device] / len(load_set(list(objects))))
+        flags = [str(self.run_dir / "policy.pt"), "--objects", *objects, "--episodes", str(each)]
+        flags += ["--seed", str(self.cfg.seed), "--device", self.device, "--output", str(out)]
+        flags += ["--episode-s", f"{PRESETS[self.preset]().env.episode_s:g}", "--no-at-rest"]
+        command = f"vd-eval {' '.join(flags)}"
+        self.commands.append(command)
+
+        def work() -> None:
+            if cli.main(flags) != 0:
+                raise DemoError("vd-eval failed; the reason is above")
+
+        title = "evaluate it by the paper's criteria, goals from all of SO(3)"
+        there = self.stages.run_if_time(
+            "paper", title, work, products=[out / "eval.json"], keep_min=PAGE_MIN, command=command
+        )
+        return EvalResult.read(out / "eval.json") if there else None
+
+    def _everything(self) -> tuple[str, ...]:
+        """All object sets of the demo, each once."""
+        return tuple(dict.fromkeys((*self.cfg.objects, *SHOWN, *self.imported)))
+
+    def _compare(self, objects: tuple[str, ...], episodes: int, folder: Path) -> None:
+        """Run the three agents and keep what they did in ``folder``."""
+        goals = {}
+        for agent, result, count in compare_agents(
+            self.run_dir, objects, episodes, seed=self.cfg.seed, device=self.device
+        ):
+            result.write(folder / f"{agent}.json")
+            goals[agent] = to_dict(count)
+            first = 100.0 * result.overall.stop_rate.value
+            print(
+                f"  {agent}: first goal reached in {first:.0f} % of episodes, "
+                f"{count.per_episode:.2f} goals an episode"
+            )
+        write_json(folder / "goals.json", goals)
+
+    def _episodes(self) -> int:
+        """Episodes of each agent: what fits into the time at the speed the simulator had in training."""
+        from vd.paper import PAPER
+        from vd.train.metrics import PROGRESS_FILE, read_progress
+
+        rows = read_progress(self.run_dir / PROGRESS_FILE)
+        steps = rows[-1]["env_steps"] - (rows[-2]["env_steps"] if len(rows) > 1 else 0)
+        speed = steps / rows[-1]["collect_s"]
+        seconds = min(SECONDS_PER_AGENT, self.stages.budget.left_s(keep_min=PAGE_MIN) / len(AGENTS))
+        low, high = EPISODES_RANGE[self.device]
+        return round(min(max(speed * seconds / (PAPER.scene.episode_s * PAPER.scene.control_hz), low), high))
 
 
 def run_demo(cfg: DemoCfg, *, started: float | None = None) -> Path:
@@ -167,25 +370,34 @@ def run_demo(cfg: DemoCfg, *, started: float | None = None) -> Path:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would hide the rest
-    started = time.monotonic() if started is None else started
     cfg.validate()
+    budget = Budget(cfg.minutes) if started is None else Budget(cfg.minutes, started=started)
     gpu = wp.is_cuda_available()
     preset = cfg.preset if cfg.preset != "auto" else ("cube" if gpu else "cpu-demo")
     device = "cuda" if gpu and preset != "cpu-demo" else "cpu"
     folder = cfg.out / _label(cfg, preset)
-    stages = _Stages(folder / "stages.json")
+    total = STAGES if cfg.meshes is None else STAGES + 1 + MESH_STAGES
+    stages = Stages(folder / "stages.json", total, budget)
     stages.load()
     machine = wp.get_device("cuda:0").name if device == "cuda" else f"{os.cpu_count()} CPU cores"
     print(f"preset {preset} on {machine}, files in {folder}")
 
-    commands: list[str] = []
-    hand, models = _author(cfg, preset, stages, commands)
-    objects, sheet = _import(cfg, folder, models, stages, commands)
-    run_dir = folder / "teacher"
-    _train(cfg, preset, objects, run_dir, started, stages, commands)
-    agents, paper = _evaluate(cfg, preset, objects, run_dir, folder, device, stages, commands)
-    video = folder / "trained.mp4"
-    _record(cfg, objects, run_dir, video, device, stages, commands)
+    demo = _Demo(cfg, preset, device, folder, stages)
+    hand = demo.author()
+    if cfg.meshes is None:
+        print("  no meshes to import (make demo MESHES=folder)")
+    else:
+        demo.import_meshes()
+        stages.total -= 0 if demo.imported else MESH_STAGES
+    sheet = demo.draw()
+    demo.train()
+    agents = demo.compare()
+    video = demo.record(cfg.objects, "video", "record the trained policy")
+    imported, imported_video = {}, None
+    if demo.imported:
+        imported = demo.compare_imported()
+        imported_video = demo.record(demo.imported, "imported-video", "record it with imported meshes")
+    paper = demo.judge_as_paper()
 
     page = cfg.out / "index.html"
     with stages.run("page", "write the page"):
@@ -196,14 +408,16 @@ def run_demo(cfg: DemoCfg, *, started: float | None = None) -> Path:
             preset=preset,
             machine=machine,
             hand=hand,
-            objects=objects,
-            run_dir=run_dir,
+            run_dir=demo.run_dir,
             sheet=sheet,
             agents=agents,
+            imported=imported,
             paper=paper,
             video=video,
+            imported_video=imported_video,
             seconds=dict(stages.seconds),
-            commands=commands,
+            left_out=stages.left_out,
+            commands=demo.commands,
         )
         write_page(results, page)
     return page
@@ -220,157 +434,39 @@ def _label(cfg: DemoCfg, preset: str) -> str:
     return f"{name}-{hashlib.sha256(chr(10).join(parts).encode()).hexdigest()[:6]}"
 
 
-def _author(cfg: DemoCfg, preset: str, stages: _Stages, commands: list[str]) -> tuple[str, list[Any]]:
-    from vd.assets_usd.hand_author import hand_usd
-    from vd.assets_usd.objects.model import load_set
-    from vd.train.presets import PRESETS
+def _import_for(meshes: list[Path], out: Path, seconds: float) -> "dict[str, ImportResult]":
+    """Import meshes in their order for a time; returns the results of those that were reached, by source."""
+    from vd.assets_usd.cache import assets_dir
+    from vd.assets_usd.objects.importer import ImportSettings, import_meshes
 
-    hand = PRESETS[preset]().env.hand
-    commands.append(f"vd-assets hand {hand}")
-    sets = dict.fromkeys((*cfg.objects, *SHOWN))
-    with stages.run("assets", f"author the hand {hand} and the objects {', '.join(sets)}"):
-        print(f"  {hand_usd(hand)}")
-        # Sets that are in the cache already are read from it.
-        models = load_set(list(sets))
-        print(f"  {len(models)} objects: {', '.join(model.name for model in models)}")
-    return hand, models
+    results: dict[str, ImportResult] = {}
+    with progress_bar("  importing", len(meshes), "mesh") as bar:
 
+        def keep(result: "ImportResult", _done: int, _total: int) -> None:
+            results[result.source] = result
+            bar.update()
+            if result.status == "refused":
+                bar.write(f"  refused {result.source}: {result.reason}", file=sys.stderr)
 
-def _import(
-    cfg: DemoCfg, folder: Path, models: list[Any], stages: _Stages, commands: list[str]
-) -> tuple[tuple[str, ...], Path]:
-    from vd.assets_usd.cli import Import, run_import
-    from vd.assets_usd.objects.model import load_set, object_files
-    from vd.assets_usd.objects.sheet import SheetStyle, contact_sheet
-
-    sheet, objects = folder / "objects.png", cfg.objects
-    title = "no meshes to import (make demo MESHES=folder)" if cfg.meshes is None else f"import {cfg.meshes}"
-    with stages.run("import", title, products=[sheet]) as needed:
-        if cfg.meshes is not None:
-            imported = folder / cfg.meshes.resolve().name
-            commands.append(f"vd-assets import {cfg.meshes} --out {imported}")
-            status = run_import(Import(paths=(cfg.meshes,), out=imported)) if needed else 0
-            if status == EXIT_INTERRUPTED:
-                raise KeyboardInterrupt
-            if not imported.is_dir() or not object_files(imported):
-                raise DemoError(
-                    f"none of the meshes in {cfg.meshes} could be imported; the reasons are above"
-                )
-            objects = (*objects, str(imported))
-            models = models + (load_set([str(imported)]) if needed else [])
-        if needed:
-            contact_sheet(models, sheet, style=SheetStyle(tile=150), title="Objects of the demo")
-    shown = " ".join(dict.fromkeys((*objects, *SHOWN)))
-    commands.append(f"vd-assets show {shown} --out {sheet}")
-    return objects, sheet
+        # Equal to those of vd-assets import, which then goes on from here.
+        settings = ImportSettings(cache=str(assets_dir() / "decompositions"))
+        try:
+            with time_limit(seconds):
+                import_meshes(meshes, out, settings, progress=keep)
+        except TimeUp:
+            pass
+    return results
 
 
-def _train(
-    cfg: DemoCfg,
-    preset: str,
-    objects: tuple[str, ...],
-    run_dir: Path,
-    started: float,
-    stages: _Stages,
-    commands: list[str],
-) -> None:
-    from vd.train import cli
-    from vd.train.checkpoint import list_checkpoints
-
-    left = cfg.minutes - (time.monotonic() - started) / 60.0 - RESERVE_MIN
-    minutes = max(left, LEAST_TRAINING_MIN)
-    flags = ["--preset", preset, "--run-dir", str(run_dir), "--seed", str(cfg.seed)]
-    flags += ["--objects", *objects]
-    flags += ["--num-worlds", str(cfg.num_worlds)] if cfg.num_worlds else []
-    flags += ["--max-steps", str(cfg.max_steps)] if cfg.max_steps else []
-    commands.append(f"vd-train teacher {' '.join(flags)}")
-    title = f"train a teacher for at most {minutes:.1f} min (Ctrl-C saves, the next call goes on)"
-    with stages.run("train", title, products=[run_dir / "policy.pt"]) as needed:
-        if not needed:
-            return
-        resume = ["--resume"] if list_checkpoints(run_dir) else []
-        status = cli.main(["teacher", *flags, "--max-minutes", f"{minutes:.2f}", *resume])
-        if status == EXIT_INTERRUPTED:
-            raise KeyboardInterrupt
-        if status != 0 or not (run_dir / "policy.pt").is_file():
-            raise DemoError(f"the training in {run_dir} failed; the reason is above")
+def _comparison_files(folder: Path) -> list[Path]:
+    return [folder / f"{name}.json" for name in (*AGENTS, "goals")]
 
 
-def _evaluate(
-    cfg: DemoCfg,
-    preset: str,
-    objects: tuple[str, ...],
-    run_dir: Path,
-    folder: Path,
-    device: str,
-    stages: _Stages,
-    commands: list[str],
-) -> "tuple[dict[str, tuple[EvalResult, GoalCount]], EvalResult]":
-    from vd.assets_usd.objects.model import load_set
-    from vd.evaluate import cli
+def _read_comparison(folder: Path) -> "dict[str, tuple[EvalResult, GoalCount]]":
     from vd.evaluate.result import EvalResult
-    from vd.train.presets import PRESETS
 
-    files = {name: folder / f"{name}.json" for name in (*AGENTS, "goals")}
-    official = folder / "evaluation"
-    judged = tuple(dict.fromkeys((*objects, *SHOWN)))
-    each = math.ceil(PAPER_EPISODES[device] / len(load_set(list(judged))))
-    flags = [str(run_dir / "policy.pt"), "--objects", *judged, "--episodes", str(each)]
-    flags += ["--seed", str(cfg.seed), "--device", device, "--output", str(official)]
-    flags += ["--episode-s", f"{PRESETS[preset]().env.episode_s:g}", "--no-at-rest"]
-    commands.append(f"vd-eval {' '.join(flags)}")
-    products = [*files.values(), official / "eval.json"]
-    with stages.run("evaluate", "evaluate it beside a random and a zero agent", products=products) as needed:
-        if needed:
-            episodes = _episodes(run_dir, device)
-            goals = {}
-            for agent, result, count in compare_agents(
-                run_dir, objects, episodes, seed=cfg.seed, device=device
-            ):
-                result.write(files[agent])
-                goals[agent] = to_dict(count)
-                print(
-                    f"  {agent}: first goal reached in {100.0 * result.overall.stop_rate.value:.0f} % of "
-                    f"episodes, "
-                    f"{count.per_episode:.2f} goals an episode"
-                )
-            write_json(files["goals"], goals)
-            print("  the trained policy under the paper's criteria, goals from all of SO(3):")
-            if cli.main(flags) != 0:
-                raise DemoError("vd-eval failed; the reason is above")
-    counts = json.loads(files["goals"].read_text())
-    agents = {agent: (EvalResult.read(files[agent]), GoalCount(**counts[agent])) for agent in AGENTS}
-    return agents, EvalResult.read(products[-1])
-
-
-def _episodes(run_dir: Path, device: str) -> int:
-    """Episodes of each agent: what fits into the time at the speed the simulator had in training."""
-    from vd.paper import PAPER
-    from vd.train.metrics import PROGRESS_FILE, read_progress
-
-    rows = read_progress(run_dir / PROGRESS_FILE)
-    steps = rows[-1]["env_steps"] - (rows[-2]["env_steps"] if len(rows) > 1 else 0)
-    speed = steps / rows[-1]["collect_s"]
-    low, high = EPISODES_RANGE[device]
-    return round(
-        min(max(speed * SECONDS_PER_AGENT / (PAPER.scene.episode_s * PAPER.scene.control_hz), low), high)
-    )
-
-
-def _record(
-    cfg: DemoCfg,
-    objects: tuple[str, ...],
-    run_dir: Path,
-    video: Path,
-    device: str,
-    stages: _Stages,
-    commands: list[str],
-) -> None:
-    flags = [str(run_dir / "policy.pt"), "--objects", *objects, "--seed", str(cfg.seed)]
-    commands.append(f"vd-play {' '.join(flags)}")
-    with stages.run("video", "record the trained policy", products=[video]) as needed:
-        if needed:
-            record_training_task(run_dir, objects, video, seed=cfg.seed, device=device)
+    counts = json.loads((folder / "goals.json").read_text())
+    return {a: (EvalResult.read(folder / f"{a}.json"), GoalCount(**counts[a])) for a in AGENTS}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

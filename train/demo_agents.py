@@ -114,7 +114,7 @@ def first_goals(env: Any, policy: Any, *, title: str = "") -> "tuple[Episode, ..
     starts, goals = env.object_pose()[:, 3:7], env.goal_quat.numpy().copy()
     errors = symmetric_error(starts, goals, np.array([IDENTITY]))
     episodes: dict[int, Episode] = {}
-    with _bar(title, env.max_episode_steps, "step") as bar:
+    with progress_bar(title, env.max_episode_steps, "step") as bar:
         for step in range(1, env.max_episode_steps + 1):
             act(env, policy)
             done, angle = env.done.numpy() != 0, env.rotation_error.numpy()
@@ -142,7 +142,7 @@ def _quat(values: Iterable[float]) -> tuple[float, float, float, float]:
     return x, y, z, w
 
 
-def _bar(title: str, total: int, unit: str) -> Any:
+def progress_bar(title: str, total: int, unit: str) -> Any:
     """A progress bar; outside a terminal a line now and then."""
     from tqdm import tqdm
 
@@ -212,7 +212,7 @@ def record_training_task(
     )
     rate = env.cfg.sim.control_hz
     steps = round(VIDEO_SECONDS * rate)
-    with _bar("  video", steps, "frame") as bar:
+    with progress_bar("  video", steps, "frame") as bar:
         write_frames(video, _counted(record(env, trained, renderer, shown, steps), bar), rate)
     env.check()
     env.close()

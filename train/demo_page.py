@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from vd.train.demo import DemoResults
+    from vd.train.demo_agents import GoalCount
 
 COLORS = {"trained": "#0072B2", "random": "#D55E00", "zero": "#8a8f98"}
 """Of Okabe and Ito, which colour-blind readers can tell apart."""
@@ -29,9 +30,13 @@ NOT_THE_TASK = ("num_worlds", "seed", "objects", "hand", "visuals", "success_end
 STAGE_NAMES = {
     "assets": "author hand and objects",
     "import": "import meshes",
+    "sheet": "draw the objects",
     "train": "train",
-    "evaluate": "evaluate",
+    "compare": "compare with random and no actions",
     "video": "record",
+    "imported": "compare on imported meshes",
+    "imported-video": "record with imported meshes",
+    "paper": "evaluate by the paper's criteria",
 }
 
 
@@ -52,14 +57,23 @@ def write_page(results: "DemoResults", path: Path) -> None:
     page.table(["setting", "paper (default)", "this demo"], list(differences(task)))
     page.text("Settings that are not in the table are the paper's, as in vd/paper.py.", small=True)
     _learning(page, results, task, rows)
-    page.section("The objects")
-    page.figure(
-        results.sheet,
-        f"The objects of this demo; it was trained on {results.agents['trained'][0].protocol.objects}. "
-        "Left of each pair the mesh, right the convex parts that collide, with the relative error of "
-        "their volume.",
-    )
-    _paper_criteria(page, results)
+    if results.imported:
+        _imported(page, results)
+    if results.sheet is not None:
+        page.section("The objects")
+        page.figure(
+            results.sheet,
+            f"The objects of this demo; it was trained on {_trained_on(results)} only. Left of each pair "
+            "the mesh, right the convex parts that collide, with the relative error of their volume.",
+        )
+    if results.paper is not None:
+        _paper_criteria(page, results, results.paper)
+    if results.left_out:
+        page.section("Left out")
+        page.text("There was no time for these; the commands do them by hand:")
+        for what, command in results.left_out:
+            page.text(f"{what[0].upper()}{what[1:]}.")
+            page.code(command)
     page.section("What the numbers mean")
     for text in _MEANINGS:
         page.text(text)
@@ -153,11 +167,12 @@ def _outcome(page: Page, results: "DemoResults", task: ReorientCfg) -> None:
         )
     page.tiles(tiles)
     page.text(verdict(agents))
-    page.video(
-        results.video,
-        "The trained policy at control rate. Beside each scene stands the goal; below it the error over "
-        "time with the tolerance, and the terms of the reward.",
-    )
+    if results.video is not None:
+        page.video(
+            results.video,
+            "The trained policy at control rate. Beside each scene stands the goal; below it the error over "
+            "time with the tolerance, and the terms of the reward.",
+        )
     page.section("Trained, random, none")
     page.figure(
         comparison_figure(agents),
@@ -165,22 +180,45 @@ def _outcome(page: Page, results: "DemoResults", task: ReorientCfg) -> None:
         f"episode ended (at the goal, at a drop, or after {task.episode_s:g} s); a drop counts as pi. All "
         f"three had the same starts and first goals, {agents['trained'].overall.episodes} episodes each.",
     )
+    _agents_table(page, results.agents)
+
+
+def _agents_table(page: Page, agents: "Mapping[str, tuple[EvalResult, GoalCount]]") -> None:
     rows = [
         (
             NAMES[name],
             percent(result.overall.stop_rate),
-            f"{results.agents[name][1].per_episode:.2f}",
+            f"{count.per_episode:.2f}",
             number(result.overall.time_to_success_s),
             number(result.overall.median_error_rad),
             percent(result.overall.drop_rate),
         )
-        for name, result in agents.items()
+        for name, (result, count) in agents.items()
     ]
     header = ["agent", "first goal", "goals an episode", "time [s]", "error [rad]", "dropped"]
     page.table(header, rows)
     page.text(
         "Time to the first goal and error at its end are medians; brackets are 95 % intervals.", small=True
     )
+
+
+def _imported(page: Page, results: "DemoResults") -> None:
+    """What the policy does with meshes that it has never seen."""
+    trained = results.imported["trained"][0]
+    page.section("Imported meshes, on which it was not trained")
+    page.text(
+        f"The same task with {len(trained.object_names)} imported meshes in place of what it was trained on "
+        f"({_trained_on(results)}): {trained.overall.episodes} episodes, the same for each agent. The "
+        "policy has never seen these shapes, and gets no description of a shape; the table says how much of "
+        "what it learned carries over."
+    )
+    _agents_table(page, results.imported)
+    if results.imported_video is not None:
+        page.video(results.imported_video, "The trained policy with some of the imported meshes.")
+
+
+def _trained_on(results: "DemoResults") -> str:
+    return results.agents["trained"][0].protocol.objects
 
 
 def verdict(agents: "Mapping[str, EvalResult]") -> str:
@@ -282,8 +320,8 @@ def learning_figure(rows: list[dict[str, Any]], per_episode: Mapping[str, float]
     return figure
 
 
-def _paper_criteria(page: Page, results: "DemoResults") -> None:
-    overall = results.paper.overall
+def _paper_criteria(page: Page, results: "DemoResults", paper: EvalResult) -> None:
+    overall = paper.overall
     page.section("The same policy, judged as in the paper")
     page.text(
         "Objects fall into the hand, goals are from all of SO(3), and a goal counts only when fingers and "
@@ -301,9 +339,10 @@ def _paper_criteria(page: Page, results: "DemoResults") -> None:
     rows.append(("stopped by itself: oriented and still", percent(overall.stop_rate), ""))
     rows.append(("dropped", percent(overall.drop_rate), ""))
     page.table([f"{overall.episodes} episodes", "this policy", "a random orientation"], rows)
-    names = ", ".join(results.paper.object_names)
+    names = ", ".join(paper.object_names)
     page.text(
-        f"Objects: {names}. Every figure of this evaluation: evaluation/eval.html in the demo's folder.",
+        f"Objects: {names}; it was trained on {_trained_on(results)} only. Every figure of this evaluation: "
+        "evaluation/eval.html in the demo's folder.",
         small=True,
     )
 
