@@ -99,3 +99,330 @@ class Recording:
     def subset(self, indices: Sequence[int]) -> "Recording":
         """The same recording with only these trajectories, in this order."""
         return replace(self, trajectories=tuple(self.trajectories[i] for i in indices))
+
+
+def read_recording(path: str | Path) -> Recording:
+    """Read and check a recording.
+
+    Args:
+        path: The folder, or its ``recording.json``.
+
+    Raises:
+        RecordingError: It cannot be used; names file, row (1 is the header), column, why, and the remedy.
+    """
+    path = Path(path)
+    file = path if path.suffix == ".json" else path / "recording.json"
+    header = _read_header(file)
+    joints = _names(file, "joints", header.get("joints"))
+    _check_model(file, header.get("model"), joints)
+    resolution: Any = header.get("encoder_resolution_rad")
+    if not _is_number(resolution) or resolution <= 0.0:
+        raise RecordingError(
+            f"{file}: 'encoder_resolution_rad' is {resolution!r}; give the size of one encoder count in rad, "
+            "e.g. 0.001534 for 4096 counts a turn"
+        )
+    servo = header.get("servo", {})
+    if not isinstance(servo, dict):
+        raise RecordingError(f"{file}: 'servo' is {servo!r}; make it an object such as {{\"model\": ..}}")
+    entries = header.get("trajectories")
+    if not isinstance(entries, list) or not entries:
+        raise RecordingError(
+            f"{file}: 'trajectories' is empty; list at least one {{file, excitation, joints}}"
+        )
+    trajectories = tuple(_read_trajectory(file, i, entry, joints) for i, entry in enumerate(entries))
+    recording = Recording(file.parent, header["model"], joints, servo, float(resolution), trajectories)
+    _check_motion(recording)
+    _check_units(recording)
+    return recording
+
+
+def write_recording(recording: Recording, folder: str | Path) -> Path:
+    """Write a recording into a folder: each file atomically, ``recording.json`` last.
+
+    Returns:
+        The folder.
+    """
+    folder = Path(folder)
+    entries = []
+    for trajectory in recording.trajectories:
+        _write_csv(folder / trajectory.file, trajectory, recording.joints)
+        entries.append(
+            {
+                "file": trajectory.file,
+                "excitation": trajectory.excitation,
+                "joints": list(trajectory.joints),
+                "duration_s": round(float(trajectory.time[-1]), CSV_DIGITS),
+                "conditions": trajectory.conditions,
+            }
+        )
+    header = {
+        "format": FORMAT,
+        "model": recording.model,
+        "joints": list(recording.joints),
+        "servo": recording.servo,
+        "encoder_resolution_rad": recording.encoder_resolution_rad,
+        "trajectories": entries,
+    }
+    write_json(folder / "recording.json", header)
+    return folder
+
+
+def _read_header(file: Path) -> dict[str, Any]:
+    if not file.is_file():
+        raise RecordingError(f"{file}: no such file; give a folder with recording.json and its CSV files")
+    try:
+        header = json.loads(file.read_text())
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{file}: not JSON ({error}); correct it at that place") from error
+    if not isinstance(header, dict):
+        raise RecordingError(f'{file}: the top level is no object; start it with {{"format": "{FORMAT}"}}')
+    if header.get("format") != FORMAT:
+        raise RecordingError(
+            f"{file}: 'format' is {header.get('format')!r}; only {FORMAT!r} is read: convert it"
+        )
+    return header
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _names(file: Path, key: str, value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list) or not value or not all(isinstance(v, str) and v for v in value):
+        raise RecordingError(f"{file}: {key!r} is {value!r}; make it a list of joint names")
+    if len(set(value)) != len(value):
+        raise RecordingError(f"{file}: {key!r} names a joint twice: {', '.join(value)}; name each once")
+    return tuple(value)
+
+
+def _check_model(file: Path, model: Any, joints: tuple[str, ...]) -> None:
+    """The model is known, and has the joints."""
+    if not isinstance(model, str) or not model:
+        raise RecordingError(f"{file}: 'model' is {model!r}; name a hand, a USD file, 'servo' or 'pendulum'")
+    if model in BARE_MODELS:
+        return
+    from vd.assets_usd.hand_spec import HANDS
+
+    if model in HANDS:
+        hand = HANDS[model]
+        known = [f"f{f}_{joint.name}" for f in range(len(hand.finger_frames)) for joint in hand.joints]
+    elif model.endswith(USD_SUFFIXES):
+        usd = file.parent / model
+        if not usd.is_file():
+            raise RecordingError(
+                f"{file}: 'model' is {model!r}, but there is no {usd}; put the USD file there"
+            )
+        from vd.assets_usd.hand_model import HandError, read_hand
+
+        try:
+            known = list(read_hand(usd).joint_names)
+        except HandError as error:
+            raise RecordingError(f"{file}: 'model': {error}") from error
+    else:
+        choices = ", ".join((*HANDS, *BARE_MODELS))
+        raise RecordingError(
+            f"{file}: unknown model {model!r}; choose one of {choices}, or name a USD file beside it"
+        )
+    for joint in joints:
+        if joint not in known:
+            raise RecordingError(
+                f"{file}: unknown joint {joint!r} in 'joints': {model} has {', '.join(known)}; rename it"
+            )
+
+
+def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...]) -> Trajectory:
+    where = f"{file}: trajectories[{number}]"
+    if not isinstance(entry, dict) or not isinstance(entry.get("file"), str):
+        raise RecordingError(f"{where}: no 'file'; name the CSV file of the trajectory")
+    name = entry["file"]
+    if Path(name).is_absolute() or ".." in Path(name).parts:
+        raise RecordingError(f"{where}: 'file' is {name!r}; keep it in the recording's folder")
+    excited = _names(file, f"trajectories[{number}].joints", entry.get("joints"))
+    for joint in excited:
+        if joint not in joints:
+            raise RecordingError(
+                f"{where}: unknown joint {joint!r}: 'joints' has {', '.join(joints)}; add or rename it"
+            )
+    conditions = entry.get("conditions", {})
+    if not isinstance(conditions, dict) or not all(
+        isinstance(value, str) or _is_number(value) for value in conditions.values()
+    ):
+        raise RecordingError(f"{where}: 'conditions' is {conditions!r}; map names to numbers or words")
+    table = file.parent / name
+    columns = _read_csv(table, joints)
+    time = columns.pop("t")
+    channels: dict[str, Any] = {}
+    for channel in CHANNELS:
+        found = [columns.get(f"{channel}.{joint}") for joint in joints]
+        if any(values is not None for values in found):
+            blank = np.full(len(time), np.nan)
+            channels[channel] = np.stack([blank if v is None else v for v in found], axis=1)
+    enabled = channels.pop("enabled", np.ones((len(time), len(joints))))
+    return Trajectory(
+        file=name,
+        excitation=str(entry.get("excitation", Path(name).stem)),
+        joints=excited,
+        conditions=conditions,
+        time=time - time[0],
+        enabled=np.nan_to_num(enabled, nan=1.0) > 0.5,
+        **channels,
+    )
+
+
+def _read_csv(file: Path, joints: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """The columns ``t`` and ``channel.joint`` of a trajectory, checked."""
+    if not file.is_file():
+        raise RecordingError(f"{file}: no such file; put it there or drop it from 'trajectories'")
+    try:
+        with file.open(newline="") as stream:
+            rows = list(csv.reader(stream))
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{file}: not a text file ({error}); export it as CSV in UTF-8") from error
+    if not rows:
+        raise RecordingError(f"{file}: empty; record it again or drop it from 'trajectories'")
+    names = [name.strip() for name in rows[0]]
+    kept = _check_columns(file, names, joints)
+    body = rows[1:]
+    while body and not any(cell.strip() for cell in body[-1]):
+        body.pop()
+    if len(body) < MIN_SAMPLES:
+        raise RecordingError(
+            f"{file}: {len(body)} samples; at least {MIN_SAMPLES} are needed, better some seconds at 100 Hz: "
+            "record it again or drop it from 'trajectories'"
+        )
+    for i, row in enumerate(body):
+        if len(row) != len(names):
+            raise RecordingError(
+                f"{file}: row {i + 2} has {len(row)} cells, the header {len(names)}; correct the row"
+            )
+    columns = {name: _numbers(file, name, [row[index] for row in body]) for name, index in kept.items()}
+    _check_values(file, columns)
+    return columns
+
+
+def _check_columns(file: Path, names: list[str], joints: tuple[str, ...]) -> dict[str, int]:
+    """Index of every column that is used; the required ones are there, and no joint is misspelt."""
+    for name in names:
+        if name and names.count(name) > 1:
+            raise RecordingError(f"{file}: row 1 has column {name!r} twice; keep one")
+        channel, dot, joint = name.partition(".")
+        if dot and channel in CHANNELS and joint not in joints:
+            raise RecordingError(
+                f"{file}: row 1, column {name!r}: unknown joint {joint!r}; recording.json has "
+                f"{', '.join(joints)}: rename the column or add the joint"
+            )
+    required = ["t", *(f"{channel}.{joint}" for joint in joints for channel in ("command", "position"))]
+    for name in required:
+        if name not in names:
+            raise RecordingError(f"{file}: row 1 has no column {name!r}; add it")
+    wanted = {"t", *(f"{channel}.{joint}" for channel in CHANNELS for joint in joints)}
+    return {name: index for index, name in enumerate(names) if name in wanted}
+
+
+def _numbers(file: Path, name: str, cells: list[str]) -> np.ndarray:
+    values = np.empty(len(cells))
+    for i, cell in enumerate(cells):
+        try:
+            values[i] = float(cell)
+        except ValueError:
+            values[i] = np.nan
+        if not math.isfinite(values[i]):
+            raise RecordingError(
+                f"{file}: row {i + 2}, column {name!r}: {cell.strip() or 'an empty cell'} is not a finite "
+                "number; drop the row, or the column if it is optional"
+            )
+    return values
+
+
+def _check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Time runs forward, and every value can be what its column says."""
+    time = columns["t"]
+    bad = np.flatnonzero(np.diff(time) <= 0.0)
+    if len(bad):
+        i = int(bad[0]) + 1
+        how = "repeats" if time[i] == time[i - 1] else "runs backward"
+        raise RecordingError(
+            f"{file}: row {i + 2}, column 't': time {how} ({time[i - 1]:g} s, then {time[i]:g} s); "
+            "sort the rows and keep one per stamp"
+        )
+    for name, values in columns.items():
+        channel = name.partition(".")[0]
+        if channel in ("command", "position"):
+            i, limit = int(np.argmax(np.abs(values))), PLAUSIBLE_RAD
+            why = "more than a turn, so these look like degrees or counts; write radians"
+        elif channel == "pwm":
+            i, limit = int(np.argmax(np.abs(values))), 1.0
+            why = "a duty cycle lies in [-1, 1]; divide by the full scale"
+        elif channel == "enabled":
+            i, limit = int(np.argmax(np.abs(values - 0.5))), 1.0
+            why = "it must be 0 or 1; correct it"
+            if values[i] in (0.0, 1.0):
+                continue
+            limit = 0.0
+        else:
+            continue
+        if abs(values[i]) > limit:
+            raise RecordingError(f"{file}: row {i + 2}, column {name!r}: {values[i]:g}: {why}")
+
+
+def _check_motion(recording: Recording) -> None:
+    """Some command moves, and where a command moves the encoder answers."""
+    needed = MOVING_COUNTS * recording.encoder_resolution_rad
+    moved = False
+    for trajectory in recording.trajectories:
+        travel = np.ptp(trajectory.command, axis=0)
+        moved |= bool((travel > 0.0).any())
+        for j, joint in enumerate(recording.joints):
+            if (
+                travel[j] > needed
+                and np.ptp(trajectory.position[:, j]) == 0.0
+                and trajectory.enabled[:, j].all()
+            ):
+                raise RecordingError(
+                    f"{recording.path / trajectory.file}: column 'position.{joint}' is "
+                    f"{trajectory.position[0, j]:g} in every row while 'command.{joint}' moves by "
+                    f"{travel[j]:.3g} rad: a dead encoder, or a servo that is off; record it again"
+                )
+    if not moved:
+        raise RecordingError(
+            f"{recording.path / 'recording.json'}: no 'command.' column moves in any trajectory, so nothing "
+            "can be identified; record steps and sines"
+        )
+
+
+def _check_units(recording: Recording) -> None:
+    """Small motions in degrees show in the size of an encoder count."""
+    for j, joint in enumerate(recording.joints):
+        levels = np.unique(np.concatenate([t.position[:, j] for t in recording.trajectories]))
+        if len(levels) < MIN_DISTINCT:
+            continue
+        steps = np.diff(levels)
+        step = float(steps[steps > 1e-9].min())
+        if step > DEGREES_RATIO * recording.encoder_resolution_rad:
+            raise RecordingError(
+                f"{recording.path}: column 'position.{joint}' moves in steps of {step:.3g}, but "
+                f"'encoder_resolution_rad' is {recording.encoder_resolution_rad:g}: these look like degrees "
+                "or counts; write radians"
+            )
+
+
+def _write_csv(file: Path, trajectory: Trajectory, joints: tuple[str, ...]) -> None:
+    """The CSV of one trajectory; telemetry that is NaN throughout is left out."""
+    columns = {"t": trajectory.time}
+    for channel in CHANNELS:
+        values = getattr(trajectory, channel)
+        if values is None or (channel == "enabled" and values.all()):
+            continue
+        for j, joint in enumerate(joints):
+            if not np.isnan(np.asarray(values[:, j], dtype=float)).all():
+                columns[f"{channel}.{joint}"] = values[:, j]
+    formats = ["%d" if name.startswith("enabled") else f"%.{CSV_DIGITS}f" for name in columns]
+    with atomic_path(file) as temporary:
+        np.savetxt(
+            temporary,
+            np.stack([np.asarray(values, dtype=float) for values in columns.values()], axis=1),
+            fmt=formats,
+            delimiter=",",
+            header=",".join(columns),
+            comments="",
+        )

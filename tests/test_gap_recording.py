@@ -1,0 +1,198 @@
+"""Recordings: what is written is read, and what cannot be used is refused with file, place and remedy."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vd.gap.recording import Recording, RecordingError, Trajectory, read_recording, write_recording
+
+SAMPLES = 200
+COUNT = 2.0 * np.pi / 4096
+
+
+def example(joints=("f0_j1", "f0_j2"), model="dclaw3", **channels) -> Recording:
+    time = np.arange(SAMPLES) / 100.0
+    command = np.stack([0.3 * np.sin((j + 2) * time) for j in range(len(joints))], axis=1)
+    position = np.round(0.95 * command / COUNT) * COUNT
+    on = np.ones((SAMPLES, len(joints)), dtype=bool)
+    trajectory = Trajectory(
+        "a.csv",
+        "sine",
+        joints,
+        {"p_gain": 400.0, "grease": "new"},
+        time,
+        command,
+        position,
+        channels.pop("enabled", on),
+        **channels,
+    )
+    return Recording(Path(), model, joints, {"model": "X"}, COUNT, (trajectory,))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return write_recording(example(), tmp_path / "recording")
+
+
+def edit_header(folder, **changes):
+    header = json.loads((folder / "recording.json").read_text())
+    for key, value in changes.items():
+        if value is None:
+            header.pop(key)
+        else:
+            header[key] = value
+    (folder / "recording.json").write_text(json.dumps(header))
+
+
+def edit_table(folder, change):
+    lines = (folder / "a.csv").read_text().splitlines()
+    rows = [line.split(",") for line in lines]
+    rows = change(rows) or rows
+    (folder / "a.csv").write_text("\n".join(",".join(row) for row in rows) + "\n")
+
+
+def set_cells(column, value, rows=range(1, SAMPLES + 1)):
+    def change(table):
+        index = table[0].index(column)
+        for row in rows:
+            cell = table[row][index]
+            table[row][index] = value(float(cell)) if callable(value) else value
+
+    return change
+
+
+def refused(folder, *words):
+    with pytest.raises(RecordingError) as error:
+        read_recording(folder)
+    for word in words:
+        assert word in str(error.value)
+    return str(error.value)
+
+
+def test_what_is_written_is_read(tmp_path):
+    enabled = np.ones((SAMPLES, 2), dtype=bool)
+    enabled[120:, 0] = False
+    voltage = np.full((SAMPLES, 2), 7.4)
+    voltage[:, 1] = np.nan  # measured on one joint only
+    written = example(enabled=enabled, voltage=voltage)
+    read = read_recording(write_recording(written, tmp_path / "r"))
+    (a,), (b,) = written.trajectories, read.trajectories
+    assert (read.joints, read.model, read.servo) == (written.joints, written.model, written.servo)
+    assert (b.joints, b.conditions, b.excitation) == (a.joints, a.conditions, a.excitation)
+    for name in ("time", "command", "position", "voltage"):
+        np.testing.assert_allclose(getattr(b, name), getattr(a, name), atol=1e-6)
+    np.testing.assert_array_equal(b.enabled, enabled)
+    assert b.current is None and b.time.dtype == np.float64
+    again = read_recording(tmp_path / "r" / "recording.json")
+    assert again.subset([0, 0]).trajectories == again.trajectories * 2
+
+
+def test_time_starts_at_zero_and_need_not_be_regular(folder):
+    edit_table(folder, set_cells("t", lambda t: f"{5.0 + t + 1e-3 * np.sin(50 * t):.6f}"))
+    time = read_recording(folder).trajectories[0].time
+    assert time[0] == 0.0 and np.ptp(np.diff(time)) > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"format": "vd-recording/9"}, ("format", "vd-recording/9", "vd-recording/1")),
+        ({"format": None}, ("format",)),
+        ({"model": "dclaw7"}, ("unknown model 'dclaw7'", "dclaw3", "servo")),
+        ({"model": "mine.usda"}, ("mine.usda",)),
+        ({"model": 3}, ("model",)),
+        ({"joints": ["f0_j1", "f9_j2"]}, ("unknown joint 'f9_j2'", "f2_j3")),
+        ({"joints": ["f0_j1", "f0_j1"]}, ("twice",)),
+        ({"joints": None}, ("joints",)),
+        ({"encoder_resolution_rad": None}, ("encoder_resolution_rad", "0.001534")),
+        ({"encoder_resolution_rad": -1.0}, ("encoder_resolution_rad",)),
+        ({"trajectories": []}, ("trajectories", "empty")),
+        ({"trajectories": [{"excitation": "x", "joints": ["f0_j1"]}]}, ("trajectories[0]", "file")),
+        ({"trajectories": [{"file": "b.csv", "joints": ["f0_j1"]}]}, ("b.csv", "no such file")),
+        ({"trajectories": [{"file": "../a.csv", "joints": ["f0_j1"]}]}, ("folder",)),
+        ({"trajectories": [{"file": "a.csv", "joints": ["f0_j3"]}]}, ("unknown joint 'f0_j3'",)),
+        ({"trajectories": [{"file": "a.csv", "joints": ["f0_j1"], "conditions": [1]}]}, ("conditions",)),
+    ],
+)
+def test_a_header_that_cannot_be_used_is_refused(folder, changes, words):
+    edit_header(folder, **changes)
+    refused(folder, "recording.json" if "b.csv" not in words else "b.csv", *words)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda t: [row[:-1] for row in t], ("row 1", "no column 'position.f0_j2'")),
+        (lambda t: [[*row, *row[-1:]] for row in t], ("'position.f0_j2' twice",)),
+        (lambda t: t[0].__setitem__(1, "command.f0_j9"), ("row 1", "unknown joint 'f0_j9'")),
+        (lambda t: t[0].__setitem__(0, "time"), ("no column 't'",)),
+        (lambda t: t[:4], ("3 samples", "at least")),
+        (lambda t: t[:1], ("0 samples",)),
+        (lambda t: [*t[:50], t[48], *t[50:]], ("row 51", "'t'", "runs backward")),
+        (lambda t: [*t[:50], t[49], *t[50:]], ("row 51", "'t'", "repeats")),
+        (set_cells("position.f0_j1", "nan", [7]), ("row 8", "'position.f0_j1'", "nan")),
+        (set_cells("command.f0_j2", "", [9]), ("row 10", "'command.f0_j2'", "empty")),
+        (set_cells("position.f0_j2", "lost", [11]), ("row 12", "lost")),
+        (lambda t: t[30].append("0"), ("row 31", "cells")),
+        (set_cells("position.f0_j2", lambda q: f"{np.degrees(q):.6f}"), ("position.f0_j2", "degrees")),
+        (set_cells("command.f0_j1", lambda q: f"{np.degrees(q):.6f}"), ("command.f0_j1", "degrees")),
+        (set_cells("position.f0_j1", "0.1"), ("position.f0_j1", "dead encoder")),
+    ],
+)
+def test_a_table_that_cannot_be_used_is_refused(folder, change, words):
+    edit_table(folder, change)
+    message = refused(folder, *words)
+    assert "a.csv" in message or "degrees" in message
+
+
+def test_commands_that_never_move_are_refused(folder):
+    edit_table(folder, set_cells("command.f0_j1", "0.2"))
+    read_recording(folder)  # one joint at rest is no fault
+    edit_table(folder, set_cells("command.f0_j2", "0.2"))
+    refused(folder, "no 'command.' column moves", "record")
+
+
+def test_a_joint_at_rest_and_a_servo_that_is_off_are_no_dead_encoders(tmp_path):
+    recording = example(enabled=np.zeros((SAMPLES, 2), dtype=bool))
+    recording.trajectories[0].position[:, 0] = 0.1
+    read_recording(write_recording(recording, tmp_path / "off"))
+
+
+def test_small_motions_in_degrees_show_in_the_encoder_counts(tmp_path):
+    small = example()
+    (trajectory,) = small.trajectories
+    for values in (trajectory.command, trajectory.position):
+        values[:] = np.degrees(np.round(values / 3.0 / COUNT) * COUNT)
+    refused(write_recording(small, tmp_path / "r"), "degrees", "encoder_resolution_rad", "position.f0_j1")
+
+
+def test_telemetry_out_of_range_is_refused(tmp_path):
+    pwm = np.full((SAMPLES, 2), 400.0)
+    refused(write_recording(example(pwm=pwm), tmp_path / "r"), "pwm.f0_j1", "full scale")
+
+
+def test_a_file_that_is_none_is_refused(tmp_path, folder):
+    refused(tmp_path / "nowhere", "nowhere", "no such file")
+    (folder / "recording.json").write_text("{")
+    refused(folder, "recording.json", "not JSON")
+    (folder / "recording.json").write_text("[1]")
+    refused(folder, "recording.json", "object")
+
+
+def test_an_empty_table_is_refused(folder):
+    (folder / "a.csv").write_text("")
+    refused(folder, "a.csv", "empty")
+
+
+@pytest.mark.parametrize(
+    ("name", "model", "joints", "trajectories"),
+    [("so101", "servo", 6, 20), ("xl330_pendulum", "pendulum", 1, 12)],
+)
+def test_real_recordings_are_read(shared_dir, name, model, joints, trajectories):
+    recording = read_recording(shared_dir / "measured" / name)
+    assert recording.model == model
+    assert (len(recording.joints), len(recording.trajectories)) == (joints, trajectories)
+    released = [t.excitation for t in recording.trajectories if not t.enabled.all()]
+    assert set(released) == ({"lift_and_drop"} if model == "pendulum" else set())
