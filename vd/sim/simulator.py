@@ -10,6 +10,7 @@ from newton.solvers import SolverMuJoCo
 from vd.kernels.actions import limit_joint_velocity_kernel
 from vd.kernels.contacts import pair_force_kernel
 from vd.kernels.guard import collect_overflow_kernel, guard_kernel
+from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
 
@@ -74,12 +75,17 @@ class Simulator:
     ``target`` [N, T] with T >= D, ``body_q`` [N, B], ``body_qd`` [N, B], ``body_force`` [N, B].
     """
 
-    def __init__(self, scene: Scene, cfg: SimCfg):
+    def __init__(
+        self, scene: Scene, cfg: SimCfg, *, servo_rows: np.ndarray | None = None, servo_seed: int = 0
+    ):
         """Build the solver of a scene.
 
         Args:
             scene: The worlds.
             cfg: Physics settings.
+            servo_rows: Parameters of every joint's servo, shape [D, P] or [N, D, P]
+                (:mod:`vd.kernels.actuators`); the solver's plain drives by default.
+            servo_seed: Seed of the random delays and losses of commands.
         """
         cfg.validate()
         self.scene, self.cfg = scene, cfg
@@ -95,6 +101,8 @@ class Simulator:
         self.joint_q = self.state.joint_q.reshape((n, -1))
         self.joint_qd = self.state.joint_qd.reshape((n, -1))
         self.target = self.control.joint_target_q.reshape((n, -1))
+        self.servo: JointServo | None = None
+        """The identified servos, or None: then ``target`` goes to the solver's drives as it is."""
         self.body_q = self.state.body_q.reshape((n, -1))
         self.body_qd = self.state.body_qd.reshape((n, -1))
         self.body_force = self.state.body_f.reshape((n, -1))
@@ -116,6 +124,17 @@ class Simulator:
         self._start_q, self._start_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
         self._dump_q, self._dump_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
         self._dump_target = wp.clone(self.target)
+        if servo_rows is not None:
+            self.target = wp.clone(self.target)  # the drives' references become the servos' output
+            self.servo = JointServo(
+                self.solver,
+                self.control,
+                self.joint_q,
+                servo_rows,
+                physics_dt=cfg.physics_dt,
+                control_dt=cfg.control_dt,
+                seed=servo_seed,
+            )
 
     def step(self) -> None:
         """Simulate one control step with the present ``target`` and ``body_force``.
@@ -125,7 +144,11 @@ class Simulator:
         wp.copy(self._start_q, self.joint_q)
         wp.copy(self._start_qd, self.joint_qd)
         wp.copy(self._next_body_force, self.body_force)
-        self._physics_steps(limits=True)
+        if self.servo is not None:
+            self.servo.send(self.target)
+        self._physics_steps(ours=True)
+        if self.servo is not None:
+            self.servo.measure()
         self._table_contact()
         wp.launch(
             guard_kernel,
@@ -135,30 +158,36 @@ class Simulator:
             device=self.device,
         )
 
-    def _physics_steps(self, *, limits: bool) -> None:
-        """The physics steps of one control step; states end where they began."""
+    def _physics_steps(self, *, ours: bool) -> None:
+        """The physics steps of one control step, with our additions; states end where they began."""
         here, there = (self.state, self.joint_q, self.joint_qd), (self._next, self._next_q, self._next_qd)
         for _ in range(self.cfg.substeps):
+            if ours and self.servo is not None:
+                self.servo.receive()
+                self.servo.drive(*here[1:])
             self.solver.step(
                 here[0], there[0], self.control, None, self.cfg.physics_dt, observables=self._observables
             )
-            if limits:
+            if ours:
                 self._limit_and_collect(here[1], *there[1:])
             here, there = there, here
 
     def physics_only(self) -> None:
         """The solver's share of a control step, nothing of ours (for benchmarks)."""
-        self._physics_steps(limits=False)
+        self._physics_steps(ours=False)
 
     def _limit_and_collect(self, previous_q: wp.array2d, q: wp.array2d, qd: wp.array2d) -> None:
         # The solver knows no joint velocity limits.
-        wp.launch(
-            limit_joint_velocity_kernel,
-            dim=(self.num_worlds, len(self.velocity_limit)),
-            inputs=[self.velocity_limit, self.cfg.physics_dt, previous_q],
-            outputs=[q, qd],
-            device=self.device,
-        )
+        if self.servo is not None:
+            self.servo.finish(previous_q, q, qd)
+        else:
+            wp.launch(
+                limit_joint_velocity_kernel,
+                dim=(self.num_worlds, len(self.velocity_limit)),
+                inputs=[self.velocity_limit, self.cfg.physics_dt, previous_q],
+                outputs=[q, qd],
+                device=self.device,
+            )
         wp.launch(
             collect_overflow_kernel,
             dim=self.num_worlds,
