@@ -30,10 +30,11 @@ font:16px/1.55 system-ui,-apple-system,"Segoe UI",sans-serif}
 main{max-width:62rem;margin:0 auto;padding:2rem 1.25rem 4rem}
 h1{font-size:1.9rem;line-height:1.2;margin:0 0 .25rem}h2{font-size:1.3rem;margin:2.5rem 0 .75rem}
 .lead,figcaption,.small{color:var(--soft)}p{margin:.6rem 0;max-width:46rem}
-.scroll{overflow-x:auto}
+ul{margin:.6rem 0;padding-left:1.3rem;max-width:46rem}li{margin:.25rem 0}
+.scroll{overflow-x:auto}details{margin:1rem 0}summary{cursor:pointer;font-weight:600}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;font-size:.92rem}
 th,td{padding:.4rem .7rem;border-bottom:1px solid var(--line);text-align:right;white-space:nowrap}
-th:first-child,td:first-child{text-align:left}
+th:first-child,td:first-child,.words{text-align:left}td.words{white-space:normal;min-width:12rem}
 thead th{color:var(--soft);font-weight:600;border-bottom:2px solid var(--line)}
 figure{margin:1.2rem 0}figure img,figure video{display:block;max-width:100%;height:auto;border-radius:.5rem}
 figure img{background:#fff}figcaption{font-size:.88rem;margin-top:.4rem;max-width:46rem}
@@ -81,15 +82,40 @@ class Page:
         )
         self._parts.append(f'<div class="tiles">{cells}</div>')
 
-    def table(self, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-        """Add a table. The first column is text, the others are numbers already formatted."""
-        head = "".join(f"<th>{escape(name)}</th>" for name in header)
+    def table(
+        self,
+        header: Sequence[str],
+        rows: Sequence[Sequence[object]],
+        *,
+        words: Sequence[int] = (),
+        folded: str = "",
+    ) -> None:
+        """Add a table. The first column is text, the others are numbers already formatted.
+
+        Args:
+            header: Names of the columns.
+            rows: Cells of each row.
+            words: Further columns that hold text, which is set from the left and wrapped.
+            folded: Heading under which the table is folded away; empty shows it.
+        """
+        kinds = [' class="words"' if column in words else "" for column in range(len(header))]
+        head = "".join(f"<th{kind}>{escape(name)}</th>" for kind, name in zip(kinds, header, strict=True))
         body = "".join(
-            "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows
+            "<tr>"
+            + "".join(f"<td{kind}>{escape(str(cell))}</td>" for kind, cell in zip(kinds, row, strict=True))
+            + "</tr>"
+            for row in rows
         )
-        self._parts.append(
+        table = (
             f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
         )
+        if folded:
+            table = f"<details><summary>{escape(folded)}</summary>{table}</details>"
+        self._parts.append(table)
+
+    def points(self, texts: Sequence[str]) -> None:
+        """Add a list with a bullet for each text."""
+        self._parts.append(f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>")
 
     def figure(self, image: "Figure | bytes | Path", caption: str) -> None:
         """Add a picture: a matplotlib figure, PNG bytes, or the path of a PNG or GIF file."""

@@ -20,6 +20,8 @@ from vd.files import atomic_path, write_json
 from vd.kernels.effects import BASELINE, EFFECTS
 
 FORMAT = "vd-gap-report/1"
+_OPTIONAL = ("hand", "hand_layer", "closing")
+"""Fields of a report in which None means none, not a number that is unknown."""
 
 Verdict = Literal["effects", "no_gap", "ambiguous", "under_excited", "unknown"]
 Decision = Literal["named", "tied", "rejected"]
@@ -251,20 +253,8 @@ class Report:
         Raises:
             ValueError: A field is unknown, of a wrong type, or contradicts another.
         """
-        values = dict(values)
-        values["effects"] = [
-            {
-                **effect,
-                "parameters": {n: from_dict(Estimate, _nan(p)) for n, p in effect["parameters"].items()},
-            }
-            for effect in values.get("effects", [])
-        ]
-        if "closing" in values and values["closing"] is not None:
-            closing = dict(values["closing"])
-            closing["per_joint"] = {n: tuple(pair) for n, pair in closing["per_joint"].items()}
-            values["closing"] = closing
-        optional = {name: values.pop(name) for name in ("hand", "hand_layer", "closing") if name in values}
-        return from_dict(Report, {**_nan(values), **optional}).validate()
+        absent = {name: None for name in _OPTIONAL if values.get(name) is None}
+        return from_dict(Report, {**_nan(values), **absent}).validate()
 
     def write(self, path: Path) -> None:
         """Write it as JSON, atomically, after :meth:`validate`."""

@@ -1,0 +1,143 @@
+"""What ``vd-gap`` found in plain sentences, for the terminal and the page."""
+
+import math
+from collections.abc import Sequence
+
+from vd.gap.result import Candidate, Estimate, Interval, NamedEffect, Report
+
+MAX_NAMED_JOINTS = 4
+"""More joints than this are counted rather than listed."""
+MILLI = 1e3
+"""Errors are shown in mrad."""
+
+
+def plain(name: str) -> str:
+    """``command_delay`` as people say it: ``command delay``."""
+    return name.replace("_", " ")
+
+
+def listing(names: Sequence[str], last: str = "and") -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} {last} {names[-1]}"
+
+
+def joints_text(joints: Sequence[str]) -> str:
+    """Joints by name, or their number where they are many."""
+    if len(joints) > MAX_NAMED_JOINTS:
+        return f"{len(joints)} joints ({joints[0]} ... {joints[-1]})"
+    return listing(joints)
+
+
+def mrad(value: float) -> str:
+    """``12.3 mrad``, with as many digits as matter."""
+    return f"{_digits(MILLI * value)} mrad" if math.isfinite(value) else "not known"
+
+
+def mrad_range(interval: Interval) -> str:
+    """``11.0 to 13.1 mrad``."""
+    if not all(map(math.isfinite, interval)):
+        return "not known"
+    return f"{_digits(MILLI * interval[0])} to {_digits(MILLI * interval[1])} mrad"
+
+
+def percent(value: float) -> str:
+    """``43 %``."""
+    return f"{100.0 * value:.0f} %" if math.isfinite(value) else "not known"
+
+
+def percent_range(interval: Interval) -> str:
+    """``40 to 47 %``."""
+    if not all(map(math.isfinite, interval)):
+        return "not known"
+    return f"{100.0 * interval[0]:.0f} to {100.0 * interval[1]:.0f} %"
+
+
+def amount(value: float, unit: str) -> str:
+    """A number with its unit, in the size in which people speak of it: ``40.2 ms``, ``12.1 mrad``."""
+    if not math.isfinite(value):
+        return "not known"
+    small = {"s": "ms", "rad": "mrad", "N m": "mN m"}.get(unit)
+    if small and 0.0 < abs(value) < 1.0:
+        return f"{_digits(MILLI * value)} {small}"
+    return f"{value:.3g}" + ("" if unit == "1" else f" {unit}")
+
+
+def estimate(one: Estimate) -> str:
+    """``40.2 ms (95 %: 39.1 to 41.3 ms)``."""
+    low, high = one.ci95
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return f"{amount(one.value, one.unit)} (interval not known)"
+    return f"{amount(one.value, one.unit)} (95 %: {amount(low, one.unit)} to {amount(high, one.unit)})"
+
+
+def effect_sentence(effect: NamedEffect) -> str:
+    """``command delay on f0_j1 (40.2 ms)``."""
+    sizes = ", ".join(amount(p.value, p.unit) for p in effect.parameters.values())
+    return f"{plain(effect.name)} on {joints_text(effect.joints)}" + (f" ({sizes})" if sizes else "")
+
+
+def verdict_sentence(report: Report) -> str:
+    """The verdict in one or two sentences that need no context."""
+    floor, before = mrad(report.noise_floor_rad), mrad(report.held_out.baseline_rmse_rad)
+    sets = [f"{{{', '.join(plain(name) for name in group)}}}" for group in report.ambiguous]
+    if report.verdict == "effects":
+        missing = listing([effect_sentence(effect) for effect in report.effects])
+        text = f"The simulation lacks {missing}. {_shrinks(report)}"
+        if sets:
+            text += f" Something else remains that this recording cannot tell apart: {listing(sets)}."
+        return text
+    if report.verdict == "no_gap":
+        return (
+            f"No gap: the plain servo model explains this recording. What remains, {before} on held-out "
+            f"motions, is no more than noise ({floor}) or than any candidate explains."
+        )
+    if report.verdict == "ambiguous":
+        return (
+            f"There is a gap ({before} on held-out motions against a noise floor of {floor}), and one of "
+            f"{listing(sets, 'or of')} explains it, but this recording cannot say which."
+        )
+    if report.verdict == "under_excited":
+        return (
+            "No verdict on effects: the motions in this recording do not determine the model. Different "
+            "parameters fit equally well."
+        )
+    return (
+        f"There is a gap ({before} on held-out motions against a noise floor of {floor}), but no effect that "
+        "is known here explains it. The cause lies outside the table of effects."
+    )
+
+
+def _shrinks(report: Report) -> str:
+    held = report.held_out
+    text = (
+        f"With it the error on motions that the fit has not seen falls from {mrad(held.baseline_rmse_rad)} "
+        f"to {mrad(held.identified_rmse_rad)} ({percent(held.reduction)} less"
+    )
+    known = all(map(math.isfinite, held.ci95))
+    text += f", 95 %: {percent_range(held.ci95)}" if known else ""
+    return f"{text}); the noise floor is {mrad(report.noise_floor_rad)}."
+
+
+def next_step(report: Report) -> str:
+    """What to do with the outcome, in a sentence or two."""
+    if report.next_experiment:
+        return report.next_experiment
+    if report.verdict == "effects":
+        return (
+            "Nothing is open. Use the identified model: pass identified.usda with --hand-layer to vd-train, "
+            "vd-eval and vd-play, and run vd-gap with it on a new recording to confirm that the gap is "
+            "closed."
+        )
+    if report.verdict == "no_gap":
+        return "Nothing to do. Use the identified baseline; record other motions only if the task needs them."
+    return "Record the same joints with other motions; vd-gap plan proposes which."
+
+
+def decision_text(row: Candidate) -> str:
+    """What became of a candidate, with the reason."""
+    word = {"named": "accepted", "tied": "cannot be told apart", "rejected": "rejected"}[row.decision]
+    return f"{word}: {row.reason}" if row.reason else word
+
+
+def _digits(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}"
