@@ -123,6 +123,7 @@ def test_resume_starts_from_the_runs_own_configuration(tmp_path):
     auto = ["--preset", "gpu", "--resume", "auto", "--run-dir"]
     assert parse_teacher([*auto, str(tmp_path)]).run.save_every == 17
     assert parse_teacher([*auto, str(tmp_path / "new")]).ppo == PRESETS["gpu"]().ppo
+    assert parse_teacher(["--smoke", "--resume", "auto", "--run-dir", str(tmp_path / "new")]).smoke
     with pytest.raises(FileNotFoundError, match="--run-dir"):
         parse_teacher(["--run-dir", str(tmp_path / "none"), "--resume"])
     (tmp_path / "config.json").write_text('{"ppo": {"epoch": 3}}')

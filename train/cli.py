@@ -116,12 +116,9 @@ def parse_teacher(arguments: Sequence[str]) -> TeacherCfg:
     """
     arguments = _normalise(arguments)
     preset = _value_of(arguments, "--preset") or "paper"
-    if "--resume" in arguments:
-        base = _saved_config(arguments, preset)
-    elif "--smoke" in arguments:
-        base = smoke()
-    else:
-        base = PRESETS.get(preset, PRESETS["paper"])()  # the second pass refuses an unknown name
+    # The second pass refuses an unknown name.
+    start = smoke() if "--smoke" in arguments else PRESETS.get(preset, PRESETS["paper"])()
+    base = _saved_config(arguments, start) if "--resume" in arguments else start
     return tyro.cli(
         TeacherCfg, args=arguments, default=base, prog="vd-train teacher", description=TEACHER_HELP
     )
@@ -289,11 +286,10 @@ def _value_of(arguments: list[str], flag: str) -> str | None:
     return arguments[places[-1] + 1] if places else None
 
 
-def _saved_config(arguments: list[str], preset: str) -> TeacherCfg:
-    """Configuration of the run that ``--resume`` goes on with."""
+def _saved_config(arguments: list[str], start: TeacherCfg) -> TeacherCfg:
+    """Configuration of the run that ``--resume`` goes on with; ``start`` is that of a new one."""
     import json
 
-    start = PRESETS.get(preset, PRESETS["paper"])()
     run_dir = Path(_value_of(arguments, "--run-dir") or start.run.run_dir)
     path = run_dir / CONFIG_NAME
     if not path.is_file():
