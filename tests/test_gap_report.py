@@ -275,7 +275,7 @@ def test_page_stands_alone_and_says_what_was_found(report, curves, tmp_path):
         assert words.plain(effect.name) in text
         assert effect.meaning in text
     pngs = {path.name for path in files if path.suffix == ".png"}
-    assert {"gap.png", "overlay_f0_j2.png", "residual_f0_j2.png", "evidence_f0_j2.png"} <= pngs
+    assert {"gap.png", "overlay_f0_j2_sine_1.00hz.png", "residual_f0_j2.png", "evidence_f0_j2.png"} <= pngs
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in pngs)
 
 
@@ -315,10 +315,14 @@ def test_a_report_with_hardly_anything_has_a_page(report, tmp_path):
     assert "Nowhere by more than noise" in (tmp_path / "report.html").read_text()
 
 
-def test_overlays_show_the_named_joint_first(report, curves):
+def test_overlays_show_joints_with_a_gap_in_different_motions(report, curves):
     chosen = figures.chosen_overlays(report, curves)
-    assert chosen[0][0] == "f0_j2"
-    assert len({joint for joint, _ in chosen}) == len(chosen)
+    assert {joint for joint, _ in chosen} == {"f0_j2"}
+    assert len({index for _, index in chosen}) == len(chosen) == 3
+    nothing = dataclasses.replace(
+        report, effects=(), joints=tuple(dataclasses.replace(one, verdict="no_gap") for one in report.joints)
+    )
+    assert len(figures.chosen_overlays(nothing, curves)) == 1
 
 
 @pytest.mark.parametrize(

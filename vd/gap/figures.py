@@ -15,7 +15,7 @@ from vd.gap.words import MILLI, plain
 INK, BLUE, ORANGE, GREEN, GREY = "#1c2330", "#0072B2", "#D55E00", "#009E73", "#8a8f98"
 WIDTH = 9.0
 OVERLAYS = 3
-"""Joint and trajectory pairs that are drawn in full, the ones with the largest gap of their joint first."""
+"""Joint and trajectory pairs that are drawn in full."""
 WINDOW_S = 8.0
 """Longest piece of a trajectory that an overlay shows; the eye cannot follow more at page width."""
 ZOOM_S = 1.2
@@ -41,7 +41,7 @@ def overlay_figure(report: Report, curves: Predictions, joint: str, index: int) 
     time = curves.time[rows]
     measured = curves.measured[rows, column]
     before, after = curves.baseline[rows, column], curves.identified[rows, column]
-    changed = bool(report.effects) and not np.allclose(before, after, equal_nan=True)
+    changed = _changed(before, after)
     wide = _worst_window(time, before - measured, WINDOW_S)
     zoom = _worst_window(time, before - measured, ZOOM_S, within=wide)
     figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
@@ -58,7 +58,7 @@ def overlay_figure(report: Report, curves: Predictions, joint: str, index: int) 
             linewidth=1.0,
             label="command",
         )
-        axes.plot(t, measured[shown], color=INK, linewidth=2.0, label="measured")
+        axes.plot(t, measured[shown], color=INK, linewidth=3.2, alpha=0.85, label="measured")
         axes.plot(t, before[shown], color=ORANGE, linewidth=1.4, linestyle="--", label="simulation before")
         if changed:
             axes.plot(t, after[shown], color=GREEN, linewidth=1.4, label="simulation after")
@@ -106,7 +106,7 @@ def residual_figure(report: Report, curves: Predictions, joint: str) -> Figure:
         ("measured speed [rad/s]", speed),
         ("command - measured [rad]", command - measured),
     )
-    changed = bool(report.effects)
+    changed = _changed(curves.baseline[seen, column], curves.identified[seen, column])
     figure = Figure(figsize=(WIDTH, 2.9), layout="constrained")
     panels = figure.subplots(1, 3, sharey=True)
     rows = _thin(np.flatnonzero(seen))
@@ -207,18 +207,27 @@ def evidence_figure(report: Report, joints: tuple[str, ...]) -> Figure:
 
 
 def chosen_overlays(report: Report, curves: Predictions) -> list[tuple[str, int]]:
-    """Joint and trajectory index of the overlays: named joints first, then by the gap before."""
-    held = {name: index for index, name in enumerate(curves.files)}
+    """Joint and trajectory index of the overlays, worst first, held-out motions before others.
+
+    Joints with a gap get one each; what is left goes to further kinds of motion of the same joints. Where
+    there is no gap, the joint with the largest error stands for all.
+    """
+    indices = {name: index for index, name in enumerate(curves.files)}
+    rows = [
+        row
+        for row in report.trajectories
+        if row.file in indices and row.joint in curves.joints and math.isfinite(row.baseline_rmse_rad)
+    ]
+    rows.sort(key=lambda row: (not row.held_out, -row.baseline_rmse_rad))
     named = {joint for effect in report.effects for joint in effect.joints}
-    best: dict[str, tuple[float, int]] = {}
-    for row in report.trajectories:
-        if row.file not in held or row.joint not in curves.joints or not math.isfinite(row.baseline_rmse_rad):
-            continue
-        rank = row.baseline_rmse_rad + (1e6 if row.held_out else 0.0)
-        if rank > best.get(row.joint, (-1.0, 0))[0]:
-            best[row.joint] = (rank, held[row.file])
-    order = sorted(best, key=lambda joint: (joint not in named, -best[joint][0]))
-    return [(joint, best[joint][1]) for joint in order[:OVERLAYS]]
+    open_joints = {one.joint for one in report.joints if one.verdict != "no_gap"} | named
+    candidates = [row for row in rows if row.joint in open_joints] or rows[:1]
+    candidates.sort(key=lambda row: row.joint not in named)  # stable: the order above within each
+    first = list({row.joint: row for row in reversed(candidates)}.values())[::-1]
+    kinds = {(row.joint, row.excitation) for row in first}
+    more = [row for row in candidates if (row.joint, row.excitation) not in kinds]
+    more = list({(row.joint, row.excitation): row for row in reversed(more)}.values())[::-1]
+    return [(row.joint, indices[row.file]) for row in [*first, *more][:OVERLAYS]]
 
 
 def _best(rows: list[Candidate]) -> list[Candidate]:
@@ -229,6 +238,11 @@ def _lower_limit(group: list[Candidate]) -> float:
     """Left end of the axis: far losses are cut off, since only their sign matters."""
     lows = [100.0 * row.gain_ci95[0] for row in group if math.isfinite(row.gain_ci95[0])]
     return max(min([*lows, -5.0]) - 3.0, -60.0)
+
+
+def _changed(before: np.ndarray, after: np.ndarray) -> bool:
+    """Whether there is an identified model to draw besides the baseline."""
+    return bool(np.isfinite(after).any()) and not np.allclose(before, after, equal_nan=True)
 
 
 def _worst_window(

@@ -174,12 +174,12 @@ def _curves(page: Page, pictures: _Pictures, report: Report, curves: Predictions
         file = curves.files[index]
         unseen = "a motion that the fit has not seen" if (joint, file) in held else "a motion of the fit"
         pictures.add(
-            f"overlay_{joint}",
+            f"overlay_{joint}_{Path(file).stem}",
             figures.overlay_figure(report, curves, joint, index),
             f"{joint} in {file}, {unseen}. Above: what was commanded, measured, and simulated. Below: the "
             "difference; the blue band is the noise floor. Right: the shaded piece in detail.",
         )
-    for joint, _ in chosen:
+    for joint in dict.fromkeys(joint for joint, _ in chosen):
         pictures.add(
             f"residual_{joint}",
             figures.residual_figure(report, curves, joint),
