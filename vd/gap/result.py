@@ -194,12 +194,15 @@ class Report:
     ambiguous: tuple[tuple[str, ...], ...]
     """Sets of effects that the recording cannot tell apart."""
     identified: Fit
+    """With the named effects and the provisional ones."""
     held_out: HeldOut
     next_experiment: str
     """What to record next, in one sentence; empty if nothing is open."""
     seconds: float
     recording: Source
     format: str = FORMAT
+    provisional: tuple[NamedEffect, ...] = ()
+    """The first of each set in ``ambiguous``: not named, but what the identified model holds of the set."""
     hand: str | None = None
     hand_layer: str | None = None
     """Identified model that the analysis started from."""
@@ -234,7 +237,7 @@ class Report:
         named = {name for group in self.ambiguous for name in group} | {e.name for e in self.effects}
         if unknown := sorted(named - set(EFFECTS)):
             raise ValueError(f"no effects are called {', '.join(unknown)}; there are {', '.join(EFFECTS)}")
-        for effect in self.effects:
+        for effect in (*self.effects, *self.provisional):
             wanted = {parameter.name for parameter in EFFECTS[effect.name].parameters}
             if extra := sorted(set(effect.parameters) - wanted):
                 raise ValueError(f"effects: {effect.name} has no parameter {', '.join(extra)}")
@@ -340,7 +343,7 @@ def parameter_columns(report: Report, joint: str) -> dict[int, float]:
     """Columns of the joint's parameter row (:mod:`vd.kernels.actuators`) that the report identified."""
     known = {p.name: p.column for p in (*BASELINE, GRAVITY)}
     columns = {known[name]: value for name, value in report.identified.parameters.get(joint, {}).items()}
-    for effect in report.effects:
+    for effect in (*report.effects, *report.provisional):
         if joint in effect.joints:
             for parameter in EFFECTS[effect.name].parameters:
                 if parameter.name in effect.parameters:
