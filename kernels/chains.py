@@ -1,0 +1,382 @@
+"""Rollouts of one chain of one to three revolute joints, one thread per parameter set and trajectory.
+
+The joints carry the servos of :mod:`vd.kernels.actuators`. Without bodies a joint is its own inertia
+(a bare servo, a pendulum); with bodies the chain is a finger: mass matrix and bias forces in 3-D.
+All vectors are in the frame of the chain's base with every joint at zero, so that link frames differ
+by offsets only.
+
+Each step ``dt`` is a leapfrog step: positions at whole steps, velocities half-way between, so the
+error of smooth motion falls with dt^2. What makes a servo stiff is implicit: damping by
+Crank-Nicolson as far as that does not ring, stiffness by average acceleration. Dry friction is an
+impulse bounded by the friction torque, found by projected Gauss-Seidel sweeps: a joint that friction
+can hold stands still exactly.
+
+A command takes the share of a step that remains when it arrives, so the motion is a smooth function
+of its delay. SI units, radians; times are whole steps and a fraction, exact over any duration.
+"""
+
+import warp as wp
+
+from vd.kernels.actuators import (
+    COMMAND_DELAY,
+    COUPLING_0,
+    ENCODER_BIAS,
+    INERTIA,
+    JITTER_DROP,
+    JITTER_SIGMA,
+    PAYLOAD_INERTIA,
+    READ_DELAY,
+    VELOCITY_LIMIT,
+    servo,
+    start_servo,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+MAX_JOINTS = 3
+"""Joints of a chain at most: Warp's vectors of three hold them."""
+SMALLEST_INERTIA = 1.0e-8
+"""Least inertia on the diagonal [kg m^2], so that a search that asks for none divides by something."""
+FRICTION_SWEEPS = 3
+"""Gauss-Seidel sweeps a step, started from the impulses of the step before."""
+CENTRED = 0.5
+"""Leapfrog: the torque of a step acts from half a step before its position to half a step after."""
+DIVERGED = 100.0
+"""Distance from the start [rad] at which a rollout stops to mean anything and is held."""
+
+
+@wp.struct
+class Links:
+    """Bodies of a chain, in the base frame with all joints at zero; one row per joint.
+
+    axis: Unit joint axes [n].
+    offset: From the joint before (the base, for the first) to the joint [n] [m].
+    mass: Masses of the links after each joint [n] [kg].
+    com: From the joint to the centre of mass [n] [m].
+    inertia: About the centre of mass [n] [kg m^2].
+    gravity: Acceleration of gravity [m/s^2].
+    """
+
+    axis: wp.array[wp.vec3]
+    offset: wp.array[wp.vec3]
+    mass: wp.array[float]
+    com: wp.array[wp.vec3]
+    inertia: wp.array[wp.mat33]
+    gravity: wp.vec3
+
+
+@wp.struct
+class Samples:
+    """Recorded trajectories, one after the other; S rows (time stamps) in all.
+
+    step: Time stamp in whole steps [S].
+    fraction: And the rest, in [0, 1] [S].
+    command: Commanded positions [S, n] [rad].
+    power: Factor on the controller's gains, 0 with the torque off [S, n].
+    """
+
+    step: wp.array[int]
+    fraction: wp.array[float]
+    command: wp.array2d[float]
+    power: wp.array2d[float]
+
+
+@wp.func
+def chain_dynamics(q: wp.vec3, speed: wp.vec3, count: int, links: Links):
+    """Mass matrix and bias torques (Coriolis, centrifugal, gravity) of the bodies.
+
+    Recursive Newton-Euler outwards; each body is projected on the joints before it at once.
+
+    Returns:
+        ``(mass, bias)`` [3, 3] and [3]; zero beyond ``count``.
+    """
+    mass = wp.mat33(0.0)
+    bias = wp.vec3(0.0)
+    axes = wp.mat33(0.0)
+    origins = wp.mat33(0.0)
+    turn = wp.quat_identity()
+    origin = wp.vec3(0.0)
+    omega = wp.vec3(0.0)
+    alpha = wp.vec3(0.0)
+    acceleration = -links.gravity
+    for i in range(count):
+        offset = wp.quat_rotate(turn, links.offset[i])
+        axis = wp.quat_rotate(turn, links.axis[i])
+        origin += offset
+        acceleration += wp.cross(alpha, offset) + wp.cross(omega, wp.cross(omega, offset))
+        alpha += speed[i] * wp.cross(omega, axis)
+        omega += speed[i] * axis
+        turn = turn * wp.quat_from_axis_angle(links.axis[i], q[i])
+        axes[i] = axis
+        origins[i] = origin
+
+        rotation = wp.quat_to_matrix(turn)
+        inertia = rotation * links.inertia[i] * wp.transpose(rotation)
+        arm = rotation * links.com[i]
+        force = links.mass[i] * (acceleration + wp.cross(alpha, arm) + wp.cross(omega, wp.cross(omega, arm)))
+        moment = inertia * alpha + wp.cross(omega, inertia * omega)
+        for j in range(i + 1):
+            axis_j = wp.vec3(axes[j, 0], axes[j, 1], axes[j, 2])
+            origin_j = wp.vec3(origins[j, 0], origins[j, 1], origins[j, 2])
+            lever = wp.cross(axis_j, origin + arm - origin_j)
+            bias[j] += wp.dot(axis_j, moment) + wp.dot(lever, force)
+            turned = inertia * axis_j
+            lever *= links.mass[i]
+            for k in range(j + 1):
+                axis_k = wp.vec3(axes[k, 0], axes[k, 1], axes[k, 2])
+                origin_k = wp.vec3(origins[k, 0], origins[k, 1], origins[k, 2])
+                entry = wp.dot(turned, axis_k) + wp.dot(lever, wp.cross(axis_k, origin + arm - origin_k))
+                mass[j, k] += entry
+                if k < j:
+                    mass[k, j] += entry
+    return mass, bias
+
+
+@wp.func
+def implicitness(ratio: float) -> float:
+    """Weight of the new velocity in the damping torque of a step, for dt damping / inertia = ``ratio``.
+
+    One half is exact to second order; above a ratio of 2 more is needed for the velocity not to ring.
+    """
+    return wp.max(0.5, 1.0 - 1.0 / wp.max(ratio, 1.0))
+
+
+@wp.func
+def split_steps(step: int, fraction: float, shift: float):
+    """The time ``step + fraction + shift`` as whole steps and a fraction in [0, 1)."""
+    rest = fraction + shift
+    whole = wp.floor(rest)
+    return step + int(whole), rest - whole
+
+
+@wp.func
+def arrival(
+    samples: Samples,
+    write: int,
+    stream: int,
+    joint: int,
+    parameters: wp.array2d[float],
+    row: int,
+    dt: float,
+):
+    """When a command acts, and whether it does: ``(step, fraction, kept)``.
+
+    The random numbers belong to the write and the joint: with other parameters they stay the same.
+    """
+    delay = parameters[row, COMMAND_DELAY]
+    sigma = parameters[row, JITTER_SIGMA]
+    drop = parameters[row, JITTER_DROP]
+    kept = 1
+    if sigma > 0.0 or drop > 0.0:
+        rng = wp.rand_init(stream * MAX_JOINTS + joint, write)
+        if wp.randf(rng) < drop:
+            kept = 0
+        delay += sigma * wp.abs(wp.randn(rng))
+    step, fraction = split_steps(samples.step[write], samples.fraction[write], CENTRED + delay / dt)
+    return step, fraction, kept
+
+
+@wp.func
+def friction_impulses(wanted: wp.vec3, inverse: wp.mat33, bound: wp.vec3, before: wp.vec3, count: int):
+    """Velocities under dry friction.
+
+    Args:
+        wanted: Velocities without friction [rad/s].
+        inverse: Inverse of the effective mass matrix [1/(kg m^2)].
+        bound: Largest friction impulses [N m s].
+        before: Impulses of the step before, to start from [N m s].
+        count: Joints.
+
+    Returns:
+        ``(speed, impulse)``; joints whose impulse is within its bound stand still exactly.
+    """
+    impulse = wp.vec3(0.0)
+    for i in range(count):
+        impulse[i] = wp.clamp(before[i], -bound[i], bound[i])
+    speed = wanted + inverse * impulse
+    for _sweep in range(FRICTION_SWEEPS):
+        for i in range(count):
+            new = wp.clamp(impulse[i] - speed[i] / inverse[i, i], -bound[i], bound[i])
+            change = new - impulse[i]
+            impulse[i] = new
+            for j in range(count):
+                speed[j] += inverse[j, i] * change
+    for i in range(count):
+        if wp.abs(impulse[i]) < bound[i]:
+            speed[i] = 0.0
+    return speed, impulse
+
+
+@wp.kernel
+def rollout_kernel(
+    # In:
+    samples: Samples,
+    first_sample: wp.array[int],
+    sample_count: wp.array[int],
+    first_output: wp.array[int],
+    stream: wp.array[int],
+    start: wp.array2d[float],
+    slot: wp.array[int],
+    lower: wp.array[float],
+    upper: wp.array[float],
+    bodies: int,
+    links: Links,
+    parameters: wp.array2d[float],
+    dt: float,
+    # Out:
+    state: wp.array2d[float],
+    predicted: wp.array3d[float],
+):
+    """Simulate trajectories with parameter sets. Launch: [C, R].
+
+    Args:
+        samples: What was recorded.
+        first_sample: Row of ``samples`` where each trajectory begins, shape [R].
+        sample_count: Rows of each trajectory, shape [R].
+        first_output: Row of ``predicted`` where each trajectory begins, shape [R].
+        stream: Number of each trajectory's random stream, shape [R].
+        start: Measured positions at the start, where the joints are at rest, shape [R, n] [rad].
+        slot: Place of each joint in the finger, which is its column of the coupling, shape [n].
+        lower: Lower stops, shape [n] [rad].
+        upper: Upper stops, shape [n] [rad].
+        bodies: 1 if the links have mass, 0 if each joint is its own inertia.
+        links: The links, if they have mass.
+        parameters: Parameter rows by set, trajectory, joint, shape [C R n, PARAMETER_COLUMNS].
+        dt: Time step [s].
+        state: Working memory, shape [C R n, STATE_COLUMNS].
+        predicted: Positions as the servo would have reported them, shape [C, S', n] [rad].
+    """
+    candidate, run = wp.tid()
+    count = slot.shape[0]
+    base_row = (candidate * first_sample.shape[0] + run) * count
+    begin = first_sample[run]
+    end = begin + sample_count[run]
+    to_output = first_output[run] - begin
+
+    q = wp.vec3(0.0)
+    q_start = wp.vec3(0.0)
+    speed = wp.vec3(0.0)
+    impulse = wp.vec3(0.0)
+    # Per joint: the command in force, the write that comes next and when, the next sample and when.
+    held = wp.vec3(0.0)
+    held_power = wp.vec3(0.0)
+    write = wp.vec3i(begin)
+    due_step = wp.vec3i(0)
+    due_fraction = wp.vec3(0.0)
+    due_kept = wp.vec3i(1)
+    read = wp.vec3i(begin)
+    read_step = wp.vec3i(0)
+    read_fraction = wp.vec3(0.0)
+    dry = wp.int32(0)  # typed: it changes in a loop
+    for j in range(count):
+        row = base_row + j
+        q[j] = start[run, j] - parameters[row, ENCODER_BIAS]
+        q_start[j] = q[j]
+        held[j] = samples.command[begin, j]
+        held_power[j] = samples.power[begin, j]
+        start_servo(held[j], q[j], row, state)
+        step, fraction, kept = arrival(samples, begin, stream[run], j, parameters, row, dt)
+        due_step[j] = step
+        due_fraction[j] = fraction
+        due_kept[j] = kept
+        step, fraction = split_steps(
+            samples.step[begin], samples.fraction[begin], -parameters[row, READ_DELAY] / dt
+        )
+        read_step[j] = step
+        read_fraction[j] = fraction
+
+    for k in range(samples.step[end - 1] + 1):
+        torque = wp.vec3(0.0)
+        damping = wp.vec3(0.0)
+        bound = wp.vec3(0.0)
+        diagonal = wp.vec3(1.0)
+        stiffness = wp.vec3(0.0)
+        for j in range(count):
+            row = base_row + j
+            # The time average of the command over the step.
+            command = held[j]
+            power = held_power[j]
+            while due_step[j] <= k:
+                if due_kept[j] == 1:
+                    share = 1.0
+                    if due_step[j] == k:
+                        share = 1.0 - due_fraction[j]
+                    command += share * (samples.command[write[j], j] - held[j])
+                    power += share * (samples.power[write[j], j] - held_power[j])
+                    held[j] = samples.command[write[j], j]
+                    held_power[j] = samples.power[write[j], j]
+                write[j] = write[j] + 1
+                if write[j] < end:
+                    step, fraction, kept = arrival(samples, write[j], stream[run], j, parameters, row, dt)
+                    # In order: no command overtakes the one before.
+                    if step < due_step[j] or (step == due_step[j] and fraction < due_fraction[j]):
+                        step = due_step[j]
+                        fraction = due_fraction[j]
+                    due_step[j] = step
+                    due_fraction[j] = fraction
+                    due_kept[j] = kept
+                else:
+                    due_step[j] = 2147483647
+            coupled = wp.float32(0.0)
+            if count > 1:
+                for i in range(count):
+                    coupled += parameters[row, COUPLING_0 + slot[i]] * q[i]
+            drive = servo(command, coupled, q[j], speed[j], power, dt, parameters, row, state)
+            torque[j] = drive.stiffness * (drive.reference - q[j]) - drive.damping * speed[j] + drive.torque
+            damping[j] = drive.damping
+            stiffness[j] = drive.stiffness
+            bound[j] = dt * drive.friction
+            if drive.friction > 0.0:
+                dry = 1
+            diagonal[j] = parameters[row, INERTIA] + parameters[row, PAYLOAD_INERTIA]
+
+        mass = wp.mat33(0.0)
+        if bodies == 1:
+            mass, bias = chain_dynamics(q, speed, count, links)
+            torque -= bias
+        for j in range(MAX_JOINTS):
+            inertia = wp.max(diagonal[j] + mass[j, j], SMALLEST_INERTIA)
+            mass[j, j] = (
+                inertia
+                + dt * damping[j] * implicitness(dt * damping[j] / inertia)
+                + 0.25 * dt * dt * stiffness[j]
+            )
+        new_speed = wp.vec3(0.0)
+        if count == 1:
+            new_speed[0] = speed[0] + dt * torque[0] / mass[0, 0]
+            change = wp.min(bound[0] / mass[0, 0], wp.abs(new_speed[0]))
+            new_speed[0] = new_speed[0] - wp.sign(new_speed[0]) * change
+        else:
+            inverse = wp.inverse(mass)
+            new_speed = speed + inverse * (dt * torque)
+            if dry == 1:
+                new_speed, impulse = friction_impulses(new_speed, inverse, bound, impulse, count)
+        for j in range(count):
+            row = base_row + j
+            limit = parameters[row, VELOCITY_LIMIT]
+            v = wp.clamp(new_speed[j], -limit, limit)
+            before = q[j]
+            after = before + dt * v
+            if after < lower[j] or after > upper[j]:
+                # A start beyond a stop, as an encoder's bias makes it, is no reason to jump.
+                after = wp.clamp(after, wp.min(lower[j], before), wp.max(upper[j], before))
+                v = 0.0
+            if not (wp.abs(after - q_start[j]) < DIVERGED):
+                after = q_start[j] + DIVERGED
+                v = 0.0
+            q[j] = after
+            speed[j] = v
+            while read_step[j] <= k and read[j] < end:
+                share = 0.0
+                if read_step[j] == k:
+                    share = read_fraction[j]
+                predicted[candidate, to_output + read[j], j] = (
+                    before + share * (after - before) + parameters[row, ENCODER_BIAS]
+                )
+                read[j] = read[j] + 1
+                if read[j] < end:
+                    step, fraction = split_steps(
+                        samples.step[read[j]], samples.fraction[read[j]], -parameters[row, READ_DELAY] / dt
+                    )
+                    read_step[j] = step
+                    read_fraction[j] = fraction
