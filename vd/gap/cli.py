@@ -1,0 +1,265 @@
+"""``vd-gap``: where simulation and measurement disagree, which effect is missing, and how much it closes."""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from vd.gap.steps import Analysis
+
+OK, FAILED, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
+"""Exit statuses: a verdict was reached, something else is wrong, the recording cannot be used, Ctrl-C."""
+
+RecordingPath = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
+
+
+@dataclass(frozen=True)
+class _Step:
+    """What all steps take; what is left out is as it was in the step before."""
+
+    recording: RecordingPath = None
+    """Folder with recording.json and its CSV files; later steps know it from DIR."""
+    out: Path = Path("gap")
+    """DIR: folder of the analysis."""
+    hand: str | None = None
+    """Hand, dclaw3 or dclaw4; by default the recording's model."""
+    model: Path | None = None
+    """The hand's own USD file, in place of --hand."""
+    hand_layer: Path | None = None
+    """Start from an identified model (identified.usda): is there a gap left?"""
+    effects: str | None = None
+    """Candidates, separated by commas; all effects by default."""
+    seed: int | None = None
+    """Seed of the search and of the resampling."""
+    device: str | None = None
+    """cpu (the default), cuda, or auto."""
+    fresh: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Repeat finished steps even if nothing has changed."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print what the step wrote as JSON."""
+
+    def analysis(self) -> "Analysis":
+        """The analysis in DIR with these settings."""
+        import warp as wp
+
+        from vd.gap.steps import Analysis
+
+        wp.config.log_level = wp.LOG_WARNING
+        if self.hand is not None and self.model is not None:
+            raise ValueError("--hand and --model both name the hand; give one of them")
+        return Analysis.open(
+            self.out,
+            {
+                "recording": self.recording,
+                "hand": self.hand or (str(self.model) if self.model else None),
+                "hand_layer": self.hand_layer,
+                "effects": None if self.effects is None else _effects(self.effects),
+                "seed": self.seed,
+                "device": None if self.device is None else _device(self.device),
+            },
+        )
+
+
+@dataclass(frozen=True)
+class Run(_Step):
+    """Find, explain, close and report: the whole analysis of a recording.
+
+    Writes DIR/report.html (one page for people), report.json, identified.usda (the identified model, for
+    --hand-layer) and the figures. An interrupted run goes on where it stopped. The exit status is 0 for
+    every verdict and 2 for a recording that cannot be used.
+    """
+
+    def run(self) -> int:
+        """Run every step and print the verdict."""
+        analysis = self.analysis()
+        analysis.run("report", fresh=self.fresh)
+        return _print_report(analysis, self.json)
+
+
+@dataclass(frozen=True)
+class Find(_Step):
+    """Fit the plain servo model of every joint, and say where and in what motion it fails."""
+
+    def run(self) -> int:
+        """Run the step."""
+        return _print_step(self, "find", "find.json")
+
+
+@dataclass(frozen=True)
+class Explain(_Step):
+    """Try every effect on motions that the fit has not seen, and name what is missing, or abstain."""
+
+    def run(self) -> int:
+        """Run the step."""
+        return _print_step(self, "explain", "explain.json")
+
+
+@dataclass(frozen=True)
+class Close(_Step):
+    """Write identified.usda and simulate the recorded commands again with it, a hand in Newton."""
+
+    def run(self) -> int:
+        """Run the step."""
+        return _print_step(self, "close", "close.json")
+
+
+@dataclass(frozen=True)
+class Report(_Step):
+    """Write report.json, report.html and the figures from what the steps before have found."""
+
+    def run(self) -> int:
+        """Run the step."""
+        analysis = self.analysis()
+        analysis.run("report", first="report", fresh=True)
+        return _print_report(analysis, self.json)
+
+
+@dataclass(frozen=True)
+class Plan(_Step):
+    """Choose the motions that would separate what is still ambiguous, as files vd-deploy record can play.
+
+    Each set of motions of a menu is simulated under the models that compete; the one on which they disagree
+    most, compared with the noise, wins. Writes DIR/next_experiment.json and its commands as CSV files.
+    """
+
+    def run(self) -> int:
+        """Explain first if that has not been done, then plan."""
+        from vd.gap.plan import plan, write_plan
+
+        analysis = self.analysis()
+        if self.recording is not None:
+            analysis.run("explain", fresh=self.fresh)
+        result = plan(analysis.explained(), analysis.recording, analysis.hand, analysis.start)
+        path = write_plan(result, self.out)
+        if self.json:
+            print(path.read_text())
+        else:
+            print(f"{result.sentence}\n{path}")
+        return OK
+
+
+@dataclass(frozen=True)
+class Hide:
+    """Make a recording in which effects are hidden, to see whether they are found.
+
+    The plant shares no code with the fitted model: it is integrated on its own at a high rate, with random
+    base parameters, encoder counts, noise and jittered time stamps. The truth is written beside the folder.
+    """
+
+    model: Annotated[str, tyro.conf.Positional]
+    """dclaw3, dclaw4 (one finger of it), servo or pendulum."""
+    out: Path
+    """Folder of the recording to write."""
+    effect: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """NAME, NAME:PARAMETER=VALUE,... or NAME@JOINT+JOINT:...; give it again for a second effect, or leave
+    it out to hide nothing."""
+    excitations: tuple[str, ...] = ("steps_and_sines",)
+    """Sets of motions."""
+    seed: int = 0
+    """Seed of everything random."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the truth as JSON."""
+
+    def run(self) -> int:
+        """Write the recording."""
+        from vd.gap.hide import hide, parse_effect, truth_path
+
+        parsed = [parse_effect(text) for text in self.effect]
+        hidden = hide(
+            self.model,
+            {name: values for name, values, _ in parsed},
+            self.out,
+            seed=self.seed,
+            effect_joints={name: joints for name, _, joints in parsed if joints},
+            excitations=self.excitations,
+        )
+        if self.json:
+            print(json.dumps(hidden.truth, indent=1))
+        else:
+            print(f"{self.out}: {len(hidden.recording.trajectories)} motions\n{truth_path(self.out)}")
+        return OK
+
+
+Command = (
+    Annotated[Run, tyro.conf.subcommand("run")]
+    | Annotated[Find, tyro.conf.subcommand("find")]
+    | Annotated[Explain, tyro.conf.subcommand("explain")]
+    | Annotated[Close, tyro.conf.subcommand("close")]
+    | Annotated[Report, tyro.conf.subcommand("report")]
+    | Annotated[Plan, tyro.conf.subcommand("plan")]
+    | Annotated[Hide, tyro.conf.subcommand("hide")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``vd-gap``; returns the exit status."""
+    command: Run | Find | Explain | Close | Report | Plan | Hide = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        args=arguments,
+        prog="vd-gap",
+        description=__doc__,
+    )
+    from vd.gap.recording import RecordingError
+
+    try:
+        return command.run()
+    except RecordingError as error:
+        print(f"vd-gap: this recording cannot be used: {error}", file=sys.stderr)
+        return UNUSABLE
+    except (ValueError, OSError) as error:
+        print(f"vd-gap: {error}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("vd-gap: stopped; the same command goes on with the step it was in", file=sys.stderr)
+        return INTERRUPTED
+
+
+def _print_step(step: _Step, name: str, file: str) -> int:
+    analysis = step.analysis()
+    analysis.run(name, first=name, fresh=step.fresh)
+    path = analysis.out / file
+    print(path.read_text() if step.json else path)
+    return OK
+
+
+def _print_report(analysis: "Analysis", as_json: bool) -> int:
+    from vd.gap.result import Report as Contents
+    from vd.gap.words import next_step, verdict_sentence
+
+    path = analysis.out / "report.json"
+    if as_json:
+        print(path.read_text())
+        return OK
+    report = Contents.read(path)
+    print(verdict_sentence(report))
+    for finding in report.findings:
+        print(f"  {finding.joint}: {finding.where}")
+    print(f"{next_step(report)}\n\n{analysis.out / 'report.html'}\n{path}")
+    return OK
+
+
+def _effects(text: str) -> tuple[str, ...]:
+    """Names of effects, separated by commas."""
+    from vd.kernels.effects import EFFECTS
+
+    names = tuple(filter(None, (name.strip() for name in text.split(","))))
+    if unknown := [name for name in names if name not in EFFECTS]:
+        raise ValueError(
+            f"--effects: no effect is called {', '.join(unknown)}; choose from {', '.join(EFFECTS)}"
+        )
+    return names
+
+
+def _device(name: str) -> str:
+    from vd.evaluate.cli import resolve_device
+
+    return resolve_device(name)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

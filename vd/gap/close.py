@@ -1,0 +1,207 @@
+"""Close the gap: write the identified model as a USD layer, read it back, and simulate the commands again.
+
+A hand is simulated in Newton, the simulator of training, never in the model that was fitted. A bare servo
+or pendulum has no articulation: there the layer is read back into the joint's own model.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vd.gap.recording import Recording
+from vd.gap.result import GRAVITY, Closing, NamedEffect, Predictions, Report, effect_values
+from vd.kernels.effects import BASELINE, EFFECTS
+
+if TYPE_CHECKING:
+    from vd.assets_usd.hand_model import HandModel
+
+LAYER = "identified.usda"
+GRAVITY_EFFECT = "gravity_load"
+_DRIVE = tuple(parameter.name for parameter in BASELINE)
+_COLUMN = {p.name: p.column for p in (*BASELINE, GRAVITY)}
+
+
+def write_identified(
+    report: Report,
+    path: Path,
+    recording: Recording,
+    hand: "HandModel | None",
+    start: Mapping[str, np.ndarray],
+) -> None:
+    """Write what a report identified as a layer.
+
+    Args:
+        report: The report.
+        path: File to write, ``.usda``.
+        recording: What it was identified from.
+        hand: The hand; None for a bare servo or pendulum.
+        start: Parameter row of each joint that the analysis started from; its effects stay in the layer.
+    """
+    from vd.assets_usd.hand_layer import write_layer
+
+    fitted = report.identified.parameters
+    write_layer(
+        path,
+        hand if hand is not None else recording.model,
+        baseline={
+            joint: {name: values[name] for name in _DRIVE if name in values}
+            for joint, values in fitted.items()
+        },
+        effects={joint: _effects(report.effects, joint, values, start) for joint, values in fitted.items()},
+        tool="vd-gap",
+        recording=report.recording.path,
+    )
+
+
+def _effects(
+    named: tuple[NamedEffect, ...],
+    joint: str,
+    fitted: Mapping[str, float],
+    start: Mapping[str, np.ndarray],
+) -> dict[str, dict[str, float | tuple[float, float, float]]]:
+    """Effects of a joint: those it started with, a pendulum's gravity, and the named ones."""
+    values: dict[str, dict[str, float | tuple[float, float, float]]] = {}
+    if joint in start:
+        for effect in EFFECTS.values():
+            row = {p.name: float(start[joint][p.column]) for p in effect.parameters}
+            if any(row[p.name] != p.neutral for p in effect.parameters):
+                values[effect.name] = dict(row)
+    if GRAVITY.name in fitted:
+        values.setdefault(GRAVITY_EFFECT, {})[GRAVITY.name] = fitted[GRAVITY.name]
+    for name, parameters in effect_values(named, joint).items():
+        known = {
+            key: (value if np.isfinite([low, high]).all() and low <= value <= high else value[0])
+            for key, value in parameters.items()
+            for _, low, high in [value]
+        }
+        values[name] = {**values.get(name, {}), **known}
+    return values
+
+
+def simulate_again(
+    report: Report,
+    layer: Path,
+    recording: Recording,
+    hand_name: str | None,
+    start_layer: Path | None,
+    curves: Predictions,
+    *,
+    device: str = "cpu",
+) -> tuple[Closing, Predictions]:
+    """Simulate the recording's commands with the baseline and with the layer.
+
+    Args:
+        report: What was identified, without a closing.
+        layer: The layer that :func:`write_identified` wrote.
+        recording: The recording.
+        hand_name: Name or file of the hand; None for a bare servo or pendulum.
+        start_layer: Layer that the analysis started from.
+        curves: The fit's curves.
+        device: Warp device.
+
+    Returns:
+        What it showed, and the new curves.
+    """
+    if hand_name is None:
+        again = _bare(layer, recording, curves, device)
+    else:
+        again = _newton(report, layer, recording, hand_name, start_layer, curves, device)
+    squares = {joint: _squares(again, joint, rows) for joint, rows in _scored(report, again).items()}
+    before, after = np.sqrt(np.concatenate(list(squares.values())).mean(axis=0))
+    note = ""
+    if len(report.held_out.trajectories) == len(recording.trajectories):
+        note = (
+            "The layer's numbers were fitted to all motions, after the held-out errors above were measured."
+        )
+    closing = Closing(
+        simulator="rollout" if hand_name is None else "newton",
+        layer=layer.name,
+        baseline_rmse_rad=float(before),
+        identified_rmse_rad=float(after),
+        per_joint={joint: _pair(np.sqrt(values.mean(axis=0))) for joint, values in squares.items()},
+        note=note,
+    )
+    return closing, again
+
+
+def _pair(values: np.ndarray) -> tuple[float, float]:
+    return float(values[0]), float(values[1])
+
+
+def _scored(report: Report, curves: Predictions) -> dict[str, np.ndarray]:
+    """Samples of each joint that count, as masks [S]: held-out motions, or all where none was held out."""
+    rows = [row for row in report.trajectories if row.held_out] or list(report.trajectories)
+    chosen: dict[str, set[int]] = {}
+    for row in rows:
+        chosen.setdefault(row.joint, set()).add(curves.files.index(row.file))
+    return {joint: np.isin(curves.trajectory, list(indices)) for joint, indices in chosen.items()}
+
+
+def _squares(curves: Predictions, joint: str, rows: np.ndarray) -> np.ndarray:
+    """Squared errors of baseline and identified model, shape [samples, 2]."""
+    column = curves.joints.index(joint)
+    models = np.stack([curves.baseline[rows, column], curves.identified[rows, column]], axis=1)
+    return (models - curves.measured[rows, column, None]) ** 2
+
+
+def _newton(
+    report: Report,
+    layer: Path,
+    recording: Recording,
+    hand_name: str,
+    start_layer: Path | None,
+    curves: Predictions,
+    device: str,
+) -> Predictions:
+    """Both models in Newton; the identified one as any user of the layer reads it."""
+    from vd.assets_usd.hands import load_hand
+    from vd.gap.newton import simulate_hand
+
+    before, after = load_hand(hand_name, layer=start_layer), load_hand(hand_name, layer=layer)
+    rows = np.array(before.servo, dtype=float)
+    for joint, values in report.baseline.parameters.items():
+        for name, value in values.items():
+            rows[before.joint_names.index(joint), _COLUMN[name]] = value
+    return _with(
+        curves,
+        recording,
+        simulate_hand(recording, before, rows, device=device),
+        simulate_hand(recording, after, np.array(after.servo, dtype=float), device=device),
+    )
+
+
+def _bare(layer: Path, recording: Recording, curves: Predictions, device: str) -> Predictions:
+    """The identified model of each joint as it comes back from the layer; the baseline as it was fitted."""
+    from vd.assets_usd.bare_layer import read_bare_layer
+    from vd.gap.rollout import Rollouts, chains
+
+    after = curves.identified.copy()
+    for chain in chains(recording, None):
+        if not np.isfinite(curves.identified[:, chain.columns]).any():
+            continue
+        rows, _ = read_bare_layer(layer, chain.joints)
+        rollouts = Rollouts(chain, recording, device=device)
+        after[:, chain.columns] = rollouts.predict(rows[None])[0]
+    return _with(curves, recording, curves.baseline, after)
+
+
+def _with(
+    curves: Predictions, recording: Recording, baseline: np.ndarray, identified: np.ndarray
+) -> Predictions:
+    """The curves with other models, at every sample of the recording; NaN where a joint was not simulated."""
+    trajectories = recording.trajectories
+    unseen = np.isnan(curves.baseline)
+    return replace(
+        curves,
+        time=np.concatenate([t.time for t in trajectories]),
+        trajectory=np.repeat(np.arange(len(trajectories)), [len(t.time) for t in trajectories]),
+        command=np.concatenate([t.command for t in trajectories]),
+        measured=np.concatenate([t.position for t in trajectories]),
+        baseline=np.where(unseen, np.nan, baseline),
+        identified=np.where(unseen, np.nan, identified),
+        joints=recording.joints,
+        files=tuple(t.file for t in trajectories),
+    )
