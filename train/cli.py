@@ -37,6 +37,7 @@ Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher 
 Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
                -m vd.train.cli teacher --preset multi-gpu --run-dir SHARED/FOLDER
 Restart by itself after a failure: torchrun --max-restarts 3 ... teacher --run-dir FOLDER --resume auto
+               (several nodes: set TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1, or old addresses outlive a restart)
 
 A run goes on with any number of GPUs and worlds (--resume); on another machine it needs its config.json and a
 checkpoint, progress.jsonl for the curve so far: vd-train teacher --run-dir FOLDER --resume small.pt

@@ -12,6 +12,7 @@ from datetime import timedelta
 from typing import NoReturn
 
 import torch
+from torch.distributed import PrefixStore
 from torch.distributed.rendezvous import rendezvous
 
 START_TIMEOUT = timedelta(minutes=20)
@@ -57,6 +58,9 @@ def join_processes(device: str) -> Processes:
     # Worlds are built by now, on some machines minutes later than on others. All wait here, so that the
     # short limit below is one of collectives alone.
     store, rank, world_size = next(iter(rendezvous("env://", timeout=START_TIMEOUT)))
+    if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":
+        # torchrun's own store outlives its workers: after a restart it still holds their addresses.
+        store = PrefixStore(f"attempt_{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}", store)
     store.set(f"built/{rank}", "1")
     store.wait([f"built/{other}" for other in range(world_size)], START_TIMEOUT)
     if cuda:
