@@ -199,7 +199,7 @@ Command = (
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
     command: Run | Find | Explain | Close | Report | Plan | Hide = tyro.cli(
-        Command,  # type: ignore[arg-type]
+        Command,
         args=arguments,
         prog="vd-gap",
         description=__doc__,

@@ -72,11 +72,10 @@ def _effects(
     if GRAVITY.name in fitted:
         values.setdefault(GRAVITY_EFFECT, {})[GRAVITY.name] = fitted[GRAVITY.name]
     for name, parameters in effect_values(named, joint).items():
-        known = {
-            key: (value if np.isfinite([low, high]).all() and low <= value <= high else value[0])
-            for key, value in parameters.items()
-            for _, low, high in [value]
-        }
+        known: dict[str, float | tuple[float, float, float]] = {}
+        for key, (value, low, high) in parameters.items():
+            certain = np.isfinite([low, high]).all() and low <= value <= high
+            known[key] = (value, low, high) if certain else value
         values[name] = {**values.get(name, {}), **known}
     return values
 

@@ -6,7 +6,7 @@ from matplotlib.figure import Figure
 
 from vd.files import atomic_path
 from vd.gap import figures
-from vd.gap.result import UNITS, Candidate, Predictions, Report
+from vd.gap.result import UNITS, Candidate, Predictions, Report, parameter_of
 from vd.gap.words import (
     amount,
     decision_text,
@@ -222,9 +222,9 @@ def _evidence(page: Page, pictures: _Pictures, report: Report) -> None:
 
 
 def _evidence_row(row: Candidate) -> tuple[str, ...]:
-    units = {p.name: p.unit for p in EFFECTS[row.name].parameters} if row.name in EFFECTS else {}
     fitted = ", ".join(
-        f"{name} {amount(value, units.get(name, '1'))}" for name, value in row.parameters.items()
+        f"{key.rpartition('.')[2]} {amount(value, parameter_of(key, row.name).unit)}"
+        for key, value in row.parameters.items()
     )
     return (
         plain(row.name) + (" (placebo)" if row.placebo else ""),

@@ -17,7 +17,7 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import atomic_path, write_json
-from vd.kernels.effects import BASELINE, EFFECTS
+from vd.kernels.effects import BASELINE, EFFECTS, Parameter
 
 FORMAT = "vd-gap-report/1"
 _OPTIONAL = ("hand", "hand_layer", "closing")
@@ -136,6 +136,7 @@ class Candidate:
     reason: str
     """Why, in a few words."""
     parameters: dict[str, float] = field(default_factory=dict)
+    """Fitted values by ``effect.parameter``, a parameter of this effect, or a baseline's name."""
     placebo: bool = False
     """A negative control (an effect driven by shuffled time), which must be rejected."""
 
@@ -337,6 +338,20 @@ class Predictions:
 
 
 _CURVES = ("command", "measured", "baseline", "identified")
+
+
+def parameter_of(key: str, effect: str = "") -> Parameter:
+    """The parameter that a key means: ``effect.parameter``, a parameter of ``effect``, or of the baseline.
+
+    Raises:
+        ValueError: There is none.
+    """
+    group, _, name = key.rpartition(".")
+    known = EFFECTS[group or effect].parameters if (group or effect) in EFFECTS else ()
+    for parameter in (*known, *(() if group else (*BASELINE, GRAVITY))):
+        if parameter.name == name:
+            return parameter
+    raise ValueError(f"no parameter is called {key!r}")
 
 
 def parameter_columns(report: Report, joint: str) -> dict[int, float]:

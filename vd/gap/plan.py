@@ -1,0 +1,375 @@
+"""Plan the next experiment: the motions on which the models that are still possible disagree most.
+
+Every set of motions of the menu is simulated under every model in question. Two models differ by what
+refitting cannot absorb: the part of their difference along small changes of their parameters is taken out,
+as far as those parameters are uncertain. The set whose least different pair stands out most from the noise
+is proposed.
+"""
+
+import csv
+import io
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+import vd.kernels.actuators as servo
+from vd.files import write_json, write_text
+from vd.gap.excitations import MENU, Excitation, JointRange
+from vd.gap.recording import BARE_MODELS, Recording, Trajectory
+from vd.gap.result import Report, parameter_columns, parameter_of
+from vd.gap.rollout import Chain, Rollouts, chains
+from vd.gap.words import listing, plain
+from vd.kernels.effects import BASELINE, EFFECTS
+
+if TYPE_CHECKING:
+    from vd.assets_usd.hand_model import HandModel
+
+FORMAT = "vd-experiment/1"
+PLAN_JSON = "next_experiment.json"
+PLAN_FOLDER = "next_experiment"
+UNCERTAINTY = 0.1
+"""Relative standard deviation that the parameters of a model are given: what old data leave open."""
+STEP = 0.02
+"""Relative change of a parameter by which its influence is computed."""
+VISIBLE = 3.0
+"""Disagreement, in noise floors, from which a recording is expected to decide."""
+PAYLOAD_SET = "second_payload"
+"""Set that changes the load; only a pendulum's load is modelled."""
+PAYLOAD_FACTORS = (1.0, 2.0)
+"""Loads of that set in units of the one that was recorded."""
+CONCLUSIONS = {
+    "steps_and_sines": "steps and sines",
+    "slow_triangle": "a slow triangle",
+    "gain_ladder": "the same motions at three P gains",
+    "second_payload": "the same motion with a second payload",
+    "torque_release": "lifting and then switching the torque off",
+    "long_holds": "levels held for several seconds",
+    "reversal_staircase": "a staircase of small steps with many reversals",
+    "chirp": "a small sine of rising frequency",
+}
+"""Sets of motions in words."""
+
+
+@dataclass(frozen=True)
+class Score:
+    """What a set of motions would show."""
+
+    name: str
+    """Key of :data:`vd.gap.excitations.MENU`."""
+    disagreement_rad: float
+    """RMS difference of the two models that differ least, refitting taken into account."""
+    floors: float
+    """The same in noise floors."""
+    seconds: float
+    """Length of all its motions."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The next experiment."""
+
+    model: str
+    joints: tuple[str, ...]
+    """All joints of the recording; commands name every one of them."""
+    moved: tuple[str, ...]
+    """Joints in question."""
+    competing: dict[str, tuple[str, ...]]
+    """Models in question, by joint."""
+    ranking: tuple[Score, ...]
+    """Best first."""
+    motions: tuple[Excitation, ...]
+    """Of the best set."""
+    sentence: str
+
+
+def plan(
+    report: Report,
+    recording: Recording,
+    hand: "HandModel | None",
+    start: Mapping[str, np.ndarray] | None = None,
+    *,
+    device: str = "cpu",
+) -> Plan:
+    """Choose the next experiment.
+
+    Args:
+        report: What is known so far.
+        recording: From what.
+        hand: The hand; None for a bare servo or pendulum.
+        start: Parameter row of each joint that the analysis started from.
+        device: Warp device.
+
+    Raises:
+        ValueError: The recording has no joint with a model to compare.
+    """
+    targets, floor = _targets(report), report.noise_floor_rad
+    reach = _reach(recording, hand)
+    totals: dict[str, list[float]] = {}
+    seconds: dict[str, float] = {}
+    kept: dict[str, list[Excitation]] = {}
+    competing: dict[str, tuple[str, ...]] = {}
+    for chain in chains(recording, hand):
+        base = _base(chain, report, start or {})
+        for joint in (name for name in chain.joints if name in targets):
+            models = _models(report, chain, joint, base, targets[joint])
+            competing[joint] = tuple(models)
+            for name in MENU:
+                motions = _motions(name, reach, recording, joint)
+                if not motions:
+                    continue
+                value = _disagreement(
+                    chain, recording, motions, joint, models, report.noise_floor_rad, device
+                )
+                totals.setdefault(name, []).append(value)
+                seconds[name] = seconds.get(name, 0.0) + sum(motion.duration for motion in motions)
+                kept.setdefault(name, []).extend(motions)
+    if not totals:
+        raise ValueError(
+            f"{recording.path}: no joint has a fitted model to plan from; run vd-gap explain first"
+        )
+    floor = report.noise_floor_rad
+    ranking = sorted(
+        (
+            Score(name, float(np.median(values)), float(np.median(values)) / floor, seconds[name])
+            for name, values in totals.items()
+        ),
+        key=lambda score: -score.floors,
+    )
+    best = ranking[0]
+    return Plan(
+        model=recording.model,
+        joints=recording.joints,
+        moved=tuple(competing),
+        competing=competing,
+        ranking=tuple(ranking),
+        motions=tuple(kept[best.name]),
+        sentence=_sentence(best, report, tuple(competing)),
+    )
+
+
+def write_plan(result: Plan, folder: Path) -> Path:
+    """Write ``next_experiment.json`` and its commands, one CSV file per motion.
+
+    A CSV has the header of a recording without what is measured: ``t``, ``command.<joint>`` for every joint
+    and, where the torque is switched off, ``enabled.<joint>``.
+
+    Returns:
+        The JSON file.
+    """
+    entries = []
+    for index, motion in enumerate(result.motions):
+        name = f"{index:03d}_{motion.joints[0]}_{motion.name}.csv"
+        write_text(Path(folder) / PLAN_FOLDER / name, _csv(motion, result.joints))
+        entries.append(
+            {
+                "file": f"{PLAN_FOLDER}/{name}",
+                "excitation": motion.name,
+                "joints": list(motion.joints),
+                "conditions": motion.conditions,
+                "duration_s": motion.duration,
+            }
+        )
+    path = Path(folder) / PLAN_JSON
+    write_json(
+        path,
+        {
+            "format": FORMAT,
+            "model": result.model,
+            "joints": list(result.joints),
+            "sentence": result.sentence,
+            "excitation": result.ranking[0].name,
+            "competing": {joint: list(names) for joint, names in result.competing.items()},
+            "ranking": [vars(score) for score in result.ranking],
+            "trajectories": entries,
+        },
+    )
+    return path
+
+
+def _targets(report: Report) -> dict[str, tuple[str, ...]]:
+    """Joints in question with the effects that compete on each; none means that all do."""
+    targets: dict[str, tuple[str, ...]] = {}
+    for group in report.ambiguous:
+        rows = [row for row in report.evidence if row.name in group and row.decision != "rejected"]
+        for joint in dict.fromkeys(joint for row in rows for joint in row.joints):
+            targets[joint] = group
+    if not targets:
+        shaky = [
+            one.joint for one in report.joints if one.verdict in ("under_excited", "ambiguous", "unknown")
+        ]
+        targets = {joint: () for joint in shaky or report.recording.joints}
+    return {joint: group for joint, group in targets.items() if joint in report.identified.parameters}
+
+
+def _base(chain: Chain, report: Report, start: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Parameter rows of the chain as identified so far, shape [n, P]."""
+    rows = np.array(chain.start_row, dtype=float)
+    for index, joint in enumerate(chain.joints):
+        rows[index] = start.get(joint, rows[index])
+        for column, value in parameter_columns(report, joint).items():
+            rows[index, column] = value
+    return rows
+
+
+def _models(
+    report: Report, chain: Chain, joint: str, base: np.ndarray, group: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """Parameter rows [n, P] of every model in question, by name."""
+    index = chain.joints.index(joint)
+    models = {}
+    for name in group:
+        found = [
+            row for row in report.evidence if row.name == name and joint in row.joints and not row.placebo
+        ]
+        values = {p.column: p.typical for p in EFFECTS[name].parameters}
+        for row in found[-1:]:  # the last round is the one in which it is in question
+            values |= {parameter_of(key, name).column: value for key, value in row.parameters.items()}
+        models[name] = base.copy()
+        for column, value in values.items():
+            models[name][index, column] = value
+    if len(models) >= 2:
+        return models
+    # Nothing in particular competes: which motion would show the most of everything?
+    models = {"plain servo": base}
+    for effect in EFFECTS.values():
+        if effect.name == "joint_coupling" and len(chain.joints) == 1:
+            continue
+        models[effect.name] = base.copy()
+        for parameter in effect.parameters:
+            models[effect.name][index, parameter.column] = parameter.typical
+    return models
+
+
+def _reach(recording: Recording, hand: "HandModel | None") -> JointRange:
+    """Range of motion of the recorded joints: the hand's, or what was commanded before."""
+    gains = [float(t.conditions["p_gain"]) for t in recording.trajectories if "p_gain" in t.conditions]
+    p_gain = max(gains, default=1.0)
+    if hand is not None:
+        index = [hand.joint_names.index(name) for name in recording.joints]
+        return JointRange(recording.joints, hand.lower[index], hand.upper[index], p_gain)
+    commands = np.concatenate([t.command for t in recording.trajectories])
+    return JointRange(recording.joints, commands.min(axis=0), commands.max(axis=0), p_gain)
+
+
+def _motions(name: str, reach: JointRange, recording: Recording, joint: str) -> list[Excitation]:
+    """Motions of a set that move the joint; none if the set cannot be predicted for this machine."""
+    motions = [motion for motion in MENU[name](reach) if motion.joints == (joint,)]
+    common = _common(recording)
+    if name == PAYLOAD_SET:
+        mass = common.get("payload_kg")
+        if recording.model not in BARE_MODELS or not isinstance(mass, float) or "arm_length_m" not in common:
+            return []
+        motions = [
+            replace(motion, conditions={**motion.conditions, "payload_kg": factor * mass})
+            for motion, factor in zip(motions, PAYLOAD_FACTORS, strict=True)
+        ]
+    return [replace(motion, conditions={**common, **motion.conditions}) for motion in motions]
+
+
+def _common(recording: Recording) -> dict[str, float | str]:
+    """Conditions that were the same in all recorded motions, and the full gain."""
+    first = dict(recording.trajectories[0].conditions)
+    return {
+        key: float(value) if isinstance(value, int) else value
+        for key, value in first.items()
+        if all(t.conditions.get(key) == value for t in recording.trajectories)
+    }
+
+
+def _disagreements(
+    chain: Chain,
+    recording: Recording,
+    motions: Sequence[Excitation],
+    joint: str,
+    models: Mapping[str, np.ndarray],
+    floor: float,
+    device: str,
+) -> list[float]:
+    """RMS difference [rad] of every pair of models, what refitting absorbs taken out."""
+    imagined = replace(
+        recording,
+        trajectories=tuple(
+            Trajectory(
+                file=f"{index}_{motion.name}",
+                excitation=motion.name,
+                joints=motion.joints,
+                conditions=motion.conditions,
+                time=motion.time,
+                command=motion.command,
+                position=motion.command,
+                enabled=motion.enabled,
+            )
+            for index, motion in enumerate(motions)
+        ),
+    )
+    rollouts = Rollouts(chain, imagined, device=device)
+    index = chain.joints.index(joint)
+    rows, free = [], []
+    for model in models.values():
+        columns = _free(chain, model, index)
+        free.append(columns)
+        rows.append(model)
+        for column in columns:
+            changed = model.copy()
+            changed[index, column] *= 1.0 + STEP
+            rows.append(changed)
+    predicted = rollouts.predict(np.array(rows))[:, :, index].astype(float)
+    curves, slopes, place = [], [], 0
+    for columns in free:
+        curves.append(predicted[place])
+        slopes.append((predicted[place + 1 : place + 1 + len(columns)] - predicted[place]) / STEP)
+        place += 1 + len(columns)
+    return [
+        _left_over(curves[a] - curves[b], np.concatenate([slopes[a], slopes[b]]), floor)
+        for a, b in itertools.combinations(range(len(curves)), 2)
+    ]
+
+
+def _free(chain: Chain, rows: np.ndarray, joint: int) -> list[int]:
+    """Columns that a fit of the model could change: the baseline's and those of effects that act."""
+    columns = [p.column for p in BASELINE if p.name in chain.baseline_free]
+    for effect in EFFECTS.values():
+        columns += [p.column for p in effect.parameters if rows[joint, p.column] != p.neutral]
+    if servo.GRAVITY_TORQUE not in columns and "tau_g_nm" in chain.baseline_free:
+        columns.append(servo.GRAVITY_TORQUE)
+    return [column for column in columns if rows[joint, column] != 0.0]
+
+
+def _left_over(difference: np.ndarray, slopes: np.ndarray, floor: float) -> float:
+    """RMS of a difference [S] after its best explanation by parameter changes [P, S] of limited size."""
+    normal = slopes @ slopes.T + np.eye(len(slopes)) * (floor / UNCERTAINTY) ** 2
+    change = np.linalg.solve(normal, slopes @ difference)
+    return float(np.sqrt(np.mean((difference - change @ slopes) ** 2)))
+
+
+def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
+    goal = (
+        f"to tell {listing([' from '.join(map(plain, group)) for group in report.ambiguous])}"
+        if report.ambiguous
+        else "to see what these motions do not show"
+    )
+    sure = (
+        f"There the models in question differ by {best.floors:.1f} times the noise floor"
+        if best.floors >= VISIBLE
+        else f"Even there the models in question differ by only {best.floors:.1f} times the noise floor, so "
+        "that it may stay open"
+    )
+    return (
+        f"Record {CONCLUSIONS[best.name]} on {listing(joints)} ({best.seconds:.0f} s) {goal}. {sure}. The "
+        f"commands are in {PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
+    )
+
+
+def _csv(motion: Excitation, joints: Sequence[str]) -> str:
+    off = not motion.enabled.all()
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["t", *(f"command.{j}" for j in joints), *(f"enabled.{j}" for j in joints if off)])
+    for row, time in enumerate(motion.time):
+        cells = [f"{time:.6f}", *(f"{value:.6f}" for value in motion.command[row])]
+        writer.writerow(cells + ([str(int(on)) for on in motion.enabled[row]] if off else []))
+    return text.getvalue()
