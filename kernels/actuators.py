@@ -6,6 +6,7 @@ neutral value; with all off, :func:`servo` returns the command itself, kp, kd, n
 torque, bit for bit. The same functions run in the gap workflow's rollouts and in the simulator: both
 apply ``stiffness (reference - q) - damping qd + torque`` with the damping treated implicitly, and
 ``friction`` as the bound of a dry friction force, so that a light joint holds still at coarse steps.
+Filter and profile give their mean over the step, as does a command that arrives within it.
 
 Parameters and states are rows of columns (``PARAMETER_*``, ``STATE_*``) of one joint in one world.
 SI units, radians; time in seconds since the joint was switched on.
@@ -67,8 +68,6 @@ STATE_COLUMNS = 8
 
 SMALLEST_TORQUE = 1.0e-9
 """Below this torque [N m] a ratio of torques says nothing."""
-STANDSTILL = 1.0e-3
-"""Speed [rad/s] below which the direction of motion is that of the driving torque."""
 
 
 @wp.struct
@@ -90,27 +89,33 @@ class Servo:
 
 
 @wp.func
-def low_pass(value: float, target: float, tau: float, dt: float) -> float:
-    """First-order low-pass, exact over a step in which ``target`` is constant; tau = 0 passes through."""
+def low_pass(value: float, target: float, tau: float, dt: float) -> wp.vec2:
+    """First-order low-pass, exact over a step in which ``target`` is constant; tau = 0 passes through.
+
+    Returns its value at the end of the step and its mean over the step.
+    """
     if tau <= 0.0:
-        return target
-    return target + (value - target) * wp.exp(-dt / tau)
+        return wp.vec2(target, target)
+    decay = wp.exp(-dt / tau)
+    error = value - target
+    return wp.vec2(target + error * decay, target + error * (1.0 - decay) * tau / dt)
 
 
 @wp.func
 def accelerate(position: float, speed: float, target: float, limit: float, dt: float) -> wp.vec2:
-    """One step of a profile to ``target`` with bounded acceleration, braking in time; limit <= 0: none.
+    """One step of a profile to ``target`` with an acceleration up to ``limit``, braking in time.
 
-    Returns the new position and speed of the profile.
+    Returns the new position and speed of the profile; the acceleration is constant over the step.
     """
-    if limit <= 0.0:
-        return wp.vec2(target, 0.0)
     error = target - position
-    # The speed from which the rest of the way is enough to stop, in steps of dt.
-    brake = limit * dt * (wp.sqrt(0.25 + 2.0 * wp.abs(error) / (limit * dt * dt)) - 0.5)
-    wanted = wp.sign(error) * wp.min(brake, wp.abs(error) / dt)
-    speed = speed + wp.clamp(wanted - speed, -limit * dt, limit * dt)
-    return wp.vec2(position + speed * dt, speed)
+    side = wp.sign(error)
+    # The speed at the end of the step from which the rest of the way is just enough to stop:
+    # |error| - (speed + wanted) dt / 2 = wanted^2 / (2 limit).
+    step = 0.5 * limit * dt
+    rest = step * step + 2.0 * limit * wp.abs(error) - limit * dt * side * speed
+    wanted = side * (wp.sqrt(wp.max(rest, 0.0)) - step)
+    new_speed = speed + wp.clamp(wanted - speed, -limit * dt, limit * dt)
+    return wp.vec2(position + 0.5 * (speed + new_speed) * dt, new_speed)
 
 
 @wp.func
@@ -156,14 +161,20 @@ def motor_torque(wanted: float, speed: float, time: float, parameters: wp.array2
 
 
 @wp.func
-def dry_friction(motor: float, speed: float, parameters: wp.array2d[float], row: int) -> float:
-    """Bound of the friction torque [N m]: Coulomb, Stribeck, load-dependent and asymmetric, added up.
+def dry_friction(motor: float, speed: float, parameters: wp.array2d[float], row: int) -> wp.vec2:
+    """Friction torque [N m]: Coulomb, Stribeck, load-dependent and asymmetric, added up.
+
+    Friction F+ against positive motion and F- against negative motion is, in motion and at rest, a
+    bound of (F+ + F-) / 2 and a constant torque of -(F+ - F-) / 2; so no direction has to be guessed.
 
     Args:
         motor: Torque of the motor [N m], which the transmission carries.
         speed: Joint velocity [rad/s].
         parameters: Parameter rows.
         row: The joint's row.
+
+    Returns:
+        The bound and the constant torque.
     """
     friction = parameters[row, COULOMB_TORQUE] + parameters[row, LOAD_FRICTION] * wp.abs(motor)
     sliding = parameters[row, STRIBECK_SLIDING]
@@ -171,14 +182,9 @@ def dry_friction(motor: float, speed: float, parameters: wp.array2d[float], row:
     if static > 0.0 or sliding > 0.0:
         ratio = speed / parameters[row, STRIBECK_SPEED]
         friction += sliding + (static - sliding) * wp.exp(-ratio * ratio)
-    direction = speed
-    if wp.abs(speed) < STANDSTILL:
-        direction = motor
-    if direction >= 0.0:
-        friction += parameters[row, FRICTION_PLUS]
-    else:
-        friction += parameters[row, FRICTION_MINUS]
-    return wp.max(friction, 0.0)
+    plus = parameters[row, FRICTION_PLUS]
+    minus = parameters[row, FRICTION_MINUS]
+    return wp.vec2(wp.max(friction + 0.5 * (plus + minus), 0.0), 0.5 * (minus - plus))
 
 
 @wp.func
@@ -189,23 +195,30 @@ def elastic_load(
     parameters: wp.array2d[float],
     row: int,
     state: wp.array2d[float],
-) -> float:
-    """Advance the second mass behind its spring (implicit Euler); returns its torque on the joint [N m]."""
+) -> wp.vec2:
+    """Advance the second mass behind its spring by one step.
+
+    A leapfrog step, which has no damping of its own, with the mass increased as average acceleration
+    asks: stable with any spring. The joint's side gets the same as a damping that acts on the change of
+    its velocity only: ``dt k / 2`` implicitly, less its torque at the present velocity.
+
+    Returns:
+        The torque on the joint [N m] and the damping [N m s/rad], to be treated implicitly.
+    """
     stiffness = parameters[row, ELASTIC_STIFFNESS]
     if stiffness <= 0.0:
-        return 0.0
+        return wp.vec2(0.0, 0.0)
     damping = parameters[row, ELASTIC_DAMPING]
-    inertia = parameters[row, ELASTIC_INERTIA]
     angle = state[row, STATE_ELASTIC]
     rate = state[row, STATE_ELASTIC_SPEED]
-    # Displacement from the joint, as the joint moves on at its present speed.
-    stretch = angle - (position + speed * dt)
-    new_rate = (inertia * rate - dt * stiffness * stretch + dt * damping * speed) / (
-        inertia + dt * damping + dt * dt * stiffness
-    )
+    spring = stiffness * (angle - position)
+    inertia = parameters[row, ELASTIC_INERTIA] + 0.5 * dt * damping + 0.25 * dt * dt * stiffness
+    new_rate = rate - dt * (spring + damping * (rate - speed)) / inertia
     state[row, STATE_ELASTIC_SPEED] = new_rate
     state[row, STATE_ELASTIC] = angle + dt * new_rate
-    return -inertia * (new_rate - rate) / dt
+    stabiliser = 0.5 * dt * stiffness
+    torque = spring + damping * 0.5 * (rate + new_rate) + stabiliser * speed
+    return wp.vec2(torque, damping + stabiliser)
 
 
 @wp.func
@@ -251,18 +264,16 @@ def servo(
     time = state[row, STATE_TIME]
     state[row, STATE_TIME] = time + dt
 
-    reference = low_pass(state[row, STATE_FILTERED], command, parameters[row, FILTER_TAU], dt)
-    state[row, STATE_FILTERED] = reference
-    profile = accelerate(
-        state[row, STATE_PROFILE],
-        state[row, STATE_PROFILE_SPEED],
-        reference,
-        parameters[row, ACCELERATION_LIMIT],
-        dt,
-    )
-    reference = profile[0]
-    state[row, STATE_PROFILE] = profile[0]
-    state[row, STATE_PROFILE_SPEED] = profile[1]
+    filtered = low_pass(state[row, STATE_FILTERED], command, parameters[row, FILTER_TAU], dt)
+    state[row, STATE_FILTERED] = filtered[0]
+    reference = filtered[1]
+    limit = parameters[row, ACCELERATION_LIMIT]
+    if limit > 0.0:
+        before = state[row, STATE_PROFILE]
+        profile = accelerate(before, state[row, STATE_PROFILE_SPEED], reference, limit, dt)
+        state[row, STATE_PROFILE] = profile[0]
+        state[row, STATE_PROFILE_SPEED] = profile[1]
+        reference = 0.5 * (before + profile[0])
     reference = play(state[row, STATE_PLAY], reference, parameters[row, BACKLASH_WIDTH])
     state[row, STATE_PLAY] = reference
     reference += coupled
@@ -282,13 +293,16 @@ def servo(
     gain = 1.0
     if wp.abs(wanted) > SMALLEST_TORQUE:
         gain = motor / wanted
+    friction = dry_friction(motor, speed, parameters, row)
+    load = elastic_load(position, speed, dt, parameters, row, state)
     result.reference = reference
     result.stiffness = gain * power * kp
-    result.damping = gain * damping
+    result.damping = gain * damping + load[1]
     result.torque = (
         gain * steady
         - parameters[row, GRAVITY_TORQUE] * wp.sin(position + parameters[row, GRAVITY_PHASE])
-        + elastic_load(position, speed, dt, parameters, row, state)
+        + load[0]
+        + friction[1]
     )
-    result.friction = dry_friction(motor, speed, parameters, row)
+    result.friction = friction[0]
     return result

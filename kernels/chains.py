@@ -154,21 +154,21 @@ def arrival(
     samples: Samples,
     write: int,
     stream: int,
-    joint: int,
     parameters: wp.array2d[float],
     row: int,
     dt: float,
 ):
     """When a command acts, and whether it does: ``(step, fraction, kept)``.
 
-    The random numbers belong to the write and the joint: with other parameters they stay the same.
+    The random numbers belong to the write, whatever the parameters. Joints share them: the commands of
+    a hand go out together.
     """
     delay = parameters[row, COMMAND_DELAY]
     sigma = parameters[row, JITTER_SIGMA]
     drop = parameters[row, JITTER_DROP]
     kept = 1
     if sigma > 0.0 or drop > 0.0:
-        rng = wp.rand_init(stream * MAX_JOINTS + joint, write)
+        rng = wp.rand_init(stream, write)
         if wp.randf(rng) < drop:
             kept = 0
         delay += sigma * wp.abs(wp.randn(rng))
@@ -275,7 +275,7 @@ def rollout_kernel(
         held[j] = samples.command[begin, j]
         held_power[j] = samples.power[begin, j]
         start_servo(held[j], q[j], row, state)
-        step, fraction, kept = arrival(samples, begin, stream[run], j, parameters, row, dt)
+        step, fraction, kept = arrival(samples, begin, stream[run], parameters, row, dt)
         due_step[j] = step
         due_fraction[j] = fraction
         due_kept[j] = kept
@@ -307,7 +307,7 @@ def rollout_kernel(
                     held_power[j] = samples.power[write[j], j]
                 write[j] = write[j] + 1
                 if write[j] < end:
-                    step, fraction, kept = arrival(samples, write[j], stream[run], j, parameters, row, dt)
+                    step, fraction, kept = arrival(samples, write[j], stream[run], parameters, row, dt)
                     # In order: no command overtakes the one before.
                     if step < due_step[j] or (step == due_step[j] and fraction < due_fraction[j]):
                         step = due_step[j]
