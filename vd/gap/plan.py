@@ -121,9 +121,9 @@ def plan(
                 motions = _motions(name, reach, recording, joint)
                 if not motions:
                     continue
-                value = _disagreement(
-                    chain, recording, motions, joint, models, report.noise_floor_rad, device
-                )
+                pairs = _disagreements(chain, recording, motions, joint, models, floor, device)
+                # Two rivals have to be separated for sure; where anything is possible, most of it shown.
+                value = float(np.min(pairs) if targets[joint] else np.median(pairs))
                 totals.setdefault(name, []).append(value)
                 seconds[name] = seconds.get(name, 0.0) + sum(motion.duration for motion in motions)
                 kept.setdefault(name, []).extend(motions)

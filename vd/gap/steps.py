@@ -198,12 +198,12 @@ class Analysis:
     def options(self) -> dict[str, Any]:
         """Keyword arguments of the steps of :mod:`vd.gap.workflow`."""
         settings = self.settings
-        return {
-            "effects": settings.effects or None,
-            "seed": settings.seed,
-            "device": settings.device,
-            "start": self.start,
-        }
+        options: dict[str, Any] = {"seed": settings.seed, "device": settings.device, "progress": _show}
+        if settings.effects:
+            options["effects"] = settings.effects
+        if self.start:
+            options["start"] = self.start
+        return options
 
     def explained(self) -> Report:
         """What ``explain`` wrote."""
@@ -221,6 +221,10 @@ class Analysis:
         return " ".join(words)
 
 
+def _show(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
 def _find(analysis: Analysis) -> None:
     from vd.gap import workflow
 
@@ -235,6 +239,7 @@ def _explain(analysis: Analysis) -> None:
 
 def _close(analysis: Analysis) -> None:
     from vd.gap.close import simulate_again, write_identified
+    from vd.gap.plan import PLAN_JSON, plan, write_plan
 
     report, layer = analysis.explained(), analysis.out / LAYER
     write_identified(report, layer, analysis.recording, analysis.hand, analysis.start)
@@ -248,17 +253,27 @@ def _close(analysis: Analysis) -> None:
         device=analysis.settings.device,
     )
     curves.write(analysis.out / CLOSING_CURVES)
+    (analysis.out / PLAN_JSON).unlink(missing_ok=True)
+    if report.verdict == "under_excited" or report.ambiguous:
+        _show("close: looking for the motions that would decide")
+        write_plan(plan(report, analysis.recording, analysis.hand, analysis.start), analysis.out)
     write_json(analysis.out / CLOSE, to_dict(closing))
 
 
 def _report(analysis: Analysis) -> None:
+    from vd.gap.plan import PLAN_JSON
     from vd.gap.report import write_report
 
     closing = from_dict(Closing, json.loads((analysis.out / CLOSE).read_text()))
     steps = analysis._record()["steps"]
+    report = analysis.explained()
+    planned = analysis.out / PLAN_JSON
     report = replace(
-        analysis.explained(),
+        report,
         closing=closing,
+        next_experiment=(
+            json.loads(planned.read_text())["sentence"] if planned.is_file() else report.next_experiment
+        ),
         seconds=sum(step["seconds"] for step in steps.values()),
         hand=analysis.hand_name,
         hand_layer=None if analysis.settings.hand_layer is None else str(analysis.settings.hand_layer),
