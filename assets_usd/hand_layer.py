@@ -111,8 +111,8 @@ def add_layer(stage: Usd.Stage, path: Path) -> None:
     """
     if not path.is_file():
         raise HandError(
-            f"{path}: no such hand layer; name the identified.usda that vd-gap wrote, or --hand-layer none for a "
-            "policy that was trained with one that is not here"
+            f"{path}: no such hand layer; name the identified.usda that vd-gap wrote, or, for a policy "
+            "trained with one that is not here, --hand-layer none"
         )
     try:
         layer = Sdf.Layer.FindOrOpen(str(path.resolve()))

@@ -53,7 +53,7 @@ def apply_action_kernel(
         params: Settings, shape [1].
         action_in: Action of the policy, shape [N, D].
         action_offset_in: Constant error of each actuator in action units, shape [N, D].
-        joint_q_in: Joint positions [rad], shape [N, *].
+        joint_q_in: Joint positions as measured [rad], shape [N, *].
         smoothed: Moving average of the applied action, shape [N, D].
         rng: Random stream of each world, shape [N].
         joint_target_out: Joint position targets [rad], shape [N, *]; the first D columns are written.

@@ -5,6 +5,7 @@ Draws act on the worlds of an int32 mask; worlds outside it keep every bit. Rang
 
 import warp as wp
 
+from vd.kernels.actuators import KD, KP
 from vd.kernels.rng import next_stream, uniform
 
 wp.set_module_options({"enable_backward": False})
@@ -14,8 +15,6 @@ wp.set_module_options({"enable_backward": False})
 class RandomisationParams:
     """Ranges of the draws; an array of length 1 in device memory.
 
-    stiffness_scale: Factor on each joint's stiffness.
-    damping_scale: Factor on each joint's damping.
     friction: Friction coefficient of the hand, and of the object.
     table_friction: Friction coefficient of the table.
     link_mass_scale: Factor on each link's mass.
@@ -24,8 +23,6 @@ class RandomisationParams:
     observation_offset_std: Standard deviation of the constant error of each observed value.
     """
 
-    stiffness_scale: wp.vec2
-    damping_scale: wp.vec2
     friction: wp.vec2
     table_friction: wp.vec2
     link_mass_scale: wp.vec2
@@ -53,6 +50,8 @@ def draw_dynamics_kernel(
     # Model:
     nominal_kp: wp.array[float],
     nominal_kd: wp.array[float],
+    kp_scale: wp.array[wp.vec2],
+    kd_scale: wp.array[wp.vec2],
     params: wp.array[RandomisationParams],
     # In:
     mask_in: wp.array[int],
@@ -72,6 +71,8 @@ def draw_dynamics_kernel(
     Args:
         nominal_kp: Stiffness before randomisation [N m/rad], shape [D].
         nominal_kd: Damping before randomisation [N m s/rad], shape [D].
+        kp_scale: Range of the factor on the stiffness, shape [D].
+        kd_scale: Range of the factor on the damping, shape [D].
         params: Ranges, shape [1].
         mask_in: 1 where a world is drawn anew, shape [N].
         rng: Random stream of each world, shape [N].
@@ -90,10 +91,10 @@ def draw_dynamics_kernel(
     state = rng[world]
 
     for joint in range(nominal_kp.shape[0]):
-        state, kp_scale = uniform(state, settings.stiffness_scale)
-        state, kd_scale = uniform(state, settings.damping_scale)
-        kp_out[world, joint] = nominal_kp[joint] * kp_scale
-        kd_out[world, joint] = nominal_kd[joint] * kd_scale
+        state, kp_factor = uniform(state, kp_scale[joint])
+        state, kd_factor = uniform(state, kd_scale[joint])
+        kp_out[world, joint] = nominal_kp[joint] * kp_factor
+        kd_out[world, joint] = nominal_kd[joint] * kd_factor
         action_offset_out[world, joint] = settings.action_offset_std * wp.randn(state)
     state, hand_friction = uniform(state, settings.friction)
     state, object_friction = uniform(state, settings.friction)
@@ -103,6 +104,47 @@ def draw_dynamics_kernel(
     table_friction_out[world] = table_friction
     for i in range(observation_offset_out.shape[1]):
         observation_offset_out[world, i] = settings.observation_offset_std * wp.randn(state)
+    rng[world] = next_stream(state, world)
+
+
+@wp.kernel
+def draw_servo_kernel(
+    # Model:
+    ranges: wp.array2d[wp.vec2],
+    # In:
+    mask_in: wp.array[int],
+    kp_in: wp.array2d[float],
+    kd_in: wp.array2d[float],
+    # In/Out:
+    rng: wp.array[wp.uint32],
+    # Out:
+    parameters_out: wp.array2d[float],
+):
+    """Draw the servo model of the joints of the masked worlds, each number for itself. Launch: [N].
+
+    Args:
+        ranges: Range of each parameter of each joint, shape [D, P]; equal ends draw nothing.
+        mask_in: 1 where a world is drawn anew, shape [N].
+        kp_in: Stiffness drawn for the world [N m/rad], shape [N, D].
+        kd_in: Damping drawn for the world [N m s/rad], shape [N, D].
+        rng: Random stream of each world, shape [N].
+        parameters_out: Rows of parameters (:mod:`vd.kernels.actuators`), shape [N D, P].
+    """
+    world = wp.tid()
+    if mask_in[world] == 0:
+        return
+    state = rng[world]
+    joints = ranges.shape[0]
+    for joint in range(joints):
+        row = world * joints + joint
+        for column in range(ranges.shape[1]):
+            bounds = ranges[joint, column]
+            value = bounds[0]
+            if bounds[1] > bounds[0]:
+                state, value = uniform(state, bounds)
+            parameters_out[row, column] = value
+        parameters_out[row, KP] = kp_in[world, joint]
+        parameters_out[row, KD] = kd_in[world, joint]
     rng[world] = next_stream(state, world)
 
 

@@ -6,20 +6,20 @@ from hypothesis import strategies as st
 from kernel_oracle import ALPHA, EXAMPLES, device_array, settings_array, streams, unwritten
 from scipy import stats
 
+from vd.kernels.actuators import PARAMETER_COLUMNS
 from vd.kernels.randomisation import (
     ForceParams,
     RandomisationParams,
     disturbance_force_kernel,
     draw_dynamics_kernel,
     draw_masses_kernel,
+    draw_servo_kernel,
 )
 from vd.kernels.rng import next_stream
 from vd.paper import PAPER
 
 DR = PAPER.randomisation
 RANGES = {
-    "stiffness_scale": wp.vec2(*DR.stiffness_scale),
-    "damping_scale": wp.vec2(*DR.damping_scale),
     "friction": wp.vec2(*DR.friction),
     "table_friction": wp.vec2(*DR.table_friction),
     "link_mass_scale": wp.vec2(*DR.link_mass_scale),
@@ -39,7 +39,9 @@ OUTPUTS = (
 )
 
 
-def draw_dynamics(device, mask, fingers=3, seed=0, observation_size=87, **changes):
+def draw_dynamics(
+    device, mask, fingers=3, seed=0, observation_size=87, kp_scale=DR.stiffness_scale, **changes
+):
     """Launch; returns every output and the streams by name."""
     worlds, joints = len(mask), 3 * fingers
     shapes = [(worlds, joints)] * 2 + [(worlds,)] * 3 + [(worlds, joints), (worlds, observation_size)]
@@ -51,6 +53,8 @@ def draw_dynamics(device, mask, fingers=3, seed=0, observation_size=87, **change
         inputs=[
             device_array(np.tile(KP, fingers), float, device),
             device_array(np.tile(KD, fingers), float, device),
+            device_array(np.broadcast_to(kp_scale, (joints, 2)), wp.vec2, device),
+            device_array(np.broadcast_to(DR.damping_scale, (joints, 2)), wp.vec2, device),
             settings_array(RandomisationParams, device, **{**RANGES, **changes}),
             device_array(mask, int, device),
             rng,
@@ -104,6 +108,47 @@ def test_dynamics_have_the_ranges_of_table_s3(device):
     offset = drawn["action_offset"]
     # Squares too: a normal made from a number drawn before hides that from linear correlation.
     assert_uncorrelated(np.hstack([kp_scale, kd_scale, frictions, offset, offset**2]), 0.05)
+
+
+def test_every_joint_has_its_own_range_of_stiffness(device):
+    scale = np.linspace(0.5, 0.9, 9)[:, None] + [0.0, 0.05]
+    drawn = draw_dynamics(device, np.ones(5000, int), kp_scale=scale)
+    for joint in range(9):
+        assert_uniform(drawn["kp"][:, joint] / np.tile(KP, 3)[joint], scale[joint])
+
+
+def draw_servo(device, mask, ranges, gains, seed=0):
+    """Launch; returns rows [N, D, P] and streams."""
+    worlds, (joints, columns, _) = len(mask), ranges.shape
+    out = unwritten((worlds * joints, columns), float, device)
+    rng = streams(worlds, seed, device)
+    inputs = [device_array(ranges, wp.vec2, device), device_array(mask, int, device)]
+    inputs += [device_array(g, float, device) for g in gains]
+    wp.launch(draw_servo_kernel, dim=worlds, inputs=[*inputs, rng], outputs=[out], device=device)
+    return out.numpy().reshape(worlds, joints, columns), rng.numpy()
+
+
+def test_servos_are_drawn_from_their_ranges_and_carry_the_gains_of_their_world(device):
+    rng = np.random.default_rng(0)
+    worlds, joints = 4000, 3
+    mask = np.arange(worlds) % 2
+    ranges = np.repeat(rng.uniform(0.1, 1.0, (joints, PARAMETER_COLUMNS, 1)), 2, axis=2).astype(np.float32)
+    drawn = [(0, 4), (0, 23), (2, 16)]
+    for joint, column in drawn:
+        ranges[joint, column] = (0.01 * column, 0.02 * column)
+    gains = rng.uniform(1.0, 2.0, (2, worlds, joints)).astype(np.float32)
+    rows, after = draw_servo(device, mask, ranges, gains, seed=8)
+    assert np.isnan(rows[mask == 0]).all()
+    np.testing.assert_array_equal(after[mask == 0], streams(worlds, 8, device).numpy()[mask == 0])
+    rows, gains = rows[mask == 1], gains[:, mask == 1]
+    np.testing.assert_array_equal(rows[:, :, :2], np.moveaxis(gains, 0, -1))
+    for joint in range(joints):
+        for column in range(2, PARAMETER_COLUMNS):
+            if (joint, column) in drawn:
+                assert_uniform(rows[:, joint, column], ranges[joint, column])
+            else:
+                assert (rows[:, joint, column] == ranges[joint, column, 0]).all()
+    assert_uncorrelated(np.stack([rows[:, j, c] for j, c in drawn], axis=1), 0.1)
 
 
 def test_no_offsets_by_default(device):

@@ -141,8 +141,17 @@ class RandomisationCfg:
     force_n_per_kg: float = PAPER.randomisation.force_n_per_kg
     force_decay: float = 0.0
     """What remains of a force in the next control step: 0 in the paper, 0.998 in the released code."""
+    effects: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Effects of servos to draw for every joint, by name and parameter: command_delay.delay_s 0 0.04 draws a
+    delay of up to 40 ms. They replace what a hand layer says about the same parameter."""
     redraw_s: float = PAPER.randomisation.redraw_s
     """Gains and frictions are drawn anew at the first reset after this time [s]."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        from vd.envs.servo import check_effects  # needs Warp, which settings alone do not
+
+        check_effects(self.effects)
 
 
 @dataclass(frozen=True)
@@ -184,6 +193,7 @@ class ReorientCfg:
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         self.sim.validate()
+        self.randomisation.validate()
         if self.start.at_rest and (self.start.poses < 1 or self.start.settle_s <= 0.0):
             raise ValueError(
                 f"start.at_rest needs start.poses >= 1 (now {self.start.poses}) and start.settle_s > 0 "

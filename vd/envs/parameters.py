@@ -62,8 +62,6 @@ class TaskParameters:
 
         self.randomisation = array(
             RandomisationParams,
-            stiffness_scale=span(random.stiffness_scale, 1.0),
-            damping_scale=span(random.damping_scale, 1.0),
             friction=span(random.friction, materials.friction),
             table_friction=span(random.table_friction, materials.table_friction),
             link_mass_scale=span(random.link_mass_scale, 1.0),

@@ -6,7 +6,14 @@ import newton
 import numpy as np
 import warp as wp
 
-from vd.kernels.randomisation import disturbance_force_kernel, draw_dynamics_kernel, draw_masses_kernel
+from vd.envs.servo import gain_scales
+from vd.kernels.actuators import INERTIA, PAYLOAD_INERTIA
+from vd.kernels.randomisation import (
+    disturbance_force_kernel,
+    draw_dynamics_kernel,
+    draw_masses_kernel,
+    draw_servo_kernel,
+)
 from vd.kernels.worlds import (
     redraw_mask_kernel,
     write_friction_kernel,
@@ -24,7 +31,7 @@ PUSH_INTERVAL_S = 1.0
 
 
 class Randomiser:
-    """Masses once at start-up; gains, frictions and constant errors at resets; forces every step.
+    """Masses once at start-up; gains, servos, frictions and constant errors at resets; forces every step.
 
     With randomisation off the same arrays hold the nominal values.
     """
@@ -57,6 +64,12 @@ class Randomiser:
         model, scene = env.sim.model, env.scene
         self._nominal_kp = wp.array(env.hand.kp, dtype=float, device=device)
         self._nominal_kd = wp.array(env.hand.kd, dtype=float, device=device)
+        kp_scale, kd_scale = gain_scales(env.hand, cfg.randomisation)
+        self._kp_scale = wp.array(kp_scale, dtype=wp.vec2, device=device)
+        self._kd_scale = wp.array(kd_scale, dtype=wp.vec2, device=device)
+        self._servo_ranges = wp.array(env.servo_ranges, dtype=wp.vec2, device=device)
+        inertia = env.servo_ranges[:, [INERTIA, PAYLOAD_INERTIA]]
+        self._inertia_varies = bool(np.any(inertia[..., 0] != inertia[..., 1]))
         self._shape_kind = wp.array(scene.shape_kind, dtype=wp.int32, device=device)
         self._nominal_friction = wp.clone(model.shape_material_mu)
         self._model_kp = model.joint_target_ke.reshape((n, -1))
@@ -104,12 +117,20 @@ class Randomiser:
         self.draw(self._due)
 
     def draw(self, mask: wp.array) -> None:
-        """Draw gains, frictions and constant errors for the worlds of ``mask``, shape [N]."""
+        """Draw gains, servos, frictions and constant errors for the worlds of ``mask``, shape [N]."""
         env = self._env
         wp.launch(
             draw_dynamics_kernel,
             dim=env.num_worlds,
-            inputs=[self._nominal_kp, self._nominal_kd, env.parameters.randomisation, mask, env.rng],
+            inputs=[
+                self._nominal_kp,
+                self._nominal_kd,
+                self._kp_scale,
+                self._kd_scale,
+                env.parameters.randomisation,
+                mask,
+                env.rng,
+            ],
             outputs=[
                 self.kp,
                 self.kd,
@@ -121,6 +142,14 @@ class Randomiser:
             ],
             device=env.device,
         )
+        if env.sim.servo is not None:
+            wp.launch(
+                draw_servo_kernel,
+                dim=env.num_worlds,
+                inputs=[self._servo_ranges, mask, self.kp, self.kd, env.rng],
+                outputs=[env.sim.servo.parameters],
+                device=env.device,
+            )
 
     def disturb(self) -> None:
         """Draw this control step's disturbance force and apply it to the object."""
@@ -158,13 +187,18 @@ class Randomiser:
         """Write gains and frictions into the model and tell the solver."""
         env = self._env
         model = env.sim.model
-        wp.launch(
-            write_gains_kernel,
-            dim=(env.num_worlds, env.num_actions),
-            inputs=[self.kp, self.kd],
-            outputs=[self._model_kp, self._model_kd],
-            device=env.device,
-        )
+        flags = newton.ModelFlags.SHAPE_PROPERTIES
+        if env.sim.servo is None:
+            flags |= newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES
+            wp.launch(
+                write_gains_kernel,
+                dim=(env.num_worlds, env.num_actions),
+                inputs=[self.kp, self.kd],
+                outputs=[self._model_kp, self._model_kd],
+                device=env.device,
+            )
+        elif self._inertia_varies:
+            env.sim.servo.push_inertia()  # the rest of a servo reaches the solver in every physics step
         wp.launch(
             write_friction_kernel,
             dim=model.shape_count,
@@ -183,7 +217,6 @@ class Randomiser:
             outputs=[model.shape_material_mu],
             device=env.device,
         )
-        flags = newton.ModelFlags.SHAPE_PROPERTIES | newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES
         env.sim.solver.notify_model_changed(flags)
 
     def stateful(self) -> dict[str, wp.array]:

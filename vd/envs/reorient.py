@@ -17,6 +17,8 @@ from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.envs.cfg import ReorientCfg
 from vd.envs.parameters import TaskParameters
 from vd.envs.randomise import Randomiser
+from vd.envs.servo import needs_servo, servo_ranges
+from vd.envs.starts import find_rest_poses
 from vd.kernels.actions import apply_action_kernel, joint_effort_kernel
 from vd.kernels.observations import fingertip_kernel, teacher_observation_kernel, teacher_observation_size
 from vd.kernels.resets import episode_kernel, reset_kernel
@@ -61,7 +63,13 @@ class ReorientEnv:
             scales=[float(s) for s in scales],
             visuals=cfg.visuals,
         )
-        self.sim = Simulator(self.scene, cfg.sim)
+        self.servo_ranges = servo_ranges(self.hand, random)
+        """Range (low, high) of each number of each joint's servo, shape [D, P, 2]; equal ends are fixed."""
+        largest = self.servo_ranges[:, :, 1] if needs_servo(self.servo_ranges) else None
+        self.sim = Simulator(self.scene, cfg.sim, servo_rows=largest, servo_seed=cfg.seed)
+        servo = self.sim.servo
+        self.measured_q = self.sim.joint_q if servo is None else servo.measured_q
+        """Joint positions as the encoders report them at the end of the step [rad], shape [N, *]."""
         self.parameters = TaskParameters(cfg, self.device)
 
         self.num_worlds = n = cfg.num_worlds
@@ -140,7 +148,7 @@ class ReorientEnv:
         self._steps = 0
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         if cfg.start.at_rest:
-            self._rest_poses = self._find_rest_poses()
+            self._rest_poses = find_rest_poses(self)
         self.reset()
 
     # Stepping
@@ -166,30 +174,6 @@ class ReorientEnv:
         self._reset_worlds(use_start=object_quat is not None, use_goal=goal_quat is not None)
         self.randomiser.push()
         self._observe()
-
-    def _find_rest_poses(self) -> wp.array:
-        """Drop every object a few times and keep where it came to lie, shape [N, K].
-
-        A drop that leaves the claw is replaced by one that did not.
-        """
-        count = self.cfg.start.poses
-        poses = np.zeros((self.num_worlds, count, 7), dtype=np.float32)
-        inside = np.zeros((self.num_worlds, count), dtype=bool)
-        for k in range(count):
-            self.reset()
-            for _ in range(round(self.cfg.start.settle_s * self.cfg.sim.control_hz)):
-                wp.copy(self.sim.target, self.sim.joint_q)
-                self.sim.step()
-            self.check()
-            poses[:, k] = self.object_pose()
-            distance = np.linalg.norm(poses[:, k, :3] - PAPER.scene.goal_position_m, axis=1)
-            inside[:, k] = distance < self.cfg.success.fall_m
-        # Choose, for every slot, the slot itself or the first good one of the world.
-        slot = np.where(inside, np.arange(count), np.argmax(inside, axis=1)[:, None])
-        poses = np.take_along_axis(poses, slot[:, :, None], axis=1)
-        lost = ~inside.any(axis=1)
-        poses[lost] = [*PAPER.scene.object_start_m, 0.0, 0.0, 0.0, 1.0]
-        return wp.array(poses, dtype=wp.transform, device=self.device)
 
     def step(self, action: Any) -> None:
         """Simulate one control step; worlds that end are reset, and the observation is fresh.
@@ -229,7 +213,7 @@ class ReorientEnv:
                 p.action,
                 self.action,
                 self.randomiser.action_offset,
-                sim.joint_q,
+                self.measured_q,
                 self.smoothed,
                 self.rng,
             ],
@@ -245,20 +229,7 @@ class ReorientEnv:
         self.randomiser.disturb()
         sim.step()
         self._fingertips()
-        wp.launch(
-            joint_effort_kernel,
-            dim=(n, d),
-            inputs=[
-                self._effort_limit,
-                self.randomiser.kp,
-                self.randomiser.kd,
-                sim.target,
-                sim.joint_q,
-                sim.joint_qd,
-            ],
-            outputs=[self.effort],
-            device=self.device,
-        )
+        self._motor_torque()
         wp.launch(
             reward_kernel,
             dim=n,
@@ -349,6 +320,29 @@ class ReorientEnv:
         )
         sim.solver.reset(sim.state, world_mask=self._world_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
+        if sim.servo is not None:
+            sim.servo.reset(self._reset)
+
+    def _motor_torque(self) -> None:
+        n, d, sim = self.num_worlds, self.num_actions, self.sim
+        if sim.servo is not None:
+            # Only the servo knows what it had in the last physics step: a late command, a limited torque.
+            wp.copy(self.effort, sim.solver.mjw_data.qfrc_actuator[:, :d])
+            return
+        wp.launch(
+            joint_effort_kernel,
+            dim=(n, d),
+            inputs=[
+                self._effort_limit,
+                self.randomiser.kp,
+                self.randomiser.kd,
+                sim.target,
+                sim.joint_q,
+                sim.joint_qd,
+            ],
+            outputs=[self.effort],
+            device=self.device,
+        )
 
     def _fingertips(self) -> None:
         wp.launch(
@@ -371,6 +365,7 @@ class ReorientEnv:
                 self._tip_offset,
                 self._body_com,
                 self.parameters.observation,
+                self.measured_q,
                 sim.joint_q,
                 sim.joint_qd,
                 sim.body_q,
@@ -450,6 +445,7 @@ class ReorientEnv:
             "observation": self.observation,
             "rng": self.rng,
             **self.randomiser.stateful(),
+            **({} if self.sim.servo is None else self.sim.servo.stateful()),
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -461,8 +457,13 @@ class ReorientEnv:
         """Continue from :meth:`state_dict`.
 
         Raises:
-            ValueError: If it belongs to another number of worlds or another hand.
+            ValueError: If it belongs to another number of worlds, another hand or another servo model.
         """
+        if state["arrays"].keys() != self._stateful().keys():
+            raise ValueError(
+                "the saved environment has other servos; resume with hand_layer and randomisation.effects "
+                "of the checkpoint, or from one without worlds (vd-train export --resumable)"
+            )
         for name, array in self._stateful().items():
             saved = state["arrays"][name]
             if saved.shape != array.numpy().shape:

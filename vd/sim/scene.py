@@ -120,7 +120,7 @@ def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBu
     builder = new_builder()
     builder.default_shape_cfg = shape_cfg(cfg, PAPER.materials.friction)
     builder.add_usd(
-        open_stage(hand.path, hand.fingertip),
+        open_stage(hand.path, hand.fingertip, hand.layer),
         xform=hand_mount(),
         floating=False,
         enable_self_collisions=True,

@@ -1,0 +1,90 @@
+"""Which servo models the worlds draw: a hand layer's values and intervals, Table S3, chosen effects."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from vd.assets_usd.hand_data import HandModel
+from vd.envs.cfg import RandomisationCfg
+from vd.kernels import actuators
+from vd.kernels.effects import BASELINE, EFFECTS, Parameter, neutral_row
+
+PARAMETERS: dict[str, Parameter] = {
+    f"{name}.{p.name}": p for name, effect in EFFECTS.items() for p in effect.parameters
+}
+"""Every parameter of every effect, by the name ``effect.parameter``."""
+
+
+def check_effects(effects: Mapping[str, tuple[float, float]]) -> None:
+    """Raise ValueError for ranges that cannot be drawn, naming the parameter and the remedy.
+
+    Args:
+        effects: Ranges (low, high) by ``effect.parameter``.
+    """
+    for name, (low, high) in effects.items():
+        if name not in PARAMETERS:
+            raise ValueError(f"randomisation.effects: no parameter {name!r}; one of {', '.join(PARAMETERS)}")
+        parameter = PARAMETERS[name]
+        lowest = -parameter.upper if parameter.signed else parameter.lower
+        if not lowest <= low <= high <= parameter.upper:
+            raise ValueError(
+                f"randomisation.effects: {name} from {low:g} to {high:g}; the low end comes first, and both "
+                f"lie between {lowest:g} and {parameter.upper:g} {parameter.unit}"
+            )
+
+
+def gain_scales(hand: HandModel, cfg: RandomisationCfg) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges of the factors on stiffness and damping, [D, 2] each.
+
+    The 95 % interval where the hand's layer has one, or else the configured range around the nominal value.
+    """
+    scales = []
+    for column, nominal, span in (
+        (actuators.KP, hand.kp, cfg.stiffness_scale),
+        (actuators.KD, hand.kd, cfg.damping_scale),
+    ):
+        interval = hand.servo_interval[:, column] / nominal[:, None]
+        scale = np.where(np.isnan(interval), span, interval)
+        scales.append(scale if cfg.enabled else np.ones_like(scale))
+    return scales[0], scales[1]
+
+
+def servo_ranges(hand: HandModel, cfg: RandomisationCfg) -> np.ndarray:
+    """Range (low, high) from which each parameter of each joint is drawn, [D, P, 2]; equal ends are fixed.
+
+    Raises:
+        ValueError: An effect to draw lacks a parameter without which it cannot be.
+    """
+    ranges = np.repeat(hand.servo[:, :, None], 2, axis=2)
+    if cfg.enabled:
+        ranges = np.where(np.isnan(hand.servo_interval), ranges, hand.servo_interval)
+        for name, span in cfg.effects.items():
+            ranges[:, PARAMETERS[name].column] = span
+        _check_complete(ranges, cfg)
+    return ranges
+
+
+def needs_servo(ranges: np.ndarray) -> bool:
+    """Whether any joint in any world has more than a plain drive.
+
+    Stiffness and damping are randomised in the plain model too; a speed limit or an armature that differs
+    between worlds takes the servo.
+    """
+    neutral = np.repeat(np.array(neutral_row())[None, :, None], 2, axis=2)
+    effects = np.setdiff1d(np.arange(actuators.PARAMETER_COLUMNS), [p.column for p in BASELINE])
+    varied = [actuators.VELOCITY_LIMIT, actuators.INERTIA]
+    return bool(
+        (ranges[:, effects] != neutral[:, effects]).any()
+        or (ranges[:, varied, 0] != ranges[:, varied, 1]).any()
+    )
+
+
+def _check_complete(ranges: np.ndarray, cfg: RandomisationCfg) -> None:
+    """Refuse an effect of which a parameter that has to be positive is left at zero."""
+    for name in cfg.effects:
+        effect = name.partition(".")[0]
+        for other, parameter in PARAMETERS.items():
+            if other.partition(".")[0] != effect or parameter.lower <= 0.0:
+                continue
+            if (ranges[:, parameter.column, 0] <= 0.0).any():
+                raise ValueError(f"randomisation.effects has {name} but not {other}; give its range too")
