@@ -286,6 +286,10 @@ def rollout_kernel(
         read_fraction[j] = fraction
 
     for k in range(samples.step[end - 1] + 1):
+        # From rest at the first position to the velocity half a step later.
+        kick = dt
+        if k == 0:
+            kick = CENTRED * dt
         torque = wp.vec3(0.0)
         damping = wp.vec3(0.0)
         bound = wp.vec3(0.0)
@@ -325,7 +329,7 @@ def rollout_kernel(
             torque[j] = drive.stiffness * (drive.reference - q[j]) - drive.damping * speed[j] + drive.torque
             damping[j] = drive.damping
             stiffness[j] = drive.stiffness
-            bound[j] = dt * drive.friction
+            bound[j] = kick * drive.friction
             if drive.friction > 0.0:
                 dry = 1
             diagonal[j] = parameters[row, INERTIA] + parameters[row, PAYLOAD_INERTIA]
@@ -338,17 +342,17 @@ def rollout_kernel(
             inertia = wp.max(diagonal[j] + mass[j, j], SMALLEST_INERTIA)
             mass[j, j] = (
                 inertia
-                + dt * damping[j] * implicitness(dt * damping[j] / inertia)
+                + kick * damping[j] * implicitness(kick * damping[j] / inertia)
                 + 0.25 * dt * dt * stiffness[j]
             )
         new_speed = wp.vec3(0.0)
         if count == 1:
-            new_speed[0] = speed[0] + dt * torque[0] / mass[0, 0]
+            new_speed[0] = speed[0] + kick * torque[0] / mass[0, 0]
             change = wp.min(bound[0] / mass[0, 0], wp.abs(new_speed[0]))
             new_speed[0] = new_speed[0] - wp.sign(new_speed[0]) * change
         else:
             inverse = wp.inverse(mass)
-            new_speed = speed + inverse * (dt * torque)
+            new_speed = speed + inverse * (kick * torque)
             if dry == 1:
                 new_speed, impulse = friction_impulses(new_speed, inverse, bound, impulse, count)
         for j in range(count):
