@@ -1,0 +1,368 @@
+"""Put the explanations of all joints together: shared effects, pooled numbers, one verdict, curves."""
+
+import importlib.metadata
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vd.assets_usd.hand_data import HandModel
+from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
+from vd.gap.recording import Recording
+from vd.gap.result import (
+    Alternative,
+    Candidate,
+    Estimate,
+    Finding,
+    Fit,
+    HeldOut,
+    JointGap,
+    NamedEffect,
+    Predictions,
+    Report,
+    Source,
+    TrajectoryError,
+    Verdict,
+)
+from vd.gap.rollout import Rollouts
+from vd.gap.select import Accepted, Explanation
+from vd.gap.statistics import interval, resamples, rmse
+from vd.gap.team import Bench, JointSpec
+from vd.kernels.effects import EFFECTS
+
+CLOSE = 0.1
+"""Values of one effect on two joints within this share of each other are one value."""
+VERDICTS: tuple[Verdict, ...] = ("effects", "ambiguous", "unknown", "under_excited", "no_gap")
+"""The verdict of a recording is the first that some joint has."""
+
+
+@dataclass(frozen=True, eq=False)
+class Analysed:
+    """A joint, its data and its explanation."""
+
+    name: str
+    spec: JointSpec
+    explanation: Explanation
+    scales: Scales
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Squared errors of one joint in the trajectories that excite it [S]."""
+
+    trajectories: np.ndarray
+    count: np.ndarray
+    baseline: np.ndarray
+    identified: np.ndarray
+
+
+def curves(
+    recording: Recording, bench: Bench, models: Sequence[tuple[str, JointSpec, np.ndarray]]
+) -> np.ndarray:
+    """Positions of all trajectories one after the other [S, J] [rad]; NaN where no joint was fitted.
+
+    Args:
+        recording: The recording.
+        bench: Its chains.
+        models: Name, problem and parameter rows of each fitted joint.
+    """
+    total = sum(len(t.time) for t in recording.trajectories)
+    result = np.full((total, len(recording.joints)), np.nan)
+    for index, chain in enumerate(bench.chains):
+        fitted = [(spec, rows) for _, spec, rows in models if spec.chain == index]
+        if not fitted:
+            continue
+        rows = chain.start_row.copy()
+        for spec, own in fitted:
+            rows[spec.joint] = own[spec.joint]
+        rollouts = Rollouts(chain, recording, dt=bench.dt, device=bench.device)
+        predicted = rollouts.predict(rows[None])[0]
+        result[:, chain.columns] = predicted
+    return result
+
+
+def assemble(
+    recording: Recording,
+    hand: HandModel | None,
+    bench: Bench,
+    joints: Sequence[Analysed],
+    findings: Sequence[Finding],
+    *,
+    seed: int,
+    seconds: float,
+    simulated: int,
+) -> tuple[Report, Predictions]:
+    """The report of all joints, and the curves of its figures."""
+    before = curves(recording, bench, [(j.name, j.spec, j.explanation.baseline.rows) for j in joints])
+    after = curves(recording, bench, [(j.name, j.spec, j.explanation.final.rows) for j in joints])
+    predictions = _predictions(recording, before, after)
+    rng = np.random.default_rng(seed)
+    errors = {j.name: _errors(j, predictions) for j in joints}
+    verdicts = [j.explanation.verdict for j in joints]
+    named = _pool(joints, named=True)
+    report = Report(
+        verdict=next((v for v in VERDICTS if v in verdicts), "no_gap"),
+        noise_floor_rad=float(np.sqrt(np.mean([j.spec.floor**2 for j in joints]))),
+        baseline=_fit(joints, predictions, predictions.baseline, "baseline"),
+        findings=tuple(findings),
+        effects=named,
+        ambiguous=_sets(joints),
+        identified=_fit(joints, predictions, predictions.identified, "final"),
+        held_out=_held_out(recording, list(errors.values()), rng),
+        next_experiment=_next(joints),
+        seconds=seconds,
+        recording=_source(recording, joints),
+        provisional=_pool(joints, named=False),
+        hand=None if hand is None else hand.name,
+        hand_layer=None if hand is None or hand.layer is None else str(hand.layer),
+        joints=tuple(_gap(j, errors[j.name], rng) for j in joints),
+        evidence=tuple(c for j in joints for c in _evidence(j)),
+        trajectories=tuple(e for j in joints for e in _trajectories(recording, j, errors[j.name])),
+        rollouts=simulated,
+        rollouts_per_s=simulated / max(seconds, 1e-9),
+        seed=seed,
+        software={
+            "python": platform.python_version(),
+            **{name: importlib.metadata.version(name) for name in ("warp-lang", "newton", "cma", "numpy")},
+        },
+    )
+    return report, predictions
+
+
+def _predictions(recording: Recording, before: np.ndarray, after: np.ndarray) -> Predictions:
+    parts = recording.trajectories
+    return Predictions(
+        time=np.concatenate([t.time for t in parts]),
+        trajectory=np.repeat(np.arange(len(parts)), [len(t.time) for t in parts]),
+        command=np.concatenate([t.command for t in parts]),
+        measured=np.concatenate([t.position for t in parts]),
+        baseline=before,
+        identified=after,
+        joints=recording.joints,
+        files=tuple(t.file for t in parts),
+    )
+
+
+def _excited(joint: Analysed, predictions: Predictions) -> np.ndarray:
+    """Indices of the trajectories that excite a joint."""
+    column = predictions.joints.index(joint.name)
+    own = []
+    for index in range(len(predictions.files)):
+        rows = predictions.trajectory == index
+        others = np.ptp(predictions.command[rows], axis=0)
+        if others[column] > 0.0:
+            own.append(index)
+    return np.array(own)
+
+
+def _errors(joint: Analysed, predictions: Predictions) -> Errors:
+    """Held-out errors where the trajectory was in a fold, errors of the full fit where it was in no fit."""
+    column = predictions.joints.index(joint.name)
+    own = _excited(joint, predictions)
+    count = np.array([(predictions.trajectory == i).sum() for i in own], float)
+    result = []
+    for fit, curve in (
+        (joint.explanation.baseline, predictions.baseline),
+        (joint.explanation.final, predictions.identified),
+    ):
+        known = dict(zip(joint.spec.trajectories, fit.held_out, strict=True))
+        sums = []
+        for i in own:
+            rows = predictions.trajectory == i
+            free = np.sum((predictions.measured[rows, column] - curve[rows, column]) ** 2)
+            sums.append(known.get(int(i), float(free)))
+        result.append(np.array(sums))
+    return Errors(own, count, *result)
+
+
+def _fit(joints: Sequence[Analysed], predictions: Predictions, curve: np.ndarray, which: str) -> Fit:
+    """Errors on all trajectories, and the baseline's parameters, of one of the two models."""
+    residuals = {}
+    for joint in joints:
+        column = predictions.joints.index(joint.name)
+        rows = np.isin(predictions.trajectory, _excited(joint, predictions))
+        residuals[joint.name] = predictions.measured[rows, column] - curve[rows, column]
+    everything = np.concatenate(list(residuals.values()))
+    return Fit(
+        rmse_rad=float(np.sqrt(np.mean(everything**2))),
+        per_joint={name: float(np.sqrt(np.mean(r**2))) for name, r in residuals.items()},
+        mae_rad=float(np.mean(np.abs(everything))),
+        parameters={j.name: _baseline_values(j, which) for j in joints},
+    )
+
+
+def _baseline_values(joint: Analysed, which: str) -> dict[str, float]:
+    rows = getattr(joint.explanation, which).rows
+    names = ["kp", "kd", "velocity_limit"]
+    names += [n for n in ("inertia", "tau_g_nm") if n in joint.spec.baseline]
+    return {name: float(rows[joint.spec.joint, BASELINE_PARAMETERS[name].column]) for name in names}
+
+
+def _ratio(errors: Sequence[Errors], rng: np.random.Generator) -> tuple[float, float, float, np.ndarray]:
+    """RMSE before and after, reduction, and its bootstrap samples, over trajectories of all joints."""
+    count, old, new = (
+        np.concatenate([getattr(e, name) for e in errors]) for name in ("count", "baseline", "identified")
+    )
+    weights = resamples(len(count), rng)
+    samples = 1.0 - rmse(new, count, weights) / np.maximum(rmse(old, count, weights), 1e-30)
+    before, after = float(rmse(old, count)), float(rmse(new, count))
+    return before, after, 1.0 - after / max(before, 1e-30), samples
+
+
+def _held_out(recording: Recording, errors: Sequence[Errors], rng: np.random.Generator) -> HeldOut:
+    before, after, reduction, samples = _ratio(errors, rng)
+    used = sorted({int(i) for e in errors for i in e.trajectories})
+    files = tuple(recording.trajectories[i].file for i in used)
+    return HeldOut(files, before, after, reduction, interval(samples))
+
+
+def _gap(joint: Analysed, errors: Errors, rng: np.random.Generator) -> JointGap:
+    weights = resamples(len(errors.count), rng)
+    return JointGap(
+        joint=joint.name,
+        noise_floor_rad=joint.spec.floor,
+        baseline_rmse_rad=float(rmse(errors.baseline, errors.count)),
+        baseline_ci95=interval(rmse(errors.baseline, errors.count, weights)),
+        identified_rmse_rad=float(rmse(errors.identified, errors.count)),
+        identified_ci95=interval(rmse(errors.identified, errors.count, weights)),
+        verdict=joint.explanation.verdict,
+        reason=joint.explanation.reason,
+    )
+
+
+def _pool(joints: Sequence[Analysed], *, named: bool) -> tuple[NamedEffect, ...]:
+    """Named (or provisional) effects, those of several joints in one entry where their values agree."""
+    result: list[NamedEffect] = []
+    order = list(EFFECTS)
+    found: dict[str, list[tuple[str, Accepted]]] = {}
+    for joint in joints:
+        if joint.explanation.verdict not in ("effects", "ambiguous"):
+            continue
+        for accepted in joint.explanation.accepted:
+            if accepted.named == named:
+                found.setdefault(accepted.name, []).append((joint.name, accepted))
+    for name in sorted(found, key=lambda n: (-len(found[n]), order.index(n))):
+        groups: list[list[tuple[str, Accepted]]] = []
+        for item in found[name]:
+            group = next((g for g in groups if all(_agree(item[1], other) for _, other in g)), None)
+            if group is None:
+                groups.append([item])
+            else:
+                group.append(item)
+        result += [_entry(name, group) for group in groups]
+    return tuple(result)
+
+
+def _agree(one: Accepted, other: Accepted) -> bool:
+    """Whether the values of an effect on two joints can be the same."""
+    if one.estimates.keys() != other.estimates.keys():
+        return False
+    for key, (value, low, high) in one.estimates.items():
+        theirs, their_low, their_high = other.estimates[key]
+        overlap = low <= their_high and their_low <= high
+        near = abs(value - theirs) <= CLOSE * max(abs(value), abs(theirs))
+        if not (overlap or near):
+            return False
+    return True
+
+
+def _entry(name: str, group: Sequence[tuple[str, Accepted]]) -> NamedEffect:
+    """One effect of joints that agree, its numbers weighted by their precision."""
+    units = {p.name: p.unit for p in EFFECTS[name].parameters}
+    parameters = {}
+    for key in group[0][1].estimates:
+        values = np.array([accepted.estimates[key] for _, accepted in group])
+        width = np.maximum(0.5 * (values[:, 2] - values[:, 1]), 1e-12)
+        weight = width**-2 / np.sum(width**-2)
+        value = float(weight @ values[:, 0])
+        below = float(np.sqrt(np.sum((weight * (values[:, 0] - values[:, 1])) ** 2)))
+        above = float(np.sqrt(np.sum((weight * (values[:, 2] - values[:, 0])) ** 2)))
+        # No narrower than the joints' own values lie apart from the pooled one.
+        apart = float(np.sqrt(weight @ (values[:, 0] - value) ** 2 / max(len(group) - 1, 1)))
+        below, above = max(below, 2.0 * apart), max(above, 2.0 * apart)
+        parameters[key] = Estimate(value, (value - below, value + above), units[key])
+    best = max(group, key=lambda item: item[1].confidence)[1]
+    return NamedEffect(
+        name=name,
+        joints=tuple(joint for joint, _ in group),
+        confidence=float(np.mean([accepted.confidence for _, accepted in group])),
+        parameters=parameters,
+        alternatives=tuple(Alternative(other, error, ci) for other, error, ci in best.alternatives),
+        at_bound=any(accepted.at_bound for _, accepted in group),
+    )
+
+
+def _sets(joints: Sequence[Analysed]) -> tuple[tuple[str, ...], ...]:
+    """Sets of effects not told apart, each once."""
+    result: list[tuple[str, ...]] = []
+    for joint in joints:
+        if joint.explanation.verdict not in ("effects", "ambiguous"):
+            continue
+        for accepted in joint.explanation.accepted:
+            members = (accepted.name, *accepted.tied)
+            if not accepted.named and len(members) > 1 and not any(set(members) == set(s) for s in result):
+                result.append(members)
+    return tuple(result)
+
+
+def _next(joints: Sequence[Analysed]) -> str:
+    sets = _sets(joints)
+    if sets:
+        listed = " and ".join(name.replace("_", " ") for name in sets[0][:2])
+        return (
+            f"vd-gap plan writes the motion on which {listed} differ the most: record it and analyse again."
+        )
+    if any(j.explanation.verdict == "under_excited" for j in joints):
+        return "Record larger and faster motions: steps, and sines up to 1.5 Hz, on every joint."
+    return ""
+
+
+def _source(recording: Recording, joints: Sequence[Analysed]) -> Source:
+    parts = recording.trajectories
+    return Source(
+        path=str(recording.path),
+        model=recording.model,
+        joints=tuple(j.name for j in joints),
+        trajectories=len(parts),
+        samples=sum(len(t.time) for t in parts),
+        seconds=float(sum(t.time[-1] for t in parts)),
+        servo=str(recording.servo.get("model", "")),
+    )
+
+
+def _evidence(joint: Analysed) -> list[Candidate]:
+    return [
+        Candidate(
+            joints=(joint.name,),
+            round=trial.round,
+            name=trial.name,
+            held_out_rmse_rad=trial.fit.held_out_rmse,
+            gain=trial.gain,
+            gain_ci95=trial.gain_ci,
+            decision=trial.decision,  # type: ignore[arg-type]
+            reason=trial.reason,
+            parameters={
+                key.rpartition(".")[2]: value
+                for key, value in trial.fit.values.items()
+                if key.startswith(f"{trial.name}.")
+            },
+            placebo=trial.placebo,
+        )
+        for trial in joint.explanation.trials
+    ]
+
+
+def _trajectories(recording: Recording, joint: Analysed, errors: Errors) -> list[TrajectoryError]:
+    rows = zip(errors.trajectories, errors.count, errors.baseline, errors.identified, strict=True)
+    return [
+        TrajectoryError(
+            file=recording.trajectories[int(i)].file,
+            excitation=recording.trajectories[int(i)].excitation,
+            joint=joint.name,
+            held_out=True,
+            baseline_rmse_rad=float(np.sqrt(old / count)),
+            identified_rmse_rad=float(np.sqrt(new / count)),
+        )
+        for i, count, old, new in rows
+    ]

@@ -1,0 +1,196 @@
+"""Coordinates in which the servo model is fitted, and sizes at which the search for an effect starts."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+import vd.kernels.actuators as servo
+from vd.kernels.effects import BASELINE, EFFECTS, Parameter
+
+GRAVITY = EFFECTS["gravity_load"].parameters[0]
+BASELINE_PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAVITY)}
+"""Everything that a baseline can fit, by name."""
+
+LOG_STEP = 0.01
+"""Finite-difference step of a logarithmic coordinate: above the noise of single precision."""
+LINEAR_STEP = 0.05
+"""Finite-difference step of a linear coordinate, in its scale or in its value if that is larger."""
+SECONDS_SCALE = 0.02
+"""Scale of delays [s]: with ``LINEAR_STEP`` a step of 2 ms, above the time step of the rollouts."""
+FLATTEST = 1e-3
+"""Scale of angles at least [rad], if the residual is smaller."""
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """One fitted number: value = exp(x) or x times scale.
+
+    Attributes:
+        key: ``kp``, or ``effect.parameter``.
+        column: Column of the parameter row.
+        log: Whether x is the logarithm.
+        scale: Value at x = 1 of a linear coordinate.
+        lower: Smallest x.
+        upper: Largest x.
+    """
+
+    key: str
+    column: int
+    log: bool
+    scale: float
+    lower: float
+    upper: float
+
+    def value(self, x: np.ndarray | float) -> np.ndarray:
+        """Parameter values at coordinates."""
+        return np.exp(x) if self.log else np.asarray(x) * self.scale
+
+    def inverse(self, value: float) -> float:
+        """Coordinate of a parameter value, within the bounds."""
+        x = math.log(max(value, 1e-12)) if self.log else value / self.scale
+        return min(max(x, self.lower), self.upper)
+
+    def step(self, x: np.ndarray) -> np.ndarray:
+        """Finite-difference step at x: backward where forward would leave the bounds."""
+        size = np.full_like(x, LOG_STEP) if self.log else LINEAR_STEP * np.maximum(1.0, np.abs(x))
+        return np.where(x + size > self.upper, -size, size)
+
+    def bound(self, x: float) -> bool:
+        """Whether x is at the far end of its range (0 of an unsigned effect is a value like any other)."""
+        margin = 1e-3 * (self.upper - self.lower)
+        return x > self.upper - margin or (self.log and x < self.lower + margin)
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Sizes of a joint's motion, from which searches start.
+
+    Attributes:
+        kp: Stiffness [N m/rad].
+        torque: Typical torque of the drive [N m].
+        peak: Largest torque of the drive [N m].
+        speed: Largest speed, noise aside [rad/s].
+        acceleration: Largest acceleration, noise aside [rad/s^2].
+        inertia: Effective inertia [kg m^2].
+        residual: RMS of what the baseline leaves [rad].
+        duration: Of the longest trajectory [s].
+    """
+
+    kp: float
+    torque: float
+    peak: float
+    speed: float
+    acceleration: float
+    inertia: float
+    residual: float
+    duration: float
+
+
+def coordinate(key: str, scales: Scales) -> Coordinate:
+    """The coordinate of a parameter by its key (``kp``, ``effect.parameter``)."""
+    effect, _, name = key.rpartition(".")
+    parameter = (
+        next(p for p in EFFECTS[effect].parameters if p.name == name) if effect else BASELINE_PARAMETERS[name]
+    )
+    if parameter.lower > 0.0:
+        bounds = math.log(parameter.lower), math.log(parameter.upper)
+        return Coordinate(key, parameter.column, True, 1.0, *bounds)
+    scale = _scale(parameter, scales)
+    low = -parameter.upper if parameter.signed else 0.0
+    return Coordinate(key, parameter.column, False, scale, low / scale, parameter.upper / scale)
+
+
+def keys(effects: Sequence[str], baseline: Sequence[str]) -> list[str]:
+    """Keys of all fitted parameters of a model: the baseline's, then the effects'."""
+    return [*baseline, *(f"{name}.{p.name}" for name in effects for p in EFFECTS[name].parameters)]
+
+
+def _scale(parameter: Parameter, scales: Scales) -> float:
+    if parameter.unit == "s":
+        return SECONDS_SCALE
+    if parameter.unit == "N m":
+        return max(0.3 * scales.torque, 1e-4)
+    if parameter.column in (servo.BACKLASH_WIDTH, servo.DEAD_ZONE_WIDTH, servo.ENCODER_BIAS):
+        return max(scales.residual, FLATTEST)
+    if parameter.column == servo.SUPPLY_SAG:
+        return 0.3 / max(scales.peak, 1e-6)
+    if parameter.column == servo.INTEGRAL_GAIN:
+        return scales.kp
+    if parameter.column == servo.PAYLOAD_INERTIA:
+        return max(0.3 * scales.inertia, 1e-6)
+    if parameter.column == servo.THERMAL_RATE:
+        return 0.3 / scales.duration
+    if parameter.column == servo.ELASTIC_DAMPING:
+        return parameter.typical
+    return parameter.typical if parameter.typical > 0.0 else 1.0
+
+
+def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, float]]:
+    """Starting values of an effect's parameters, by key, from small to large.
+
+    Args:
+        effect: Name of the effect.
+        others: Slots of the other joints of the chain.
+        scales: Sizes of the joint's motion.
+    """
+    torque, peak, speed = scales.torque, scales.peak, scales.speed
+    small = max(scales.residual, FLATTEST)
+    period = SECONDS_SCALE
+    table: dict[str, list[dict[str, float]]] = {
+        "command_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],
+        "read_delay": [{"delay_s": f * period} for f in (0.3, 1.0, 3.0, 6.0)],
+        "command_jitter": [
+            {"sigma_s": s, "p_drop": p} for s, p in ((0.01, 0.02), (0.03, 0.02), (0.01, 0.2), (0.03, 0.4))
+        ],
+        "command_filter": [{"tau_s": f * period} for f in (0.3, 1.0, 3.0, 10.0)],
+        "acceleration_limit": [{"a_max_rad_s2": f * scales.acceleration} for f in (2.0, 1.0, 0.5, 0.25, 0.1)],
+        "torque_limit": [{"tau_max_nm": f * peak} for f in (0.9, 0.6, 0.35, 0.2)],
+        "torque_speed_limit": [
+            {"tau_stall_nm": f * peak, "omega_0_rad_s": g * speed}
+            for f, g in ((1.0, 1.1), (1.0, 2.0), (0.5, 1.2), (0.5, 2.5), (0.25, 1.5))
+        ],
+        "torque_saturation": [{"tau_s_nm": f * peak} for f in (1.5, 0.7, 0.35, 0.2)],
+        "supply_sag": [{"relative": f / peak} for f in (0.1, 0.4, 1.2, 4.0)],
+        "thermal_drift": [{"rate_per_s": f / scales.duration} for f in (0.1, 0.5, 1.5)],
+        "coulomb_friction": [{"tau_c_nm": f * torque} for f in (0.03, 0.1, 0.3, 0.7)],
+        "stribeck_friction": [
+            {"tau_s_nm": f * torque, "tau_c_nm": g * torque, "v_s_rad_s": h * speed}
+            for f, g, h in ((0.1, 0.02, 0.05), (0.3, 0.1, 0.05), (0.3, 0.05, 0.2), (0.7, 0.2, 0.05))
+        ],
+        "load_friction": [{"k_load": k} for k in (0.05, 0.15, 0.4)],
+        "asymmetric_friction": [
+            {"tau_plus_nm": f * torque, "tau_minus_nm": g * torque}
+            for f, g in ((0.1, 0.03), (0.03, 0.1), (0.4, 0.1), (0.1, 0.4))
+        ],
+        "backlash": [{"width_rad": f * small} for f in (0.7, 2.0, 5.0)],
+        "dead_zone": [{"width_rad": f * small} for f in (0.7, 2.0, 5.0)],
+        "integral_action": [{"k_i": f * scales.kp} for f in (0.1, 0.5, 2.0, 8.0)],
+        "encoder_bias": [{"bias_rad": f * small} for f in (0.5, -0.5, 1.5, -1.5)],
+        "gravity_load": [
+            {"tau_g_nm": f * torque, "phase_rad": p} for f in (0.1, 0.5) for p in (0.0, 1.57, -1.57, 3.1)
+        ],
+        "payload_inertia": [{"j_kgm2": f * scales.inertia} for f in (0.1, 0.5, 2.0)],
+        "elastic_transmission": [
+            {
+                "k_nm_rad": f * scales.kp,
+                "c_nms_rad": 0.1 * f * scales.kp * period,
+                "j_kgm2": g * scales.inertia,
+            }
+            for f, g in ((0.3, 0.3), (1.0, 0.3), (1.0, 1.0), (3.0, 0.3), (3.0, 2.0))
+        ],
+        "joint_coupling": [
+            {f"from_{slot + 1}": f if slot == other else 0.0 for slot in others}
+            for other in others
+            for f in (0.05, -0.05)
+        ],
+    }
+    bounds = {p.name: (p.lower, p.upper) for p in EFFECTS[effect].parameters}
+    return [
+        {
+            f"{effect}.{name}": value if value <= 0.0 else min(max(value, bounds[name][0]), bounds[name][1])
+            for name, value in start.items()
+        }
+        for start in table[effect]
+    ]

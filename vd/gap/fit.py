@@ -1,0 +1,440 @@
+"""Fit the servo model of one joint to its trajectories: CMA-ES for the start, Levenberg-Marquardt to finish.
+
+Every simulation is a rollout of the whole trajectory; all perturbed parameter sets of a step go through
+one call of :class:`vd.gap.rollout.Rollouts`.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cma
+import numpy as np
+
+import vd.kernels.actuators as servo
+from vd.gap.coordinates import Coordinate, Scales, coordinate, keys
+from vd.gap.rollout import Chain, Rollouts
+from vd.gap.statistics import rmse
+from vd.kernels.chains import MAX_JOINTS
+from vd.kernels.effects import EFFECTS
+
+RIDGE = 0.01
+"""Pull towards the start, as information in units of the noise floor: holds directions that the data
+leave free (the torque scale of a bare servo), moves no others."""
+LAMBDAS = (0.1, 1.0, 10.0)
+"""Factors on the damping that are tried in each step of Levenberg-Marquardt."""
+FIRST_DAMPING = 1e-3
+MAX_DAMPING = 1e6
+LOG_TRUST = 1.5
+"""Largest change of a logarithmic coordinate in one step."""
+LINEAR_TRUST = 5.0
+"""Largest change of a linear coordinate in one step, plus its size."""
+TOLERANCE = 1e-4
+"""Relative improvement of the squared error at which a fit has converged."""
+CMA_SIGMA = 0.7
+"""First step of CMA-ES in logarithmic coordinates."""
+CMA_TRAJECTORIES = 4
+CMA_POPULATION = 16
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """A fitted model of one joint; S trajectories, P parameters.
+
+    Attributes:
+        effects: Names of the effects in the model.
+        coordinates: What was fitted.
+        x: Fitted coordinates [P].
+        rows: Parameter rows of the chain's joints, shape [n, PARAMETER_COLUMNS].
+        sse: Sum of squared errors of each trajectory [S] [rad^2].
+        held_out: The same, each trajectory predicted by a fit without its group [S].
+        count: Samples of each trajectory [S].
+        gram: J^T J of each trajectory, [S, P, P].
+        gradient: J^T r of each trajectory, [S, P].
+    """
+
+    effects: tuple[str, ...]
+    coordinates: tuple[Coordinate, ...]
+    x: np.ndarray
+    rows: np.ndarray
+    sse: np.ndarray
+    held_out: np.ndarray
+    count: np.ndarray
+    gram: np.ndarray
+    gradient: np.ndarray
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter values by key."""
+        return {c.key: float(c.value(x)) for c, x in zip(self.coordinates, self.x, strict=True)}
+
+    @property
+    def rmse(self) -> float:
+        """RMSE on what was fitted [rad]."""
+        return float(rmse(self.sse, self.count))
+
+    @property
+    def held_out_rmse(self) -> float:
+        """RMSE on held-out trajectories [rad]."""
+        return float(rmse(self.held_out, self.count))
+
+    @property
+    def at_bound(self) -> tuple[str, ...]:
+        """Keys of effect parameters that ended at a bound."""
+        pairs = zip(self.coordinates, self.x, strict=True)
+        return tuple(c.key for c, x in pairs if "." in c.key and c.bound(float(x)))
+
+
+class JointProblem:
+    """The data of one joint, and fits of models to it.
+
+    Args:
+        rollouts: Simulation of the joint's chain.
+        joint: Index of the joint in the chain.
+        trajectories: Indices of the trajectories used, ascending.
+        folds: Fold of each of them, shape [S]; a fold is held out as a whole.
+        floor: Noise floor [rad].
+        baseline: Keys of the baseline's parameters.
+    """
+
+    def __init__(
+        self,
+        rollouts: Rollouts,
+        joint: int,
+        trajectories: Sequence[int],
+        folds: Sequence[int],
+        floor: float,
+        baseline: Sequence[str],
+    ):
+        self.rollouts = rollouts
+        self.joint = joint
+        self.trajectories = np.asarray(trajectories)
+        self.folds = np.asarray(folds)
+        self.floor = floor
+        self.baseline = tuple(baseline)
+        self.simulated = 0
+        self._measured = {
+            int(t): rollouts.measured[rollouts.sample_trajectory == t, joint] for t in self.trajectories
+        }
+        self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
+
+    def residuals(self, rows: np.ndarray, trajectories: Sequence[int] | None = None) -> np.ndarray:
+        """Measured minus predicted position of the joint for C chains [C, n, PARAMETER_COLUMNS]: [C, N]."""
+        chosen = [int(t) for t in (self.trajectories if trajectories is None else trajectories)]
+        predicted = self.rollouts.predict(rows, chosen)[:, :, self.joint]
+        self.simulated += len(rows) * len(chosen)
+        return np.concatenate([self._measured[t] for t in chosen])[None] - predicted
+
+    def rows(self, base: np.ndarray, coordinates: Sequence[Coordinate], x: np.ndarray) -> np.ndarray:
+        """Chains [C, n, PARAMETER_COLUMNS] with this joint's parameters at coordinates [C, P]."""
+        rows = np.repeat(base[None], len(x), axis=0)
+        for i, c in enumerate(coordinates):
+            rows[:, self.joint, c.column] = c.value(x[:, i])
+        return rows
+
+    def split(self, samples: np.ndarray, trajectories: Sequence[int] | None = None) -> list[np.ndarray]:
+        """Cut the last axis into trajectories."""
+        chosen = self.trajectories if trajectories is None else trajectories
+        ends = np.cumsum([len(self._measured[int(t)]) for t in chosen])[:-1]
+        return np.split(samples, ends, axis=-1)
+
+    def sums(self, residuals: np.ndarray, trajectories: Sequence[int] | None = None) -> np.ndarray:
+        """Squared errors of each trajectory, shape [C, S]."""
+        parts = self.split(residuals, trajectories)
+        return np.stack([np.einsum("cn,cn->c", part, part) for part in parts], axis=1)
+
+    def scales(self, row: np.ndarray, residual: float) -> Scales:
+        """Sizes of the joint's motion with a baseline row [PARAMETER_COLUMNS]."""
+        torques, speeds, accelerations, duration = [], [], [], 0.0
+        chain, recording = self.rollouts.chain, self.rollouts.recording
+        column = int(chain.columns[self.joint])
+        for t in self.trajectories:
+            trajectory = recording.trajectories[int(t)]
+            time, position = trajectory.time, trajectory.position[:, column]
+            torques.append(row[servo.KP] * np.abs(trajectory.command[:, column] - position))
+            # Motion over 50 ms: encoder counts do not look like speed.
+            grid = np.arange(0.0, time[-1], 0.05)
+            smooth = np.interp(grid, time, position)
+            speed = np.diff(smooth) / 0.05
+            speeds.append(np.abs(speed))
+            accelerations.append(np.abs(np.diff(speed)) / 0.05)
+            duration = max(duration, float(time[-1]))
+        torque = np.concatenate(torques)
+        speed_max = float(np.percentile(np.concatenate(speeds), 99.5))
+        acceleration = float(np.percentile(np.concatenate(accelerations), 99.5))
+        peak = float(np.percentile(torque, 99.5))
+        return Scales(
+            kp=float(row[servo.KP]),
+            torque=float(np.sqrt(np.mean(torque**2))) + 1e-9,
+            peak=peak + 1e-9,
+            speed=speed_max + 1e-3,
+            acceleration=acceleration + 0.1,
+            inertia=max(float(row[servo.INERTIA]) + chain.inertia_scale(self.joint), 1e-6),
+            residual=residual,
+            duration=duration,
+        )
+
+    def fit(
+        self,
+        base: np.ndarray,
+        effects: Sequence[str],
+        starts: Sequence[Mapping[str, float]],
+        scales: Scales,
+        *,
+        iterations: int = 12,
+        trajectories: Sequence[int] | None = None,
+        refits: int = 0,
+    ) -> list[JointFit]:
+        """Fit a model from several starts at once, by Levenberg-Marquardt.
+
+        Args:
+            base: Rows of the chain's joints [n, PARAMETER_COLUMNS]; this joint's parameters start there.
+            effects: Effects in the model besides the baseline.
+            starts: Starting values by key; what is absent starts at ``base``.
+            scales: Sizes of the joint's motion.
+            iterations: Steps at most.
+                trajectories: Subset to fit to, without held-out errors; all of the problem's if None.
+            refits: Steps of Levenberg-Marquardt of each refit without a fold; 0: one Gauss-Newton step.
+
+        Returns:
+            One fit per start, best first.
+        """
+        coordinates = [coordinate(key, scales) for key in self.fitted(effects)]
+        x0 = np.array(
+            [
+                [c.inverse(float(start.get(c.key, base[self.joint, c.column]))) for c in coordinates]
+                for start in starts
+            ]
+        )
+        chosen = self.trajectories if trajectories is None else np.asarray(trajectories)
+        x, residual, jacobian = self._descend(base, coordinates, x0, iterations, chosen)
+        fits = [
+            self._result(base, effects, coordinates, x[i], residual[i], jacobian[i], chosen)
+            for i in range(len(x))
+        ]
+        fits.sort(key=lambda fit: float(fit.sse.sum()))
+        if trajectories is None:
+            fits[0] = replace(fits[0], held_out=self.cross_validate(fits[0], scales, refits))
+        return fits
+
+    def fitted(self, effects: Sequence[str]) -> list[str]:
+        """Keys of what a model with these effects fits on this joint."""
+        others = others_in(self.rollouts.chain, self.joint)
+        absent = {f"joint_coupling.from_{slot + 1}" for slot in range(MAX_JOINTS) if slot not in others}
+        return [key for key in keys(effects, self.baseline) if key not in absent]
+
+    def _descend(
+        self,
+        base: np.ndarray,
+        coordinates: Sequence[Coordinate],
+        x: np.ndarray,
+        iterations: int,
+        chosen: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Levenberg-Marquardt from B starts [B, P] in lockstep: coordinates, residuals, Jacobians."""
+        lower = np.array([c.lower for c in coordinates])
+        upper = np.array([c.upper for c in coordinates])
+        logarithmic = np.array([c.log for c in coordinates])
+        ridge = RIDGE * self.floor**2
+        origin = x.copy()
+        residual = self.residuals(self.rows(base, coordinates, x), chosen)
+        cost = np.einsum("bn,bn->b", residual, residual) + ridge * ((x - origin) ** 2).sum(1)
+        damping = np.full(len(x), FIRST_DAMPING)
+        jacobian = np.zeros((len(x), x.shape[1], residual.shape[1]))
+        active = np.arange(len(x))
+        for _ in range(iterations):
+            jacobian[active] = self._jacobian(base, coordinates, x[active], residual[active], chosen)
+            trials = np.empty((len(active), len(LAMBDAS), x.shape[1]))
+            for i, b in enumerate(active):
+                gram = jacobian[b] @ jacobian[b].T + ridge * np.eye(x.shape[1])
+                gradient = jacobian[b] @ residual[b] - ridge * (x[b] - origin[b])
+                free = ~(((x[b] <= lower) & (gradient < 0.0)) | ((x[b] >= upper) & (gradient > 0.0)))
+                for k, factor in enumerate(LAMBDAS):
+                    step = np.zeros_like(x[b])
+                    part = gram[np.ix_(free, free)]
+                    damped = part + np.diag(damping[b] * factor * np.diag(part))
+                    step[free] = np.linalg.solve(damped, gradient[free])
+                    limit = np.where(logarithmic, LOG_TRUST, LINEAR_TRUST + np.abs(x[b]))
+                    trials[i, k] = np.clip(x[b] + np.clip(step, -limit, limit), lower, upper)
+            flat = trials.reshape(-1, x.shape[1])
+            answers = self.residuals(self.rows(base, coordinates, flat), chosen)
+            offset = flat - np.repeat(origin[active], len(LAMBDAS), axis=0)
+            costs = np.einsum("bn,bn->b", answers, answers) + ridge * (offset**2).sum(1)
+            going = []
+            for i, b in enumerate(active):
+                k = int(np.argmin(costs[i * len(LAMBDAS) : (i + 1) * len(LAMBDAS)]))
+                best = i * len(LAMBDAS) + k
+                gain = (cost[b] - costs[best]) / max(cost[b], 1e-300)
+                if gain > 0.0:
+                    x[b], residual[b], cost[b] = flat[best], answers[best], costs[best]
+                    damping[b] = max(damping[b] * LAMBDAS[k] * 0.3, 1e-7)
+                    if gain > TOLERANCE:
+                        going.append(b)
+                else:
+                    damping[b] *= 100.0
+                    if damping[b] < MAX_DAMPING:
+                        going.append(b)
+            active = np.array(going, int)
+            if not len(active):
+                break
+        jacobian = self._jacobian(base, coordinates, x, residual, chosen)
+        return x, residual, jacobian
+
+    def _jacobian(
+        self,
+        base: np.ndarray,
+        coordinates: Sequence[Coordinate],
+        x: np.ndarray,
+        residual: np.ndarray,
+        chosen: np.ndarray,
+    ) -> np.ndarray:
+        """d(predicted)/dx of B parameter sets, shape [B, P, N]."""
+        size = x.shape[1]
+        steps = np.stack([c.step(x[:, i]) for i, c in enumerate(coordinates)], axis=1)
+        moved = np.repeat(x[:, None], size, axis=1)
+        moved[:, np.arange(size), np.arange(size)] += steps
+        answers = self.residuals(self.rows(base, coordinates, moved.reshape(-1, size)), chosen)
+        answers = answers.reshape(len(x), size, -1)
+        return (residual[:, None] - answers) / steps[:, :, None]
+
+    def _result(
+        self,
+        base: np.ndarray,
+        effects: Sequence[str],
+        coordinates: Sequence[Coordinate],
+        x: np.ndarray,
+        residual: np.ndarray,
+        jacobian: np.ndarray,
+        chosen: np.ndarray,
+    ) -> JointFit:
+        parts = self.split(jacobian, chosen)
+        errors = self.split(residual, chosen)
+        return JointFit(
+            effects=tuple(effects),
+            coordinates=tuple(coordinates),
+            x=x,
+            rows=self.rows(base, coordinates, x[None])[0],
+            sse=self.sums(residual[None], chosen)[0],
+            held_out=np.full(len(chosen), np.nan),
+            count=np.array([len(e) for e in errors], float),
+            gram=np.stack([j @ j.T for j in parts]),
+            gradient=np.stack([j @ e for j, e in zip(parts, errors, strict=True)]),
+        )
+
+    def cross_validate(self, fit: JointFit, scales: Scales, iterations: int = 0) -> np.ndarray:
+        """Squared errors of each trajectory, predicted by a fit without its fold, shape [S].
+
+        The refit is one Gauss-Newton step from the full fit, or ``iterations`` of
+        Levenberg-Marquardt if given.
+        """
+        result = np.zeros(len(self.trajectories))
+        lower = np.array([c.lower for c in fit.coordinates])
+        upper = np.array([c.upper for c in fit.coordinates])
+        logarithmic = np.array([c.log for c in fit.coordinates])
+        trust = np.where(logarithmic, 0.3 * LOG_TRUST, 1.0 + 0.5 * np.abs(fit.x))
+        ridge = RIDGE * self.floor**2 * np.eye(len(fit.x))
+        for fold in np.unique(self.folds):
+            out = self.folds == fold
+            if iterations:
+                inside = self.trajectories[~out]
+                refit = self.fit(
+                    fit.rows, fit.effects, [fit.values], scales, iterations=iterations, trajectories=inside
+                )[0]
+                x = refit.x
+            else:
+                gram, gradient = fit.gram[~out].sum(0) + ridge, fit.gradient[~out].sum(0)
+                fixed = ((fit.x <= lower) & (gradient < 0.0)) | ((fit.x >= upper) & (gradient > 0.0))
+                step = np.zeros(len(fit.x))
+                free = ~fixed
+                damped = gram[np.ix_(free, free)]
+                damped = damped + np.diag(FIRST_DAMPING * np.diag(damped))
+                step[free] = np.linalg.solve(damped, gradient[free])
+                x = np.clip(fit.x + np.clip(step, -trust, trust), lower, upper)
+            rows = self.rows(fit.rows, fit.coordinates, x[None])
+            chosen = self.trajectories[out]
+            result[out] = self.sums(self.residuals(rows, chosen), chosen)[0]
+        return result
+
+    def promise(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> np.ndarray:
+        """Share of the squared error that each start could remove, the present parameters readjusted.
+
+        A linear estimate from one rollout per start: the start's change of the prediction, less what
+        the fitted parameters can imitate, against the residual.
+
+        Args:
+            fit: Present model.
+            starts: Starting values of the effect that each start adds, by key.
+            scales: Sizes of the joint's motion.
+        """
+        here = fit.x[None]
+        residual = self.residuals(self.rows(fit.rows, fit.coordinates, here))
+        jacobian = self._jacobian(fit.rows, fit.coordinates, here, residual, self.trajectories)[0]
+        basis = np.linalg.svd(jacobian, full_matrices=False)[2]
+        left = residual[0] - basis.T @ (basis @ residual[0])
+        rows = np.repeat(fit.rows[None], len(starts), axis=0)
+        for i, start in enumerate(starts):
+            for key, value in start.items():
+                rows[i, self.joint, coordinate(key, scales).column] = value
+        change = residual - self.residuals(rows)
+        change -= (change @ basis.T) @ basis
+        along = change @ left
+        power = np.einsum("cn,cn->c", change, change)
+        # A multiple within a factor of a few of the start; more is another size, and less than 0 no effect.
+        factor = np.clip(along / np.maximum(power, 1e-300), 0.0, 3.0)
+        gain = 2.0 * factor * along - factor**2 * power
+        return gain / max(float(residual[0] @ residual[0]), 1e-300)
+
+    def placebo(self, before: JointFit, after: JointFit) -> float:
+        """Share of the held-out RMSE that a control removes that must remove nothing.
+
+        The control is the change that the effect made to the prediction, reversed in time and handed
+        to the next trajectory, with a free factor that is fitted without the held-out fold.
+        """
+        old = self.split(self.residuals(before.rows[None])[0])
+        new = self.split(self.residuals(after.rows[None])[0])
+        change = [a - b for a, b in zip(old, new, strict=True)]
+        shuffled = [np.resize(change[i - 1][::-1], len(part)) for i, part in enumerate(change)]
+        left = 0.0
+        for fold in np.unique(self.folds):
+            inside = [i for i, f in enumerate(self.folds) if f != fold]
+            power = sum(float(shuffled[i] @ shuffled[i]) for i in inside)
+            factor = sum(float(shuffled[i] @ old[i]) for i in inside) / max(power, 1e-300)
+            for i in np.flatnonzero(self.folds == fold):
+                left += float(np.sum((old[i] - factor * shuffled[i]) ** 2))
+        total = sum(float(part @ part) for part in old)
+        return 1.0 - float(np.sqrt(left / max(total, 1e-300)))
+
+    def start_baseline(self, base: np.ndarray, scales: Scales, *, seed: int, generations: int) -> np.ndarray:
+        """The paper's search: CMA-ES on the squared error of a few trajectories. Returns rows."""
+        coordinates = [coordinate(key, scales) for key in self.baseline]
+        x0 = np.array([c.inverse(float(base[self.joint, c.column])) for c in coordinates])
+        spread = np.linspace(0, len(self.trajectories) - 1, CMA_TRAJECTORIES).round().astype(int)
+        chosen = self.trajectories[np.unique(spread)]
+        bounds = [[c.lower for c in coordinates], [c.upper for c in coordinates]]
+        options = {"seed": seed + 1, "popsize": CMA_POPULATION, "bounds": bounds, "verbose": -9}
+        strategy = cma.CMAEvolutionStrategy(x0, CMA_SIGMA, options)
+        for _ in range(generations):
+            asked = strategy.ask()
+            x = np.array(asked)
+            residual = self.residuals(self.rows(base, coordinates, x), chosen)
+            strategy.tell(asked, list(np.log(np.einsum("cn,cn->c", residual, residual) + 1e-12)))
+            if strategy.stop():
+                break
+        best = np.asarray(strategy.result.xbest)
+        return self.rows(base, coordinates, best[None])[0]
+
+
+def others_in(chain: Chain, joint: int) -> list[int]:
+    """Slots of the other joints of a chain, whose motion can drive a joint."""
+    return [int(slot) for j, slot in enumerate(chain.slot) if j != joint]
+
+
+def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
+    """Effects that a joint of a chain can have besides its baseline."""
+    excluded = set()
+    if "tau_g_nm" in chain.baseline_free:
+        excluded.add("gravity_load")
+    if "inertia" in chain.baseline_free:
+        excluded.add("payload_inertia")
+    if len(chain.joints) == 1:
+        excluded.add("joint_coupling")
+    return [name for name in EFFECTS if name in effects and name not in excluded]

@@ -1,0 +1,138 @@
+"""What the data can carry: noise floor, bootstrap over trajectories, intervals that allow for few of them.
+
+Residuals within a trajectory are strongly correlated, so the unit of every interval is the trajectory,
+never the sample.
+"""
+
+import numpy as np
+from scipy.stats import t as student
+
+from vd.gap.recording import Recording, Trajectory
+
+CONFIDENCE = 0.95
+BOOTSTRAP = 2000
+"""Resamples of whole trajectories."""
+QUANTISATION = 1.0 / np.sqrt(12.0)
+"""Standard deviation of a uniform error of one encoder count."""
+HOLD_S = 0.25
+"""The command must have been constant for this long before a sample counts as held."""
+HOLD_COUNTS = 3.0
+"""Travel over ``HOLD_S`` [encoder counts] below which a joint is at rest apart from noise."""
+WINDOW = 16
+"""Samples of a window in which slow motion is a parabola."""
+SLOW_COUNTS = (4.0, 30.0)
+"""Encoder counts that slow motion travels in a window: enough to dither, not enough to bend."""
+MIN_WINDOWS = 8
+"""Windows of slow motion below which their noise is not estimated."""
+MIN_HELD = 30
+"""Held samples below which their noise is not estimated."""
+
+
+def held(trajectory: Trajectory, joint: int, resolution: float) -> np.ndarray:
+    """Samples at which command and position both rest, shape [T] bool."""
+    time = trajectory.time
+    first = np.searchsorted(time, time - HOLD_S)
+    changed = np.abs(np.diff(trajectory.command[:, joint], prepend=trajectory.command[0, joint])) > 0.0
+    changes = np.cumsum(changed)
+    still = (changes - changes[first] == 0) & (time >= HOLD_S)
+    position = trajectory.position[:, joint]
+    count = max(int(np.median(np.arange(len(time)) - first)), 1)
+    # Averages of the two halves of the window: slow motion moves them, noise does not.
+    half = max(count // 2, 1)
+    smooth = np.convolve(position, np.ones(half) / half, mode="full")[: len(position)]
+    travel = np.abs(smooth - np.roll(smooth, half))
+    travel[: 2 * half] = np.inf
+    return still & (travel < HOLD_COUNTS * resolution)
+
+
+def noise_floor(recording: Recording, joint: int) -> float:
+    """Smallest RMS residual that a perfect model can have on a joint [rad].
+
+    The largest of the encoder's quantisation, of the noise in second differences at rest (which do
+    not contain it while noise is less than a count), and of what a parabola leaves of slow motion
+    (which contains both).
+    """
+    quantum = QUANTISATION * recording.encoder_resolution_rad
+    squares, count, moving = 0.0, 0, []
+    for trajectory in recording.trajectories:
+        position = trajectory.position[:, joint]
+        second = position[2:] - 2.0 * position[1:-1] + position[:-2]
+        rest = held(trajectory, joint, recording.encoder_resolution_rad)[1:-1]
+        squares += float(np.sum(second[rest] ** 2))
+        count += int(rest.sum())
+        moving += _slow_noise(trajectory.time, position, recording.encoder_resolution_rad)
+    resting = np.sqrt(squares / (6.0 * count)) if count >= MIN_HELD else 0.0
+    slow = np.sqrt(np.median(moving)) if len(moving) >= MIN_WINDOWS else 0.0
+    return float(max(quantum, resting, slow))
+
+
+def _slow_noise(time: np.ndarray, position: np.ndarray, resolution: float) -> list[float]:
+    """Variances about a parabola in windows of slow steady motion [rad^2]."""
+    result = []
+    for first in range(0, len(time) - WINDOW + 1, WINDOW):
+        part = slice(first, first + WINDOW)
+        travel = abs(position[part][-1] - position[first]) / resolution
+        if SLOW_COUNTS[0] <= travel <= SLOW_COUNTS[1]:
+            basis = np.vander(time[part] - time[first], 3)
+            left = position[part] - basis @ np.linalg.lstsq(basis, position[part], rcond=None)[0]
+            result.append(float(left @ left) / (WINDOW - 3))
+    return result
+
+
+def resamples(units: int, rng: np.random.Generator, count: int = BOOTSTRAP) -> np.ndarray:
+    """Weights of the units in each bootstrap resample, shape [count, units]; every row sums to ``units``."""
+    return rng.multinomial(units, np.full(units, 1.0 / units), size=count).astype(float)
+
+
+def interval(samples: np.ndarray) -> tuple[float, float]:
+    """Central 95 % interval of bootstrap samples."""
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.percentile(samples, [tail, 100.0 - tail])
+    return float(low), float(high)
+
+
+def rmse(sse: np.ndarray, count: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """Root mean square over trajectories.
+
+    Args:
+        sse: Sum of squared errors of each trajectory, shape [..., S].
+        count: Samples of each trajectory, shape [S].
+        weights: Weights of the trajectories, shape [R, S]; the result then has a last axis R.
+    """
+    if weights is None:
+        return np.sqrt(sse.sum(-1) / count.sum())
+    return np.sqrt(np.maximum(sse @ weights.T, 0.0) / np.maximum(weights @ count, 1e-30))
+
+
+def covariance(gram: np.ndarray, gradient: np.ndarray, ridge: np.ndarray, floor: float) -> np.ndarray:
+    """Covariance of a least-squares estimate, robust against residuals that are correlated in a trajectory.
+
+    The jackknife over trajectories in one Gauss-Newton step each (the cluster-robust CR3 estimate),
+    but at least the textbook covariance of white noise at the floor.
+
+    Args:
+        gram: J^T J of each trajectory, shape [S, P, P].
+        gradient: J^T r of each trajectory, r = measured - predicted, shape [S, P].
+        ridge: Added to the diagonal of the sum, shape [P].
+        floor: Noise floor [rad].
+    """
+    total = gram.sum(0) + np.diag(ridge)
+    slope = gradient.sum(0)
+    center = np.linalg.solve(total, slope)
+    units = len(gram)
+    white = floor**2 * np.linalg.inv(total)
+    if units < 2:
+        return white
+    steps = np.array(
+        [np.linalg.lstsq(total - gram[s], slope - gradient[s], rcond=None)[0] - center for s in range(units)]
+    )
+    robust = (units - 1) / units * steps.T @ steps
+    larger = np.maximum(np.diag(robust), np.diag(white)) / np.maximum(np.diag(robust), 1e-300)
+    scale = np.sqrt(larger)
+    return robust * np.outer(scale, scale)
+
+
+def half_width(variance: np.ndarray, units: int) -> np.ndarray:
+    """Half the 95 % interval of estimates whose variance was estimated from ``units`` trajectories."""
+    freedom = max(units - 1, 1)
+    return float(student.ppf(0.5 + 0.5 * CONFIDENCE, freedom)) * np.sqrt(np.maximum(variance, 0.0))

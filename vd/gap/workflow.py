@@ -1,0 +1,368 @@
+"""Find and explain a gap: from a recording to a :class:`vd.gap.result.Report` without a closing.
+
+``find`` identifies the baseline and says where it fails (``DIR/find.json``); ``explain`` selects the
+effects (``DIR/explain.json``, ``DIR/predictions.npz``). Both are skipped where their result is there
+already and its inputs are the same.
+"""
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd.assets_usd.hand_data import HandModel
+from vd.files import write_json
+from vd.gap.assemble import Analysed, assemble, curves
+from vd.gap.coordinates import Scales
+from vd.gap.design import design
+from vd.gap.find import findings
+from vd.gap.fit import JointFit, candidates, others_in
+from vd.gap.recording import Recording, read_recording
+from vd.gap.result import Finding, Report
+from vd.gap.rollout import STEP_S, Chain, chains
+from vd.gap.select import Explanation, Selection
+from vd.gap.statistics import noise_floor, resamples
+from vd.gap.team import Bench, JointSpec, Team
+from vd.gap.telemetry import vetoes
+from vd.kernels.effects import EFFECTS
+
+FIND_FORMAT = "vd-gap-find/1"
+VERSION = 1
+"""Of the method; a result of another version is not resumed."""
+CMA_GENERATIONS = 20
+BASELINE_ITERATIONS = 15
+POLISH_ITERATIONS = 5
+LONG_STEP_S = 1.0 / 240.0
+"""Time step [s] for recordings so long that the usual step would take minutes a joint."""
+LONG_S = 600.0
+"""Total motion [s] above which a recording counts as long."""
+SPEED_STARTS = (1.05, 3.0)
+"""Starts of the velocity limit, in largest speeds seen: one that binds, one that does not."""
+
+Progress = Callable[[str], None]
+
+
+def _silent(_: str) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to analyse.
+
+    Attributes:
+        effects: Effects to consider.
+        seed: Of everything random.
+        device: Warp device.
+        workers: Processes; the machine's cores by default, one on a GPU.
+    """
+
+    effects: tuple[str, ...] = tuple(EFFECTS)
+    seed: int = 0
+    device: str = "cpu"
+    workers: int | None = None
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.effects) - set(EFFECTS))
+        if unknown:
+            raise ValueError(f"no effects are called {', '.join(unknown)}; choose from {', '.join(EFFECTS)}")
+
+    @property
+    def processes(self) -> int:
+        """Worker processes."""
+        if self.workers is not None:
+            return self.workers
+        return len(os.sched_getaffinity(0)) if self.device == "cpu" else 1
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint under analysis: its data and its baseline."""
+
+    name: str
+    spec: JointSpec
+    scales: Scales
+    fit: JointFit
+
+
+def find(
+    recording: Recording | Path,
+    hand: HandModel | None,
+    out: Path,
+    *,
+    progress: Progress = _silent,
+    **options: Any,
+) -> list[Finding]:
+    """Identify the baseline of every excited joint, and say where it and the measurement disagree.
+
+    Args:
+        recording: The recording or its folder.
+        hand: The hand, for a recording of one.
+        out: Folder for ``find.json``.
+        progress: Called with lines of progress.
+        options: Fields of :class:`Options`.
+
+    Returns:
+        The findings, as in ``find.json``.
+
+    Raises:
+        RecordingError: The recording cannot be used.
+        ValueError: An unknown effect, or a recording that is not of this hand.
+    """
+    chosen = Options(**options)
+    recording = read_recording(recording) if isinstance(recording, Path | str) else recording
+    out = Path(out)
+    key = fingerprint(recording, hand, chosen)
+    known = _read(out / "find.json", key)
+    if known is not None:
+        progress("find: already done")
+        return [Finding(**f) for f in known["findings"]]
+    begin = time.perf_counter()
+    with _team(recording, hand, chosen) as team:
+        joints = _identify(team, _specs(recording, team.bench.chains), chosen, progress)
+        predicted = curves(recording, team.bench, [(j.name, j.spec, j.fit.rows) for j in joints])
+        floors = {j.name: j.spec.floor for j in joints}
+        found = findings(recording, predicted, floors)
+        value = {
+            "format": FIND_FORMAT,
+            "key": key,
+            "findings": [asdict(f) for f in found],
+            "joints": {j.name: {"rows": j.fit.rows.tolist(), "rmse_rad": j.fit.rmse} for j in joints},
+            "simulated": team.simulated,
+            "seconds": time.perf_counter() - begin,
+        }
+    write_json(out / "find.json", value)
+    for finding in found:
+        progress(f"  {finding.where}")
+    return found
+
+
+def explain(
+    recording: Recording | Path,
+    hand: HandModel | None,
+    out: Path,
+    *,
+    progress: Progress = _silent,
+    **options: Any,
+) -> Report:
+    """Name what the baseline lacks; runs :func:`find` first where it has not been run.
+
+    Args:
+        recording: The recording or its folder.
+        hand: The hand, for a recording of one.
+        out: Folder for ``explain.json`` and ``predictions.npz``.
+        progress: Called with lines of progress.
+        options: Fields of :class:`Options`.
+
+    Returns:
+        The report, as in ``explain.json``.
+
+    Raises:
+        RecordingError: The recording cannot be used.
+        ValueError: An unknown effect, or a recording that is not of this hand.
+    """
+    chosen = Options(**options)
+    recording = read_recording(recording) if isinstance(recording, Path | str) else recording
+    out = Path(out)
+    key = fingerprint(recording, hand, chosen)
+    if _read(out / "explain.key.json", key) is not None and (out / "explain.json").is_file():
+        progress("explain: already done")
+        return Report.read(out / "explain.json")
+    found = find(recording, hand, out, progress=progress, **options)
+    known = json.loads((out / "find.json").read_text())
+    begin = time.perf_counter()
+    with _team(recording, hand, chosen) as team:
+        joints = _resume(team, _specs(recording, team.bench.chains), known["joints"])
+        explained = _explain_all(team, joints, recording, chosen, progress)
+        analysed = [
+            Analysed(j.name, j.spec, replace_baseline(e, j.fit), j.scales)
+            for j, e in zip(joints, explained, strict=True)
+        ]
+        seconds = known["seconds"] + time.perf_counter() - begin
+        simulated = known["simulated"] + team.simulated
+        report, predictions = assemble(
+            recording,
+            hand,
+            team.bench,
+            analysed,
+            found,
+            seed=chosen.seed,
+            seconds=seconds,
+            simulated=simulated,
+        )
+    predictions.write(out / "predictions.npz")
+    report.write(out / "explain.json")
+    write_json(out / "explain.key.json", {"key": key})
+    progress(f"explain: {report.verdict} after {seconds:.0f} s")
+    return report
+
+
+def run(recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any) -> Report:
+    """Find and explain; see :func:`explain`."""
+    return explain(recording, hand, out, **options)
+
+
+def fingerprint(recording: Recording, hand: HandModel | None, options: Options) -> str:
+    """What a result depends on, as a hash."""
+    digest = hashlib.sha256()
+    digest.update(
+        repr((VERSION, recording.model, recording.joints, recording.encoder_resolution_rad)).encode()
+    )
+    for trajectory in recording.trajectories:
+        digest.update(repr((trajectory.file, trajectory.excitation, trajectory.joints)).encode())
+        digest.update(repr(sorted(trajectory.conditions.items())).encode())
+        for array in (trajectory.time, trajectory.command, trajectory.position, trajectory.enabled):
+            digest.update(np.ascontiguousarray(array).tobytes())
+        for channel in (trajectory.pwm, trajectory.voltage, trajectory.current):
+            digest.update(b"-" if channel is None else np.ascontiguousarray(channel).tobytes())
+    if hand is not None:
+        for chain in chains(recording, hand):
+            for value in (chain.start_row, chain.mass, chain.com, chain.inertia, chain.offset, chain.axis):
+                digest.update(np.ascontiguousarray(value).tobytes())
+    digest.update(repr((options.effects, options.seed)).encode())
+    return digest.hexdigest()
+
+
+def _read(path: Path, key: str) -> dict[str, Any] | None:
+    """The JSON of an earlier run with the same inputs."""
+    try:
+        value = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+    return value if isinstance(value, dict) and value.get("key") == key else None
+
+
+def _team(recording: Recording, hand: HandModel | None, options: Options) -> Team:
+    length = sum(float(t.time[-1]) for t in recording.trajectories)
+    dt = LONG_STEP_S if length > LONG_S else STEP_S
+    return Team(Bench(recording, chains(recording, hand), dt, options.device), options.processes)
+
+
+def _specs(recording: Recording, parts: Sequence[Chain]) -> list[JointSpec]:
+    """The problems of all excited joints."""
+    specs = []
+    for index, chain in enumerate(parts):
+        for joint in range(len(chain.joints)):
+            trajectories, folds = design(recording, chain, joint)
+            if trajectories:
+                floor = noise_floor(recording, int(chain.columns[joint]))
+                specs.append(JointSpec(index, joint, trajectories, folds, floor, baseline_of(chain)))
+    return specs
+
+
+def baseline_of(chain: Chain) -> tuple[str, ...]:
+    """What the baseline fits: all that the chain lets free but one anchor of a free torque scale.
+
+    Without known masses, torques are known up to a factor: a pendulum's load holds it if known, the
+    nominal stiffness if not.
+    """
+    anchor = ""
+    if not chain.bodies:
+        anchor = "tau_g_nm" if chain.reference_load is not None else "kp"
+    return tuple(name for name in chain.baseline_free if name != anchor)
+
+
+def _identify(team: Team, specs: Sequence[JointSpec], options: Options, progress: Progress) -> list[Joint]:
+    """Baselines of all joints; the joints of a chain once more with the others' baselines."""
+
+    def first(spec: JointSpec) -> Joint:
+        chain = team.bench.chains[spec.chain]
+        rows = chain.start_row.copy()
+        scales = team.run(spec, [("scales", {"row": rows[spec.joint], "residual": spec.floor})])[0]
+        start = {"base": rows, "scales": scales, "seed": options.seed, "generations": CMA_GENERATIONS}
+        searched = team.run(spec, [("start_baseline", start)])[0]
+        starts = [{}, *({"velocity_limit": f * scales.speed} for f in SPEED_STARTS)]
+        call = {"base": searched, "effects": (), "starts": starts, "scales": scales}
+        fit = team.run(spec, [("fit", {**call, "iterations": BASELINE_ITERATIONS})])[0][0]
+        name = chain.joints[spec.joint]
+        progress(f"find: {name}: baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}")
+        return Joint(name, spec, _scales(team, spec, fit), fit)
+
+    joints = _parallel(first, specs)
+    if all(len(chain.joints) == 1 for chain in team.bench.chains):
+        return joints
+    return _together(team, joints)
+
+
+def _together(team: Team, joints: Sequence[Joint]) -> list[Joint]:
+    """Refit each joint with the other joints of its chain as they were found."""
+
+    def again(joint: Joint) -> Joint:
+        rows = joint.fit.rows.copy()
+        for other in joints:
+            if other.spec.chain == joint.spec.chain:
+                rows[other.spec.joint] = other.fit.rows[other.spec.joint]
+        call = {"base": rows, "effects": joint.fit.effects, "starts": [{}], "scales": joint.scales}
+        fit = team.run(joint.spec, [("fit", {**call, "iterations": POLISH_ITERATIONS})])[0][0]
+        return replace(joint, fit=fit, scales=_scales(team, joint.spec, fit))
+
+    return _parallel(again, joints)
+
+
+def _scales(team: Team, spec: JointSpec, fit: JointFit) -> Scales:
+    call = {"row": fit.rows[spec.joint], "residual": fit.rmse}
+    return team.run(spec, [("scales", call)])[0]
+
+
+def _resume(team: Team, specs: Sequence[JointSpec], known: dict[str, Any]) -> list[Joint]:
+    """The joints of an earlier ``find``, their fits recomputed from its rows."""
+
+    def one(spec: JointSpec) -> Joint:
+        name = team.bench.chains[spec.chain].joints[spec.joint]
+        rows = np.array(known[name]["rows"])
+        scales = team.run(spec, [("scales", {"row": rows[spec.joint], "residual": known[name]["rmse_rad"]})])[
+            0
+        ]
+        call = {"base": rows, "effects": (), "starts": [{}], "scales": scales, "iterations": 1}
+        return Joint(name, spec, scales, team.run(spec, [("fit", {**call, "refits": REFITS})])[0][0])
+
+    return _parallel(one, specs)
+
+
+REFITS = 3
+"""Steps of Levenberg-Marquardt of each refit without a fold."""
+
+
+def _explain_all(
+    team: Team, joints: Sequence[Joint], recording: Recording, options: Options, progress: Progress
+) -> list[Explanation]:
+    """Select the effects of every joint."""
+
+    def one(joint: Joint) -> Explanation:
+        chain = team.bench.chains[joint.spec.chain]
+        rng = np.random.default_rng([options.seed, joint.spec.chain, joint.spec.joint])
+        selection = Selection(
+            run=lambda calls: team.run(joint.spec, calls),
+            joint=joint.spec.joint,
+            others=others_in(chain, joint.spec.joint),
+            candidates=candidates(chain, options.effects),
+            floor=joint.spec.floor,
+            scales=joint.scales,
+            weights=resamples(len(joint.spec.trajectories), rng),
+            refits=REFITS,
+            vetoes=vetoes(recording, chain, joint.spec, joint.fit.rows),
+            report=lambda line: progress(f"explain: {joint.name}: {line}"),
+        )
+        result = selection.explain(joint.fit)
+        progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
+        return result
+
+    return _parallel(one, joints)
+
+
+def replace_baseline(explanation: Explanation, baseline: JointFit) -> Explanation:
+    """The explanation with the joint's baseline."""
+    return replace(explanation, baseline=baseline)
+
+
+def _parallel(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """Results in order; threads, since the work waits for processes."""
+    with ThreadPoolExecutor(max(len(items), 1)) as pool:
+        return list(pool.map(work, items))
