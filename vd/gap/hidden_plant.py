@@ -18,6 +18,8 @@ from vd.gap.hidden_finger import Finger, FingerBody, slip
 
 STEP_S = 4.0e-4
 """Time step [s]: five times finer than the fitted model's, second order where the motion is smooth."""
+PROFILE_SUBSTEPS = 4
+"""Steps of a motion profile in one of the plant: where it stops is decided in the last of them."""
 EQUILIBRIUM_SWEEPS = 60
 """Fixed-point sweeps for the droop under gravity at the start; each gains a digit or more."""
 CABLE = "cable_spring"
@@ -155,7 +157,8 @@ class _Batch:
                 held = _hold_mean(arrival + delay[b, j], command, edges)
                 if tau[b, j] > 0.0:
                     keep = np.exp(-dt / tau[b, j])
-                    held, _ = lfilter([1.0 - keep], [1.0, -keep], held, zi=[keep * held[0]])
+                    ends, _ = lfilter([1.0 - keep], [1.0, -keep], held, zi=[keep * held[0]])
+                    held = 0.5 * (np.concatenate([held[:1], ends[:-1]]) + ends)
                 result[:, b, j] = held
         self._profile(result, self.of("acceleration_limit", "a_max_rad_s2"))
         self._play(result, 0.5 * self.of("backlash", "width_rad"))
@@ -166,19 +169,19 @@ class _Batch:
         on = limit > 0.0
         if not on.any():
             return
-        dt, bound = self.dt, limit[on]
+        dt, bound = self.dt / PROFILE_SUBSTEPS, limit[on]
         position, speed = reference[0][on], np.zeros(int(on.sum()))
         for k in range(self.steps):
-            away = reference[k][on] - position
-            far = np.abs(away)
-            # Braking at the limit from this speed, seen half a step ahead, ends on the target.
-            wish = np.minimum(
-                np.sqrt(2.0 * bound * far + (0.5 * bound * dt) ** 2) - 0.5 * bound * dt, far / dt
-            )
-            wish = np.copysign(wish, away)
-            speed = speed + np.minimum(np.maximum(wish - speed, -bound * dt), bound * dt)
-            position = position + dt * speed
-            reference[k][on] = position
+            target, start = reference[k][on], position
+            for _ in range(PROFILE_SUBSTEPS):
+                away = target - position
+                far = np.abs(away)
+                # Braking at the limit from this speed, seen half a step ahead, ends on the target.
+                wish = np.sqrt(2.0 * bound * far + (0.5 * bound * dt) ** 2) - 0.5 * bound * dt
+                wish = np.copysign(np.minimum(wish, far / dt), away)
+                speed = speed + np.minimum(np.maximum(wish - speed, -bound * dt), bound * dt)
+                position = position + dt * speed
+            reference[k][on] = 0.5 * (start + position)
 
     def _play(self, reference: np.ndarray, half: np.ndarray) -> None:
         """Let the reference lag by the play at every reversal; in place."""
