@@ -1,0 +1,284 @@
+"""``vd-gap`` on the command line: steps, resuming, exit statuses, the layer, the plan."""
+
+import csv
+import json
+import re
+
+import numpy as np
+import pytest
+
+from vd.assets_usd.bare_layer import read_bare_layer
+from vd.assets_usd.hand_data import HandError
+from vd.gap import cli, steps
+from vd.gap.close import simulate_again, write_identified
+from vd.gap.hide import hide
+from vd.gap.plan import plan, write_plan
+from vd.gap.recording import read_recording
+from vd.gap.result import (
+    Candidate,
+    Estimate,
+    Fit,
+    HeldOut,
+    JointGap,
+    NamedEffect,
+    Predictions,
+    Report,
+    Source,
+    TrajectoryError,
+)
+from vd.gap.rollout import Rollouts, chains
+from vd.kernels import actuators
+
+JOINT = "joint"
+FLOOR = 1e-3
+BASE = {"kp": 3.0, "kd": 0.3, "velocity_limit": 7.0, "inertia": 2e-3}
+FRICTION = 0.15
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """A bare servo with friction."""
+    folder = tmp_path_factory.mktemp("recordings") / "servo"
+    hide("servo", {"coulomb_friction": {"tau_c_nm": FRICTION}}, folder, seed=3, base_spread=0.0)
+    return folder
+
+
+def servo_curves(folder, rows):
+    """Curves of rows (baseline, identified), each {column: value} on the fitted base."""
+    found = read_recording(folder)
+    (chain,) = chains(found, None)
+    models = np.tile(chain.start_row, (2, 1, 1))
+    for model, values in zip(models, rows, strict=True):
+        for column, value in {**base_columns(), **values}.items():
+            model[0, column] = value
+    rollouts = Rollouts(chain, found)
+    predicted = rollouts.predict(models)
+    return Predictions(
+        time=rollouts.time,
+        trajectory=rollouts.sample_trajectory,
+        command=np.concatenate([t.command for t in found.trajectories]),
+        measured=rollouts.measured,
+        baseline=predicted[0].astype(float),
+        identified=predicted[1].astype(float),
+        joints=found.joints,
+        files=tuple(t.file for t in found.trajectories),
+    )
+
+
+def base_columns():
+    return {
+        actuators.KP: BASE["kp"],
+        actuators.KD: BASE["kd"],
+        actuators.VELOCITY_LIMIT: BASE["velocity_limit"],
+        actuators.INERTIA: BASE["inertia"],
+    }
+
+
+def servo_report(folder, *, verdict="effects", ambiguous=()):
+    """What a fit might say about the recording, and its curves."""
+    curves = servo_curves(folder, ({}, {actuators.COULOMB_TORQUE: FRICTION}))
+    before = float(np.sqrt(np.mean((curves.baseline - curves.measured) ** 2)))
+    after = float(np.sqrt(np.mean((curves.identified - curves.measured) ** 2)))
+    friction = NamedEffect(
+        "coulomb_friction", (JOINT,), 0.98, {"tau_c_nm": Estimate(FRICTION, (0.14, 0.16), "N m")}
+    )
+    decision = "named" if verdict == "effects" else "tied"
+    names = {"coulomb_friction": {"tau_c_nm": FRICTION}, "backlash": {"width_rad": 0.08}}
+    report = Report(
+        verdict=verdict,
+        noise_floor_rad=FLOOR,
+        baseline=Fit(before, {JOINT: before}, before, {JOINT: BASE}),
+        findings=(),
+        effects=(friction,) if verdict == "effects" else (),
+        ambiguous=ambiguous,
+        identified=Fit(after, {JOINT: after}, after, {JOINT: BASE}),
+        held_out=HeldOut(curves.files, before, after, 1.0 - after / before, (0.5, 0.9)),
+        next_experiment="",
+        seconds=1.0,
+        recording=Source(str(folder), "servo", (JOINT,), len(curves.files), len(curves.time), 40.0),
+        joints=(JointGap(JOINT, FLOOR, before, (0.0, 1.0), after, (0.0, 1.0), verdict, "made up"),),
+        evidence=tuple(
+            Candidate((JOINT,), 1, name, after, 0.8, (0.7, 0.9), decision, "made up", values)
+            for name, values in names.items()
+        ),
+        trajectories=tuple(TrajectoryError(file, file, JOINT, True, before, after) for file in curves.files),
+    )
+    return report, curves
+
+
+@pytest.fixture
+def fitted(monkeypatch, recording):
+    """Stands for the fit, which has tests of its own; counts how often each step ran."""
+    workflow = pytest.importorskip("vd.gap.workflow")
+    calls = {"find": 0, "explain": 0, "options": []}
+
+    def find(found, hand, out, **options):
+        calls["find"] += 1
+        calls["options"].append(options)
+        (out / steps.FIND).write_text("{}")
+
+    def explain(found, hand, out, **options):
+        calls["explain"] += 1
+        report, curves = servo_report(recording)
+        curves.write(out / steps.CURVES)
+        report.write(out / steps.EXPLAIN)
+
+    monkeypatch.setattr(workflow, "find", find)
+    monkeypatch.setattr(workflow, "explain", explain)
+    return calls
+
+
+def test_run_writes_everything_and_says_what_was_found(fitted, recording, tmp_path, capsys):
+    out = tmp_path / "gap"
+    assert cli.main(["run", str(recording), "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "lacks coulomb friction on joint (150 mN m)" in printed
+    assert str(out / "report.html") in printed
+    report = Report.read(out / "report.json")
+    assert report.closing is not None and report.closing.simulator == "rollout"
+    assert report.closing.identified_rmse_rad < 0.5 * report.closing.baseline_rmse_rad
+    assert report.command.startswith(f"vd-gap run {recording}")
+    assert {path.name for path in out.iterdir()} >= {"identified.usda", "report.html", "gap.png"}
+
+
+def test_finished_steps_are_kept_until_something_changes(fitted, recording, tmp_path, capsys, monkeypatch):
+    def without_figures(report, curves, folder):
+        report.write(folder / "report.json")
+        (folder / "report.html").write_text("")
+
+    monkeypatch.setattr("vd.gap.report.write_report", without_figures)
+    out = str(tmp_path / "gap")
+    arguments = ["run", str(recording), "--out", out]
+    assert cli.main(arguments) == cli.main(arguments) == 0
+    assert (fitted["find"], fitted["explain"]) == (1, 1)
+    assert "nothing has changed" in capsys.readouterr().err
+    (tmp_path / "gap" / "explain.json").unlink()
+    assert cli.main(arguments) == 0
+    assert (fitted["find"], fitted["explain"]) == (1, 2)
+    assert cli.main([*arguments, "--seed", "5"]) == 0
+    assert (fitted["find"], fitted["explain"]) == (2, 3)
+    assert cli.main([*arguments, "--seed", "5", "--fresh"]) == 0
+    assert (fitted["find"], fitted["explain"]) == (3, 4)
+
+
+def test_steps_go_on_from_what_the_one_before_wrote(fitted, recording, tmp_path, capsys):
+    out = str(tmp_path / "gap")
+    assert cli.main(["explain", str(recording), "--out", out]) == 1
+    assert "run vd-gap find --out" in capsys.readouterr().err
+    assert cli.main(["find", str(recording), "--out", out, "--seed", "7"]) == 0
+    for step in ("explain", "close", "report"):
+        assert cli.main([step, "--out", out]) == 0, step
+    assert fitted["find"] == 1
+    assert "--seed 7" in Report.read(tmp_path / "gap" / "report.json").command
+
+
+def test_json_is_the_report(fitted, recording, tmp_path, capsys):
+    out = tmp_path / "gap"
+    assert cli.main(["run", str(recording), "--out", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads((out / "report.json").read_text())
+
+
+def test_unusable_recordings_exit_with_2_and_a_message(tmp_path, capsys):
+    missing = tmp_path / "none"
+    assert cli.main(["run", str(missing), "--out", str(tmp_path / "gap")]) == 2
+    message = capsys.readouterr().err
+    assert str(missing) in message and "Traceback" not in message
+    assert not (tmp_path / "gap" / "report.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--effects", "coulomb_friction,stiction"], "stiction"),
+        (["--hand", "dclaw3", "--model", "hand.usda"], "--hand and --model"),
+        (["--device", "tpu"], "--device is 'tpu'"),
+    ],
+)
+def test_wrong_flags_are_named(recording, tmp_path, capsys, flags, message):
+    assert cli.main(["run", str(recording), "--out", str(tmp_path / "gap"), *flags]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_nothing_begun_says_how_to_begin(tmp_path, capsys):
+    assert cli.main(["close", "--out", str(tmp_path / "gap")]) == 1
+    assert "vd-gap run RECORDING" in capsys.readouterr().err
+
+
+def test_hide_writes_a_recording_and_the_truth(tmp_path, capsys):
+    out = tmp_path / "rec"
+    assert (
+        cli.main(["hide", "servo", "--effect", "command_delay:delay_s=0.04", "--out", str(out), "--json"])
+        == 0
+    )
+    truth = json.loads(capsys.readouterr().out)
+    assert truth["effects"]["command_delay"]["parameters"]["delay_s"] == {"joint": 0.04}
+    assert len(read_recording(out).trajectories) == 8
+    assert cli.main(["hide", "servo", "--effect", "stiction", "--out", str(out)]) == 1
+    assert "unknown effect 'stiction'" in capsys.readouterr().err
+
+
+def test_layer_of_a_bare_servo_reads_back_as_it_was_identified(recording, tmp_path):
+    report, curves = servo_report(recording)
+    layer = tmp_path / "identified.usda"
+    found = read_recording(recording)
+    write_identified(report, layer, found, None, {})
+    rows, intervals = read_bare_layer(layer, (JOINT,))
+    for column, value in {**base_columns(), actuators.COULOMB_TORQUE: FRICTION}.items():
+        assert rows[0, column] == pytest.approx(value, rel=1e-6)
+    np.testing.assert_allclose(intervals[0, actuators.COULOMB_TORQUE], (0.14, 0.16), rtol=1e-6)
+    closing, again = simulate_again(report, layer, found, None, None, curves)
+    np.testing.assert_allclose(again.identified, curves.identified, atol=1e-5)
+    assert closing.identified_rmse_rad == pytest.approx(report.held_out.identified_rmse_rad, rel=1e-3)
+
+
+def test_effects_of_the_layer_that_was_started_from_stay(recording, tmp_path):
+    report, _ = servo_report(recording)
+    (chain,) = chains(read_recording(recording), None)
+    start = chain.start_row.copy()
+    start[0, actuators.COMMAND_DELAY] = 0.02
+    write_identified(report, tmp_path / "two.usda", read_recording(recording), None, {JOINT: start[0]})
+    rows, _ = read_bare_layer(tmp_path / "two.usda", (JOINT,))
+    assert rows[0, actuators.COMMAND_DELAY] == pytest.approx(0.02)
+    assert rows[0, actuators.COULOMB_TORQUE] == pytest.approx(FRICTION)
+
+
+def test_layers_that_are_none_are_named(recording, tmp_path):
+    report, _ = servo_report(recording)
+    layer = tmp_path / "identified.usda"
+    with pytest.raises(HandError, match="no such layer"):
+        read_bare_layer(layer, (JOINT,))
+    layer.write_text("not USD")
+    with pytest.raises(HandError, match=re.escape(str(layer))):
+        read_bare_layer(layer, (JOINT,))
+    layer.write_text("#usda 1.0\n")
+    with pytest.raises(HandError, match="not an identified servo model"):
+        read_bare_layer(layer, (JOINT,))
+    write_identified(report, layer, read_recording(recording), None, {})
+    with pytest.raises(HandError, match="no joint /servo/elbow"):
+        read_bare_layer(layer, ("elbow",))
+
+
+def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tmp_path):
+    report, _ = servo_report(recording, verdict="ambiguous", ambiguous=(("coulomb_friction", "backlash"),))
+    result = plan(report, read_recording(recording), None)
+    assert result.competing == {JOINT: ("coulomb_friction", "backlash")}
+    scores = [score.floors for score in result.ranking]
+    assert scores == sorted(scores, reverse=True) and scores[0] > 3.0
+    assert "second_payload" not in {score.name for score in result.ranking}, "a bare servo's load is unknown"
+    assert "coulomb friction from backlash" in result.sentence
+    written = json.loads(write_plan(result, tmp_path).read_text())
+    assert written["excitation"] == result.ranking[0].name
+    for entry in written["trajectories"]:
+        with (tmp_path / entry["file"]).open() as file:
+            rows = list(csv.DictReader(file))
+        assert {"t", f"command.{JOINT}"} <= set(rows[0])
+        time = [float(row["t"]) for row in rows]
+        assert time[0] == 0.0 and np.all(np.diff(time) > 0.0)
+        assert time[-1] == pytest.approx(entry["duration_s"], abs=1e-5)
+
+
+def test_plan_for_motions_that_show_too_little(recording):
+    report, _ = servo_report(recording, verdict="under_excited")
+    result = plan(report, read_recording(recording), None)
+    assert result.moved == (JOINT,)
+    assert "what these motions do not show" in result.sentence
