@@ -11,6 +11,7 @@ from vd.gap.words import (
     amount,
     decision_text,
     estimate,
+    finding_text,
     joints_text,
     listing,
     mrad,
@@ -19,6 +20,7 @@ from vd.gap.words import (
     percent,
     percent_range,
     plain,
+    unit_text,
     verdict_sentence,
 )
 from vd.kernels.effects import EFFECTS
@@ -26,6 +28,8 @@ from vd.page import Page
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
 FIGURE_DPI = 150
+MAX_ALTERNATIVES = 5
+"""Shown beside a named effect; the evidence table has all."""
 
 _VERDICT_WORDS = {
     "effects": "Missing effect named",
@@ -112,7 +116,7 @@ def _found(page: Page, report: Report) -> None:
             "Before any effect is added, the plain servo model (stiffness, damping, speed limit) is fitted. "
             "What it cannot follow:"
         )
-        page.points([f"{finding.joint}: {finding.where}" for finding in report.findings])
+        page.points([finding_text(finding) for finding in report.findings])
     else:
         page.text("Nowhere by more than noise, once the plain servo model is fitted.")
     if report.joints:
@@ -204,6 +208,13 @@ def _evidence(page: Page, pictures: _Pictures, report: Report) -> None:
         "shuffled "
         "time: if one of them seemed to help, the method would be fooling itself."
     )
+    tried = {row.name for row in report.evidence}
+    if left := [plain(name) for name in EFFECTS if name not in tried]:
+        page.text(
+            f"Not fitted, because they do not apply here or a first screening left them no chance: "
+            f"{', '.join(left)}.",
+            small=True,
+        )
     for joints in dict.fromkeys(row.joints for row in report.evidence):
         rows = [row for row in report.evidence if row.joints == joints]
         pictures.add(
@@ -257,14 +268,14 @@ def _parameters(page: Page, report: Report) -> None:
                 [f"in place of {plain(effect.name)}", "held-out error", "worse by (95 %)"],
                 [
                     (plain(one.name), mrad(one.held_out_rmse_rad), mrad_range(one.difference_ci95))
-                    for one in effect.alternatives
+                    for one in effect.alternatives[:MAX_ALTERNATIVES]
                 ],
             )
     names = list(dict.fromkeys(n for fit in report.identified.parameters.values() for n in fit))
     if names:
         before, after = report.baseline.parameters, report.identified.parameters
         page.table(
-            ["joint", *(f"{name} [{UNITS.get(name, '1')}]" for name in names)],
+            ["joint", *(f"{name} [{unit_text(UNITS.get(name, '1'))}]" for name in names)],
             [
                 (joint, *(_before_after(before.get(joint, {}).get(n), values.get(n)) for n in names))
                 for joint, values in after.items()
@@ -277,8 +288,14 @@ def _parameters(page: Page, report: Report) -> None:
             small=True,
         )
     if report.closing is not None:
-        page.text(f"All of this is in {report.closing.layer}. Use it in training, evaluation and viewer:")
-        page.code(f"vd-train teacher --hand-layer {report.closing.layer}")
+        page.text(
+            f"All of this is in {report.closing.layer}, USD in plain text. "
+            + ("To train with it (vd-eval and vd-play take it too), and to " if report.hand else "To ")
+            + "see whether a new recording agrees with it:"
+        )
+        if report.hand is not None:
+            page.code(f"vd-train teacher --hand {report.hand} --hand-layer {report.closing.layer}")
+        page.code(f"vd-gap run NEW_RECORDING --hand-layer {report.closing.layer} --out DIR")
 
 
 def _before_after(before: float | None, after: float | None) -> str:

@@ -3,10 +3,12 @@
 import math
 from collections.abc import Sequence
 
-from vd.gap.result import Candidate, Estimate, Interval, NamedEffect, Report
+from vd.gap.result import Candidate, Estimate, Finding, Interval, NamedEffect, Report
 
 MAX_NAMED_JOINTS = 4
 """More joints than this are counted rather than listed."""
+MAX_PLACES = 6
+"""Decimals of an estimate at most."""
 MILLI = 1e3
 """Errors are shown in mrad."""
 
@@ -52,22 +54,36 @@ def percent_range(interval: Interval) -> str:
     return f"{100.0 * interval[0]:.0f} to {100.0 * interval[1]:.0f} %"
 
 
+def unit_text(unit: str) -> str:
+    """A unit as it is printed: ``kg m²``; empty for a pure number."""
+    return "" if unit == "1" else unit.replace("^2", "²")
+
+
 def amount(value: float, unit: str) -> str:
     """A number with its unit, in the size in which people speak of it: ``40.2 ms``, ``12.1 mrad``."""
     if not math.isfinite(value):
         return "not known"
-    small = {"s": "ms", "rad": "mrad", "N m": "mN m"}.get(unit)
-    if small and 0.0 < abs(value) < 1.0:
-        return f"{_digits(MILLI * value)} {small}"
-    return f"{value:.3g}" + ("" if unit == "1" else f" {unit}")
+    factor, shown = _size(value, unit)
+    return f"{_digits(factor * value)} {shown}".strip()
 
 
 def estimate(one: Estimate) -> str:
-    """``40.2 ms (95 %: 39.1 to 41.3 ms)``."""
-    low, high = one.ci95
+    """``40.2 ms (95 %: 39.1 to 41.3)``, with two digits of the interval's half width."""
+    factor, shown = _size(one.value, one.unit)
+    low, high = (factor * x for x in one.ci95)
     if not (math.isfinite(low) and math.isfinite(high)):
         return f"{amount(one.value, one.unit)} (interval not known)"
-    return f"{amount(one.value, one.unit)} (95 %: {amount(low, one.unit)} to {amount(high, one.unit)})"
+    half = max(0.5 * (high - low), 1e-6 * abs(factor * one.value), 1e-9)
+    places = min(max(1 - math.floor(math.log10(half)), 0), MAX_PLACES)
+    text = f"{factor * one.value:.{places}f} {shown}".strip()
+    return f"{text} (95 %: {low:.{places}f} to {high:.{places}f})"
+
+
+def finding_text(finding: Finding) -> str:
+    """Joint, and where it fails."""
+    if finding.where.startswith(finding.joint):
+        return finding.where
+    return f"{finding.joint}: {finding.where}"
 
 
 def effect_sentence(effect: NamedEffect) -> str:
@@ -122,6 +138,11 @@ def next_step(report: Report) -> str:
     """What to do with the outcome, in a sentence or two."""
     if report.next_experiment:
         return report.next_experiment
+    if report.verdict == "effects" and report.hand is None:
+        return (
+            "Nothing is open. identified.usda has the servo's model, with every effect by name. Run vd-gap "
+            "with --hand-layer identified.usda on a new recording to confirm that the gap is closed."
+        )
     if report.verdict == "effects":
         return (
             "Nothing is open. Use the identified model: pass identified.usda with --hand-layer to vd-train, "
@@ -139,5 +160,13 @@ def decision_text(row: Candidate) -> str:
     return f"{word}: {row.reason}" if row.reason else word
 
 
+def _size(value: float, unit: str) -> tuple[float, str]:
+    """Factor and unit in which a number is printed."""
+    small = {"s": "ms", "rad": "mrad", "N m": "mN m"}.get(unit)
+    return (MILLI, small) if small and 0.0 < abs(value) < 1.0 else (1.0, unit_text(unit))
+
+
 def _digits(value: float) -> str:
-    return f"{value:.3g}" if abs(value) < 1e3 else f"{value:.0f}"
+    """Three digits, but nothing beyond the third decimal."""
+    rounded = round(value, 3) if abs(value) < 1.0 else value
+    return f"{rounded + 0.0:.3g}" if abs(value) < 1e3 else f"{value:.0f}"
