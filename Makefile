@@ -24,7 +24,7 @@ BENCH_ARGS ?=
 
 help:
 	@echo 'make demo     author the assets, train and evaluate a small policy, write demo/index.html'
-	@echo '              MESHES=DIR adds your own meshes; DEMO_ARGS="--minutes 8" passes options on'
+	@echo '              MESHES=DIR tries it on your own meshes; DEMO_ARGS="--minutes 8" passes options on'
 	@echo 'make test     all tests; TEST_ARGS="-k rewards" chooses some'
 	@echo 'make lint     ruff, without changing files      make format   the same, changing files'
 	@echo 'make type     mypy on the built package         make bench    simulation throughput'
