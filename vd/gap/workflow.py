@@ -9,9 +9,9 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -62,12 +62,15 @@ class Options:
         seed: Of everything random.
         device: Warp device.
         workers: Processes; the machine's cores by default, one on a GPU.
+        start: Parameter rows [PARAMETER_COLUMNS] of joints by name, of an identified model to start from:
+            its effects are part of the baseline, and what is named comes on top.
     """
 
     effects: tuple[str, ...] = tuple(EFFECTS)
     seed: int = 0
     device: str = "cpu"
     workers: int | None = None
+    start: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.effects) - set(EFFECTS))
@@ -227,6 +230,8 @@ def fingerprint(recording: Recording, hand: HandModel | None, options: Options) 
             for value in (chain.start_row, chain.mass, chain.com, chain.inertia, chain.offset, chain.axis):
                 digest.update(np.ascontiguousarray(value).tobytes())
     digest.update(repr((options.effects, options.seed)).encode())
+    for joint, row in sorted(options.start.items()):
+        digest.update(joint.encode() + np.ascontiguousarray(row).tobytes())
     return digest.hexdigest()
 
 
@@ -242,7 +247,14 @@ def _read(path: Path, key: str) -> dict[str, Any] | None:
 def _team(recording: Recording, hand: HandModel | None, options: Options) -> Team:
     length = sum(float(t.time[-1]) for t in recording.trajectories)
     dt = LONG_STEP_S if length > LONG_S else STEP_S
-    return Team(Bench(recording, chains(recording, hand), dt, options.device), options.processes)
+    parts = [_started(chain, options.start) for chain in chains(recording, hand)]
+    return Team(Bench(recording, parts, dt, options.device), options.processes)
+
+
+def _started(chain: Chain, start: Mapping[str, np.ndarray]) -> Chain:
+    """The chain with the joints of an identified model as they were identified."""
+    rows = [start.get(joint, row) for joint, row in zip(chain.joints, chain.start_row, strict=True)]
+    return replace(chain, start_row=np.array(rows, dtype=float))
 
 
 def _specs(recording: Recording, parts: Sequence[Chain]) -> list[JointSpec]:
