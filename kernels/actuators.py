@@ -66,9 +66,6 @@ STATE_ELASTIC_SPEED = 6
 STATE_TIME = 7
 STATE_COLUMNS = 8
 
-SMALLEST_TORQUE = 1.0e-9
-"""Below this torque [N m] a ratio of torques says nothing."""
-
 
 @wp.struct
 class Servo:
@@ -131,12 +128,24 @@ def dead_zone(error: float, width: float) -> float:
 
 
 @wp.func
-def motor_torque(wanted: float, speed: float, time: float, parameters: wp.array2d[float], row: int) -> float:
-    """Torque that the motor gives when the controller wants ``wanted`` [N m] at ``speed`` [rad/s].
+def motor_torque(
+    wanted: float, speed: float, time: float, parameters: wp.array2d[float], row: int
+) -> wp.vec2:
+    """What the motor gives when the controller wants ``wanted`` [N m] at ``speed`` [rad/s].
 
     In the order of the signal: supply sag (tau / (1 + r |tau|): voltage falls with current), warming
     (exp(-rate t)), soft loss (tau_s tanh(tau / tau_s)), hard limit, and the torque-speed line
     tau_stall (1 - |speed| / omega_0), which bounds driving, not braking.
+
+    Args:
+        wanted: Torque wanted [N m].
+        speed: Joint velocity [rad/s].
+        time: Time since the joint was switched on [s].
+        parameters: Parameter rows.
+        row: The joint's row.
+
+    Returns:
+        The torque [N m], and how much of it the torque-speed line takes per speed [N m s/rad].
     """
     torque = wanted
     sag = parameters[row, SUPPLY_SAG]
@@ -152,12 +161,17 @@ def motor_torque(wanted: float, speed: float, time: float, parameters: wp.array2
     if limit > 0.0:
         torque = wp.clamp(torque, -limit, limit)
     stall = parameters[row, STALL_TORQUE]
+    fall = 0.0
     if stall > 0.0:
         bound = stall
+        slope = 0.0
         if torque * speed > 0.0:
-            bound = stall * wp.max(0.0, 1.0 - wp.abs(speed) / parameters[row, NO_LOAD_SPEED])
-        torque = wp.clamp(torque, -bound, bound)
-    return torque
+            slope = stall / parameters[row, NO_LOAD_SPEED]
+            bound = wp.max(0.0, stall - slope * wp.abs(speed))
+        if wp.abs(torque) > bound:
+            torque = wp.clamp(torque, -bound, bound)
+            fall = slope
+    return wp.vec2(torque, fall)
 
 
 @wp.func
@@ -235,9 +249,39 @@ def start_servo(command: float, position: float, row: int, state: wp.array2d[flo
 
 
 @wp.func
-def servo(
-    command: float,
-    coupled: float,
+def shape_command(
+    command: float, dt: float, parameters: wp.array2d[float], row: int, state: wp.array2d[float]
+) -> float:
+    """The reference that firmware and transmission make of a command: filter, profile, backlash.
+
+    Args:
+        command: Commanded position, constant over ``dt`` [rad].
+        dt: Duration [s]; a step in which a command arrives can be taken in two parts.
+        parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
+        row: The joint's row.
+        state: State rows, shape [R, STATE_COLUMNS]; the joint's row is advanced.
+
+    Returns:
+        The reference, its mean over ``dt`` [rad].
+    """
+    filtered = low_pass(state[row, STATE_FILTERED], command, parameters[row, FILTER_TAU], dt)
+    state[row, STATE_FILTERED] = filtered[0]
+    reference = filtered[1]
+    limit = parameters[row, ACCELERATION_LIMIT]
+    if limit > 0.0:
+        before = state[row, STATE_PROFILE]
+        profile = accelerate(before, state[row, STATE_PROFILE_SPEED], reference, limit, dt)
+        state[row, STATE_PROFILE] = profile[0]
+        state[row, STATE_PROFILE_SPEED] = profile[1]
+        reference = 0.5 * (before + profile[0])
+    reference = play(state[row, STATE_PLAY], reference, parameters[row, BACKLASH_WIDTH])
+    state[row, STATE_PLAY] = reference
+    return reference
+
+
+@wp.func
+def drive_joint(
+    reference: float,
     position: float,
     speed: float,
     power: float,
@@ -246,11 +290,10 @@ def servo(
     row: int,
     state: wp.array2d[float],
 ) -> Servo:
-    """One time step of a joint's servo.
+    """One time step of the control loop, the motor and the load of a joint.
 
     Args:
-        command: Commanded position, already delayed [rad].
-        coupled: Sum of the other joints' positions times this joint's coupling row [rad].
+        reference: Result of :func:`shape_command`, and what coupled joints add to it [rad].
         position: True joint position [rad].
         speed: Joint velocity [rad/s].
         power: Factor on the controller's position and integral gains: 0 with the torque off, or a gain
@@ -264,45 +307,62 @@ def servo(
     time = state[row, STATE_TIME]
     state[row, STATE_TIME] = time + dt
 
-    filtered = low_pass(state[row, STATE_FILTERED], command, parameters[row, FILTER_TAU], dt)
-    state[row, STATE_FILTERED] = filtered[0]
-    reference = filtered[1]
-    limit = parameters[row, ACCELERATION_LIMIT]
-    if limit > 0.0:
-        before = state[row, STATE_PROFILE]
-        profile = accelerate(before, state[row, STATE_PROFILE_SPEED], reference, limit, dt)
-        state[row, STATE_PROFILE] = profile[0]
-        state[row, STATE_PROFILE_SPEED] = profile[1]
-        reference = 0.5 * (before + profile[0])
-    reference = play(state[row, STATE_PLAY], reference, parameters[row, BACKLASH_WIDTH])
-    state[row, STATE_PLAY] = reference
-    reference += coupled
     width = parameters[row, DEAD_ZONE_WIDTH]
     if width > 0.0:
         reference = position + dead_zone(reference - position, width)
-
-    kp = parameters[row, KP]
     integral = 0.0
     if parameters[row, INTEGRAL_GAIN] > 0.0 and power > 0.0:
         integral = state[row, STATE_INTEGRAL] + (reference - position) * dt
         state[row, STATE_INTEGRAL] = integral
-    damping = parameters[row, KD]
     steady = power * parameters[row, INTEGRAL_GAIN] * integral
-    wanted = power * kp * (reference - position) - damping * speed + steady
+    kp = power * parameters[row, KP]
+    damping = parameters[row, KD]
+    wanted = kp * (reference - position) - damping * speed + steady
     motor = motor_torque(wanted, speed, time, parameters, row)
-    gain = 1.0
-    if wp.abs(wanted) > SMALLEST_TORQUE:
-        gain = motor / wanted
-    friction = dry_friction(motor, speed, parameters, row)
+    if motor[0] != wanted:
+        gain = motor[0] / wanted
+        kp *= gain
+        damping = gain * damping + motor[1]
+        steady = gain * steady + motor[1] * speed
+    friction = dry_friction(motor[0], speed, parameters, row)
     load = elastic_load(position, speed, dt, parameters, row, state)
     result.reference = reference
-    result.stiffness = gain * power * kp
-    result.damping = gain * damping + load[1]
+    result.stiffness = kp
+    result.damping = damping + load[1]
     result.torque = (
-        gain * steady
+        steady
         - parameters[row, GRAVITY_TORQUE] * wp.sin(position + parameters[row, GRAVITY_PHASE])
         + load[0]
         + friction[1]
     )
     result.friction = friction[0]
     return result
+
+
+@wp.func
+def servo(
+    command: float,
+    coupled: float,
+    position: float,
+    speed: float,
+    power: float,
+    dt: float,
+    parameters: wp.array2d[float],
+    row: int,
+    state: wp.array2d[float],
+) -> Servo:
+    """One time step of a joint's servo: :func:`shape_command`, then :func:`drive_joint`.
+
+    Args:
+        command: Commanded position, already delayed, its mean over the step [rad].
+        coupled: Sum of the other joints' positions times this joint's coupling row [rad].
+        position: As in :func:`drive_joint`.
+        speed: As in :func:`drive_joint`.
+        power: As in :func:`drive_joint`.
+        dt: Time step [s].
+        parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
+        row: The joint's row.
+        state: State rows, shape [R, STATE_COLUMNS]; the joint's row is advanced.
+    """
+    reference = shape_command(command, dt, parameters, row, state) + coupled
+    return drive_joint(reference, position, speed, power, dt, parameters, row, state)

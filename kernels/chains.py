@@ -27,7 +27,8 @@ from vd.kernels.actuators import (
     PAYLOAD_INERTIA,
     READ_DELAY,
     VELOCITY_LIMIT,
-    servo,
+    drive_joint,
+    shape_command,
     start_servo,
 )
 
@@ -297,16 +298,19 @@ def rollout_kernel(
         stiffness = wp.vec3(0.0)
         for j in range(count):
             row = base_row + j
-            # The time average of the command over the step.
-            command = held[j]
+            # Commands that arrive within the step divide it; the reference is the mean over it.
+            reference = wp.float32(0.0)
             power = held_power[j]
+            done = wp.float32(0.0)
             while due_step[j] <= k:
                 if due_kept[j] == 1:
-                    share = 1.0
+                    part = wp.float32(0.0)
                     if due_step[j] == k:
-                        share = 1.0 - due_fraction[j]
-                    command += share * (samples.command[write[j], j] - held[j])
-                    power += share * (samples.power[write[j], j] - held_power[j])
+                        part = due_fraction[j] - done
+                    if part > 0.0:
+                        reference += part * shape_command(held[j], part * dt, parameters, row, state)
+                        done += part
+                    power += (1.0 - done) * (samples.power[write[j], j] - held_power[j])
                     held[j] = samples.command[write[j], j]
                     held_power[j] = samples.power[write[j], j]
                 write[j] = write[j] + 1
@@ -325,7 +329,9 @@ def rollout_kernel(
             if count > 1:
                 for i in range(count):
                     coupled += parameters[row, COUPLING_0 + slot[i]] * q[i]
-            drive = servo(command, coupled, q[j], speed[j], power, dt, parameters, row, state)
+            part = 1.0 - done
+            reference += part * shape_command(held[j], part * dt, parameters, row, state) + coupled
+            drive = drive_joint(reference, q[j], speed[j], power, dt, parameters, row, state)
             torque[j] = drive.stiffness * (drive.reference - q[j]) - drive.damping * speed[j] + drive.torque
             damping[j] = drive.damping
             stiffness[j] = drive.stiffness
