@@ -1,4 +1,4 @@
-"""``vd-bench``: measure speed and physics; figures are ratios and rates within one run."""
+"""``vd-bench``: measure speed, physics and the gap workflow; rates are ratios within one run."""
 
 import dataclasses
 import json
@@ -125,6 +125,65 @@ class ReplayCommand:
         return 0
 
 
+@dataclass(frozen=True)
+class GapCommand:
+    """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
+
+    One result file per case: run it again to go on, give --shard on each machine, --collect for the figures.
+    """
+
+    out: Path = Path("runs/gap-battery")
+    """Folder of the results, figures (summary.json) and tables (summary.md)."""
+    model: str = "dclaw3"
+    """dclaw3 or dclaw4 (one finger), or servo or pendulum, which are quick."""
+    kinds: tuple[str, ...] = ("single", "none", "pair", "outside")
+    """Kinds of cases."""
+    effects: tuple[str, ...] = ()
+    """Effects to hide; all that show on the model by default."""
+    sizes: tuple[int, ...] = (0, 1, 2, 3)
+    """Sizes of single effects: gaps of about 1.5, 3, 6 and 12 noise floors."""
+    seeds: int = 5
+    """Recordings of each effect and size."""
+    nothing: int = 200
+    """Recordings with nothing hidden, or only other stiffness, damping and mass."""
+    shard: str = "1/1"
+    """Part i/n of the cases, for n machines."""
+    jobs: int = 1
+    """Cases at a time."""
+    device: str = "cpu"
+    """Warp device."""
+    collect: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Run nothing; figures of the results that are there."""
+    keep: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Keep recordings and analyses."""
+
+    def run(self) -> int:
+        """Run the cases, then write and print the tables."""
+        from vd.bench.gap import battery, collect, parse_shard, run_battery
+        from vd.bench.gap_score import markdown, summary
+        from vd.files import write_json, write_text
+
+        cases = battery(
+            self.model,
+            kinds=self.kinds,
+            effects=self.effects,
+            sizes=self.sizes,
+            seeds=self.seeds,
+            nothing=self.nothing,
+        )
+        if not self.collect:
+            device = choose_device(self.device)
+            shard = parse_shard(self.shard)
+            run_battery(cases, self.out, shard=shard, jobs=self.jobs, device=device, keep=self.keep)
+        results = collect(self.out)
+        if not results:
+            raise ValueError(f"{self.out} holds no results; run the battery without --collect first")
+        write_json(self.out / "summary.json", summary(results))
+        write_text(self.out / "summary.md", markdown(results))
+        print(markdown(results))
+        return 0
+
+
 def choose_device(name: str) -> str:
     """The Warp device of ``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
     import warp as wp
@@ -137,6 +196,7 @@ def choose_device(name: str) -> str:
 Command = (
     Annotated[SimCommand, tyro.conf.subcommand("sim")]
     | Annotated[PhysicsCommand, tyro.conf.subcommand("physics")]
+    | Annotated[GapCommand, tyro.conf.subcommand("gap")]
     | Annotated[ReplayCommand, tyro.conf.subcommand("replay")]
 )
 

@@ -1,0 +1,331 @@
+"""Compare what the gap workflow says with what was hidden, and gather the figures to reach."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vd.gap.hidden_plant import CABLE, COGGING, WARMING
+from vd.gap.hide import Hiding
+from vd.gap.recording import BARE_MODELS
+from vd.gap.sizes import sized_effect
+from vd.kernels.effects import EFFECTS
+
+KINDS = ("single", "none", "pair", "outside")
+MASS_SPREAD = 0.2
+"""Of links whose mass is changed, as the paper's randomisation has it."""
+CLEAR_GAP = 3.0
+"""Gap in noise floors from which a single effect counts for the goals."""
+NEIGHBOURS: Mapping[str, tuple[str, ...]] = {
+    COGGING: (),
+    CABLE: ("gravity_load",),
+    WARMING: ("coulomb_friction", "stribeck_friction", "asymmetric_friction", "load_friction"),
+}
+"""Effects of the table that do what one outside does, in part: naming them is no error."""
+MASS_EFFECTS = ("gravity_load", "payload_inertia")
+"""What a hand with other masses than its model has: naming them is right."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One recording of the battery.
+
+    Attributes:
+        kind: ``single``, ``none``, ``pair`` or ``outside``.
+        model: Hand (one finger of it), ``servo`` or ``pendulum``.
+        effects: What is hidden.
+        size: Index of the size, 0 .. 3.
+        seed: Of base parameters and noise.
+        change: With nothing hidden: ``exact`` (the model's own base), ``base`` (other stiffness, damping,
+            speed limit) or ``mass`` (other masses as well).
+    """
+
+    kind: str
+    model: str
+    effects: tuple[str, ...]
+    size: int
+    seed: int
+    change: str = "base"
+
+    @property
+    def name(self) -> str:
+        """Name of its result file."""
+        what = "+".join(self.effects) or self.change
+        return f"{self.kind}-{self.model}-{what}-size{self.size}-seed{self.seed}"
+
+    def hiding(self) -> Hiding:
+        """The recording to make."""
+        index = KINDS.index(self.kind)
+        return Hiding(
+            model=self.model,
+            effects={name: sized_effect(name, self.size, self.model) for name in self.effects},
+            seed=1000 * index + self.seed,
+            base_spread=0.0 if self.change == "exact" else Hiding.base_spread,
+            mass_spread=MASS_SPREAD if self.change == "mass" else 0.0,
+        )
+
+
+def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, Any]:
+    """Compare a report (``vd-gap-report/1``) with the truth.
+
+    Returns:
+        The case; verdict; names and sets given; which are right and wrong; gaps in noise floors; relative
+        errors and interval coverage of the parameters of effects named rightly; seconds.
+    """
+    floor = truth["noise_floor_rad"]
+    named = list(dict.fromkeys(effect["name"] for effect in report["effects"]))
+    sets = [list(group) for group in report["ambiguous"]]
+    right = set(case.effects) | (set(MASS_EFFECTS) if case.change == "mass" else set())
+    tolerated = right | {n for name in case.effects for n in NEIGHBOURS.get(name, ())}
+    held_out = report["held_out"]
+    return {
+        "case": asdict(case),
+        "verdict": report["verdict"],
+        "named": named,
+        "sets": sets,
+        "missed": [n for n in case.effects if n not in named and not any(n in group for group in sets)],
+        "false": [n for n in named if n not in tolerated],
+        "gap": _ratio(report["baseline"]["rmse_rad"], floor),
+        "left": _ratio(held_out["identified_rmse_rad"], floor),
+        "shrunk": _ratio(held_out["baseline_rmse_rad"], held_out["identified_rmse_rad"]),
+        "parameters": _parameters(case, report, truth),
+        "seconds": report["seconds"],
+    }
+
+
+def _ratio(a: float | None, b: float | None) -> float | None:
+    return a / b if a is not None and b else None
+
+
+def _parameters(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Relative error and coverage of every parameter of every effect named rightly, joint by joint."""
+    rows = []
+    for effect in report["effects"]:
+        hidden = truth["effects"].get(effect["name"])
+        if hidden is None or effect["name"] not in EFFECTS:
+            continue
+        units = {p.name: p.unit for p in EFFECTS[effect["name"]].parameters}
+        for joint, (key, estimate) in itertools.product(effect["joints"], effect["parameters"].items()):
+            true = hidden["parameters"][key][joint] * _torque_unit(case, report, truth, joint, units[key])
+            low, high = estimate["ci95"]
+            if not true or estimate["value"] is None:
+                continue  # a parameter that is not hidden has no relative error
+            rows.append(
+                {
+                    "parameter": f"{effect['name']}.{key}",
+                    "joint": joint,
+                    "error": abs(estimate["value"] / true - 1.0),
+                    "covered": low is not None and high is not None and low <= true <= high,
+                }
+            )
+    return rows
+
+
+def _torque_unit(
+    case: Case, report: Mapping[str, Any], truth: Mapping[str, Any], joint: str, unit: str
+) -> float:
+    """True torques in the report's unit of torque.
+
+    Of a bare servo every torque is known up to one factor only, and the fit holds the stiffness at its
+    nominal value; the other torques follow.
+    """
+    if case.model not in BARE_MODELS or not ("N m" in unit or "kg" in unit):
+        return 1.0
+    factor = report["identified"]["parameters"][joint].get("kp", math.nan) / truth["base"]["kp"][joint]
+    if not math.isfinite(factor):
+        return 1.0
+    return 1.0 / factor if unit == "1/(N m)" else factor
+
+
+def said(result: Mapping[str, Any]) -> str:
+    """The names and sets of a result in a few words."""
+    sets = [" or ".join(group) for group in result["sets"]]
+    return ", ".join([*result["named"], *(f"{{{group}}}" for group in sets)]) or "nothing"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One of the figures to reach.
+
+    Attributes:
+        what: In words.
+        goal: Bound, in words.
+        value: Measured; None if no case says anything.
+        cases: Cases behind it.
+        reached: Whether the value is within the bound.
+        share: Whether the value is a share of cases.
+    """
+
+    what: str
+    goal: str
+    value: float | None
+    cases: int
+    reached: bool | None
+    share: bool = False
+
+    @property
+    def text(self) -> str:
+        """The value, a share in percent."""
+        if self.value is None:
+            return "-"
+        return f"{100 * self.value:.1f} %" if self.share else f"{self.value:.3g}"
+
+
+def figures(results: Iterable[Mapping[str, Any]]) -> list[Figure]:
+    """The goals' figures over all results, failed cases counted against them."""
+    everything = list(results)
+
+    def of(kind: str) -> list[Mapping[str, Any]]:
+        return [r for r in everything if r["case"]["kind"] == kind]
+
+    def clear(result: Mapping[str, Any]) -> bool:
+        return "error" in result or (result["gap"] or 0.0) >= CLEAR_GAP
+
+    single = [r for r in of("single") if clear(r)]
+    named = [r for r in single if "error" not in r and r["case"]["effects"][0] in r["named"]]
+    parameters = [row for r in named for row in r["parameters"]]
+    none, pair, outside = of("none"), of("pair"), of("outside")
+    return [
+        _share("first name right", ">= 95 %", single, _first_right, least=0.95),
+        _share("right, or in the named set", ">= 99 %", single, lambda r: not r["missed"], least=0.99),
+        _median("size of the set", "1", [_set_size(r) for r in single if "error" not in r], most=1.0),
+        _share("single: a wrong name", "", single, lambda r: bool(r["false"])),
+        _share("nothing hidden: a false name", "<= 2 %", none, lambda r: bool(r["false"]), most=0.02),
+        _share("nothing hidden: any name at all (mass included)", "", none, lambda r: bool(r["named"])),
+        _share("two hidden: both named", ">= 80 %", pair, _all_named, least=0.8),
+        _share("two hidden: one or both, none wrong", ">= 98 %", pair, _one_and_none_wrong, least=0.98),
+        _share("outside: unknown or neighbours", ">= 90 %", outside, _unknown_or_near, least=0.9),
+        _share("outside: a confident wrong name", "<= 2 %", outside, lambda r: bool(r["false"]), most=0.02),
+        _median("relative error of parameters", "<= 0.1", [row["error"] for row in parameters], most=0.1),
+        _between("95 % intervals that cover", "90-98 %", [row["covered"] for row in parameters], 0.9, 0.98),
+        _median("held-out gap: times smaller", ">= 5", _values(single, "shrunk"), least=5.0),
+        _median("held-out gap: noise floors left", "<= 1.3", _values(single, "left"), most=1.3),
+        _median("seconds a recording", "", _values(everything, "seconds")),
+        _share("cases that failed to run", "0", everything, lambda r: False, most=0.0, error=True),
+    ]
+
+
+def _values(results: Iterable[Mapping[str, Any]], key: str) -> list[float]:
+    return [r[key] for r in results if r.get(key) is not None]
+
+
+def _first_right(result: Mapping[str, Any]) -> bool:
+    """The named effect, or the first of the set, is the hidden one."""
+    first = result["named"][:1] or [group[0] for group in result["sets"][:1]]
+    return first == list(result["case"]["effects"])
+
+
+def _set_size(result: Mapping[str, Any]) -> float:
+    """Candidates among which the answer leaves the choice: 1 for a name, none counts as all."""
+    truth = result["case"]["effects"][0]
+    if truth in result["named"]:
+        return 1.0
+    return float(min((len(group) for group in result["sets"] if truth in group), default=len(EFFECTS)))
+
+
+def _all_named(result: Mapping[str, Any]) -> bool:
+    return set(result["case"]["effects"]) <= set(result["named"])
+
+
+def _one_and_none_wrong(result: Mapping[str, Any]) -> bool:
+    return bool(set(result["case"]["effects"]) & set(result["named"])) and not result["false"]
+
+
+def _unknown_or_near(result: Mapping[str, Any]) -> bool:
+    """Abstains, or names and sets hold neighbours only."""
+    near = NEIGHBOURS.get(result["case"]["effects"][0], ())
+    sets_near = all(any(name in near for name in group) for group in result["sets"])
+    return not result["false"] and (result["verdict"] in ("unknown", "no_gap", "under_excited") or sets_near)
+
+
+def _figure(
+    what: str, goal: str, value: float | None, cases: int, least: float | None, most: float | None
+) -> Figure:
+    if value is None or (least is None and most is None):
+        return Figure(what, goal, value, cases, None)
+    low = -math.inf if least is None else least
+    high = math.inf if most is None else most
+    return Figure(what, goal, value, cases, low <= value <= high)
+
+
+def _share(
+    what: str,
+    goal: str,
+    results: Sequence[Mapping[str, Any]],
+    says: Callable[[Mapping[str, Any]], bool],
+    *,
+    least: float | None = None,
+    most: float | None = None,
+    error: bool | None = None,
+) -> Figure:
+    """Share of cases; one that failed counts against the goal unless ``error`` says how it counts."""
+    failed = error if error is not None else most is not None
+    hits = [failed if "error" in r else says(r) for r in results]
+    value = float(np.mean(hits)) if hits else None
+    return replace(_figure(what, goal, value, len(hits), least, most), share=True)
+
+
+def _between(what: str, goal: str, values: Sequence[bool], least: float, most: float) -> Figure:
+    share = float(np.mean(values)) if values else None
+    return replace(_figure(what, goal, share, len(values), least, most), share=True)
+
+
+def _median(
+    what: str, goal: str, values: Sequence[float], *, least: float | None = None, most: float | None = None
+) -> Figure:
+    return _figure(what, goal, float(np.median(values)) if values else None, len(values), least, most)
+
+
+def by_effect(results: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Single effects: what came of each at each size."""
+    groups: dict[tuple[str, int], list[Mapping[str, Any]]] = {}
+    for result in results:
+        case = result["case"]
+        if case["kind"] in ("single", "outside"):
+            groups.setdefault((case["effects"][0], case["size"]), []).append(result)
+    rows = []
+    for (name, size), group in sorted(groups.items()):
+        good = [r for r in group if "error" not in r]
+        answers = [said(r) if r["named"] or r["sets"] else r["verdict"] for r in good]
+        rows.append(
+            {
+                "effect": name,
+                "size": size,
+                "cases": len(group),
+                "failed": len(group) - len(good),
+                "gap": float(np.median(gaps)) if (gaps := _values(good, "gap")) else None,
+                "named": sum(name in r["named"] for r in good),
+                "in_set": sum(any(name in s for s in r["sets"]) and name not in r["named"] for r in good),
+                "wrong": sum(bool(r["false"]) for r in good),
+                "answers": {answer: answers.count(answer) for answer in dict.fromkeys(answers)},
+            }
+        )
+    return rows
+
+
+def markdown(results: Sequence[Mapping[str, Any]]) -> str:
+    """The figures as tables: the goals first, then every effect."""
+    lines = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
+    for figure in figures(results):
+        reached = {True: "yes", False: "no", None: ""}[figure.reached]
+        lines.append(f"| {figure.what} | {figure.goal} | {figure.text} | {figure.cases} | {reached} |")
+    lines += ["", "| hidden | size | gap / floor | named | in a set | wrong | of | answers |"]
+    lines += ["|---|---|---|---|---|---|---|---|"]
+    for row in by_effect(results):
+        answers = "; ".join(f"{count} x {answer}" for answer, count in row["answers"].items())
+        gap = "-" if row["gap"] is None else f"{row['gap']:.1f}"
+        counts = " | ".join(str(row[key]) for key in ("named", "in_set", "wrong", "cases"))
+        lines.append(f"| `{row['effect']}` | {row['size']} | {gap} | {counts} | {answers} |")
+    return "\n".join(lines) + "\n"
+
+
+def summary(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Figures and effects for ``summary.json``."""
+    return {
+        "cases": len(results),
+        "figures": [asdict(figure) for figure in figures(results)],
+        "effects": by_effect(results),
+    }
