@@ -66,6 +66,9 @@ STATE_ELASTIC_SPEED = 6
 STATE_TIME = 7
 STATE_COLUMNS = 8
 
+SMALLEST_SPEED = 1.0e-3
+"""Least speed scale [rad/s] of a parameter that divides, far below the bounds of any."""
+
 
 @wp.struct
 class Servo:
@@ -110,7 +113,8 @@ def accelerate(position: float, speed: float, target: float, limit: float, dt: f
     # |error| - (speed + wanted) dt / 2 = wanted^2 / (2 limit).
     step = 0.5 * limit * dt
     rest = step * step + 2.0 * limit * wp.abs(error) - limit * dt * side * speed
-    wanted = side * (wp.sqrt(wp.max(rest, 0.0)) - step)
+    # The last steps aim at the target itself: the speed that stops there exactly would alternate.
+    wanted = side * wp.min(wp.sqrt(wp.max(rest, 0.0)) - step, wp.abs(error) / dt)
     new_speed = speed + wp.clamp(wanted - speed, -limit * dt, limit * dt)
     return wp.vec2(position + 0.5 * (speed + new_speed) * dt, new_speed)
 
@@ -166,7 +170,7 @@ def motor_torque(
         bound = stall
         slope = 0.0
         if torque * speed > 0.0:
-            slope = stall / parameters[row, NO_LOAD_SPEED]
+            slope = stall / wp.max(parameters[row, NO_LOAD_SPEED], SMALLEST_SPEED)
             bound = wp.max(0.0, stall - slope * wp.abs(speed))
         if wp.abs(torque) > bound:
             torque = wp.clamp(torque, -bound, bound)
@@ -194,7 +198,7 @@ def dry_friction(motor: float, speed: float, parameters: wp.array2d[float], row:
     sliding = parameters[row, STRIBECK_SLIDING]
     static = parameters[row, STRIBECK_STATIC]
     if static > 0.0 or sliding > 0.0:
-        ratio = speed / parameters[row, STRIBECK_SPEED]
+        ratio = speed / wp.max(parameters[row, STRIBECK_SPEED], SMALLEST_SPEED)
         friction += sliding + (static - sliding) * wp.exp(-ratio * ratio)
     plus = parameters[row, FRICTION_PLUS]
     minus = parameters[row, FRICTION_MINUS]

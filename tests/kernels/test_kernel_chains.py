@@ -1,0 +1,569 @@
+"""Rollouts of chains against MuJoCo's C engine, a finer NumPy integration, and closed forms."""
+
+import mujoco
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_oracle import EXAMPLES, device_array, unwritten
+
+from vd.kernels import actuators as servo
+from vd.kernels.chains import DIVERGED, Links, Samples, chain_dynamics, rollout_kernel
+from vd.kernels.effects import EFFECTS, neutral_row
+
+DT = 1 / 480
+FINE = 10
+"""The oracle's steps in one of the kernel's."""
+PLAIN = {servo.KP: 3.0, servo.KD: 0.3, servo.VELOCITY_LIMIT: 50.0, servo.INERTIA: 2e-3}
+GRAVITY = np.array([1.0, -2.0, 9.0])
+
+
+def random_bodies(rng, n):
+    """Axes, offsets, masses, centres of mass, inertias of a finger-sized chain."""
+    axis = rng.normal(size=(n, 3))
+    turn = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    moments = rng.uniform(5e-6, 1e-5, (n, 3)) + 5e-6
+    return {
+        "axis": axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        "offset": rng.uniform(-0.07, 0.07, (n, 3)),
+        "mass": rng.uniform(0.02, 0.1, n),
+        "com": rng.uniform(-0.05, 0.05, (n, 3)),
+        "inertia": np.einsum("nij,nj,nkj->nik", turn, moments, turn),
+    }
+
+
+def links_struct(bodies, gravity, device):
+    links = Links()
+    for name, dtype in (
+        ("axis", wp.vec3),
+        ("offset", wp.vec3),
+        ("mass", float),
+        ("com", wp.vec3),
+        ("inertia", wp.mat33),
+    ):
+        setattr(links, name, device_array(bodies[name], dtype, device))
+    links.gravity = wp.vec3(*gravity)
+    return links
+
+
+def rows_of(*settings, n=1):
+    """Parameter rows [C, n, P] of the plain servo with settings by column."""
+    rows = np.tile(neutral_row(), (len(settings), n, 1))
+    for row, values in zip(rows, settings, strict=True):
+        for column, value in {**PLAIN, **values}.items():
+            row[:, column] = value
+    return rows
+
+
+def roll(device, rows, time, command, start, *, bodies=None, gravity=GRAVITY, dt=DT, power=None, stops=1e6):
+    """Roll trajectories out; time [T], command [R, T, n], start [R, n]. Returns [C, R, T, n]."""
+    runs, count, n = command.shape
+    sets = len(rows)
+    steps = np.tile(time / dt, runs)
+    samples = Samples()
+    samples.step = device_array(np.floor(steps), int, device)
+    samples.fraction = device_array(steps - np.floor(steps), float, device)
+    samples.command = device_array(command.reshape(-1, n), float, device)
+    power = np.ones_like(command) if power is None else power
+    samples.power = device_array(power.reshape(-1, n), float, device)
+    first = device_array(np.arange(runs) * count, int, device)
+    links = Links() if bodies is None else links_struct(bodies, gravity, device)
+    parameters = np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS)
+    predicted = unwritten((sets, runs * count, n), float, device)
+    wp.launch(
+        rollout_kernel,
+        dim=(sets, runs),
+        inputs=[
+            samples,
+            first,
+            device_array(np.full(runs, count), int, device),
+            first,
+            device_array(np.arange(runs), int, device),
+            device_array(start, float, device),
+            device_array(np.arange(n), int, device),
+            device_array(np.full(n, -stops), float, device),
+            device_array(np.full(n, stops), float, device),
+            int(bodies is not None),
+            links,
+            device_array(parameters, float, device),
+            dt,
+        ],
+        outputs=[unwritten((len(parameters), servo.STATE_COLUMNS), float, device), predicted],
+        device=device,
+    )
+    result = predicted.numpy().astype(float)
+    assert np.isfinite(result).all(), "a sample was not written, or is no number"
+    return result.reshape(sets, runs, count, n)
+
+
+def one_joint(device, rows, time, command, start=0.0, **options):
+    """One joint, one trajectory: [C, T]."""
+    return roll(device, rows, time, command[None, :, None], np.full((1, 1), start), **options)[:, 0, :, 0]
+
+
+def excitation(rng, seconds=2.0):
+    """Irregular stamps, and steps and a sine as command."""
+    time = np.concatenate([[0.0], np.cumsum(rng.uniform(0.004, 0.03, int(seconds / 0.017)))])
+    steps = rng.uniform(-0.5, 0.5, 8)[np.minimum((time / (seconds / 8)).astype(int), 7)]
+    return time, np.where(time < 0.75 * seconds, steps, 0.4 * np.sin(2 * np.pi * 2.0 * time))
+
+
+# --- Bodies ---
+
+
+@wp.kernel
+def dynamics_kernel(
+    q: wp.array[wp.vec3],
+    speed: wp.array[wp.vec3],
+    count: int,
+    links: Links,
+    mass_out: wp.array[wp.mat33],
+    bias_out: wp.array[wp.vec3],
+):
+    i = wp.tid()
+    mass, bias = chain_dynamics(q[i], speed[i], count, links)
+    mass_out[i] = mass
+    bias_out[i] = bias
+
+
+def mujoco_chain(bodies, gravity, armature=0.0, damping=0.0, friction=0.0):
+    """The chain in MuJoCo, torque-driven, implicit damping."""
+
+    def text(values):
+        return " ".join(repr(float(v)) for v in np.ravel(values))
+
+    xml = ""
+    for i in range(len(bodies["mass"])):
+        inertia = bodies["inertia"][i]
+        full = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+        xml += (
+            f'<body pos="{text(bodies["offset"][i])}"><joint name="j{i}" axis="{text(bodies["axis"][i])}" '
+            f'armature="{armature}" damping="{damping}" frictionloss="{friction}" '
+            'solreffriction="0.0005 1" solimpfriction="0.9999 0.9999 0.001 0.5 2"/>'
+            f'<inertial pos="{text(bodies["com"][i])}" mass="{bodies["mass"][i]}" '
+            f'fullinertia="{text(full)}"/>'
+        )
+    xml += "</body>" * len(bodies["mass"])
+    option = f'<option gravity="{text(gravity)}" timestep="{DT / FINE}" integrator="implicitfast"/>'
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><compiler angle="radian"/>{option}<worldbody>{xml}</worldbody></mujoco>'
+    )
+    return model, mujoco.MjData(model)
+
+
+@EXAMPLES
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 3))
+def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
+    rng = np.random.default_rng(seed)
+    bodies = random_bodies(rng, n)
+    q, speed = rng.uniform(-3, 3, (5, 3)), rng.uniform(-6, 6, (5, 3))
+    mass, bias = unwritten(5, wp.mat33, device), unwritten(5, wp.vec3, device)
+    wp.launch(
+        dynamics_kernel,
+        dim=5,
+        inputs=[
+            device_array(q, wp.vec3, device),
+            device_array(speed, wp.vec3, device),
+            n,
+            links_struct(bodies, GRAVITY, device),
+        ],
+        outputs=[mass, bias],
+        device=device,
+    )
+    model, data = mujoco_chain(bodies, GRAVITY)
+    for i in range(5):
+        data.qpos[:], data.qvel[:] = q[i, :n], speed[i, :n]
+        mujoco.mj_forward(model, data)
+        full = np.zeros((n, n))
+        mujoco.mj_fullM(model, full, data.qM) if hasattr(data, "qM") else mujoco.mj_fullM(model, data, full)
+        scale = np.abs(full).max()
+        np.testing.assert_allclose(mass.numpy()[i, :n, :n], full, atol=1e-5 * scale)
+        np.testing.assert_allclose(bias.numpy()[i, :n], data.qfrc_bias, atol=2e-6)
+        assert not mass.numpy()[i, n:].any() and not bias.numpy()[i, n:].any()
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("friction", [0.0, 0.08])
+def test_finger_follows_mujoco(device, n, friction):
+    rng = np.random.default_rng(n)
+    bodies = random_bodies(rng, n)
+    time, _ = excitation(rng)
+    command = np.stack([excitation(np.random.default_rng(10 + i))[1][: len(time)] for i in range(n)], axis=1)
+    time = time[: len(command)]
+    rows = rows_of({servo.INERTIA: 1e-3, servo.COULOMB_TORQUE: friction}, n=n)
+    start = rng.uniform(-0.3, 0.3, n)
+    got = roll(device, rows, time, command[None], start[None], bodies=bodies)[0, 0]
+
+    model, data = mujoco_chain(bodies, GRAVITY, 1e-3, PLAIN[servo.KD], friction)
+    data.qpos[:] = start
+    expected = [start]
+    fine = DT / FINE
+    for k in range(int(np.ceil(time[-1] / fine))):
+        last = np.searchsorted(time, k * fine + 1e-9, side="right") - 1
+        data.qfrc_applied[:] = PLAIN[servo.KP] * (command[last] - data.qpos)
+        mujoco.mj_step(model, data)
+        expected.append(data.qpos.copy())
+    grid = np.arange(len(expected)) * fine
+    expected = np.stack([np.interp(time, grid, np.array(expected)[:, j]) for j in range(n)], axis=1)
+    # MuJoCo's step is of first order: most of the difference is its own.
+    assert np.abs(got - expected).max() < 1.7e-3
+    assert np.sqrt(np.mean((got - expected) ** 2)) < 4e-4
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_a_free_chain_keeps_its_energy(device, n):
+    rng = np.random.default_rng(n)
+    bodies = random_bodies(rng, n)
+    dt = DT / 4  # it tumbles with 30 rad/s
+    time = np.arange(0, 3, dt)
+    settings = {servo.KP: 0.0, servo.KD: 0.0, servo.INERTIA: 1e-4, servo.VELOCITY_LIMIT: 1e6}
+    start = np.full((1, n), 0.7)
+    command = np.zeros((1, len(time), n))
+    got = roll(device, rows_of(settings, n=n), time, command, start, bodies=bodies, dt=dt)[0, 0]
+    speed = np.gradient(got, dt, axis=0)
+    model, data = mujoco_chain(bodies, GRAVITY, 1e-4)
+    model.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY
+    energy, kinetic = [], []
+    for q, v in zip(got[2:-2:19], speed[2:-2:19], strict=True):
+        data.qpos[:], data.qvel[:] = q, v
+        mujoco.mj_forward(model, data)
+        energy.append(data.energy.sum())
+        kinetic.append(data.energy[1])
+    assert max(kinetic) > 1e-3, "it did not move"
+    assert np.ptp(energy) < 0.05 * max(kinetic)
+
+
+# --- One joint: every effect against a finer integration that shares no code ---
+
+
+def integrate(rows, time, command, start, dt):
+    """Semi-implicit Euler in float64, C joints [C, P] at once; positions [C, T] at the stamps."""
+    names = [name for name, value in vars(servo).items() if type(value) is int and "STATE" not in name]
+    p = {name: rows[:, getattr(servo, name)] for name in names if name != "PARAMETER_COLUMNS"}
+    q = start - p["ENCODER_BIAS"]
+    v, work = np.zeros_like(q), np.zeros_like(q)
+    smooth, profile, profile_speed, played = (np.full_like(q, command[0]) for _ in range(4))
+    profile_speed = np.zeros_like(q)
+    other, other_speed = q.copy(), np.zeros_like(q)
+    history = [q]
+    mass = p["INERTIA"] + p["PAYLOAD_INERTIA"]
+    on = {name: p[name] > 0 for name in p}
+    for k in range(int(np.ceil(time[-1] / dt)) + 1):
+        t = k * dt
+        write = np.searchsorted(time, t + 0.5 * dt - p["COMMAND_DELAY"], side="right") - 1
+        reference = command[np.maximum(write, 0)]
+        tau = np.where(on["FILTER_TAU"], p["FILTER_TAU"], 1.0)
+        smooth = smooth + dt / tau * (reference - smooth)
+        reference = np.where(on["FILTER_TAU"], smooth, reference)
+        a = np.where(on["ACCELERATION_LIMIT"], p["ACCELERATION_LIMIT"], 1.0)
+        to_go = reference - profile
+        target_speed = np.sign(to_go) * np.minimum(np.sqrt(2 * a * np.abs(to_go)), np.abs(to_go) / dt)
+        profile_speed = profile_speed + np.clip(target_speed - profile_speed, -a * dt, a * dt)
+        profile = profile + dt * profile_speed
+        reference = np.where(on["ACCELERATION_LIMIT"], profile, reference)
+        played = np.clip(played, reference - p["BACKLASH_WIDTH"] / 2, reference + p["BACKLASH_WIDTH"] / 2)
+        error = played - q
+        half = p["DEAD_ZONE_WIDTH"] / 2
+        error = np.sign(error) * np.maximum(np.abs(error) - half, 0.0)
+        work = work + error * dt
+        torque = p["KP"] * error + p["INTEGRAL_GAIN"] * work - p["KD"] * v
+        torque = torque / (1 + p["SUPPLY_SAG"] * np.abs(torque)) * np.exp(-p["THERMAL_RATE"] * t)
+        soft = np.where(on["SATURATION_TORQUE"], p["SATURATION_TORQUE"], 1.0)
+        torque = np.where(on["SATURATION_TORQUE"], soft * np.tanh(torque / soft), torque)
+        hard = np.where(on["TORQUE_LIMIT"], p["TORQUE_LIMIT"], np.inf)
+        torque = np.clip(torque, -hard, hard)
+        no_load = np.where(on["STALL_TORQUE"], p["NO_LOAD_SPEED"], 1.0)
+        line = p["STALL_TORQUE"] * np.maximum(1 - np.where(torque * v > 0, np.abs(v), 0) / no_load, 0)
+        line = np.where(on["STALL_TORQUE"], line, np.inf)
+        torque = np.clip(torque, -line, line)
+        stribeck = p["STRIBECK_SLIDING"] + (p["STRIBECK_STATIC"] - p["STRIBECK_SLIDING"]) * np.exp(
+            -((v / p["STRIBECK_SPEED"]) ** 2)
+        )
+        dry = p["COULOMB_TORQUE"] + p["LOAD_FRICTION"] * np.abs(torque) + stribeck
+        between = p["ELASTIC_STIFFNESS"] * (other - q) + p["ELASTIC_DAMPING"] * (other_speed - v)
+        between = np.where(on["ELASTIC_STIFFNESS"], between, 0.0)
+        torque = torque + between - p["GRAVITY_TORQUE"] * np.sin(q + p["GRAVITY_PHASE"])
+        free = v + dt * torque / mass
+        brake = dt / mass * (dry + np.where(free > 0, p["FRICTION_PLUS"], p["FRICTION_MINUS"]))
+        v = np.sign(free) * np.maximum(np.abs(free) - brake, 0.0)
+        v = np.clip(v, -p["VELOCITY_LIMIT"], p["VELOCITY_LIMIT"])
+        other_speed = other_speed - dt * between / p["ELASTIC_INERTIA"]
+        other = other + dt * other_speed
+        q = q + dt * v
+        history.append(q)
+    grid = np.arange(len(history)) * dt
+    past = np.array(history)
+    return np.stack(
+        [
+            np.interp(time - rows[c, servo.READ_DELAY], grid, past[:, c]) + rows[c, servo.ENCODER_BIAS]
+            for c in range(len(rows))
+        ]
+    )
+
+
+DETERMINISTIC = [name for name in EFFECTS if name not in ("command_jitter", "joint_coupling")]
+DRAWS = 6
+SIZES = {"thermal_drift.rate_per_s": 0.2, "gravity_load.phase_rad": 0.5}
+"""Sizes in place of the typical ones, to be seen in two seconds."""
+
+
+@pytest.fixture(scope="module")
+def effects_reference():
+    """Rows with each effect at random sizes, the motion, and the oracle's answer; plain rows first."""
+    rng = np.random.default_rng(5)
+    rows = np.tile(rows_of({})[:, 0], ((1 + len(DETERMINISTIC)) * DRAWS, 1))
+    rows[:, servo.KP] *= rng.uniform(0.5, 2.0, len(rows))
+    rows[:, servo.KD] *= rng.uniform(0.3, 1.5, len(rows))
+    for i, name in enumerate(DETERMINISTIC):
+        block = rows[(i + 1) * DRAWS : (i + 2) * DRAWS]
+        for parameter in EFFECTS[name].parameters:
+            size = SIZES.get(f"{name}.{parameter.name}", parameter.typical)
+            block[:, parameter.column] = size * rng.uniform(0.5, 2.0, DRAWS)
+            if parameter.signed:
+                block[:, parameter.column] *= rng.choice([-1.0, 1.0], DRAWS)
+    time, command = excitation(rng)
+    return (
+        rows,
+        time,
+        command,
+        integrate(rows.astype(np.float32).astype(float), time, command, 0.1, DT / FINE),
+    )
+
+
+@pytest.mark.parametrize("effect", ["none", *DETERMINISTIC])
+def test_an_effect_follows_a_finer_integration(device, effects_reference, effect):
+    rows, time, command, expected = effects_reference
+    index = ["none", *DETERMINISTIC].index(effect)
+    block = slice(index * DRAWS, (index + 1) * DRAWS)
+    got = one_joint(device, rows[block, None], time, command, 0.1)
+    error = np.sqrt(np.mean((got - expected[block]) ** 2, axis=1))
+    assert error.max() < 1.5e-3, f"rms {error}"
+    if effect != "none":
+        plain = rows[block].copy()
+        for parameter in EFFECTS[effect].parameters:
+            plain[:, parameter.column] = parameter.neutral
+        without = one_joint(device, plain[:, None], time, command, 0.1)
+        assert np.sqrt(np.mean((got - without) ** 2, axis=1)).max() > 3e-3, "the effect does nothing"
+
+
+def test_all_effects_together_follow_a_finer_integration(device):
+    rng = np.random.default_rng(8)
+    rows = np.tile(rows_of({})[:, 0], (20, 1))
+    for name in DETERMINISTIC:
+        for parameter in EFFECTS[name].parameters:
+            size = parameter.typical * rng.uniform(0.2, 1.0, len(rows))
+            rows[:, parameter.column] = size
+    time, command = excitation(rng)
+    got = one_joint(device, rows[:, None], time, command)
+    expected = integrate(rows, time, command, 0.0, DT / FINE)
+    error = np.sqrt(np.mean((got - expected) ** 2, axis=1))
+    assert np.median(error) < 3e-3 and error.max() < 1e-2
+
+
+def test_the_error_falls_with_the_square_of_the_step(device):
+    time = np.arange(0, 1.5, 0.05)
+    command = 0.3 * np.sin(2 * np.pi * np.arange(0, 1.5, 0.05))
+    rows = rows_of({servo.ELASTIC_STIFFNESS: 3.0, servo.ELASTIC_DAMPING: 5e-3, servo.ELASTIC_INERTIA: 2e-3})
+    truth = one_joint(device, rows, time, command, dt=1 / 7680)
+    errors = [
+        np.abs(one_joint(device, rows, time, command, dt=dt) - truth).max() for dt in (1 / 240, 1 / 480)
+    ]
+    assert errors[1] < 1e-3 and errors[0] / errors[1] > 3.0, errors
+
+
+# --- Friction ---
+
+
+def test_a_held_joint_stands_still_exactly(device):
+    n = 3
+    bodies = random_bodies(np.random.default_rng(0), n)
+    time = np.arange(0, 1, 0.01)
+    rows = rows_of({servo.KP: 0.0, servo.KD: 0.01, servo.COULOMB_TORQUE: 0.5}, n=n)
+    start = np.array([[0.3, -0.4, 0.5]])
+    got = roll(device, rows, time, np.zeros((1, len(time), n)), start, bodies=bodies)[0, 0]
+    np.testing.assert_array_equal(got, np.tile(start.astype(np.float32), (len(time), 1)))
+
+
+def test_a_joint_held_by_friction_stays_while_its_neighbours_move(device):
+    n = 3
+    bodies = random_bodies(np.random.default_rng(1), n)
+    time = np.arange(0, 2, 0.01)
+    command = np.zeros((1, len(time), n))
+    command[0, :, 1:] = 0.4 * np.sin(4.0 * time)[:, None]
+    rows = rows_of({}, n=n)
+    rows[:, 0, servo.COULOMB_TORQUE] = 2.0
+    rows[:, 1:, servo.COULOMB_TORQUE] = 0.02
+    got = roll(device, rows, time, command, np.zeros((1, n)), bodies=bodies)[0, 0]
+    np.testing.assert_array_equal(got[:, 0], 0.0)
+    assert np.ptp(got[:, 1:], axis=0).min() > 0.3
+
+
+@EXAMPLES
+@given(plus=st.floats(0.0, 0.4), minus=st.floats(0.0, 0.4), pull=st.floats(-0.6, 0.6))
+def test_breakaway_is_each_directions_own(device, plus, minus, pull):
+    settings = {servo.FRICTION_PLUS: plus, servo.FRICTION_MINUS: minus, servo.KP: 1.0}
+    if min(abs(pull - plus), abs(pull + minus)) < 2e-3:
+        return
+    time = np.arange(0, 0.5, 0.02)
+    got = one_joint(device, rows_of(settings), time, np.full(len(time), pull))[0]
+    moves = np.sign(pull) if (pull > plus or pull < -minus) else 0.0
+    assert np.sign(got[-1]) == moves
+    # The joint comes to rest, or creeps up to, where the friction of its direction holds the spring.
+    rest = pull - plus if moves > 0 else pull + minus
+    if moves:
+        assert 0.0 < abs(got[-1]) <= abs(rest) + 1e-4
+
+
+# --- Time ---
+
+
+@EXAMPLES
+@given(
+    delay=st.floats(0.0, 0.2),
+    read=st.floats(0.0, 0.2),
+    seed=st.integers(0, 1000),
+)
+def test_delays_shift_in_time_by_any_fraction_of_a_step(device, delay, read, seed):
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, 1.0, DT)
+    command = np.where(time < 0.1, 0.0, rng.uniform(0.2, 1.0))
+    rows = rows_of({servo.COMMAND_DELAY: delay, servo.READ_DELAY: read}, {})
+    got, plain = one_joint(device, rows, time, command)
+    expected = np.interp(time - delay - read, time, plain)
+    assert np.abs(got - expected).max() < 2e-3
+
+
+def test_motion_is_a_smooth_function_of_the_delays(device):
+    rng = np.random.default_rng(3)
+    time, command = excitation(rng)
+    delays = np.linspace(0.01, 0.014, 41)  # two steps of 1/480 s
+    for column in (servo.COMMAND_DELAY, servo.READ_DELAY):
+        got = one_joint(device, rows_of(*({column: d} for d in delays)), time, command)
+        slope = np.diff(got, axis=0) / np.diff(delays)[:, None]
+        size = np.sqrt(np.mean(slope**2))
+        assert np.sqrt(np.mean(np.diff(slope, axis=0) ** 2)) < 0.1 * size
+
+
+def test_commands_act_at_irregular_stamps(device):
+    # A stiff massless-looking servo follows its command; the answer to a step is that of an exponential.
+    kp, kd = 3.0, 0.3
+    stamps = np.array([0.0, 0.1003, 0.1004, 0.25037, 0.6])
+    command = np.array([0.0, 1.0, 0.5, -0.2, -0.2])
+    rows = rows_of({servo.KP: kp, servo.KD: kd, servo.INERTIA: 1e-6, servo.VELOCITY_LIMIT: 1e6})
+    got = one_joint(device, rows, stamps, command)[0]
+    q, expected = 0.0, [0.0]
+    for i in range(len(stamps) - 1):
+        q = command[i] + (q - command[i]) * np.exp(-(stamps[i + 1] - stamps[i]) * kp / kd)
+        expected.append(q)
+    np.testing.assert_allclose(got, expected, atol=1e-3)
+
+
+def test_jitter_delays_by_half_a_normal_on_average_and_is_smooth_in_its_size(device):
+    time = np.arange(0, 20.0, 0.25)
+    command = np.where(np.arange(len(time)) % 2 == 0, 0.0, 1.0)
+    fine = np.arange(0, 20.0, 0.005)
+    held = command[np.searchsorted(time, fine + 1e-9, side="right") - 1]
+    # Writes with every sample would each have their draw; only those that change the command are sent.
+    sigma = 0.03
+    rows = rows_of({}, {servo.JITTER_SIGMA: sigma}, {servo.JITTER_SIGMA: 1.001 * sigma})
+    many = roll(device, rows, time, np.tile(command[None, :, None], (50, 1, 1)), np.zeros((50, 1)))[..., 0]
+    plain, jittered, nudged = many
+    assert held.shape == fine.shape
+    # Mean position at the next stamp, linearised: the delay of each command moves the answer back.
+    shifted = roll(
+        device,
+        rows_of({servo.COMMAND_DELAY: sigma * np.sqrt(2 / np.pi)}),
+        time,
+        command[None, :, None],
+        np.zeros((1, 1)),
+    )[0, 0, :, 0]
+    np.testing.assert_allclose(jittered.mean(axis=0)[10:], shifted[10:], atol=0.015)
+    assert np.abs(jittered - plain).max() > 0.03
+    assert not np.allclose(jittered[0], jittered[1], atol=1e-3), "trajectories share their draws"
+    assert np.abs(nudged - jittered).max() < 1e-3
+
+
+def test_dropped_commands_leave_the_one_before_in_force(device):
+    time = np.arange(0, 60.0, 1.0)
+    command = np.arange(60) % 2 * 0.5
+    p = 0.3
+    got = one_joint(device, rows_of({servo.JITTER_DROP: p}), time, command, start=0.0)[0]
+    # One second settles: the position before each stamp is the command in force, 0 or 0.5.
+    np.testing.assert_allclose(got[1:], 0.5 * np.round(got[1:] / 0.5), atol=2e-3)
+    wrong = np.mean(np.abs(got[1:] - command[:-1]) > 0.25)
+    # The last write that was kept has the wrong parity with probability p / (1 + p).
+    assert wrong == pytest.approx(p / (1 + p), abs=0.17)
+    assert one_joint(device, rows_of({servo.JITTER_DROP: 1.0}), time, command).max() < 1e-6
+
+
+def test_torque_off_acts_with_the_command(device):
+    time = np.arange(0, 1.0, 0.01)
+    power = np.where(time < 0.5, 1.0, 0.0)[None, :, None]
+    settings = {servo.GRAVITY_TORQUE: 0.5, servo.KD: 0.05}
+    command = np.full(len(time), 1.0)
+    got = one_joint(device, rows_of(settings), time, command, 0.8, power=power)[0]
+    assert got[40:50].min() > 0.75, "held up by the servo"
+    assert got[-1] < 0.1, "falls without it"
+
+
+# --- Bounds ---
+
+
+def test_speed_and_stops_bound_the_motion(device):
+    time = np.arange(0, 1.0, DT)
+    rows = rows_of({servo.VELOCITY_LIMIT: 2.0})
+    got = one_joint(device, rows, time, np.full(len(time), 3.0), stops=1.2)[0]
+    assert np.diff(got).max() / DT == pytest.approx(2.0, rel=1e-3)
+    assert got.max() == pytest.approx(1.2, abs=1e-6)
+    assert got[-1] == got.max()
+
+
+def test_a_coupled_joint_follows_its_neighbour(device):
+    time = np.arange(0, 2.0, 0.01)
+    command = np.zeros((1, len(time), 2))
+    command[0, :, 0] = 0.5
+    rows = rows_of({}, n=2)
+    rows[0, 1, servo.COUPLING_0] = 0.3
+    got = roll(device, rows, time, command, np.zeros((1, 2)))[0, 0]
+    np.testing.assert_allclose(got[-1], [0.5, 0.15], atol=1e-3)
+
+
+@EXAMPLES
+@given(seed=st.integers(0, 2**31), n=st.integers(1, 3))
+def test_any_parameters_within_their_bounds_give_numbers(device, seed, n):
+    rng = np.random.default_rng(seed)
+    rows = np.tile(neutral_row(), (6, n, 1))
+    for effect in EFFECTS.values():
+        for p in effect.parameters:
+            rows[:, :, p.column] = rng.choice([p.lower, p.upper, p.neutral, p.typical], (6, n))
+    rows[:, :, servo.KP] = rng.choice([1e-3, 1e3], (6, n))
+    rows[:, :, servo.KD] = rng.choice([1e-5, 1e2], (6, n))
+    rows[:, :, servo.INERTIA] = rng.choice([0.0, 1e-6, 10.0], (6, n))
+    rows[:, :, servo.VELOCITY_LIMIT] = rng.choice([0.05, 1e6], (6, n))
+    time, command = excitation(rng, 0.5)
+    commands = np.repeat(command[None, :, None], n, axis=2)
+    bodies = random_bodies(rng, n) if rng.random() < 0.5 else None
+    got = roll(device, rows, time, commands, np.zeros((1, n)), bodies=bodies)
+    assert np.abs(got).max() < 2 * DIVERGED
+
+
+def test_stiff_servos_are_stable_at_any_stiffness(device):
+    time = np.arange(0, 1.0, 0.01)
+    settings = [{servo.KP: kp, servo.KD: 0.05 * kp, servo.INERTIA: 1e-6} for kp in (1.0, 30.0, 1000.0)]
+    got = one_joint(device, rows_of(*settings), time, np.full(len(time), 0.5))
+    np.testing.assert_allclose(got[:, -1], 0.5, atol=1e-3)
+    assert (np.diff(got, axis=1) > -1e-4).all(), "it rings"
+
+
+def test_trajectories_and_sets_do_not_mix(device):
+    rng = np.random.default_rng(4)
+    time, _ = excitation(rng)
+    commands = rng.uniform(-0.5, 0.5, (3, len(time), 2))
+    rows = rows_of({}, {servo.KP: 1.0}, n=2)
+    start = rng.uniform(-0.2, 0.2, (3, 2))
+    together = roll(device, rows, time, commands, start)
+    for c in range(2):
+        for r in range(3):
+            alone = roll(device, rows[c : c + 1], time, commands[r : r + 1], start[r : r + 1])[0, 0]
+            np.testing.assert_array_equal(together[c, r], alone)
