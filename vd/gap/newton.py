@@ -1,0 +1,447 @@
+"""Recordings of a hand replayed in Newton, and the paper's identification there.
+
+:func:`simulate_hand` checks what the fit found in the simulator that trains policies: same solver, same
+servo kernels. :func:`identify` is the paper's search (Methods, identification of robot dynamics):
+CMA-ES over stiffness, damping and velocity limit by the squared error of trajectories, all candidates
+and trajectories simulated at once. The fingers of a hand do not move each other, so one world replays a
+different trajectory with every finger. Contacts are off; SI units, radians.
+"""
+
+import dataclasses
+import math
+import time
+import zlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import mujoco
+import newton
+import numpy as np
+import warp as wp
+
+from vd.assets_usd.hand_model import HandModel
+from vd.gap.recording import Recording, Trajectory
+from vd.gap.rollout import STREAM_BITS
+from vd.kernels.actuators import ENCODER_BIAS, KD, KP, VELOCITY_LIMIT
+from vd.kernels.chains import Samples
+from vd.kernels.effects import BASELINE
+from vd.kernels.joint_replay import Tracks, replay_command_kernel, sample_position_kernel, tick_kernel
+from vd.sim.actuators import JointServo
+from vd.sim.cfg import SimCfg
+from vd.sim.scene import build_hand, new_builder
+from vd.sim.simulator import make_solver
+
+JOINTS_PER_FINGER = 3
+DEFAULT_DT = 1.0 / 480.0
+"""Physics step [s]: a quarter of training's, at which the integrator's error is under a milliradian."""
+CONSTRAINT_ROWS = 32
+"""Rows of a hand without contacts: one per joint for its limit and one for its friction."""
+CONTACTS = 4
+"""The solver wants room for some contacts even if there are none."""
+GRAPH_STEPS = 16
+"""Physics steps per CUDA graph; even, since states are swapped every step."""
+SEARCHED = (KP, KD, VELOCITY_LIMIT)
+"""What the paper identifies, by column of a parameter row."""
+SEARCH_SPREAD = 0.3
+"""First standard deviation of the search, in logarithms of the parameters."""
+
+
+class HandReplay:
+    """Worlds with a hand each, every finger of which follows a trajectory of a recording.
+
+    W worlds, F fingers, D joints, P = PARAMETER_COLUMNS.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        hand: HandModel,
+        tracks: np.ndarray,
+        *,
+        dt: float = DEFAULT_DT,
+        device: str = "cpu",
+        keep_positions: bool = False,
+    ):
+        """Build the worlds.
+
+        Args:
+            recording: The recording; its joints are joints of the hand.
+            hand: The hand.
+            tracks: Trajectory that each finger follows, or -1 for none, shape [W, F].
+            dt: Physics step [s].
+            device: Warp device.
+            keep_positions: Keep the predicted positions, not just their squared errors.
+
+        Raises:
+            ValueError: The recording has joints that the hand has not.
+        """
+        unknown = [name for name in recording.joints if name not in hand.joint_names]
+        if unknown:
+            raise ValueError(
+                f"{recording.path}: joints {', '.join(unknown)} are not joints of {hand.name} "
+                f"({', '.join(hand.joint_names)}); name the hand that was recorded"
+            )
+        self.hand, self.dt, self.device = hand, dt, device
+        tracks = np.asarray(tracks)
+        self.num_worlds = w = len(tracks)
+        self.num_joints = d = hand.num_joints
+        self._load(recording, tracks)
+        self._build()
+
+        def zeros(*shape: int, dtype: Any = float) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self.squared_error = zeros(w, d)
+        """Sum over samples of the squared error of every joint [rad^2], shape [W, D]."""
+        kept = max(self._length[i] for i in tracks.flat if i >= 0) if keep_positions else 0
+        self.positions = zeros(w, int(kept), d)
+        """Predicted positions [rad] by sample of the world's tracks, shape [W, T, D]."""
+        self._step = zeros(1, dtype=wp.int32)
+        self._write, self._read = zeros(w, d, dtype=wp.int32), zeros(w, d, dtype=wp.int32)
+        self._due_step, self._due_fraction = zeros(w, d, dtype=wp.int32), zeros(w, d)
+        self._held, self._held_power = zeros(w, d), zeros(w, d)
+        self._graph: Any = None
+        self._loaded = False
+
+    def _load(self, recording: Recording, tracks: np.ndarray) -> None:
+        """Put the trajectories on the device, one after the other."""
+        trajectories = recording.trajectories
+        self._length = np.array([len(t.time) for t in trajectories])
+        start = np.concatenate([[0], np.cumsum(self._length)])
+        first = np.where(tracks >= 0, start[tracks], 0)
+        last = np.where(tracks >= 0, start[tracks + 1], 0)
+        streams = np.array([random_stream(t) for t in trajectories])
+        gains = [float(t.conditions.get("p_gain", 0.0)) for t in trajectories]
+        reference = max(gains)
+        power = np.concatenate(
+            [
+                t.enabled * (gain / reference if gain > 0.0 else 1.0)
+                for t, gain in zip(trajectories, gains, strict=True)
+            ]
+        )
+        stamps = np.concatenate([t.time for t in trajectories]) / self.dt
+        command = np.concatenate([t.command for t in trajectories])
+        position = np.concatenate([t.position for t in trajectories])
+        names = list(recording.joints)
+        column = np.array([names.index(n) if n in names else -1 for n in self.hand.joint_names])
+        self.duration = float(max(trajectories[i].time[-1] for i in tracks.flat if i >= 0))
+
+        # Where every joint starts, and the command it has had: rest where nothing is recorded.
+        by_joint = np.repeat(first, JOINTS_PER_FINGER, axis=1)
+        recorded = (np.repeat(tracks, JOINTS_PER_FINGER, axis=1) >= 0) & (column >= 0)
+        idle = np.clip(0.0, self.hand.lower, self.hand.upper)
+        self._start = np.where(recorded, position[by_joint, column], idle)
+        self._start_command = np.where(recorded, command[by_joint, column], idle)
+        self._start_power = np.where(recorded, power[by_joint, column], 1.0)
+        self._recorded, self._first_sample = recorded, by_joint.astype(np.int32)
+
+        def array(values: np.ndarray, dtype: Any = float) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=self.device)
+
+        self._position = array(position)
+        self._samples = Samples()
+        self._samples.step = array(np.floor(stamps), int)
+        self._samples.fraction = array(stamps - np.floor(stamps))
+        self._samples.command, self._samples.power = array(command), array(power)
+        self._tracks = Tracks()
+        self._tracks.column = array(column, int)
+        self._tracks.first, self._tracks.last = array(first, int), array(last, int)
+        self._tracks.stream = array(streams[tracks], int)
+
+    def _build(self) -> None:
+        cfg = dataclasses.replace(
+            SimCfg(),
+            physics_hz=1.0 / self.dt,
+            control_hz=0.5 / self.dt,
+            contact_time_constant_s=max(SimCfg().contact_time_constant_s, 2.0 * self.dt),
+            njmax=CONSTRAINT_ROWS,
+            nconmax=CONTACTS,
+        )
+        world = build_hand(self.hand, cfg, visuals=False)
+        scene = new_builder()
+        scene.replicate(world, self.num_worlds)
+        self.model = scene.finalize(device=self.device)
+        self.solver = make_solver(self.model, cfg)
+        self.solver.mjw_model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+        self.control = self.model.control()
+        self._states = self.model.state(), self.model.state()
+        self._q = [s.joint_q.reshape((self.num_worlds, -1)) for s in self._states]
+        self._qd = [s.joint_qd.reshape((self.num_worlds, -1)) for s in self._states]
+        self.servo = JointServo(
+            self.solver,
+            self.control,
+            self._q[0],
+            self.hand.servo,
+            physics_dt=self.dt,
+            control_dt=self.duration,  # commands come from the recording, none is in transit
+        )
+
+    def run(self, rows: np.ndarray) -> None:
+        """Simulate all trajectories from rest at the first recorded positions.
+
+        Args:
+            rows: Servo parameters, shape [D, P] or [W, D, P].
+        """
+        rows = np.asarray(rows, dtype=float)
+        self.servo.set_rows(rows)
+        start = np.where(self._recorded, self._start - rows[..., ENCODER_BIAS], self._start)
+        self._q[0].assign(start.astype(np.float32))
+        self._qd[0].zero_()
+        self.solver.reset(self._states[0], flags=newton.StateFlags(0))
+        self.servo.command.assign(self._start_command.astype(np.float32))
+        self.servo.power.assign(self._start_power.astype(np.float32))
+        self.servo.reset(
+            wp.ones(self.num_worlds, dtype=wp.int32, device=self.device), command=self.servo.command
+        )
+        wp.copy(self._held, self.servo.command)
+        wp.copy(self._held_power, self.servo.power)
+        for array in (self._step, self.squared_error, self._due_step, self._due_fraction):
+            array.zero_()
+        self._write.assign(self._first_sample)
+        self._read.assign(self._first_sample)
+        steps = math.ceil(self.duration / self.dt) + 1
+        for _ in range(math.ceil(steps / GRAPH_STEPS)):
+            self._advance()
+
+    def _advance(self) -> None:
+        """Some physics steps; on CUDA as one graph, once every kernel is loaded."""
+        if not self.model.device.is_cuda or not self._loaded:
+            self._launch_steps()
+            self._loaded = True
+            return
+        if self._graph is None:
+            with wp.ScopedCapture(device=self.device) as capture:
+                self._launch_steps()
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
+
+    def _launch_steps(self) -> None:
+        dim, servo = (self.num_worlds, self.num_joints), self.servo
+        given = [servo.parameters, self._samples, self._tracks]
+        commands = [self._write, self._due_step, self._due_fraction, self._held, self._held_power]
+        for k in range(GRAPH_STEPS):
+            here, there = k % 2, 1 - k % 2
+            wp.launch(
+                replay_command_kernel,
+                dim=dim,
+                inputs=[*given, self.dt, self._step, *commands],
+                outputs=[servo.command, servo.power],
+                device=self.device,
+            )
+            servo.drive(self._q[here], self._qd[here])
+            self.solver.step(self._states[here], self._states[there], self.control, None, self.dt)
+            servo.finish(self._q[here], self._q[there], self._qd[there])
+            wp.launch(
+                sample_position_kernel,
+                dim=dim,
+                inputs=[
+                    *given,
+                    self._position,
+                    self.dt,
+                    self._step,
+                    self._q[here],
+                    self._q[there],
+                    self._read,
+                    self.squared_error,
+                ],
+                outputs=[self.positions],
+                device=self.device,
+            )
+            wp.launch(tick_kernel, dim=1, inputs=[self._step], device=self.device)
+
+
+def random_stream(trajectory: Trajectory) -> int:
+    """The stream of a trajectory's random delays, the same as in the rollouts."""
+    return zlib.crc32(trajectory.file.encode()) & ((1 << STREAM_BITS) - 1)
+
+
+def simulate_hand(
+    recording: Recording,
+    hand: HandModel,
+    rows: np.ndarray,
+    *,
+    dt: float = DEFAULT_DT,
+    device: str = "cpu",
+    indices: Sequence[int] | None = None,
+) -> np.ndarray:
+    """What Newton makes of a recording's commands, sampled where the recording has positions.
+
+    Args:
+        recording: A recording of a hand.
+        hand: The hand.
+        rows: Servo parameters, shape [D, P].
+        dt: Physics step [s].
+        device: Warp device.
+        indices: Trajectories to simulate, each a world of one batch; all by default.
+
+    Returns:
+        Predicted recorded positions [rad] in the recording's columns, the samples of the trajectories one
+        after the other, shape [S, J].
+    """
+    chosen = list(range(len(recording.trajectories)) if indices is None else indices)
+    tracks = np.repeat(np.array(chosen)[:, None], hand.num_fingers, axis=1)
+    replay = HandReplay(recording, hand, tracks, dt=dt, device=device, keep_positions=True)
+    replay.run(rows)
+    columns = [hand.joint_names.index(name) for name in recording.joints]
+    positions = replay.positions.numpy()[..., columns].astype(float)
+    lengths = [len(recording.trajectories[i].time) for i in chosen]
+    return np.concatenate([positions[k, :length] for k, length in enumerate(lengths)])
+
+
+@dataclasses.dataclass(frozen=True)
+class Identified:
+    """What the search found, for K identified joints."""
+
+    joints: tuple[str, ...]
+    """Names of the joints."""
+    kp: np.ndarray
+    """Stiffness [N m/rad], shape [K]."""
+    kd: np.ndarray
+    """Damping [N m s/rad], shape [K]."""
+    velocity_limit: np.ndarray
+    """Velocity limit [rad/s], shape [K]."""
+    rmse: dict[str, float]
+    """Root mean squared error over the trajectories that excite a finger, by finger [rad]."""
+    start_rmse: dict[str, float]
+    """The same of the values that the search started from [rad]."""
+    rollouts: int
+    """Trajectories simulated, of one finger each."""
+    seconds: float
+    """Time that took, without building the worlds and compiling kernels."""
+
+    @property
+    def rollouts_per_second(self) -> float:
+        """Trajectories of one finger simulated in a second."""
+        return self.rollouts / self.seconds
+
+
+def pack_tracks(recording: Recording, hand: HandModel, fingers: Sequence[int]) -> np.ndarray:
+    """Spread the trajectories that excite each finger over worlds, long ones together, shape [W, F].
+
+    Fingers not in ``fingers`` and slots that are left over get -1.
+
+    Raises:
+        ValueError: A finger that is to be identified was never excited.
+    """
+    queues: list[list[int]] = []
+    for finger in range(hand.num_fingers):
+        names = set(finger_joints(hand, finger))
+        excited = [i for i, t in enumerate(recording.trajectories) if names & set(t.joints)]
+        if finger in fingers and not excited:
+            raise ValueError(
+                f"{recording.path}: no trajectory excites finger {finger} ({', '.join(sorted(names))}); "
+                "record one, or leave its joints out"
+            )
+        order = sorted(excited, key=lambda i: -recording.trajectories[i].time[-1])
+        queues.append(order if finger in fingers else [])
+    tracks = np.full((max(map(len, queues)), hand.num_fingers), -1)
+    for finger, queue in enumerate(queues):
+        tracks[: len(queue), finger] = queue
+    return tracks
+
+
+def finger_joints(hand: HandModel, finger: int) -> tuple[str, ...]:
+    """Names of the joints of a finger."""
+    return hand.joint_names[JOINTS_PER_FINGER * finger : JOINTS_PER_FINGER * (finger + 1)]
+
+
+def identify(
+    recording: Recording,
+    hand: HandModel,
+    joints: Sequence[str] | None = None,
+    *,
+    generations: int = 100,
+    population: int = 64,
+    start: np.ndarray | None = None,
+    dt: float = DEFAULT_DT,
+    device: str = "cpu",
+    seed: int = 0,
+    progress: Callable[[int, dict[str, float]], None] | None = None,
+) -> Identified:
+    """Identify stiffness, damping and velocity limits as the paper does: CMA-ES on parallel simulations.
+
+    Every finger has a search of its own; they advance together, in the same worlds. The score is the
+    squared error of the finger's joints over the trajectories that excite one of them.
+
+    Args:
+        recording: A recording of the hand.
+        hand: The hand.
+        joints: Joints to identify; all that are recorded by default.
+        generations: Generations of the search.
+        population: Candidates of a generation; times the trajectories of a finger: the worlds.
+        start: Servo parameters to start from and to keep otherwise, shape [D, P]; the hand's by default.
+        dt: Physics step [s].
+        device: Warp device.
+        seed: Seed of the search.
+        progress: Called after each generation with its number and the best error of each finger [rad].
+
+    Raises:
+        ValueError: A joint is not recorded or its finger was never excited.
+    """
+    import cma
+
+    names = tuple(recording.joints if joints is None else joints)
+    missing = [name for name in names if name not in recording.joints]
+    if missing:
+        raise ValueError(f"{recording.path}: joints {', '.join(missing)} are not recorded; leave them out")
+    base = np.array(hand.servo if start is None else start, dtype=float)
+    chosen = [hand.joint_names.index(name) for name in names]
+    fingers = sorted({joint // JOINTS_PER_FINGER for joint in chosen})
+    tracks = pack_tracks(recording, hand, fingers)
+    slots = len(tracks)
+    replay = HandReplay(recording, hand, np.tile(tracks, (population, 1)), dt=dt, device=device)
+
+    bounds = {p.column: (p.lower, p.upper) for p in BASELINE}
+    members = {f: [j for j in chosen if j // JOINTS_PER_FINGER == f] for f in fingers}
+    searches = {}
+    for f in fingers:
+        centre = np.log(base[np.ix_(members[f], SEARCHED)]).flatten()
+        low = np.log([bounds[c][0] for _ in members[f] for c in SEARCHED])
+        high = np.log([bounds[c][1] for _ in members[f] for c in SEARCHED])
+        options = {"popsize": population, "seed": seed + f + 1, "bounds": [low, high], "verbose": -9}
+        searches[f] = cma.CMAEvolutionStrategy(np.clip(centre, low, high), SEARCH_SPREAD, options)
+    samples = {
+        f: sum(len(recording.trajectories[i].time) for i in tracks[:, f] if i >= 0) * len(scored)
+        for f in fingers
+        if (scored := [n for n in finger_joints(hand, f) if n in recording.joints])
+    }
+
+    def evaluate(rows: np.ndarray) -> dict[int, np.ndarray]:
+        """Mean squared error of each finger for rows [population, D, P]."""
+        replay.run(np.repeat(rows, slots, axis=0))
+        error = replay.squared_error.numpy().reshape(population, slots, -1, JOINTS_PER_FINGER)
+        error = np.nan_to_num(error.astype(float), nan=np.inf).sum(axis=(1, 3))
+        return {f: error[:, f] / samples[f] for f in fingers}
+
+    first = evaluate(np.tile(base, (population, 1, 1)))  # also compiles every kernel
+    start_rmse = {f"f{f}": float(np.sqrt(first[f][0])) for f in fingers}
+    best = {f: (first[f][0], base[np.ix_(members[f], SEARCHED)]) for f in fingers}
+    began, rollouts = time.perf_counter(), 0
+    for generation in range(generations):
+        rows = np.tile(base, (population, 1, 1))
+        asked = {f: searches[f].ask() for f in fingers}
+        for f in fingers:
+            values = np.exp(np.array(asked[f])).reshape(population, len(members[f]), len(SEARCHED))
+            rows[np.ix_(range(population), members[f], SEARCHED)] = values
+        scores = evaluate(rows)
+        rollouts += population * int(np.count_nonzero(tracks >= 0))
+        for f in fingers:
+            searches[f].tell(asked[f], scores[f].tolist())
+            winner = int(np.argmin(scores[f]))
+            if scores[f][winner] < best[f][0]:
+                best[f] = (scores[f][winner], rows[winner][np.ix_(members[f], SEARCHED)])
+        if progress is not None:
+            progress(generation + 1, {f"f{f}": float(np.sqrt(best[f][0])) for f in fingers})
+    found = base.copy()
+    for f in fingers:
+        found[np.ix_(members[f], SEARCHED)] = best[f][1]
+    return Identified(
+        joints=names,
+        kp=found[chosen, KP],
+        kd=found[chosen, KD],
+        velocity_limit=found[chosen, VELOCITY_LIMIT],
+        rmse={f"f{f}": float(np.sqrt(best[f][0])) for f in fingers},
+        start_rmse=start_rmse,
+        rollouts=rollouts,
+        seconds=time.perf_counter() - began,
+    )
