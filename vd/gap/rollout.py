@@ -23,6 +23,8 @@ STEP_S = 1.0 / 480.0
 """Time step [s]: four of the simulator's, a fifth of a servo's fastest time constant (inertia / kd)."""
 GRAVITY_M_S2 = 9.81
 """Acceleration of gravity, the simulator's."""
+DOWN_IN_BASE = np.array([0.0, 0.0, 1.0])
+"""Down in a hand's base frame: palm down, as :func:`vd.sim.scene.hand_mount` has it."""
 JOINTS_PER_FINGER = 3
 FREE = 1.0e6
 """A position [rad] no joint reaches: the stop of one that has none."""
@@ -185,8 +187,6 @@ def _finger(
     recording: Recording, hand: HandModel, finger: int, names: tuple[str, ...], p_gain: float | None
 ) -> Chain:
     """A finger's bodies with all joints at zero; what an unrecorded joint carries is fixed to its parent."""
-    from vd.sim.scene import hand_mount  # brings in the simulator, which bare servos do without
-
     slots = [i for i in range(JOINTS_PER_FINGER) if hand.joint_names[finger * JOINTS_PER_FINGER + i] in names]
     joints = finger * JOINTS_PER_FINGER + np.array(slots)
     poses = hand.forward_kinematics(np.zeros(hand.num_joints))
@@ -221,7 +221,6 @@ def _finger(
     rows[:, servo.KD] = hand.kd[joints]
     rows[:, servo.VELOCITY_LIMIT] = hand.velocity_limit[joints]
     rows[:, servo.INERTIA] = hand.armature[joints]
-    mount = Rotation.from_quat(np.array(hand_mount())[3:])
     return Chain(
         name=f"f{finger}",
         joints=names,
@@ -235,7 +234,7 @@ def _finger(
         mass=mass,
         com=com,
         inertia=inertia,
-        gravity=mount.inv().apply([0.0, 0.0, -GRAVITY_M_S2]),
+        gravity=GRAVITY_M_S2 * DOWN_IN_BASE,
         lower=hand.lower[joints],
         upper=hand.upper[joints],
         reference_p_gain=p_gain,

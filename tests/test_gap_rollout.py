@@ -1,0 +1,213 @@
+"""Chains of recordings, and what their rollouts make of conditions, subsets and the hand's bodies."""
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hands import load_hand
+from vd.gap.recording import Recording, Trajectory, read_recording
+from vd.gap.rollout import GRAVITY_M_S2, Rollouts, chains
+from vd.kernels import actuators as servo
+from vd.sim.scene import hand_mount
+
+
+def trajectory(name, command, *, conditions=None, time=None, position=None, joints=None, enabled=None):
+    """A trajectory of command [T, J]; the position only matters at the start."""
+    command = np.asarray(command, float)
+    time = np.arange(len(command)) * 0.02 if time is None else time
+    position = np.zeros_like(command) if position is None else position
+    enabled = np.ones(command.shape, bool) if enabled is None else enabled
+    return Trajectory(f"{name}.csv", name, joints, conditions or {}, time, command, position, enabled)
+
+
+def recording(model, joints, *trajectories):
+    """A recording in memory."""
+    filled = tuple(t if t.joints else replace(t, joints=tuple(joints)) for t in trajectories)
+    return Recording(Path("memory"), model, tuple(joints), {}, 1.5e-3, filled)
+
+
+def wave(seconds=2.0, joints=1, phase=0.0):
+    """Commands [T, J] every 20 ms."""
+    t = np.arange(0, seconds, 0.02)[:, None]
+    return 0.4 * np.sin(2 * np.pi * (0.5 + 0.3 * np.arange(joints)) * t + phase)
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand("dclaw3")
+
+
+def test_bare_servos_are_one_chain_each():
+    found = chains(recording("servo", ("Pitch", "Jaw"), trajectory("a", wave(joints=2))))
+    assert [chain.joints for chain in found] == [("Pitch",), ("Jaw",)]
+    assert [list(chain.columns) for chain in found] == [[0], [1]]
+    assert set(found[0].baseline_free) == {"kp", "kd", "velocity_limit", "inertia"}
+    assert found[0].start_row[0, servo.GRAVITY_TORQUE] == 0.0
+
+
+def test_a_pendulum_hangs_from_its_load():
+    load = {"payload_kg": 0.49, "arm_length_m": 0.1}
+    (chain,) = chains(recording("pendulum", ("p",), trajectory("a", wave(), conditions=load)))
+    assert chain.start_row[0, servo.GRAVITY_TORQUE] == pytest.approx(0.49 * 9.81 * 0.1)
+    assert chain.start_row[0, servo.INERTIA] > 0.49 * 0.1**2
+    assert "tau_g_nm" in chain.baseline_free
+
+
+def test_each_trajectory_has_its_own_load(device):
+    heavy, light = ({"payload_kg": m, "arm_length_m": 0.1} for m in (0.5, 0.2))
+    data = recording(
+        "pendulum",
+        ("p",),
+        trajectory("a", wave(), conditions=light),
+        trajectory("b", wave(), conditions=heavy),
+    )
+    (chain,) = chains(data)
+    got = Rollouts(chain, data, device=device).predict(chain.start_row[None], [0])
+    row = chain.start_row.copy()
+    row[0, servo.GRAVITY_TORQUE] = 0.2 * GRAVITY_M_S2 * 0.1
+    row[0, servo.INERTIA] -= 0.3 * 0.1**2
+    plain = replace(chain, reference_load=None)
+    expected = Rollouts(plain, data, device=device).predict(row[None], [0])
+    np.testing.assert_allclose(got, expected, atol=1e-6)
+    assert np.abs(got - Rollouts(plain, data).predict(chain.start_row[None], [0])).max() > 1e-2
+
+
+def test_a_gain_set_on_purpose_scales_the_stiffness_also_in_a_subset():
+    data = recording(
+        "servo",
+        ("j",),
+        trajectory("a", wave(), conditions={"p_gain": 200}),
+        trajectory("b", wave(), conditions={"p_gain": 800}),
+    )
+    (chain,) = chains(data)
+    row = chain.start_row.copy()
+    got = Rollouts(chain, data).predict(row[None])
+    alone = Rollouts(chain, data.subset([0])).predict(row[None])
+    np.testing.assert_array_equal(alone[0], got[0, :100])
+    row[0, servo.KP] /= 4
+    expected = Rollouts(replace(chain, reference_p_gain=None), data).predict(row[None], [0])
+    np.testing.assert_allclose(alone, expected, atol=1e-6)
+
+
+def test_trajectories_come_in_the_order_asked_for():
+    data = recording("servo", ("j", "k"), *(trajectory(f"t{i}", wave(1.0 + i, 2, phase=i)) for i in range(3)))
+    chain = chains(data)[1]
+    rollouts = Rollouts(chain, data)
+    assert rollouts.measured.shape == (300, 1) and rollouts.excited.shape == (300, 1)
+    rows = np.repeat(chain.start_row[None], 2, axis=0)
+    rows[1, 0, servo.KP] *= 0.5
+    everything = rollouts.predict(rows)
+    parts = [everything[:, rollouts.sample_trajectory == t] for t in (2, 0)]
+    np.testing.assert_array_equal(rollouts.predict(rows, [2, 0]), np.concatenate(parts, axis=1))
+    assert rollouts.predict(rows[:0]).shape == (0, 300, 1)
+    again = pickle.loads(pickle.dumps(rollouts))
+    np.testing.assert_array_equal(again.predict(rows), everything)
+
+
+def test_excited_joints_are_marked():
+    data = recording("servo", ("j", "k"), trajectory("a", wave(joints=2), joints=("k",)))
+    marks = [Rollouts(chain, data).excited.all() for chain in chains(data)]
+    assert marks == [False, True]
+
+
+def test_a_rollout_starts_where_it_was_measured():
+    position = np.full((100, 1), 0.25)
+    data = recording("servo", ("j",), trajectory("a", np.full((100, 1), 0.2), position=position))
+    (chain,) = chains(data)
+    row = chain.start_row.copy()
+    row[0, servo.ENCODER_BIAS] = 0.05
+    got = Rollouts(chain, data).predict(row[None])[0, :, 0]
+    np.testing.assert_allclose(got, 0.25, atol=1e-6)
+
+
+def test_a_finger_droops_as_its_weight_asks(hand):
+    """In rest the springs carry the weight: the gradient of the potential energy by the hand's kinematics."""
+    names = ("f1_j3", "f1_j1", "f1_j2")  # columns in another order than the finger's
+    target = np.array([-0.7, 0.3, 0.5])
+    data = recording(
+        "dclaw3", names, trajectory("a", np.tile(target, (200, 1)), position=np.tile(target, (200, 1)))
+    )
+    (chain,) = chains(data, hand)
+    assert chain.joints == ("f1_j1", "f1_j2", "f1_j3") and list(chain.columns) == [1, 2, 0]
+    rest = Rollouts(chain, data).predict(chain.start_row[None])[0, -1]
+    down = Rotation.from_quat(np.array(hand_mount())[3:]).inv().apply([0.0, 0.0, -1.0])
+
+    def potential(q):
+        full = np.zeros(hand.num_joints)
+        full[3:6] = q
+        poses = hand.forward_kinematics(full)[4:7]
+        centres = poses[:, :3] + Rotation.from_quat(poses[:, 3:]).apply(hand.link_com[4:7])
+        return -9.81 * hand.link_mass[4:7] @ (centres @ down)
+
+    step = 1e-5 * np.eye(3)
+    weight = np.array([(potential(rest + d) - potential(rest - d)) / 2e-5 for d in step])
+    spring = hand.kp[3:6] * (target[list(chain.columns)] - rest)
+    np.testing.assert_allclose(spring, weight, atol=2e-4)
+    assert np.abs(weight).max() > 0.01
+
+
+def test_unrecorded_joints_stand_still(hand):
+    names = tuple(hand.joint_names[:3])
+    command = np.zeros((200, 3))
+    command[:, 1] = wave(4.0)[:, 0]
+    whole = recording("dclaw3", names, trajectory("a", command))
+    part = recording("dclaw3", names[1:2], trajectory("a", command[:, 1:2]))
+    (chain,), (alone,) = chains(whole, hand), chains(part, hand)
+    rows = chain.start_row.copy()
+    rows[[0, 2], servo.KP] = 1e4
+    expected = Rollouts(chain, whole, dt=1 / 1920).predict(rows[None])[0, :, 1]
+    got = Rollouts(alone, part, dt=1 / 1920).predict(alone.start_row[None])[0, :, 0]
+    np.testing.assert_allclose(got, expected, atol=1e-3)
+    assert alone.inertia_scale(0) == pytest.approx(chain.inertia_scale(1))
+
+
+def test_the_chain_has_the_kinetic_energy_of_the_hand(hand):
+    data = recording("dclaw3", hand.joint_names[:3], trajectory("a", np.zeros((30, 3))))
+    (chain,) = chains(data, hand)
+    for joint in range(3):
+        # Energy at 1 rad/s by finite differences of the poses.
+        step = 1e-4
+        turned = np.zeros((2, hand.num_joints))
+        turned[:, joint] = -step / 2, step / 2
+        poses = hand.forward_kinematics(turned)[:, 1:4]
+        turns = [Rotation.from_quat(pose[:, 3:]) for pose in poses]
+        centres = [
+            pose[:, :3] + turn.apply(hand.link_com[1:4]) for pose, turn in zip(poses, turns, strict=True)
+        ]
+        speed = (centres[1] - centres[0]) / step
+        spin = (turns[0].inv() * turns[1]).as_rotvec() / step
+        inertia = hand.link_mass[1:4] @ (speed**2).sum(axis=1)
+        inertia += np.einsum("li,lij,lj->", spin, hand.link_inertia[1:4], spin)
+        assert chain.inertia_scale(joint) == pytest.approx(inertia, rel=1e-4)
+
+
+def test_bad_input_says_what_to_do(hand):
+    data = recording("dclaw3", ("f0_j1",), trajectory("a", wave()))
+    with pytest.raises(ValueError, match="needs its hand"):
+        chains(data)
+    with pytest.raises(ValueError, match="f9_j1"):
+        chains(recording("dclaw3", ("f9_j1",), trajectory("a", wave())), hand)
+    (chain,) = chains(data, hand)
+    with pytest.raises(ValueError, match="time step"):
+        Rollouts(chain, data, dt=0.0)
+    with pytest.raises(ValueError, match="shape"):
+        Rollouts(chain, data).predict(chain.start_row)
+
+
+def test_an_unfitted_servo_already_resembles_a_real_one(shared_dir):
+    data = read_recording(shared_dir / "measured" / "xl330_pendulum")
+    (chain,) = chains(data)
+    rollouts = Rollouts(chain, data)
+    stiff = np.array([8, 9, 10, 11])
+    rows = np.repeat(chain.start_row[None], 2, axis=0)
+    rows[1, 0, servo.LOAD_FRICTION] = 0.3
+    assert {data.trajectories[i].conditions["p_gain"] for i in stiff} == {800}
+    predicted = rollouts.predict(rows, list(stiff))[..., 0]
+    measured = rollouts.measured[np.isin(rollouts.sample_trajectory, stiff), 0]
+    assert predicted.shape == (2, len(measured)) and np.isfinite(predicted).all()
+    # The signs, units and times of servo and pendulum are right.
+    assert np.corrcoef(predicted[0], measured)[0, 1] > 0.9
