@@ -179,16 +179,26 @@ class Randomiser:
             return
         if self._push_graph is None:
             with wp.ScopedCapture(device=self._env.device) as capture:
-                self.push()
+                self._push_gains_and_frictions()
             self._push_graph = capture.graph
         wp.capture_launch(self._push_graph)
+        self._push_inertia()
 
     def push(self) -> None:
-        """Write gains and frictions into the model and tell the solver."""
+        """Write gains, frictions and inertias of rotors into the model and tell the solver."""
+        self._push_gains_and_frictions()
+        self._push_inertia()
+
+    def _push_inertia(self) -> None:
+        # The solver computes constants from it in memory of its own: not for a graph.
+        if self._env.sim.servo is not None and self._inertia_varies:
+            self._env.sim.servo.push_inertia()
+
+    def _push_gains_and_frictions(self) -> None:
         env = self._env
         model = env.sim.model
         flags = newton.ModelFlags.SHAPE_PROPERTIES
-        if env.sim.servo is None:
+        if env.sim.servo is None:  # which sets the gains itself, in every physics step
             flags |= newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES
             wp.launch(
                 write_gains_kernel,
@@ -197,8 +207,6 @@ class Randomiser:
                 outputs=[self._model_kp, self._model_kd],
                 device=env.device,
             )
-        elif self._inertia_varies:
-            env.sim.servo.push_inertia()  # the rest of a servo reaches the solver in every physics step
         wp.launch(
             write_friction_kernel,
             dim=model.shape_count,

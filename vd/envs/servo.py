@@ -7,7 +7,8 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import RandomisationCfg
 from vd.kernels import actuators
-from vd.kernels.effects import BASELINE, EFFECTS, Parameter, neutral_row
+from vd.kernels.effects import EFFECTS, Parameter
+from vd.sim.actuators import has_effects
 
 PARAMETERS: dict[str, Parameter] = {
     f"{name}.{p.name}": p for name, effect in EFFECTS.items() for p in effect.parameters
@@ -70,13 +71,8 @@ def needs_servo(ranges: np.ndarray) -> bool:
     Stiffness and damping are randomised in the plain model too; a speed limit or an armature that differs
     between worlds takes the servo.
     """
-    neutral = np.repeat(np.array(neutral_row())[None, :, None], 2, axis=2)
-    effects = np.setdiff1d(np.arange(actuators.PARAMETER_COLUMNS), [p.column for p in BASELINE])
-    varied = [actuators.VELOCITY_LIMIT, actuators.INERTIA]
-    return bool(
-        (ranges[:, effects] != neutral[:, effects]).any()
-        or (ranges[:, varied, 0] != ranges[:, varied, 1]).any()
-    )
+    drives = ranges[:, [actuators.VELOCITY_LIMIT, actuators.INERTIA]]
+    return has_effects(np.moveaxis(ranges, 2, 0)) or bool(np.any(drives[..., 0] != drives[..., 1]))
 
 
 def _check_complete(ranges: np.ndarray, cfg: RandomisationCfg) -> None:

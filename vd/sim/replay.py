@@ -14,6 +14,7 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import write_json
+from vd.sim.actuators import has_effects
 from vd.sim.cfg import SimCfg
 from vd.sim.simulator import NanDump, Simulator
 
@@ -80,7 +81,8 @@ def replay(path: Path, *, device: str = "cpu") -> Iterator[str]:
     # One physics step a call: the control rate is raised to half the physics rate, an even multiple.
     cfg = dataclasses.replace(sim, control_hz=sim.physics_hz / 2.0)
     scene = build_scene(hand=hand, objects=[item], num_worlds=1, cfg=cfg, device=device)
-    simulator = Simulator(scene, cfg)
+    # Servos start at rest: what they remembered is not in a dump.
+    simulator = Simulator(scene, cfg, servo_rows=hand.servo if has_effects(hand.servo) else None)
     simulator.joint_q.assign(arrays["joint_q"][None])
     simulator.joint_qd.assign(arrays["joint_qd"][None])
     target = simulator.target.numpy().copy()
