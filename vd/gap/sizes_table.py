@@ -66,6 +66,17 @@ SCALES: dict[str, dict[str, tuple[float, ...]]] = {
         "stribeck_friction": (0.03806, 0.09658, 0.20272, 0.41139),
         "load_friction": (0.21852, 0.55385, 1.14231, 2.16008),
         "asymmetric_friction": (0.04736, 0.12007, 0.25191, 0.51167),
+        "backlash": (0.05519, 0.14037, 0.2957, 0.60385),
+        "dead_zone": (0.06393, 0.1621, 0.34033, 0.69253),
+        "integral_action": (0.00877, 0.02311, 0.05196, 0.12044),
+        "encoder_bias": (0.03548, 0.08975, 0.18773, 0.37946),
+        "gravity_load": (0.07977, 0.20191, 0.42276, 0.85626),
+        "payload_inertia": (0.09483, 0.23911, 0.49692, 0.99397),
+        "elastic_transmission": (0.06651, 0.17135, 0.368, 0.77166),
+        "joint_coupling": (0.03569, 0.08983, 0.18614, 0.36922),
+        "cogging": (0.08, 0.20247, 0.42377, 0.85882),
+        "cable_spring": (0.01009, 0.02559, 0.05374, 0.10947),
+        "temperature_friction": (0.03941, 0.09997, 0.20995, 0.42712),
     },
 }
 """Model and effect to strengths of the four sizes; effects that cannot show on a model are absent."""
