@@ -1,4 +1,4 @@
-"""Motions that excite one joint at a time: the paper's steps and sines, and the menu for what they leave open.
+"""Motions that excite one joint at a time: the paper's steps and sines, and a menu for what they leave open.
 
 The paper commands steps and sines of 0.05 to 1.5 Hz, amplitudes in proportion to the joint limits.
 Commands are in rad, times in seconds.
