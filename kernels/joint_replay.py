@@ -10,7 +10,7 @@ after the other, J recorded joints. Times, delays and lost commands are those of
 import warp as wp
 
 from vd.kernels.actuators import ENCODER_BIAS, READ_DELAY
-from vd.kernels.chains import CENTRED, Samples, arrival, split_steps
+from vd.kernels.chains import Samples, arrival, split_steps
 from vd.kernels.joint_servo import JOINTS_PER_FINGER
 
 wp.set_module_options({"enable_backward": False})
@@ -54,8 +54,7 @@ def replay_command_kernel(
     """The mean command of each servo over the coming physics step. Launch: [W, D].
 
     As :func:`vd.kernels.joint_servo.receive_command_kernel`, a command acts from its arrival to the end
-    of the step. A rollout's leapfrog step is centred and this one is not: the solver's fully implicit
-    damping is late by as much as that is early.
+    of the step.
 
     Args:
         parameters: Parameter rows, shape [W D, PARAMETER_COLUMNS].
@@ -87,7 +86,6 @@ def replay_command_kernel(
     waiting = wp.bool(True)
     while waiting and upcoming < last:
         step, fraction, kept = arrival(samples, upcoming, tracks.stream[world, finger], parameters, row, dt)
-        step, fraction = split_steps(step, fraction, -CENTRED)
         late_step = due_step[world, joint]
         late_fraction = due_fraction[world, joint]
         if step < late_step or (step == late_step and fraction < late_fraction):

@@ -26,6 +26,7 @@ from vd.kernels.actuators import (
     servo,
     start_servo,
 )
+from vd.kernels.chains import CENTRED, implicitness
 from vd.kernels.rng import next_stream
 
 wp.set_module_options({"enable_backward": False})
@@ -45,6 +46,7 @@ def send_command_kernel(
     # Model:
     parameters: wp.array2d[float],
     # In:
+    dt: float,
     command_in: wp.array2d[float],
     state_in: wp.array2d[float],
     # In/Out:
@@ -57,10 +59,12 @@ def send_command_kernel(
     """Send a command to every joint: it arrives after the delay and |N(0, sigma)| more, or never. Launch [N].
 
     The commands of a hand go out together, so its joints share one draw of the jitter and one of the
-    loss. Commands arrive in the order in which they were sent.
+    loss. Commands arrive in the order in which they were sent. What a joint is told at a time acts from
+    there on, which is the middle of a physics step: velocities are those between two positions.
 
     Args:
         parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
+        dt: Physics time step [s].
         command_in: Commanded positions [rad], shape [N, *].
         state_in: State rows, shape [N D, STATE_COLUMNS].
         rng: Random stream of each world, shape [N].
@@ -80,7 +84,7 @@ def send_command_kernel(
         row = world * joints + joint
         if loss >= parameters[row, JITTER_DROP]:
             delay = parameters[row, COMMAND_DELAY] + jitter * parameters[row, JITTER_SIGMA]
-            arrival = state_in[row, STATE_TIME] + delay
+            arrival = state_in[row, STATE_TIME] + CENTRED * dt + delay
             head = transit_head[world, joint]
             count = transit_count[world, joint]
             if count > 0:
@@ -168,10 +172,14 @@ def drive_joint_kernel(
 ):
     """One time step of every servo, written to the solver's inputs. Launch: [N, D].
 
-    The drive is MuJoCo's affine actuator, whose damping is integrated implicitly; dry friction its
-    friction loss. That constraint asks for the acceleration -b v; with b = 1/dt + kd/m a joint within
-    the bound of its friction stops in one step, the implicit damping included. (The default b, of a
-    time constant of 20 ms, and 1/dt alone both let it slide on.)
+    The drive is MuJoCo's affine actuator. Its damping is integrated implicitly, an error of half a
+    physics step; as in :mod:`vd.kernels.chains` only the share of it that stability needs is left there,
+    and the rest acts at the present velocity, through the reference, so that the effort limit sees it.
+    With this a model identified at small steps moves the same at the simulator's.
+
+    Dry friction is the solver's friction loss. That constraint asks for the acceleration -b v; with
+    b = 1/dt + kd/m a joint within the bound of its friction stops in one step, the implicit damping
+    included. (The default b, of a time constant of 20 ms, and 1/dt alone both let it slide on.)
 
     Args:
         parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
@@ -208,13 +216,19 @@ def drive_joint_kernel(
         row,
         state,
     )
-    reference_out[world, joint] = drive.reference
+    mobility = inverse_inertia[world, joint]
+    reference = drive.reference
+    damping = drive.damping
+    if drive.stiffness > 0.0:
+        damping *= implicitness(dt * damping * mobility)
+        reference -= (drive.damping - damping) * speed / drive.stiffness
+    reference_out[world, joint] = reference
     joint_force_out[world, joint] = drive.torque
     gain_out[world, joint][0] = drive.stiffness
     bias_out[world, joint][1] = -drive.stiffness
-    bias_out[world, joint][2] = -drive.damping
+    bias_out[world, joint][2] = -damping
     friction_out[world, joint] = drive.friction
-    stop = 1.0 / dt + drive.damping * inverse_inertia[world, joint]
+    stop = 1.0 / dt + damping * mobility
     friction_solref_out[world, joint] = wp.vec2(-1.0, -stop * FRICTION_IMPEDANCE)
     friction_solimp_out[world, joint] = vec5(FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0)
 

@@ -181,7 +181,7 @@ class JointServo:
         wp.launch(
             send_command_kernel,
             dim=self.num_worlds,
-            inputs=[self.parameters, command, self.state, self._rng, *self._transit],
+            inputs=[self.parameters, self.dt, command, self.state, self._rng, *self._transit],
             device=self.device,
         )
 
