@@ -1,6 +1,7 @@
 """``vd-gap`` on the command line: steps, resuming, exit statuses, the layer, the plan."""
 
 import csv
+import dataclasses
 import json
 import re
 
@@ -279,6 +280,25 @@ def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tm
 
 def test_plan_for_motions_that_show_too_little(recording):
     report, _ = servo_report(recording, verdict="under_excited")
-    result = plan(report, read_recording(recording), None)
+    slow = read_recording(recording).subset([3])
+    result = plan(report, slow, None)
     assert result.moved == (JOINT,)
     assert "what these motions do not show" in result.sentence
+    assert slow.trajectories[0].excitation not in {motion.name for motion in result.motions}
+
+
+def test_plan_says_when_nothing_would_help(recording):
+    """An effect and its twin: the same model twice."""
+    report, _ = servo_report(
+        recording, verdict="ambiguous", ambiguous=(("coulomb_friction", "stribeck_friction"),)
+    )
+    twins = {
+        "coulomb_friction": {"tau_c_nm": FRICTION},
+        "stribeck_friction": {"tau_s_nm": FRICTION, "tau_c_nm": FRICTION, "v_s_rad_s": 0.1},
+    }
+    rows = tuple(
+        dataclasses.replace(row, name=name, parameters=twins[name])
+        for row, name in zip(report.evidence, twins, strict=True)
+    )
+    result = plan(dataclasses.replace(report, evidence=rows), read_recording(recording), None)
+    assert "No motion of the menu would tell coulomb friction from stribeck friction" in result.sentence

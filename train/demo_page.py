@@ -11,6 +11,7 @@ from vd.evaluate.report import number, percent
 from vd.evaluate.result import EvalResult
 from vd.page import Page
 from vd.paper import PAPER
+from vd.train.demo_gap import add_gap
 from vd.train.metrics import PROGRESS_FILE, read_progress
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ STAGE_NAMES = {
     "assets": "author hand and objects",
     "import": "import meshes",
     "sheet": "draw the objects",
+    "gap": "find a hidden gap",
     "train": "train",
     "compare": "compare with random and no actions",
     "video": "record",
@@ -68,6 +70,8 @@ def write_page(results: "DemoResults", path: Path) -> None:
         )
     if results.paper is not None:
         _paper_criteria(page, results, results.paper)
+    if results.gap:
+        add_gap(page, results.folder, path.parent)
     if results.left_out:
         page.section("Left out")
         page.text("There was no time for these; the commands do them by hand:")

@@ -38,6 +38,7 @@ th:first-child,td:first-child,.words{text-align:left}td.words{white-space:normal
 thead th{color:var(--soft);font-weight:600;border-bottom:2px solid var(--line)}
 figure{margin:1.2rem 0}figure img,figure video{display:block;max-width:100%;height:auto;border-radius:.5rem}
 figure img{background:#fff}figcaption{font-size:.88rem;margin-top:.4rem;max-width:46rem}
+a{color:var(--lead)}
 .tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(11rem,1fr));gap:.75rem;margin:1.25rem 0}
 .tile{background:var(--tint);border-radius:.6rem;padding:.8rem 1rem}
 .tile b{display:block;font-size:1.55rem;line-height:1.25;color:var(--lead);font-variant-numeric:tabular-nums}
@@ -72,6 +73,15 @@ class Page:
     def code(self, text: str) -> None:
         """Add a line of code, such as a command."""
         self._parts.append(f"<p><code>{escape(text)}</code></p>")
+
+    def link(self, text: str, target: str) -> None:
+        """Add a line that leads to another file.
+
+        Args:
+            text: What is there.
+            target: Path relative to the page.
+        """
+        self._parts.append(f'<p><a href="{escape(target)}">{escape(text)}</a></p>')
 
     def tiles(self, tiles: Sequence[tuple[str, str, str]]) -> None:
         """Add headline numbers: (value, what it is, small print such as its interval) each."""

@@ -43,6 +43,7 @@ def write_identified(
     from vd.assets_usd.hand_layer import write_layer
 
     fitted = report.identified.parameters
+    held = (*report.effects, *report.provisional)
     write_layer(
         path,
         hand if hand is not None else recording.model,
@@ -50,19 +51,19 @@ def write_identified(
             joint: {name: values[name] for name in _DRIVE if name in values}
             for joint, values in fitted.items()
         },
-        effects={joint: _effects(report.effects, joint, values, start) for joint, values in fitted.items()},
+        effects={joint: _effects(held, joint, values, start) for joint, values in fitted.items()},
         tool="vd-gap",
         recording=report.recording.path,
     )
 
 
 def _effects(
-    named: tuple[NamedEffect, ...],
+    held: tuple[NamedEffect, ...],
     joint: str,
     fitted: Mapping[str, float],
     start: Mapping[str, np.ndarray],
 ) -> dict[str, dict[str, float | tuple[float, float, float]]]:
-    """Effects of a joint: those it started with, a pendulum's gravity, and the named ones."""
+    """Effects of a joint: those it started with, a pendulum's gravity, and the identified ones."""
     values: dict[str, dict[str, float | tuple[float, float, float]]] = {}
     if joint in start:
         for effect in EFFECTS.values():
@@ -71,7 +72,7 @@ def _effects(
                 values[effect.name] = dict(row)
     if GRAVITY.name in fitted:
         values.setdefault(GRAVITY_EFFECT, {})[GRAVITY.name] = fitted[GRAVITY.name]
-    for name, parameters in effect_values(named, joint).items():
+    for name, parameters in effect_values(held, joint).items():
         known: dict[str, float | tuple[float, float, float]] = {}
         for key, (value, low, high) in parameters.items():
             certain = np.isfinite([low, high]).all() and low <= value <= high

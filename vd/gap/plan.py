@@ -1,14 +1,15 @@
 """Plan the next experiment: the motions on which the models that are still possible disagree most.
 
-Every set of motions of the menu is simulated under every model in question. Two models differ by what
-refitting cannot absorb: the part of their difference along small changes of their parameters is taken out,
-as far as those parameters are uncertain. The set whose least different pair stands out most from the noise
-is proposed.
+Every set of motions of the menu is simulated under every model in question, together with what has been
+recorded. Two models differ by what refitting to both cannot absorb: the part of their difference along small
+changes of their parameters is taken out, as far as those parameters are uncertain, and so is the size of what
+they already disagree about. The set whose least different pair stands out most from the noise is proposed.
 """
 
 import csv
 import io
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,8 +34,12 @@ PLAN_JSON = "next_experiment.json"
 PLAN_FOLDER = "next_experiment"
 UNCERTAINTY = 0.1
 """Relative standard deviation that the parameters of a model are given: what old data leave open."""
-STEP = 0.02
+STEP = 0.05
 """Relative change of a parameter by which its influence is computed."""
+KNOWN_S = 60.0
+"""Recorded time that refits are held to [s]."""
+FINE_STEP_S = 1.0 / 2400.0
+"""Time step [s]: rivals differ by less than a delay of the fit's own step."""
 VISIBLE = 3.0
 """Disagreement, in noise floors, from which a recording is expected to decide."""
 PAYLOAD_SET = "second_payload"
@@ -122,16 +127,17 @@ def plan(
                 if not motions:
                     continue
                 pairs = _disagreements(chain, recording, motions, joint, models, floor, device)
-                # Two rivals have to be separated for sure; where anything is possible, most of it shown.
-                value = float(np.min(pairs) if targets[joint] else np.median(pairs))
+                # Rivals have to be separated for sure; where anything is possible, much of it has to show.
+                value = float(np.min(pairs) if targets[joint] else np.mean(pairs))
                 totals.setdefault(name, []).append(value)
                 seconds[name] = seconds.get(name, 0.0) + sum(motion.duration for motion in motions)
                 kept.setdefault(name, []).extend(motions)
     if not totals:
         raise ValueError(
-            f"{recording.path}: no joint has a fitted model to plan from; run vd-gap explain first"
+            f"{recording.path}: no joint has a fitted model to plan from, or every motion of the menu has "
+            "been "
+            "recorded; run vd-gap explain first"
         )
-    floor = report.noise_floor_rad
     ranking = sorted(
         (
             Score(name, float(np.median(values)), float(np.median(values)) / floor, seconds[name])
@@ -221,6 +227,10 @@ def _models(
     """Parameter rows [n, P] of every model in question, by name."""
     index = chain.joints.index(joint)
     models = {}
+    base = base.copy()
+    for name in group:  # one of them stands in the identified model for all
+        for parameter in EFFECTS[name].parameters:
+            base[index, parameter.column] = parameter.neutral
     for name in group:
         found = [
             row for row in report.evidence if row.name == name and joint in row.joints and not row.placebo
@@ -257,15 +267,23 @@ def _reach(recording: Recording, hand: "HandModel | None") -> JointRange:
 
 def _motions(name: str, reach: JointRange, recording: Recording, joint: str) -> list[Excitation]:
     """Motions of a set that move the joint; none if the set cannot be predicted for this machine."""
-    motions = [motion for motion in MENU[name](reach) if motion.joints == (joint,)]
     common = _common(recording)
+    recorded = {
+        (t.excitation, t.conditions.get("p_gain")) for t in recording.trajectories if joint in t.joints
+    }
+    motions = [
+        motion
+        for motion in MENU[name](reach)
+        if motion.joints == (joint,)
+        and (motion.name, motion.conditions.get("p_gain", common.get("p_gain"))) not in recorded
+    ]
     if name == PAYLOAD_SET:
         mass = common.get("payload_kg")
         if recording.model not in BARE_MODELS or not isinstance(mass, float) or "arm_length_m" not in common:
             return []
         motions = [
             replace(motion, conditions={**motion.conditions, "payload_kg": factor * mass})
-            for motion, factor in zip(motions, PAYLOAD_FACTORS, strict=True)
+            for motion, factor in zip(motions, PAYLOAD_FACTORS, strict=False)
         ]
     return [replace(motion, conditions={**common, **motion.conditions}) for motion in motions]
 
@@ -290,9 +308,11 @@ def _disagreements(
     device: str,
 ) -> list[float]:
     """RMS difference [rad] of every pair of models, what refitting absorbs taken out."""
+    known = _known(recording, joint)
     imagined = replace(
         recording,
-        trajectories=tuple(
+        trajectories=known
+        + tuple(
             Trajectory(
                 file=f"{index}_{motion.name}",
                 excitation=motion.name,
@@ -306,7 +326,8 @@ def _disagreements(
             for index, motion in enumerate(motions)
         ),
     )
-    rollouts = Rollouts(chain, imagined, device=device)
+    rollouts = Rollouts(chain, imagined, dt=FINE_STEP_S, device=device)
+    old = sum(len(trajectory.time) for trajectory in known)
     index = chain.joints.index(joint)
     rows, free = [], []
     for model in models.values():
@@ -324,7 +345,7 @@ def _disagreements(
         slopes.append((predicted[place + 1 : place + 1 + len(columns)] - predicted[place]) / STEP)
         place += 1 + len(columns)
     return [
-        _left_over(curves[a] - curves[b], np.concatenate([slopes[a], slopes[b]]), floor)
+        _left_over(curves[a] - curves[b], np.concatenate([slopes[a], slopes[b]]), floor, old)
         for a, b in itertools.combinations(range(len(curves)), 2)
     ]
 
@@ -339,28 +360,45 @@ def _free(chain: Chain, rows: np.ndarray, joint: int) -> list[int]:
     return [column for column in columns if rows[joint, column] != 0.0]
 
 
-def _left_over(difference: np.ndarray, slopes: np.ndarray, floor: float) -> float:
-    """RMS of a difference [S] after its best explanation by parameter changes [P, S] of limited size."""
+def _known(recording: Recording, joint: str) -> tuple[Trajectory, ...]:
+    """Recorded motions of the joint that a refit has to go on explaining, the shortest first."""
+    own = sorted((t for t in recording.trajectories if joint in t.joints), key=lambda t: t.time[-1])
+    ends = np.cumsum([t.time[-1] for t in own])
+    return tuple(own[: max(int(np.searchsorted(ends, KNOWN_S, side="right")), 1)])
+
+
+def _left_over(difference: np.ndarray, slopes: np.ndarray, floor: float, old: int) -> float:
+    """What two models say differently about new motions once both have been refitted.
+
+    Args:
+        difference: Of their predictions [S] [rad].
+        slopes: Change of a prediction with the logarithm of a parameter [P, S] [rad].
+        floor: Noise floor [rad].
+        old: Samples at the start that have been recorded, and do not tell the models apart.
+    """
     normal = slopes @ slopes.T + np.eye(len(slopes)) * (floor / UNCERTAINTY) ** 2
     change = np.linalg.solve(normal, slopes @ difference)
-    return float(np.sqrt(np.mean((difference - change @ slopes) ** 2)))
+    square = (difference - change @ slopes) ** 2
+    blind = float(np.mean(square[:old])) if old else 0.0
+    return math.sqrt(max(float(np.mean(square[old:])) - blind, 0.0))
 
 
 def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
-    goal = (
-        f"to tell {listing([' from '.join(map(plain, group)) for group in report.ambiguous])}"
-        if report.ambiguous
-        else "to see what these motions do not show"
-    )
-    sure = (
-        f"There the models in question differ by {best.floors:.1f} times the noise floor"
-        if best.floors >= VISIBLE
-        else f"Even there the models in question differ by only {best.floors:.1f} times the noise floor, so "
-        "that it may stay open"
-    )
+    apart = " or ".join(" from ".join(map(plain, group)) for group in report.ambiguous)
+    if best.floors < VISIBLE:
+        goal = f"tell {apart}" if apart else "show more than these do"
+        return (
+            f"No motion of the menu would {goal}: the models in question differ by at most {best.floors:.1f} "
+            "times the noise floor, so either serves in simulation. To decide, record another quantity, "
+            "such as "
+            f"current or an external sensor. The best of the menu is in {PLAN_FOLDER}/."
+        )
+    goal = f"to tell {apart}" if apart else "to see what these motions do not show"
     return (
-        f"Record {CONCLUSIONS[best.name]} on {listing(joints)} ({best.seconds:.0f} s) {goal}. {sure}. The "
-        f"commands are in {PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
+        f"Record {CONCLUSIONS[best.name]} on {listing(joints)} ({best.seconds:.0f} s) {goal}: there the "
+        "models "
+        f"in question differ by {best.floors:.1f} times the noise floor. The commands are in {PLAN_FOLDER}/; "
+        "add what was measured to the recording and run vd-gap again."
     )
 
 

@@ -95,7 +95,7 @@ def _headline(page: Page, report: Report) -> None:
         ),
         (mrad(held.baseline_rmse_rad), "gap before", "error on held-out motions, plain servo model fitted"),
     ]
-    if report.effects:
+    if report.effects or report.provisional:
         note = f"{percent(held.reduction)} less (95 %: {percent_range(held.ci95)})"
         tiles.append((mrad(held.identified_rmse_rad), "gap after", note))
     tiles.append((mrad(floor), "noise floor", "what no model can explain: resolution, repeatability"))
@@ -254,8 +254,18 @@ def _parameters(page: Page, report: Report) -> None:
         for effect in report.effects
         for name, one in effect.parameters.items()
     ]
+    rows += [
+        (joints_text(effect.joints), f"{plain(effect.name)} (not named)", name, estimate(one), "")
+        for effect in report.provisional
+        for name, one in effect.parameters.items()
+    ]
     if rows:
         page.table(["joint", "effect", "parameter", "value", "confidence"], rows, words=(1, 2))
+        if report.provisional:
+            page.text(
+                "Not named: an effect that stands for its ambiguous set, so that the model can be simulated.",
+                small=True,
+            )
         page.text(
             "Confidence is the share of repetitions, on motions drawn anew and with the choice repeated, "
             "in which "

@@ -103,15 +103,16 @@ def verdict_sentence(report: Report) -> str:
             text += f" Something else remains that this recording cannot tell apart: {listing(sets)}."
         return text
     if report.verdict == "no_gap":
+        model = "plain servo model" if report.hand_layer is None else f"model in {report.hand_layer}"
         return (
-            f"No gap: the plain servo model explains this recording. What remains, {before} on held-out "
+            f"No gap: the {model} explains this recording. What remains, {before} on held-out "
             f"motions, is no more than noise ({floor}) or than any candidate explains."
         )
     if report.verdict == "ambiguous":
         return (
             f"There is a gap ({before} on held-out motions against a noise floor of {floor}), and one of "
-            f"{listing(sets, 'or of')} explains it, but this recording cannot say which."
-        )
+            f"{listing(sets, 'or of')} explains it, but this recording cannot say which. {_stands_in(report)}"
+        ).strip()
     if report.verdict == "under_excited":
         return (
             "No verdict on effects: the motions in this recording do not determine the model. Different "
@@ -132,6 +133,13 @@ def _shrinks(report: Report) -> str:
     known = all(map(math.isfinite, held.ci95))
     text += f", 95 %: {percent_range(held.ci95)}" if known else ""
     return f"{text}); the noise floor is {mrad(report.noise_floor_rad)}."
+
+
+def _stands_in(report: Report) -> str:
+    if not report.provisional:
+        return ""
+    held, names = report.held_out, listing([effect_sentence(effect) for effect in report.provisional])
+    return f"With {names} in its place the error falls to {mrad(held.identified_rmse_rad)}."
 
 
 def next_step(report: Report) -> str:
