@@ -211,3 +211,17 @@ def test_an_unfitted_servo_already_resembles_a_real_one(shared_dir):
     assert predicted.shape == (2, len(measured)) and np.isfinite(predicted).all()
     # The signs, units and times of servo and pendulum are right.
     assert np.corrcoef(predicted[0], measured)[0, 1] > 0.9
+
+
+@pytest.mark.parametrize(("rate", "samples"), [(480.0, 411), (2400.0, 1171)])
+def test_every_sample_is_predicted_wherever_its_stamp_falls_within_a_step(rate, samples):
+    """4.1 s and 11.7 s are whole numbers of steps only up to rounding."""
+    time = np.arange(samples) / 100.0
+    command = 0.1 * np.ones((len(time), 1))
+    found = recording("servo", ("a",), trajectory("a", command, time=time, position=command))
+    (chain,) = chains(found)
+    for garbage in (np.nan, 1e9, -5.0):
+        left = [np.full(len(time), garbage, np.float32) for _ in range(50)]
+        del left  # memory that the predictions are likely to get
+        predicted = Rollouts(chain, found, dt=1.0 / rate).predict(chain.start_row[None])
+        np.testing.assert_allclose(predicted, 0.1, atol=1e-5)

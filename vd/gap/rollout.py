@@ -297,9 +297,13 @@ class Rollouts:
         command = np.concatenate([t.command[:, columns] for t in trajectories])
         power = np.concatenate([t.enabled[:, columns] * self._gain(t.conditions) for t in trajectories])
         steps = self.time / self.dt
+        whole = np.floor(steps)
+        # In single precision a fraction just under 1 is 1: the next step, which must then be counted.
+        fraction = (steps - whole).astype(np.float32)
+        whole, fraction = whole + (fraction >= 1.0), np.where(fraction < 1.0, fraction, 0.0)
         samples = Samples()
-        samples.step = wp.array(np.floor(steps), dtype=int, device=self.device)
-        samples.fraction = wp.array(steps - np.floor(steps), dtype=float, device=self.device)
+        samples.step = wp.array(whole, dtype=int, device=self.device)
+        samples.fraction = wp.array(fraction, dtype=float, device=self.device)
         samples.command = wp.array(command, dtype=float, device=self.device)
         samples.power = wp.array(power, dtype=float, device=self.device)
         return samples
