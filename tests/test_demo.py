@@ -1,5 +1,6 @@
 """The demo from end to end, tiny, and what its page says about what it cannot know beforehand."""
 
+import re
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -7,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from test_gap_report import sample_curves, sample_report
 
 from vd.assets_usd.objects import importer
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.result import Episode, EvalResult, Protocol, summarise
+from vd.gap.report import write_report
 from vd.train import cli, demo, demo_agents, demo_page
+from vd.train.demo_gap import ANALYSIS
 from vd.train.demo_stages import Budget, Stages, TimeUp, time_limit
 from vd.train.presets import PRESETS
 
@@ -45,6 +49,12 @@ def stages_in(folder: Path, minutes: float = 1.0, clock: Clock | None = None) ->
     return Stages(folder / "stages.json", 1, Budget(minutes, clock, clock()))
 
 
+def made_up_gap(folder: Path, _seed: int, _device: str) -> None:
+    """The report of a gap that was never looked for; tests/test_demo_gap.py looks for one."""
+    curves = sample_curves()
+    write_report(sample_report(curves), curves, folder / ANALYSIS)
+
+
 @pytest.fixture
 def small(monkeypatch, tmp_path) -> demo.DemoCfg:
     """Settings under which every stage is short, with assets of its own."""
@@ -58,6 +68,7 @@ def small(monkeypatch, tmp_path) -> demo.DemoCfg:
     monkeypatch.setitem(demo.MESH_EPISODES, "cpu", 4)
     monkeypatch.setattr(demo_agents, "VIDEO_SECONDS", 0.5)
     monkeypatch.setattr(demo_agents, "VIDEO_CELLS", 1)
+    monkeypatch.setattr(demo, "find_hidden_gap", made_up_gap)
     return demo.DemoCfg(
         out=tmp_path / "demo", minutes=20.0, objects=("cube",), preset="cpu-demo", num_worlds=4, max_steps=128
     )
@@ -79,6 +90,9 @@ def test_demo_ends_with_a_page_and_repeats_nothing(small, cone, capsys):
     text = page.read_text()
     assert text.count("<video") == 2
     assert text.count("<img") >= 4  # comparison, learning, curves, contact sheet
+    assert "lacks command delay" in text
+    (link,) = re.findall(r'<a href="([^"]+)"', text)
+    assert (page.parent / link).is_file()
     assert "task on purpose" in text  # what makes it easier is said
     assert "not trained" in text and "no time" not in text
     for name in demo_page.NAMES.values():
@@ -97,7 +111,7 @@ def test_demo_ends_with_a_page_and_repeats_nothing(small, cone, capsys):
     assert demo.run_demo(small) == page
     assert page.is_file()
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    # Import, objects, training, comparison, video, both again with meshes, evaluation.
+    # Import, objects, gap, training, comparison, video, both again with meshes, evaluation.
     assert capsys.readouterr().out.count("done before") == total - 2
 
 
@@ -121,7 +135,7 @@ def test_a_used_up_budget_still_ends_with_a_page_that_says_what_is_missing(small
         assert f"by hand: {command}" in output
         assert command in text.partition("Left out")[2]
     assert "cone.stl" in text
-    assert "[8/8, " in output  # nothing is announced for meshes that are not there
+    assert "[9/9, " in output  # nothing is announced for meshes that are not there
 
 
 def test_a_machine_too_slow_for_the_comparison_ends_with_the_remedy(tmp_path):

@@ -1,4 +1,4 @@
-"""The demo's gap: friction hidden in a simulated servo, found, named and closed, in under a minute."""
+"""The demo's gap: play hidden in a simulated servo, found, named and closed, in under a minute."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,14 +10,14 @@ if TYPE_CHECKING:
 
 MODEL = "servo"
 """A single joint is enough to show it, and takes a quarter of a finger's time."""
-EFFECT, PARAMETER, SIZE_NM = "coulomb_friction", "tau_c_nm", 0.15
+EFFECT, PARAMETER, SIZE_RAD = "backlash", "width_rad", 0.06
 RECORDING, ANALYSIS = "gap-recording", "gap"
 
 
 def gap_commands(folder: Path, seed: int, device: str) -> list[list[str]]:
     """Arguments of ``vd-gap`` that make the recording and analyse it."""
     recording = str(folder / RECORDING)
-    effect = f"{EFFECT}:{PARAMETER}={SIZE_NM:g}"
+    effect = f"{EFFECT}:{PARAMETER}={SIZE_RAD:g}"
     run = ["run", recording, "--out", str(folder / ANALYSIS), "--seed", str(seed)]
     return [
         ["hide", MODEL, "--effect", effect, "--out", recording, "--seed", str(seed)],
@@ -69,7 +69,7 @@ def add_gap(page: Page, folder: Path, base: Path) -> None:
     page.section("A hidden gap, found and closed")
     page.text(
         "A simulation of a machine is wrong somewhere, and the first question is where. Here "
-        f"{plain(EFFECT)} of {amount(SIZE_NM, 'N m')} was hidden in a servo that shares no code with the "
+        f"{plain(EFFECT)} of {amount(SIZE_RAD, 'rad')} was hidden in a servo that shares no code with the "
         "simulation. vd-gap saw nothing but the recording of commands and positions. What it says:"
     )
     page.text(verdict_sentence(report))

@@ -376,8 +376,10 @@ def _left_over(difference: np.ndarray, slopes: np.ndarray, floor: float, old: in
         floor: Noise floor [rad].
         old: Samples at the start that have been recorded, and do not tell the models apart.
     """
-    normal = slopes @ slopes.T + np.eye(len(slopes)) * (floor / UNCERTAINTY) ** 2
-    change = np.linalg.solve(normal, slopes @ difference)
+    # Ridge regression as an augmented least-squares problem: the rivals share most of their slopes.
+    system = np.concatenate([slopes, np.eye(len(slopes)) * floor / UNCERTAINTY], axis=1).T
+    target = np.concatenate([difference, np.zeros(len(slopes))])
+    change = np.linalg.lstsq(system, target, rcond=None)[0]
     square = (difference - change @ slopes) ** 2
     blind = float(np.mean(square[:old])) if old else 0.0
     return math.sqrt(max(float(np.mean(square[old:])) - blind, 0.0))
