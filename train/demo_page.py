@@ -211,7 +211,7 @@ def _imported(page: Page, results: "DemoResults") -> None:
     trained = results.imported["trained"][0]
     page.section("Imported meshes, on which it was not trained")
     page.text(
-        f"The same task with imported meshes ({len(trained.object_names)}) in place of what it was trained on "
+        f"The same task with imported meshes ({len(trained.object_names)}) in place of what it trained on "
         f"({_trained_on(results)}): {trained.overall.episodes} episodes, the same for each agent. The "
         "policy has never seen these shapes, and gets no description of a shape; the table says how much of "
         "what it learned carries over."
