@@ -52,13 +52,17 @@ class Coordinate:
         x = math.log(max(value, 1e-12)) if self.log else value / self.scale
         return min(max(x, self.lower), self.upper)
 
-    def step(self, x: np.ndarray) -> np.ndarray:
-        """Finite-difference step at x: backward where forward would leave the bounds."""
+    def step(self, x: np.ndarray, widened: np.ndarray) -> np.ndarray:
+        """Finite-difference step at x, times ``widened``: the other way where it would leave the bounds."""
         size = np.full_like(x, LOG_STEP) if self.log else LINEAR_STEP * np.maximum(1.0, np.abs(x))
-        return np.where(x + size > self.upper, -size, size)
+        size = size * widened
+        outside = (x + size > self.upper) | (x + size < self.lower)
+        return np.where(outside, -size, size)
 
     def bound(self, x: float) -> bool:
-        """Whether x is at the far end of its range (0 of an unsigned effect is a value like any other)."""
+        """Whether x is at the far end of its range; 0 of an effect and half a turn are values like others."""
+        if self.column == servo.GRAVITY_PHASE:
+            return False
         margin = 1e-3 * (self.upper - self.lower)
         return x > self.upper - margin or (self.log and x < self.lower + margin)
 

@@ -23,7 +23,11 @@ leave free (the torque scale of a bare servo), moves no others."""
 LAMBDAS = (0.1, 1.0, 10.0)
 """Factors on the damping that are tried in each step of Levenberg-Marquardt."""
 FIRST_DAMPING = 1e-3
-MAX_DAMPING = 1e6
+WIDEN = -3.0
+"""Factor on the finite-difference steps after a step that fails, with the other sign: dry friction makes
+the squared error rugged at the scale of the smallest steps."""
+FAILURES = 4
+"""Failed steps in a row that end a fit."""
 LOG_TRUST = 1.5
 """Largest change of a logarithmic coordinate in one step."""
 LINEAR_TRUST = 5.0
@@ -238,11 +242,12 @@ class JointProblem:
         origin = x.copy()
         residual = self.residuals(self.rows(base, coordinates, x), chosen)
         cost = np.einsum("bn,bn->b", residual, residual) + ridge * ((x - origin) ** 2).sum(1)
-        damping = np.full(len(x), FIRST_DAMPING)
+        damping, failures = np.full(len(x), FIRST_DAMPING), np.zeros(len(x), int)
         jacobian = np.zeros((len(x), x.shape[1], residual.shape[1]))
         active = np.arange(len(x))
         for _ in range(iterations):
-            jacobian[active] = self._jacobian(base, coordinates, x[active], residual[active], chosen)
+            widened = WIDEN ** failures[active]
+            jacobian[active] = self._jacobian(base, coordinates, x[active], residual[active], chosen, widened)
             trials = np.empty((len(active), len(LAMBDAS), x.shape[1]))
             for i, b in enumerate(active):
                 gram = jacobian[b] @ jacobian[b].T + ridge * np.eye(x.shape[1])
@@ -267,16 +272,15 @@ class JointProblem:
                 if gain > 0.0:
                     x[b], residual[b], cost[b] = flat[best], answers[best], costs[best]
                     damping[b] = max(damping[b] * LAMBDAS[k] * 0.3, 1e-7)
-                    if gain > TOLERANCE:
-                        going.append(b)
-                else:
-                    damping[b] *= 100.0
-                    if damping[b] < MAX_DAMPING:
-                        going.append(b)
+                failures[b] = 0 if gain > TOLERANCE else failures[b] + 1
+                if gain <= 0.0:
+                    damping[b] *= 3.0
+                if failures[b] < FAILURES:
+                    going.append(b)
             active = np.array(going, int)
             if not len(active):
                 break
-        jacobian = self._jacobian(base, coordinates, x, residual, chosen)
+        jacobian = self._jacobian(base, coordinates, x, residual, chosen, np.ones(len(x)))
         return x, residual, jacobian
 
     def _jacobian(
@@ -286,10 +290,11 @@ class JointProblem:
         x: np.ndarray,
         residual: np.ndarray,
         chosen: np.ndarray,
+        widened: np.ndarray,
     ) -> np.ndarray:
-        """d(predicted)/dx of B parameter sets, shape [B, P, N]."""
+        """d(predicted)/dx of B parameter sets, shape [B, P, N], with steps times ``widened`` [B]."""
         size = x.shape[1]
-        steps = np.stack([c.step(x[:, i]) for i, c in enumerate(coordinates)], axis=1)
+        steps = np.stack([c.step(x[:, i], widened) for i, c in enumerate(coordinates)], axis=1)
         moved = np.repeat(x[:, None], size, axis=1)
         moved[:, np.arange(size), np.arange(size)] += steps
         answers = self.residuals(self.rows(base, coordinates, moved.reshape(-1, size)), chosen)
@@ -367,7 +372,7 @@ class JointProblem:
         """
         here = fit.x[None]
         residual = self.residuals(self.rows(fit.rows, fit.coordinates, here))
-        jacobian = self._jacobian(fit.rows, fit.coordinates, here, residual, self.trajectories)[0]
+        jacobian = self._jacobian(fit.rows, fit.coordinates, here, residual, self.trajectories, np.ones(1))[0]
         basis = np.linalg.svd(jacobian, full_matrices=False)[2]
         left = residual[0] - basis.T @ (basis @ residual[0])
         rows = np.repeat(fit.rows[None], len(starts), axis=0)

@@ -29,6 +29,9 @@ MIN_GAIN = 0.05
 """Share of the held-out RMSE that an effect must remove."""
 MIN_GAIN_FLOORS = 0.7
 """Gap that an effect must close, as sqrt(before^2 - after^2), in noise floors."""
+KEEP_TAIL = 0.1
+"""Share of the resamples that may see no gain from an effect that is in the model already: what was
+earned is not lost to the luck of another local fit."""
 NAMED = 0.9
 """Share of the resamples that must choose an effect for it to be named."""
 PENALTY = 0.01
@@ -37,18 +40,29 @@ TIE = 0.01
 """Relative RMSE within which two candidates are a tie whatever their interval."""
 EXPLAINED = 1.1
 """A winner within this factor of the noise floor leaves white residuals ..."""
-EXCESS_FLOORS = 0.25
-"""... so that an alternative with this much more, in noise floors, is worse even if only few motions show
-it: thousands of samples carry that difference."""
+EXCESS_FLOORS = 0.15
+"""... so that an alternative that leaves this much more, in noise floors, is worse: thousands of samples
+carry that difference."""
 RECOVERED = 0.5
 """Share of the squared gap that the named effects must recover; less is an unknown cause."""
+RANDOM = "command_jitter"
+"""The effect that no single prediction shows (:mod:`vd.gap.jitter`); it is tried when nothing else is
+enough, and as the last."""
+JITTER_START_S = 0.005
+MIN_TRAJECTORIES = 3
+DETERMINED = ("kp", "kd", "inertia")
+"""Baseline parameters that every useful excitation determines."""
+WIDE = 10.0
+"""Ratio of the ends of an interval from which a parameter counts as open."""
 MAX_EFFECTS = 3
+MAX_ROUNDS = 6
+"""Rounds in all, with those after a revision."""
 SHORT_LIST = 10
 """Candidates of a round that are fitted, after the linear screening of all."""
-FINALISTS = 5
+FINALISTS = 6
 """Candidates of a round that are fitted to the end."""
 STARTS = 2
-SCREEN_ITERATIONS = 4
+SCREEN_ITERATIONS = 7
 FULL_ITERATIONS = 12
 
 Call = tuple[str, dict[str, Any]]
@@ -132,12 +146,63 @@ class Selection:
 
     def explain(self, baseline: JointFit) -> Explanation:
         """Select effects, starting from the fitted baseline."""
+        loose = self.undetermined(baseline)
+        if len(baseline.sse) < MIN_TRAJECTORIES:
+            text = (
+                f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_TRAJECTORIES} at least"
+            )
+            return Explanation(baseline, baseline, "under_excited", text)
         if baseline.held_out_rmse < NO_GAP * self.floor:
+            if loose:
+                return Explanation(baseline, baseline, "under_excited", loose)
             return Explanation(baseline, baseline, "no_gap", "the plain model is within the noise floor")
-        present = baseline
-        trials: list[Trial] = []
+        present, rivals, trials = baseline, {}, self.contradicted(baseline)
+        tried = 0
+        while tried < MAX_ROUNDS:
+            longer, added, rows = self.extend(present, tried)
+            trials += rows
+            tried = max((row.round for row in rows), default=MAX_ROUNDS)
+            rivals.update(added)
+            if longer is present:
+                break
+            present = longer
+            if RANDOM in present.effects:
+                break
+            if len(present.effects) > 1:
+                revised, rivals = self.revise(present)
+                if set(revised.effects) == set(present.effects) or len(revised.effects) >= MAX_EFFECTS:
+                    present = revised
+                    break
+                present = revised
+            if present.held_out_rmse < NO_GAP * self.floor or len(present.effects) >= MAX_EFFECTS:
+                break
+        return self.conclude(baseline, present, rivals, trials, loose)
+
+    def contradicted(self, baseline: JointFit) -> list[Trial]:
+        """The rows of candidates that telemetry rules out."""
+        unknown = float("nan"), float("nan")
+        return [
+            Trial(
+                1,
+                name,
+                replace(baseline, held_out=baseline.held_out * np.nan),
+                unknown[0],
+                unknown,
+                reason=why,
+            )
+            for name, why in self.vetoes.items()
+            if name in self.candidates
+        ]
+
+    def extend(self, present: JointFit, done: int) -> tuple[JointFit, dict[str, list[JointFit]], list[Trial]]:
+        """Add effects one by one while they are earned.
+
+        Returns:
+            The larger model, the fits with others in the place of each added effect, and the evidence.
+        """
         rivals: dict[str, list[JointFit]] = {}
-        for number in range(1, MAX_EFFECTS + 1):
+        trials: list[Trial] = []
+        for number in range(done + 1, MAX_ROUNDS + 1):
             fits = self.fit_candidates(present)
             if not fits:
                 break
@@ -146,23 +211,27 @@ class Selection:
             trials += self.judge(number, present, fits, best, accepted, why)
             if not accepted:
                 break
-            name = best.effects[-1]
+            name, before, after = best.effects[-1], present.held_out_rmse, best.held_out_rmse
+            self.report(f"+ {name}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
             rivals[name] = list(fits.values())
-            self.report(
-                f"+ {name}: {1e3 * present.held_out_rmse:.2f} -> {1e3 * best.held_out_rmse:.2f} mrad held out"
-            )
             present = best
-            if present.held_out_rmse < NO_GAP * self.floor:
+            if name == RANDOM:
                 break
-        if len(present.effects) > 1:
-            present, rivals = self.revise(present)
-        return self.conclude(baseline, present, rivals, trials)
+            if present.held_out_rmse < NO_GAP * self.floor or len(present.effects) >= MAX_EFFECTS:
+                break
+        return present, rivals, trials
+
+    def undetermined(self, fit: JointFit) -> str:
+        """Which parameter of the baseline the motions leave open, in words; empty if none."""
+        for key, (low, high) in intervals(fit, self.floor).items():
+            if key in DETERMINED and high > WIDE * low:
+                return f"{key} can lie anywhere between {low:.2g} and {high:.2g}: the motions do not show it"
+        return ""
 
     def fit_candidates(self, present: JointFit, skip: Sequence[str] = ()) -> dict[str, JointFit]:
         """Fits with each promising further effect, the finalists to convergence, by name."""
-        names = [
-            n for n in self.candidates if n not in present.effects and n not in skip and n not in self.vetoes
-        ]
+        skip = {*present.effects, *self.vetoes, *skip}
+        names = [name for name in self.candidates if name not in skip and name != RANDOM]
         starts = {name: sizes(name, self.others, self.scales) for name in names}
         flat = [(name, start) for name in names for start in starts[name]]
         if not flat:
@@ -184,8 +253,23 @@ class Selection:
         refits = self.run(
             [self.call(present, fit.effects[-1], [fit.values], FULL_ITERATIONS) for fit in finalists]
         )
-        fits = {fit.effects[-1]: fit for fit in screened[FINALISTS:]}
-        return {**{r[0].effects[-1]: r[0] for r in refits}, **fits}
+        fits = {fit.effects[-1]: fit for fit in (*(r[0] for r in refits), *screened[FINALISTS:])}
+        if RANDOM in self.candidates and RANDOM not in skip:
+            if min(fit.rmse for fit in fits.values()) > NO_GAP * self.floor:
+                fits[RANDOM] = self.run([("fit_jitter", self.jitter_start(present, fits))])[0]
+        return fits
+
+    def jitter_start(self, present: JointFit, fits: Mapping[str, JointFit]) -> dict[str, Any]:
+        """Where the fit of a random delay starts: at the constant delay, if that was fitted."""
+        delay = fits.get("command_delay")
+        start = {**present.values, "command_delay.delay_s": JITTER_START_S}
+        return {
+            "base": present.rows,
+            "effects": present.effects,
+            "starts": [start if delay is None else delay.values],
+            "scales": self.scales,
+            "iterations": FULL_ITERATIONS,
+        }
 
     def call(
         self, present: JointFit, name: str, starts: Sequence[Mapping[str, float]], iterations: int
@@ -211,17 +295,31 @@ class Selection:
         return error + (price if weights is None else price[:, None])
 
     def winner(self, fits: Sequence[JointFit]) -> JointFit:
-        """The candidate with the best held-out score."""
-        return fits[int(np.argmin(self.scores(fits)))]
+        """The candidate with the best held-out score; the simpler one that it contains if that is as good.
+
+        One with a parameter at its bound wins only if all have.
+        """
+        inside = [fit for fit in fits if not fit.at_bound] or list(fits)
+        best = inside[int(np.argmin(self.scores(inside)))]
+        simpler = [f for f in inside if f.effects[-1] in NESTED.get(best.effects[-1], ())]
+        return next((fit for fit in simpler if self.tied(best, fit)[0]), best)
 
     def gain(self, before: JointFit, after: JointFit) -> tuple[float, tuple[float, float]]:
         """Share of the held-out RMSE removed, with its interval over trajectories."""
         old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
         return 1.0 - after.held_out_rmse / before.held_out_rmse, interval(1.0 - new / old)
 
-    def better(self, before: JointFit, after: JointFit) -> tuple[bool, str]:
-        """Whether the step from one model to the larger is earned, and if not why."""
-        gain, (low, _) = self.gain(before, after)
+    def better(self, before: JointFit, after: JointFit, tail: float = 0.025) -> tuple[bool, str]:
+        """Whether the step from one model to the larger is earned, and if not why.
+
+        Args:
+            before: The smaller model.
+            after: The larger.
+            tail: Share of the resamples that may see no gain.
+        """
+        old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
+        gain = 1.0 - after.held_out_rmse / before.held_out_rmse
+        low = float(np.quantile(1.0 - new / old, tail))
         closed = np.sqrt(max(before.held_out_rmse**2 - after.held_out_rmse**2, 0.0))
         if gain < MIN_GAIN:
             return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
@@ -232,13 +330,16 @@ class Selection:
         return True, ""
 
     def tied(self, winner: JointFit, other: JointFit) -> tuple[bool, tuple[float, float]]:
-        """Whether the recording does not tell two fits apart, and the interval of their difference [rad]."""
+        """Whether the recording does not tell two fits apart, and the interval of their difference [rad].
+
+        A winner at the noise floor leaves white residuals, so that samples count: what the other leaves
+        in excess of it is then decisive, even if few motions show it.
+        """
         best, error = (rmse(fit.held_out, fit.count, self.weights) for fit in (winner, other))
         low, high = interval(error - best)
-        explained = winner.held_out_rmse < EXPLAINED * self.floor
-        excess = other.held_out_rmse**2 - winner.held_out_rmse**2
-        if explained and excess > (EXCESS_FLOORS * self.floor) ** 2:
-            return False, (low, high)
+        if winner.held_out_rmse < EXPLAINED * self.floor:
+            excess = other.rmse**2 - winner.rmse**2
+            return excess < (EXCESS_FLOORS * self.floor) ** 2, (low, high)
         return low <= TIE * winner.held_out_rmse, (low, high)
 
     def judge(
@@ -282,7 +383,7 @@ class Selection:
                 if len(present.effects) < 2:
                     break
                 without = self.refit(present, [e for e in present.effects if e != name])
-                if not self.better(without, present)[0]:
+                if not self.better(without, present, KEEP_TAIL)[0]:
                     self.report(f"- {name}: not needed beside the others")
                     present, changed = without, True
                     break
@@ -313,20 +414,25 @@ class Selection:
         final: JointFit,
         rivals: Mapping[str, list[JointFit]],
         trials: Sequence[Trial],
+        loose: str,
     ) -> Explanation:
         """Confidence, sets and verdict of the final model."""
-        spread = self.spread(final)
+        spread = intervals(final, self.floor)
         accepted = [self.accept(final, name, rivals.get(name, [final]), spread) for name in final.effects]
         explanation = Explanation(baseline, final, "unknown", "", tuple(accepted), tuple(trials))
         if not accepted:
-            best = max((t.gain for t in trials if not t.placebo), default=0.0)
-            why = trials[0].reason if trials else "there is no candidate"
+            tried = [t for t in trials if not t.placebo and np.isfinite(t.gain)]
+            best = max((t.gain for t in tried), default=0.0)
+            why = tried[0].reason if tried else "there is no candidate"
             if baseline.held_out_rmse > 2.0 * self.floor and best < MIN_GAIN:
                 return replace(explanation, reason=f"a gap that no candidate explains ({why})")
+            if loose:
+                return replace(explanation, verdict="under_excited", reason=loose)
             return replace(explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}")
         gap = baseline.held_out_rmse**2 - self.floor**2
         share = (baseline.held_out_rmse**2 - final.held_out_rmse**2) / max(gap, 1e-30)
-        if share < RECOVERED:
+        # What chance does to each sample stays, however well its size is known.
+        if share < RECOVERED and RANDOM not in final.effects:
             text = f"the best candidate recovers {100.0 * share:.0f} % of the squared gap, less than half"
             return replace(explanation, reason=text)
         named = [a.name for a in accepted if a.named]
@@ -354,6 +460,9 @@ class Selection:
             alternatives.append((other, fit.held_out_rmse, ci))
             if same and name not in NESTED.get(other, ()):
                 tied.append(other)
+        if share < NAMED and not tied:
+            rival = int(np.argmax(np.bincount(choice, minlength=len(others) + 1)[1:]))
+            tied.append(others[rival].effects[-1])
         return Accepted(
             name=name,
             confidence=share,
@@ -366,10 +475,6 @@ class Selection:
             tied=tuple(tied),
             at_bound=any(key.startswith(f"{name}.") for key in final.at_bound),
         )
-
-    def spread(self, fit: JointFit) -> dict[str, tuple[float, float]]:
-        """95 % intervals of all parameters of a fit, by key."""
-        return intervals(fit, self.floor)
 
 
 def intervals(fit: JointFit, floor: float, ridge: float = 0.01) -> dict[str, tuple[float, float]]:

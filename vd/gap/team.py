@@ -11,6 +11,7 @@ from typing import Any
 import warp as wp
 
 from vd.gap.fit import JointProblem
+from vd.gap.jitter import fit_jitter
 from vd.gap.recording import Recording
 from vd.gap.rollout import Chain, Rollouts
 
@@ -67,7 +68,10 @@ class Bench:
         """Run a method of the problem: its result, and the trajectories simulated."""
         problem = self.problem(spec)
         before = problem.simulated
-        result = getattr(problem, call[0])(**call[1])
+        if call[0] == "fit_jitter":
+            result = fit_jitter(problem, **call[1])
+        else:
+            result = getattr(problem, call[0])(**call[1])
         return result, problem.simulated - before
 
 

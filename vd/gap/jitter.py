@@ -1,0 +1,164 @@
+"""Fit a delay that varies by chance: no single prediction is right, so the spread is compared too.
+
+Many draws of the delays give the mean and variance of the position at every sample. The likelihood of
+what was measured, under a normal distribution with that mean and that variance on top of the noise
+floor, is maximised over the jitter's two parameters; the rest of the model is that of the best constant
+delay. Its result stands in the table as the RMSE that a normal distribution of constant width would need for
+the same likelihood.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from vd.gap.coordinates import Coordinate, Scales, coordinate
+from vd.gap.fit import JointFit, JointProblem
+from vd.gap.rollout import Rollouts
+
+DRAWS = 16
+"""Realisations of the delays."""
+SMOOTH = 9
+"""Samples over which the variance is averaged: 16 draws alone leave a third of error in it."""
+SHARES = (0.15, 0.4, 0.7, 1.0)
+"""Shares of the mean delay that the search gives to the jitter at its start, the rest to dropped commands."""
+HALF_NORMAL_MEAN = 0.798
+"""Mean of |N(0, 1)|."""
+EVALUATIONS = 40
+STEP = 0.1
+"""Relative step of the finite differences of the likelihood: above the error of the draws."""
+LEAST_DROP = 1e-4
+
+
+class JitterFit:
+    """The jitter of one joint.
+
+    Args:
+        problem: The joint's data.
+        base: Fit with a constant command delay besides the effects that the joint has.
+        scales: Sizes of the joint's motion.
+    """
+
+    def __init__(self, problem: JointProblem, base: JointFit, scales: Scales):
+        self.problem, self.base = problem, base
+        self.coordinates = [coordinate(f"command_jitter.{name}", scales) for name in ("sigma_s", "p_drop")]
+        self.delay = base.values["command_delay.delay_s"]
+        recording = problem.rollouts.recording
+        chosen = [recording.trajectories[int(t)] for t in problem.trajectories]
+        self.size = len(chosen)
+        self.period = float(np.median(np.concatenate([np.diff(t.time) for t in chosen])))
+        # A trajectory's name seeds its draws.
+        copies = tuple(replace(t, file=f"{t.file}#{draw}") for draw in range(DRAWS) for t in chosen)
+        self.rollouts = Rollouts(
+            problem.rollouts.chain,
+            replace(recording, trajectories=copies),
+            dt=problem.rollouts.dt,
+            device=problem.rollouts.device,
+        )
+        self.measured = np.concatenate([t.position[:, self._column] for t in chosen])
+        self.ends = np.cumsum([len(t.time) for t in chosen])[:-1]
+
+    @property
+    def _column(self) -> int:
+        return int(self.problem.rollouts.chain.columns[self.problem.joint])
+
+    def row(self, sigma: float, drop: float) -> np.ndarray:
+        """Rows of the chain with the jitter in place of the constant delay."""
+        rows = self.base.rows.copy()
+        for c in self.base.coordinates:
+            if c.key == "command_delay.delay_s":
+                rows[self.problem.joint, c.column] = 0.0
+        for c, value in zip(self.coordinates, (sigma, drop), strict=True):
+            rows[self.problem.joint, c.column] = value
+        return rows
+
+    def losses(self, sigma: float, drop: float) -> np.ndarray:
+        """Negative log-likelihood of each trajectory [S], less that constant which all models share."""
+        predicted = self.rollouts.predict(self.row(sigma, drop)[None])[0, :, self.problem.joint]
+        self.problem.simulated += DRAWS * self.size
+        draws = predicted.reshape(DRAWS, -1).astype(float)
+        error = self.measured - draws.mean(axis=0)
+        spread = np.split(draws.var(axis=0, ddof=1), self.ends)
+        kernel = np.ones(SMOOTH) / SMOOTH
+        smooth = np.concatenate([np.convolve(part, kernel, mode="same") for part in spread])
+        # The mean of the draws has an error of its own.
+        variance = self.problem.floor**2 + (1.0 + 1.0 / DRAWS) * smooth
+        losses = 0.5 * (np.log(variance) + error**2 / variance)
+        return np.array([part.sum() for part in np.split(losses, self.ends)])
+
+    def fit(self) -> JointFit:
+        """The jitter with the largest likelihood, as a fit like any other."""
+
+        def total(x: np.ndarray) -> float:
+            return float(self.losses(*self._values(x)).sum())
+
+        starts = []
+        for share in SHARES:
+            sigma = share * self.delay / HALF_NORMAL_MEAN
+            # A dropped command lasts for the one before: on average p / (1 - p) periods.
+            periods = (1.0 - share) * self.delay / self.period
+            drop = max(periods / (1.0 + periods), LEAST_DROP)
+            starts.append(np.log([max(sigma, 1e-4), drop]))
+        start = min(starts, key=total)
+        simplex = start + np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 1.0]])
+        options = {"maxfev": EVALUATIONS, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
+        best = minimize(total, start, method="Nelder-Mead", options=options)
+        return self._result(*self._values(best.x))
+
+    def _values(self, x: np.ndarray) -> tuple[float, float]:
+        limits = [c.value(c.upper) for c in self.coordinates]
+        sigma, drop = (min(float(np.exp(v)), float(limit)) for v, limit in zip(x, limits, strict=True))
+        return sigma, drop
+
+    def _result(self, sigma: float, drop: float) -> JointFit:
+        """Equivalent errors, and the curvature of the likelihood in the place of the Gauss-Newton matrices."""
+        keep = [i for i, c in enumerate(self.base.coordinates) if c.key != "command_delay.delay_s"]
+        x = np.array([c.inverse(v) for c, v in zip(self.coordinates, (sigma, drop), strict=True)])
+        steps = np.maximum(STEP * x, [c.inverse(LEAST_DROP) for c in self.coordinates])
+        here = self.losses(sigma, drop)
+        sides = np.empty((2, 2, self.size))
+        for i in range(2):
+            for k, sign in enumerate((1.0, -1.0)):
+                moved = x.copy()
+                moved[i] = max(moved[i] + sign * steps[i], 0.0)
+                pair = [float(c.value(v)) for c, v in zip(self.coordinates, moved, strict=True)]
+                sides[i, k] = self.losses(pair[0], pair[1])
+        size, count = len(keep) + 2, self.problem.count
+        gram, gradient = np.zeros((self.size, size, size)), np.zeros((self.size, size))
+        gram[:, : size - 2, : size - 2] = self.base.gram[:, keep][:, :, keep]
+        gradient[:, : size - 2] = self.base.gradient[:, keep]
+        for i in range(2):
+            curvature = (sides[i, 0] + sides[i, 1] - 2.0 * here) / steps[i] ** 2
+            at = size - 2 + i
+            # No trajectory alone may bend the wrong way by the error of the draws; the sum is what counts.
+            share = max(float(curvature.sum()), 1e-6) / self.size
+            gram[:, at, at] = share * self.problem.floor**2
+            gradient[:, at] = -(sides[i, 0] - sides[i, 1]) / (2.0 * steps[i]) * self.problem.floor**2
+        equivalent = count * np.exp(2.0 * here / count - 1.0)
+        coordinates: list[Coordinate] = [*(self.base.coordinates[i] for i in keep), *self.coordinates]
+        effects = tuple(e for e in self.base.effects if e != "command_delay")
+        return JointFit(
+            effects=(*effects, "command_jitter"),
+            coordinates=tuple(coordinates),
+            x=np.concatenate([self.base.x[keep], x]),
+            rows=self.row(sigma, drop),
+            sse=equivalent,
+            held_out=equivalent,
+            count=count,
+            gram=gram,
+            gradient=gradient,
+        )
+
+
+def fit_jitter(
+    problem: JointProblem,
+    base: np.ndarray,
+    effects: Sequence[str],
+    starts: Sequence[Mapping[str, float]],
+    scales: Scales,
+    iterations: int,
+) -> JointFit:
+    """Fit ``effects`` and jitter: first with a constant delay for its mean, then its spread."""
+    fit = problem.fit(base, (*effects, "command_delay"), starts, scales, iterations=iterations)[0]
+    return JitterFit(problem, fit, scales).fit()
