@@ -9,7 +9,7 @@ after the other, J recorded joints. Times, delays and lost commands are those of
 
 import warp as wp
 
-from vd.kernels.actuators import ENCODER_BIAS, READ_DELAY
+from vd.kernels.actuators import ENCODER_BIAS, READ_DELAY, shape_command
 from vd.kernels.chains import Samples, arrival, split_steps
 from vd.kernels.joint_servo import JOINTS_PER_FINGER
 
@@ -47,14 +47,14 @@ def replay_command_kernel(
     due_fraction: wp.array2d[float],
     held: wp.array2d[float],
     held_power: wp.array2d[float],
+    state: wp.array2d[float],
     # Out:
-    command_out: wp.array2d[float],
+    reference_out: wp.array2d[float],
     power_out: wp.array2d[float],
 ):
-    """The mean command of each servo over the coming physics step. Launch: [W, D].
+    """The mean reference of each servo over the coming physics step. Launch: [W, D].
 
-    As :func:`vd.kernels.joint_servo.receive_command_kernel`, a command acts from its arrival to the end
-    of the step.
+    As in :func:`vd.kernels.joint_servo.receive_command_kernel`, commands that arrive divide the step.
 
     Args:
         parameters: Parameter rows, shape [W D, PARAMETER_COLUMNS].
@@ -67,22 +67,24 @@ def replay_command_kernel(
         due_fraction: And the rest, shape [W, D].
         held: The command that arrived last [rad], shape [W, D].
         held_power: Its power factor, shape [W, D].
-        command_out: Mean commands [rad], shape [W, D].
+        state: State rows, shape [W D, STATE_COLUMNS].
+        reference_out: Mean references [rad], shape [W, D].
         power_out: Mean power factors, shape [W, D].
     """
     world, joint = wp.tid()
     column = tracks.column[joint]
-    if column < 0:
-        return
     finger = joint // JOINTS_PER_FINGER
     row = world * write.shape[1] + joint
     now = step_in[0]
     upcoming = write[world, joint]
     last = tracks.last[world, finger]
+    if column < 0:
+        last = upcoming  # nothing recorded: the first command holds
     value = held[world, joint]
     value_power = held_power[world, joint]
-    command = value
     power = value_power
+    reference = wp.float32(0.0)
+    done = wp.float32(0.0)
     waiting = wp.bool(True)
     while waiting and upcoming < last:
         step, fraction, kept = arrival(samples, upcoming, tracks.stream[world, finger], parameters, row, dt)
@@ -93,11 +95,11 @@ def replay_command_kernel(
             fraction = late_fraction
         if step <= now:
             if kept == 1:
-                share = 1.0
-                if step == now:
-                    share = 1.0 - fraction
-                command += share * (samples.command[upcoming, column] - value)
-                power += share * (samples.power[upcoming, column] - value_power)
+                if step == now and fraction > done:
+                    part = fraction - done
+                    reference += part * shape_command(value, part * dt, parameters, row, state)
+                    done += part
+                power += (1.0 - done) * (samples.power[upcoming, column] - value_power)
                 value = samples.command[upcoming, column]
                 value_power = samples.power[upcoming, column]
             due_step[world, joint] = step
@@ -108,7 +110,9 @@ def replay_command_kernel(
     write[world, joint] = upcoming
     held[world, joint] = value
     held_power[world, joint] = value_power
-    command_out[world, joint] = command
+    rest = 1.0 - done
+    reference += rest * shape_command(value, rest * dt, parameters, row, state)
+    reference_out[world, joint] = reference
     power_out[world, joint] = power
 
 

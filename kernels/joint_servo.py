@@ -2,7 +2,7 @@
 
 Order in a control step: :func:`send_command_kernel` once; before every physics step
 :func:`receive_command_kernel` and :func:`drive_joint_kernel`; after it :func:`finish_joint_kernel`;
-:func:`measure_joint_kernel` once at the end. The model of a joint is :func:`vd.kernels.actuators.servo`;
+:func:`measure_joint_kernel` once at the end. The model of a joint is that of :mod:`vd.kernels.actuators`;
 here its result goes where MuJoCo Warp reads it, per world and physics step.
 
 N worlds, D hand joints of fingers of three; joint ``j`` of world ``w`` has row ``w D + j`` of the
@@ -23,7 +23,8 @@ from vd.kernels.actuators import (
     READ_DELAY,
     STATE_TIME,
     VELOCITY_LIMIT,
-    servo,
+    drive_joint,
+    shape_command,
     start_servo,
 )
 from vd.kernels.chains import CENTRED, implicitness
@@ -101,52 +102,58 @@ def send_command_kernel(
 
 @wp.kernel
 def receive_command_kernel(
+    # Model:
+    parameters: wp.array2d[float],
     # In:
     dt: float,
-    state_in: wp.array2d[float],
     # In/Out:
+    state: wp.array2d[float],
     transit_head: wp.array2d[wp.int32],
     transit_count: wp.array2d[wp.int32],
     transit_value: wp.array3d[float],
     transit_time: wp.array3d[float],
     held: wp.array2d[float],
     # Out:
-    command_out: wp.array2d[float],
+    reference_out: wp.array2d[float],
 ):
-    """The command that a joint has during the coming physics step. Launch: [N, D].
+    """The reference that a joint has during the coming physics step. Launch: [N, D].
 
-    A command that arrives within the step acts for the rest of it: the step's mean, which is the linear
-    interpolation between delays of whole steps.
+    A command that arrives within the step divides it, so that the motion is a smooth function of the
+    delay; the reference is the mean over the step.
 
     Args:
+        parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
         dt: Physics time step [s].
-        state_in: State rows, shape [N D, STATE_COLUMNS].
+        state: State rows, shape [N D, STATE_COLUMNS].
         transit_head: As in :func:`send_command_kernel`.
         transit_count: As in :func:`send_command_kernel`.
         transit_value: As in :func:`send_command_kernel`.
         transit_time: As in :func:`send_command_kernel`.
         held: The command that arrived last [rad], shape [N, D].
-        command_out: Mean command of the step [rad], shape [N, D].
+        reference_out: Mean reference of the step [rad], shape [N, D].
     """
     world, joint = wp.tid()
+    row = world * held.shape[1] + joint
     capacity = transit_value.shape[2]
-    now = state_in[world * held.shape[1] + joint, STATE_TIME]
+    now = state[row, STATE_TIME]
     head = transit_head[world, joint]
     count = transit_count[world, joint]
     value = held[world, joint]
-    mean = wp.float32(0.0)
-    passed = wp.float32(0.0)
+    reference = wp.float32(0.0)
+    done = wp.float32(0.0)
     while count > 0 and transit_time[world, joint, head] < now + dt:
-        part = wp.max(0.0, transit_time[world, joint, head] - now) / dt
-        mean += value * (part - passed)
-        passed = part
+        part = (transit_time[world, joint, head] - now) / dt - done
+        if part > 0.0:
+            reference += part * shape_command(value, part * dt, parameters, row, state)
+            done += part
         value = transit_value[world, joint, head]
         head = (head + 1) % capacity
         count -= 1
     transit_head[world, joint] = head
     transit_count[world, joint] = count
     held[world, joint] = value
-    command_out[world, joint] = mean + value * (1.0 - passed)
+    rest = 1.0 - done
+    reference_out[world, joint] = reference + rest * shape_command(value, rest * dt, parameters, row, state)
 
 
 @wp.kernel
@@ -156,7 +163,7 @@ def drive_joint_kernel(
     inverse_inertia: wp.array2d[float],
     # In:
     dt: float,
-    command_in: wp.array2d[float],
+    reference_in: wp.array2d[float],
     power_in: wp.array2d[float],
     joint_q_in: wp.array2d[float],
     joint_qd_in: wp.array2d[float],
@@ -186,7 +193,7 @@ def drive_joint_kernel(
         parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
         inverse_inertia: Diagonal of the inverse inertia matrix [1/(kg m^2)], shape [N, *].
         dt: Physics time step [s].
-        command_in: Command of this step [rad], shape [N, D].
+        reference_in: Mean reference of this step [rad], shape [N, D].
         power_in: Factor on the controller's gains, 0 with the torque off, shape [N, D].
         joint_q_in: Joint positions [rad], shape [N, *].
         joint_qd_in: Joint velocities [rad/s], shape [N, *].
@@ -200,15 +207,14 @@ def drive_joint_kernel(
         friction_solimp_out: Its solimp, shape [N, *].
     """
     world, joint = wp.tid()
-    row = world * command_in.shape[1] + joint
+    row = world * reference_in.shape[1] + joint
     first = joint - joint % JOINTS_PER_FINGER
     coupled = wp.float32(0.0)
     for k in range(JOINTS_PER_FINGER):
         coupled += parameters[row, COUPLING_0 + k] * joint_q_in[world, first + k]
     speed = joint_qd_in[world, joint]
-    drive = servo(
-        command_in[world, joint],
-        coupled,
+    drive = drive_joint(
+        reference_in[world, joint] + coupled,
         joint_q_in[world, joint],
         speed,
         power_in[world, joint],

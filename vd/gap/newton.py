@@ -188,13 +188,10 @@ class HandReplay:
         self._q[0].assign(start.astype(np.float32))
         self._qd[0].zero_()
         self.solver.reset(self._states[0], flags=newton.StateFlags(0))
-        self.servo.command.assign(self._start_command.astype(np.float32))
-        self.servo.power.assign(self._start_power.astype(np.float32))
-        self.servo.reset(
-            wp.ones(self.num_worlds, dtype=wp.int32, device=self.device), command=self.servo.command
-        )
-        wp.copy(self._held, self.servo.command)
-        wp.copy(self._held_power, self.servo.power)
+        self._held.assign(self._start_command.astype(np.float32))
+        self._held_power.assign(self._start_power.astype(np.float32))
+        wp.copy(self.servo.power, self._held_power)
+        self.servo.reset(wp.ones(self.num_worlds, dtype=wp.int32, device=self.device), command=self._held)
         for array in (self._step, self.squared_error, self._due_step, self._due_fraction):
             array.zero_()
         self._write.assign(self._first_sample)
@@ -224,8 +221,8 @@ class HandReplay:
             wp.launch(
                 replay_command_kernel,
                 dim=dim,
-                inputs=[*given, self.dt, self._step, *commands],
-                outputs=[servo.command, servo.power],
+                inputs=[*given, self.dt, self._step, *commands, servo.state],
+                outputs=[servo.reference, servo.power],
                 device=self.device,
             )
             servo.drive(self._q[here], self._qd[here])

@@ -91,8 +91,9 @@ class JointServo:
         """State rows, shape [N D, STATE_COLUMNS]."""
         self.power = wp.ones((n, d), dtype=float, device=self.device)
         """Factor on the controllers' gains; 0 switches the torque off, shape [N, D]."""
-        self.command = zeros(n, d)
-        """Command at the servo in the present physics step [rad], shape [N, D]."""
+        self.reference = zeros(n, d)
+        """What filter, profile and backlash make of the commands in the present physics step [rad],
+        its mean, shape [N, D]."""
         self.measured_q = zeros(n, d)
         """Positions as the servos report them [rad], with read delay and bias, shape [N, D]."""
         bounds = {column: PARAMETERS[column][1].upper for column in DELAYS}
@@ -186,19 +187,18 @@ class JointServo:
         )
 
     def receive(self) -> None:
-        """Find the command of the coming physics step among those sent."""
-        self._launch(
-            receive_command_kernel, [self.dt, self.state, *self._transit, self._held], [self.command]
-        )
+        """Find the references of the coming physics step from the commands sent."""
+        inputs = [self.parameters, self.dt, self.state, *self._transit, self._held]
+        self._launch(receive_command_kernel, inputs, [self.reference])
 
     def drive(self, joint_q: wp.array2d, joint_qd: wp.array2d) -> None:
-        """Advance the servos by one physics step under ``command`` and set the solver's drives.
+        """Advance the servos by one physics step under ``reference`` and set the solver's drives.
 
         Args:
             joint_q: Joint positions at the start of the step [rad], shape [N, *].
             joint_qd: Joint velocities [rad/s], shape [N, *].
         """
-        inputs = [self.parameters, self._inverse_inertia, self.dt, self.command, self.power]
+        inputs = [self.parameters, self._inverse_inertia, self.dt, self.reference, self.power]
         self._launch(drive_joint_kernel, [*inputs, joint_q, joint_qd, self.state], self._outputs)
 
     def finish(self, previous_q: wp.array2d, joint_q: wp.array2d, joint_qd: wp.array2d) -> None:
