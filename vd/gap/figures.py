@@ -195,11 +195,11 @@ def evidence_figure(report: Report, joints: tuple[str, ...]) -> Figure:
         axes.set_yticks(range(len(group)), names, fontsize=8)
         axes.axvline(0.0, color=INK, linewidth=0.8)
         axes.set_xlim(left=_lower_limit(group), right=104.0)
-        axes.set_title(
-            "first effect" if number == 1 else f"effect {number}, given the ones before", fontsize=9
-        )
-        axes.set_xlabel("error removed on held-out motions [%]", fontsize=9)
+        axes.set_title("first effect" if number == 1 else f"effect {number}", fontsize=9)
         axes.tick_params(axis="x", labelsize=8)
+    figure.supxlabel(
+        "share of the error on held-out motions that it removes, given the effects before [%]", fontsize=9
+    )
     for label, color in (("accepted", GREEN), ("cannot be told apart", BLUE), ("rejected", GREY)):
         panels[0].plot([], [], "o", color=color, label=label)
     figure.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=9)

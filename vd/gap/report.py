@@ -28,6 +28,8 @@ from vd.page import Page
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
 FIGURE_DPI = 150
+MAX_FINDINGS = 3
+"""Shown of each joint, the largest first; report.json has all."""
 MAX_ALTERNATIVES = 5
 """Shown beside a named effect; the evidence table has all."""
 
@@ -116,7 +118,9 @@ def _found(page: Page, report: Report) -> None:
             "Before any effect is added, the plain servo model (stiffness, damping, speed limit) is fitted. "
             "What it cannot follow:"
         )
-        page.points([finding_text(finding) for finding in report.findings])
+        for joint in dict.fromkeys(finding.joint for finding in report.findings):
+            found = [finding for finding in report.findings if finding.joint == joint]
+            page.points([finding_text(finding) for finding in found[:MAX_FINDINGS]])
     else:
         page.text("Nowhere by more than noise, once the plain servo model is fitted.")
     if report.joints:
