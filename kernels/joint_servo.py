@@ -224,13 +224,16 @@ def drive_joint_kernel(
         state,
     )
     mobility = inverse_inertia[world, joint]
+    damping = drive.damping * implicitness(dt * drive.damping * mobility)
+    explicit = (drive.damping - damping) * speed
     reference = drive.reference
-    damping = drive.damping
+    torque = drive.torque
     if drive.stiffness > 0.0:
-        damping *= implicitness(dt * damping * mobility)
-        reference -= (drive.damping - damping) * speed / drive.stiffness
+        reference -= explicit / drive.stiffness
+    else:
+        torque -= explicit
     reference_out[world, joint] = reference
-    joint_force_out[world, joint] = drive.torque
+    joint_force_out[world, joint] = torque
     gain_out[world, joint][0] = drive.stiffness
     bias_out[world, joint][1] = -drive.stiffness
     bias_out[world, joint][2] = -damping

@@ -1,0 +1,155 @@
+"""Commands in transit, measured positions and limits of the simulator's servo, against NumPy."""
+
+import numpy as np
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_oracle import EXAMPLES, device_array, floats, streams, unwritten
+
+from vd.kernels import actuators as servo
+from vd.kernels.effects import neutral_row
+from vd.kernels.joint_servo import (
+    finish_joint_kernel,
+    joint_inertia_kernel,
+    measure_joint_kernel,
+    receive_command_kernel,
+    send_command_kernel,
+)
+
+DT = 1.0 / 120.0
+SUBSTEPS = 4
+CONTROL_DT = SUBSTEPS * DT
+
+
+def hundredths(low: int, high: int) -> st.SearchStrategy[float]:
+    """Numbers from ``low`` to ``high`` hundredths."""
+    return st.integers(low, high).map(lambda value: value / 100.0)
+
+
+def parameter_rows(count: int, **columns: object) -> np.ndarray:
+    """Neutral rows with columns, by the names of their constants, set."""
+    rows = np.tile(neutral_row(), (count, 1))
+    for name, value in columns.items():
+        rows[:, getattr(servo, name)] = value
+    return rows
+
+
+def mean_of_delayed(commands: np.ndarray, start: float, delay: float, step: int) -> float:
+    """Mean over physics step ``step`` of commands that hold from k CONTROL_DT + DT / 2 + delay on.
+
+    Integrated on a grid a thousand times finer.
+    """
+    times = (step + (np.arange(1000) + 0.5) / 1000.0) * DT
+    index = np.floor((times - 0.5 * DT - delay) / CONTROL_DT + 1e-9).astype(int)
+    return float(np.where(index < 0, start, commands[np.clip(index, 0, len(commands) - 1)]).mean())
+
+
+@EXAMPLES
+@given(commands=floats((6,)), start=hundredths(-200, 200), delay=hundredths(0, 15))
+def test_commands_arrive_after_their_delay(device, commands, start, delay):
+    joints, capacity = 2, 8
+    rows = device_array(parameter_rows(joints, COMMAND_DELAY=[0.0, delay]), float, device)
+    state = device_array(np.zeros((joints, servo.STATE_COLUMNS)), float, device)
+    head, count = (wp.zeros((1, joints), dtype=wp.int32, device=device) for _ in range(2))
+    value, time = (unwritten((1, joints, capacity), float, device) for _ in range(2))
+    held = device_array(np.full((1, joints), start), float, device)
+    rng = streams(1, 0, device)
+    transit = [head, count, value, time]
+    for control, command in enumerate(commands):
+        both = device_array([[command, command]], float, device)
+        wp.launch(send_command_kernel, dim=1, inputs=[rows, DT, both, state, rng, *transit], device=device)
+        for k in range(SUBSTEPS):
+            reference = unwritten((1, joints), float, device)
+            wp.launch(
+                receive_command_kernel,
+                dim=(1, joints),
+                inputs=[rows, DT, state, *transit, held],
+                outputs=[reference],
+                device=device,
+            )
+            step = control * SUBSTEPS + k
+            expected = [mean_of_delayed(commands, start, d, step) for d in (0.0, delay)]
+            # The grid resolves a thousandth of a step; commands jump by 4 at most.
+            assert np.allclose(reference.numpy()[0], expected, atol=0.02)
+            clock = state.numpy()
+            clock[:, servo.STATE_TIME] += DT
+            state.assign(clock)
+
+
+def test_jitter_delays_in_order_and_drops_its_share(device):
+    worlds, sends = 4000, 3
+    rows = device_array(parameter_rows(worlds, JITTER_SIGMA=0.05, JITTER_DROP=0.25), float, device)
+    state = device_array(np.zeros((worlds, servo.STATE_COLUMNS)), float, device)
+    head, count = (wp.zeros((worlds, 1), dtype=wp.int32, device=device) for _ in range(2))
+    value, time = (unwritten((worlds, 1, 4), float, device) for _ in range(2))
+    rng = streams(worlds, 1, device)
+    command = wp.zeros((worlds, 1), dtype=float, device=device)
+    for _ in range(sends):
+        inputs = [rows, DT, command, state, rng, head, count, value, time]
+        wp.launch(send_command_kernel, dim=worlds, inputs=inputs, device=device)
+    kept = count.numpy()[:, 0]
+    # Six standard deviations of a binomial mean.
+    assert abs(kept.mean() / sends - 0.75) < 6.0 * np.sqrt(0.75 * 0.25 / (worlds * sends))
+    arrivals = time.numpy()[:, 0]
+    first = arrivals[kept > 0, 0] - 0.5 * DT
+    assert first.min() >= 0.0
+    # The mean of |N(0, sigma)| is sigma sqrt(2 / pi).
+    assert abs(first.mean() - 0.05 * np.sqrt(2.0 / np.pi)) < 6.0 * 0.05 / np.sqrt(worlds)
+    all_kept = arrivals[kept == sends][:, :sends]
+    assert np.all(np.diff(all_kept, axis=1) >= 0.0)
+
+
+@EXAMPLES
+@given(
+    positions=floats((12,)),
+    delay=hundredths(0, 6),
+    bias=hundredths(-50, 50),
+    limit=hundredths(50, 5000),
+)
+def test_measured_positions_are_old_limited_and_biased(device, positions, delay, bias, limit):
+    rows = device_array(
+        parameter_rows(1, READ_DELAY=delay, ENCODER_BIAS=bias, VELOCITY_LIMIT=limit), float, device
+    )
+    index = wp.zeros((1, 1), dtype=wp.int32, device=device)
+    history = device_array(np.zeros((1, 1, 10)), float, device)
+    past, before = [0.0] * 12, 0.0
+    for position in positions:
+        speed = (position - before) / DT
+        allowed = float(np.clip(speed, -limit, limit))
+        after = position if abs(speed) <= limit else before + allowed * DT
+        q, qd = device_array([[position]], float, device), device_array([[speed]], float, device)
+        wp.launch(
+            finish_joint_kernel,
+            dim=(1, 1),
+            inputs=[rows, DT, device_array([[before]], float, device), q, qd, index],
+            outputs=[history],
+            device=device,
+        )
+        assert np.allclose(qd.numpy(), allowed, rtol=1e-4, atol=1e-4)
+        assert np.allclose(q.numpy(), after, atol=1e-4)
+        before = float(q.numpy()[0, 0])
+        past.append(before)
+        measured = unwritten((1, 1), float, device)
+        wp.launch(
+            measure_joint_kernel,
+            dim=(1, 1),
+            inputs=[rows, DT, index, history],
+            outputs=[measured],
+            device=device,
+        )
+        expected = np.interp(-delay, np.arange(-len(past) + 1, 1) * DT, past) + bias
+        assert np.allclose(measured.numpy(), expected, atol=1e-3)
+
+
+def test_inertia_goes_to_its_joint(device):
+    rows = parameter_rows(6, INERTIA=np.arange(6.0), PAYLOAD_INERTIA=10.0)
+    armature = unwritten((2, 5), float, device)
+    wp.launch(
+        joint_inertia_kernel,
+        dim=(2, 3),
+        inputs=[device_array(rows, float, device)],
+        outputs=[armature],
+        device=device,
+    )
+    assert np.array_equal(armature.numpy()[:, :3], [[10.0, 11.0, 12.0], [13.0, 14.0, 15.0]])
+    assert np.isnan(armature.numpy()[:, 3:]).all()
