@@ -22,7 +22,7 @@ from vd.files import write_json, write_text
 from vd.gap.excitations import MENU, Excitation, JointRange
 from vd.gap.recording import BARE_MODELS, Recording, Trajectory
 from vd.gap.result import Report, parameter_columns, parameter_of
-from vd.gap.rollout import Chain, Rollouts, chains
+from vd.gap.rollout import STEP_S, Chain, Rollouts, chains
 from vd.gap.words import listing, plain
 from vd.kernels.effects import BASELINE, EFFECTS
 
@@ -42,6 +42,8 @@ FINE_STEP_S = 1.0 / 2400.0
 """Time step [s]: rivals differ by less than a delay of the fit's own step."""
 VISIBLE = 3.0
 """Disagreement, in noise floors, from which a recording is expected to decide."""
+PLAIN = "plain servo"
+"""The model without any further effect."""
 PAYLOAD_SET = "second_payload"
 """Set that changes the load; only a pendulum's load is modelled."""
 PAYLOAD_FACTORS = (1.0, 2.0)
@@ -126,9 +128,10 @@ def plan(
                 motions = _motions(name, reach, recording, joint)
                 if not motions:
                     continue
-                pairs = _disagreements(chain, recording, motions, joint, models, floor, device)
-                # Rivals have to be separated for sure; where anything is possible, much of it has to show.
-                value = float(np.min(pairs) if targets[joint] else np.mean(pairs))
+                step = FINE_STEP_S if targets[joint] else STEP_S
+                pairs = _disagreements(chain, recording, motions, joint, models, floor, step, device)
+                # Rivals have to be separated for sure; where anything is possible, it is the sum that counts.
+                value = float(np.min(pairs) if targets[joint] else np.sqrt(np.mean(np.square(pairs))))
                 totals.setdefault(name, []).append(value)
                 seconds[name] = seconds.get(name, 0.0) + sum(motion.duration for motion in motions)
                 kept.setdefault(name, []).extend(motions)
@@ -244,7 +247,7 @@ def _models(
     if len(models) >= 2:
         return models
     # Nothing in particular competes: which motion would show the most of everything?
-    models = {"plain servo": base}
+    models = {PLAIN: base}
     for effect in EFFECTS.values():
         if effect.name == "joint_coupling" and len(chain.joints) == 1:
             continue
@@ -305,9 +308,10 @@ def _disagreements(
     joint: str,
     models: Mapping[str, np.ndarray],
     floor: float,
+    dt: float,
     device: str,
 ) -> list[float]:
-    """RMS difference [rad] of every pair of models, what refitting absorbs taken out."""
+    """RMS difference [rad] of every two rivals, or of each to the plain servo, after refitting."""
     known = _known(recording, joint)
     imagined = replace(
         recording,
@@ -326,7 +330,7 @@ def _disagreements(
             for index, motion in enumerate(motions)
         ),
     )
-    rollouts = Rollouts(chain, imagined, dt=FINE_STEP_S, device=device)
+    rollouts = Rollouts(chain, imagined, dt=dt, device=device)
     old = sum(len(trajectory.time) for trajectory in known)
     index = chain.joints.index(joint)
     rows, free = [], []
@@ -344,9 +348,12 @@ def _disagreements(
         curves.append(predicted[place])
         slopes.append((predicted[place + 1 : place + 1 + len(columns)] - predicted[place]) / STEP)
         place += 1 + len(columns)
+    count = len(models)
+    plain_first = PLAIN in models  # then every effect is one of many, and is compared with none
+    pairs = [(0, b) for b in range(1, count)] if plain_first else itertools.combinations(range(count), 2)
     return [
         _left_over(curves[a] - curves[b], np.concatenate([slopes[a], slopes[b]]), floor, old)
-        for a, b in itertools.combinations(range(len(curves)), 2)
+        for a, b in pairs
     ]
 
 

@@ -117,10 +117,11 @@ class Analysis:
 
     @cached_property
     def start(self) -> dict[str, np.ndarray]:
-        """Parameter row of each joint from the layer that the analysis starts from; empty without."""
+        """Parameter row of each excited joint from the layer that the analysis starts from; empty without."""
         if self.settings.hand_layer is None:
             return {}
-        joints = self.recording.joints
+        moved = {joint for trajectory in self.recording.trajectories for joint in trajectory.joints}
+        joints = tuple(joint for joint in self.recording.joints if joint in moved)
         if self.hand is not None:
             names = self.hand.joint_names
             return {joint: self.hand.servo[names.index(joint)] for joint in joints if joint in names}
