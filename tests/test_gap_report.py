@@ -262,6 +262,14 @@ def test_parameters_reach_their_columns(report):
     assert effect_values(report.effects, JOINTS[0]) == {}
 
 
+def test_figures_of_an_earlier_analysis_go(report, tmp_path):
+    (tmp_path / "overlay_f0_j9_old.png").write_bytes(b"")
+    (tmp_path / "mine.png").write_bytes(b"")
+    write_report(report, None, tmp_path)
+    assert not (tmp_path / "overlay_f0_j9_old.png").exists()
+    assert (tmp_path / "mine.png").exists()
+
+
 def test_page_stands_alone_and_says_what_was_found(report, curves, tmp_path):
     files = write_report(report, curves, tmp_path)
     page = (tmp_path / "report.html").read_text()

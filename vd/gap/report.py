@@ -27,6 +27,7 @@ from vd.kernels.effects import EFFECTS
 from vd.page import Page
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"
+FIGURES = ("gap.png", "overlay_*.png", "residual_*.png", "evidence_*.png")
 FIGURE_DPI = 150
 MAX_FINDINGS = 3
 """Shown of each joint, the largest first; report.json has all."""
@@ -53,6 +54,9 @@ def write_report(report: Report, curves: Predictions | None, folder: Path) -> li
     Returns:
         The files written.
     """
+    for pattern in FIGURES:  # of an earlier analysis, of which other motions were drawn
+        for path in Path(folder).glob(pattern):
+            path.unlink()
     report.write(folder / REPORT_JSON)
     page = Page("Gap report: " + report.recording.model, verdict_sentence(report))
     pictures = _Pictures(page, folder)
