@@ -1,0 +1,166 @@
+"""Newton replays a recording as the rollouts predict it, and the paper's search finds what made one."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vd.assets_usd.hands import load_hand
+from vd.gap.excitations import JointRange, steps_and_sines
+from vd.gap.newton import HandReplay, identify, pack_tracks, simulate_hand
+from vd.gap.recording import Recording, Trajectory
+from vd.gap.rollout import Rollouts, chains
+from vd.kernels import actuators as servo
+
+HAND = load_hand("dclaw3")
+EFFECTS: dict[str, dict[str, float]] = {
+    "plain": {},
+    "late": {"COMMAND_DELAY": 0.013, "READ_DELAY": 0.021, "ENCODER_BIAS": 0.02, "JITTER_SIGMA": 0.01},
+    "shaped": {"FILTER_TAU": 0.03, "ACCELERATION_LIMIT": 40.0, "BACKLASH_WIDTH": 0.03},
+    "rubbing": {"COULOMB_TORQUE": 0.1, "LOAD_FRICTION": 0.15},
+    "weak": {"TORQUE_LIMIT": 0.5, "THERMAL_RATE": 0.1, "SUPPLY_SAG": 0.3},
+    "loaded": {
+        "PAYLOAD_INERTIA": 2e-3,
+        "GRAVITY_TORQUE": 0.05,
+        "INTEGRAL_GAIN": 2.0,
+        "DEAD_ZONE_WIDTH": 0.02,
+    },
+    "elastic": {"ELASTIC_STIFFNESS": 3.0, "ELASTIC_DAMPING": 5e-3, "ELASTIC_INERTIA": 2e-3},
+}
+
+
+@cache
+def motions(kind: str, joints: tuple[str, ...], seconds: float) -> Recording:
+    """The start of one of the paper's excitations on some joints, with the commands as positions."""
+    reach = JointRange(HAND.joint_names, HAND.lower, HAND.upper)
+    trajectories = []
+    for motion in steps_and_sines(reach):
+        if motion.name == kind and motion.joints[0] in joints:
+            keep = motion.time <= seconds
+            command = motion.command[keep]
+            start = np.tile(command[0], (len(command), 1))
+            trajectories.append(
+                Trajectory(
+                    f"{motion.joints[0]}.csv",
+                    kind,
+                    motion.joints,
+                    motion.conditions,
+                    motion.time[keep],
+                    command,
+                    start,
+                    motion.enabled[keep],
+                )
+            )
+    return Recording(Path("unsaved"), HAND.name, HAND.joint_names, {}, 1e-4, tuple(trajectories))
+
+
+def rows(**columns: float) -> np.ndarray:
+    """The hand's servo rows with columns, by the names of their constants, set for all joints."""
+    values = HAND.servo.copy()
+    for name, value in columns.items():
+        values[:, getattr(servo, name)] = value
+    return values
+
+
+def test_newton_agrees_with_the_rollouts_under_every_kind_of_effect():
+    recording = motions("sine_0.50hz", ("f0_j1", "f0_j2"), 0.9)
+    count, length = 2, len(recording.trajectories[0].time)
+    tracks = np.tile(np.array([[0, -1, -1], [1, -1, -1]]), (len(EFFECTS), 1))
+    replay = HandReplay(recording, HAND, tracks, keep_positions=True)
+    each = np.stack([rows(**columns) for columns in EFFECTS.values()])
+    replay.run(np.repeat(each, count, axis=0))
+    newton = replay.positions.numpy()[:, :, :3].reshape(len(EFFECTS), count * length, 3)
+    predicted = Rollouts(chains(recording, HAND)[0], recording).predict(each[:, :3])
+    error = np.sqrt(np.mean((newton - predicted) ** 2, axis=(1, 2)))
+    moved = np.sqrt(np.mean((predicted - predicted[0]) ** 2, axis=(1, 2)))
+    for name, rmse, effect in zip(EFFECTS, error, moved, strict=True):
+        assert rmse < 1e-3, f"{name}: {rmse:.2e} rad"
+        assert name == "plain" or effect > 3.0 * rmse, f"{name} changes nothing: {effect:.2e} rad"
+    # The squared error that the search uses is that of the same positions.
+    measured = np.concatenate([t.position[:, :3] for t in recording.trajectories])
+    expected = ((newton - measured) ** 2).reshape(len(EFFECTS), count, length, 3).sum(axis=2)
+    squared = replay.squared_error.numpy()[:, :3].reshape(len(EFFECTS), count, 3)
+    assert np.allclose(squared, expected, rtol=1e-3, atol=1e-6)
+
+
+def test_positions_come_in_the_columns_of_the_recording():
+    recording = motions("sine_0.50hz", ("f0_j1", "f0_j2"), 0.3)
+    columns = [4, 1, 0]
+    shuffled = replace(
+        recording,
+        joints=tuple(recording.joints[c] for c in columns),
+        trajectories=tuple(
+            replace(
+                t,
+                command=t.command[:, columns],
+                position=t.position[:, columns],
+                enabled=t.enabled[:, columns],
+            )
+            for t in recording.trajectories
+        ),
+    )
+    whole = simulate_hand(recording, HAND, rows(), dt=1.0 / 240.0, indices=[1])
+    part = simulate_hand(shuffled, HAND, rows(), dt=1.0 / 240.0, indices=[1])
+    assert part.shape == (len(recording.trajectories[1].time), 3)
+    # Joint f0_j3 now stands at zero, not at its centre, which moves f0_j1 and f0_j2 a little.
+    assert np.abs(part - whole[:, columns]).max() < 0.02 < np.ptp(whole[:, 1])
+
+
+def test_torque_off_lets_a_finger_hang():
+    recording = motions("step_large", ("f0_j2",), 1.0)
+    (trajectory,) = recording.trajectories
+    enabled = np.zeros_like(trajectory.enabled)
+    limp = replace(recording, trajectories=(replace(trajectory, enabled=enabled),))
+    held = simulate_hand(recording, HAND, rows(), dt=1.0 / 240.0)
+    free = simulate_hand(limp, HAND, rows(), dt=1.0 / 240.0)
+    assert np.ptp(held[:, 1]) > 0.3 and np.abs(free[:, 1] - held[:, 1]).max() > 0.3
+
+
+def test_fingers_are_packed_into_the_same_worlds():
+    recording = motions("sine_0.50hz", ("f0_j1", "f0_j2", "f1_j1"), 0.3)
+    assert pack_tracks(recording, HAND, [0, 1]).tolist() == [[0, 2, -1], [1, -1, -1]]
+    with pytest.raises(ValueError, match="no trajectory excites finger 2"):
+        pack_tracks(recording, HAND, [0, 2])
+
+
+def test_unknown_joints_are_named():
+    recording = replace(motions("sine_0.50hz", ("f0_j1",), 0.3), joints=("elbow",) * 9)
+    with pytest.raises(ValueError, match="elbow"):
+        simulate_hand(recording, HAND, rows())
+
+
+def test_the_search_finds_the_gains_that_made_a_recording():
+    """Two fingers, one joint each, searched together; the true gains are 40 % off the start."""
+    joints, dt = ("f0_j1", "f1_j2"), 1.0 / 120.0
+    recording = motions("step_large", joints, 1.2)
+    truth = HAND.servo.copy()
+    chosen = [HAND.joint_names.index(name) for name in joints]
+    truth[chosen, servo.KP] *= 1.4
+    truth[chosen, servo.KD] *= 0.7
+    positions = simulate_hand(recording, HAND, truth, dt=dt)
+    lengths = np.cumsum([len(t.time) for t in recording.trajectories])[:-1]
+    made = replace(
+        recording,
+        trajectories=tuple(
+            replace(t, position=p)
+            for t, p in zip(recording.trajectories, np.split(positions, lengths), strict=True)
+        ),
+    )
+    heard = []
+    found = identify(
+        made,
+        HAND,
+        joints,
+        generations=10,
+        population=10,
+        dt=dt,
+        progress=lambda generation, rmse: heard.append((generation, rmse)),
+    )
+    for finger in ("f0", "f1"):
+        assert found.rmse[finger] < 0.15 * found.start_rmse[finger]
+    # A step that never reaches the velocity limit shows the time constant best.
+    assert np.allclose(found.kp / found.kd, (truth[:, servo.KP] / truth[:, servo.KD])[chosen], rtol=0.1)
+    assert [generation for generation, _ in heard] == list(range(1, 11))
+    assert found.rollouts == 10 * 10 * 2 and found.rollouts_per_second > 0.0
