@@ -63,11 +63,13 @@ def response(sim: Simulator, offset: float = 0.2, steps: int = STEPS) -> tuple[n
 
 def test_without_rows_nothing_of_the_servo_is_launched(monkeypatch):
     sim = simulator(None)
-    launched = []
-    launch = wp.launch
-    monkeypatch.setattr(
-        wp, "launch", lambda kernel, *a, **k: (launched.append(kernel), launch(kernel, *a, **k))[1]
-    )
+    launched, launch = [], wp.launch
+
+    def record(kernel: wp.Kernel, *args: object, **kwargs: object) -> object:
+        launched.append(kernel)
+        return launch(kernel, *args, **kwargs)
+
+    monkeypatch.setattr(wp, "launch", record)
     sim.step()
     assert sim.servo is None and sim.target.ptr == sim.control.joint_target_q.ptr
     assert launched and not any("joint_servo" in kernel.module.name for kernel in launched)
