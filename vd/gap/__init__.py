@@ -1,1 +1,1 @@
-"""The gap workflow: where simulation and measurement disagree, which effect is missing, how much it closes."""
+"""The gap workflow: where simulation and measurement disagree, what is missing, how much it closes."""
