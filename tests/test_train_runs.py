@@ -24,7 +24,7 @@ from vd.train.checkpoint import (
     set_random_state,
     without_worlds,
 )
-from vd.train.metrics import read_progress
+from vd.train.metrics import GoalWindow, read_progress
 from vd.train.runner import Interrupted, TrainingDivergedError
 
 TIMING = ("elapsed_s", "steps_per_s", "collect_s", "learn_s")
@@ -76,8 +76,9 @@ def test_resuming_from_an_older_checkpoint_rewrites_the_curve(tmp_path):
     assert _rows(tmp_path) == before
 
 
-def test_keeps_the_last_few_and_the_best(tmp_path):
+def test_keeps_the_last_few_and_the_best_since_two_episodes_are_over(tmp_path):
     runner = make_runner(tmp_path, save_every=1, keep_last=2)
+    runner._window = GoalWindow(2)
     runner.learn(5)
     assert [p.name for p in list_checkpoints(tmp_path)] == ["model_0000004.pt", "model_0000005.pt"]
     best = load_checkpoint(find_checkpoint(tmp_path, "best"))
@@ -85,8 +86,14 @@ def test_keeps_the_last_few_and_the_best(tmp_path):
         (row["task/difficulty"], row["success_per_goal"] or 0.0, row["mean_reward"])
         for row in _rows(tmp_path)
     ]
-    assert best["iter"] == 1 + scores.index(max(scores))
+    assert best["iter"] == 2 + scores[1:].index(max(scores[1:]))
     assert load_policy(tmp_path / "policy.pt").iteration == best["iter"]
+
+
+def test_before_two_episodes_are_over_the_latest_is_the_best(tmp_path):
+    make_runner(tmp_path, save_every=1, keep_last=1).learn(3)
+    assert load_checkpoint(find_checkpoint(tmp_path, "best"))["iter"] == 3
+    assert load_policy(tmp_path / "policy.pt").iteration == 3
 
 
 def test_a_crash_while_writing_leaves_the_old_checkpoint(tmp_path, monkeypatch):

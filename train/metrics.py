@@ -76,6 +76,11 @@ class GoalWindow:
             "mean_reward": reward / len(self._rows),
         }
 
+    @property
+    def full(self) -> bool:
+        """Whether it is as long as meant; before, early successes look like a rate."""
+        return len(self._rows) == self._rows.maxlen
+
     def state_dict(self) -> list[list[float]]:
         """The rows, oldest first."""
         return [list(row) for row in self._rows]

@@ -316,11 +316,13 @@ class TeacherRunner(OnPolicyRunner):
         """Write the checkpoint of this iteration, and the best if it is one.
 
         The best is chosen by difficulty of the curriculum, then success per goal over the last two
-        episodes, then mean reward, in that order: while nothing succeeds the reward decides.
+        episodes, then mean reward, in that order: while nothing succeeds the reward decides. Until two
+        episodes are over the latest takes its place: worlds whose goal is near succeed first, so that early
+        rates are too high and no later one would beat them.
         """
         path = checkpoint_path(self.run.run_dir, self.current_learning_iteration)
         better = self.current_learning_iteration > 0 and (self._best is None or self._score > self._best)
-        if better:
+        if better and self._window.full:
             self._best = self._score
         state = self._state(None)
         if not self.is_main:
