@@ -9,6 +9,7 @@ import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
+from vd.gap.judge import Accepted, Explanation
 from vd.gap.recording import Recording
 from vd.gap.result import (
     Alternative,
@@ -26,7 +27,6 @@ from vd.gap.result import (
     Verdict,
 )
 from vd.gap.rollout import Rollouts
-from vd.gap.select import Accepted, Explanation
 from vd.gap.statistics import interval, resamples, rmse
 from vd.gap.team import Bench, JointSpec
 from vd.kernels.effects import EFFECTS

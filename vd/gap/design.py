@@ -10,7 +10,7 @@ BYSTANDERS = 2
 """Trajectories of each other joint of the chain in which a joint's own rest is fitted too."""
 CONDITION_VALUES = 3
 """Values of a condition from which on its values, not the motions, are held out."""
-MAX_SAMPLES = 40_000
+MAX_SAMPLES = 15_000
 """Samples of a joint that are fitted; the rest is held out for good."""
 
 
@@ -58,7 +58,8 @@ def _within_budget(recording: Recording, own: list[int]) -> list[int]:
     if total <= MAX_SAMPLES:
         return own
     # Short ones first: different motions say more than long ones.
-    kept, used = [], 0
+    kept: list[int] = []
+    used = 0
     for i in sorted(own, key=lambda i: len(recording.trajectories[i].time)):
         used += len(recording.trajectories[i].time)
         if used > MAX_SAMPLES and len(kept) >= MAX_FOLDS:

@@ -40,7 +40,7 @@ CMA_TRAJECTORIES = 4
 CMA_POPULATION = 16
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class JointFit:
     """A fitted model of one joint; S trajectories, P parameters.
 
@@ -121,7 +121,9 @@ class JointProblem:
         }
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
 
-    def residuals(self, rows: np.ndarray, trajectories: Sequence[int] | None = None) -> np.ndarray:
+    def residuals(
+        self, rows: np.ndarray, trajectories: Sequence[int] | np.ndarray | None = None
+    ) -> np.ndarray:
         """Measured minus predicted position of the joint for C chains [C, n, PARAMETER_COLUMNS]: [C, N]."""
         chosen = [int(t) for t in (self.trajectories if trajectories is None else trajectories)]
         predicted = self.rollouts.predict(rows, chosen)[:, :, self.joint]
@@ -135,13 +137,17 @@ class JointProblem:
             rows[:, self.joint, c.column] = c.value(x[:, i])
         return rows
 
-    def split(self, samples: np.ndarray, trajectories: Sequence[int] | None = None) -> list[np.ndarray]:
+    def split(
+        self, samples: np.ndarray, trajectories: Sequence[int] | np.ndarray | None = None
+    ) -> list[np.ndarray]:
         """Cut the last axis into trajectories."""
         chosen = self.trajectories if trajectories is None else trajectories
         ends = np.cumsum([len(self._measured[int(t)]) for t in chosen])[:-1]
         return np.split(samples, ends, axis=-1)
 
-    def sums(self, residuals: np.ndarray, trajectories: Sequence[int] | None = None) -> np.ndarray:
+    def sums(
+        self, residuals: np.ndarray, trajectories: Sequence[int] | np.ndarray | None = None
+    ) -> np.ndarray:
         """Squared errors of each trajectory, shape [C, S]."""
         parts = self.split(residuals, trajectories)
         return np.stack([np.einsum("cn,cn->c", part, part) for part in parts], axis=1)
@@ -185,7 +191,7 @@ class JointProblem:
         scales: Scales,
         *,
         iterations: int = 12,
-        trajectories: Sequence[int] | None = None,
+        trajectories: Sequence[int] | np.ndarray | None = None,
         refits: int = 0,
     ) -> list[JointFit]:
         """Fit a model from several starts at once, by Levenberg-Marquardt.
@@ -196,7 +202,7 @@ class JointProblem:
             starts: Starting values by key; what is absent starts at ``base``.
             scales: Sizes of the joint's motion.
             iterations: Steps at most.
-                trajectories: Subset to fit to, without held-out errors; all of the problem's if None.
+            trajectories: Subset to fit to, without held-out errors; all of the problem's if None.
             refits: Steps of Levenberg-Marquardt of each refit without a fold; 0: one Gauss-Newton step.
 
         Returns:
@@ -282,6 +288,12 @@ class JointProblem:
                 break
         jacobian = self._jacobian(base, coordinates, x, residual, chosen, np.ones(len(x)))
         return x, residual, jacobian
+
+    def jacobian(self, fit: JointFit) -> np.ndarray:
+        """d(predicted)/dx at a fit, shape [P, N]."""
+        here = fit.x[None]
+        residual = self.residuals(fit.rows[None])
+        return self._jacobian(fit.rows, fit.coordinates, here, residual, self.trajectories, np.ones(1))[0]
 
     def _jacobian(
         self,
@@ -370,9 +382,8 @@ class JointProblem:
             starts: Starting values of the effect that each start adds, by key.
             scales: Sizes of the joint's motion.
         """
-        here = fit.x[None]
-        residual = self.residuals(self.rows(fit.rows, fit.coordinates, here))
-        jacobian = self._jacobian(fit.rows, fit.coordinates, here, residual, self.trajectories, np.ones(1))[0]
+        residual = self.residuals(fit.rows[None])
+        jacobian = self.jacobian(fit)
         basis = np.linalg.svd(jacobian, full_matrices=False)[2]
         left = residual[0] - basis.T @ (basis @ residual[0])
         rows = np.repeat(fit.rows[None], len(starts), axis=0)

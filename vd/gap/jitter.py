@@ -21,10 +21,15 @@ DRAWS = 16
 """Realisations of the delays."""
 SMOOTH = 9
 """Samples over which the variance is averaged: 16 draws alone leave a third of error in it."""
-SHARES = (0.15, 0.4, 0.7, 1.0)
-"""Shares of the mean delay that the search gives to the jitter at its start, the rest to dropped commands."""
-HALF_NORMAL_MEAN = 0.798
-"""Mean of |N(0, 1)|."""
+START_SIGMA_DROP = tuple((sigma, drop) for sigma in (0.0015, 0.005, 0.015) for drop in (0.01, 0.1, 0.4))
+"""Where the search starts: [s] and the share of commands dropped."""
+ROUNDS = 2
+"""Searches, with the rest of the model linearised anew before the second."""
+LARGEST = 2.0
+"""Logarithm of the largest equivalent error squared [rad^2]: as good as none."""
+DAMPING = 1e-4
+TRUST = 0.5
+"""Largest shift of a coordinate of the rest of the model in a round."""
 EVALUATIONS = 40
 STEP = 0.1
 """Relative step of the finite differences of the likelihood: above the error of the draws."""
@@ -43,11 +48,9 @@ class JitterFit:
     def __init__(self, problem: JointProblem, base: JointFit, scales: Scales):
         self.problem, self.base = problem, base
         self.coordinates = [coordinate(f"command_jitter.{name}", scales) for name in ("sigma_s", "p_drop")]
-        self.delay = base.values["command_delay.delay_s"]
         recording = problem.rollouts.recording
         chosen = [recording.trajectories[int(t)] for t in problem.trajectories]
         self.size = len(chosen)
-        self.period = float(np.median(np.concatenate([np.diff(t.time) for t in chosen])))
         # A trajectory's name seeds its draws.
         copies = tuple(replace(t, file=f"{t.file}#{draw}") for draw in range(DRAWS) for t in chosen)
         self.rollouts = Rollouts(
@@ -58,6 +61,9 @@ class JitterFit:
         )
         self.measured = np.concatenate([t.position[:, self._column] for t in chosen])
         self.ends = np.cumsum([len(t.time) for t in chosen])[:-1]
+        self.keep = [i for i, c in enumerate(base.coordinates) if c.key != "command_delay.delay_s"]
+        self.jacobian = problem.jacobian(base)[self.keep]
+        self.shift = np.zeros(len(self.keep))
 
     @property
     def _column(self) -> int:
@@ -74,7 +80,10 @@ class JitterFit:
         return rows
 
     def losses(self, sigma: float, drop: float) -> np.ndarray:
-        """Negative log-likelihood of each trajectory [S], less that constant which all models share."""
+        """Negative log-likelihood of each trajectory [S], less a constant that all models share.
+
+        The rest of the model moves along, to first order, by weighted least squares.
+        """
         predicted = self.rollouts.predict(self.row(sigma, drop)[None])[0, :, self.problem.joint]
         self.problem.simulated += DRAWS * self.size
         draws = predicted.reshape(DRAWS, -1).astype(float)
@@ -84,6 +93,11 @@ class JitterFit:
         smooth = np.concatenate([np.convolve(part, kernel, mode="same") for part in spread])
         # The mean of the draws has an error of its own.
         variance = self.problem.floor**2 + (1.0 + 1.0 / DRAWS) * smooth
+        weighted = self.jacobian / variance
+        gram = weighted @ self.jacobian.T
+        gram += np.diag(DAMPING * np.diag(gram) + DAMPING)
+        self.shift = np.clip(np.linalg.solve(gram, weighted @ error), -TRUST, TRUST)
+        error = error - self.shift @ self.jacobian
         losses = 0.5 * (np.log(variance) + error**2 / variance)
         return np.array([part.sum() for part in np.split(losses, self.ends)])
 
@@ -93,18 +107,25 @@ class JitterFit:
         def total(x: np.ndarray) -> float:
             return float(self.losses(*self._values(x)).sum())
 
-        starts = []
-        for share in SHARES:
-            sigma = share * self.delay / HALF_NORMAL_MEAN
-            # A dropped command lasts for the one before: on average p / (1 - p) periods.
-            periods = (1.0 - share) * self.delay / self.period
-            drop = max(periods / (1.0 + periods), LEAST_DROP)
-            starts.append(np.log([max(sigma, 1e-4), drop]))
-        start = min(starts, key=total)
-        simplex = start + np.array([[0.0, 0.0], [0.3, 0.0], [0.0, 1.0]])
-        options = {"maxfev": EVALUATIONS, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
-        best = minimize(total, start, method="Nelder-Mead", options=options)
-        return self._result(*self._values(best.x))
+        start = min(np.log(np.array(START_SIGMA_DROP)), key=total)
+        for _ in range(ROUNDS):
+            simplex = start + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0]])
+            options = {"maxfev": EVALUATIONS, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
+            start = minimize(total, start, method="Nelder-Mead", options=options).x
+            sigma, drop = self._values(start)
+            self.losses(sigma, drop)
+            self._move(self.shift)
+        return self._result(sigma, drop)
+
+    def _move(self, shift: np.ndarray) -> None:
+        """Take the shift of the rest of the model, and linearise it there."""
+        x = self.base.x.copy()
+        for i, change in zip(self.keep, shift, strict=True):
+            c = self.base.coordinates[i]
+            x[i] = min(max(x[i] + change, c.lower), c.upper)
+        rows = self.problem.rows(self.base.rows, self.base.coordinates, x[None])[0]
+        self.base = replace(self.base, x=x, rows=rows)
+        self.jacobian = self.problem.jacobian(self.base)[self.keep]
 
     def _values(self, x: np.ndarray) -> tuple[float, float]:
         limits = [c.value(c.upper) for c in self.coordinates]
@@ -112,8 +133,8 @@ class JitterFit:
         return sigma, drop
 
     def _result(self, sigma: float, drop: float) -> JointFit:
-        """Equivalent errors, and the curvature of the likelihood in the place of the Gauss-Newton matrices."""
-        keep = [i for i, c in enumerate(self.base.coordinates) if c.key != "command_delay.delay_s"]
+        """Equivalent errors, and the likelihood's curvature in the place of the Gauss-Newton matrices."""
+        keep = self.keep
         x = np.array([c.inverse(v) for c, v in zip(self.coordinates, (sigma, drop), strict=True)])
         steps = np.maximum(STEP * x, [c.inverse(LEAST_DROP) for c in self.coordinates])
         here = self.losses(sigma, drop)
@@ -135,7 +156,7 @@ class JitterFit:
             share = max(float(curvature.sum()), 1e-6) / self.size
             gram[:, at, at] = share * self.problem.floor**2
             gradient[:, at] = -(sides[i, 0] - sides[i, 1]) / (2.0 * steps[i]) * self.problem.floor**2
-        equivalent = count * np.exp(2.0 * here / count - 1.0)
+        equivalent = count * np.exp(np.minimum(2.0 * here / count - 1.0, LARGEST))
         coordinates: list[Coordinate] = [*(self.base.coordinates[i] for i in keep), *self.coordinates]
         effects = tuple(e for e in self.base.effects if e != "command_delay")
         return JointFit(

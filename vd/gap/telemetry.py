@@ -98,4 +98,5 @@ def _plain_duty(
     left = float(np.sum((duty - slope * error) ** 2)) / max(float(np.sum(duty**2)), 1e-300)
     if 1.0 - left < LINEAR:
         return ""
-    return f"the recorded duty cycle follows the plain error ({100.0 * (1.0 - left):.1f} % of it): it acts downstream"
+    share = 100.0 * (1.0 - left)
+    return f"the recorded duty cycle follows the plain error ({share:.1f} % of it): it acts downstream"

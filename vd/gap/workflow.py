@@ -24,10 +24,11 @@ from vd.gap.coordinates import Scales
 from vd.gap.design import design
 from vd.gap.find import findings
 from vd.gap.fit import JointFit, candidates, others_in
+from vd.gap.judge import Explanation, share
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S, Chain, chains
-from vd.gap.select import Explanation, Selection
+from vd.gap.select import Selection
 from vd.gap.statistics import noise_floor, resamples
 from vd.gap.team import Bench, JointSpec, Team
 from vd.gap.telemetry import vetoes
@@ -366,7 +367,7 @@ def _explain_all(
         progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
         return result
 
-    return _parallel(one, joints)
+    return share(_parallel(one, joints))
 
 
 def replace_baseline(explanation: Explanation, baseline: JointFit) -> Explanation:

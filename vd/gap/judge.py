@@ -1,0 +1,290 @@
+"""Rules of evidence: what earns an effect its place, its name, or a place in a set of equals.
+
+Everything is judged on trajectories that the fit has not seen, and resampled by whole trajectories with
+the choice inside the resampling.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from vd.gap.fit import RIDGE, JointFit
+from vd.gap.result import Verdict
+from vd.gap.statistics import covariance, half_width, interval, rmse
+from vd.kernels.effects import EFFECTS
+
+NESTED = {
+    "stribeck_friction": ("coulomb_friction",),
+    "asymmetric_friction": ("coulomb_friction",),
+    "torque_speed_limit": ("torque_limit",),
+    "elastic_transmission": ("payload_inertia",),
+}
+"""Effects that contain a simpler one; in a tie the simpler one is meant."""
+
+NO_GAP = 1.15
+"""A baseline within this factor of the noise floor leaves nothing to explain."""
+UNEXPLAINED = 1.5
+"""A baseline beyond this factor of the noise floor has a gap, whether or not an effect explains it."""
+MIN_GAIN = 0.05
+"""Share of the held-out RMSE that an effect must remove."""
+MIN_GAIN_FLOORS = 0.7
+"""Gap that an effect must close, as sqrt(before^2 - after^2), in noise floors."""
+NAMED = 0.9
+"""Share of the resamples that must choose an effect for it to be named."""
+PENALTY = 0.01
+"""Relative RMSE that a further parameter must earn to be preferred."""
+TIE = 0.01
+"""Relative RMSE within which two candidates are a tie whatever their interval."""
+EXPLAINED = 1.1
+"""A winner within this factor of the noise floor leaves white residuals ..."""
+EXCESS_FLOORS = 0.15
+"""... so that an alternative that leaves this much more, in noise floors, is worse: thousands of samples
+carry that difference."""
+RECOVERED = 0.5
+"""Share of the squared gap that the named effects must recover; less is an unknown cause."""
+RANDOM = "command_jitter"
+"""The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
+DETERMINED = ("kp", "kd", "inertia")
+"""Baseline parameters that every useful excitation determines."""
+WIDE = 10.0
+"""Ratio of the ends of an interval from which a parameter counts as open."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate in one round of the selection."""
+
+    round: int
+    name: str
+    fit: JointFit
+    gain: float
+    gain_ci: tuple[float, float]
+    decision: str = "rejected"
+    reason: str = ""
+    placebo: bool = False
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """An effect of the final model."""
+
+    name: str
+    confidence: float
+    estimates: dict[str, tuple[float, float, float]]
+    """Parameter -> (value, low, high)."""
+    alternatives: tuple[tuple[str, float, tuple[float, float]], ...]
+    """(name, held-out RMSE, interval of the difference to this effect's), best first."""
+    tied: tuple[str, ...]
+    """Alternatives that this recording does not tell from it."""
+    at_bound: bool
+
+    @property
+    def named(self) -> bool:
+        """Whether it is the answer rather than one of a set."""
+        return not self.tied and not self.at_bound and self.confidence >= NAMED
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What one joint lacks."""
+
+    baseline: JointFit
+    final: JointFit
+    verdict: Verdict
+    reason: str
+    accepted: tuple[Accepted, ...] = ()
+    trials: tuple[Trial, ...] = ()
+
+
+@dataclass(kw_only=True)
+class Judge:
+    """Compares fits of one joint.
+
+    Attributes:
+        floor: Noise floor [rad].
+        weights: Bootstrap weights of the trajectories [R, S].
+    """
+
+    floor: float
+    weights: np.ndarray
+
+    def scores(self, fits: Sequence[JointFit], weights: np.ndarray | None = None) -> np.ndarray:
+        """Log of held-out RMSE plus the price of parameters, shape [C] or [C, R]."""
+        loss = np.stack([fit.held_out for fit in fits])
+        error = np.log(np.maximum(rmse(loss, fits[0].count, weights), 1e-12))
+        price = PENALTY * np.array([len(fit.x) for fit in fits], float)
+        return error + (price if weights is None else price[:, None])
+
+    def winner(self, fits: Sequence[JointFit]) -> JointFit:
+        """The candidate with the best held-out score; the simpler one that it contains if that is as good.
+
+        One with a parameter at its bound wins only if all have.
+        """
+        inside = [fit for fit in fits if not fit.at_bound] or list(fits)
+        best = inside[int(np.argmin(self.scores(inside)))]
+        simpler = [f for f in inside if f.effects[-1] in NESTED.get(best.effects[-1], ())]
+        return next((fit for fit in simpler if self.tied(best, fit)[0]), best)
+
+    def gain(self, before: JointFit, after: JointFit) -> tuple[float, tuple[float, float]]:
+        """Share of the held-out RMSE removed, with its interval over trajectories."""
+        old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
+        return 1.0 - after.held_out_rmse / before.held_out_rmse, interval(1.0 - new / old)
+
+    def better(self, before: JointFit, after: JointFit, tail: float = 0.025) -> tuple[bool, str]:
+        """Whether the step from one model to the larger is earned, and if not why.
+
+        Args:
+            before: The smaller model.
+            after: The larger.
+            tail: Share of the resamples that may see no gain.
+        """
+        old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
+        gain = 1.0 - after.held_out_rmse / before.held_out_rmse
+        low = float(np.quantile(1.0 - new / old, tail))
+        closed = np.sqrt(max(before.held_out_rmse**2 - after.held_out_rmse**2, 0.0))
+        if gain < MIN_GAIN:
+            return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
+        if low <= 0.0:
+            return False, "its gain over trajectories is not distinguishable from 0"
+        if closed < MIN_GAIN_FLOORS * self.floor:
+            return False, "what it removes is below the noise floor"
+        return True, ""
+
+    def tied(self, winner: JointFit, other: JointFit) -> tuple[bool, tuple[float, float]]:
+        """Whether the recording does not tell two fits apart, and the interval of their difference [rad].
+
+        A winner at the noise floor leaves white residuals, so that samples count: what the other leaves
+        in excess of it is then decisive, even if few motions show it.
+        """
+        best, error = (rmse(fit.held_out, fit.count, self.weights) for fit in (winner, other))
+        low, high = interval(error - best)
+        if winner.held_out_rmse < EXPLAINED * self.floor:
+            excess = other.rmse**2 - winner.rmse**2
+            return excess < (EXCESS_FLOORS * self.floor) ** 2, (low, high)
+        return low <= TIE * winner.held_out_rmse, (low, high)
+
+    def undetermined(self, fit: JointFit) -> str:
+        """Which parameter of the baseline the motions leave open, in words; empty if none."""
+        for key, (low, high) in intervals(fit, self.floor).items():
+            if key in DETERMINED and high > WIDE * low:
+                return f"{key} can lie anywhere between {low:.2g} and {high:.2g}: the motions do not show it"
+        return ""
+
+    def settle(self, trials: Sequence[Trial], final: JointFit) -> list[Trial]:
+        """The evidence with the steps that did not last marked as such."""
+        text = "helped at first, not needed or not earned in the end"
+        return [
+            replace(t, decision="rejected", reason=text)
+            if t.decision == "named" and t.name not in final.effects
+            else t
+            for t in trials
+        ]
+
+    def conclude(
+        self,
+        baseline: JointFit,
+        final: JointFit,
+        rivals: Mapping[str, list[JointFit]],
+        trials: Sequence[Trial],
+        loose: str,
+    ) -> Explanation:
+        """Confidence, sets and verdict of the final model."""
+        spread = intervals(final, self.floor)
+        accepted = [self.accept(final, name, rivals.get(name, [final]), spread) for name in final.effects]
+        explanation = Explanation(baseline, final, "unknown", "", tuple(accepted), tuple(trials))
+        if not accepted:
+            tried = [t for t in trials if not t.placebo and np.isfinite(t.gain)]
+            why = tried[0].reason if tried else "there is no candidate"
+            if baseline.held_out_rmse > UNEXPLAINED * self.floor:
+                return replace(explanation, reason=f"a gap that no candidate explains: the best {why}")
+            if loose:
+                return replace(explanation, verdict="under_excited", reason=loose)
+            return replace(explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}")
+        gap = baseline.held_out_rmse**2 - self.floor**2
+        share = (baseline.held_out_rmse**2 - final.held_out_rmse**2) / max(gap, 1e-30)
+        # What chance does to each sample stays, however well its size is known.
+        if share < RECOVERED and RANDOM not in final.effects:
+            text = f"the best candidate recovers {100.0 * share:.0f} % of the squared gap, less than half"
+            return replace(explanation, reason=text)
+        named = [a.name for a in accepted if a.named]
+        if named:
+            return replace(explanation, verdict="effects", reason=f"{' and '.join(named)} explain it")
+        if all(a.at_bound for a in accepted):
+            return replace(explanation, reason=f"{accepted[0].name} fits only with a parameter at its bound")
+        sets = "; ".join(" or ".join((a.name, *a.tied)) for a in accepted if not a.at_bound)
+        return replace(explanation, verdict="ambiguous", reason=f"{sets}: not told apart")
+
+    def accept(
+        self,
+        final: JointFit,
+        name: str,
+        rivals: Sequence[JointFit],
+        spread: Mapping[str, tuple[float, float]],
+    ) -> Accepted:
+        """Confidence and set of one effect of the final model."""
+        own = next((fit for fit in rivals if fit.effects and fit.effects[-1] == name), None)
+        mine = final if own is None or any(fit is final for fit in rivals) else own
+        others = [fit for fit in rivals if fit is not mine and fit.effects[-1] != name]
+        choice = np.argmin(self.scores([mine, *others], self.weights), axis=0)
+        simple = {i + 1 for i, fit in enumerate(others) if name in NESTED.get(fit.effects[-1], ())}
+        share = float(np.mean([c == 0 or c in simple for c in choice]))
+        alternatives, tied = [], []
+        for fit in sorted(others, key=lambda other: other.held_out_rmse):
+            other = fit.effects[-1]
+            same, ci = self.tied(mine, fit)
+            alternatives.append((other, fit.held_out_rmse, ci))
+            if same and name not in NESTED.get(other, ()):
+                tied.append(other)
+        if share < NAMED and not tied:
+            rival = int(np.argmax(np.bincount(choice, minlength=len(others) + 1)[1:]))
+            tied.append(others[rival].effects[-1])
+        return Accepted(
+            name=name,
+            confidence=share,
+            estimates={
+                p.name: (final.values[f"{name}.{p.name}"], *spread[f"{name}.{p.name}"])
+                for p in EFFECTS[name].parameters
+                if f"{name}.{p.name}" in final.values
+            },
+            alternatives=tuple(alternatives),
+            tied=tuple(tied),
+            at_bound=any(key.startswith(f"{name}.") for key in final.at_bound),
+        )
+
+
+def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
+    """95 % intervals of a fit's parameters, by key, from the spread over trajectories."""
+    matrix = covariance(fit.gram, fit.gradient, np.full(len(fit.x), RIDGE * floor**2), floor)
+    width = half_width(np.diag(matrix), len(fit.gram))
+    result = {}
+    for c, x, w in zip(fit.coordinates, fit.x, width, strict=True):
+        low, high = max(x - w, c.lower), min(x + w, c.upper)
+        result[c.key] = float(c.value(low)), float(c.value(high))
+    return result
+
+
+def share(explanations: Sequence[Explanation]) -> list[Explanation]:
+    """Name on a joint the first of a set that another joint names, or that all such sets share.
+
+    A machine's joints are alike: one cause on all of them is simpler than another on each.
+    """
+    named = {a.name for e in explanations for a in e.accepted if a.named}
+    sets = [{a.name, *a.tied} for e in explanations for a in e.accepted if not a.named and not a.at_bound]
+    if len(sets) > 1:
+        common = set.intersection(*sets)
+        named |= common if len(common) == 1 else set()
+    result = []
+    for explanation in explanations:
+        accepted = tuple(
+            replace(a, tied=(), confidence=max(a.confidence, NAMED))
+            if a.name in named and a.tied and not a.at_bound
+            else a
+            for a in explanation.accepted
+        )
+        verdict, reason = explanation.verdict, explanation.reason
+        names = [a.name for a in accepted if a.named]
+        if verdict == "ambiguous" and names:
+            verdict, reason = "effects", f"{' and '.join(names)} explain it, as on the other joints"
+        result.append(replace(explanation, accepted=accepted, verdict=verdict, reason=reason))
+    return result
