@@ -39,6 +39,9 @@ CMA_SIGMA = 0.7
 CMA_TRAJECTORIES = 4
 CMA_POPULATION = 16
 
+Trajectories = Sequence[int] | np.ndarray | None
+"""Indices of trajectories; None: all."""
+
 
 @dataclass(frozen=True, eq=False)
 class JointFit:
@@ -121,9 +124,7 @@ class JointProblem:
         }
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
 
-    def residuals(
-        self, rows: np.ndarray, trajectories: Sequence[int] | np.ndarray | None = None
-    ) -> np.ndarray:
+    def residuals(self, rows: np.ndarray, trajectories: Trajectories = None) -> np.ndarray:
         """Measured minus predicted position of the joint for C chains [C, n, PARAMETER_COLUMNS]: [C, N]."""
         chosen = [int(t) for t in (self.trajectories if trajectories is None else trajectories)]
         predicted = self.rollouts.predict(rows, chosen)[:, :, self.joint]
@@ -137,17 +138,13 @@ class JointProblem:
             rows[:, self.joint, c.column] = c.value(x[:, i])
         return rows
 
-    def split(
-        self, samples: np.ndarray, trajectories: Sequence[int] | np.ndarray | None = None
-    ) -> list[np.ndarray]:
+    def split(self, samples: np.ndarray, trajectories: Trajectories = None) -> list[np.ndarray]:
         """Cut the last axis into trajectories."""
         chosen = self.trajectories if trajectories is None else trajectories
         ends = np.cumsum([len(self._measured[int(t)]) for t in chosen])[:-1]
         return np.split(samples, ends, axis=-1)
 
-    def sums(
-        self, residuals: np.ndarray, trajectories: Sequence[int] | np.ndarray | None = None
-    ) -> np.ndarray:
+    def sums(self, residuals: np.ndarray, trajectories: Trajectories = None) -> np.ndarray:
         """Squared errors of each trajectory, shape [C, S]."""
         parts = self.split(residuals, trajectories)
         return np.stack([np.einsum("cn,cn->c", part, part) for part in parts], axis=1)
@@ -191,7 +188,7 @@ class JointProblem:
         scales: Scales,
         *,
         iterations: int = 12,
-        trajectories: Sequence[int] | np.ndarray | None = None,
+        trajectories: Trajectories = None,
         refits: int = 0,
     ) -> list[JointFit]:
         """Fit a model from several starts at once, by Levenberg-Marquardt.

@@ -1,0 +1,185 @@
+"""Selection of effects: the rules on made-up fits, and whole analyses of small recordings."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_gap_fit import recorded
+
+import vd.kernels.actuators as servo
+from vd.gap.coordinates import Coordinate
+from vd.gap.fit import JointFit
+from vd.gap.judge import Accepted, Explanation, Judge, share
+from vd.gap.recording import Recording
+from vd.gap.result import Predictions, Report
+from vd.gap.statistics import resamples
+from vd.gap.telemetry import vetoes
+from vd.gap.workflow import explain, find
+
+FLOOR = 1e-3
+COUNT = np.full(10, 500.0)
+SMALL = ("command_delay", "coulomb_friction", "torque_saturation", "thermal_drift", "command_filter")
+
+
+def made_up(effects: tuple[str, ...], errors: np.ndarray | float, fitted: float | None = None) -> JointFit:
+    """A fit with given held-out RMSE of each trajectory [rad]."""
+    held_out = COUNT * np.broadcast_to(errors, COUNT.shape) ** 2
+    size = 3 + len(effects)
+    return JointFit(
+        effects=effects,
+        coordinates=tuple(Coordinate(f"p{i}", i, False, 1.0, -9.0, 9.0) for i in range(size)),
+        x=np.zeros(size),
+        rows=np.zeros((1, servo.PARAMETER_COLUMNS)),
+        sse=held_out if fitted is None else COUNT * fitted**2,
+        held_out=held_out,
+        count=COUNT,
+        gram=np.tile(np.eye(size), (10, 1, 1)),
+        gradient=np.zeros((10, size)),
+    )
+
+
+@pytest.fixture
+def judge() -> Judge:
+    return Judge(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
+
+
+def test_gain_must_hold_over_trajectories(judge: Judge) -> None:
+    before = made_up((), 0.010)
+    assert judge.better(before, made_up(("backlash",), 0.005))[0]
+    assert not judge.better(before, made_up(("backlash",), 0.0097))[0]
+    # One trajectory gains much, others lose a little: the interval over trajectories covers 0.
+    uneven = np.full(10, 0.0102)
+    uneven[0] = 0.0
+    assert not judge.better(before, made_up(("backlash",), uneven))[0]
+
+
+def test_what_is_under_the_noise_floor_is_no_gain(judge: Judge) -> None:
+    accepted, why = judge.better(made_up((), 1.15e-3), made_up(("backlash",), 1.05e-3))
+    assert not accepted and "noise floor" in why
+
+
+def test_a_tie_is_a_set(judge: Judge) -> None:
+    rng = np.random.default_rng(1)
+    winner = made_up(("coulomb_friction",), 0.004)
+    noise = rng.normal(0.0, 1e-3, 10)
+    assert judge.tied(winner, made_up(("dead_zone",), 0.004 + noise - noise.mean()))[0]
+    assert not judge.tied(winner, made_up(("backlash",), 0.006))[0]
+
+
+def test_at_the_floor_samples_decide(judge: Judge) -> None:
+    """An explained recording tells candidates apart even if one motion alone shows the difference."""
+    errors = np.full(10, FLOOR)
+    winner = made_up(("coulomb_friction",), errors)
+    errors = errors.copy()
+    errors[3] = 1.5 * FLOOR
+    assert not judge.tied(winner, made_up(("dead_zone",), errors))[0]
+    assert judge.tied(winner, made_up(("dead_zone",), FLOOR))[0]
+
+
+def test_the_simpler_of_nested_effects_wins_a_tie(judge: Judge) -> None:
+    simple = made_up(("coulomb_friction",), 1.000e-3)
+    complex_ = made_up(("stribeck_friction",), 0.970e-3, fitted=0.999e-3)
+    assert judge.winner([complex_, simple]) is simple
+    better = made_up(("stribeck_friction",), 1.0e-3)
+    worse = made_up(("coulomb_friction",), 1.6e-3)
+    assert judge.winner([better, worse]) is better
+
+
+def test_a_bound_is_no_estimate(judge: Judge) -> None:
+    stuck = made_up(("backlash",), 0.004)
+    end = Coordinate("backlash.width_rad", servo.BACKLASH_WIDTH, False, 1.0, 0.0, 9.0)
+    stuck = replace(stuck, coordinates=(*stuck.coordinates[:-1], end), x=np.array([0.0, 0.0, 0.0, 9.0]))
+    inside = made_up(("dead_zone",), 0.005)
+    assert stuck.at_bound == ("backlash.width_rad",)
+    assert judge.winner([stuck, inside]) is inside
+
+
+def test_sets_of_several_joints_meet_in_one_name() -> None:
+    fit = made_up((), 0.01)
+
+    def explanation(name: str, *tied: str) -> Explanation:
+        accepted = Accepted(name, 0.6 if tied else 1.0, {}, (), tied, False)
+        return Explanation(fit, fit, "ambiguous" if tied else "effects", "", (accepted,))
+
+    first, second = share([explanation("backlash", "dead_zone"), explanation("backlash", "coulomb_friction")])
+    assert first.verdict == second.verdict == "effects"
+    first, second = share([explanation("backlash", "dead_zone"), explanation("backlash")])
+    assert first.accepted[0].named
+    (alone,) = share([explanation("backlash", "dead_zone")])
+    assert alone.verdict == "ambiguous"
+
+
+def analysed(recording: Recording, out: Path, **options: object) -> Report:
+    return explain(recording, None, out, workers=1, **{"effects": SMALL, **options})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "parameter", "column", "value"),
+    [
+        ("coulomb_friction", "tau_c_nm", servo.COULOMB_TORQUE, 0.05),
+        ("command_filter", "tau_s", servo.FILTER_TAU, 0.04),
+    ],
+)
+def test_a_hidden_effect_is_named(
+    name: str, parameter: str, column: int, value: float, tmp_path: Path
+) -> None:
+    report = analysed(recorded({column: value}), tmp_path)
+    assert report.verdict == "effects"
+    assert [effect.name for effect in report.effects] == [name]
+    estimate = report.effects[0].parameters[parameter]
+    assert estimate.value == pytest.approx(value, rel=0.1)
+    assert report.effects[0].confidence >= 0.9
+    assert report.held_out.identified_rmse_rad < 1.3 * report.noise_floor_rad
+    placebos = [c for c in report.evidence if c.placebo]
+    assert placebos and all(c.gain < 0.05 and c.decision == "rejected" for c in placebos)
+
+
+def test_nothing_hidden_is_no_gap_and_resumes(tmp_path: Path) -> None:
+    recording = recorded({})
+    report = analysed(recording, tmp_path)
+    assert report.verdict == "no_gap" and not report.effects and not report.ambiguous
+    lines: list[str] = []
+    again = explain(recording, None, tmp_path, workers=1, effects=SMALL, progress=lines.append)
+    assert again == report and any("already done" in line for line in lines)
+    curves = Predictions.read(tmp_path / "predictions.npz")
+    assert np.isfinite(curves.identified).all()
+    other = explain(recording, None, tmp_path, workers=1, effects=SMALL[:2], progress=lines.append)
+    assert other.seconds != report.seconds
+
+
+def test_an_effect_that_is_not_considered_ends_unknown_or_tied(tmp_path: Path) -> None:
+    report = analysed(recorded({servo.BACKLASH_WIDTH: 0.08}), tmp_path, effects=("thermal_drift",))
+    assert report.verdict == "unknown" and not report.effects
+
+
+def test_few_trajectories_are_under_excited(tmp_path: Path) -> None:
+    report = analysed(recorded({servo.COULOMB_TORQUE: 0.05}).subset([0, 3]), tmp_path)
+    assert report.verdict == "under_excited" and not report.effects
+
+
+def test_unknown_effects_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="slime"):
+        find(recorded({}), None, tmp_path, effects=("slime",))
+
+
+def test_telemetry_contradicts_a_cause() -> None:
+    """A duty cycle in proportion to the error leaves no room for a delay; a steady voltage none for sag."""
+    from vd.gap.rollout import chains
+    from vd.gap.team import JointSpec
+
+    recording = recorded({servo.COULOMB_TORQUE: 0.05})
+    parts = tuple(
+        replace(t, pwm=0.5 * (t.command - t.position), voltage=np.full(t.position.shape, 7.4))
+        for t in recording.trajectories
+    )
+    (chain,) = chains(recording)
+    spec = JointSpec(0, 0, tuple(range(len(parts))), tuple(range(len(parts))), FLOOR, ("kd",))
+    found = vetoes(replace(recording, trajectories=parts), chain, spec, chain.start_row)
+    assert {"supply_sag", "command_delay", "dead_zone"} <= set(found)
+    assert "coulomb_friction" not in found and "torque_saturation" not in found
+    assert vetoes(recording, chain, spec, chain.start_row) == {}
+    falling = tuple(
+        replace(t, voltage=7.4 - 2.0 * np.abs(t.command - t.position)) for t in recording.trajectories
+    )
+    assert "supply_sag" not in vetoes(replace(recording, trajectories=falling), chain, spec, chain.start_row)
