@@ -96,18 +96,22 @@ def test_a_bound_is_no_estimate(judge: Judge) -> None:
 
 
 def test_sets_of_several_joints_meet_in_one_name() -> None:
-    fit = made_up((), 0.01)
-
     def explanation(name: str, *tied: str) -> Explanation:
         accepted = Accepted(name, 0.6 if tied else 1.0, {}, (), tied, False)
-        return Explanation(fit, fit, "ambiguous" if tied else "effects", "", (accepted,))
+        fits = [made_up((other,), 0.01) for other in (name, *tied)]
+        verdict = "ambiguous" if tied else "effects"
+        return Explanation(made_up((), 0.02), fits[0], verdict, "", (accepted,), (), {name: fits})
 
-    first, second = share([explanation("backlash", "dead_zone"), explanation("backlash", "coulomb_friction")])
-    assert first.verdict == second.verdict == "effects"
-    first, second = share([explanation("backlash", "dead_zone"), explanation("backlash")])
-    assert first.accepted[0].named
-    (alone,) = share([explanation("backlash", "dead_zone")])
-    assert alone.verdict == "ambiguous"
+    def names(*explanations: Explanation) -> list[str]:
+        shared = share(explanations, [FLOOR] * len(explanations))
+        return [e.accepted[0].name if e.accepted[0].named else "?" for e in shared]
+
+    one, other = explanation("backlash", "dead_zone"), explanation("backlash", "coulomb_friction")
+    assert names(one, other) == ["backlash", "backlash"]
+    assert names(one, explanation("backlash")) == ["backlash", "backlash"]
+    assert names(one, explanation("dead_zone")) == ["dead_zone", "dead_zone"]
+    assert names(one, explanation("thermal_drift")) == ["?", "thermal_drift"]
+    assert names(one) == ["?"]
 
 
 def analysed(recording: Recording, out: Path, **options: object) -> Report:

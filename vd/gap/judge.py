@@ -5,7 +5,7 @@ the choice inside the resampling.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -95,6 +95,8 @@ class Explanation:
     reason: str
     accepted: tuple[Accepted, ...] = ()
     trials: tuple[Trial, ...] = ()
+    rivals: Mapping[str, Sequence[JointFit]] = field(default_factory=dict)
+    """Fits with others in the place of each effect."""
 
 
 @dataclass(kw_only=True)
@@ -192,7 +194,7 @@ class Judge:
         """Confidence, sets and verdict of the final model."""
         spread = intervals(final, self.floor)
         accepted = [self.accept(final, name, rivals.get(name, [final]), spread) for name in final.effects]
-        explanation = Explanation(baseline, final, "unknown", "", tuple(accepted), tuple(trials))
+        explanation = Explanation(baseline, final, "unknown", "", tuple(accepted), tuple(trials), rivals)
         if not accepted:
             tried = [t for t in trials if not t.placebo and np.isfinite(t.gain)]
             why = tried[0].reason if tried else "there is no candidate"
@@ -242,11 +244,7 @@ class Judge:
         return Accepted(
             name=name,
             confidence=share,
-            estimates={
-                p.name: (final.values[f"{name}.{p.name}"], *spread[f"{name}.{p.name}"])
-                for p in EFFECTS[name].parameters
-                if f"{name}.{p.name}" in final.values
-            },
+            estimates=_estimates(final, name, spread),
             alternatives=tuple(alternatives),
             tied=tuple(tied),
             at_bound=any(key.startswith(f"{name}.") for key in final.at_bound),
@@ -264,27 +262,50 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
     return result
 
 
-def share(explanations: Sequence[Explanation]) -> list[Explanation]:
-    """Name on a joint the first of a set that another joint names, or that all such sets share.
+def share(explanations: Sequence[Explanation], floors: Sequence[float]) -> list[Explanation]:
+    """Name on a joint that member of a set which another joint names, or which all such sets share.
 
     A machine's joints are alike: one cause on all of them is simpler than another on each.
     """
     named = {a.name for e in explanations for a in e.accepted if a.named}
-    sets = [{a.name, *a.tied} for e in explanations for a in e.accepted if not a.named and not a.at_bound]
+    sets = [{a.name, *a.tied} for e in explanations for a in e.accepted if a.tied and not a.at_bound]
     if len(sets) > 1:
         common = set.intersection(*sets)
         named |= common if len(common) == 1 else set()
-    result = []
-    for explanation in explanations:
-        accepted = tuple(
-            replace(a, tied=(), confidence=max(a.confidence, NAMED))
-            if a.name in named and a.tied and not a.at_bound
-            else a
-            for a in explanation.accepted
-        )
-        verdict, reason = explanation.verdict, explanation.reason
-        names = [a.name for a in accepted if a.named]
-        if verdict == "ambiguous" and names:
-            verdict, reason = "effects", f"{' and '.join(names)} explain it, as on the other joints"
-        result.append(replace(explanation, accepted=accepted, verdict=verdict, reason=reason))
-    return result
+    return [_adopt(e, named, floor) for e, floor in zip(explanations, floors, strict=True)]
+
+
+def _adopt(explanation: Explanation, named: set[str], floor: float) -> Explanation:
+    """One joint's explanation with what the other joints name in the place of its sets."""
+    final, accepted = explanation.final, list(explanation.accepted)
+    for i, own in enumerate(accepted):
+        others = [name for name in own.tied if name in named]
+        if not own.tied or own.at_bound or (own.name not in named and len(others) != 1):
+            continue
+        if own.name not in named:
+            fits = explanation.rivals.get(own.name, ())
+            fit = next((fit for fit in fits if fit.effects[-1] == others[0]), None)
+            if fit is None or set(fit.effects) != {*final.effects, others[0]} - {own.name}:
+                continue
+            final = fit
+            own = replace(own, name=others[0])
+        accepted[i] = replace(own, tied=(), confidence=max(own.confidence, NAMED))
+    if final is not explanation.final:
+        spread = intervals(final, floor)
+        accepted = [replace(a, estimates=_estimates(final, a.name, spread)) for a in accepted]
+    verdict, reason = explanation.verdict, explanation.reason
+    names = [a.name for a in accepted if a.named]
+    if verdict == "ambiguous" and names:
+        verdict, reason = "effects", f"{' and '.join(names)} explain it, as on the other joints"
+    return replace(explanation, final=final, accepted=tuple(accepted), verdict=verdict, reason=reason)
+
+
+def _estimates(
+    final: JointFit, name: str, spread: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float, float]]:
+    """Parameters of an effect with their intervals."""
+    return {
+        p.name: (final.values[f"{name}.{p.name}"], *spread[f"{name}.{p.name}"])
+        for p in EFFECTS[name].parameters
+        if f"{name}.{p.name}" in final.values
+    }

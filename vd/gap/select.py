@@ -11,7 +11,7 @@ import numpy as np
 
 from vd.gap.coordinates import Scales, sizes
 from vd.gap.fit import JointFit
-from vd.gap.judge import NESTED, NO_GAP, RANDOM, Explanation, Judge, Trial
+from vd.gap.judge import EXPLAINED, NESTED, NO_GAP, RANDOM, Explanation, Judge, Trial
 from vd.kernels.effects import EFFECTS
 
 MIN_TRAJECTORIES = 3
@@ -22,8 +22,14 @@ SHORT_LIST = 10
 """Candidates of a round that are fitted, after the linear screening of all."""
 FINALISTS = 6
 """Candidates of a round that are fitted to the end."""
+FIRST = 4
+"""Candidates that are fitted before the rest of the short list."""
+ALIKE = 0.5
+"""Share of the best promise that a candidate must have to be fitted once another explains everything."""
+BEHIND = 3.0
+"""Finalists have at most this many times the error of the best after screening."""
 STARTS = 2
-SCREEN_ITERATIONS = 7
+SCREEN_ITERATIONS = 6
 FULL_ITERATIONS = 12
 JITTER_START_S = 0.005
 NEAR = 4.0
@@ -82,8 +88,9 @@ class Selection(Judge):
         present, rivals, rows = self.search(baseline, baseline)
         trials += rows
         first = {t.name: t.fit for t in rows if t.round == 1 and not t.placebo}
-        for name in sorted(first, key=lambda n: first[n].held_out_rmse):
-            if not NO_GAP * self.floor < present.held_out_rmse < NEAR * self.floor:
+        for name in sorted(first, key=lambda n: first[n].rmse):
+            near = NO_GAP * self.floor < present.held_out_rmse < NEAR * self.floor
+            if present.effects and not near:
                 break  # explained, or far beyond what another path would change
             if name in present.effects or self.restarts == 0 or first[name].at_bound:
                 continue
@@ -190,17 +197,32 @@ class Selection(Judge):
         for i in np.argsort(-promise):
             order[flat[i][0]].append(int(i))
         ranked = sorted(names, key=lambda name: -promise[order[name][0]])[:SHORT_LIST]
-        calls = []
-        for name in ranked:
-            chosen = [{**present.values, **flat[i][1]} for i in order[name][:STARTS]]
-            calls.append(self.call(present, name, chosen, SCREEN_ITERATIONS))
-        screened = [fits[0] for fits in self.run(calls)]
-        screened.sort(key=lambda fit: float(fit.sse.sum()))
-        finalists = screened[:FINALISTS]
+
+        def screen(chosen: Sequence[str]) -> list[JointFit]:
+            calls = [
+                self.call(
+                    present,
+                    name,
+                    [{**present.values, **flat[i][1]} for i in order[name][:STARTS]],
+                    SCREEN_ITERATIONS,
+                )
+                for name in chosen
+            ]
+            return [fits[0] for fits in self.run(calls)]
+
+        screened = screen(ranked[:FIRST])
+        rest = ranked[FIRST:]
+        if min(fit.rmse for fit in screened) < EXPLAINED * self.floor:
+            # What explains everything has only those to fear that promised nearly as much.
+            enough = ALIKE * promise[order[ranked[0]][0]]
+            rest = [name for name in rest if promise[order[name][0]] > enough]
+        screened += screen(rest)
+        screened.sort(key=lambda fit: fit.rmse)
+        finalists = [fit for fit in screened[:FINALISTS] if fit.rmse < BEHIND * screened[0].rmse]
         refits = self.run(
             [self.call(present, fit.effects[-1], [fit.values], FULL_ITERATIONS) for fit in finalists]
         )
-        fits = {fit.effects[-1]: fit for fit in (*(r[0] for r in refits), *screened[FINALISTS:])}
+        fits = {fit.effects[-1]: fit for fit in (*(r[0] for r in refits), *screened[len(finalists) :])}
         return fits
 
     def add_random(self, present: JointFit) -> JointFit:

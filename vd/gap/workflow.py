@@ -367,7 +367,7 @@ def _explain_all(
         progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
         return result
 
-    return share(_parallel(one, joints))
+    return share(_parallel(one, joints), [joint.spec.floor for joint in joints])
 
 
 def replace_baseline(explanation: Explanation, baseline: JointFit) -> Explanation:
