@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
 
 LAYER = "identified.usda"
+WHOLE_HAND_LAYER = "identified-all-fingers.usda"
+"""The same on every finger, as the paper applies what it identified on one."""
 GRAVITY_EFFECT = "gravity_load"
 _DRIVE = tuple(parameter.name for parameter in BASELINE)
 _COLUMN = {p.name: p.column for p in (*BASELINE, GRAVITY)}
@@ -30,6 +32,8 @@ def write_identified(
     recording: Recording,
     hand: "HandModel | None",
     start: Mapping[str, np.ndarray],
+    *,
+    every_finger: bool = False,
 ) -> None:
     """Write what a report identified as a layer.
 
@@ -39,22 +43,48 @@ def write_identified(
         recording: What it was identified from.
         hand: The hand; None for a bare servo or pendulum.
         start: Parameter row of each joint that the analysis started from; its effects stay in the layer.
+        every_finger: Give the joints of the fingers that were not recorded the model of their counterpart on
+            the first recorded finger (paper, Dynamics Identification).
     """
     from vd.assets_usd.hand_layer import write_layer
 
     fitted = report.identified.parameters
     held = (*report.effects, *report.provisional)
+    source = {joint: joint for joint in fitted}
+    if every_finger and hand is not None:
+        source |= _counterparts(hand.joint_names, tuple(fitted))
     write_layer(
         path,
         hand if hand is not None else recording.model,
         baseline={
-            joint: {name: values[name] for name in _DRIVE if name in values}
-            for joint, values in fitted.items()
+            joint: {name: fitted[known][name] for name in _DRIVE if name in fitted[known]}
+            for joint, known in source.items()
         },
-        effects={joint: _effects(held, joint, values, start) for joint, values in fitted.items()},
+        effects={joint: _effects(held, known, fitted[known], start) for joint, known in source.items()},
         tool="vd-gap",
         recording=report.recording.path,
     )
+
+
+def one_finger(recording: Recording, hand: "HandModel | None") -> bool:
+    """Whether a hand has more fingers than were recorded."""
+    if hand is None:
+        return False
+    return len({_finger(j) for j in recording.joints}) < len({_finger(j) for j in hand.joint_names})
+
+
+def _finger(joint: str) -> str:
+    return joint.partition("_")[0]
+
+
+def _counterparts(joints: tuple[str, ...], known: tuple[str, ...]) -> dict[str, str]:
+    """The identified joint at the same place of another finger, for joints that have none of their own."""
+    place = {joint.partition("_")[2]: joint for joint in reversed(known)}
+    return {
+        joint: place[joint.partition("_")[2]]
+        for joint in joints
+        if joint not in known and joint.partition("_")[2] in place
+    }
 
 
 def _effects(

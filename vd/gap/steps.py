@@ -239,11 +239,15 @@ def _explain(analysis: Analysis) -> None:
 
 
 def _close(analysis: Analysis) -> None:
-    from vd.gap.close import simulate_again, write_identified
+    from vd.gap.close import WHOLE_HAND_LAYER, one_finger, simulate_again, write_identified
     from vd.gap.plan import PLAN_JSON, plan, write_plan
 
     report, layer = analysis.explained(), analysis.out / LAYER
+    whole = layer.with_name(WHOLE_HAND_LAYER)
+    whole.unlink(missing_ok=True)
     write_identified(report, layer, analysis.recording, analysis.hand, analysis.start)
+    if one_finger(analysis.recording, analysis.hand):
+        write_identified(report, whole, analysis.recording, analysis.hand, analysis.start, every_finger=True)
     closing, curves = simulate_again(
         report,
         layer,
