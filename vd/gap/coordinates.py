@@ -19,6 +19,10 @@ LINEAR_STEP = 0.05
 """Finite-difference step of a linear coordinate, in its scale or in its value if that is larger."""
 SECONDS_SCALE = 0.02
 """Scale of delays [s]: with ``LINEAR_STEP`` a step of 2 ms, above the time step of the rollouts."""
+SLOWING = ("torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag", "acceleration_limit")
+"""Effects whose work a speed limit does in part."""
+FREE_SPEED = 3.0
+"""A speed limit that does not bind, in largest speeds."""
 FLATTEST = 1e-3
 """Scale of angles at least [rad], if the residual is smaller."""
 
@@ -191,10 +195,14 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
         ],
     }
     bounds = {p.name: (p.lower, p.upper) for p in EFFECTS[effect].parameters}
-    return [
+    starts = [
         {
             f"{effect}.{name}": value if value <= 0.0 else min(max(value, bounds[name][0]), bounds[name][1])
             for name, value in start.items()
         }
         for start in table[effect]
     ]
+    if effect in SLOWING:
+        # The baseline's speed limit took the effect's place: let go of it as well.
+        starts += [{**start, "velocity_limit": FREE_SPEED * speed} for start in starts]
+    return starts

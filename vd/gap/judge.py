@@ -30,6 +30,8 @@ MIN_GAIN = 0.05
 """Share of the held-out RMSE that an effect must remove."""
 MIN_GAIN_FLOORS = 0.7
 """Gap that an effect must close, as sqrt(before^2 - after^2), in noise floors."""
+MIN_SHARE = 0.02
+"""The same in whole gaps: no integrator's model of a large effect is better than that."""
 NAMED = 0.9
 """Share of the resamples that must choose an effect for it to be named."""
 PENALTY = 0.01
@@ -106,10 +108,12 @@ class Judge:
     Attributes:
         floor: Noise floor [rad].
         weights: Bootstrap weights of the trajectories [R, S].
+        whole: Held-out RMSE of the baseline [rad]; what is small beside it is the model's own error.
     """
 
     floor: float
     weights: np.ndarray
+    whole: float = 0.0
 
     def scores(self, fits: Sequence[JointFit], weights: np.ndarray | None = None) -> np.ndarray:
         """Log of held-out RMSE plus the price of parameters, shape [C] or [C, R]."""
@@ -149,6 +153,8 @@ class Judge:
             return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
         if low <= 0.0:
             return False, "its gain over trajectories is not distinguishable from 0"
+        if closed < MIN_SHARE * self.whole:
+            return False, "what it removes is small beside the whole gap"
         if closed < MIN_GAIN_FLOORS * self.floor:
             return False, "what it removes is below the noise floor"
         return True, ""

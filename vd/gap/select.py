@@ -28,7 +28,6 @@ ALIKE = 0.5
 """Share of the best promise that a candidate must have to be fitted once another explains everything."""
 BEHIND = 3.0
 """Finalists have at most this many times the error of the best after screening."""
-STARTS = 2
 SCREEN_ITERATIONS = 6
 FULL_ITERATIONS = 12
 JITTER_START_S = 0.005
@@ -75,6 +74,7 @@ class Selection(Judge):
     def explain(self, baseline: JointFit) -> Explanation:
         """Select effects, starting from the fitted baseline."""
         loose = self.undetermined(baseline)
+        self.whole = baseline.held_out_rmse
         if len(baseline.sse) < MIN_TRAJECTORIES:
             text = (
                 f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_TRAJECTORIES} at least"
@@ -203,7 +203,7 @@ class Selection(Judge):
                 self.call(
                     present,
                     name,
-                    [{**present.values, **flat[i][1]} for i in order[name][:STARTS]],
+                    [{**present.values, **start} for start in _two([flat[i][1] for i in order[name]])],
                     SCREEN_ITERATIONS,
                 )
                 for name in chosen
@@ -345,3 +345,9 @@ class Selection(Judge):
         values = {k: v for k, v in present.values.items() if k.rpartition(".")[0] in ("", *effects)}
         call = {"base": rows, "effects": tuple(effects), "starts": [values], "scales": self.scales}
         return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0][0]
+
+
+def _two(starts: Sequence[dict[str, float]]) -> list[dict[str, float]]:
+    """The best of starts in order of promise, and the best that changes other parameters, if any does."""
+    other = next((start for start in starts[1:] if start.keys() != starts[0].keys()), None)
+    return [starts[0], *([other] if other is not None else starts[1:2])]
