@@ -36,8 +36,9 @@ NAMED = 0.9
 """Share of the resamples that must choose an effect for it to be named."""
 PENALTY = 0.01
 """Relative RMSE that a further parameter must earn to be preferred."""
-TIE = 0.01
-"""Relative RMSE within which two candidates are a tie whatever their interval."""
+TIE_TAIL = 0.05
+"""Share of the resamples in which the other of two candidates is better that makes them a tie: half of
+what a name may lose."""
 EXPLAINED = 1.1
 """A winner within this factor of the noise floor leaves white residuals ..."""
 EXCESS_FLOORS = 0.15
@@ -170,7 +171,7 @@ class Judge:
         if winner.held_out_rmse < EXPLAINED * self.floor:
             excess = other.rmse**2 - winner.rmse**2
             return excess < (EXCESS_FLOORS * self.floor) ** 2, (low, high)
-        return low <= TIE * winner.held_out_rmse, (low, high)
+        return float(np.quantile(error - best, TIE_TAIL)) <= 0.0, (low, high)
 
     def undetermined(self, fit: JointFit) -> str:
         """Which parameter of the baseline the motions leave open, in words; empty if none."""
@@ -274,7 +275,8 @@ def share(explanations: Sequence[Explanation], floors: Sequence[float]) -> list[
     A machine's joints are alike: one cause on all of them is simpler than another on each.
     """
     named = {a.name for e in explanations for a in e.accepted if a.named}
-    sets = [{a.name, *a.tied} for e in explanations for a in e.accepted if a.tied and not a.at_bound]
+    open_sets = [[{a.name, *a.tied} for a in e.accepted if a.tied and not a.at_bound] for e in explanations]
+    sets = [of_joint[0] for of_joint in open_sets if len(of_joint) == 1]
     if len(sets) > 1:
         common = set.intersection(*sets)
         named |= common if len(common) == 1 else set()

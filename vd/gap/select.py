@@ -334,7 +334,9 @@ class Selection(Judge):
         """The model itself, and fits with other effects in the place of one of its own."""
         if without is None:
             without = self.refit(present, [e for e in present.effects if e != name])
-        return [present, *self.fit_candidates(without, skip=(name,)).values()]
+        # Beside Coulomb friction, a friction that contains it is no other cause.
+        contains = [c for c, simpler in NESTED.items() if set(simpler) & set(without.effects)]
+        return [present, *self.fit_candidates(without, skip=(name, *contains)).values()]
 
     def refit(self, present: JointFit, effects: Sequence[str]) -> JointFit:
         """The fit with only some of a model's effects."""
