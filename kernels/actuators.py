@@ -301,7 +301,8 @@ def drive_joint(
         position: True joint position [rad].
         speed: Joint velocity [rad/s].
         power: Factor on the controller's position and integral gains: 0 with the torque off, or a gain
-            that was set on purpose; the damping, mostly the motor's own, stays.
+            that was set on purpose, which leaves the damping as it is. With the torque off the damping,
+            mostly back-EMF, goes too, since the terminals are open; friction stays.
         dt: Time step [s].
         parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
         row: The joint's row.
@@ -321,6 +322,8 @@ def drive_joint(
     steady = power * parameters[row, INTEGRAL_GAIN] * integral
     kp = power * parameters[row, KP]
     damping = parameters[row, KD]
+    if power <= 0.0:
+        damping = 0.0
     wanted = kp * (reference - position) - damping * speed + steady
     motor = motor_torque(wanted, speed, time, parameters, row)
     if motor[0] != wanted:

@@ -223,7 +223,8 @@ class _Batch:
         path = np.empty((self.steps + 1, *q.shape))
         path[0] = q
         loads.start(q)
-        on, stiffness = first, self.kp * self.gain * first
+        # Open terminals carry no current: the damping of a servo that is off, mostly back-EMF, is gone.
+        on, stiffness, damping = first, self.kp * self.gain * first, self.kd * (first > 0.0)
         for k in range(self.steps):
             middle = q + half * v
             error = reference[k] - middle
@@ -233,13 +234,13 @@ class _Batch:
                 error = error - np.minimum(np.maximum(error, -dead), dead)
             if switch is not None:
                 on = switch[k]
-                stiffness = self.kp * self.gain * on
-            wanted = stiffness * error - self.kd * v
+                stiffness, damping = self.kp * self.gain * on, self.kd * (on > 0.0)
+            wanted = stiffness * error - damping * v
             if creeping:
                 wound = wound + dt * error * (on > 0.0)
                 wanted = wanted + self.gain * on * integral_gain * wound
             torque, slope = motor(wanted, v, k * dt)
-            resisting = 0.5 * slope * self.kd
+            resisting = 0.5 * slope * damping
             push = torque + loads(middle, v)
             minus, plus = loads.friction(torque, v, k * dt)
             if self.body is None:
