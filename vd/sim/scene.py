@@ -46,6 +46,8 @@ class Scene:
     """The objects in use."""
     world_object: np.ndarray
     """Index into ``objects`` for every world, shape [N]."""
+    world_scale: np.ndarray
+    """Size factor of every world's object, shape [N]."""
     bodies_per_world: int
     """B."""
     link_body: np.ndarray
@@ -249,10 +251,13 @@ def build_scene(
         )
     hand_builder = build_hand(hand, cfg, visuals=visuals)
     world_object = assign_objects(num_worlds, len(objects))
+    world_scale = np.ones(num_worlds)
     scene = new_builder()
     for index, item in enumerate(objects):
         count = int(np.count_nonzero(world_object == index))
-        per_scale = np.bincount(assign_objects(count, len(scales)), minlength=len(scales))
+        scale_index = assign_objects(count, len(scales))
+        world_scale[world_object == index] = np.asarray(scales)[scale_index]
+        per_scale = np.bincount(scale_index, minlength=len(scales))
         for scale, copies in zip(scales, per_scale, strict=False):
             if copies == 0:
                 continue
@@ -262,11 +267,15 @@ def build_scene(
             add_object(world, item, cfg, scale=float(scale), visuals=visuals)
             scene.replicate(world, int(copies))
     model = scene.finalize(device=device)
-    return describe(model, hand, list(objects), world_object)
+    return describe(model, hand, list(objects), world_object, world_scale)
 
 
 def describe(
-    model: newton.Model, hand: HandModel, objects: list[ObjectModel], world_object: np.ndarray
+    model: newton.Model,
+    hand: HandModel,
+    objects: list[ObjectModel],
+    world_object: np.ndarray,
+    world_scale: np.ndarray,
 ) -> Scene:
     """Find the hand's links, the object and the kinds of shapes in a finalized model."""
     bodies = model.body_count // len(world_object)
@@ -285,6 +294,7 @@ def describe(
         hand=hand,
         objects=objects,
         world_object=world_object,
+        world_scale=world_scale,
         bodies_per_world=bodies,
         link_body=np.array([names.index(link) for link in hand.link_names], dtype=np.int32),
         object_body=object_body,
