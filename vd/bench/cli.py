@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -144,12 +145,20 @@ class GapCommand:
     """Sizes of single effects: gaps of about 1.5, 3, 6 and 12 noise floors."""
     seeds: int = 5
     """Recordings of each effect and size."""
+    first_seed: int = 0
+    """Seed of the first recording: other seeds than those that the method was tuned on."""
     nothing: int = 200
     """Recordings with nothing hidden, or only other stiffness, damping and mass."""
+    pairs: int | None = None
+    """Pairs of effects, drawn at random; all by default."""
     shard: str = "1/1"
     """Part i/n of the cases, for n machines."""
     jobs: int = 1
-    """Cases at a time."""
+    """Cases at a time, one process and one thread each."""
+    limit_s: float = 1800.0
+    """Longest time of a case [s]; one that takes longer has failed."""
+    stop_after_s: float = math.inf
+    """Time [s] after which to end, with the figures of what is done; run it again to go on."""
     device: str = "cpu"
     """Warp device."""
     collect: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -169,12 +178,23 @@ class GapCommand:
             effects=self.effects,
             sizes=self.sizes,
             seeds=self.seeds,
+            first_seed=self.first_seed,
             nothing=self.nothing,
+            pairs=self.pairs,
         )
         if not self.collect:
             device = choose_device(self.device)
             shard = parse_shard(self.shard)
-            run_battery(cases, self.out, shard=shard, jobs=self.jobs, device=device, keep=self.keep)
+            run_battery(
+                cases,
+                self.out,
+                shard=shard,
+                jobs=max(self.jobs, 1),
+                device=device,
+                keep=self.keep,
+                limit_s=self.limit_s,
+                stop_after_s=self.stop_after_s,
+            )
         results = collect(self.out)
         if not results:
             raise ValueError(f"{self.out} holds no results; run the battery without --collect first")

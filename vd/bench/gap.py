@@ -8,16 +8,19 @@ interrupted, resumed and split over machines.
 
 import itertools
 import json
+import math
 import shutil
 import traceback
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vd.bench.gap_score import KINDS, Case, said, score
+from vd.bench.workers import run_tasks
 from vd.files import write_json
 from vd.gap.hidden_plant import OUTSIDE
 from vd.gap.hide import simulate_hidden, write_hidden
@@ -27,6 +30,8 @@ from vd.gap.sizes import GAPS, showing
 PAIR_SIZE = 2
 """Size of both effects of a pair: about six noise floors each."""
 NOTHING_HIDDEN = 200
+CASE_LIMIT_S = 1800.0
+"""Longest time of a case [s]."""
 
 
 def battery(
@@ -36,9 +41,11 @@ def battery(
     effects: Sequence[str] = (),
     sizes: Sequence[int] = (0, 1, 2, 3),
     seeds: int = 5,
+    first_seed: int = 0,
     nothing: int = NOTHING_HIDDEN,
+    pairs: int | None = None,
 ) -> list[Case]:
-    """The cases, in an order whose every part is a fair sample: seeds outside, effects inside.
+    """The cases, in a random order with all kinds mixed in proportion: any first part is a fair sample.
 
     Args:
         model: Hand, ``servo`` or ``pendulum``.
@@ -46,7 +53,9 @@ def battery(
         effects: Effects to hide; empty: all that show on the model.
         sizes: Sizes of single effects and of those outside the table.
         seeds: Recordings of each effect and size.
+        first_seed: Seed of the first: recordings that the method has not been tuned on.
         nothing: Recordings with nothing hidden.
+        pairs: Pairs of effects, drawn at random; all if None.
 
     Raises:
         ValueError: An unknown kind, effect or size.
@@ -62,22 +71,33 @@ def battery(
         )
     names = tuple(effects) or shown
     changes = ("exact", "base") if model in BARE_MODELS else ("exact", "base", "mass")
+    numbers = range(first_seed, first_seed + seeds)
     cases = {
         "single": [
             Case("single", model, (name,), size, seed)
-            for seed, size, name in itertools.product(range(seeds), sizes, names)
+            for seed, size, name in itertools.product(numbers, sizes, names)
         ],
-        "none": [Case("none", model, (), 0, seed, changes[seed % len(changes)]) for seed in range(nothing)],
+        "none": [
+            Case("none", model, (), 0, first_seed + i, changes[i % len(changes)]) for i in range(nothing)
+        ],
         "pair": [
-            Case("pair", model, pair, PAIR_SIZE, seed)
-            for seed, pair in enumerate(itertools.combinations(names, 2))
+            Case("pair", model, pair, PAIR_SIZE, first_seed + number)
+            for number, pair in enumerate(itertools.combinations(names, 2))
         ],
         "outside": [
             Case("outside", model, (name,), size, seed)
-            for seed, size, name in itertools.product(range(seeds), sizes, OUTSIDE)
+            for seed, size, name in itertools.product(numbers, sizes, OUTSIDE)
         ],
     }
-    return [case for kind in KINDS if kind in kinds for case in cases[kind]]
+    chosen = [_shuffled(cases[kind]) for kind in KINDS if kind in kinds]
+    if pairs is not None:
+        chosen = [group[:pairs] if group and group[0].kind == "pair" else group for group in chosen]
+    placed = [((i + 0.5) / len(group), case) for group in chosen for i, case in enumerate(group)]
+    return [case for _, case in sorted(placed, key=lambda item: item[0])]
+
+
+def _shuffled(cases: Sequence[Case]) -> list[Case]:
+    return [cases[i] for i in np.random.default_rng(0).permutation(len(cases))]
 
 
 def run_case(case: Case, folder: Path, device: str = "cpu", keep: bool = False) -> dict[str, Any]:
@@ -120,20 +140,24 @@ def run_battery(
     folder: Path,
     *,
     shard: tuple[int, int] = (0, 1),
-    jobs: int = 1,
+    jobs: int = 0,
     device: str = "cpu",
     keep: bool = False,
+    limit_s: float = CASE_LIMIT_S,
+    stop_after_s: float = math.inf,
     report: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
-    """Run what has no result yet of one shard of the cases.
+    """Run what has no result yet of one shard of the cases; what failed before comes last.
 
     Args:
         cases: The battery.
         folder: Folder of results; those of all shards may lie in one.
         shard: (index, count): this process takes every ``count``-th case from ``index`` on.
-        jobs: Processes.
+        jobs: Processes; 0 runs the cases in this one, without limits of time.
         device: Warp device of the analyses.
         keep: Keep recordings and analyses.
+        limit_s: Longest time of a case [s]; one that takes longer has failed.
+        stop_after_s: Time [s] after which to end; cases that run then have no result.
         report: Called with a line per case.
 
     Returns:
@@ -142,24 +166,45 @@ def run_battery(
     folder.mkdir(parents=True, exist_ok=True)
     mine = list(cases[shard[0] :: shard[1]])
     done = {case: read_result(folder / f"{case.name}.json") for case in mine}
-    open_cases = [case for case in mine if done[case] is None or "error" in (done[case] or {})]
+    failed = [case for case in mine if "error" in (done[case] or {})]
+    open_cases = [*(case for case in mine if done[case] is None), *failed]
     report(f"{len(mine) - len(open_cases)} of {len(mine)} cases have results; {len(open_cases)} to run")
+    number = 0
 
-    def finished(number: int, case: Case, result: dict[str, Any]) -> None:
+    def finished(case: Case, result: dict[str, Any] | None, why: str) -> None:
+        nonlocal number
+        number += 1
+        if result is None:
+            result = {"case": asdict(case), "error": why}
+            write_json(folder / f"{case.name}.json", result)
         done[case] = result
-        answer = "failed" if "error" in result else f"{result['verdict']}: {said(result)}"
+        answer = f"failed: {why}" if "error" in result else f"{result['verdict']}: {said(result)}"
         report(f"[{number}/{len(open_cases)}] {case.name}: {answer}")
 
-    if jobs == 1:
-        for number, case in enumerate(open_cases, 1):
-            finished(number, case, run_case(case, folder, device, keep))
-    else:
-        # Fresh processes: Warp and a CUDA context do not survive a fork.
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            running = {pool.submit(run_case, case, folder, device, keep): case for case in open_cases}
-            for number, future in enumerate(as_completed(running), 1):
-                finished(number, running[future], future.result())
+    work = partial(run_case, folder=folder, device=device, keep=keep)
+    if jobs == 0:
+        for case in open_cases:
+            finished(case, work(case), "")
+        return [result for result in done.values() if result is not None]
+    if open_cases:
+        _compile(device)
+    gpu = device.startswith("cuda")
+    left = run_tasks(
+        work, open_cases, finished, jobs=jobs, limit_s=limit_s, stop_after_s=stop_after_s, gpu=gpu
+    )
+    if left:
+        report(f"stopped after {stop_after_s:.0f} s with {left} cases to run: run it again to go on")
     return [result for result in done.values() if result is not None]
+
+
+def _compile(device: str) -> None:
+    """Fill Warp's cache before many processes want the same kernels at once."""
+    import warp as wp
+
+    import vd.kernels.chains
+
+    wp.config.log_level = wp.LOG_WARNING
+    wp.load_module(vd.kernels.chains, device=device)
 
 
 def read_result(path: Path) -> dict[str, Any] | None:
