@@ -1,6 +1,6 @@
-"""Rotations and points: differences, angles, uniform draws on SO(3), points carried by links.
+"""Rotations: differences, angles, uniform draws on SO(3).
 
-Quaternions are xyzw and of unit length; angles are in radians, positions in metres.
+Quaternions are xyzw and of unit length; angles are in radians.
 """
 
 import warp as wp
@@ -51,28 +51,3 @@ def random_rotation_within(rng: wp.uint32, max_angle: float):
     axis = wp.sample_unit_sphere_surface(rng)
     vector = axis * wp.sin(half)
     return rng, wp.quat(vector[0], vector[1], vector[2], wp.cos(half))
-
-
-@wp.kernel
-def transform_link_points_kernel(
-    # Model:
-    points_in: wp.array[wp.vec3],
-    point_body_in: wp.array[int],
-    # In:
-    body_q_in: wp.array2d[wp.transform],
-    frame_in: wp.transform,
-    # Out:
-    points_out: wp.array2d[wp.vec3],
-):
-    """Carry points fixed to links into one frame: inverse(frame) * body_q * point. Launch: [N, P].
-
-    Args:
-        points_in: Points in the frame of their link [m], shape [P].
-        point_body_in: Link of each point, an index within a world, shape [P].
-        body_q_in: Link poses in the world frame, shape [N, B].
-        frame_in: Pose in the world frame of the frame in which the points are wanted.
-        points_out: Points in that frame [m], shape [N, P].
-    """
-    world, point = wp.tid()
-    link = wp.transform_multiply(wp.transform_inverse(frame_in), body_q_in[world, point_body_in[point]])
-    points_out[world, point] = wp.transform_point(link, points_in[point])

@@ -9,14 +9,11 @@ from kernel_oracle import (
     angle_between,
     ball_cdf,
     device_array,
-    floats,
     goals,
-    pose_matrix,
     quaternions,
     relative_quaternion,
     rotation_angles,
     streams,
-    transforms,
     unwritten,
 )
 from scipy import stats
@@ -27,7 +24,6 @@ from vd.kernels.transforms import (
     random_rotation_within,
     rotation_angle,
     rotation_difference,
-    transform_link_points_kernel,
 )
 
 DRAWS = 100_000
@@ -131,28 +127,3 @@ def test_draws_repeat_with_the_seed_and_differ_between_worlds(device):
     np.testing.assert_array_equal(first, again)
     assert not np.array_equal(first, draw_rotations(-1.0, 5, device, 1000))
     assert len(np.unique(first, axis=0)) == 1000
-
-
-@EXAMPLES
-@given(data=st.data(), worlds=st.integers(1, 3), bodies=st.integers(1, 4), points=st.integers(1, 7))
-def test_link_points_match_homogeneous_matrices(device, data, worlds, bodies, points):
-    point = data.draw(floats((points, 3), -0.1, 0.1))
-    body = data.draw(st.lists(st.integers(0, bodies - 1), min_size=points, max_size=points))
-    pose, frame = data.draw(transforms((worlds, bodies))), data.draw(transforms(()))
-    out = unwritten((worlds, points), wp.vec3, device)
-    wp.launch(
-        transform_link_points_kernel,
-        dim=(worlds, points),
-        inputs=[
-            device_array(point, wp.vec3, device),
-            device_array(body, int, device),
-            device_array(pose, wp.transform, device),
-            wp.transform(*frame.tolist()),
-        ],
-        outputs=[out],
-        device=device,
-    )
-    homogeneous = np.append(point, np.ones((points, 1)), axis=1)
-    world = np.einsum("npij,pj->npi", pose_matrix(pose)[:, body], homogeneous)
-    expected = np.einsum("ij,npj->npi", np.linalg.inv(pose_matrix(frame)), world)
-    np.testing.assert_allclose(out.numpy(), expected[..., :3], atol=1e-6)

@@ -1,0 +1,118 @@
+import itertools
+
+import numpy as np
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from kernel_oracle import EXAMPLES, device_array
+
+from vd.kernels.coordinate_maps import (
+    coarsen,
+    hash_table,
+    neighbour_table,
+    strided_tables,
+    window_table,
+)
+from vd.kernels.voxels import coordinates, voxelise
+
+OFFSETS = list(itertools.product((-1, 0, 1), repeat=3))
+"""Of a 3x3x3 kernel, in the order of its weights."""
+CORNERS = list(itertools.product((0, 1), repeat=3))
+FAR = 2047
+"""Last cell of the grid."""
+
+
+@st.composite
+def grids(draw):
+    """Occupied cells (cloud, x, y, z) of up to three clouds, crowded, some at the ends of the grid."""
+    clouds = draw(st.integers(1, 3))
+    count = draw(st.integers(1, 30))
+    cells = draw(hnp.arrays(np.int32, (clouds, count, 3), elements=st.integers(-3, 3)))
+    ends = draw(hnp.arrays(np.int8, (clouds, count), elements=st.integers(0, 9)))
+    cells[ends == 0] = FAR
+    cells[ends == 1] = -FAR - 1
+    return cells
+
+
+def sites(cells, device, level):
+    """Keys and rows (cloud, x, y, z) of a level."""
+    keys = voxelise(device_array(cells + 0.5, wp.vec3, device), 1.0)
+    for _ in range(level):
+        keys, _ = coarsen(keys)
+    return keys, coordinates(keys, level).numpy()
+
+
+def row_of(rows):
+    return {tuple(int(v) for v in row): i for i, row in enumerate(rows)}
+
+
+def moved(row, offset, factor=1):
+    return (int(row[0]), *(factor * int(c) + o for c, o in zip(row[1:], offset, strict=True)))
+
+
+@EXAMPLES
+@given(cells=grids(), level=st.integers(0, 3))
+def test_coarse_sites_are_the_floors_of_halves(device, cells, level):
+    keys, rows = sites(cells, device, level)
+    coarse, place = coarsen(keys)
+    found = coordinates(coarse, level + 1).numpy()
+    expected = np.c_[rows[:, 0], np.floor(rows[:, 1:] / 2).astype(int)]
+    assert set(map(tuple, found)) == set(map(tuple, expected))
+    assert len(found) == len(set(map(tuple, found)))
+    np.testing.assert_array_equal(found[place.numpy() - 1], expected)
+
+
+@EXAMPLES
+@given(cells=grids(), level=st.integers(0, 2))
+def test_neighbours_are_all_the_sites_at_each_offset(device, cells, level):
+    keys, rows = sites(cells, device, level)
+    table, index = neighbour_table(keys, level).numpy(), row_of(rows)
+    for row, k in itertools.product(range(len(rows)), range(27)):
+        assert table[row, k] == index.get(moved(rows[row], OFFSETS[k]), len(rows))
+
+
+@EXAMPLES
+@given(cells=grids(), level=st.integers(0, 2))
+def test_strided_maps_hold_every_pair_of_input_and_output(device, cells, level):
+    keys, rows = sites(cells, device, level)
+    coarse, _ = coarsen(keys)
+    outputs = coordinates(coarse, level + 1).numpy()
+    table, back = (t.numpy() for t in strided_tables(keys, coarse, level))
+    index = row_of(rows)
+    for row, k in itertools.product(range(len(outputs)), range(27)):
+        expected = index.get(moved(outputs[row], OFFSETS[k], 2), len(rows))
+        assert table[row, k] == expected
+    pairs = {(table[row, k], row, k) for row, k in zip(*np.nonzero(table < len(rows)), strict=True)}
+    assert pairs == {(row, back[row, k], k) for row, k in zip(*np.nonzero(back < len(outputs)), strict=True)}
+
+
+@EXAMPLES
+@given(cells=grids(), level=st.integers(0, 2))
+def test_windows_hold_the_sites_of_each_cell(device, cells, level):
+    keys, rows = sites(cells, device, level)
+    coarse, place = coarsen(keys)
+    outputs = coordinates(coarse, level + 1).numpy()
+    table, index = window_table(keys, place, len(outputs)).numpy(), row_of(rows)
+    for row, k in itertools.product(range(len(outputs)), range(8)):
+        assert table[row, k] == index.get(moved(outputs[row], CORNERS[k], 2), len(rows))
+    assert sorted(table[table < len(rows)]) == list(range(len(rows)))
+
+
+def test_hash_table_holds_every_key_once(device):
+    cells = np.random.default_rng(0).integers(-60, 60, (4, 5000, 3))
+    keys, rows = sites(cells, device, 0)
+    slot_key, slot_row = (a.numpy() for a in hash_table(keys))
+    used = slot_key >= 0
+    assert used.sum() == len(rows) <= len(slot_key) / 2
+    np.testing.assert_array_equal(keys.numpy()[slot_row[used]], slot_key[used])
+    assert len(set(slot_row[used])) == len(rows)
+
+
+def test_no_sites_give_empty_maps(device):
+    keys = wp.empty(0, dtype=wp.int64, device=device)
+    coarse, place = coarsen(keys)
+    assert coarse.shape == place.shape == (0,)
+    assert neighbour_table(keys, 0).shape == (0, 27)
+    assert [t.shape for t in strided_tables(keys, coarse, 0)] == [(0, 27), (0, 27)]
+    assert window_table(keys, place, 0).shape == (0, 8)

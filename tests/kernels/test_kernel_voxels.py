@@ -1,0 +1,190 @@
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from kernel_oracle import ALPHA, EXAMPLES, device_array, streams, unwritten
+from scipy import stats
+
+from vd.kernels.voxels import (
+    CloudNoise,
+    cloud_offsets,
+    coordinates,
+    draw_noise,
+    key_coordinates,
+    spread_bits,
+    voxel_key_kernel,
+    voxelise,
+)
+
+SIZE = 0.005
+HALF = 2048
+
+
+@wp.kernel(enable_backward=False)
+def bits_kernel(cells: wp.array2d[int], out: wp.array2d[int]):
+    i = wp.tid()
+    one, two = wp.int64(1), wp.int64(2)
+    key = (spread_bits(cells[i, 0]) << two) | (spread_bits(cells[i, 1]) << one) | spread_bits(cells[i, 2])
+    back = key_coordinates(key)
+    for axis in range(3):
+        out[i, axis] = back[axis]
+
+
+@st.composite
+def clouds(draw):
+    """Points in voxel units, many in the same voxel or on a border, some not finite or far away."""
+    shape = (draw(st.integers(1, 3)), draw(st.integers(1, 12)), 3)
+    whole = draw(hnp.arrays(np.int32, shape, elements=st.integers(-3, 3)))
+    part = draw(hnp.arrays(np.float32, shape, elements=st.sampled_from([0.0, 0.25, 0.5, 0.875])))
+    points = (whole + part).astype(np.float32)
+    odd = draw(hnp.arrays(np.int8, shape[:2], elements=st.integers(0, 9)))
+    points[odd == 0, 1] = np.nan
+    points[odd == 1, 2] = np.inf
+    points[odd == 2, 0] = HALF
+    points[odd == 3, 0] = -HALF
+    return points
+
+
+def expected_voxels(points, size):
+    """Sorted set of (cloud, x, y, z), by Python's integers."""
+    found = set()
+    for cloud, rows in enumerate(points):
+        for point in rows:
+            cell = np.floor(point / np.float32(size))
+            if np.isfinite(cell).all() and (cell >= -HALF).all() and (cell < HALF).all():
+                found.add((cloud, *(int(c) for c in cell)))
+    return found
+
+
+def voxels(points, device, size=1.0, noise=None):
+    keys = voxelise(device_array(points, wp.vec3, device), size, noise)
+    return coordinates(keys).numpy(), keys
+
+
+def test_bits_come_back_from_a_key(device):
+    cells = np.random.default_rng(0).integers(0, 4096, (1000, 3)).astype(np.int32)
+    cells[:2] = [[0], [4095]]
+    out = unwritten(cells.shape, int, device)
+    wp.launch(
+        bits_kernel, dim=len(cells), inputs=[device_array(cells, int, device)], outputs=[out], device=device
+    )
+    np.testing.assert_array_equal(out.numpy(), cells)
+
+
+@EXAMPLES
+@given(points=clouds())
+def test_voxels_are_the_set_of_floors(device, points):
+    rows, keys = voxels(points, device)
+    assert len(set(map(tuple, rows))) == len(rows)
+    assert set(map(tuple, rows)) == expected_voxels(points, 1.0)
+    offsets = cloud_offsets(keys, len(points)).numpy()
+    np.testing.assert_array_equal(offsets, [np.sum(rows[:, 0] < b) for b in range(len(points) + 1)])
+    assert (np.diff(keys.numpy()) > 0).all()
+
+
+def test_floor_goes_down_below_zero_too(device):
+    """Truncation would put -1 mm and +1 mm in one voxel, twice as thick as the others."""
+    points = np.array([[[-0.001, 0.001, -0.0051]]], np.float32)
+    np.testing.assert_array_equal(voxels(points, device, SIZE)[0], [[0, -1, 0, -2]])
+
+
+@EXAMPLES
+@given(points=clouds(), seed=st.integers(0, 1000))
+def test_order_of_points_does_not_matter(device, points, seed):
+    shuffled = np.random.default_rng(seed).permutation(points, axis=1)
+    np.testing.assert_array_equal(voxels(points, device)[0], voxels(shuffled, device)[0])
+
+
+def test_a_cloud_without_points_has_no_voxel(device):
+    points = np.full((3, 2, 3), np.nan, np.float32)
+    points[1] = 0.0
+    rows, keys = voxels(points, device)
+    np.testing.assert_array_equal(rows, [[1, 0, 0, 0]])
+    np.testing.assert_array_equal(cloud_offsets(keys, 3).numpy(), [0, 0, 1, 1])
+    assert len(voxels(np.full((2, 1, 3), np.nan, np.float32), device)[0]) == 0
+
+
+def test_refuses_a_size_that_is_not_positive():
+    with pytest.raises(ValueError, match="voxel_size"):
+        voxelise(wp.zeros((1, 1), dtype=wp.vec3, device="cpu"), 0.0)
+
+
+def noise_of(device, count, seed=0, jitter=0.4, std=0.004, dropout=0.4, ratio=(0.0, 0.2)):
+    noise = CloudNoise()
+    noise.jitter_probability, noise.jitter_std = jitter, std
+    noise.dropout_probability, noise.dropout_ratio = dropout, wp.vec2(*ratio)
+    return draw_noise(wp.array([noise], dtype=CloudNoise, device=device), streams(count, seed, device))
+
+
+def test_noise_is_drawn_for_each_cloud_as_the_paper_says(device):
+    count = 20000
+    draw = noise_of(device, count)
+    jitter, dropout = draw.jitter.numpy(), draw.dropout.numpy()
+    assert set(np.unique(jitter)) == {0.0, np.float32(0.004)}
+    jittered, dropped = jitter > 0, dropout > 0
+    for share in (jittered, dropped):
+        assert stats.binomtest(int(share.sum()), count, 0.4).pvalue > ALPHA
+    assert stats.binomtest(int((jittered & dropped).sum()), count, 0.16).pvalue > ALPHA
+    assert stats.kstest(dropout[dropped], stats.uniform(0, 0.2).cdf).pvalue > ALPHA
+    assert len(np.unique(draw.stream.numpy())) > count - 3
+
+
+def keys_of(points, draw, device, size):
+    out = wp.full(2 * points.shape[0] * points.shape[1], -1, dtype=wp.int64, device=device)
+    wp.launch(
+        voxel_key_kernel,
+        dim=points.shape[:2],
+        inputs=[device_array(points, wp.vec3, device), size, draw.jitter, draw.dropout, draw.stream],
+        outputs=[out],
+        device=device,
+    )
+    return out
+
+
+def test_jitter_is_gaussian_in_metres_and_dropout_loses_its_share(device):
+    points = np.zeros((2, 20000, 3), np.float32)
+    fine = 1e-4  # voxels far below the jitter, so that their coordinates show its distribution
+    draw = noise_of(device, 2, jitter=1.0, dropout=1.0, ratio=(0.2, 0.2))
+    keys = keys_of(points, draw, device, fine)
+    per_cloud = []
+    for cloud in range(2):
+        own = keys[cloud * 20000 : (cloud + 1) * 20000]
+        rows = coordinates(own).numpy()
+        kept = rows[rows[:, 0] == cloud][:, 1:] * fine
+        assert stats.binomtest(len(kept), 20000, 0.8).pvalue > ALPHA
+        for axis in range(3):
+            assert stats.kstest(kept[:, axis] + 0.5 * fine, stats.norm(0, 0.004).cdf).statistic < 0.02
+        assert np.abs(np.corrcoef(kept.T) - np.eye(3)).max() < 0.05
+        per_cloud.append(kept)
+    assert len(per_cloud[0]) != len(per_cloud[1]) or not np.array_equal(*per_cloud)
+
+
+def test_noise_repeats_with_the_seed_and_differs_between_clouds_and_draws(device):
+    points = np.tile(np.random.default_rng(0).normal(size=(1, 300, 3)).astype(np.float32) * 0.05, (4, 1, 1))
+
+    def rows(seed):
+        draw = noise_of(device, 4, seed, jitter=1.0, dropout=1.0, ratio=(0.1, 0.2))
+        found = voxels(points, device, SIZE, draw)[0]
+        return [found[found[:, 0] == cloud][:, 1:].tobytes() for cloud in range(4)]
+
+    first = rows(1)
+    assert first == rows(1)
+    assert len(set(first)) == 4
+    assert not set(first) & set(rows(2))
+
+
+def test_streams_advance(device):
+    rng = streams(3, 5, device)
+    noise = CloudNoise()
+    noise.dropout_probability, noise.dropout_ratio = 1.0, wp.vec2(0.0, 0.2)
+    settings = wp.array([noise], dtype=CloudNoise, device=device)
+    draws = [draw_noise(settings, rng).dropout.numpy() for _ in range(2)]
+    assert not np.isclose(*draws).any()
+
+
+def test_no_probability_means_no_noise(device):
+    points = np.random.default_rng(1).normal(size=(2, 200, 3)).astype(np.float32) * 0.05
+    quiet = noise_of(device, 2, jitter=0.0, dropout=0.0)
+    np.testing.assert_array_equal(voxels(points, device, SIZE)[0], voxels(points, device, SIZE, quiet)[0])
