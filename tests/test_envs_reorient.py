@@ -5,10 +5,26 @@ import dataclasses
 import numpy as np
 import pytest
 import warp as wp
+from scipy.spatial.transform import Rotation
 
-from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, StartCfg, SuccessCfg
+from vd.envs.cfg import (
+    CurriculumCfg,
+    GoalCfg,
+    ObservationCfg,
+    RandomisationCfg,
+    ReorientCfg,
+    StartCfg,
+    SuccessCfg,
+)
 from vd.envs.reorient import ReorientEnv
-from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
+from vd.kernels.shapes import (
+    EXTENT_CENTRE_M,
+    SHAPE_UNIT_M,
+    extent_directions,
+    shape_observation_size,
+    shape_observation_slices,
+)
 from vd.sim.cfg import SimCfg
 from vd.sim.replay import replay
 from vd.sim.simulator import SimulationError
@@ -188,6 +204,53 @@ def test_curriculum_tightens_only_while_goals_are_reached():
     assert numbers["difficulty"] == 0.75
     assert numbers["success_per_goal"] == pytest.approx(0.1)
     assert numbers["drop_per_goal"] == pytest.approx(0.3)
+
+
+def test_goals_can_widen_before_stillness_tightens():
+    curriculum = CurriculumCfg(
+        enabled=True, goal_start_rad=0.5, stillness_start=4.0, goal_span=(0.0, 0.5), stillness_span=(0.5, 1.0)
+    )
+    env = make(curriculum=curriculum, goal=GoalCfg(max_angle_rad=2.5))
+    limit = SuccessCfg().object_spin_rad_s
+    seen = []
+    for difficulty in (0.0, 0.25, 0.5, 0.75, 1.0):
+        env.parameters.set_difficulty(difficulty)
+        spin = float(env.parameters.success.numpy()["object_spin"][0])
+        seen.append((float(env.parameters.goal.numpy()["max_angle"][0]), spin / limit))
+    assert np.allclose(seen, [(0.5, 4.0), (1.5, 4.0), (2.5, 4.0), (2.5, 2.0), (2.5, 1.0)], rtol=1e-5)
+    with pytest.raises(ValueError, match=r"curriculum\.goal_span is 0\.5 0\.5"):
+        make(curriculum=dataclasses.replace(curriculum, goal_span=(0.5, 0.5)))
+
+
+def test_the_shape_is_seen_behind_the_state_and_changes_nothing_else(device):
+    seeing = {"objects": ("symmetric",), "num_worlds": 14, "observation": ObservationCfg(shape="full")}
+    random = RandomisationCfg(enabled=True, observation_noise_mean=0.0, observation_noise_std=0.0)
+    env = make(device, **seeing, randomisation=random)
+    run(env, 3)
+    state = teacher_observation_size(3)
+    observation = env.observation.numpy()
+    assert env.num_observations == observation.shape[1] == state + shape_observation_size(3)
+    slices = shape_observation_slices(3)
+    tips = observation[:, teacher_observation_slices(3)["fingertips"]].reshape(-1, 3, 13)[..., :3]
+    vectors = SHAPE_UNIT_M * observation[:, state:][:, slices["surface"]].reshape(-1, 3, 3)
+    extents = EXTENT_CENTRE_M + SHAPE_UNIT_M * observation[:, state:][:, slices["extent"]]
+    pose, goal = env.object_pose(), env.goal_quat.numpy()
+    assert set(np.round(env.scene.world_scale, 3)) == {0.95, 1.0, 1.05}, "sizes differ"
+    for w in range(env.num_worlds):
+        cloud = env.scene.world_scale[w] * env.objects[env.world_object[w]].surface_points.astype(float)
+        placed = Rotation.from_quat(pose[w, 3:]).apply(cloud)
+        assert extents[w] == pytest.approx((placed @ extent_directions().T).max(axis=0), abs=1e-5)
+        aim = Rotation.from_quat(goal[w]).apply(cloud)
+        goal_extents = EXTENT_CENTRE_M + SHAPE_UNIT_M * observation[w, state:][slices["goal_extent"]]
+        assert goal_extents == pytest.approx((aim @ extent_directions().T).max(axis=0), abs=1e-5)
+        distance = np.linalg.norm(tips[w][:, None] - (pose[w, :3] + placed)[None], axis=2).min(axis=1)
+        assert np.linalg.norm(vectors[w], axis=1) == pytest.approx(distance, abs=1e-5)
+
+
+def test_a_blind_teacher_observes_as_before():
+    blind, seeing = make(), make(observation=ObservationCfg(shape="full"))
+    first, second = run(blind, 5), run(seeing, 5)
+    assert np.array_equal(first, second[..., : first.shape[-1]])
 
 
 def test_randomisation_reaches_the_solver():

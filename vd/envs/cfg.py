@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from math import pi
+from typing import Literal
 
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
@@ -68,6 +69,16 @@ class SuccessCfg:
 
 
 @dataclass(frozen=True)
+class ObservationCfg:
+    """What the teacher sees besides the paper's state."""
+
+    shape: Literal["none", "full"] = "none"
+    """none: nothing of the object's shape, as in the paper. full: the vector from each fingertip to the
+    nearest point of the surface, and how far the object extends in 26 directions, now and at the goal;
+    exact, privileged."""
+
+
+@dataclass(frozen=True)
 class GoalCfg:
     """Which goals are drawn."""
 
@@ -96,7 +107,9 @@ class CurriculumCfg:
 
     While the success rate of goals is above ``raise_at`` the difficulty grows by ``rate`` per update,
     while it is below ``lower_at`` it shrinks; in between it stays. Difficulty 0 is ``stillness_start``
-    times the stillness thresholds and ``goal_start_rad``; difficulty 1 is the configured task.
+    times the stillness thresholds and ``goal_start_rad``; difficulty 1 is the configured task. Goals and
+    stillness each move over a span of the difficulty, together by default; ``goal_span`` 0 0.5 and
+    ``stillness_span`` 0.5 1 widen the goals first.
     """
 
     enabled: bool = False
@@ -105,6 +118,10 @@ class CurriculumCfg:
     """Factor on the four stillness thresholds at difficulty 0."""
     goal_start_rad: float = 1.0
     """Largest goal angle at difficulty 0 [rad]."""
+    stillness_span: tuple[float, float] = (0.0, 1.0)
+    """Difficulties from which to which the stillness thresholds tighten."""
+    goal_span: tuple[float, float] = (0.0, 1.0)
+    """Difficulties from which to which the largest goal angle grows."""
     raise_at: float = 0.6
     """Success rate of goals above which the task gets harder."""
     lower_at: float = 0.3
@@ -113,6 +130,14 @@ class CurriculumCfg:
     """Change of the difficulty per update (one update each training iteration)."""
     energy_start: float = 0.0
     """Factor on the energy term at difficulty 0; it grows to 1."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        for name, (low, high) in {"stillness_span": self.stillness_span, "goal_span": self.goal_span}.items():
+            if not 0.0 <= low < high <= 1.0:
+                raise ValueError(
+                    f"curriculum.{name} is {low:g} {high:g}; it has to rise, and lie within 0 and 1"
+                )
 
 
 @dataclass(frozen=True)
@@ -178,6 +203,7 @@ class ReorientCfg:
     """Keep visual shapes, for rendering."""
     sim: SimCfg = field(default_factory=SimCfg)
     action: ActionCfg = field(default_factory=ActionCfg)
+    observation: ObservationCfg = field(default_factory=ObservationCfg)
     reward: RewardCfg = field(default_factory=RewardCfg)
     success: SuccessCfg = field(default_factory=SuccessCfg)
     start: StartCfg = field(default_factory=StartCfg)
@@ -194,6 +220,7 @@ class ReorientCfg:
         """Raise ValueError naming the field and the remedy."""
         self.sim.validate()
         self.randomisation.validate()
+        self.curriculum.validate()
         if self.start.at_rest and (self.start.poses < 1 or self.start.settle_s <= 0.0):
             raise ValueError(
                 f"start.at_rest needs start.poses >= 1 (now {self.start.poses}) and start.settle_s > 0 "

@@ -79,7 +79,7 @@ class TaskParameters:
         """Write reward, success and goal parameters for a difficulty in [0, 1] (1: as configured)."""
         cfg, curriculum = self.cfg, self.cfg.curriculum
         # Thresholds shrink geometrically: each step of difficulty tightens by the same factor.
-        slack = curriculum.stillness_start ** (1.0 - difficulty)
+        slack = curriculum.stillness_start ** (1.0 - _progress(difficulty, curriculum.stillness_span))
         energy = curriculum.energy_start + (1.0 - curriculum.energy_start) * difficulty
         start = min(curriculum.goal_start_rad, cfg.goal.max_angle_rad)
         reward, success = cfg.reward, cfg.success
@@ -113,7 +113,7 @@ class TaskParameters:
         )
         self._write(
             "goal",
-            max_angle=start + (cfg.goal.max_angle_rad - start) * difficulty,
+            max_angle=start + (cfg.goal.max_angle_rad - start) * _progress(difficulty, curriculum.goal_span),
             about_vertical=int(cfg.goal.about_vertical),
         )
 
@@ -122,3 +122,9 @@ class TaskParameters:
         for field, value in values.items():
             staging[field][0] = value
         getattr(self, name).assign(staging)
+
+
+def _progress(difficulty: float, span: tuple[float, float]) -> float:
+    """How far ``difficulty`` has come from the begin to the end of ``span``, in [0, 1]."""
+    begin, end = span
+    return min(1.0, max(0.0, (difficulty - begin) / (end - begin)))

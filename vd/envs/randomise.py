@@ -8,6 +8,7 @@ import warp as wp
 
 from vd.envs.servo import gain_scales
 from vd.kernels.actuators import INERTIA, PAYLOAD_INERTIA
+from vd.kernels.observations import teacher_observation_size
 from vd.kernels.randomisation import (
     disturbance_force_kernel,
     draw_dynamics_kernel,
@@ -53,7 +54,8 @@ class Randomiser:
         self.object_mass = zeros(n)
         """Object mass [kg], shape [N]."""
         self.action_offset = zeros(n, d)
-        self.observation_offset = zeros(n, env.num_observations)
+        # Not of the shape's values, which no sensor measures.
+        self.observation_offset = zeros(n, teacher_observation_size(env.num_fingers))
         self.force = zeros(n, dtype=wp.vec3)
         """Disturbance force on the object [N], world frame, shape [N]."""
         self._age, self._due = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)

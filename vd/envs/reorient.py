@@ -18,12 +18,14 @@ from vd.envs.cfg import ReorientCfg
 from vd.envs.parameters import TaskParameters
 from vd.envs.randomise import Randomiser
 from vd.envs.servo import needs_servo, servo_ranges
+from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
 from vd.kernels.actions import apply_action_kernel, joint_effort_kernel
 from vd.kernels.observations import fingertip_kernel, teacher_observation_kernel, teacher_observation_size
 from vd.kernels.resets import episode_kernel, reset_kernel
 from vd.kernels.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.rng import init_rng_kernel
+from vd.kernels.shapes import shape_observation_size
 from vd.kernels.worlds import count_goals_kernel, record_step_kernel, world_mask_kernel
 from vd.paper import PAPER
 from vd.sim.replay import save_dump
@@ -75,7 +77,8 @@ class ReorientEnv:
         self.num_worlds = n = cfg.num_worlds
         self.num_fingers = f = self.hand.num_fingers
         self.num_actions = d = self.hand.num_joints
-        self.num_observations = teacher_observation_size(f)
+        sees_shape = cfg.observation.shape != "none"
+        self.num_observations = teacher_observation_size(f) + sees_shape * shape_observation_size(f)
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
         self.reward_term_names = REWARD_TERMS
@@ -91,7 +94,7 @@ class ReorientEnv:
         self.smoothed = zeros(n, d)
         """Moving average of the applied actions, shape [N, D]."""
         self.observation = zeros(n, self.num_observations)
-        """Teacher observation, fresh after resets and new goals, shape [N, O]."""
+        """Teacher observation, fresh after resets and new goals, shape [N, O]; the shape's values last."""
         self.reward = zeros(n)
         """Reward of the present step, shape [N]."""
         self.reward_terms = zeros(n, len(REWARD_TERMS))
@@ -131,10 +134,13 @@ class ReorientEnv:
         self._given_goal = zeros(n, dtype=wp.quat)
         self._lower, self._upper = array(self.hand.lower), array(self.hand.upper)
         self._effort_limit = array(self.hand.effort)
-        self._tip_body = array(self.scene.link_body[self.hand.tip_link], wp.int32)
-        self._tip_offset = array(self.hand.tip_frame, wp.transform)
+        self.tip_body = array(self.scene.link_body[self.hand.tip_link], wp.int32)
+        """Link of each fingertip, an index within a world, shape [F]."""
+        self.tip_offset = array(self.hand.tip_frame, wp.transform)
+        """Fingertip frames in the frames of their links, shape [F]."""
         self._body_com = wp.clone(self.sim.model.body_com[: self.scene.bodies_per_world])
         self._reset_q = array(np.tile(PAPER.scene.reset_joint_rad, f))
+        self._shapes = ShapeObserver(self) if sees_shape else None
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
         self.randomiser = Randomiser(self)
 
@@ -348,7 +354,7 @@ class ReorientEnv:
         wp.launch(
             fingertip_kernel,
             dim=(self.num_worlds, self.num_fingers),
-            inputs=[self._tip_body, self._tip_offset, self.sim.body_q],
+            inputs=[self.tip_body, self.tip_offset, self.sim.body_q],
             outputs=[self.tip_pos],
             device=self.device,
         )
@@ -361,8 +367,8 @@ class ReorientEnv:
             inputs=[
                 self._lower,
                 self._upper,
-                self._tip_body,
-                self._tip_offset,
+                self.tip_body,
+                self.tip_offset,
                 self._body_com,
                 self.parameters.observation,
                 self.measured_q,
@@ -378,6 +384,8 @@ class ReorientEnv:
             outputs=[self.observation],
             device=self.device,
         )
+        if self._shapes is not None:
+            self._shapes.launch()
 
     # Reading
 

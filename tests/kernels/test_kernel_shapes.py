@@ -1,0 +1,156 @@
+import numpy as np
+import pytest
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_oracle import (
+    EXAMPLES,
+    device_array,
+    floats,
+    goals,
+    pose_matrix,
+    quaternions,
+    transforms,
+    unwritten,
+)
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from vd.kernels.shapes import (
+    EXTENT_CENTRE_M,
+    ORIENTATIONS,
+    SHAPE_UNIT_M,
+    extent_directions,
+    extent_kernel,
+    shape_observation_size,
+    shape_observation_slices,
+    surface_kernel,
+)
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
+    """N worlds with one of K clouds each, scaled, and a hand of 3 or 4 fingers."""
+    fingers, worlds = draw(st.sampled_from([3, 4])), draw(st.integers(1, 3))
+    shapes, count = draw(st.integers(1, 3)), draw(st.integers(1, 12))
+    joints, bodies = 3 * fingers, 3 * fingers + 2
+    orientation = draw(quaternions((worlds,)))
+    return {
+        "points": draw(floats((shapes, count, 3), -0.1, 0.1)),
+        "object": np.array(draw(st.lists(st.integers(0, shapes - 1), min_size=worlds, max_size=worlds))),
+        "scale": draw(floats((worlds,), 0.5, 2.0)),
+        "tip_body": np.array(draw(st.permutations(range(bodies)))[:fingers]),
+        "tip_offset": draw(transforms((fingers,))),
+        "q": np.concatenate([draw(floats((worlds, joints))), draw(floats((worlds, 3))), orientation], axis=1),
+        "body_q": draw(transforms((worlds, bodies))),
+        "goal": draw(goals(orientation)),
+    }
+
+
+def observe(device, scene, *, first=2):
+    """Launch both kernels behind ``first`` columns and before one more; returns all columns."""
+    worlds, fingers = len(scene["q"]), len(scene["tip_body"])
+    out = unwritten((worlds, first + shape_observation_size(fingers) + 1), float, device)
+    common = [
+        device_array(scene["points"], wp.vec3, device),
+        device_array(scene["object"], int, device),
+        device_array(scene["scale"], float, device),
+    ]
+    q = device_array(scene["q"], float, device)
+    slices = shape_observation_slices(fingers)
+    wp.launch(
+        surface_kernel,
+        dim=(worlds, fingers),
+        inputs=[
+            *common,
+            device_array(scene["tip_body"], int, device),
+            device_array(scene["tip_offset"], wp.transform, device),
+            3 * fingers,
+            first + slices["surface"].start,
+            q,
+            device_array(scene["body_q"], wp.transform, device),
+        ],
+        outputs=[out],
+        device=device,
+    )
+    directions = extent_directions()
+    wp.launch(
+        extent_kernel,
+        dim=(worlds, ORIENTATIONS, len(directions)),
+        inputs=[
+            *common,
+            device_array(directions, wp.vec3, device),
+            3 * fingers,
+            first + slices["extent"].start,
+            q,
+            device_array(scene["goal"], wp.quat, device),
+        ],
+        outputs=[out],
+        device=device,
+    )
+    return out.numpy()
+
+
+def placed(scene, world, quat):
+    """The world's surface points turned by ``quat``, about the object's origin [m], float64."""
+    points = scene["points"][scene["object"][world]].astype(np.float64) * float(scene["scale"][world])
+    return Rotation.from_quat(quat).apply(points)
+
+
+def test_directions_are_even_unit_vectors():
+    directions = extent_directions()
+    assert directions.shape == (26, 3)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
+    cosine = directions @ directions.T - 2.0 * np.eye(26)
+    assert np.degrees(np.arccos(cosine.max(axis=1))).max() < 46.0, "a direction without a neighbour"
+    np.testing.assert_allclose(directions.sum(axis=0), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(("fingers", "size"), [(3, 61), (4, 64)])
+def test_columns_tile_the_values(fingers, size):
+    slices = list(shape_observation_slices(fingers).values())
+    columns = np.concatenate([np.arange(s.start, s.stop) for s in slices])
+    assert shape_observation_size(fingers) == size
+    np.testing.assert_array_equal(columns, np.arange(size))
+
+
+@EXAMPLES
+@given(scene=scenes())
+def test_fingertips_are_told_the_nearest_point_of_the_surface(device, scene):
+    fingers, first = len(scene["tip_body"]), 2
+    out = observe(device, scene, first=first)
+    values = out[:, first:][:, shape_observation_slices(fingers)["surface"]].reshape(-1, fingers, 3)
+    tips = pose_matrix(scene["body_q"])[:, scene["tip_body"]] @ pose_matrix(scene["tip_offset"])
+    for world, vectors in enumerate(values):
+        pose = scene["q"][world, 3 * fingers :].astype(np.float64)
+        cloud = pose[:3] + placed(scene, world, pose[3:])
+        tip = tips[world, :, :3, 3]
+        ends = tip + SHAPE_UNIT_M * vectors
+        distance, _ = cKDTree(cloud).query(tip)
+        # Two points may be equally near: the length is the nearest, and the end is a point of the cloud.
+        np.testing.assert_allclose(SHAPE_UNIT_M * np.linalg.norm(vectors, axis=1), distance, atol=2e-6)
+        np.testing.assert_allclose(cKDTree(cloud).query(ends)[0], 0.0, atol=2e-6)
+
+
+@EXAMPLES
+@given(scene=scenes())
+def test_extents_are_the_support_function_now_and_at_the_goal(device, scene):
+    fingers, first = len(scene["tip_body"]), 2
+    out = observe(device, scene, first=first)
+    slices = shape_observation_slices(fingers)
+    for world in range(len(out)):
+        for name, quat in (
+            ("extent", scene["q"][world, 3 * fingers + 3 :]),
+            ("goal_extent", scene["goal"][world]),
+        ):
+            support = (placed(scene, world, quat) @ extent_directions().T).max(axis=0)
+            values = EXTENT_CENTRE_M + SHAPE_UNIT_M * out[world, first:][slices[name]]
+            np.testing.assert_allclose(values, support, atol=2e-6)
+
+
+@EXAMPLES
+@given(scene=scenes())
+def test_nothing_else_is_written(device, scene):
+    out = observe(device, scene, first=2)
+    assert np.isnan(out[:, :2]).all() and np.isnan(out[:, -1]).all()
+    assert np.isfinite(out[:, 2:-1]).all()

@@ -1,0 +1,72 @@
+"""The shape of each world's object as the teacher sees it: its points on the device, and their launches."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import warp as wp
+
+from vd.kernels.observations import teacher_observation_size
+from vd.kernels.shapes import (
+    ORIENTATIONS,
+    extent_directions,
+    extent_kernel,
+    shape_observation_slices,
+    surface_kernel,
+)
+
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
+
+
+class ShapeObserver:
+    """Writes the columns of ``vd.kernels.shapes`` behind the state in the observation of ``env``."""
+
+    def __init__(self, env: "ReorientEnv"):
+        """Put surface points and scales of the objects on the device."""
+        self._env = env
+        device = env.device
+        points = np.stack([item.surface_points for item in env.objects])
+        self._points = wp.array(points, dtype=wp.vec3, device=device)
+        self._object = wp.array(env.scene.world_object, dtype=wp.int32, device=device)
+        self._scale = wp.array(env.scene.world_scale, dtype=float, device=device)
+        self._directions = wp.array(extent_directions(), dtype=wp.vec3, device=device)
+        first, slices = teacher_observation_size(env.num_fingers), shape_observation_slices(env.num_fingers)
+        self._surface_column = first + slices["surface"].start
+        self._extent_column = first + slices["extent"].start
+
+    def launch(self) -> None:
+        """Write the values of the present state and goal."""
+        env = self._env
+        wp.launch(
+            surface_kernel,
+            dim=(env.num_worlds, env.num_fingers),
+            inputs=[
+                self._points,
+                self._object,
+                self._scale,
+                env.tip_body,
+                env.tip_offset,
+                env.num_actions,
+                self._surface_column,
+                env.sim.joint_q,
+                env.sim.body_q,
+            ],
+            outputs=[env.observation],
+            device=env.device,
+        )
+        wp.launch(
+            extent_kernel,
+            dim=(env.num_worlds, ORIENTATIONS, len(self._directions)),
+            inputs=[
+                self._points,
+                self._object,
+                self._scale,
+                self._directions,
+                env.num_actions,
+                self._extent_column,
+                env.sim.joint_q,
+                env.goal_quat,
+            ],
+            outputs=[env.observation],
+            device=env.device,
+        )
