@@ -311,6 +311,93 @@ def test_a_checkpoint_without_worlds_goes_on_with_new_episodes(tmp_path):
     assert _rows(tmp_path)[-1]["task/difficulty"] == pytest.approx(0.05)
 
 
+class SeeingEnv(DummyEnv):
+    """The dummy with three more values behind its observation, one of them large."""
+
+    num_observations = DummyEnv.num_observations + 3
+
+    def _observe(self) -> None:
+        marker = np.full((self.num_worlds, 1), float(self.steps), dtype=np.float32) * 1e-3
+        more = np.hstack([self._target * self._target, 100.0 + self._target[:, :1]])
+        self.observation.assign(np.hstack([self._target, np.abs(self._target), marker, more]))
+
+
+def _outputs(runner, observation: torch.Tensor) -> list[torch.Tensor]:
+    """Means, standard deviations and values."""
+    from tensordict import TensorDict
+
+    seen = TensorDict({"policy": observation}, batch_size=[len(observation)])
+    with torch.inference_mode():
+        runner.alg.actor(seen, stochastic_output=True)
+        policy = runner.alg.get_policy()
+        return [policy.output_mean.clone(), policy.output_std.clone(), runner.alg.critic(seen)]
+
+
+@pytest.mark.parametrize("how", ["load", "begin_from"])
+@pytest.mark.parametrize("normalise", [True, False])
+def test_networks_that_see_more_act_as_before_and_learn_on(tmp_path, how, normalise):
+    from dataclasses import replace
+
+    from train_dummy import SMALL_POLICY
+
+    policy = replace(SMALL_POLICY, normalise_observations=normalise)
+    blind = make_runner(tmp_path / "blind", policy=policy)
+    blind.learn(3)
+    seeing = make_runner(tmp_path / "seeing", env=SeeingEnv(num_worlds=16, seed=4), policy=policy, seed=4)
+    getattr(seeing, how)(str(find_checkpoint(tmp_path / "blind", "latest")))
+    assert seeing.new_inputs == 3 and seeing.new_episodes
+
+    observation = torch.randn(50, 8) * torch.tensor([1.0] * 5 + [30.0] * 3)
+    before, after = _outputs(blind, observation[:, :5]), _outputs(seeing, observation)
+    assert all(torch.allclose(one, two, atol=1e-6) for one, two in zip(before, after, strict=True))
+    assert seeing.current_learning_iteration == 3 and seeing.env_steps == blind.env_steps
+    assert seeing.env.env.difficulty == blind.env.env.difficulty > 0.0
+    assert seeing.alg.learning_rate == blind.alg.learning_rate
+
+    old, new = (r.alg.optimizer.state_dict()["state"] for r in (blind, seeing))
+    assert old.keys() == new.keys()
+    wider = [i for i in old if old[i]["exp_avg"].shape != new[i]["exp_avg"].shape]
+    assert len(wider) == 2, "the first layers of actor and critic"
+    for i in old:
+        columns = old[i]["exp_avg"].shape[-1]
+        assert float(old[i]["step"]) == float(new[i]["step"])
+        for moment in ("exp_avg", "exp_avg_sq"):
+            assert torch.equal(old[i][moment], new[i][moment][..., :columns])
+    for i in wider:
+        assert not new[i]["exp_avg"][:, 5:].any()
+        assert torch.allclose(new[i]["exp_avg_sq"][:, 5:], old[i]["exp_avg_sq"].mean(dim=1, keepdim=True))
+
+    seeing.learn(2)
+    assert seeing.alg.actor.state_dict()["mlp.0.weight"][:, 5:].abs().max() > 0.0, "nothing new was learned"
+    assert load_policy(tmp_path / "seeing" / "policy.pt").num_observations == 8
+
+
+def test_networks_cannot_see_less(tmp_path):
+    make_runner(tmp_path, env=SeeingEnv(num_worlds=16)).learn(1)
+    blind = make_runner(tmp_path / "blind")
+    with pytest.raises(ValueError, match="read 8 values and this run observes 5"):
+        blind.load(str(find_checkpoint(tmp_path, "latest")))
+
+
+def test_a_new_run_can_begin_from_anothers_checkpoint(tmp_path):
+    first = make_runner(tmp_path / "first", save_every=1)
+    first._window = GoalWindow(1)
+    first.learn(3)
+    checkpoint = find_checkpoint(tmp_path / "first", "latest")
+    assert load_checkpoint(checkpoint)["best"] is not None
+    second = make_runner(tmp_path / "second", env=DummyEnv(num_worlds=16, seed=7), seed=7)
+    second.begin_from(str(checkpoint))
+    assert second.new_inputs == 0 and second.new_episodes == "it is of another run"
+    one, two = _weights(first), _weights(second)
+    assert all(torch.equal(one[name], two[name]) for name in one)
+    assert not second.env.env.step_count.numpy().any()
+    assert second._best is None and not second._window.full, "another run's rates would decide which is best"
+    second.learn(1)
+    assert [row["iteration"] for row in _rows(tmp_path / "second")] == [4]
+    with pytest.raises(ValueError, match="is a policy; --init needs a checkpoint"):
+        second.begin_from(str(tmp_path / "first" / "policy.pt"))
+
+
 def test_a_run_goes_on_with_another_number_of_worlds_to_the_same_steps(tmp_path):
     make_runner(tmp_path).learn(3)  # 16 worlds x 8 steps = 128 an iteration
     resumed = make_runner(tmp_path, env=DummyEnv(num_worlds=8), max_steps=600)

@@ -140,6 +140,8 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
     cfg = replace(cfg, run=replace(cfg.run, device=device))
     present = list_checkpoints(cfg.run.run_dir)
+    if cfg.init is not None and not cfg.init.is_file():
+        raise FileNotFoundError(f"--init: no file {cfg.init}; give a checkpoint of vd-train teacher")
     resume = cfg.resume if cfg.resume != AUTO else "latest" if present else None
     checkpoint = find_checkpoint(cfg.run.run_dir, resume) if resume else None
     if checkpoint is None and present:
@@ -175,6 +177,8 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     runner = TeacherRunner(env, cfg.ppo, cfg.policy, cfg.run, task=task, device=device, deadline=deadline)
     if checkpoint is not None:
         runner.load(str(checkpoint))
+    elif cfg.init is not None:
+        runner.begin_from(str(cfg.init))
     return runner
 
 
@@ -217,6 +221,8 @@ def _teacher(arguments: list[str], started: float) -> int:
         print(f"resumed after iteration {runner.current_learning_iteration} of {runner.total_iterations}")
         if runner.new_episodes:
             print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
+        if runner.new_inputs:
+            print(f"{runner.new_inputs} observed values are new to the networks and start without effect")
     interrupted = False
     try:
         with ending_together(Interrupted) if runner.is_distributed else nullcontext():

@@ -27,6 +27,7 @@ from vd.train.checkpoint import (
     save_checkpoint,
     saved_worlds,
     set_random_state,
+    without_worlds,
 )
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg, rsl_rl_config, validate
 from vd.train.distributed import Processes, join_processes, watch_iteration
@@ -34,6 +35,7 @@ from vd.train.metrics import GoalWindow, ProgressFile, StepMeans
 from vd.train.ppo import TeacherPPO
 from vd.train.progress import ProgressLine
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
+from vd.train.widen import new_inputs, widen
 
 POLICY_NAME = "policy.pt"
 """The best policy so far, in the run's folder: what vd-eval, vd-play and deployment read."""
@@ -68,6 +70,7 @@ class TeacherRunner(OnPolicyRunner):
         current_learning_iteration: Iterations completed, over all resumed runs.
         env_steps: Control steps completed, over all worlds and processes.
         new_episodes: Why the checkpoint that was loaded could not restore the worlds; empty if it did.
+        new_inputs: Observed values that the networks of that checkpoint did not read.
     """
 
     alg: TeacherPPO
@@ -95,12 +98,19 @@ class TeacherRunner(OnPolicyRunner):
         self._elapsed_s = 0.0
         self._means = StepMeans()
         # Two episodes, so that a window never misses the time-outs of worlds that run in step.
-        self._window = GoalWindow(math.ceil(2 * env.max_episode_length / ppo.rollout_steps))
+        self._window_length = math.ceil(2 * env.max_episode_length / ppo.rollout_steps)
+        self._window = GoalWindow(self._window_length)
         self._score = (0.0, 0.0, -math.inf)
         self._best: tuple[float, ...] | None = None
         self._signal = 0
         self._stagger_due = True
         self.new_episodes = ""
+        self.new_inputs = 0
+
+    @property
+    def num_observations(self) -> int:
+        """Values that actor and critic read."""
+        return int(self.env.get_observations()[OBSERVATION_GROUP].shape[1])
 
     @property
     def total_iterations(self) -> int:
@@ -239,6 +249,7 @@ class TeacherRunner(OnPolicyRunner):
 
         With the processes and worlds of the checkpoint the run goes on exactly. With others, or from a
         checkpoint without worlds, all but worlds and random states is restored, and episodes start anew.
+        So they do where the run observes more than the checkpoint's networks read; those are widened.
 
         Args:
             path: The checkpoint.
@@ -250,7 +261,33 @@ class TeacherRunner(OnPolicyRunner):
             ValueError: The file is damaged, or of another network.
         """
         state = load_checkpoint(Path(path), map_location or self.device)
+        return self._restore(state, path, load_cfg, strict)
+
+    def begin_from(self, path: str) -> None:
+        """Begin with networks, optimiser, curriculum and counters of another run's checkpoint.
+
+        Worlds and random states are this run's own, and so is the choice of the best checkpoint.
+
+        Args:
+            path: The checkpoint.
+
+        Raises:
+            ValueError: The file is damaged, a policy only, or of another network.
+        """
+        state = load_checkpoint(Path(path), self.device)
+        if "optimizer_state_dict" not in state:
+            raise ValueError(f"{path} is a policy; --init needs a checkpoint, which has an optimiser too")
+        self._restore(without_worlds(state), path, None, True)
+        self.new_episodes = "it is of another run"
+        self._best = None
+        self._window = GoalWindow(self._window_length)
+
+    def _restore(self, state: dict[str, Any], path: str, load_cfg: dict | None, strict: bool) -> dict:
+        """Take over a checkpoint that was read; see :meth:`load`."""
         try:
+            self.new_inputs = new_inputs(state, self.num_observations)
+            if self.new_inputs:
+                state = widen(state, self.new_inputs, self.alg.actor, self.alg.critic)
             everything = self.alg.load(state, load_cfg, strict)
         except (RuntimeError, ValueError, KeyError) as error:
             raise ValueError(
@@ -271,6 +308,8 @@ class TeacherRunner(OnPolicyRunner):
         worlds = {saved_worlds(rank) for rank in ranks}
         if worlds == {0}:
             self.new_episodes = "it holds no worlds"
+        elif self.new_inputs:
+            self.new_episodes = f"this run observes {self.new_inputs} values more"
         elif len(ranks) != self.gpu_world_size:
             self.new_episodes = f"it is of {len(ranks)} processes, this run has {self.gpu_world_size}"
         elif worlds != {self.env.num_envs}:
@@ -293,7 +332,7 @@ class TeacherRunner(OnPolicyRunner):
             ranks = [None] * self.gpu_world_size
             torch.distributed.all_gather_object(ranks, mine)
         spec = PolicySpec(
-            num_observations=self.env.get_observations()[OBSERVATION_GROUP].shape[1],
+            num_observations=self.num_observations,
             num_actions=self.env.num_actions,
             hidden=self.policy_cfg.hidden,
             activation=self.policy_cfg.activation,
