@@ -143,6 +143,13 @@ def test_lost_contacts_stop_the_run_and_name_the_setting():
         run(env, 30)
 
 
+def test_lost_convex_pairs_stop_the_run_and_name_the_setting(monkeypatch):
+    monkeypatch.setattr("vd.sim.simulator.FEWEST_CONVEX_PAIRS", 1)
+    env = make(sim=dataclasses.replace(SimCfg(), nccdmax=0))
+    with pytest.raises(SimulationError, match=r"raise sim\.nccdmax \(now 0\)"):
+        run(env, 60)
+
+
 def test_a_state_that_is_not_finite_stops_the_run_and_can_be_replayed(tmp_path):
     env = make()
     env.dump_dir = tmp_path

@@ -22,6 +22,13 @@ START = np.tile(PAPER.scene.reset_joint_rad, D // 3).astype(np.float32)
 STEPS = 10
 
 
+@pytest.fixture(autouse=True)
+def on_device(device: str):
+    """Every test of this file on every device."""
+    with wp.ScopedDevice(device):
+        yield
+
+
 def rows(**columns: float) -> np.ndarray:
     """The hand's servo rows with columns, by the names of their constants, set for all joints."""
     values = HAND.servo.copy()
@@ -32,7 +39,9 @@ def rows(**columns: float) -> np.ndarray:
 
 def simulator(servo_rows: np.ndarray | None, worlds: int = 1) -> Simulator:
     """Worlds at rest at the task's start, commands at the present positions."""
-    scene = build_scene(hand=HAND, objects=load_set("cube")[:1], num_worlds=worlds, cfg=CFG, device="cpu")
+    scene = build_scene(
+        hand=HAND, objects=load_set("cube")[:1], num_worlds=worlds, cfg=CFG, device=wp.get_device().alias
+    )
     sim = Simulator(scene, CFG, servo_rows=servo_rows)
     state = sim.joint_q.numpy()
     state[:, :D] = START

@@ -6,6 +6,7 @@ network and noise. States come from that policy's own actions in contact.
 """
 
 import dataclasses
+import gc
 import importlib
 import pkgutil
 import time
@@ -180,6 +181,7 @@ def free_memory(device: str) -> int:
     """Free memory of a CUDA device [bytes], after returning what allocators hold back."""
     import torch
 
+    gc.collect()  # an earlier row's simulation may still wait for it
     torch.cuda.empty_cache()
     wp.set_mempool_release_threshold(device, 0)
     wp.synchronize_device(device)

@@ -18,6 +18,9 @@ from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
 # this is a solver failure on its way to NaN.
 MAX_SPEED = 500.0
 
+# Work space of convex pairs is shared by all worlds; few worlds have no average to rely on.
+FEWEST_CONVEX_PAIRS = 64
+
 # MuJoCo Warp's overflow bits that mean lost contacts or constraint rows, by the setting to change.
 # Its other bits count solver and line-search iterations, which are stopping rules, not losses.
 OVERFLOW_REMEDY = {
@@ -25,6 +28,7 @@ OVERFLOW_REMEDY = {
     1 << 1: ("constraint Jacobian entries", "sim.njmax"),
     1 << 2: ("broad-phase pairs", "sim.nconmax"),
     1 << 3: ("contacts", "sim.nconmax"),
+    1 << 4: ("overlapping convex pairs", "sim.nccdmax"),
 }
 
 
@@ -65,6 +69,8 @@ def make_solver(model: newton.Model, cfg: SimCfg) -> SolverMuJoCo:
         kinematic_switchable_roots=False,
     )
     solver.mjw_model.opt.warn_overflow = False
+    # The solver would take one for each contact, and has no argument for it.
+    solver.mjw_data.naccdmax = max(cfg.nccdmax * model.world_count, FEWEST_CONVEX_PAIRS)
     return solver
 
 
