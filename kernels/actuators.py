@@ -66,6 +66,10 @@ STATE_ELASTIC_SPEED = 6
 STATE_TIME = 7
 STATE_COLUMNS = 8
 
+NO_EFFORT_LIMIT = wp.constant(1.0e9)
+"""A torque [N m] that no drive reaches."""
+LEAST_SLOPE = 0.02
+"""Least share of the stiffness that a motor at its limit keeps: the reference stays within reach of floats."""
 SMALLEST_SPEED = 1.0e-3
 """Least speed scale [rad/s] of a parameter that divides, far below the bounds of any."""
 
@@ -79,6 +83,8 @@ class Servo:
     damping: Damping of the drive [N m s/rad].
     torque: Torque besides the drive's [N m].
     friction: Bound of the dry friction torque [N m].
+    motor: Mean size of the motor's torque, which load friction follows [N m].
+    motor_damping: How that torque falls with speed, signed as it pulls [N m s/rad].
     """
 
     reference: float
@@ -86,6 +92,8 @@ class Servo:
     damping: float
     torque: float
     friction: float
+    motor: float
+    motor_damping: float
 
 
 @wp.func
@@ -133,49 +141,66 @@ def dead_zone(error: float, width: float) -> float:
 
 @wp.func
 def motor_torque(
-    wanted: float, speed: float, time: float, parameters: wp.array2d[float], row: int
-) -> wp.vec2:
+    wanted: float, speed: float, time: float, effort: float, parameters: wp.array2d[float], row: int
+) -> wp.vec3:
     """What the motor gives when the controller wants ``wanted`` [N m] at ``speed`` [rad/s].
 
     In the order of the signal: supply sag (tau / (1 + r |tau|): voltage falls with current), warming
     (exp(-rate t)), soft loss (tau_s tanh(tau / tau_s)), hard limit, and the torque-speed line
-    tau_stall (1 - |speed| / omega_0), which bounds driving, not braking.
+    tau_stall (1 - |speed| / omega_0), which bounds driving, not braking; beyond omega_0 nothing drives.
 
     Args:
         wanted: Torque wanted [N m].
         speed: Joint velocity [rad/s].
         time: Time since the joint was switched on [s].
+        effort: Largest torque of the drive [N m].
         parameters: Parameter rows.
         row: The joint's row.
 
     Returns:
-        The torque [N m], and how much of it the torque-speed line takes per speed [N m s/rad].
+        The torque [N m], its slope by the torque wanted, and how much of it the torque-speed line takes
+        per speed [N m s/rad].
     """
     torque = wanted
+    slope = wp.float32(1.0)
     sag = parameters[row, SUPPLY_SAG]
     if sag > 0.0:
-        torque = torque / (1.0 + sag * wp.abs(torque))
+        share = 1.0 / (1.0 + sag * wp.abs(torque))
+        torque *= share
+        slope *= share * share
     rate = parameters[row, THERMAL_RATE]
     if rate > 0.0:
-        torque = torque * wp.exp(-rate * time)
+        cool = wp.exp(-rate * time)
+        torque *= cool
+        slope *= cool
     soft = parameters[row, SATURATION_TORQUE]
     if soft > 0.0:
-        torque = soft * wp.tanh(torque / soft)
-    limit = parameters[row, TORQUE_LIMIT]
-    if limit > 0.0:
+        bent = wp.tanh(torque / soft)
+        torque = soft * bent
+        slope *= 1.0 - bent * bent
+    limit = effort
+    if parameters[row, TORQUE_LIMIT] > 0.0:
+        limit = wp.min(limit, parameters[row, TORQUE_LIMIT])
+    if wp.abs(torque) > limit:
         torque = wp.clamp(torque, -limit, limit)
+        slope = 0.0
     stall = parameters[row, STALL_TORQUE]
-    fall = 0.0
+    fall = wp.float32(0.0)
     if stall > 0.0:
         bound = stall
-        slope = 0.0
+        steep = wp.float32(0.0)
         if torque * speed > 0.0:
-            slope = stall / wp.max(parameters[row, NO_LOAD_SPEED], SMALLEST_SPEED)
-            bound = wp.max(0.0, stall - slope * wp.abs(speed))
+            line = stall / wp.max(parameters[row, NO_LOAD_SPEED], SMALLEST_SPEED)
+            bound = stall - line * wp.abs(speed)
+            steep = line
+            if bound <= 0.0:
+                bound = 0.0
+                steep = 0.0
         if wp.abs(torque) > bound:
             torque = wp.clamp(torque, -bound, bound)
-            fall = slope
-    return wp.vec2(torque, fall)
+            slope = 0.0
+            fall = steep
+    return wp.vec3(torque, slope, fall)
 
 
 @wp.func
@@ -186,7 +211,7 @@ def dry_friction(motor: float, speed: float, parameters: wp.array2d[float], row:
     bound of (F+ + F-) / 2 and a constant torque of -(F+ - F-) / 2; so no direction has to be guessed.
 
     Args:
-        motor: Torque of the motor [N m], which the transmission carries.
+        motor: Torque of the motor [N m], which the transmission carries; its size counts.
         speed: Joint velocity [rad/s].
         parameters: Parameter rows.
         row: The joint's row.
@@ -286,10 +311,13 @@ def shape_command(
 @wp.func
 def drive_joint(
     reference: float,
+    before: float,
+    share: float,
     position: float,
     speed: float,
     power: float,
     dt: float,
+    effort: float,
     parameters: wp.array2d[float],
     row: int,
     state: wp.array2d[float],
@@ -297,13 +325,18 @@ def drive_joint(
     """One time step of the control loop, the motor and the load of a joint.
 
     Args:
-        reference: Result of :func:`shape_command`, and what coupled joints add to it [rad].
+        reference: Result of :func:`shape_command`, and what coupled joints add to it, its mean over the
+            step [rad].
+        before: Its mean over the first ``share`` of the step, until a command arrived [rad]. What limits
+            the motor has to see the jump: the limit of a mean would let it act a part of a step early.
+        share: That share of the step; 0 if no command arrived within it.
         position: True joint position [rad].
         speed: Joint velocity [rad/s].
         power: Factor on the controller's position and integral gains: 0 with the torque off, or a gain
             that was set on purpose, which leaves the damping as it is. With the torque off the damping,
             mostly back-EMF, goes too, since the terminals are open; friction stays.
         dt: Time step [s].
+        effort: Largest torque of the drive [N m]; ``NO_EFFORT_LIMIT`` where somebody else keeps it.
         parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
         row: The joint's row.
         state: State rows, shape [R, STATE_COLUMNS]; the joint's row is advanced.
@@ -313,8 +346,18 @@ def drive_joint(
     state[row, STATE_TIME] = time + dt
 
     width = parameters[row, DEAD_ZONE_WIDTH]
+    parts = share > 0.0 and share < 1.0
+    first = before
+    second = reference
+    if parts:
+        second = (reference - share * before) / (1.0 - share)
     if width > 0.0:
-        reference = position + dead_zone(reference - position, width)
+        if parts:
+            first = position + dead_zone(first - position, width)
+            second = position + dead_zone(second - position, width)
+            reference = share * first + (1.0 - share) * second
+        else:
+            reference = position + dead_zone(reference - position, width)
     integral = 0.0
     if parameters[row, INTEGRAL_GAIN] > 0.0 and power > 0.0:
         integral = state[row, STATE_INTEGRAL] + (reference - position) * dt
@@ -325,13 +368,26 @@ def drive_joint(
     if power <= 0.0:
         damping = 0.0
     wanted = kp * (reference - position) - damping * speed + steady
-    motor = motor_torque(wanted, speed, time, parameters, row)
+    motor = motor_torque(wanted, speed, time, effort, parameters, row)
+    carried = wp.abs(motor[0])
+    if parts:
+        early = wanted + kp * (first - reference)
+        late = wanted + kp * (second - reference)
+        motor_early = motor_torque(early, speed, time, effort, parameters, row)
+        motor_late = motor_torque(late, speed, time, effort, parameters, row)
+        if motor_early[0] != early or motor_late[0] != late:
+            motor = share * motor_early + (1.0 - share) * motor_late
+        carried = share * wp.abs(motor_early[0]) + (1.0 - share) * wp.abs(motor_late[0])
     if motor[0] != wanted:
-        gain = motor[0] / wanted
-        kp *= gain
-        damping = gain * damping + motor[1]
-        steady = gain * steady + motor[1] * speed
-    friction = dry_friction(motor[0], speed, parameters, row)
+        # Stiffness and damping are the slopes at this torque, so that an implicit step takes nothing of a
+        # torque at its limit, which no motion changes; the reference is where they pull that torque from.
+        damping = motor[1] * damping + motor[2]
+        kp *= wp.max(motor[1], LEAST_SLOPE)
+        steady = motor[0] + damping * speed
+        if kp > 0.0:
+            reference = position + steady / kp
+            steady = 0.0
+    friction = dry_friction(carried, speed, parameters, row)
     load = elastic_load(position, speed, dt, parameters, row, state)
     result.reference = reference
     result.stiffness = kp
@@ -343,6 +399,8 @@ def drive_joint(
         + friction[1]
     )
     result.friction = friction[0]
+    result.motor = carried
+    result.motor_damping = wp.sign(motor[0]) * damping
     return result
 
 
@@ -372,4 +430,6 @@ def servo(
         state: State rows, shape [R, STATE_COLUMNS]; the joint's row is advanced.
     """
     reference = shape_command(command, dt, parameters, row, state) + coupled
-    return drive_joint(reference, position, speed, power, dt, parameters, row, state)
+    return drive_joint(
+        reference, reference, 0.0, position, speed, power, dt, NO_EFFORT_LIMIT, parameters, row, state
+    )

@@ -24,6 +24,7 @@ from vd.kernels.actuators import (
     INERTIA,
     JITTER_DROP,
     JITTER_SIGMA,
+    LOAD_FRICTION,
     PAYLOAD_INERTIA,
     READ_DELAY,
     VELOCITY_LIMIT,
@@ -208,6 +209,30 @@ def friction_impulses(wanted: wp.vec3, inverse: wp.mat33, bound: wp.vec3, before
     return speed, impulse
 
 
+@wp.func
+def slip(speed: float, change: float):
+    """A speed [rad/s] less what dry friction takes of it, ``change`` at most."""
+    return speed - wp.sign(speed) * wp.min(change, wp.abs(speed))
+
+
+@wp.func
+def load_bounds(bound: wp.vec3, kick: float, motor: wp.vec3, loaded: wp.vec3, gained: wp.vec3):
+    """Friction impulses at the middle of a step, for those that follow the motor's torque.
+
+    Args:
+        bound: Largest friction impulses with the torques at the step's beginning [N m s].
+        kick: Duration of the step [s].
+        motor: Load friction that these bounds hold [N m].
+        loaded: How it falls with speed [N m s/rad].
+        gained: Change of speed over the step [rad/s].
+    """
+    result = bound
+    for j in range(MAX_JOINTS):
+        middle = wp.abs(motor[j] - 0.5 * loaded[j] * gained[j])
+        result[j] = wp.max(bound[j] + kick * (middle - motor[j]), 0.0)
+    return result
+
+
 @wp.kernel
 def rollout_kernel(
     # In:
@@ -220,6 +245,7 @@ def rollout_kernel(
     slot: wp.array[int],
     lower: wp.array[float],
     upper: wp.array[float],
+    effort: wp.array[float],
     bodies: int,
     links: Links,
     parameters: wp.array2d[float],
@@ -240,6 +266,7 @@ def rollout_kernel(
         slot: Place of each joint in the finger, which is its column of the coupling, shape [n].
         lower: Lower stops, shape [n] [rad].
         upper: Upper stops, shape [n] [rad].
+        effort: Largest torques of the drives, shape [n] [N m].
         bodies: 1 if the links have mass, 0 if each joint is its own inertia.
         links: The links, if they have mass.
         parameters: Parameter rows by set, trajectory, joint, shape [C R n, PARAMETER_COLUMNS].
@@ -296,6 +323,8 @@ def rollout_kernel(
         bound = wp.vec3(0.0)
         diagonal = wp.vec3(1.0)
         stiffness = wp.vec3(0.0)
+        motor = wp.vec3(0.0)
+        loaded = wp.vec3(0.0)
         for j in range(count):
             row = base_row + j
             # Commands that arrive within the step divide it; the reference is the mean over it.
@@ -329,13 +358,20 @@ def rollout_kernel(
             if count > 1:
                 for i in range(count):
                     coupled += parameters[row, COUPLING_0 + slot[i]] * q[i]
+            before = wp.float32(0.0)
+            if done > 0.0:
+                before = reference / done + coupled
             part = 1.0 - done
             reference += part * shape_command(held[j], part * dt, parameters, row, state) + coupled
-            drive = drive_joint(reference, q[j], speed[j], power, dt, parameters, row, state)
+            drive = drive_joint(
+                reference, before, done, q[j], speed[j], power, dt, effort[j], parameters, row, state
+            )
             torque[j] = drive.stiffness * (drive.reference - q[j]) - drive.damping * speed[j] + drive.torque
             damping[j] = drive.damping
             stiffness[j] = drive.stiffness
             bound[j] = kick * drive.friction
+            motor[j] = parameters[row, LOAD_FRICTION] * drive.motor
+            loaded[j] = parameters[row, LOAD_FRICTION] * drive.motor_damping
             if drive.friction > 0.0:
                 dry = 1
             diagonal[j] = parameters[row, INERTIA] + parameters[row, PAYLOAD_INERTIA]
@@ -353,23 +389,29 @@ def rollout_kernel(
             )
         new_speed = wp.vec3(0.0)
         if count == 1:
-            new_speed[0] = speed[0] + kick * torque[0] / mass[0, 0]
-            change = wp.min(bound[0] / mass[0, 0], wp.abs(new_speed[0]))
-            new_speed[0] = new_speed[0] - wp.sign(new_speed[0]) * change
+            free = speed[0] + kick * torque[0] / mass[0, 0]
+            new_speed[0] = slip(free, bound[0] / mass[0, 0])
+            if loaded[0] != 0.0:
+                bound = load_bounds(bound, kick, motor, loaded, new_speed - speed)
+                new_speed[0] = slip(free, bound[0] / mass[0, 0])
         else:
             inverse = wp.inverse(mass)
-            new_speed = speed + inverse * (kick * torque)
+            free_speed = speed + inverse * (kick * torque)
+            new_speed = free_speed
             if dry == 1:
-                new_speed, impulse = friction_impulses(new_speed, inverse, bound, impulse, count)
+                new_speed, impulse = friction_impulses(free_speed, inverse, bound, impulse, count)
+                if loaded[0] != 0.0 or loaded[1] != 0.0 or loaded[2] != 0.0:
+                    bound = load_bounds(bound, kick, motor, loaded, new_speed - speed)
+                    new_speed, impulse = friction_impulses(free_speed, inverse, bound, impulse, count)
         for j in range(count):
             row = base_row + j
             limit = parameters[row, VELOCITY_LIMIT]
             v = wp.clamp(new_speed[j], -limit, limit)
-            before = q[j]
-            after = before + dt * v
+            last = q[j]
+            after = last + dt * v
             if after < lower[j] or after > upper[j]:
                 # A start beyond a stop, as an encoder's bias makes it, is no reason to jump.
-                after = wp.clamp(after, wp.min(lower[j], before), wp.max(upper[j], before))
+                after = wp.clamp(after, wp.min(lower[j], last), wp.max(upper[j], last))
                 v = 0.0
             if not (wp.abs(after - q_start[j]) < DIVERGED):
                 after = q_start[j] + DIVERGED
@@ -381,7 +423,7 @@ def rollout_kernel(
                 if read_step[j] == k:
                     share = read_fraction[j]
                 predicted[candidate, to_output + read[j], j] = (
-                    before + share * (after - before) + parameters[row, ENCODER_BIAS]
+                    last + share * (after - last) + parameters[row, ENCODER_BIAS]
                 )
                 read[j] = read[j] + 1
                 if read[j] < end:

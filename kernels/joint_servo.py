@@ -19,6 +19,7 @@ from vd.kernels.actuators import (
     INERTIA,
     JITTER_DROP,
     JITTER_SIGMA,
+    NO_EFFORT_LIMIT,
     PAYLOAD_INERTIA,
     READ_DELAY,
     STATE_TIME,
@@ -215,10 +216,13 @@ def drive_joint_kernel(
     speed = joint_qd_in[world, joint]
     drive = drive_joint(
         reference_in[world, joint] + coupled,
+        0.0,
+        0.0,
         joint_q_in[world, joint],
         speed,
         power_in[world, joint],
         dt,
+        NO_EFFORT_LIMIT,  # the solver keeps it
         parameters,
         row,
         state,

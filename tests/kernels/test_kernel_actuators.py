@@ -245,6 +245,18 @@ def test_the_torque_speed_line_damps(device):
     assert out[0, 0, DAMPING] == pytest.approx(0.25), "the slope of the line, for the implicit step"
 
 
+@EXAMPLES
+@given(error=floats(-2.0, 2.0), speed=floats(-9.0, 9.0), idle=floats(0.1, 4.0))
+def test_beyond_the_no_load_speed_nothing_drives_and_nothing_brakes_for_it(device, error, speed, idle):
+    row = row_of(kd=0.0, STALL_TORQUE=0.7, NO_LOAD_SPEED=idle)
+    out, _ = steps_of(device, row, [error], 0.0, speed)
+    torque = total(out, 0.0, speed)[0, 0]
+    assert torque * error >= -1e-6, "the line turned the torque round"
+    if error * speed > 0.0 and abs(speed) >= idle * (1.0 + 1e-6):
+        assert torque == pytest.approx(0.0, abs=1e-6) and out[0, 0, DAMPING] == 0.0
+    assert abs(torque) <= 0.7 + 1e-6
+
+
 # --- Friction ---
 
 

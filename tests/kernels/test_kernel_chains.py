@@ -56,7 +56,7 @@ def rows_of(*settings, n=1):
     return rows
 
 
-def roll(device, rows, time, command, start, *, bodies=None, gravity=GRAVITY, dt=DT, power=None, stops=1e6):
+def roll(device, rows, time, command, start, *, bodies=None, gravity=GRAVITY, dt=DT, power=None, stops=1e6, effort=1e6):
     """Roll trajectories out; time [T], command [R, T, n], start [R, n]. Returns [C, R, T, n]."""
     runs, count, n = command.shape
     sets = len(rows)
@@ -84,6 +84,7 @@ def roll(device, rows, time, command, start, *, bodies=None, gravity=GRAVITY, dt
             device_array(np.arange(n), int, device),
             device_array(np.full(n, -stops), float, device),
             device_array(np.full(n, stops), float, device),
+            device_array(np.full(n, effort), float, device),
             int(bodies is not None),
             links,
             device_array(parameters, float, device),
@@ -370,6 +371,42 @@ def test_the_error_falls_with_the_square_of_the_step(device):
         np.abs(one_joint(device, rows, time, command, dt=dt) - truth).max() for dt in (1 / 240, 1 / 480)
     ]
     assert errors[1] < 1e-3 and errors[0] / errors[1] > 3.0, errors
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {servo.TORQUE_LIMIT: 0.15},
+        {servo.SATURATION_TORQUE: 0.2},
+        {servo.SUPPLY_SAG: 4.0},
+        {servo.STALL_TORQUE: 0.3, servo.NO_LOAD_SPEED: 3.0},
+    ],
+)
+def test_a_motor_at_its_limit_needs_no_finer_step(device, settings):
+    """The damping, implicit, takes nothing of a torque that is limited: with a share of it, 15 times worse."""
+    time = np.arange(0, 1.5, 0.01)
+    command = np.where((time > 0.1) & (time < 0.8), 0.6, 0.0)
+    rows = rows_of(settings)
+    truth = one_joint(device, rows, time, command, dt=1 / 15360)
+    coarse = one_joint(device, rows, time, command, dt=DT)
+    assert np.sqrt(np.mean((coarse - truth) ** 2)) < 2e-4
+
+
+def test_a_drive_gives_no_more_than_its_effort(device):
+    rng = np.random.default_rng(3)
+    time, command = excitation(rng)
+    limit = 0.25
+    plain = rows_of({})
+    got = one_joint(device, plain, time, command, effort=limit)
+    expected = one_joint(device, rows_of({servo.TORQUE_LIMIT: limit}), time, command)
+    np.testing.assert_array_equal(got, expected)
+    fine = integrate(rows_of({servo.TORQUE_LIMIT: limit})[:, 0], time, command, np.zeros(1), DT / FINE)
+    assert np.sqrt(np.mean((got - fine) ** 2)) < 1.5e-3
+    free = one_joint(device, plain, time, command)
+    assert np.abs(free - got).max() > 0.02, "the limit does nothing"
+    # The smaller of the two counts.
+    both = one_joint(device, rows_of({servo.TORQUE_LIMIT: 4.0 * limit}), time, command, effort=limit)
+    np.testing.assert_array_equal(both, got)
 
 
 # --- Friction ---

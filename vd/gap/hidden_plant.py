@@ -49,6 +49,7 @@ class Plant:
         body: A finger, or None for joints on their own.
         effects: Name to parameter to values [J].
         full_gain: P gain, as recordings name it, at which ``kp`` holds.
+        effort: Largest torque of the drives [N m]; None: no limit.
     """
 
     joints: tuple[str, ...]
@@ -60,6 +61,7 @@ class Plant:
     body: FingerBody | None = None
     effects: Mapping[str, Mapping[str, np.ndarray]] = field(default_factory=dict)
     full_gain: float = 1.0
+    effort: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,7 +297,11 @@ class _Motor:
         self.sag = batch.of("supply_sag", "relative")
         self.rate = batch.of("thermal_drift", "rate_per_s")
         self.soft = _where_on(batch.of("torque_saturation", "tau_s_nm"))
-        self.hard = _where_on(batch.of("torque_limit", "tau_max_nm"))
+        efforts = [np.inf if p.effort is None else p.effort for p in batch.plants]
+        self.hard = np.minimum(
+            _where_on(batch.of("torque_limit", "tau_max_nm")),
+            np.stack([np.broadcast_to(effort, batch.kp.shape[1:]) for effort in efforts]),
+        )
         self.stall = _where_on(batch.of("torque_speed_limit", "tau_stall_nm"))
         self.idle = _where_on(batch.of("torque_speed_limit", "omega_0_rad_s"))
         self.sags, self.warms = self.sag.any(), self.rate.any()

@@ -375,4 +375,5 @@ def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
         gravity_torque=np.zeros(3),
         body=body,
         full_gain=FULL_P_GAIN,
+        effort=hand.effort[index],
     )

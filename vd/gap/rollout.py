@@ -27,7 +27,7 @@ DOWN_IN_BASE = np.array([0.0, 0.0, 1.0])
 """Down in a hand's base frame: palm down, as :func:`vd.sim.scene.hand_mount` has it."""
 JOINTS_PER_FINGER = 3
 FREE = 1.0e6
-"""A position [rad] no joint reaches: the stop of one that has none."""
+"""A position [rad] that no joint and a torque [N m] that no drive reaches: the bound of one that has none."""
 STREAM_BITS = 28
 """Bits of the number of a trajectory's random stream."""
 
@@ -78,6 +78,7 @@ class Chain:
         gravity: Acceleration of gravity in the base frame [3] [m/s^2].
         lower: Lower stops [n] [rad].
         upper: Upper stops [n] [rad].
+        effort: Largest torques of the drives [n] [N m].
         reference_p_gain: Largest ``p_gain`` of the recording, at which kp is identified; None without.
         reference_load: A pendulum's load, at which inertia and gravity torque are identified, or None.
     """
@@ -97,6 +98,7 @@ class Chain:
     gravity: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+    effort: np.ndarray
     reference_p_gain: float | None
     reference_load: Load | None
 
@@ -178,6 +180,7 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
         gravity=np.zeros(3),
         lower=np.array([-FREE]),
         upper=np.array([FREE]),
+        effort=np.array([FREE]),
         reference_p_gain=p_gain,
         reference_load=load,
     )
@@ -237,6 +240,7 @@ def _finger(
         gravity=GRAVITY_M_S2 * DOWN_IN_BASE,
         lower=hand.lower[joints],
         upper=hand.upper[joints],
+        effort=hand.effort[joints],
         reference_p_gain=p_gain,
         reference_load=None,
     )
@@ -287,6 +291,10 @@ class Rollouts:
         excited = np.array([[joint in t.joints for joint in chain.joints] for t in trajectories])
         self.excited = excited[self.sample_trajectory]
 
+    def at(self, dt: float) -> "Rollouts":
+        """The same with another time step [s]."""
+        return Rollouts(self.chain, self.recording, dt=dt, device=self.device)
+
     def __getstate__(self) -> dict[str, object]:
         """Leave the device's arrays behind: another process makes its own."""
         return {key: value for key, value in self.__dict__.items() if key not in ("_samples", "_links")}
@@ -313,8 +321,8 @@ class Rollouts:
         return float(conditions.get("p_gain", reference)) / reference if reference else 1.0
 
     @cached_property
-    def _links(self) -> tuple[Links, wp.array, wp.array, wp.array]:
-        """The links; slots; lower and upper stops."""
+    def _links(self) -> tuple[Links, wp.array, wp.array, wp.array, wp.array]:
+        """The links; slots; lower and upper stops; efforts."""
         chain = self.chain
         links = Links()
         for name, dtype in (
@@ -327,8 +335,9 @@ class Rollouts:
             setattr(links, name, wp.array(getattr(chain, name), dtype=dtype, device=self.device))
         links.gravity = wp.vec3(*chain.gravity)
         slot = wp.array(chain.slot, dtype=int, device=self.device)
-        lower, upper = (wp.array(v, dtype=float, device=self.device) for v in (chain.lower, chain.upper))
-        return links, slot, lower, upper
+        bounds = (chain.lower, chain.upper, chain.effort)
+        lower, upper, effort = (wp.array(v, dtype=float, device=self.device) for v in bounds)
+        return links, slot, lower, upper, effort
 
     def predict(self, rows: np.ndarray, trajectories: Sequence[int] | None = None) -> np.ndarray:
         """Recorded positions as each parameter set would have them, in one launch.
@@ -358,7 +367,7 @@ class Rollouts:
         parameters = np.repeat(rows[:, None], runs, axis=1)
         self._scale_loads(parameters, chosen)
         state = wp.empty((sets * runs * n, servo.STATE_COLUMNS), dtype=float, device=self.device)
-        links, slot, lower, upper = self._links
+        links, slot, lower, upper, effort = self._links
 
         def integers(values: np.ndarray) -> wp.array:
             return wp.array(values, dtype=int, device=self.device)
@@ -376,6 +385,7 @@ class Rollouts:
                 slot,
                 lower,
                 upper,
+                effort,
                 int(self.chain.bodies),
                 links,
                 wp.array(parameters.reshape(-1, servo.PARAMETER_COLUMNS), dtype=float, device=self.device),
