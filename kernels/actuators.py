@@ -69,7 +69,7 @@ STATE_COLUMNS = 8
 NO_EFFORT_LIMIT = wp.constant(1.0e9)
 """A torque [N m] that no drive reaches."""
 LEAST_SLOPE = 0.02
-"""Least share of the stiffness that a motor at its limit keeps: the reference stays within reach of floats."""
+"""Least share of the stiffness that a motor at its limit keeps: it keeps the reference within reach."""
 SMALLEST_SPEED = 1.0e-3
 """Least speed scale [rad/s] of a parameter that divides, far below the bounds of any."""
 

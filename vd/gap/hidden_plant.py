@@ -18,8 +18,9 @@ from vd.gap.hidden_finger import Finger, FingerBody, slip
 
 STEP_S = 4.0e-4
 """Time step [s]: five times finer than the fitted model's, second order where the motion is smooth."""
-PROFILE_SUBSTEPS = 4
-"""Steps of a motion profile in one of the plant: where it stops is decided in the last of them."""
+PARTS = 8
+"""Parts of a step in which the reference is kept: a motor at its limit must not act before the command
+arrives, nor a profile stop late."""
 EQUILIBRIUM_SWEEPS = 60
 """Fixed-point sweeps for the droop under gravity at the start; each gains a digit or more."""
 CABLE = "cable_spring"
@@ -144,13 +145,14 @@ class _Batch:
         return Finger(bodies, payload)
 
     def references(self) -> np.ndarray:
-        """What the servos pull to, before the joint has a say: the command's path [K, B, J] [rad]."""
+        """What the servos pull to, before the joint has a say: the command's path [K, PARTS, B, J] [rad]."""
         from scipy.signal import lfilter
 
-        dt, edges = self.dt, np.arange(self.steps + 1) * self.dt
+        dt = self.dt / PARTS
+        edges = np.arange(self.steps * PARTS + 1) * dt
         delay, sigma = self.of("command_delay", "delay_s"), self.of("command_jitter", "sigma_s")
         drop, tau = self.of("command_jitter", "p_drop"), self.of("command_filter", "tau_s")
-        result = np.empty((self.steps, len(self.runs), self.count))
+        result = np.empty((self.steps * PARTS, len(self.runs), self.count))
         for b, run in enumerate(self.runs):
             rng = np.random.default_rng(run.seed)
             for j in range(self.count):
@@ -164,25 +166,24 @@ class _Batch:
                 result[:, b, j] = held
         self._profile(result, self.of("acceleration_limit", "a_max_rad_s2"))
         self._play(result, 0.5 * self.of("backlash", "width_rad"))
-        return result
+        return result.reshape(self.steps, PARTS, len(self.runs), self.count)
 
     def _profile(self, reference: np.ndarray, limit: np.ndarray) -> None:
         """Follow the reference with bounded acceleration, braking in time to stop on it; in place."""
         on = limit > 0.0
         if not on.any():
             return
-        dt, bound = self.dt / PROFILE_SUBSTEPS, limit[on]
+        dt, bound = self.dt / PARTS, limit[on]
         position, speed = reference[0][on], np.zeros(int(on.sum()))
-        for k in range(self.steps):
-            target, start = reference[k][on], position
-            for _ in range(PROFILE_SUBSTEPS):
-                away = target - position
-                far = np.abs(away)
-                # Braking at the limit from this speed, seen half a step ahead, ends on the target.
-                wish = np.sqrt(2.0 * bound * far + (0.5 * bound * dt) ** 2) - 0.5 * bound * dt
-                wish = np.copysign(np.minimum(wish, far / dt), away)
-                speed = speed + np.minimum(np.maximum(wish - speed, -bound * dt), bound * dt)
-                position = position + dt * speed
+        for k in range(len(reference)):
+            start = position
+            away = reference[k][on] - position
+            far = np.abs(away)
+            # Braking at the limit from this speed, seen half a step ahead, ends on the target.
+            wish = np.sqrt(2.0 * bound * far + (0.5 * bound * dt) ** 2) - 0.5 * bound * dt
+            wish = np.copysign(np.minimum(wish, far / dt), away)
+            speed = speed + np.minimum(np.maximum(wish - speed, -bound * dt), bound * dt)
+            position = position + dt * speed
             reference[k][on] = 0.5 * (start + position)
 
     def _play(self, reference: np.ndarray, half: np.ndarray) -> None:
@@ -191,7 +192,7 @@ class _Batch:
         if not on.any():
             return
         gap, output = half[on], reference[0][on]
-        for k in range(self.steps):
+        for k in range(len(reference)):
             target = reference[k][on]
             output = np.minimum(np.maximum(output, target - gap), target + gap)
             reference[k][on] = output
@@ -220,41 +221,62 @@ class _Batch:
             coupling[:, j, j] = 0.0
         coupled, zoned, creeping = coupling.any(), dead.any(), integral_gain.any()
 
-        q = self._equilibrium(reference[0], first, coupling)
+        q = self._equilibrium(reference[0, 0], first, coupling)
         v, wound = np.zeros_like(q), np.zeros_like(q)
         path = np.empty((self.steps + 1, *q.shape))
         path[0] = q
         loads.start(q)
         # Open terminals carry no current: the damping of a servo that is off, mostly back-EMF, is gone.
         on, stiffness, damping = first, self.kp * self.gain * first, self.kd * (first > 0.0)
+        means = reference.mean(axis=1)
         for k in range(self.steps):
             middle = q + half * v
-            error = reference[k] - middle
+            # A motor without limits is linear: the mean of the parts is enough.
+            error = (reference[k] if motor.bends or zoned else means[k]) - middle
             if coupled:
                 error = error + np.einsum("bij,bj->bi", coupling, middle)
             if zoned:
                 error = error - np.minimum(np.maximum(error, -dead), dead)
+                error = error if motor.bends else error.mean(axis=0)
             if switch is not None:
                 on = switch[k]
                 stiffness, damping = self.kp * self.gain * on, self.kd * (on > 0.0)
-            wanted = stiffness * error - damping * v
+            wanted = stiffness * error
             if creeping:
-                wound = wound + dt * error * (on > 0.0)
+                wound = wound + dt * (error.mean(axis=0) if motor.bends else error) * (on > 0.0)
                 wanted = wanted + self.gain * on * integral_gain * wound
-            torque, slope = motor(wanted, v, k * dt)
-            resisting = 0.5 * slope * damping
-            push = torque + loads(middle, v)
-            minus, plus = loads.friction(torque, v, k * dt)
-            if self.body is None:
-                mass = self.inertia / dt + resisting
-                momentum = mass * v + push
-                v = slip(momentum, minus, plus) / mass
-            else:
-                v = self.body.velocity(middle, v, push, resisting, minus, plus, self.inertia, dt)
+            torque, slope, carried = motor(wanted - damping * v, v, k * dt)
+            load = loads(middle, v)
+            new = self._speed(middle, v, torque + load, 0.5 * slope * damping, loads, carried, v, k * dt)
+            if loads.loads or motor.stalls:
+                # Both follow the speed: once more with that of the middle of the step.
+                mean = 0.5 * (v + new)
+                torque, _, carried = motor(wanted - damping * mean, mean, k * dt)
+                new = self._speed(middle, v, torque + load, 0.0, loads, carried, mean, k * dt)
+            v = new
             v = np.minimum(np.maximum(v, -self.limit), self.limit)
             q = middle + half * v
             path[k + 1] = q
         return path
+
+    def _speed(
+        self,
+        middle: np.ndarray,
+        v: np.ndarray,
+        push: np.ndarray,
+        resisting: Any,
+        loads: "_Loads",
+        carried: np.ndarray,
+        sliding: np.ndarray,
+        time: float,
+    ) -> np.ndarray:
+        """Speeds after a step [B, J] from ``v``, friction as of a torque carried and a sliding speed."""
+        minus, plus = loads.friction(carried, sliding, time)
+        if self.body is not None:
+            zero = np.zeros_like(v)
+            return self.body.velocity(middle, v, push, resisting + zero, minus, plus, self.inertia, self.dt)
+        mass = self.inertia / self.dt + resisting
+        return slip(mass * v + push, minus, plus) / mass
 
     def _equilibrium(self, reference: np.ndarray, on: np.ndarray, coupling: np.ndarray) -> np.ndarray:
         """Where the joints hang at rest on their springs [B, J]; one that is off starts at the reference."""
@@ -308,8 +330,16 @@ class _Motor:
         self.softens = np.isfinite(self.soft).any()
         self.clips, self.stalls = np.isfinite(self.hard).any(), np.isfinite(self.stall).any()
         self.soft = np.minimum(self.soft, 1e9)  # tanh(x / inf) inf is not x
+        self.bends = self.sags or self.softens or self.clips or self.stalls
 
-    def __call__(self, wanted: np.ndarray, speed: np.ndarray, time: float) -> tuple[Any, Any]:
+    def __call__(self, wanted: np.ndarray, speed: np.ndarray, time: float) -> tuple[Any, Any, Any]:
+        """Mean torque, its slope by the torque wanted, and its mean size; of parts of a step if it bends.
+
+        Args:
+            wanted: Torque wanted, in parts of the step [PARTS, B, J] if the motor bends, or [B, J] [N m].
+            speed: Speed of the joints [B, J] [rad/s].
+            time: Time since the start [s].
+        """
         torque, slope = wanted, np.ones_like(wanted)
         if self.sags:
             share = 1.0 / (1.0 + self.sag * np.abs(torque))
@@ -328,7 +358,9 @@ class _Motor:
             bound = np.where(torque * speed > 0.0, available, self.stall)
             slope = slope * (np.abs(torque) < bound)
             torque = np.minimum(np.maximum(torque, -bound), bound)
-        return torque, slope
+        if self.bends:
+            return torque.mean(axis=0), slope.mean(axis=0), np.abs(torque).mean(axis=0)
+        return torque, slope, np.abs(torque)
 
 
 def _where_on(values: np.ndarray) -> np.ndarray:
@@ -395,10 +427,16 @@ class _Loads:
         return torque
 
     def friction(self, motor: np.ndarray, v: np.ndarray, time: float) -> tuple[Any, Any]:
-        """Bounds of the friction torque against negative and positive motion [B, J] [N m]."""
+        """Bounds of the friction torque against negative and positive motion [B, J] [N m].
+
+        Args:
+            motor: Size of the motors' torque [B, J] [N m].
+            v: Speed [B, J] [rad/s].
+            time: Time since the start [s].
+        """
         bound = self.constant
         if self.loads:
-            bound = bound + self.load * np.abs(motor)
+            bound = bound + self.load * motor
         if self.stribecks:
             fading = np.exp(-np.square(v / self.scale))
             bound = bound + self.sliding + (self.static - self.sliding) * fading

@@ -34,7 +34,7 @@ FULL_P_GAIN = 400.0
 """P gain, in the units of Dynamixel X servos, at which the stiffness is the plant's."""
 PLANAR_TOLERANCE = 1.0e-6
 """Distance [m] from the link's axis that the closed form of the finger ignores."""
-CHUNK = 160
+CHUNK = 48
 """Trajectories simulated together: enough to amortise Python, few enough for memory."""
 
 SERVO = {"kp": 3.0, "kd": 0.3, "velocity_limit": 7.0, "inertia": 2.0e-3, "gravity": 0.0}

@@ -259,9 +259,11 @@ class Judge:
 
 
 def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
-    """95 % intervals of a fit's parameters, by key, from the spread over trajectories."""
+    """95 % intervals of a fit's parameters, by key: the spread over trajectories, and the time step's error."""
     matrix = covariance(fit.gram, fit.gradient, np.full(len(fit.x), RIDGE * floor**2), floor)
     width = half_width(np.diag(matrix), len(fit.gram))
+    if fit.step_error is not None:
+        width = np.hypot(width, fit.step_error)
     result = {}
     for c, x, w in zip(fit.coordinates, fit.x, width, strict=True):
         low, high = max(x - w, c.lower), min(x + w, c.upper)
