@@ -259,7 +259,7 @@ class Judge:
 
 
 def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
-    """95 % intervals of a fit's parameters, by key: the spread over trajectories, and the time step's error."""
+    """95 % intervals by key: the spread over trajectories, and the error of the time step."""
     matrix = covariance(fit.gram, fit.gradient, np.full(len(fit.x), RIDGE * floor**2), floor)
     width = half_width(np.diag(matrix), len(fit.gram))
     if fit.step_error is not None:
