@@ -5,8 +5,8 @@ quaternions xyzw. The values are written behind the state in the observation, sc
 """
 
 from itertools import product
+from math import hypot
 
-import numpy as np
 import warp as wp
 
 from vd.kernels.columns import read_quat, read_vec3, write_vec3
@@ -22,10 +22,10 @@ ORIENTATIONS = 2
 """Extents are given as the object lies, and as it would lie at the goal."""
 
 
-def extent_directions() -> np.ndarray:
-    """Directions in which extents are taken, to the faces, edges and corners of a cube, unit [26, 3]."""
-    steps = np.array([step for step in product((-1.0, 0.0, 1.0), repeat=3) if any(step)])
-    return steps / np.linalg.norm(steps, axis=1, keepdims=True)
+def extent_directions() -> list[tuple[float, float, float]]:
+    """Directions in which extents are taken, to the faces, edges and corners of a cube: 26 unit vectors."""
+    steps = [step for step in product((-1.0, 0.0, 1.0), repeat=3) if any(step)]
+    return [(x / hypot(x, y, z), y / hypot(x, y, z), z / hypot(x, y, z)) for x, y, z in steps]
 
 
 def shape_observation_slices(fingers: int) -> dict[str, slice]:

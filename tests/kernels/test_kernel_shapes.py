@@ -98,7 +98,7 @@ def placed(scene, world, quat):
 
 
 def test_directions_are_even_unit_vectors():
-    directions = extent_directions()
+    directions = np.array(extent_directions())
     assert directions.shape == (26, 3)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
     cosine = directions @ directions.T - 2.0 * np.eye(26)
@@ -143,7 +143,7 @@ def test_extents_are_the_support_function_now_and_at_the_goal(device, scene):
             ("extent", scene["q"][world, 3 * fingers + 3 :]),
             ("goal_extent", scene["goal"][world]),
         ):
-            support = (placed(scene, world, quat) @ extent_directions().T).max(axis=0)
+            support = (placed(scene, world, quat) @ np.array(extent_directions()).T).max(axis=0)
             values = EXTENT_CENTRE_M + SHAPE_UNIT_M * out[world, first:][slices[name]]
             np.testing.assert_allclose(values, support, atol=2e-6)
 
