@@ -29,6 +29,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.assets_usd": (*LEAVES, "vd.kernels", "vd.assets_usd"),
     "vd.sim": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim"),
     "vd.envs": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim", "vd.envs"),
+    "vd.sensors": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim", "vd.sensors"),
     "vd": ("vd",),
     "vd.train": ("vd",),
     "vd.deploy": ("vd",),

@@ -145,6 +145,14 @@ class TeacherConstants:
 
 
 @dataclass(frozen=True)
+class CameraConstants:
+    """Depth camera and its cloud; pose, size and focal length are the hand's (its USD)."""
+
+    points: int = source(6000, "C", "camera points of a cloud, drawn with replacement after the crop")
+    crop_m: tuple[float, float] = source((0.005, 0.2), "C", "world z that is kept: no table, no palm")
+
+
+@dataclass(frozen=True)
 class PaperConstants:
     """All constants; ``PAPER`` is the one instance."""
 
@@ -156,6 +164,7 @@ class PaperConstants:
     randomisation: RandomisationConstants = RandomisationConstants()
     materials: NominalMaterials = NominalMaterials()
     teacher: TeacherConstants = TeacherConstants()
+    camera: CameraConstants = CameraConstants()
 
 
 PAPER = PaperConstants()

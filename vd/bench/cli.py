@@ -1,4 +1,4 @@
-"""``vd-bench``: measure speed, physics and the gap workflow; rates are ratios within one run."""
+"""``vd-bench``: measure speed, physics, depth and the gap workflow; rates are ratios within one run."""
 
 import dataclasses
 import json
@@ -102,6 +102,44 @@ class PhysicsCommand:
             from vd.files import write_json
 
             write_json(self.json, report)
+        return 0
+
+
+@dataclass(frozen=True)
+class DepthCommand:
+    """Depth images and clouds per second, beside Newton's camera at the same size in the same run."""
+
+    worlds: tuple[int, ...] = (256, 1024, 4096)
+    """World counts to measure; 1 for the figure at deployment on a CPU."""
+    objects: tuple[str, ...] = ("procedural-150-seed0",)
+    """Object sets, mixed over the worlds."""
+    hand: str = "dclaw4"
+    """Hand."""
+    device: str = "auto"
+    """Warp device; auto is the first GPU, or else the CPU."""
+    seed: int = 0
+    """Of the poses."""
+    json: Path | None = None
+    """Write the rows to this file as JSON."""
+
+    def run(self) -> int:
+        """Measure and print."""
+        import warp as wp
+
+        from vd.assets_usd.objects.model import load_set
+        from vd.bench.depth import measure
+        from vd.files import write_json
+
+        wp.config.log_level = wp.LOG_WARNING
+        device = choose_device(self.device)
+        objects = load_set(list(self.objects))
+        rows: list[dict[str, Any]] = []
+        for worlds in self.worlds:
+            row = dataclasses.asdict(measure(objects, worlds, device, hand=self.hand, seed=self.seed))
+            rows.append(row)
+            print(json.dumps(row), flush=True)
+            if self.json:  # after each row: a later one may not fit the device
+                write_json(self.json, {"device": str(wp.get_device(device).name), "rows": rows})
         return 0
 
 
@@ -216,6 +254,7 @@ def choose_device(name: str) -> str:
 Command = (
     Annotated[SimCommand, tyro.conf.subcommand("sim")]
     | Annotated[PhysicsCommand, tyro.conf.subcommand("physics")]
+    | Annotated[DepthCommand, tyro.conf.subcommand("depth")]
     | Annotated[GapCommand, tyro.conf.subcommand("gap")]
     | Annotated[ReplayCommand, tyro.conf.subcommand("replay")]
 )

@@ -1,0 +1,240 @@
+"""Depth by rays and by rasterisation against closed forms and trimesh's ray engine, and each other.
+
+Rule of the silhouette: a pixel is left out of a comparison if the oracle, cast through four points a
+hundredth of a pixel around its centre, does not see one flat surface, or sees it at the very end of the
+camera's range. Single precision cannot say there.
+"""
+
+import numpy as np
+import pytest
+import trimesh
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_oracle import EXAMPLES, device_array, floats, quaternions
+from scipy.spatial.transform import Rotation
+from trimesh.ray.ray_triangle import ray_triangle_id
+
+from vd.assets_usd.hand_data import CameraModel
+from vd.paper import PAPER
+from vd.sensors.cfg import DepthCameraCfg
+from vd.sensors.depth_camera import DepthCamera
+from vd.sensors.surfaces import Surface, SurfaceSet
+
+METHODS = ["rays", "raster"]
+WIDTH, HEIGHT = 37, 23  # neither is a multiple of a tile
+NEAR, FAR = 0.0437, 1.5  # no round number: surfaces should not lie there by chance
+DEPTH_TOLERANCE = 2e-6  # metres: single precision at half a metre, and a dozen operations
+NUDGE_PX = 0.01
+NUDGED_DEPTH = 2e-3  # a surface that a hundredth of a pixel takes this far is seen along its edge
+
+
+def camera(width=WIDTH, height=HEIGHT, focal=30.0, near=NEAR, far=FAR):
+    """A small camera at the origin that looks along z, off the middle by a fraction of a pixel."""
+    return CameraModel(
+        width=width,
+        height=height,
+        fx=focal,
+        fy=1.1 * focal,
+        cx=0.5 * width + 0.3,
+        cy=0.5 * height - 0.4,
+        near=near,
+        far=far,
+        position=np.zeros(3),
+        quaternion=np.array([0.0, 0.0, 0.0, 1.0]),
+    )
+
+
+def directions(model, shift=(0.0, 0.0)):
+    """Directions through the pixels (moved by ``shift`` pixels), z = 1, shape [H, W, 3]."""
+    u, v = np.meshgrid(np.arange(model.width) + 0.5 + shift[0], np.arange(model.height) + 0.5 + shift[1])
+    return np.stack([(u - model.cx) / model.fx, (v - model.cy) / model.fy, np.ones_like(u)], axis=-1)
+
+
+def shoot(device, meshes, poses, scales, method, *, model=None, eye=None, table=False):
+    """Depth image [H, W] of meshes at ``poses`` [S, 7]; the camera's pose ``eye`` [7] in the world."""
+    count = len(meshes)
+    surfaces = SurfaceSet(
+        meshes, np.arange(count), np.arange(count)[None], np.asarray(scales)[None], device=device
+    )
+    body_q = device_array(np.asarray(poses)[None], wp.transform, device)
+    depth_camera = DepthCamera(
+        surfaces, model or camera(), body_q, cfg=DepthCameraCfg(method=method, points=0)
+    )
+    if eye is not None:
+        depth_camera.extrinsics.assign(np.asarray(eye, np.float32)[None])
+    depth_camera.table.fill_(int(table))
+    depth_camera.true_depth.fill_(np.nan)
+    depth_camera.capture()
+    return depth_camera.depth.numpy()[0]
+
+
+def in_range(depth, model=None):
+    """What a camera reports of true depths (infinite for nothing)."""
+    model = model or camera()
+    return np.where((depth >= model.near) & (depth <= model.far), depth, 0.0)
+
+
+def compare(depth, oracle, model=None, *, atol=DEPTH_TOLERANCE, least_share=0.6):
+    """Assert that an image agrees with ``oracle(directions) -> depth`` but at silhouettes."""
+    model = model or camera()
+    assert np.isfinite(depth).all()
+    true = oracle(directions(model))
+    wanted = in_range(true, model)
+    inside = (np.abs(true - model.near) > atol) & (np.abs(true - model.far) > atol)
+    for shift in [(NUDGE_PX, 0), (-NUDGE_PX, 0), (0, NUDGE_PX), (0, -NUDGE_PX)]:
+        inside &= np.abs(in_range(oracle(directions(model, shift)), model) - wanted) < NUDGED_DEPTH
+    assert inside.mean() > least_share, "too little is left to compare"
+    np.testing.assert_allclose(depth[inside], wanted[inside], rtol=0, atol=atol)
+
+
+def solid(mesh):
+    """A trimesh mesh as a surface."""
+    return Surface(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32))
+
+
+BOX = trimesh.creation.box(extents=(0.2, 0.12, 0.3))
+
+
+@st.composite
+def placements(draw, count=1):
+    """Poses [count, 7] of things of 0.3 m in front of the camera, some around it, and scales [count]."""
+    position = draw(floats((count, 3), -0.3, 0.3)) + np.array([0.0, 0.0, draw(st.floats(0.0, 1.2))])
+    return np.concatenate([position, draw(quaternions((count,)))], axis=1), draw(floats((count,), 0.5, 1.5))
+
+
+def box_oracle(pose, scale, half):
+    """Depth of a box's surface along each direction, by slabs in float64; inf where it is missed."""
+
+    def depth(rays):
+        turn = Rotation.from_quat(pose[3:])
+        origin = turn.inv().apply(-np.asarray(pose[:3], float))
+        ray = turn.inv().apply(rays.reshape(-1, 3)).reshape(rays.shape)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bounds = np.stack([(-half * scale - origin) / ray, (half * scale - origin) / ray])
+        enter, leave = bounds.min(axis=0).max(axis=-1), bounds.max(axis=0).min(axis=-1)
+        first = np.where(enter > 0, enter, leave)  # from inside, the far wall is seen
+        return np.where((enter <= leave) & (leave > 0), first, np.inf)
+
+    return depth
+
+
+@pytest.mark.parametrize("method", METHODS)
+@EXAMPLES
+@given(place=placements())
+def test_box_by_slabs_from_anywhere_even_inside(device, method, place):
+    poses, scales = place
+    depth = shoot(device, [solid(BOX)], poses, scales, method)
+    compare(depth, box_oracle(poses[0], scales[0], np.array([0.1, 0.06, 0.15])))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_sphere_within_the_sagitta_of_its_facets(device, method):
+    radius, centre = 0.15, np.array([0.05, -0.03, 0.6])
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    edge = np.linalg.norm(ball.vertices[ball.edges[:, 0]] - ball.vertices[ball.edges[:, 1]], axis=1).max()
+
+    depth = shoot(device, [solid(ball)], [[*centre, 0, 0, 0, 1]], [1.0], method)
+    rays = directions(camera())
+    hit = depth > 0
+    distance = np.linalg.norm(depth[hit, None] * rays[hit] - centre, axis=-1)
+    deepest = edge**2 / (6 * radius)  # middle of an equilateral triangle with its corners on the sphere
+    assert distance.max() < radius + DEPTH_TOLERANCE and distance.min() > radius - 1.1 * deepest
+    # A ray that passes nearer to the centre than any facet's middle hits.
+    through = np.linalg.norm(np.cross(rays, centre), axis=-1) / np.linalg.norm(rays, axis=-1)
+    assert hit[through < radius - 1.1 * deepest].all() and hit.sum() > 100
+    assert (depth[hit] < rays[hit] @ centre).all(), "the near side"
+
+
+@pytest.mark.parametrize("method", METHODS)
+@EXAMPLES
+@given(height=st.floats(0.1, 1.0), tilt=floats((2,), -0.6, 0.6))
+def test_table_is_a_box_seen_from_above(device, method, height, tilt):
+    # Looking down (pi about x), then tilted; the far mesh only fills the set.
+    eye_turn = Rotation.from_euler("x", np.pi) * Rotation.from_euler("xy", tilt)
+    eye = np.array([0.1, -0.05, height, *eye_turn.as_quat()])
+    far_away = [[0.0, 0.0, 100.0, 0, 0, 0, 1]]
+    depth = shoot(device, [solid(BOX)], far_away, [1.0], method, eye=eye, table=True)
+    half = 0.5 * np.array(PAPER.scene.table_size_m)
+    middle = np.array([0.0, 0.0, PAPER.scene.table_top_m - half[2]])
+    pose = np.concatenate([eye_turn.inv().apply(middle - eye[:3]), eye_turn.inv().as_quat()])
+    compare(depth, box_oracle(pose, 1.0, half), atol=1e-5)
+    bare = shoot(device, [solid(BOX)], far_away, [1.0], method, eye=eye, table=False)
+    assert not bare.any()
+
+
+class AllTriangles:
+    """A search tree that finds every triangle: trimesh's own needs a package more."""
+
+    def __init__(self, triangles):
+        flat = triangles.reshape(-1, 3)
+        self.bounds = np.concatenate([flat.min(axis=0), flat.max(axis=0)])
+        self._all = list(range(len(triangles)))
+
+    def intersection(self, _bounds):
+        """Indices of all triangles."""
+        return self._all
+
+
+def trimesh_oracle(meshes, poses, scales):
+    """Nearest depth along each direction by trimesh's ray engine, in float64."""
+
+    def depth(rays):
+        flat = rays.reshape(-1, 3)
+        nearest = np.full(len(flat), np.inf)
+        for mesh, pose, scale in zip(meshes, poses, scales, strict=True):
+            corners = Rotation.from_quat(pose[3:]).apply(scale * mesh.vertices.astype(float)) + pose[:3]
+            triangles = corners[mesh.faces]
+            _, ray, location = ray_triangle_id(
+                triangles, np.zeros_like(flat), flat, tree=AllTriangles(triangles)
+            )
+            if len(ray):
+                np.minimum.at(nearest, ray, location[:, 2])
+        return nearest.reshape(rays.shape[:-1])
+
+    return depth
+
+
+SHAPES = [
+    solid(trimesh.creation.torus(0.1, 0.04, major_sections=12, minor_sections=8)),
+    solid(trimesh.creation.cylinder(0.05, 0.2, sections=10)),
+    solid(trimesh.creation.icosphere(subdivisions=1, radius=0.08)),
+]
+
+
+@pytest.mark.parametrize("method", METHODS)
+@EXAMPLES
+@given(place=placements(count=3))
+def test_several_meshes_by_the_ray_engine_of_trimesh(device, method, place):
+    poses, scales = place
+    model = camera(width=19, height=13, focal=15.0)
+    depth = shoot(device, SHAPES, poses, scales, method, model=model)
+    compare(depth, trimesh_oracle(SHAPES, poses, scales), model, atol=2e-5)
+
+
+@EXAMPLES
+@given(place=placements(count=3))
+def test_both_methods_make_the_same_image(device, place):
+    poses, scales = place
+    rays, raster = (shoot(device, SHAPES, poses, scales, method) for method in METHODS)
+    at_the_limit = np.minimum(np.abs(np.maximum(rays, raster) - NEAR), np.abs(FAR - raster)) < 1e-5
+    assert np.mean((np.abs(rays - raster) < 1e-4) | at_the_limit) > 0.99, "but for silhouettes"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_closed_surfaces_have_no_cracks(device, method):
+    # The inside of a sphere of 5120 triangles around the camera: a ray between two of them would show.
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
+    model = camera(width=301, height=203, focal=150.0)
+    for seed in range(3):
+        turn = Rotation.random(random_state=seed).as_quat()
+        depth = shoot(device, [solid(ball)], [[0.02, 0.01, 0.03, *turn]], [1.0], method, model=model)
+        assert (depth > 0.2).all()
+
+
+def test_range_of_the_camera(device):
+    for method in METHODS:
+        for distance, seen in [(0.04, 0.0), (0.06, 0.06), (1.4, 1.4), (1.6, 0.0)]:
+            plate = solid(trimesh.creation.box(extents=(9.0, 9.0, 0.002)))
+            depth = shoot(device, [plate], [[0, 0, distance + 0.001, 0, 0, 0, 1]], [1.0], method)
+            np.testing.assert_allclose(depth, seen, atol=1e-5)

@@ -1,0 +1,315 @@
+"""The depth camera on the hand's scene: against Newton's camera, its clouds, viewpoints and late images.
+
+Rule of the edge: in comparisons with Newton a pixel is left out if Newton's inverse depth, which is affine
+on a plane, bends by more than 0.001 / m at it (0.4 mm at 0.6 m), along its row or its column. None of the
+others may differ, and of all pixels one in a thousand.
+"""
+
+import numpy as np
+import pytest
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.objects.model import load_set
+from vd.bench.depth import NewtonCamera, bench_scene, pose
+from vd.paper import PAPER
+from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.depth_camera import DepthCamera
+from vd.sim.cfg import SimCfg
+from vd.sim.scene import build_scene, hand_mount
+
+WORLDS = 3
+EDGE_BEND = 0.001
+TOLERANCE_M = 2e-5  # single precision of both cameras at 0.6 m
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """Scene and state on each device, with visual shapes for Newton; built once."""
+    built = {}
+
+    def get(device):
+        if device not in built:
+            objects = load_set("procedural-150-seed0")[::60]
+            built[device] = bench_scene(objects, WORLDS, "dclaw4", device, 3)
+        return built[device]
+
+    return get
+
+
+def make(scene, state, **settings):
+    return DepthCamera.of_scene(
+        scene, state.body_q.reshape((scene.num_worlds, -1)), DepthCameraCfg(**settings), seed=5
+    )
+
+
+def host(array):
+    """A copy: on the CPU ``numpy()`` is a view of what the next capture overwrites."""
+    return array.numpy().copy()
+
+
+def smooth(depth):
+    """Pixels that are no edge: not at the border, inverse depth even along row and column, [N, H, W]."""
+    inverse = np.where(depth > 0, 1 / np.where(depth > 0, depth, 1), 0.0)
+    bend = np.full(depth.shape, np.inf)
+    middle = 2 * inverse[:, 1:-1, 1:-1]
+    bend[:, 1:-1, 1:-1] = np.maximum(
+        np.abs(inverse[:, :-2, 1:-1] + inverse[:, 2:, 1:-1] - middle),
+        np.abs(inverse[:, 1:-1, :-2] + inverse[:, 1:-1, 2:] - middle),
+    )
+    return bend < EDGE_BEND
+
+
+@pytest.mark.parametrize("method", ["rays", "raster"])
+def test_image_is_that_of_newtons_camera(device, scenes, method):
+    scene, state = scenes(device)
+    ours = make(scene, state, method=method)
+    ours.true_depth.fill_(np.nan)
+    ours.capture()
+    theirs = NewtonCamera(scene, host(ours.camera_q))
+    theirs.refit(state)
+    theirs.render(state)
+    reference = host(theirs.depth)
+    reference = np.where(reference > scene.hand.camera.far, 0.0, reference)
+    keep = smooth(reference)
+    assert keep.mean() > 0.7
+    np.testing.assert_allclose(host(ours.depth)[keep], reference[keep], rtol=0, atol=TOLERANCE_M)
+    assert np.mean(np.abs(host(ours.depth) - reference) > TOLERANCE_M) < 1e-3
+    seen = reference[:, 40:140, 100:220]
+    assert np.ptp(seen) > 0.1, "the picture shows a hand, not a table alone"
+
+
+def test_objects_have_the_size_of_their_world(device):
+    from vd.assets_usd.hands import load_hand
+
+    objects = load_set("cube")
+    scene = build_scene(
+        hand=load_hand("dclaw3"),
+        objects=objects,
+        num_worlds=4,
+        cfg=SimCfg(),
+        device=device,
+        scales=(0.8, 1.2),
+        visuals=True,
+    )
+    np.testing.assert_array_equal(scene.world_scale, [0.8, 0.8, 1.2, 1.2])
+    state = scene.model.state()
+    pose(scene, state, np.random.default_rng(0))
+    ours = make(scene, state)
+    ours.capture()
+    theirs = NewtonCamera(scene, host(ours.camera_q))
+    theirs.refit(state)
+    theirs.render(state)
+    reference = host(theirs.depth)
+    keep = smooth(reference) & (reference < scene.hand.camera.far)
+    np.testing.assert_allclose(host(ours.depth)[keep], reference[keep], rtol=0, atol=TOLERANCE_M)
+
+
+def image_points(camera_model, depth):
+    """World points [H, W, 3] of a depth image at the camera of the USD."""
+    v, u = np.mgrid[: camera_model.height, : camera_model.width] + 0.5
+    rays = np.stack(
+        [
+            (u - camera_model.cx) / camera_model.fx,
+            (v - camera_model.cy) / camera_model.fy,
+            np.ones_like(u),
+        ],
+        axis=-1,
+    )
+    base = Rotation.from_quat(camera_model.quaternion).apply((rays * depth[..., None]).reshape(-1, 3))
+    base = (base + camera_model.position).reshape(*depth.shape, 3)
+    mount = hand_mount()
+    return base, Rotation.from_quat(mount.q).apply(base.reshape(-1, 3)).reshape(base.shape) + np.array(
+        mount.p
+    )
+
+
+def test_cloud_is_the_crop_of_the_image_in_the_frame_of_the_base(device, scenes):
+    scene, state = scenes(device)
+    camera = make(scene, state)
+    camera.points.fill_(np.nan)
+    camera.capture()
+    depth, count, points = host(camera.depth), host(camera.count), host(camera.points)
+    assert points.shape == (WORLDS, PAPER.camera.points, 3) and np.isfinite(points).all()
+    low, high = PAPER.camera.crop_m
+    for world in range(WORLDS):
+        base, in_world = image_points(scene.hand.camera, depth[world].astype(float))
+        kept = (depth[world] > 0) & (in_world[..., 2] >= low) & (in_world[..., 2] <= high)
+        assert abs(kept.sum() - count[world]) <= 2, "single precision at the crop's edge"
+        assert 1000 < count[world] < PAPER.camera.points
+        # All pixels are there, in the order of tiles; the rows beyond them repeat them.
+        cloud = points[world, : count[world]]
+        a, b = (x[np.lexsort(np.round(x, 6).T)] for x in (cloud, base[kept]))
+        if len(a) == len(b):
+            np.testing.assert_allclose(np.sort(a, axis=0), np.sort(b, axis=0), atol=2e-6)
+        again = points[world, count[world] :]
+        np.testing.assert_array_equal(again, points[world, : len(again)])
+
+
+def test_a_smaller_cloud_takes_each_pixel_once_and_evenly(device, scenes):
+    scene, state = scenes(device)
+    wanted, frames = 500, 40
+    camera = make(scene, state, points=wanted)
+    whole = make(scene, state)
+    whole.capture()
+    pixels = {tuple(p) for p in host(whole.points)[0]}
+    hits: dict[tuple, int] = {}
+    for _ in range(frames):
+        camera.capture()
+        assert host(camera.count)[0] == wanted
+        chosen = [tuple(p) for p in host(camera.points)[0]]
+        assert len(set(chosen)) == wanted and set(chosen) <= pixels
+        for p in chosen:
+            hits[p] = hits.get(p, 0) + 1
+    # Each pixel is chosen with probability wanted / available in each frame.
+    mean = frames * wanted / host(camera.available)[0]
+    assert len(hits) > 0.9 * (1 - np.exp(-mean)) * len(pixels)
+    assert max(hits.values()) < mean + 8 * np.sqrt(mean)
+
+
+@pytest.mark.parametrize("block", [2, 3])
+def test_a_ray_for_each_block_sees_one_of_its_pixels(device, scenes, block):
+    scene, state = scenes(device)
+    image = make(scene, state, method="rays", points=0)
+    image.capture()
+    full = host(image.depth)
+    blocks = make(scene, state, method="rays", block=block)
+    blocks.true_depth.fill_(np.nan)
+    blocks.capture()
+    sparse = host(blocks.depth)
+    rows, columns = sparse.shape[1:]
+    assert (rows, columns) == (-(-180 // block), -(-320 // block))
+    padded = np.full((WORLDS, rows * block, columns * block), -1.0)
+    padded[:, :180, :320] = full
+    candidates = padded.reshape(WORLDS, rows, block, columns, block).transpose(0, 1, 3, 2, 4)
+    candidates = candidates.reshape(WORLDS, rows, columns, -1)
+    nearest = np.abs(candidates - sparse[..., None])
+    assert nearest.min(axis=-1).max() < 1e-6
+    # All pixels of a block have their turn.
+    decided = np.ptp(candidates, axis=-1) > 1e-3
+    turn = np.bincount(nearest[decided].argmin(axis=-1), minlength=block**2) / decided.sum()
+    assert np.abs(turn * block**2 - 1).max() < 0.35
+    everything = {tuple(p) for p in np.round(make_cloud(scene, state), 5)}
+    some = {tuple(p) for p in np.round(host(blocks.points)[0, : host(blocks.count)[0]], 5)}
+    assert len(some - everything) < 0.02 * len(some), "points of the full cloud, but for rounding"
+
+
+def make_cloud(scene, state):
+    camera = make(scene, state)
+    camera.capture()
+    return host(camera.points)[0]
+
+
+def test_table_can_be_taken_away_world_by_world(device, scenes):
+    scene, state = scenes(device)
+    camera = make(scene, state, points=0)
+    camera.capture()
+    there = host(camera.depth)
+    camera.table.assign(np.array([1, 0, 1], np.int32))
+    camera.capture()
+    gone = host(camera.depth)
+    np.testing.assert_array_equal(gone[[0, 2]], there[[0, 2]])
+    assert (gone[1] == 0).mean() > (there[1] == 0).mean() + 0.2
+    kept = gone[1] > 0
+    np.testing.assert_array_equal(gone[1][kept], there[1][kept])
+
+
+def test_viewpoints_differ_between_worlds_as_asked(device, scenes):
+    scene, state = scenes(device)
+    body_q = state.body_q.reshape((WORLDS, -1))
+    cfg = DepthCameraCfg(position_noise_m=0.01, rotation_noise_rad=0.02, focal_noise=0.01, points=0)
+    camera = DepthCamera.of_scene(scene, body_q, cfg, seed=1)
+    same = DepthCamera.of_scene(scene, body_q, cfg, seed=1)
+    for one in (camera, same):
+        one.capture()
+    np.testing.assert_array_equal(host(camera.depth), host(same.depth))
+    poses = host(camera.extrinsics)
+    nominal = scene.hand.camera
+    moved = np.linalg.norm(poses[:, :3] - nominal.position, axis=1)
+    turned = (Rotation.from_quat(poses[:, 3:]) * Rotation.from_quat(nominal.quaternion).inv()).magnitude()
+    assert (moved > 0).all() and moved.max() < 0.06 and (turned > 0).all() and turned.max() < 0.12
+    # A point of the object projects where the world's own camera says.
+    theirs = NewtonCamera(scene, host(camera.camera_q))
+    assert len(np.unique(np.round(host(camera.camera_q)[:, 0], 6))) == WORLDS
+    assert theirs.poses.shape == (WORLDS,)
+
+
+def test_late_images_are_past_images(device, scenes):
+    scene, state = scenes(device)
+    frame_s = 1.0 / PAPER.scene.control_hz
+    now = make(scene, state, points=0)
+    late = make(scene, state, points=0, latency_s=(0.0, 2 * frame_s))
+    late.delay.assign(np.array([0.0, 1.0, 2.0], np.float32))
+    generator = np.random.default_rng(8)
+    start = host(state.joint_q)
+    history = []
+    for _ in range(5):
+        pose(scene, state, generator)
+        now.capture()
+        late.capture()
+        history.append(host(now.depth))
+        for world, delay in enumerate((0, 1, 2)):
+            if len(history) > delay:
+                np.testing.assert_allclose(host(late.depth)[world], history[-1 - delay][world], atol=1e-5)
+    # After a reset of world 2, its past is gone; that of world 1 is not.
+    pose(scene, state, generator)
+    late.reset(wp.array([0, 0, 1], dtype=wp.int32, device=device))
+    now.capture()
+    late.capture()
+    np.testing.assert_allclose(host(late.depth)[2], host(now.depth)[2], atol=1e-5)
+    np.testing.assert_allclose(host(late.depth)[1], history[-1][1], atol=1e-5)
+    state.joint_q.assign(start)
+    pose(scene, state, np.random.default_rng(3))
+
+
+def test_half_a_frame_late_lies_between(device, scenes):
+    scene, state = scenes(device)
+    frame_s = 1.0 / PAPER.scene.control_hz
+    late = make(scene, state, points=0, latency_s=(0.5 * frame_s, 0.5 * frame_s))
+    np.testing.assert_allclose(host(late.delay), 0.5)
+    before = host(state.body_q).reshape(WORLDS, -1, 7)
+    late.capture()
+    pose(scene, state, np.random.default_rng(9))
+    after = host(state.body_q).reshape(WORLDS, -1, 7)
+    late.capture()
+    shown = host(late._late_q)
+    np.testing.assert_allclose(shown[..., :3], 0.5 * (before + after)[..., :3], atol=1e-6)
+    a, b, c = (Rotation.from_quat(x[..., 3:].reshape(-1, 4)) for x in (before, shown, after))
+    np.testing.assert_allclose((a.inv() * b).magnitude(), (b.inv() * c).magnitude(), atol=1e-3)
+    pose(scene, state, np.random.default_rng(3))
+
+
+def test_a_perfect_sensor_costs_no_image(device, scenes):
+    scene, state = scenes(device)
+    camera = make(scene, state)
+    assert camera.depth is camera.true_depth
+    noisy = make(scene, state, sensor=DepthSensorCfg.realistic())
+    assert noisy.depth is not noisy.true_depth
+    noisy.depth.fill_(np.nan)
+    noisy.capture()
+    camera.capture()
+    np.testing.assert_array_equal(host(noisy.true_depth), host(camera.depth))
+    measured, true = host(noisy.depth), host(noisy.true_depth)
+    assert np.isfinite(measured).all()
+    flat = smooth(true) & (measured > 0) & (true > 0)
+    sensor = noisy.cfg.sensor
+    disparity = sensor.imager.focal_px * sensor.imager.baseline_m / np.stack([measured[flat], true[flat]])
+    error = disparity[0] - disparity[1]
+    expected = np.hypot(sensor.disparity_std_px, sensor.disparity_step_px / np.sqrt(12))
+    assert abs(np.std(error) / expected - 1) < 0.05 and abs(np.mean(error)) < 0.01 * expected
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"block": 2}, "method = rays"),
+        ({"method": "rays", "block": 2, "sensor": DepthSensorCfg(flying=0.1)}, "block = 1"),
+        ({"latency_s": (0.2, 0.1)}, "latency_s"),
+        ({"crop_m": (0.2, 0.0)}, "crop_m"),
+        ({"sensor": DepthSensorCfg(flying=0.6, edge_dropout=0.6)}, "must not exceed 1"),
+        ({"position_noise_m": -1.0}, "position_noise_m"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        DepthCameraCfg(**settings).validate()

@@ -1,0 +1,230 @@
+"""``vd-bench depth``: depth images and clouds per second, beside Newton's camera on the same scene.
+
+Hands of 16 links in random poses around the reset, a different object in each block of worlds near the table.
+Rates count images, each from new poses: Newton's include the refit of its hierarchies, which moving bodies
+need, ours the placing of meshes. Images of both are compared, so that a wrong one cannot look fast.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import newton
+import numpy as np
+import warp as wp
+from newton.sensors import SensorCamera
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_data import CameraModel
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.model import ObjectModel
+from vd.bench.sim import captured, seconds_per_call
+from vd.paper import PAPER
+from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.depth_camera import DepthCamera
+from vd.sim.cfg import SimCfg
+from vd.sim.scene import Scene, build_scene
+
+JOINT_SPREAD_RAD = 0.3
+"""Standard deviation of the joints around the reset: fingers around, over and beside the object."""
+OBJECT_HEIGHT_M = 0.05
+"""Height of the objects' centres: about that of an object on the table."""
+OBJECT_SPREAD_M = 0.01
+"""Standard deviation of the objects' positions, along each axis."""
+SAME_DEPTH_M = 1e-3
+"""Depths of two cameras that differ by more count as different."""
+LEAST_TIME_S = 1.0
+"""Each rate is the mean over about this time, after a warm-up."""
+
+NEWTON_FROM_OPTICAL = Rotation.from_euler("x", 180, degrees=True)
+"""Newton's cameras look along -z with +y up; the optical frame along +z with +y down."""
+
+
+@dataclass(frozen=True)
+class DepthRow:
+    """Images per second of one number of worlds."""
+
+    worlds: int
+    """Worlds side by side, one camera each."""
+    width: int
+    """Pixels."""
+    height: int
+    """Pixels."""
+    newton: float
+    """Newton's ``SensorCamera``, forward depth only, in the faster of two orders of traversal."""
+    newton_order: str
+    """That order."""
+    newton_refit_share: float
+    """Share of its time that refitting its hierarchies takes."""
+    images: dict[str, float] = field(default_factory=dict)
+    """Ours, depth images alone, by method."""
+    clouds: dict[str, float] = field(default_factory=dict)
+    """Ours with a cloud of each image, by method (and block of pixels a ray)."""
+    with_sensor: float = 0.0
+    """Ours with a cloud and every error of the sensor, by the faster method."""
+    images_over_newton: float = 0.0
+    """The faster of ours over Newton's, images alone."""
+    points: float = 0.0
+    """Points of a cloud, mean over worlds."""
+    different: float = 0.0
+    """Share of pixels that differ by more than 1 mm between Newton's image and ours (silhouettes)."""
+    methods_different: float = 0.0
+    """The same between ray casting and rasterisation."""
+
+
+def bench_scene(
+    objects: list[ObjectModel], worlds: int, hand: str, device: str, seed: int
+) -> tuple[Scene, Any]:
+    """A scene with visual shapes, and a Newton state with random poses.
+
+    Args:
+        objects: Objects to spread over the worlds; the first ones if there are fewer worlds.
+        worlds: Number of worlds.
+        hand: Name of a hand.
+        device: Warp device.
+        seed: Of the poses.
+    """
+    scene = build_scene(
+        hand=load_hand(hand),
+        objects=objects[:worlds],
+        num_worlds=worlds,
+        cfg=SimCfg(),
+        device=device,
+        visuals=True,
+    )
+    state = scene.model.state()
+    pose(scene, state, np.random.default_rng(seed))
+    return scene, state
+
+
+def pose(scene: Scene, state: Any, generator: np.random.Generator) -> None:
+    """Give every world of a state random joints and a random pose of its object."""
+    n, d = scene.num_worlds, scene.hand.num_joints
+    reset = np.tile(PAPER.scene.reset_joint_rad, scene.hand.num_fingers)
+    joints = reset + JOINT_SPREAD_RAD * generator.standard_normal((n, d))
+    position = OBJECT_SPREAD_M * generator.standard_normal((n, 3)) + [0.0, 0.0, OBJECT_HEIGHT_M]
+    quat = Rotation.random(n, random_state=generator).as_quat()
+    joints = np.clip(joints, scene.hand.lower, scene.hand.upper)
+    state.joint_q.assign(np.concatenate([joints, position, quat], axis=1).astype(np.float32).ravel())
+    newton.eval_fk(scene.model, state.joint_q, state.joint_qd, state)
+
+
+class NewtonCamera:
+    """Newton's ray-traced camera with the hand's viewpoint in every world, forward depth only."""
+
+    def __init__(self, scene: Scene, camera_q: np.ndarray, order: str = "PIXEL_PRIORITY"):
+        """Prepare rays and image.
+
+        Args:
+            scene: Worlds, built with visual shapes.
+            camera_q: Optical frames in the world frame, shape [N, 7].
+            order: Name of a ``SensorCamera.RenderOrder``.
+        """
+        self.model, camera = scene.model, scene.hand.camera
+        device = self.model.device
+        self.sensor = SensorCamera(self.model, load_textures=False)
+        self.rays = newton_rays(camera, str(device))
+        turned = (Rotation.from_quat(camera_q[:, 3:]) * NEWTON_FROM_OPTICAL).as_quat()
+        poses = np.concatenate([camera_q[:, :3], turned], axis=1).astype(np.float32)
+        self.poses = wp.array(poses, dtype=wp.transformf, device=device)
+        self.depth = self.sensor.allocate_image_depth_forward(len(poses), camera.width, camera.height)
+        self.config = SensorCamera.RenderConfig(render_order=SensorCamera.RenderOrder[order])
+
+    def refit(self, state: Any) -> None:
+        """Follow the bodies with the hierarchies."""
+        self.model.bvh_refit_shapes(state)
+
+    def render(self, state: Any) -> None:
+        """Draw, without a refit."""
+        self.sensor.update(
+            state, self.poses, self.rays, forward_depth_image=self.depth, render_config=self.config
+        )
+
+
+def newton_rays(camera: CameraModel, device: str) -> wp.array:
+    """Rays of a camera with a centred principal point, in Newton's form."""
+    return SensorCamera.compute_camera_rays_pinhole(
+        camera.width,
+        camera.height,
+        focal_length=camera.fx,
+        horizontal_aperture=float(camera.width),
+        vertical_aperture=camera.height * camera.fx / camera.fy,
+        device=device,
+    )
+
+
+def rate(worlds: int, function: Any, device: str) -> float:
+    """Images per second of a function that takes one in every world; waits for the device."""
+    function()
+    once = seconds_per_call(function, 1, device)
+    calls = max(1, min(100, round(LEAST_TIME_S / once)))
+    return worlds / seconds_per_call(function, calls, device)
+
+
+def measure(
+    objects: list[ObjectModel], worlds: int, device: str, *, hand: str = "dclaw4", seed: int = 0
+) -> DepthRow:
+    """Measure one number of worlds."""
+    scene, state = bench_scene(objects, worlds, hand, device, seed)
+    body_q = state.body_q.reshape((worlds, -1))
+    camera = scene.hand.camera
+
+    images: dict[str, float] = {}
+    depths: dict[str, np.ndarray] = {}
+    camera_q = np.empty(0)
+    for method in ("rays", "raster"):
+        ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method, points=0))
+        ours.capture()
+        images[method] = rate(worlds, captured(ours.capture, device), device)
+        depths[method], camera_q = ours.depth.numpy().copy(), ours.camera_q.numpy()
+    best = max(images, key=lambda method: images[method])
+
+    clouds: dict[str, float] = {}
+    points = 0.0
+    for method, block in (("rays", 1), ("rays", 2), ("rays", 3), ("raster", 1)):
+        ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method, block=block))
+        ours.capture()
+        clouds[method if block == 1 else f"{method}/{block}"] = rate(
+            worlds, captured(ours.capture, device), device
+        )
+        if block == 1:
+            points = float(ours.count.numpy().mean())
+    ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=best, sensor=DepthSensorCfg.realistic()))
+    ours.capture()
+    with_sensor = rate(worlds, captured(ours.capture, device), device)
+    del ours
+
+    newton_rates: dict[str, float] = {}
+    reference = np.empty(0)
+    refit_s = 0.0
+    for order in ("PIXEL_PRIORITY", "TILED"):
+        theirs = NewtonCamera(scene, camera_q, order)
+
+        def frame(theirs: NewtonCamera = theirs) -> None:
+            theirs.refit(state)
+            theirs.render(state)
+
+        newton_rates[order] = rate(worlds, frame, device)
+        refit_s = 1.0 / rate(1, lambda theirs=theirs: theirs.refit(state), device)
+        reference = theirs.depth.numpy().copy()
+    order = max(newton_rates, key=lambda name: newton_rates[name])
+    fastest = newton_rates[order]
+    return DepthRow(
+        worlds=worlds,
+        width=camera.width,
+        height=camera.height,
+        newton=fastest,
+        newton_order=order,
+        newton_refit_share=refit_s * fastest / worlds,
+        images=images,
+        clouds=clouds,
+        with_sensor=with_sensor,
+        images_over_newton=images[best] / fastest,
+        points=points,
+        different=_different(np.where(reference > camera.far, 0.0, reference), depths["rays"]),
+        methods_different=_different(depths["raster"], depths["rays"]),
+    )
+
+
+def _different(a: np.ndarray, b: np.ndarray) -> float:
+    """Share of pixels that differ by more than :data:`SAME_DEPTH_M`."""
+    return float(np.mean(np.abs(a - b) > SAME_DEPTH_M))

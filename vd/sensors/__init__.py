@@ -1,0 +1,1 @@
+"""Sensors of the robot, simulated: the depth camera."""

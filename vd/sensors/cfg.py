@@ -1,0 +1,128 @@
+"""Settings of the depth camera and of its errors; by default a perfect camera at the hand's viewpoint."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from vd.paper import PAPER
+
+
+@dataclass(frozen=True)
+class StereoImager:
+    """What of a stereo camera sets the errors of its depth."""
+
+    baseline_m: float
+    """Distance between the two imagers [m]."""
+    focal_px: float
+    """Focal length of an imager [pixel], at the resolution at which disparities are found."""
+
+
+D415 = StereoImager(baseline_m=0.055, focal_px=1024.2)
+"""Intel RealSense D415: baseline 55 mm (D400 series data sheet); 1280 pixels over the camera's 64 degrees."""
+
+
+@dataclass(frozen=True)
+class DepthSensorCfg:
+    """Errors of a stereo depth camera. All are off: zero."""
+
+    imager: StereoImager = D415
+    """Camera whose disparities are noisy and rounded."""
+    disparity_std_px: float = 0.0
+    """Noise of the disparity [pixel]; in depth it is z^2 / (focal length * baseline) times that. Real cameras
+    of this kind: 0.05 to 0.1."""
+    disparity_step_px: float = 0.0
+    """Rounding of the disparity [pixel]; the D400 series resolves 1/32."""
+    edge_jump_m: float = 0.02
+    """Difference of depth between neighbouring pixels that makes an edge [m]."""
+    edge_dropout: float = 0.0
+    """Share of edge pixels that have no depth."""
+    flying: float = 0.0
+    """Share of edge pixels that lie somewhere between the two surfaces."""
+    dropout: float = 0.0
+    """Share of all pixels that have no depth."""
+    min_range_m: float = 0.0
+    """Depth below which there is none [m]; a D415 sees from 0.45 m on at 1280 x 720."""
+
+    @staticmethod
+    def realistic() -> "DepthSensorCfg":
+        """A D415 as it is: measured noise, the rounding of its chip, frayed edges, its least distance."""
+        return DepthSensorCfg(
+            disparity_std_px=0.08,
+            disparity_step_px=1.0 / 32.0,
+            edge_dropout=0.3,
+            flying=0.1,
+            dropout=0.005,
+            min_range_m=0.3,
+        )
+
+    @property
+    def uses_edges(self) -> bool:
+        """Whether anything depends on a pixel's neighbours."""
+        return self.edge_dropout > 0.0 or self.flying > 0.0
+
+    @property
+    def enabled(self) -> bool:
+        """Whether anything is measured otherwise than it is."""
+        return self.uses_edges or any(
+            value > 0.0
+            for value in (self.disparity_std_px, self.disparity_step_px, self.dropout, self.min_range_m)
+        )
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        for name in ("disparity_std_px", "disparity_step_px", "min_range_m"):
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"sensor.{name} = {getattr(self, name)}; it must not be negative")
+        if self.imager.baseline_m <= 0.0 or self.imager.focal_px <= 0.0 or self.edge_jump_m <= 0.0:
+            raise ValueError("sensor.imager and sensor.edge_jump_m must be positive")
+        if min(self.edge_dropout, self.flying, self.dropout) < 0.0 or self.dropout > 1.0:
+            raise ValueError("sensor.edge_dropout, flying and dropout are shares: choose them in [0, 1]")
+        if self.edge_dropout + self.flying > 1.0:
+            raise ValueError(
+                f"sensor.edge_dropout + sensor.flying = {self.edge_dropout + self.flying}; "
+                "together they must not exceed 1"
+            )
+
+
+@dataclass(frozen=True)
+class DepthCameraCfg:
+    """A depth camera on the hand's base in every world."""
+
+    method: Literal["raster", "rays"] = "raster"
+    """How depth is found. The images are the same; rays can be cast through some of the pixels only."""
+    block: int = 1
+    """Cast one ray through a random pixel of each block of this many pixels a side (rays only), which can be
+    enough for a cloud. 1 gives the image."""
+    points: int = PAPER.camera.points
+    """Points of a cloud at most; 0 makes no clouds."""
+    crop_m: tuple[float, float] = PAPER.camera.crop_m
+    """Least and largest height over the table of a cloud's points [m]."""
+    position_noise_m: float = 0.0
+    """Standard deviation of the camera's position in each world, along each axis [m]."""
+    rotation_noise_rad: float = 0.0
+    """Standard deviation of its orientation about each axis [rad]."""
+    focal_noise: float = 0.0
+    """Standard deviation of the focal length, relative to it."""
+    latency_s: tuple[float, float] = (0.0, 0.0)
+    """Range of the images' age [s], drawn evenly for each world."""
+    sensor: DepthSensorCfg = field(default_factory=DepthSensorCfg)
+    """Errors of the measured depth."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        self.sensor.validate()
+        if self.method not in ("raster", "rays"):
+            raise ValueError(f"method = {self.method!r}; choose raster or rays")
+        if self.block < 1 or self.points < 0:
+            raise ValueError(f"block = {self.block} must be at least 1, points = {self.points} at least 0")
+        if self.block > 1 and self.method != "rays":
+            raise ValueError(f"block = {self.block} needs method = rays; rasterisation fills whole images")
+        if self.block > 1 and self.sensor.uses_edges:
+            raise ValueError(
+                "sensor.edge_dropout and flying look at neighbouring pixels; they need block = 1"
+            )
+        if self.crop_m[0] > self.crop_m[1]:
+            raise ValueError(f"crop_m = {self.crop_m}; name the lower height first")
+        if not 0.0 <= self.latency_s[0] <= self.latency_s[1]:
+            raise ValueError(f"latency_s = {self.latency_s}; name two times, none negative, the least first")
+        if min(self.position_noise_m, self.rotation_noise_rad, self.focal_noise) < 0.0:
+            raise ValueError("position_noise_m, rotation_noise_rad and focal_noise must not be negative")

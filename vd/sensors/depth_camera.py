@@ -1,0 +1,382 @@
+"""A depth camera in every world: image and cloud from the simulator's poses, on its device.
+
+World frame: z up, table top at z = 0. The optical frame has x right, y down, z forward. Depth is measured
+along the optical axis [m]; 0 means no value: nothing within the camera's range, or lost by the sensor, as
+real depth cameras report it. Quaternions are xyzw.
+"""
+
+import math
+
+import numpy as np
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_data import CameraModel
+from vd.kernels.depth_cloud import (
+    choose_points_kernel,
+    count_points_kernel,
+    crop_cells_kernel,
+    next_frame_kernel,
+)
+from vd.kernels.depth_sensor import (
+    DepthSensorParams,
+    delay_poses_kernel,
+    forget_poses_kernel,
+    measure_depth_kernel,
+    next_count_kernel,
+)
+from vd.kernels.depth_views import NO_HIT, View, place_camera_kernel, place_meshes_kernel
+from vd.kernels.rasterise import finish_depth_kernel, rasterise_kernel
+from vd.kernels.raycast import (
+    TILE_COLUMNS,
+    TILE_ROWS,
+    cull_tiles_kernel,
+    order_shapes_kernel,
+    raycast_kernel,
+)
+from vd.kernels.rng import init_rng_kernel
+from vd.paper import PAPER
+from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.surfaces import SurfaceSet, scene_surfaces
+from vd.sim.scene import Scene
+
+WARP_LANES = 32
+"""Threads of a tile on a GPU: one for each of its cells. The CPU runs one after the other anyway."""
+
+
+class DepthCamera:
+    """N depth cameras of H x W pixels, one a world, over S shapes and a table.
+
+    ``capture()`` launches kernels only, so that it can be part of a CUDA graph; results lie in ``depth``,
+    ``points`` and ``count``. Extrinsics, intrinsics, sensor and latency are arrays with one entry a world and
+    may be changed between captures.
+    """
+
+    def __init__(
+        self,
+        surfaces: SurfaceSet,
+        camera: CameraModel,
+        body_q: wp.array,
+        *,
+        cfg: DepthCameraCfg | None = None,
+        camera_body: int = -1,
+        frame_s: float = 1.0 / PAPER.scene.control_hz,
+        seed: int = 0,
+    ):
+        """Allocate images and clouds.
+
+        Args:
+            surfaces: What can be seen.
+            camera: The camera before it is randomised; its pose is in the frame of ``camera_body``.
+            body_q: Body poses in the world frame, shape [N, B]; read at each capture.
+            cfg: Settings.
+            camera_body: Body that carries the cameras, an index within a world; -1 for the world.
+            frame_s: Time between captures [s], to which latencies relate.
+            seed: Of viewpoints, latencies and sensor errors.
+
+        Raises:
+            ValueError: For a setting that cannot work, naming field and remedy.
+        """
+        self.cfg = cfg = cfg or DepthCameraCfg()
+        cfg.validate()
+        self.camera, self.surfaces, self.body_q = camera, surfaces, body_q
+        self.device = device = str(body_q.device)
+        self.num_worlds = n = surfaces.num_worlds
+        self._camera_body = camera_body
+        self.height, self.width = camera.height, camera.width
+        self.rows, self.columns = math.ceil(self.height / cfg.block), math.ceil(self.width / cfg.block)
+        self._tile_rows, self._tile_columns = (
+            math.ceil(self.rows / int(TILE_ROWS)),
+            math.ceil(self.columns / int(TILE_COLUMNS)),
+        )
+        shapes, tiles = surfaces.num_shapes, self._tile_rows * self._tile_columns
+        self._table = _table_box()
+        generator = np.random.default_rng(seed)
+
+        def empty(*shape: int, dtype: type = float) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self.views = wp.array(_views(camera, generator, cfg, n), dtype=View, device=device)
+        """Focal lengths, principal point [pixel] and range [m] of each camera, shape [N]."""
+        self.extrinsics = wp.array(_extrinsics(camera, generator, cfg, n), dtype=wp.transform, device=device)
+        """Optical frame of each camera in the frame of the body that carries it, shape [N]."""
+        self.sensors = wp.array([_sensor(cfg.sensor, camera)] * n, dtype=DepthSensorParams, device=device)
+        """Sensor settings of each camera; used if any was on at the start, shape [N]."""
+        delay = generator.uniform(*cfg.latency_s, size=n) / frame_s
+        self.delay = wp.array(delay, dtype=float, device=device)
+        """Age of each camera's images [frame], shape [N]; at most that of ``cfg.latency_s``."""
+        self.table = wp.ones(n, dtype=wp.int32, device=device)
+        """Whether each world's table is there, shape [N]."""
+        self.camera_q = empty(n, dtype=wp.transform)
+        """Optical frames in the world frame at the last capture, shape [N]."""
+        self.true_depth = empty(n, self.rows, self.columns)
+        """Depth without sensor errors [m], shape [N, H, W]; a row and column for each block of pixels."""
+        self.depth = empty(n, self.rows, self.columns) if cfg.sensor.enabled else self.true_depth
+        """Measured depth [m], 0 for none; the same array as ``true_depth`` if the sensor is perfect."""
+        self.points = empty(n, cfg.points, dtype=wp.vec3)
+        """Points within the crop, in the frame of the camera's body (the hand's base) [m], shape [N, K]. Rows
+        beyond ``count`` repeat the first ones."""
+        self.count = empty(n, dtype=wp.int32)
+        """Points of each cloud, shape [N]."""
+        self.available = empty(n, dtype=wp.int32)
+        """Pixels within the crop, of which the points were chosen, shape [N]."""
+        self.rng = wp.empty(n, dtype=wp.uint32, device=device)
+        """Random state of each world, shape [N]."""
+        wp.launch(init_rng_kernel, dim=n, inputs=[seed], outputs=[self.rng], device=device)
+
+        self._rotation, self._position = empty(n, shapes, dtype=wp.mat33), empty(n, shapes, dtype=wp.vec3)
+        self._window, self._nearest = empty(n, shapes, dtype=wp.vec4), empty(n, shapes)
+        self._order = empty(n, shapes, dtype=wp.int32)
+        self._tile_shapes, self._tile_cells = (
+            empty(n, tiles, dtype=wp.uint32),
+            empty(n, tiles, dtype=wp.uint32),
+        )
+        self._tile_first = empty(n, tiles, dtype=wp.int32)
+        self._row_count = empty(n, self._tile_rows, dtype=wp.int32)
+        self._row_first = empty(n, self._tile_rows, dtype=wp.int32)
+        self._depth_bits = self.true_depth.view(wp.int32)
+        self._history: wp.array | None = None
+        if cfg.latency_s[1] > 0.0:
+            slots = math.ceil(cfg.latency_s[1] / frame_s) + 1
+            self._frame = empty(1, dtype=wp.int32)
+            self._late_q = wp.clone(body_q)
+            self._history = empty(slots, *body_q.shape, dtype=wp.transform)
+            self.reset()
+
+    @classmethod
+    def of_scene(
+        cls,
+        scene: Scene,
+        body_q: wp.array,
+        cfg: DepthCameraCfg | None = None,
+        *,
+        frame_s: float = 1.0 / PAPER.scene.control_hz,
+        seed: int = 0,
+    ) -> "DepthCamera":
+        """The camera of the hand's USD in every world of a scene.
+
+        Args:
+            scene: The worlds; their model needs no visual shapes.
+            body_q: Body poses, shape [N, B] (``Simulator.body_q``).
+            cfg: Settings.
+            frame_s: Time between captures [s].
+            seed: Of viewpoints, latencies and sensor errors.
+        """
+        return cls(
+            scene_surfaces(scene),
+            scene.hand.camera,
+            body_q,
+            cfg=cfg,
+            camera_body=int(scene.link_body[0]),
+            frame_s=frame_s,
+            seed=seed,
+        )
+
+    def reset(self, mask: wp.array | None = None) -> None:
+        """Forget the past of worlds, so that no late image shows what was before their reset.
+
+        Args:
+            mask: 1 where a world was reset, shape [N] int32; all by default.
+        """
+        if self._history is None:
+            return
+        if mask is None:
+            mask = wp.ones(self.num_worlds, dtype=wp.int32, device=self.device)
+        self._launch(forget_poses_kernel, self.body_q.shape, [mask, self.body_q], [self._history])
+
+    def capture(self) -> None:
+        """Take an image in every world and make its cloud. Launches only; nothing reaches the host."""
+        n, surfaces = self.num_worlds, self.surfaces
+        body_q = self._late_poses()
+        self._launch(place_camera_kernel, n, [self._camera_body, self.extrinsics, body_q], [self.camera_q])
+        self._launch(
+            place_meshes_kernel,
+            self._nearest.shape,
+            [
+                self.views,
+                surfaces.shape_body,
+                surfaces.shape_mesh,
+                surfaces.shape_scale,
+                surfaces.mesh_lower,
+                surfaces.mesh_upper,
+                self.camera_q,
+                body_q,
+            ],
+            [self._rotation, self._position, self._window, self._nearest],
+        )
+        if self.cfg.method == "rays":
+            self._cast()
+        else:
+            self._rasterise()
+        if self.depth is not self.true_depth:
+            self._launch(
+                measure_depth_kernel,
+                self.depth.shape,
+                [self.sensors, self.true_depth, self.rng],
+                [self.depth],
+            )
+        if self.cfg.points:
+            self._make_clouds()
+        self._launch(next_frame_kernel, n, [self.rng], [])
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _late_poses(self) -> wp.array:
+        """Body poses that this capture shows."""
+        if self._history is None:
+            return self.body_q
+        self._launch(
+            delay_poses_kernel,
+            self.body_q.shape,
+            [self._frame, self.delay, self.body_q, self._history],
+            [self._late_q],
+        )
+        self._launch(next_count_kernel, 1, [self._frame], [])
+        return self._late_q
+
+    def _cast(self) -> None:
+        n, surfaces = self.num_worlds, self.surfaces
+        tiles = self._tile_rows * self._tile_columns
+        lanes = 1 if self.device == "cpu" else WARP_LANES
+        self._launch(order_shapes_kernel, self._nearest.shape, [self._nearest], [self._order])
+        self._launch(
+            cull_tiles_kernel,
+            (n, tiles),
+            [self.cfg.block, self._tile_columns, self._window, self._order],
+            [self._tile_shapes],
+        )
+        self._launch(
+            raycast_kernel,
+            (n, tiles, lanes),
+            [
+                self.views,
+                surfaces.mesh_id,
+                surfaces.shape_mesh,
+                surfaces.shape_scale,
+                *self._table,
+                self.height,
+                self.width,
+                self.cfg.block,
+                self._tile_columns,
+                lanes,
+                self.table,
+                self.camera_q,
+                self._rotation,
+                self._position,
+                self._nearest,
+                self._order,
+                self._tile_shapes,
+                self.rng,
+            ],
+            [self.true_depth],
+        )
+
+    def _rasterise(self) -> None:
+        surfaces = self.surfaces
+        self.true_depth.fill_(NO_HIT)
+        self._launch(
+            rasterise_kernel,
+            (self.num_worlds, len(surfaces.slot_shape)),
+            [
+                self.views,
+                surfaces.points,
+                surfaces.triangles,
+                surfaces.mesh_first,
+                surfaces.slot_shape,
+                surfaces.slot_index,
+                surfaces.shape_mesh,
+                surfaces.shape_scale,
+                self._rotation,
+                self._position,
+                self._window,
+            ],
+            [self._depth_bits],
+        )
+        self._launch(
+            finish_depth_kernel,
+            self.true_depth.shape,
+            [self.views, *self._table, self.table, self.camera_q],
+            [self.true_depth],
+        )
+
+    def _make_clouds(self) -> None:
+        n, cfg = self.num_worlds, self.cfg
+        self._launch(
+            crop_cells_kernel,
+            (n, self._tile_rows),
+            [
+                self.views,
+                *cfg.crop_m,
+                self.height,
+                self.width,
+                cfg.block,
+                self._tile_columns,
+                self.camera_q,
+                self.rng,
+                self.depth,
+            ],
+            [self._tile_cells, self._tile_first, self._row_count],
+        )
+        self._launch(
+            count_points_kernel,
+            n,
+            [cfg.points, self._row_count],
+            [self._row_first, self.available, self.count],
+        )
+        self._launch(
+            choose_points_kernel,
+            (n, cfg.points),
+            [
+                self.views,
+                self.height,
+                self.width,
+                cfg.block,
+                self._tile_columns,
+                self.extrinsics,
+                self.rng,
+                self.depth,
+                self._tile_cells,
+                self._tile_first,
+                self._row_first,
+                self.available,
+            ],
+            [self.points],
+        )
+
+
+def _table_box() -> tuple[wp.vec3, wp.vec3]:
+    """Lower and upper corner of the paper's table in the world frame [m]."""
+    x, y, z = PAPER.scene.table_size_m
+    top = PAPER.scene.table_top_m
+    return wp.vec3(-0.5 * x, -0.5 * y, top - z), wp.vec3(0.5 * x, 0.5 * y, top)
+
+
+def _views(camera: CameraModel, generator: np.random.Generator, cfg: DepthCameraCfg, n: int) -> list[View]:
+    views = []
+    for factor in 1.0 + cfg.focal_noise * generator.standard_normal(n):
+        view = View()
+        view.fx, view.fy = camera.fx * factor, camera.fy * factor
+        view.cx, view.cy = camera.cx, camera.cy
+        view.near, view.far = camera.near, camera.far
+        views.append(view)
+    return views
+
+
+def _extrinsics(
+    camera: CameraModel, generator: np.random.Generator, cfg: DepthCameraCfg, n: int
+) -> np.ndarray:
+    """Poses of the optical frames [N, 7], the turn about the camera's own axes."""
+    turn = Rotation.from_rotvec(cfg.rotation_noise_rad * generator.standard_normal((n, 3)))
+    position = camera.position + cfg.position_noise_m * generator.standard_normal((n, 3))
+    return np.concatenate([position, (Rotation.from_quat(camera.quaternion) * turn).as_quat()], axis=1)
+
+
+def _sensor(cfg: DepthSensorCfg, camera: CameraModel) -> DepthSensorParams:
+    params = DepthSensorParams()
+    params.depth_disparity = cfg.imager.focal_px * cfg.imager.baseline_m
+    params.disparity_std, params.disparity_step = cfg.disparity_std_px, cfg.disparity_step_px
+    params.edge_jump = cfg.edge_jump_m if cfg.uses_edges else 0.0
+    params.edge_dropout, params.flying, params.dropout = cfg.edge_dropout, cfg.flying, cfg.dropout
+    params.min_range, params.max_range = cfg.min_range_m, camera.far
+    return params

@@ -1,0 +1,116 @@
+"""The triangles that a camera can see in each world, gathered for the device."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import warp as wp
+
+from vd.assets_usd.hand_visuals import read_surfaces
+from vd.kernels.raycast import MAX_SHAPES
+from vd.sim.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles fixed to a body: vertices [V, 3] [m] in its frame, faces [T, 3]."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+class SurfaceSet:
+    """M distinct meshes and which of them is where: S shapes in each of N worlds, B bodies a world.
+
+    Equal meshes (links of different fingers, objects of different worlds) are kept once, with one bounding
+    volume hierarchy.
+    """
+
+    def __init__(
+        self,
+        meshes: Sequence[Surface],
+        shape_body: np.ndarray,
+        shape_mesh: np.ndarray,
+        shape_scale: np.ndarray,
+        *,
+        device: str,
+    ):
+        """Copy meshes to the device and build their hierarchies.
+
+        Args:
+            meshes: The meshes.
+            shape_body: Body that carries each shape, an index within a world; -1 for the world, shape [S].
+            shape_mesh: Mesh of each shape in each world, shape [N, S].
+            shape_scale: Size factor of each shape in each world, shape [N, S].
+            device: Warp device.
+
+        Raises:
+            ValueError: More shapes than a tile's word has bits, or a mesh without triangles.
+        """
+        self.num_worlds, self.num_shapes = shape_mesh.shape
+        if self.num_shapes > MAX_SHAPES:
+            raise ValueError(
+                f"{self.num_shapes} shapes a world; the depth camera takes {MAX_SHAPES} at most: join some"
+            )
+        if empty := [i for i, mesh in enumerate(meshes) if not len(mesh.faces)]:
+            raise ValueError(f"meshes {empty} have no triangles; leave them out")
+        sizes = np.array([len(mesh.faces) for mesh in meshes])
+        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
+        triangles = np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)])
+
+        def array(values: np.ndarray, dtype: type) -> wp.array:
+            return wp.array(values, dtype=dtype, device=device)
+
+        self.points = array(np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32), wp.vec3)
+        """Vertices of all meshes in their frames [m], shape [V]."""
+        self.triangles = array(triangles.astype(np.int32), wp.vec3i)
+        """Their triangles, mesh after mesh, shape [F]."""
+        self.mesh_first = array(np.concatenate([[0], np.cumsum(sizes)]), wp.int32)
+        """First triangle of each mesh, and the end, shape [M + 1]."""
+        self._meshes = [
+            wp.Mesh(
+                array(mesh.vertices.astype(np.float32), wp.vec3),
+                array(mesh.faces.astype(np.int32).ravel(), wp.int32),
+            )
+            for mesh in meshes
+        ]
+        self.mesh_id = array(np.array([mesh.id for mesh in self._meshes]), wp.uint64)
+        """Hierarchies, shape [M]."""
+        self.mesh_lower = array(np.array([mesh.vertices.min(axis=0) for mesh in meshes]), wp.vec3)
+        """Lower corner of each mesh's bounds [m], shape [M]."""
+        self.mesh_upper = array(np.array([mesh.vertices.max(axis=0) for mesh in meshes]), wp.vec3)
+        """Upper corner, shape [M]."""
+        self.shape_body = array(shape_body, wp.int32)
+        """Body of each shape, shape [S]."""
+        self.shape_mesh = array(shape_mesh, wp.int32)
+        """Mesh of each shape, shape [N, S]."""
+        self.shape_scale = array(shape_scale, wp.float32)
+        """Size factor of each shape, shape [N, S]."""
+        # Worlds differ in their objects' triangles; there is a thread for each of the most.
+        most = sizes[shape_mesh].max(axis=0)
+        self.slot_shape = array(np.repeat(np.arange(self.num_shapes), most), wp.int32)
+        """Shape of each thread of the rasterisation, shape [K]."""
+        self.slot_index = array(np.concatenate([np.arange(n) for n in most]), wp.int32)
+        """Triangle of each thread within its mesh, shape [K]."""
+
+
+def scene_surfaces(scene: Scene) -> SurfaceSet:
+    """What a camera sees of a scene but the table: the hand's links, and the object as its last shape."""
+    parts = read_surfaces(scene.hand)
+    meshes: list[Surface] = []
+    known: dict[bytes, int] = {}
+
+    def index(vertices: np.ndarray, faces: np.ndarray) -> int:
+        key = vertices.tobytes() + faces.tobytes()
+        if key not in known:
+            known[key] = len(meshes)
+            meshes.append(Surface(vertices, faces))
+        return known[key]
+
+    links = [index(part.vertices, part.faces) for part in parts]
+    objects = np.array([index(item.vertices, item.faces) for item in scene.objects])
+    shape_mesh = np.column_stack([np.tile(links, (scene.num_worlds, 1)), objects[scene.world_object]])
+    shape_scale = np.ones(shape_mesh.shape)
+    shape_scale[:, -1] = scene.world_scale
+    bodies = [*(scene.link_body[part.link] for part in parts), scene.object_body]
+    return SurfaceSet(meshes, np.array(bodies), shape_mesh, shape_scale, device=str(scene.model.device))
