@@ -4,8 +4,7 @@ Privileged and exact: no sensor gives these values, and they get no noise. World
 quaternions xyzw. The values are written behind the state in the observation, scaled to about one.
 """
 
-from itertools import product
-from math import hypot
+from math import cos, pi, sin
 
 import warp as wp
 
@@ -18,23 +17,29 @@ SHAPE_UNIT_M = 0.02
 """Unit of the values [m]: fingertips are this far from the surface, and extents vary by it."""
 EXTENT_CENTRE_M = 0.05
 """Subtracted from extents [m]: about their mean over objects of 6 to 15 cm."""
+AZIMUTHS_PER_FINGER = 3
+"""Directions of a ring for each finger: every 40 degrees with three, every 30 with four."""
+RING_ELEVATIONS = (-0.25 * pi, 0.0, 0.25 * pi)
+"""Elevations of the rings of directions [rad]."""
 ORIENTATIONS = 2
 """Extents are given as the object lies, and as it would lie at the goal."""
 
 
-def extent_directions() -> list[tuple[float, float, float]]:
-    """Directions in which extents are taken, to the faces, edges and corners of a cube: 26 unit vectors."""
-    steps = [step for step in product((-1.0, 0.0, 1.0), repeat=3) if any(step)]
-    return [(x / hypot(x, y, z), y / hypot(x, y, z), z / hypot(x, y, z)) for x, y, z in steps]
+def extent_directions(fingers: int) -> list[tuple[float, float, float]]:
+    """Directions in which extents are taken for a hand of G ``fingers``: 9 G + 2 unit vectors.
+
+    Up, down, then rings of 3 G directions each, 45 degrees below the horizontal, level, and 45 above. A
+    turn of the world from one finger to the next moves every direction to another one of its ring.
+    """
+    azimuths = [2.0 * pi * i / (AZIMUTHS_PER_FINGER * fingers) for i in range(AZIMUTHS_PER_FINGER * fingers)]
+    rings = [(cos(a) * cos(e), sin(a) * cos(e), sin(e)) for e in RING_ELEVATIONS for a in azimuths]
+    return [(0.0, 0.0, 1.0), (0.0, 0.0, -1.0), *rings]
 
 
 def shape_observation_slices(fingers: int) -> dict[str, slice]:
     """Columns of each part of the shape's values, counted from the first of them."""
-    sizes = {
-        "surface": 3 * fingers,
-        "extent": len(extent_directions()),
-        "goal_extent": len(extent_directions()),
-    }
+    directions = len(extent_directions(fingers))
+    sizes = {"surface": 3 * fingers, "extent": directions, "goal_extent": directions}
     slices, start = {}, 0
     for name, size in sizes.items():
         slices[name] = slice(start, start + size)
@@ -43,7 +48,7 @@ def shape_observation_slices(fingers: int) -> dict[str, slice]:
 
 
 def shape_observation_size(fingers: int) -> int:
-    """Number of values for a hand of ``fingers`` fingers: 3 G + 52."""
+    """Number of values for a hand of ``fingers`` fingers: 21 G + 4."""
     return shape_observation_slices(fingers)["goal_extent"].stop
 
 

@@ -246,10 +246,10 @@ def test_the_shape_is_seen_behind_the_state_and_changes_nothing_else(device):
     for w in range(env.num_worlds):
         cloud = env.scene.world_scale[w] * env.objects[env.world_object[w]].surface_points.astype(float)
         placed = Rotation.from_quat(pose[w, 3:]).apply(cloud)
-        assert extents[w] == pytest.approx((placed @ np.array(extent_directions()).T).max(axis=0), abs=1e-5)
+        assert extents[w] == pytest.approx((placed @ np.array(extent_directions(3)).T).max(axis=0), abs=1e-5)
         aim = Rotation.from_quat(goal[w]).apply(cloud)
         goal_extents = EXTENT_CENTRE_M + SHAPE_UNIT_M * observation[w, state:][slices["goal_extent"]]
-        assert goal_extents == pytest.approx((aim @ np.array(extent_directions()).T).max(axis=0), abs=1e-5)
+        assert goal_extents == pytest.approx((aim @ np.array(extent_directions(3)).T).max(axis=0), abs=1e-5)
         distance = np.linalg.norm(tips[w][:, None] - (pose[w, :3] + placed)[None], axis=2).min(axis=1)
         assert np.linalg.norm(vectors[w], axis=1) == pytest.approx(distance, abs=1e-5)
 

@@ -73,7 +73,7 @@ def observe(device, scene, *, first=2):
         outputs=[out],
         device=device,
     )
-    directions = extent_directions()
+    directions = extent_directions(fingers)
     wp.launch(
         extent_kernel,
         dim=(worlds, ORIENTATIONS, len(directions)),
@@ -97,16 +97,19 @@ def placed(scene, world, quat):
     return Rotation.from_quat(quat).apply(points)
 
 
-def test_directions_are_even_unit_vectors():
-    directions = np.array(extent_directions())
-    assert directions.shape == (26, 3)
+@pytest.mark.parametrize("fingers", [3, 4])
+def test_directions_are_even_and_as_symmetric_as_the_hand(fingers):
+    directions = np.array(extent_directions(fingers))
+    count = 9 * fingers + 2
+    assert directions.shape == (count, 3)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0)
-    cosine = directions @ directions.T - 2.0 * np.eye(26)
+    cosine = directions @ directions.T - 2.0 * np.eye(count)
     assert np.degrees(np.arccos(cosine.max(axis=1))).max() < 46.0, "a direction without a neighbour"
-    np.testing.assert_allclose(directions.sum(axis=0), 0.0, atol=1e-12)
+    turned = Rotation.from_euler("z", 2 * np.pi / fingers).apply(directions)
+    assert cKDTree(directions).query(turned)[0].max() < 1e-12
 
 
-@pytest.mark.parametrize(("fingers", "size"), [(3, 61), (4, 64)])
+@pytest.mark.parametrize(("fingers", "size"), [(3, 67), (4, 88)])
 def test_columns_tile_the_values(fingers, size):
     slices = list(shape_observation_slices(fingers).values())
     columns = np.concatenate([np.arange(s.start, s.stop) for s in slices])
@@ -143,7 +146,7 @@ def test_extents_are_the_support_function_now_and_at_the_goal(device, scene):
             ("extent", scene["q"][world, 3 * fingers + 3 :]),
             ("goal_extent", scene["goal"][world]),
         ):
-            support = (placed(scene, world, quat) @ np.array(extent_directions()).T).max(axis=0)
+            support = (placed(scene, world, quat) @ np.array(extent_directions(fingers)).T).max(axis=0)
             values = EXTENT_CENTRE_M + SHAPE_UNIT_M * out[world, first:][slices[name]]
             np.testing.assert_allclose(values, support, atol=2e-6)
 

@@ -74,8 +74,8 @@ class ObservationCfg:
 
     shape: Literal["none", "full"] = "none"
     """none: nothing of the object's shape, as in the paper. full: the vector from each fingertip to the
-    nearest point of the surface, and how far the object extends in 26 directions, now and at the goal;
-    exact, privileged."""
+    nearest point of the surface, and how far the object extends in 9 directions for each finger, up and
+    down, now and at the goal; exact, privileged."""
 
 
 @dataclass(frozen=True)

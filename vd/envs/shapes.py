@@ -29,7 +29,7 @@ class ShapeObserver:
         self._points = wp.array(points, dtype=wp.vec3, device=device)
         self._object = wp.array(env.scene.world_object, dtype=wp.int32, device=device)
         self._scale = wp.array(env.scene.world_scale, dtype=float, device=device)
-        self._directions = wp.array(extent_directions(), dtype=wp.vec3, device=device)
+        self._directions = wp.array(extent_directions(env.num_fingers), dtype=wp.vec3, device=device)
         first, slices = teacher_observation_size(env.num_fingers), shape_observation_slices(env.num_fingers)
         self._surface_column = first + slices["surface"].start
         self._extent_column = first + slices["extent"].start
