@@ -134,9 +134,9 @@ def strided_kernel(
     level: int,
     slot_key_in: wp.array[wp.int64],
     slot_row_in: wp.array[int],
+    reverse: int,
     # Out:
     table_out: wp.array2d[int],
-    back_out: wp.array2d[int],
 ):
     """Sites of a fine grid that each site of the next coarser one reads: input = 2 output + offset.
 
@@ -148,9 +148,8 @@ def strided_kernel(
         level: How often the fine grid was halved.
         slot_key_in: Hash table of the keys of the coarse level.
         slot_row_in: Rows of its slots.
-        table_out: Fine rows, shape [M, 27], filled with F before.
-        back_out: Coarse rows that read each fine site, by the same offsets, shape [F, 27], filled
-            with M before.
+        reverse: 1 for the reverse map: coarse rows that read each fine site, by the same offsets.
+        table_out: Fine rows, shape [M, 27], filled with F before; or coarse rows, [F, 27], filled with M.
     """
     row = wp.tid()
     key = fine_key_in[row]
@@ -169,8 +168,10 @@ def strided_kernel(
                     if found >= 0:
                         # offset + 1 on each axis: 1 for an even coordinate, 2 or 0 for an odd one
                         k = 9 * (1 + odd_x - 2 * dx) + 3 * (1 + odd_y - 2 * dy) + 1 + odd_z - 2 * dz
-                        table_out[found, k] = row
-                        back_out[row, k] = found
+                        if reverse != 0:
+                            table_out[row, k] = found
+                        else:
+                            table_out[found, k] = row
 
 
 @wp.kernel
@@ -223,28 +224,28 @@ def neighbour_table(keys: wp.array, level: int) -> wp.array:
     return table
 
 
-def strided_tables(fine: wp.array, coarse: wp.array, level: int) -> tuple[wp.array, wp.array]:
-    """Maps of a 3x3x3 convolution of stride 2.
+def strided_table(fine: wp.array, coarse: wp.array, level: int, *, reverse: bool = False) -> wp.array:
+    """Map of a 3x3x3 convolution of stride 2.
 
     Args:
         fine: Keys of the input sites [F].
         coarse: Keys of the output sites [M], from :func:`coarsen`.
         level: Level of the input sites.
+        reverse: Give the output sites that read each input site, not the input sites that each output reads.
 
     Returns:
-        Input rows of each output site [M, 27], and output rows that read each input site [F, 27].
+        Input rows of each output site [M, 27]; or, reversed, output rows of each input site [F, 27].
     """
-    inputs, outputs, device = fine.shape[0], coarse.shape[0], fine.device
-    table = wp.full((outputs, KERNEL), inputs, dtype=int, device=device)
-    back = wp.full((inputs, KERNEL), outputs, dtype=int, device=device)
+    rows, none = (fine, coarse) if reverse else (coarse, fine)
+    table = wp.full((rows.shape[0], KERNEL), none.shape[0], dtype=int, device=fine.device)
     wp.launch(
         strided_kernel,
-        dim=inputs,
-        inputs=[fine, level, *hash_table(coarse)],
-        outputs=[table, back],
-        device=device,
+        dim=fine.shape[0],
+        inputs=[fine, level, *hash_table(coarse), int(reverse)],
+        outputs=[table],
+        device=fine.device,
     )
-    return table, back
+    return table
 
 
 def window_table(fine: wp.array, place: wp.array, outputs: int) -> wp.array:

@@ -1,6 +1,7 @@
 """Synthetic point clouds: surface samples carried by links, object and goal, in the hand's base frame.
 
-Metres, quaternions xyzw. N worlds, B bodies a world, H samples of the hand, K samples of each object.
+Metres, quaternions xyzw. N worlds, B bodies a world, H samples of the hand, K samples of each object;
+R rows, one cloud each: of all worlds at one time, or of any worlds at any times, from recorded poses.
 """
 
 import warp as wp
@@ -37,38 +38,40 @@ def link_points_kernel(
     # Model:
     model: CloudModel,
     # In:
+    world_in: wp.array[int],
     body_q_in: wp.array2d[wp.transform],
     goal_quat_in: wp.array[wp.quat],
     # Out:
     points_out: wp.array2d[wp.vec3],
 ):
-    """Carry every sample into the hand's base frame: P' = P R^T + p. Launch: [N, H + K] or [N, H + 2 K].
+    """Carry every sample into the hand's base frame: P' = P R^T + p. Launch: [R, K + H] or [R, K + H + K].
 
-    Columns are the hand's samples, then the goal's, then the object's: the shorter launch leaves the
+    Columns are the goal's samples, then the hand's, then the object's: the shorter launch leaves the
     object out, for a camera to see it instead. Links and object are posed as in the simulation; the
     goal's cloud is the object turned to the wanted orientation, at a fixed place beside the scene.
 
     Args:
         model: The samples.
-        body_q_in: Body poses in the world frame, shape [N, B].
-        goal_quat_in: Wanted orientation of the object in the world frame, shape [N].
-        points_out: Points in the base frame [m], shape [N, *]; columns beyond the launch stay.
+        world_in: World of each row, shape [R].
+        body_q_in: Body poses of each row in the world frame, shape [R, B].
+        goal_quat_in: Wanted orientation of the object in the world frame, shape [R].
+        points_out: Points in the base frame [m], shape [R, *]; columns beyond the launch stay.
     """
-    world, column = wp.tid()
-    to_base = wp.transform_inverse(body_q_in[world, model.base_body])
-    hand = model.hand_points.shape[0]
-    if column < hand:
-        link = wp.transform_multiply(to_base, body_q_in[world, model.hand_body[column]])
-        points_out[world, column] = wp.transform_point(link, model.hand_points[column])
+    row, column = wp.tid()
+    world = world_in[row]
+    to_base = wp.transform_inverse(body_q_in[row, model.base_body])
+    hand, samples = model.hand_points.shape[0], model.object_points.shape[1]
+    if column >= samples and column < samples + hand:
+        sample = column - samples
+        link = wp.transform_multiply(to_base, body_q_in[row, model.hand_body[sample]])
+        points_out[row, column] = wp.transform_point(link, model.hand_points[sample])
         return
-    samples = model.object_points.shape[1]
-    sample = (column - hand) % samples
-    point = model.world_scale[world] * model.object_points[model.world_object[world], sample]
-    if column < hand + samples:
-        turned = wp.quat_rotate(
-            wp.transform_get_rotation(to_base), wp.quat_rotate(goal_quat_in[world], point)
-        )
-        points_out[world, column] = model.goal_position + turned
+    if column < samples:
+        point = model.world_scale[world] * model.object_points[model.world_object[world], column]
+        turn = wp.transform_get_rotation(to_base) * goal_quat_in[row]
+        points_out[row, column] = model.goal_position + wp.quat_rotate(turn, point)
     else:
-        item = wp.transform_multiply(to_base, body_q_in[world, model.object_body])
-        points_out[world, column] = wp.transform_point(item, point)
+        sample = column - samples - hand
+        point = model.world_scale[world] * model.object_points[model.world_object[world], sample]
+        item = wp.transform_multiply(to_base, body_q_in[row, model.object_body])
+        points_out[row, column] = wp.transform_point(item, point)

@@ -153,6 +153,37 @@ class CameraConstants:
 
 
 @dataclass(frozen=True)
+class CloudConstants:
+    """Point clouds of the student and their voxels (Methods, stages 1 and 2; point cloud voxelization)."""
+
+    points_per_link: int = source(500, "C", "cached samples of every link with a mesh, the base excepted")
+    object_points: int = source(500, "C", "samples of the object, and of the goal")
+    goal_position_m: tuple[float, float, float] = source(
+        (0.0, 0.0, -0.08), "C", "the goal's cloud in the base frame, behind the palm"
+    )
+    voxel_m: float = source(0.005, "P", "point cloud voxelization; true floor, the code truncates")
+    feature: float = source(0.5, "C", "the one feature of every voxel: nothing marks the goal but its place")
+    jitter_probability: float = source(0.4, "P", "of each cloud, Supplementary Methods, observation noise")
+    jitter_std_m: float = source(0.004, "P", "N(0, 0.004) on point positions")
+    jitter_voxels_code: float = source(1.0, "C", "after voxelisation, clipped at 2 and truncated; 3.4 mm")
+    dropout_probability: float = source(0.4, "P", "of each cloud, independently")
+    dropout_ratio: tuple[float, float] = source((0.0, 0.2), "P", "share of the points that is lost")
+
+
+@dataclass(frozen=True)
+class StudentConstants:
+    """Network of the student (Figure 7; sizes from the code)."""
+
+    channels: tuple[int, ...] = source((32, 64, 128, 256), "C", "one stage each, every stage halves the grid")
+    blocks: int = source(2, "C", "pre-activation residual blocks a stage")
+    embedding: int = source(256, "C", "after global pooling, and after the projector")
+    action_hidden: int = source(32, "C", "MLP D-32-GELU-32 of the previous action")
+    memory: int = source(256, "P", "GRU (Methods, architecture); width C")
+    head_hidden: int = source(256, "C", "layer after the GRU, GELU")
+    distance_hidden: int = source(128, "C", "256-128-GELU-1 on the embedding, before action and GRU")
+
+
+@dataclass(frozen=True)
 class PaperConstants:
     """All constants; ``PAPER`` is the one instance."""
 
@@ -165,6 +196,8 @@ class PaperConstants:
     materials: NominalMaterials = NominalMaterials()
     teacher: TeacherConstants = TeacherConstants()
     camera: CameraConstants = CameraConstants()
+    cloud: CloudConstants = CloudConstants()
+    student: StudentConstants = StudentConstants()
 
 
 PAPER = PaperConstants()

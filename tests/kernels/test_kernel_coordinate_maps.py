@@ -11,7 +11,7 @@ from vd.kernels.coordinate_maps import (
     coarsen,
     hash_table,
     neighbour_table,
-    strided_tables,
+    strided_table,
     window_table,
 )
 from vd.kernels.voxels import coordinates, voxelise
@@ -78,7 +78,7 @@ def test_strided_maps_hold_every_pair_of_input_and_output(device, cells, level):
     keys, rows = sites(cells, device, level)
     coarse, _ = coarsen(keys)
     outputs = coordinates(coarse, level + 1).numpy()
-    table, back = (t.numpy() for t in strided_tables(keys, coarse, level))
+    table, back = (strided_table(keys, coarse, level, reverse=r).numpy() for r in (False, True))
     index = row_of(rows)
     for row, k in itertools.product(range(len(outputs)), range(27)):
         expected = index.get(moved(outputs[row], OFFSETS[k], 2), len(rows))
@@ -114,5 +114,7 @@ def test_no_sites_give_empty_maps(device):
     coarse, place = coarsen(keys)
     assert coarse.shape == place.shape == (0,)
     assert neighbour_table(keys, 0).shape == (0, 27)
-    assert [t.shape for t in strided_tables(keys, coarse, 0)] == [(0, 27), (0, 27)]
+    assert (
+        strided_table(keys, coarse, 0).shape == strided_table(keys, coarse, 0, reverse=True).shape == (0, 27)
+    )
     assert window_table(keys, place, 0).shape == (0, 8)

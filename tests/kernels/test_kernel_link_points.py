@@ -26,7 +26,8 @@ def cloud_model(hand, body, samples, world_object, world_scale, device):
 @st.composite
 def scenes(draw):
     """Samples of hand and objects, and the poses that carry them."""
-    worlds, bodies, hand = draw(st.integers(1, 3)), draw(st.integers(2, 4)), draw(st.integers(1, 6))
+    worlds, rows = draw(st.integers(1, 3)), draw(st.integers(1, 4))
+    bodies, hand = draw(st.integers(2, 4)), draw(st.integers(1, 6))
     objects, samples = draw(st.integers(1, 3)), draw(st.integers(1, 4))
 
     def indices(count, highest):
@@ -38,15 +39,17 @@ def scenes(draw):
         "samples": draw(floats((objects, samples, 3), -0.05, 0.05)),
         "world_object": indices(worlds, objects),
         "world_scale": draw(floats((worlds,), 0.9, 1.1)),
-        "body_q": draw(transforms((worlds, bodies))),
-        "goal": draw(quaternions((worlds,))),
+        "world": indices(rows, worlds),
+        "body_q": draw(transforms((rows, bodies))),
+        "goal": draw(quaternions((rows,))),
     }
 
 
 def expected_points(scene):
-    """Hand, goal, object in the base frame by homogeneous matrices, world by world."""
+    """Goal, hand, object in the base frame by homogeneous matrices, row by row."""
     clouds = []
-    for world, poses in enumerate(pose_matrix(scene["body_q"])):
+    for row, poses in enumerate(pose_matrix(scene["body_q"])):
+        world = scene["world"][row]
         to_base = np.linalg.inv(poses[BASE])
 
         def carry(matrix, points, to_base=to_base):
@@ -57,25 +60,26 @@ def expected_points(scene):
             for b, p in zip(scene["body"], scene["hand"].astype(float), strict=True)
         ]
         item = scene["samples"][scene["world_object"][world]].astype(float) * scene["world_scale"][world]
-        turn = pose_matrix(np.append(np.zeros(3), scene["goal"][world]))[:3, :3]
+        turn = pose_matrix(np.append(np.zeros(3), scene["goal"][row]))[:3, :3]
         goal = (to_base[:3, :3] @ turn @ item.T).T + GOAL_POSITION
-        clouds.append(np.concatenate([hand, goal, carry(poses[OBJECT], item)]))
+        clouds.append(np.concatenate([goal, hand, carry(poses[OBJECT], item)]))
     return np.array(clouds)
 
 
 def launch(scene, device, *, with_object=True, spare=0):
     hand, samples = len(scene["hand"]), scene["samples"].shape[1]
-    worlds = len(scene["goal"])
+    rows = len(scene["goal"])
     model = cloud_model(
         *(scene[key] for key in ("hand", "body", "samples", "world_object", "world_scale")), device
     )
     columns = hand + samples * (2 if with_object else 1)
-    out = unwritten((worlds, columns + spare), wp.vec3, device)
+    out = unwritten((rows, columns + spare), wp.vec3, device)
     wp.launch(
         link_points_kernel,
-        dim=(worlds, columns),
+        dim=(rows, columns),
         inputs=[
             model,
+            device_array(scene["world"], int, device),
             device_array(scene["body_q"], wp.transform, device),
             device_array(scene["goal"], wp.quat, device),
         ],
@@ -113,11 +117,12 @@ def test_goal_reached_means_equal_clouds_but_for_the_place(device):
         "samples": samples,
         "world_object": [0],
         "world_scale": [1.05],
+        "world": [0],
         "body_q": poses,
         "goal": quat[None].astype(np.float32),
     }
     points = launch(scene, device)[0]
-    shift = points[1:21] - points[21:]
+    shift = points[:20] - points[21:]
     np.testing.assert_allclose(shift, np.tile(shift[0], (20, 1)), atol=1e-6)
     # the base looks down: 0.15 m below it is +0.15 along its z, and x is mirrored
     np.testing.assert_allclose(shift[0], GOAL_POSITION - [-0.01, 0.02, 0.15], atol=1e-6)
@@ -128,9 +133,12 @@ def test_the_launch_can_be_captured():
     device = "cuda:0"
     model = cloud_model(np.ones((1, 3)), [0], np.ones((1, 1, 3)), [0], [1.0], device)
     poses = wp.array(np.tile([0, 0, 0, 0, 0, 0, 1.0], (1, 2, 1)), dtype=wp.transform, device=device)
+    world = wp.zeros(1, dtype=int, device=device)
     goal = wp.array([[0, 0, 0, 1.0]], dtype=wp.quat, device=device)
     out = unwritten((1, 3), wp.vec3, device)
     with wp.ScopedCapture(device=device) as capture:
-        wp.launch(link_points_kernel, dim=(1, 3), inputs=[model, poses, goal], outputs=[out], device=device)
+        wp.launch(
+            link_points_kernel, dim=(1, 3), inputs=[model, world, poses, goal], outputs=[out], device=device
+        )
     wp.capture_launch(capture.graph)
-    np.testing.assert_allclose(out.numpy()[0, 0], [1.0, 1.0, 1.0])
+    np.testing.assert_allclose(out.numpy()[0, 1], [1.0, 1.0, 1.0])

@@ -1,0 +1,231 @@
+"""The student's network: sizes of the paper, memory, heads, and what they may depend on."""
+
+import dataclasses
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from vd.config import from_dict, to_dict
+from vd.student.cfg import LEAN, PAPER_NETWORK, PRESETS, EncoderCfg, StudentCfg
+from vd.student.clouds import Voxeliser
+from vd.student.network import Student
+
+ACTIONS = 12
+SMALL = StudentCfg(
+    encoder=EncoderCfg(channels=(4, 8), blocks=1, embedding=16),
+    action_hidden=8,
+    memory=12,
+    head_hidden=16,
+    distance_hidden=8,
+)
+
+
+def clouds(count: int, points: int = 200, seed: int = 0) -> np.ndarray:
+    """Points [count, points, 3] on spheres of different sizes."""
+    generator = np.random.default_rng(seed)
+    directions = generator.normal(size=(count, points, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    return (directions * generator.uniform(0.03, 0.08, (count, 1, 1))).astype(np.float32)
+
+
+def sites(points: np.ndarray, device: str):
+    return Voxeliser(device=device)(wp.array(points, dtype=wp.vec3, device=device))
+
+
+def student(cfg: StudentCfg, device: str) -> Student:
+    torch.manual_seed(0)
+    return Student(cfg, ACTIONS).to(wp.device_to_torch(device)).eval()
+
+
+def count(module: torch.nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
+
+
+def test_paper_preset_has_the_released_sizes():
+    net = Student(PAPER_NETWORK, ACTIONS)
+    encoder = net.encoder
+    assert count(encoder.stages[3]) == pytest.approx(7.97e6, rel=1e-3)
+    assert count(encoder) - count(encoder.projector) == pytest.approx(10.70e6, rel=1e-3)
+    assert count(encoder.projector) == pytest.approx(65.8e3, rel=1e-3)
+    assert count(net.memory) == pytest.approx(395e3, rel=1e-3)
+    assert count(net.head) == pytest.approx(65.8e3, rel=1e-3)
+    assert count(net.action_layers) + count(net.merge_action) == pytest.approx(75e3, rel=1e-2)
+    assert count(net.distance) == pytest.approx(33e3, rel=1e-2)
+    assert count(net.mean) + count(net.log_std) == pytest.approx(6e3, rel=5e-2)
+    assert count(net) == pytest.approx(11.34e6, rel=1e-3)
+    norms = [module for module in net.modules() if isinstance(module, torch.nn.BatchNorm1d)]
+    assert all((norm.weight == 1.0).all() for norm in norms)
+
+
+def test_paper_preset_halves_the_grid_five_times(device):
+    net = student(PAPER_NETWORK, device)
+    seen = []
+    for stage in net.encoder.stages:
+        stage.register_forward_hook(lambda _, __, output: seen.append(output[1].level))
+    net.encode(sites(clouds(1), device))
+    assert seen == [2, 3, 4, 5]  # 32 voxels, 160 mm
+
+
+def test_first_convolution_has_the_spread_of_he_fan_out():
+    net = Student(PAPER_NETWORK, ACTIONS)
+    weight = net.encoder.stages[2].conv.weight
+    assert weight.std().item() == pytest.approx((2.0 / (27 * 128)) ** 0.5, rel=0.02)
+
+
+@pytest.mark.parametrize("goal", ["merged", "separate"])
+def test_every_parameter_learns(device, goal):
+    net = student(dataclasses.replace(SMALL, goal=goal), device).train()
+    scene = sites(clouds(6), device)
+    second = sites(clouds(6, seed=1), device) if goal == "separate" else None
+    embedding = net.encode(scene, second).unflatten(0, (2, 3))
+    previous = torch.randn(2, 3, ACTIONS, device=scene.device)
+    output = net(embedding, previous, net.initial_hidden(3))
+    (output.mean.sum() + output.log_std.sum() + output.distance.square().sum()).backward()
+    dead = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    assert not dead
+    assert output.mean.shape == output.log_std.shape == (2, 3, ACTIONS)
+    assert output.distance.shape == (2, 3, 2)
+
+
+def test_batch_and_order_of_points_do_not_matter(device):
+    net, points = student(SMALL, device), clouds(3)
+    together = net.encode(sites(points, device))
+    alone = torch.cat([net.encode(sites(points[i : i + 1], device)) for i in range(3)])
+    torch.testing.assert_close(together, alone, atol=1e-5, rtol=1e-5)
+    shuffled = np.random.default_rng(0).permutation(points, axis=1)
+    assert torch.equal(together, net.encode(sites(shuffled, device)))
+
+
+def test_moving_a_cloud_by_whole_cells_of_the_last_stage_changes_nothing(device):
+    """Nothing but the grid gives a place a meaning, so the goal is told from the scene by its place alone."""
+    net, points = student(SMALL, device), clouds(1)
+    cell = 0.005 * 8  # two stages and one pooling: eight voxels
+    moved = net.encode(sites(points + np.float32([cell, -cell, 2 * cell]), device))
+    torch.testing.assert_close(net.encode(sites(points, device)), moved, atol=1e-4, rtol=1e-4)
+
+
+def sequence(net: Student, steps: int, worlds: int):
+    generator = torch.Generator().manual_seed(1)
+    device = net.mean.weight.device
+    embedding = torch.randn(steps, worlds, SMALL.encoder.embedding, generator=generator).to(device)
+    return embedding, torch.randn(steps, worlds, ACTIONS, generator=generator).to(device)
+
+
+def test_sequence_equals_single_steps_with_the_memory_cleared_at_ends(device):
+    net = student(SMALL, device)
+    embedding, previous = sequence(net, 7, 3)
+    done = torch.zeros(7, 3, device=embedding.device)
+    done[2, 0] = done[2, 1] = done[3, 0] = done[6, 2] = 1.0
+    whole = net(embedding, previous, net.initial_hidden(3), done)
+    hidden = net.initial_hidden(3)
+    for t in range(7):
+        step = net(embedding[t : t + 1], previous[t : t + 1], hidden)
+        for one, all_steps in ((step.mean, whole.mean), (step.distance, whole.distance)):
+            torch.testing.assert_close(one[0], all_steps[t], atol=1e-5, rtol=1e-5)
+        hidden = step.hidden * (1.0 - done[t, :, None])
+    torch.testing.assert_close(hidden, whole.hidden, atol=1e-5, rtol=1e-5)
+    assert (whole.hidden[2] == 0).all()
+    assert not torch.allclose(whole.mean, net(embedding, previous, net.initial_hidden(3)).mean)
+
+
+def test_distance_before_the_memory_knows_this_cloud_only(device):
+    net = student(SMALL, device)
+    embedding, previous = sequence(net, 2, 1)
+    changed = embedding.clone()
+    changed[0] += 1.0
+    one, other = (net(e, previous, net.initial_hidden(1)).distance[1, 0] for e in (embedding, changed))
+    before, after = list(net.distance).index("before"), list(net.distance).index("after")
+    assert one[before] == other[before]
+    assert one[after] != other[after]
+
+
+def test_standard_deviation_keeps_to_its_range(device):
+    net = student(SMALL, device)
+    with torch.no_grad():
+        net.log_std.weight.mul_(1e4)
+    embedding, previous = sequence(net, 4, 4)
+    std = net(embedding, previous, net.initial_hidden(4)).log_std.exp()
+    assert std.min() >= 0.02 * 0.999 and std.max() <= 1.001
+    free = student(dataclasses.replace(SMALL, std_range=None), device)
+    with torch.no_grad():
+        free.log_std.bias.fill_(5.0)
+    assert free(embedding, previous, free.initial_hidden(4)).log_std.max() > 4.0
+
+
+def test_goal_has_to_be_given_as_configured(device):
+    scene = sites(clouds(1), device)
+    with pytest.raises(ValueError, match="separate"):
+        student(dataclasses.replace(SMALL, goal="separate"), device).encode(scene)
+    with pytest.raises(ValueError, match="one cloud"):
+        student(SMALL, device).encode(scene, scene)
+
+
+def test_acting_step_by_step_in_half_precision(device):
+    net = student(SMALL, device)
+    scene = sites(clouds(2), device)
+    previous = torch.zeros(2, ACTIONS, device=scene.device)
+    with torch.inference_mode():
+        single = net.act(scene, previous, net.initial_hidden(2))
+        with torch.autocast(scene.device.type, dtype=torch.bfloat16):
+            half = net.act(scene, previous, net.initial_hidden(2))
+    assert single.mean.shape == (2, ACTIONS) and single.hidden.shape == (2, SMALL.memory)
+    torch.testing.assert_close(half.mean.float(), single.mean, atol=0.05, rtol=0.05)
+
+
+def test_it_can_tell_two_shapes_apart(device):
+    """A few steps of training: large sphere or small, from voxels alone."""
+    net = student(SMALL, device).train()
+    generator = np.random.default_rng(2)
+    directions = generator.normal(size=(32, 300, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    large = np.arange(32) % 2
+    points = (directions * np.where(large, 0.06, 0.04)[:, None, None]).astype(np.float32)
+    scene = sites(points, device)
+    target = torch.tensor(large, dtype=torch.float32, device=scene.device)
+    optimiser = torch.optim.AdamW(net.parameters(), lr=3e-3)
+    losses = []
+    for _ in range(30):
+        embedding = net.encode(scene)[None]
+        output = net(embedding, torch.zeros(1, 32, ACTIONS, device=scene.device), net.initial_hidden(32))
+        loss = (output.distance[0, :, 0] - target).square().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.1 * losses[0]
+
+
+def test_presets_survive_a_dictionary():
+    assert PRESETS == {"paper": PAPER_NETWORK, "lean": LEAN}
+    for cfg in PRESETS.values():
+        cfg.validate()
+        assert from_dict(StudentCfg, to_dict(cfg)) == cfg
+    assert count(Student(LEAN, ACTIONS)) < 0.5 * count(Student(PAPER_NETWORK, ACTIONS))
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"distance": ()}, "distance"),
+        ({"distance": ("after", "after")}, "distance"),
+        ({"voxel_m": 0.0}, "voxel_m"),
+        ({"memory": 0}, "width"),
+        ({"std_range": (1.0, 0.5)}, "std_range"),
+        ({"encoder": EncoderCfg(channels=())}, "channels"),
+        ({"encoder": EncoderCfg(pooled_stages=9)}, "pooled_stages"),
+        ({"encoder": EncoderCfg(blocks=-1)}, "blocks"),
+    ],
+)
+def test_refuses_sizes_that_make_no_network(change, field):
+    with pytest.raises(ValueError, match=field):
+        Student(dataclasses.replace(LEAN, **change), ACTIONS)
+
+
+def test_a_robot_needs_no_simulator():
+    code = "import sys, vd.student.network, vd.student.clouds; print(*sys.modules)"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not {"newton", "mujoco", "pxr", "rsl_rl"} & set(run.stdout.split())

@@ -1,0 +1,190 @@
+"""Sparse layers against dense ones, against a scalar oracle, and their gradients."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vd.kernels.voxels import voxelise
+from vd.student import sparse
+from vd.student.sites import Sites
+from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool, parts
+
+OFFSETS = list(itertools.product((-1, 0, 1), repeat=3))
+EXTENT = 8
+"""Clouds of these tests lie in [-8, 8)."""
+
+
+def make_sites(cells: np.ndarray, device: str) -> Sites:
+    """Sites of cells [B, P, 3], integers."""
+    points = wp.array(cells.astype(np.float32) + 0.5, dtype=wp.vec3, device=device)
+    return Sites(voxelise(points, 1.0), len(cells))
+
+
+def random_sites(device: str, *, clouds: int = 2, points: int = 120, seed: int = 0) -> Sites:
+    cells = np.random.default_rng(seed).integers(-EXTENT, EXTENT, (clouds, points, 3))
+    cells[..., 2] //= 2  # some crowded, so that kernels overlap
+    return make_sites(cells, device)
+
+
+def features_of(sites: Sites, channels: int, dtype=torch.float32, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(len(sites), channels, dtype=dtype, generator=generator).to(sites.device)
+
+
+def indices(sites: Sites, extent: int) -> torch.Tensor:
+    """Cloud and cell of each site, counted from the corner, [4, M]."""
+    corner = torch.tensor([0, extent, extent, extent], device=sites.device)
+    return (sites.coordinates.long() + corner).T
+
+
+def to_dense(values: torch.Tensor, sites: Sites, extent: int) -> torch.Tensor:
+    """A dense tensor [B, C, 2 extent, 2 extent, 2 extent] with the values at their cells, zeros elsewhere."""
+    dense = values.new_zeros((sites.clouds, 2 * extent, 2 * extent, 2 * extent, values.shape[1]))
+    b, x, y, z = (
+        sites.coordinates.long() + torch.tensor([0, extent, extent, extent], device=values.device)
+    ).T
+    dense[b, x, y, z] = values
+    return dense.permute(0, 4, 1, 2, 3)
+
+
+def at_sites(dense: torch.Tensor, sites: Sites, extent: int) -> torch.Tensor:
+    """Values [M, C] of a dense tensor at the cells."""
+    return dense.permute(0, 2, 3, 4, 1)[tuple(indices(sites, extent))]
+
+
+def dense_weight(conv: SparseConv3d) -> torch.Tensor:
+    """The weights as ``conv3d`` takes them: [C_out, C_in, 3, 3, 3]."""
+    return conv.weight.detach().permute(2, 1, 0).unflatten(2, (3, 3, 3))
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_convolution_equals_a_dense_one_masked_to_the_sites(device, stride):
+    sites = random_sites(device)
+    conv = SparseConv3d(5, 7, stride=stride).to(sites.device)
+    values = features_of(sites, 5)
+    result = conv(values, sites)
+    outputs = sites if stride == 1 else sites.coarser
+    dense = torch.nn.functional.conv3d(
+        to_dense(values, sites, EXTENT), dense_weight(conv), stride=stride, padding=1
+    )
+    torch.testing.assert_close(result, at_sites(dense, outputs, EXTENT // stride), atol=1e-5, rtol=1e-5)
+
+
+def test_pooling_equals_a_dense_one(device):
+    sites = random_sites(device)
+    values = features_of(sites, 6)
+    empty = to_dense(torch.ones_like(values), sites, EXTENT) == 0
+    dense = to_dense(values, sites, EXTENT).masked_fill(empty, -torch.inf)
+    expected = at_sites(torch.nn.functional.max_pool3d(dense, 2), sites.coarser, EXTENT // 2)
+    torch.testing.assert_close(SparseMaxPool3d()(values, sites), expected, atol=0.0, rtol=0.0)
+
+
+@settings(max_examples=25, deadline=None)
+@given(data=st.data(), stride=st.sampled_from([1, 2]), level=st.integers(0, 1))
+def test_convolution_matches_sums_over_a_dictionary(device, data, stride, level):
+    """An oracle that knows cells and weights only: no maps, no matrices."""
+    cells = data.draw(st.lists(st.tuples(*[st.integers(-3, 3)] * 3), min_size=1, max_size=12))
+    sites = make_sites(np.array([cells]), device)
+    for _ in range(level):
+        sites = sites.coarser
+    conv = SparseConv3d(2, 3, stride=stride).to(sites.device)
+    values = features_of(sites, 2)
+    held = {tuple(row): value for row, value in zip(sites.coordinates.tolist(), values.tolist(), strict=True)}
+    weight = conv.weight.tolist()
+    outputs = sites if stride == 1 else sites.coarser
+    expected = []
+    for cloud, *cell in outputs.coordinates.tolist():
+        total = [0.0] * 3
+        for k, offset in enumerate(OFFSETS):
+            there = (cloud, *(stride * c + o for c, o in zip(cell, offset, strict=True)))
+            for i, value in enumerate(held.get(there, (0.0, 0.0))):
+                total = [t + value * weight[k][i][o] for o, t in enumerate(total)]
+        expected.append(total)
+    torch.testing.assert_close(conv(values, sites).cpu(), torch.tensor(expected), atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_gradients_of_a_convolution(device, stride):
+    sites = random_sites(device, points=10)
+    conv = SparseConv3d(2, 3, stride=stride).double().to(sites.device)
+    values = features_of(sites, 2, torch.float64).requires_grad_()
+
+    def run(values, weight):
+        return torch.func.functional_call(conv, {"weight": weight}, (values, sites))
+
+    assert torch.autograd.gradcheck(run, (values, conv.weight))
+
+
+def test_gradients_of_pooling(device):
+    sites = random_sites(device, points=12)
+    values = features_of(sites, 2, torch.float64).requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: SparseMaxPool3d()(v, sites), (values,))
+    assert torch.autograd.gradcheck(lambda v: global_pool(v, sites), (values,))
+
+
+def test_global_pooling_keeps_clouds_apart_and_gives_zeros_for_an_empty_one(device):
+    cells = np.zeros((3, 2, 3), np.float32)
+    cells[2, 1] = 5.0
+    cells[1] = np.nan
+    sites = Sites(voxelise(wp.array(cells, dtype=wp.vec3, device=device), 1.0), 3)
+    values = torch.tensor([[-1.0], [-4.0], [2.0]], device=sites.device, requires_grad=True)
+    pooled = global_pool(values, sites)
+    expected = torch.tensor([[-1.0, -1.0], [0.0, 0.0], [2.0, -1.0]], device=sites.device)
+    torch.testing.assert_close(pooled, expected)
+    pooled.sum().backward()
+    torch.testing.assert_close(values.grad, torch.tensor([[2.0], [0.5], [1.5]], device=sites.device))
+
+
+def test_parts_give_the_same_as_the_whole(device, monkeypatch):
+    sites = random_sites(device)
+    conv = SparseConv3d(4, 4).to(sites.device)
+    values = features_of(sites, 4)
+
+    def gradients():
+        inputs = values.clone().requires_grad_()
+        output = conv(inputs, sites)
+        (output * torch.arange(4, device=output.device)).sum().backward()
+        grad, conv.weight.grad = conv.weight.grad, None
+        return output.detach(), inputs.grad, grad
+
+    whole = gradients()
+    monkeypatch.setattr(sparse, "GATHER_LIMIT", 27 * 4 * 50)
+    assert len(parts(sites.neighbours, 4)) > 2
+    for one, other in zip(whole, gradients(), strict=True):
+        torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
+
+
+def test_half_precision_stays_near_single(device):
+    sites = random_sites(device)
+    conv = SparseConv3d(8, 8, stride=2).to(sites.device)
+    values = features_of(sites, 8).requires_grad_()
+    single = conv(values, sites)
+    with torch.autocast(sites.device.type, dtype=torch.bfloat16):
+        half = conv(values, sites)
+    assert half.dtype == torch.bfloat16
+    torch.testing.assert_close(half.float(), single, atol=0.03, rtol=0.03)
+    half.float().sum().backward()
+    assert values.grad.dtype == conv.weight.grad.dtype == torch.float32
+    assert SparseMaxPool3d()(half, sites.coarser).dtype == torch.bfloat16
+    assert global_pool(half, sites.coarser).dtype == torch.float32
+
+
+def test_no_sites_flow_through(device):
+    empty = wp.array(np.full((2, 3, 3), np.nan), dtype=wp.vec3, device=device)
+    sites = Sites(voxelise(empty, 1.0), 2)
+    conv = SparseConv3d(2, 3, stride=2).to(sites.device)
+    values = features_of(sites, 2).requires_grad_()
+    output = SparseMaxPool3d()(conv(values, sites), sites.coarser)
+    pooled = global_pool(output, sites.coarser.coarser)
+    torch.testing.assert_close(pooled, torch.zeros(2, 6, device=sites.device))
+    pooled.sum().backward()
+
+
+def test_refuses_other_strides():
+    with pytest.raises(ValueError, match="stride 3"):
+        SparseConv3d(1, 1, stride=3)

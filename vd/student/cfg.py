@@ -1,0 +1,120 @@
+"""Configuration of the student: its clouds, and its network with the presets ``paper`` and ``lean``."""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from vd.paper import PAPER
+
+DistancePlace = Literal["before", "after"]
+
+STD_RANGE = (0.02, 1.0)
+"""Standard deviation of the student's actions, as of the teachers trained here: always some exploration."""
+
+
+@dataclass(frozen=True)
+class NoiseCfg:
+    """Augmentation of point clouds in training; each cloud draws its own, evaluation has none."""
+
+    jitter_probability: float = PAPER.cloud.jitter_probability
+    """Share of clouds with jitter."""
+    jitter_std_m: float = PAPER.cloud.jitter_std_m
+    """Standard deviation of the jitter of each coordinate [m]."""
+    dropout_probability: float = PAPER.cloud.dropout_probability
+    """Share of clouds that lose points."""
+    dropout_ratio: tuple[float, float] = PAPER.cloud.dropout_ratio
+    """Range of the share of points that such a cloud loses."""
+
+    def validate(self) -> None:
+        """Raise ``ValueError`` for what cannot be drawn, naming the field."""
+        low, high = self.dropout_ratio
+        for name, value in (
+            ("jitter_probability", self.jitter_probability),
+            ("dropout_probability", self.dropout_probability),
+            ("dropout_ratio", low),
+            ("dropout_ratio", high),
+        ):
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"noise.{name} = {value} must lie in [0, 1]")
+        if low > high:
+            raise ValueError(f"noise.dropout_ratio = {self.dropout_ratio} must be (low, high)")
+        if not self.jitter_std_m >= 0.0:
+            raise ValueError(f"noise.jitter_std_m = {self.jitter_std_m} must not be negative")
+
+
+@dataclass(frozen=True)
+class EncoderCfg:
+    """Sparse residual network from voxels to one embedding of a cloud."""
+
+    channels: tuple[int, ...] = (32, 64, 128, 128)
+    """Width of each stage; every stage begins with a convolution of stride 2."""
+    blocks: int = PAPER.student.blocks
+    """Pre-activation residual blocks of a stage."""
+    pooled_stages: int = 1
+    """Stages, from the first, that halve the grid once more by max pooling after their first convolution."""
+    embedding: int = PAPER.student.embedding
+    """Width of the embedding."""
+    feature: float = PAPER.cloud.feature
+    """The one feature of every voxel."""
+
+    def validate(self) -> None:
+        """Raise ``ValueError`` for sizes that make no network, naming the field."""
+        if not self.channels or min(self.channels) < 1:
+            raise ValueError(f"encoder.channels = {self.channels} must name the width of at least one stage")
+        if self.blocks < 0 or self.embedding < 1:
+            raise ValueError("encoder.blocks must not be negative and encoder.embedding be positive")
+        if not 0 <= self.pooled_stages <= len(self.channels):
+            raise ValueError(f"encoder.pooled_stages must lie in [0, {len(self.channels)}]")
+
+
+@dataclass(frozen=True)
+class StudentCfg:
+    """The student's network; the default is leaner than the paper's (preset ``lean``)."""
+
+    encoder: EncoderCfg = field(default_factory=EncoderCfg)
+    """From voxels to an embedding."""
+    voxel_m: float = PAPER.cloud.voxel_m
+    """Side of a voxel [m]."""
+    goal: Literal["merged", "separate"] = "merged"
+    """Goal and scene as one cloud, or with an encoder each."""
+    action_hidden: int = PAPER.student.action_hidden
+    """Width of the layers for the previous action."""
+    memory: int = PAPER.student.memory
+    """Width of the GRU."""
+    head_hidden: int = PAPER.student.head_hidden
+    """Width of the layer after the GRU."""
+    distance_hidden: int = PAPER.student.distance_hidden
+    """Width of the hidden layer of a distance head."""
+    distance: tuple[DistancePlace, ...] = ("before", "after")
+    """Where heads predict the rotation distance: before the GRU, from this cloud alone, or after it.
+
+    The last one is the one to stop by.
+    """
+    std_range: tuple[float, float] | None = STD_RANGE
+    """Open interval of the standard deviation of actions; None for no bounds."""
+
+    def validate(self) -> None:
+        """Raise ``ValueError`` for what cannot be built, naming the field."""
+        self.encoder.validate()
+        if not self.voxel_m > 0.0:
+            raise ValueError(f"student.voxel_m = {self.voxel_m} must be positive")
+        if len(set(self.distance)) != len(self.distance) or not self.distance:
+            raise ValueError(f"student.distance = {self.distance} must name one or both of before, after")
+        if min(self.action_hidden, self.memory, self.head_hidden, self.distance_hidden) < 1:
+            raise ValueError("student: every width must be positive")
+        if self.std_range is not None and not 0.0 < self.std_range[0] < self.std_range[1]:
+            raise ValueError(f"student.std_range = {self.std_range} must be (low, high), both positive")
+
+
+LEAN = StudentCfg()
+"""A last stage of half the width, distance heads before and after the GRU, bounded standard deviation."""
+
+PAPER_NETWORK = replace(
+    LEAN,
+    encoder=EncoderCfg(channels=PAPER.student.channels),
+    distance=("before",),
+    std_range=None,
+)
+"""The network of the paper, sizes as in its released code."""
+
+PRESETS = {"paper": PAPER_NETWORK, "lean": LEAN}
+"""Networks by name."""

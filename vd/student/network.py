@@ -1,0 +1,206 @@
+"""The student's network: sparse encoder, memory, policy and distance heads.
+
+T steps, N worlds, B = T N or N clouds, D actions, E the embedding, G the memory, H distance heads.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import nn
+
+from vd.student.cfg import EncoderCfg, StudentCfg
+from vd.student.sites import Sites
+from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool
+
+
+@dataclass(frozen=True)
+class StudentOutput:
+    """What the network says of a step, leading shape [N] or [T, N]."""
+
+    mean: torch.Tensor
+    """Mean of the actions, not clipped [.., D]."""
+    log_std: torch.Tensor
+    """Logarithm of their standard deviation [.., D]."""
+    distance: torch.Tensor
+    """Predicted angle to the goal by each distance head [rad], in the order of the configuration [.., H]."""
+    hidden: torch.Tensor
+    """Memory after the last step [N, G]."""
+
+
+class ResidualBlock(nn.Module):
+    """BN, ReLU, convolution, twice, added to the input (He et al. 2016), on the cells of one level."""
+
+    def __init__(self, channels: int):
+        super().__init__()
+        self.norm1 = nn.BatchNorm1d(channels)
+        self.conv1 = SparseConv3d(channels, channels)
+        self.norm2 = nn.BatchNorm1d(channels)
+        self.conv2 = SparseConv3d(channels, channels)
+
+    def forward(self, features: torch.Tensor, sites: Sites) -> torch.Tensor:
+        """Features [M, C] of the same cells."""
+        inner = self.conv1(torch.relu(self.norm1(features)), sites)
+        return features + self.conv2(torch.relu(self.norm2(inner)), sites)
+
+
+class EncoderStage(nn.Module):
+    """A convolution of stride 2, BN, max pooling if asked for, and residual blocks."""
+
+    def __init__(self, in_channels: int, channels: int, blocks: int, *, pooled: bool):
+        super().__init__()
+        self.conv = SparseConv3d(in_channels, channels, stride=2)
+        self.norm = nn.BatchNorm1d(channels)
+        self.pool = SparseMaxPool3d() if pooled else None
+        self.blocks = nn.ModuleList(ResidualBlock(channels) for _ in range(blocks))
+
+    def forward(self, features: torch.Tensor, sites: Sites) -> tuple[torch.Tensor, Sites]:
+        """Features of the coarser cells, and these."""
+        features, sites = self.norm(self.conv(features, sites)), sites.coarser
+        if self.pool is not None:
+            features, sites = self.pool(features, sites), sites.coarser
+        for block in self.blocks:
+            features = block(features, sites)
+        return features, sites
+
+
+class VoxelEncoder(nn.Module):
+    """Occupied voxels to one embedding of each cloud: stages, global max and mean, two linear layers."""
+
+    def __init__(self, cfg: EncoderCfg):
+        super().__init__()
+        self.feature = cfg.feature
+        widths = (1, *cfg.channels)
+        self.stages = nn.ModuleList(
+            EncoderStage(inner, outer, cfg.blocks, pooled=i < cfg.pooled_stages)
+            for i, (inner, outer) in enumerate(zip(widths, cfg.channels, strict=False))
+        )
+        self.final = nn.Linear(2 * cfg.channels[-1], cfg.embedding)
+        self.projector = nn.Linear(cfg.embedding, cfg.embedding)
+
+    def forward(self, sites: Sites) -> torch.Tensor:
+        """Embeddings [B, E] of the clouds of ``sites``, which has level 0."""
+        features = self.final.weight.new_full((len(sites), 1), self.feature)
+        for stage in self.stages:
+            features, sites = stage(features, sites)
+        return torch.relu(self.projector(self.final(global_pool(features, sites))))
+
+
+class Student(nn.Module):
+    """From voxels and the previous action to the next, with memory.
+
+    One step: :meth:`encode`, then :meth:`forward` with T = 1, or :meth:`act` for both. In training all
+    clouds of a sequence are encoded in one batch, then :meth:`forward` runs over their embeddings.
+    """
+
+    def __init__(self, cfg: StudentCfg, num_actions: int):
+        """Build with random weights.
+
+        Args:
+            cfg: Sizes and variants.
+            num_actions: D.
+
+        Raises:
+            ValueError: For sizes that make no network.
+        """
+        super().__init__()
+        cfg.validate()
+        self.cfg = cfg
+        self.num_actions = num_actions
+        width = cfg.encoder.embedding
+        self.encoder = VoxelEncoder(cfg.encoder)
+        self.goal_encoder = VoxelEncoder(cfg.encoder) if cfg.goal == "separate" else None
+        self.merge_goal = nn.Linear(2 * width, width) if cfg.goal == "separate" else None
+        self.action_layers = nn.Sequential(
+            nn.Linear(num_actions, cfg.action_hidden),
+            nn.GELU(),
+            nn.Linear(cfg.action_hidden, cfg.action_hidden),
+        )
+        self.merge_action = nn.Linear(width + cfg.action_hidden, width)
+        self.memory = nn.GRU(width, cfg.memory)
+        self.head = nn.Sequential(nn.Linear(cfg.memory, cfg.head_hidden), nn.GELU())
+        self.mean = nn.Linear(cfg.head_hidden, num_actions)
+        self.log_std = nn.Linear(cfg.head_hidden, num_actions)
+        self.distance = nn.ModuleDict(
+            {
+                place: nn.Sequential(
+                    nn.Linear(width if place == "before" else cfg.memory, cfg.distance_hidden),
+                    nn.GELU(),
+                    nn.Linear(cfg.distance_hidden, 1),
+                )
+                for place in cfg.distance
+            }
+        )
+
+    def initial_hidden(self, worlds: int) -> torch.Tensor:
+        """The memory at the start of an episode: zeros [N, G]."""
+        return self.mean.weight.new_zeros((worlds, self.cfg.memory))
+
+    def encode(self, scene: Sites, goal: Sites | None = None) -> torch.Tensor:
+        """Embeddings [B, E] of clouds.
+
+        Args:
+            scene: Voxels of scene and goal together, or of the scene alone with separate encoders.
+            goal: Voxels of the goal, with separate encoders.
+
+        Raises:
+            ValueError: The goal is missing, or given although it is part of the scene.
+        """
+        if (goal is not None) != (self.goal_encoder is not None):
+            raise ValueError(
+                f"a student with goal = {self.cfg.goal!r} takes "
+                + ("scene and goal voxels" if goal is None else "the voxels of scene and goal as one cloud")
+            )
+        embedding = self.encoder(scene)
+        if self.goal_encoder is None or self.merge_goal is None or goal is None:
+            return embedding
+        return torch.relu(self.merge_goal(torch.cat([embedding, self.goal_encoder(goal)], dim=-1)))
+
+    def forward(
+        self,
+        embedding: torch.Tensor,
+        previous_action: torch.Tensor,
+        hidden: torch.Tensor,
+        done: torch.Tensor | None = None,
+    ) -> StudentOutput:
+        """Run the memory over a sequence and read the heads.
+
+        Args:
+            embedding: From :meth:`encode`, shape [T, N, E].
+            previous_action: The (smoothed) action before each step, shape [T, N, D].
+            hidden: Memory before the first step, shape [N, G].
+            done: Where a world ended with step t, so that step t + 1 starts without memory, shape [T, N].
+        """
+        inputs = torch.cat([embedding, self.action_layers(previous_action)], dim=-1)
+        remembered, hidden = self._remember(self.merge_action(inputs), hidden, done)
+        features = self.head(remembered)
+        places = {"before": embedding, "after": remembered}
+        distance = [head(places[place]) for place, head in self.distance.items()]
+        log_std = self.log_std(features)
+        if self.cfg.std_range is not None:
+            low, high = (math.log(bound) for bound in self.cfg.std_range)
+            log_std = low + (high - low) * torch.sigmoid(log_std)
+        return StudentOutput(self.mean(features), log_std, torch.cat(distance, dim=-1), hidden)
+
+    def act(
+        self, scene: Sites, previous_action: torch.Tensor, hidden: torch.Tensor, goal: Sites | None = None
+    ) -> StudentOutput:
+        """One step of N clouds: ``previous_action`` [N, D] and ``hidden`` [N, G] give leading shape [N]."""
+        output = self(self.encode(scene, goal)[None], previous_action[None], hidden)
+        return StudentOutput(output.mean[0], output.log_std[0], output.distance[0], output.hidden)
+
+    def _remember(
+        self, inputs: torch.Tensor, hidden: torch.Tensor, done: torch.Tensor | None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """The GRU over [T, N, E], its memory cleared where worlds ended."""
+        steps = inputs.shape[0]
+        # Runs of steps between which no world ends go through the GRU in one call.
+        ends = [] if done is None else done.bool().any(dim=1).nonzero().flatten().tolist()
+        outputs, start, state = [], 0, hidden[None]
+        for end in sorted({*(end + 1 for end in ends), steps}):
+            output, state = self.memory(inputs[start:end], state)
+            outputs.append(output)
+            if done is not None:
+                state = state.masked_fill(done[end - 1].bool().view(1, -1, 1), 0.0)
+            start = end
+        return torch.cat(outputs), state[0]
