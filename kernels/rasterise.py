@@ -26,8 +26,10 @@ def edge_normal(a: wp.vec3, b: wp.vec3, index_a: int, index_b: int) -> wp.vec3:
     rounding of a cross product depends on the order of its factors, so the indices choose the order.
     """
     if index_a < index_b:
-        return wp.cross(a, b)
-    return -wp.cross(b, a)
+        first, second, sign = a, b, 1.0
+    else:
+        first, second, sign = b, a, -1.0
+    return wp.cross(first, second) * sign
 
 
 @wp.kernel
@@ -116,10 +118,16 @@ def rasterise_kernel(
     nearest = wp.min(a[2], wp.min(b[2], c[2]))
     farthest = wp.max(a[2], wp.max(b[2], c[2]))
     for row in range(top, bottom):
+        # Along a row the direction is (x, y, 1) with x alone changing.
+        y = (float(row) + 0.5 - view.cy) / view.fy
+        ka = na[1] * y + na[2]
+        kb = nb[1] * y + nb[2]
+        kc = nc[1] * y + nc[2]
+        kn = normal[1] * y + normal[2]
         for column in range(left, right):
-            direction = pixel_direction(view, column, row)
-            if wp.dot(direction, na) >= 0.0 and wp.dot(direction, nb) >= 0.0 and wp.dot(direction, nc) >= 0.0:
-                slope = wp.dot(direction, normal)
+            x = (float(column) + 0.5 - view.cx) / view.fx
+            if na[0] * x + ka >= 0.0 and nb[0] * x + kb >= 0.0 and nc[0] * x + kc >= 0.0:
+                slope = normal[0] * x + kn
                 if slope > 0.0:
                     bits = wp.cast(wp.clamp(offset / slope, nearest, farthest), wp.int32)
                     if bits < depth_bits[world, row, column]:
@@ -132,30 +140,34 @@ def finish_depth_kernel(
     views: wp.array[View],
     table_lower: wp.vec3,
     table_upper: wp.vec3,
+    lanes: int,
     # In:
     table_in: wp.array[int],
     camera_q_in: wp.array[wp.transform],
     # In/Out:
     depth: wp.array3d[float],
 ):
-    """Add the table, and write 0 where nothing is within the camera's range. Launch: [N, H, W].
+    """Add the table, and write 0 where nothing is within the camera's range. Launch: [N, H, lanes].
 
     Args:
         views: Camera of each world, shape [N].
         table_lower: Lower corner of the table in the world frame [m].
         table_upper: Upper corner [m].
+        lanes: Threads of a row.
         table_in: Whether the table is there, shape [N].
         camera_q_in: Optical frames in the world frame, shape [N].
         depth: Depth along the optical axis [m], shape [N, H, W].
     """
-    world, row, column = wp.tid()
+    world, row, lane = wp.tid()
     view = views[world]
-    best = depth[world, row, column]
-    if table_in[world] != 0:
-        camera_q = camera_q_in[world]
-        direction = wp.transform_vector(camera_q, pixel_direction(view, column, row))
-        eye = wp.transform_get_translation(camera_q)
-        best = wp.min(best, box_depth(eye, direction, table_lower, table_upper))
-    if best < view.near or best > view.far:
-        best = EMPTY
-    depth[world, row, column] = best
+    camera_q = camera_q_in[world]
+    eye = wp.transform_get_translation(camera_q)
+    rotation = wp.quat_to_matrix(wp.transform_get_rotation(camera_q))
+    for column in range(lane, depth.shape[2], lanes):
+        best = depth[world, row, column]
+        if table_in[world] != 0:
+            direction = rotation * pixel_direction(view, column, row)
+            best = wp.min(best, box_depth(eye, direction, table_lower, table_upper))
+        if best < view.near or best > view.far:
+            best = EMPTY
+        depth[world, row, column] = best

@@ -153,6 +153,7 @@ def raycast_kernel(
     view = views[world]
     camera_q = camera_q_in[world]
     eye = wp.transform_get_translation(camera_q)
+    rotation = wp.quat_to_matrix(wp.transform_get_rotation(camera_q))
     rows = depth_out.shape[1]
     columns = depth_out.shape[2]
     first_row = (tile // tile_columns) * TILE_ROWS
@@ -166,7 +167,7 @@ def raycast_kernel(
             direction = pixel_direction(view, pixel_column, pixel_row)
             best = wp.float32(NO_HIT)
             if table_in[world] != 0:
-                best = box_depth(eye, wp.transform_vector(camera_q, direction), table_lower, table_upper)
+                best = box_depth(eye, rotation * direction, table_lower, table_upper)
             remaining = word
             rank = wp.int32(0)
             while remaining != wp.uint32(0):

@@ -41,7 +41,7 @@ from vd.sensors.surfaces import SurfaceSet, scene_surfaces
 from vd.sim.scene import Scene
 
 WARP_LANES = 32
-"""Threads of a tile on a GPU: one for each of its cells. The CPU runs one after the other anyway."""
+"""Threads that share a tile or a row of pixels on a GPU. The CPU runs one after the other anyway."""
 
 
 class DepthCamera:
@@ -91,6 +91,7 @@ class DepthCamera:
         )
         shapes, tiles = surfaces.num_shapes, self._tile_rows * self._tile_columns
         self._table = _table_box()
+        self._lanes = 1 if device == "cpu" else WARP_LANES
         generator = np.random.default_rng(seed)
 
         def empty(*shape: int, dtype: type = float) -> wp.array:
@@ -238,7 +239,7 @@ class DepthCamera:
     def _cast(self) -> None:
         n, surfaces = self.num_worlds, self.surfaces
         tiles = self._tile_rows * self._tile_columns
-        lanes = 1 if self.device == "cpu" else WARP_LANES
+        lanes = self._lanes
         self._launch(order_shapes_kernel, self._nearest.shape, [self._nearest], [self._order])
         self._launch(
             cull_tiles_kernel,
@@ -295,8 +296,8 @@ class DepthCamera:
         )
         self._launch(
             finish_depth_kernel,
-            self.true_depth.shape,
-            [self.views, *self._table, self.table, self.camera_q],
+            (self.num_worlds, self.height, self._lanes),
+            [self.views, *self._table, self._lanes, self.table, self.camera_q],
             [self.true_depth],
         )
 
