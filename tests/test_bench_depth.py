@@ -1,0 +1,43 @@
+"""``vd-bench depth`` measures both cameras on the same scene and writes what scripts read."""
+
+import json
+
+import pytest
+
+from vd.bench import depth
+from vd.bench.cli import DepthCommand
+
+
+def test_rows_hold_rates_and_agreement(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(depth, "LEAST_TIME_S", 0.01)
+    out = tmp_path / "depth.json"
+    DepthCommand(worlds=(1, 2), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
+    report = json.loads(out.read_text())
+    assert [row["worlds"] for row in report["rows"]] == [1, 2]
+    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == report["rows"]
+    for row in report["rows"]:
+        assert set(row["images"]) == {"rays", "raster"} and min(row["images"].values()) > 0
+        best = max(row["images"].values())
+        assert row["images_over_newton"] == pytest.approx(best / row["newton"])
+        assert 0 < row["newton_refit_share"] < 1
+        # The hand covers some of the picture, and nobody sees it otherwise.
+        assert row["points"] > 500
+        assert row["different"] < 1e-3 and row["methods_different"] < 1e-3
+
+
+def test_an_image_of_something_else_would_show(monkeypatch, tmp_path):
+    monkeypatch.setattr(depth, "LEAST_TIME_S", 0.01)
+    monkeypatch.setattr(depth, "newton_rays", lambda camera, device: _wide(camera, device))
+    out = tmp_path / "depth.json"
+    DepthCommand(worlds=(1,), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["different"] > 0.1
+
+
+def _wide(camera, device):
+    """Rays of a camera with twice the opening."""
+    from newton.sensors import SensorCamera
+
+    return SensorCamera.compute_camera_rays_pinhole(
+        camera.width, camera.height, camera_fov=1.2, device=device
+    )
