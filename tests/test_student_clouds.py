@@ -11,7 +11,7 @@ from vd.assets_usd.objects.model import load_set
 from vd.paper import PAPER
 from vd.sim.scene import hand_mount
 from vd.student.cfg import NoiseCfg
-from vd.student.clouds import SceneClouds, Voxeliser
+from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +93,23 @@ def test_without_the_object_its_columns_are_left_to_a_camera(assets, device):
     points = written(clouds, body_q, goal, with_object=False)
     assert np.isnan(points[:, clouds.item]).all()
     assert np.isfinite(points[:, : clouds.item.start]).all()
+
+
+@pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])
+def test_kinematics_match_the_hands(name, device):
+    hand = load_hand(name)
+    generator = np.random.default_rng(0)
+    q = generator.uniform(hand.lower, hand.upper, (20, hand.num_joints))
+    links = generator.permutation(len(hand.link_names) + 2)[: len(hand.link_names)]
+    base = compose(np.array(hand_mount()), np.array([0.1, 0, 0, 0, 0, 0, 1.0]))
+    kinematics = HandKinematics(hand, link_body=links, base=base, device=device)
+    body_q = wp.full((20, len(links) + 2), wp.transform(*[np.nan] * 7), dtype=wp.transform, device=device)
+    kinematics.write(wp.array(q, dtype=float, device=device), body_q)
+    poses, expected = body_q.numpy(), compose(base, hand.forward_kinematics(q))
+    np.testing.assert_allclose(poses[:, links, :3], expected[..., :3], atol=1e-6)
+    aligned = np.abs(np.sum(poses[:, links, 3:] * expected[..., 3:], axis=-1))
+    np.testing.assert_allclose(aligned, 1.0, atol=1e-6)
+    assert np.isnan(np.delete(poses, links, axis=1)).all()
 
 
 def test_voxels_of_a_scene(assets, device):

@@ -1,4 +1,4 @@
-"""Point clouds of scenes as the student sees them in its first stage, and their voxels."""
+"""Point clouds of scenes, from poses or joint positions, and their voxels."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,6 +9,7 @@ import warp as wp
 
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.objects.model import ObjectModel
+from vd.kernels.kinematics import Joints, forward_kinematics_kernel
 from vd.kernels.link_points import CloudModel, link_points_kernel
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.voxels import CloudNoise, draw_noise, voxelise
@@ -96,6 +97,43 @@ class SceneClouds:
             dim=(body_q.shape[0], columns),
             inputs=[self._model, self._all_worlds if worlds is None else worlds, body_q, goal_quat],
             outputs=[points],
+            device=self.device,
+        )
+
+
+class HandKinematics:
+    """Poses of a hand's links from joint positions, on the device, in place of a simulator's."""
+
+    def __init__(self, hand: HandModel, *, link_body: np.ndarray, base: Sequence[float], device: str):
+        """Put the joints on the device.
+
+        Args:
+            hand: The hand.
+            link_body: Column of each link in the poses, base first, shape [L].
+            base: Pose of the base in the world frame: position [m], quaternion xyzw, [7].
+            device: Warp device.
+        """
+        self.device = device
+
+        def array(values: Any, dtype: Any) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        joints = Joints()
+        joints.parent = array(np.asarray(link_body)[hand.joint_parent], wp.int32)
+        joints.child = array(np.asarray(link_body)[hand.joint_child], wp.int32)
+        joints.axis = array(hand.joint_axis, wp.vec3)
+        joints.parent_frame = array(hand.joint_parent_frame, wp.transform)
+        joints.child_frame = array(hand.joint_child_frame, wp.transform)
+        self._joints, self._base_body = joints, int(link_body[0])
+        self._base = wp.transform(*(float(value) for value in base))
+
+    def write(self, joint_q: wp.array, body_q: wp.array) -> None:
+        """Write link poses in the world frame, shape [N, B], for positions [rad], shape [N, >= D]."""
+        wp.launch(
+            forward_kinematics_kernel,
+            dim=joint_q.shape[0],
+            inputs=[self._joints, self._base_body, self._base, joint_q],
+            outputs=[body_q],
             device=self.device,
         )
 
