@@ -199,6 +199,14 @@ EFFECTS: dict[str, Effect] = {
 """Every effect by name, in the order in which a signal meets them, roughly."""
 
 
+EQUIVALENT: dict[str, tuple[str, ...]] = {"command_delay": ("read_delay",)}
+"""Effects that stand for others which leave the same positions, whatever the motion.
+
+A servo that does not change with time, and is commanded rather than steered by what it reports, shifts
+its whole motion in time either way. By convention the shift is one of the command.
+"""
+
+
 def neutral_row() -> list[float]:
     """A parameter row with every effect off and no drive, ``PARAMETER_COLUMNS`` values."""
     row = [0.0] * servo.PARAMETER_COLUMNS

@@ -12,7 +12,7 @@ from vd.gap.hidden_plant import CABLE, COGGING, WARMING
 from vd.gap.hide import Hiding
 from vd.gap.recording import BARE_MODELS
 from vd.gap.sizes import sized_effect
-from vd.kernels.effects import EFFECTS
+from vd.kernels.effects import EFFECTS, EQUIVALENT
 
 KINDS = ("single", "none", "pair", "outside")
 MASS_SPREAD = 0.2
@@ -25,6 +25,8 @@ NEIGHBOURS: Mapping[str, tuple[str, ...]] = {
     WARMING: ("coulomb_friction", "stribeck_friction", "asymmetric_friction", "load_friction"),
 }
 """Effects of the table that do what one outside does, in part: naming them is no error."""
+STANDS_FOR: Mapping[str, str] = {other: name for name, others in EQUIVALENT.items() for other in others}
+"""Effects of which positions alone cannot show that they are not another, which is named for both."""
 MASS_EFFECTS = ("gravity_load", "payload_inertia")
 """What a hand with other masses than its model has: naming them is right."""
 
@@ -79,6 +81,8 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
     named = list(dict.fromkeys(effect["name"] for effect in report["effects"]))
     sets = [list(group) for group in report["ambiguous"]]
     right = set(case.effects) | (set(MASS_EFFECTS) if case.change == "mass" else set())
+    # The name that stands for a hidden effect is right if the report says that it does.
+    right |= {STANDS_FOR[n] for n in case.effects if n in STANDS_FOR and any(n in group for group in sets)}
     tolerated = right | {n for name in case.effects for n in NEIGHBOURS.get(name, ())}
     held_out = report["held_out"]
     return {
@@ -86,6 +90,9 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
         "verdict": report["verdict"],
         "named": named,
         "sets": sets,
+        "by_convention": [
+            n for n in case.effects if n not in named and STANDS_FOR.get(n) in {*named} & right
+        ],
         "missed": [n for n in case.effects if n not in named and not any(n in group for group in sets)],
         "false": [n for n in named if n not in tolerated],
         "gap": _ratio(report["baseline"]["rmse_rad"], floor),
@@ -215,23 +222,33 @@ def _values(results: Iterable[Mapping[str, Any]], key: str) -> list[float]:
 def _first_right(result: Mapping[str, Any]) -> bool:
     """The named effect, or the first of the set, is the hidden one."""
     first = result["named"][:1] or [group[0] for group in result["sets"][:1]]
-    return first == list(result["case"]["effects"])
+    return first == list(result["case"]["effects"]) or _conventional(result)
+
+
+def _conventional(result: Mapping[str, Any]) -> bool:
+    """What is hidden is named by the effect that stands for it, and by nothing else."""
+    return bool(result.get("by_convention")) and len(result["named"]) == len(result["case"]["effects"])
 
 
 def _set_size(result: Mapping[str, Any]) -> float:
     """Candidates among which the answer leaves the choice: 1 for a name, none counts as all."""
     truth = result["case"]["effects"][0]
-    if truth in result["named"]:
+    if truth in result["named"] or _conventional(result):
         return 1.0
     return float(min((len(group) for group in result["sets"] if truth in group), default=len(EFFECTS)))
 
 
+def _found(result: Mapping[str, Any]) -> set[str]:
+    """Hidden effects that are named, by convention too."""
+    return set(result["case"]["effects"]) & {*result["named"], *result.get("by_convention", ())}
+
+
 def _all_named(result: Mapping[str, Any]) -> bool:
-    return set(result["case"]["effects"]) <= set(result["named"])
+    return len(_found(result)) == len(result["case"]["effects"])
 
 
 def _one_and_none_wrong(result: Mapping[str, Any]) -> bool:
-    return bool(set(result["case"]["effects"]) & set(result["named"])) and not result["false"]
+    return bool(_found(result)) and not result["false"]
 
 
 def _unknown_or_near(result: Mapping[str, Any]) -> bool:
@@ -297,8 +314,8 @@ def by_effect(results: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
                 "cases": len(group),
                 "failed": len(group) - len(good),
                 "gap": float(np.median(gaps)) if (gaps := _values(good, "gap")) else None,
-                "named": sum(name in r["named"] for r in good),
-                "in_set": sum(any(name in s for s in r["sets"]) and name not in r["named"] for r in good),
+                "named": sum(name in _found(r) for r in good),
+                "in_set": sum(any(name in s for s in r["sets"]) and name not in _found(r) for r in good),
                 "wrong": sum(bool(r["false"]) for r in good),
                 "answers": {answer: answers.count(answer) for answer in dict.fromkeys(answers)},
             }

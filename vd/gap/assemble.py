@@ -29,7 +29,7 @@ from vd.gap.result import (
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import interval, resamples, rmse
 from vd.gap.team import Bench, JointSpec
-from vd.kernels.effects import EFFECTS
+from vd.kernels.effects import EFFECTS, EQUIVALENT
 
 CLOSE = 0.1
 """Values of one effect on two joints within this share of each other are one value."""
@@ -300,14 +300,15 @@ def _sets(joints: Sequence[Analysed]) -> tuple[tuple[str, ...], ...]:
         if joint.explanation.verdict not in ("effects", "ambiguous"):
             continue
         for accepted in joint.explanation.accepted:
-            members = (accepted.name, *accepted.tied)
-            if not accepted.named and len(members) > 1 and not any(set(members) == set(s) for s in result):
+            members = (accepted.name, *accepted.equivalent, *accepted.tied)
+            open_ = accepted.tied and not accepted.named
+            if (open_ or accepted.equivalent) and not any(set(members) == set(s) for s in result):
                 result.append(members)
     return tuple(result)
 
 
 def _next(joints: Sequence[Analysed]) -> str:
-    sets = _sets(joints)
+    sets = [group for group in _sets(joints) if set(group[1:]) - set(EQUIVALENT.get(group[0], ()))]
     if sets:
         listed = " and ".join(name.replace("_", " ") for name in sets[0][:2])
         return (

@@ -11,7 +11,7 @@ import cma
 import numpy as np
 
 import vd.kernels.actuators as servo
-from vd.gap.coordinates import Coordinate, Scales, coordinate, keys
+from vd.gap.coordinates import Coordinate, Scales, coordinate, keys, sizes
 from vd.gap.rollout import Chain, Rollouts
 from vd.gap.statistics import rmse
 from vd.kernels.chains import MAX_JOINTS
@@ -42,6 +42,12 @@ CMA_POPULATION = 16
 FINER = (2, 4)
 """Divisors of the time step at which an estimate is finished: what the last one changes is its error."""
 FINER_ITERATIONS = 4
+MOVING_COUNTS = 1.5
+"""Encoder counts between two samples from which their rounding errors are independent."""
+OTHER_STARTS = 4
+OTHER_SPREAD = 0.2
+"""Standard deviation of the logarithm of the baseline's parameters at other starts."""
+OTHER_ITERATIONS = 16
 
 Trajectories = Sequence[int] | np.ndarray | None
 """Indices of trajectories; None: all."""
@@ -62,6 +68,8 @@ class JointFit:
         gram: J^T J of each trajectory, [S, P, P].
         gradient: J^T r of each trajectory, [S, P].
         step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
+        structure: Sum of products of successive residuals in motion, and their number, of each trajectory
+            [2, S] [rad^2]: zero on average if only noise is left; None where not estimated.
     """
 
     effects: tuple[str, ...]
@@ -74,6 +82,7 @@ class JointFit:
     gram: np.ndarray
     gradient: np.ndarray
     step_error: np.ndarray | None = None
+    structure: np.ndarray | None = None
 
     @property
     def values(self) -> dict[str, float]:
@@ -377,9 +386,8 @@ class JointProblem:
     def refine(self, fit: JointFit, scales: Scales) -> JointFit:
         """The same model fitted on with finer time steps, for values that do not depend on the step.
 
-        Some effects converge slowly (the bound of load friction follows the torque of the step before):
-        the change from the last halving is kept as the error that is left. Held-out errors are those of
-        ``fit``, to be compared with those of other models.
+        What the last halving changes is kept as the error that is left, and the structure of the
+        residuals is measured. Held-out errors are those of ``fit``, to be compared with other models'.
         """
         rollouts, x, error = self.rollouts, fit.x, np.zeros(len(fit.x))
         result = fit
@@ -395,9 +403,50 @@ class JointProblem:
                     trajectories=self.trajectories,
                 )[0]
                 x, error = result.x, np.abs(result.x - x)
+            residual = self.residuals(result.rows[None])[0]
         finally:
             self.rollouts = rollouts
-        return replace(result, held_out=fit.held_out, step_error=error)
+        structure = self._structure(residual)
+        return replace(result, held_out=fit.held_out, step_error=error, structure=structure)
+
+    def _structure(self, residual: np.ndarray) -> np.ndarray:
+        """Products of successive residuals in motion [2, S]; at rest the rounding to counts repeats."""
+        count = self.rollouts.recording.encoder_resolution_rad
+        sums = []
+        for t, part in zip(self.trajectories, self.split(residual), strict=True):
+            moving = np.abs(np.diff(self._measured[int(t)])) > MOVING_COUNTS * count
+            sums.append((float(np.sum((part[1:] * part[:-1])[moving])), float(moving.sum())))
+        return np.array(sums).T
+
+    def again(self, fit: JointFit, scales: Scales, *, seed: int) -> JointFit:
+        """The same model searched for from elsewhere, without what the first search knows.
+
+        Args:
+            fit: What the first search found.
+            scales: Sizes of the joint's motion.
+            seed: Of the starts: the baseline's parameters at random about what was found, every effect
+                at one of its starting sizes.
+
+        Returns:
+            The best of ``OTHER_STARTS`` fits, without held-out errors.
+        """
+        rng = np.random.default_rng(seed)
+        others = others_in(self.rollouts.chain, self.joint)
+        starts = []
+        for _ in range(OTHER_STARTS):
+            start = {key: fit.values[key] * np.exp(rng.normal(0.0, OTHER_SPREAD)) for key in self.baseline}
+            for effect in fit.effects:
+                options = sizes(effect, others, scales)
+                start.update(options[int(rng.integers(len(options)))])
+            starts.append(start)
+        return self.fit(
+            fit.rows,
+            fit.effects,
+            starts,
+            scales,
+            iterations=OTHER_ITERATIONS,
+            trajectories=self.trajectories,
+        )[0]
 
     def promise(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> np.ndarray:
         """Share of the squared error that each start could remove, the present parameters readjusted.

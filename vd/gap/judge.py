@@ -12,7 +12,7 @@ import numpy as np
 from vd.gap.fit import RIDGE, JointFit
 from vd.gap.result import Verdict
 from vd.gap.statistics import covariance, half_width, interval, rmse
-from vd.kernels.effects import EFFECTS
+from vd.kernels.effects import EFFECTS, EQUIVALENT
 
 NESTED = {
     "stribeck_friction": ("coulomb_friction",),
@@ -46,6 +46,14 @@ EXCESS_FLOORS = 0.15
 carry that difference."""
 RECOVERED = 0.5
 """Share of the squared gap that the named effects must recover; less is an unknown cause."""
+STRUCTURE = 0.09
+"""Mean product of successive residuals in motion, in squared noise floors, from which a model lacks
+something: the right ones leave 0.05 at most (the noise of the first sample, which starts a rollout)."""
+STRUCTURE_SURE = 0.02
+"""The same for the low end of its interval over trajectories."""
+REPEATABLE = 3.0
+"""Final error, in noise floors, up to which residuals are held against noise alone. A real machine that is
+farther from it does not repeat its motions that well; how well is not known from one recording of each."""
 RANDOM = "command_jitter"
 """The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
 DETERMINED = ("kp", "kd", "inertia")
@@ -81,11 +89,15 @@ class Accepted:
     tied: tuple[str, ...]
     """Alternatives that this recording does not tell from it."""
     at_bound: bool
+    equivalent: tuple[str, ...] = ()
+    """Effects that leave the same positions whatever the motion; the name stands for them too."""
+    doubt: str = ""
+    """Why it is no name in spite of all."""
 
     @property
     def named(self) -> bool:
         """Whether it is the answer rather than one of a set."""
-        return not self.tied and not self.at_bound and self.confidence >= NAMED
+        return not self.tied and not self.at_bound and not self.doubt and self.confidence >= NAMED
 
 
 @dataclass(frozen=True)
@@ -110,11 +122,13 @@ class Judge:
         floor: Noise floor [rad].
         weights: Bootstrap weights of the trajectories [R, S].
         whole: Held-out RMSE of the baseline [rad]; what is small beside it is the model's own error.
+        equivalent: Effects that one stands for, since the recording cannot tell them apart.
     """
 
     floor: float
     weights: np.ndarray
     whole: float = 0.0
+    equivalent: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def scores(self, fits: Sequence[JointFit], weights: np.ndarray | None = None) -> np.ndarray:
         """Log of held-out RMSE plus the price of parameters, shape [C] or [C, R]."""
@@ -197,11 +211,30 @@ class Judge:
         rivals: Mapping[str, list[JointFit]],
         trials: Sequence[Trial],
         loose: str,
+        refined: JointFit | None = None,
+        again: JointFit | None = None,
     ) -> Explanation:
-        """Confidence, sets and verdict of the final model."""
-        spread = intervals(final, self.floor)
-        accepted = [self.accept(final, name, rivals.get(name, [final]), spread) for name in final.effects]
-        explanation = Explanation(baseline, final, "unknown", "", tuple(accepted), tuple(trials), rivals)
+        """Confidence, sets and verdict of the final model.
+
+        Args:
+            baseline: The model without effects.
+            final: The model chosen.
+            rivals: Fits with others in the place of each effect.
+            trials: The evidence.
+            loose: What of the baseline the motions leave open.
+            refined: The final model at finer time steps, whose values are reported.
+            again: The final model as another search finds it.
+        """
+        told = final if refined is None else refined
+        spread = intervals(told, self.floor)
+        accepted = []
+        for name in final.effects:
+            fits = rivals.get(name, [final])
+            one = self.accept(final, name, fits, spread, told)
+            if not one.tied:
+                one = replace(one, doubt=self.disagreement(baseline, final, name, fits, again))
+            accepted.append(one)
+        explanation = Explanation(baseline, told, "unknown", "", tuple(accepted), tuple(trials), rivals)
         if not accepted:
             tried = [t for t in trials if not t.placebo and np.isfinite(t.gain)]
             why = tried[0].reason if tried else "there is no candidate"
@@ -216,13 +249,60 @@ class Judge:
         if share < RECOVERED and RANDOM not in final.effects:
             text = f"the best candidate recovers {100.0 * share:.0f} % of the squared gap, less than half"
             return replace(explanation, reason=text)
+        lack = self.lack_of_fit(told)
+        if lack:
+            names = " and ".join(a.name for a in accepted)
+            return replace(explanation, reason=f"{names} come nearest, but {lack}: the cause is another")
         named = [a.name for a in accepted if a.named]
         if named:
             return replace(explanation, verdict="effects", reason=f"{' and '.join(named)} explain it")
         if all(a.at_bound for a in accepted):
             return replace(explanation, reason=f"{accepted[0].name} fits only with a parameter at its bound")
-        sets = "; ".join(" or ".join((a.name, *a.tied)) for a in accepted if not a.at_bound)
-        return replace(explanation, verdict="ambiguous", reason=f"{sets}: not told apart")
+        sets = [" or ".join((a.name, *a.tied)) for a in accepted if a.tied and not a.at_bound]
+        if not sets:
+            doubts = [a.doubt for a in accepted if a.doubt]
+            return replace(explanation, reason=(doubts or ["nothing is chosen often enough"])[0])
+        return replace(explanation, verdict="ambiguous", reason=f"{'; '.join(sets)}: not told apart")
+
+    def lack_of_fit(self, fit: JointFit) -> str:
+        """Why residuals near the noise floor are more than noise, in words; empty if they are not.
+
+        A wrong model that is flexible enough comes near the floor, and what it leaves is a function of
+        the motion: successive residuals agree, where noise has no memory.
+        """
+        if fit.structure is None or fit.rmse > REPEATABLE * self.floor:
+            return ""
+        products, count = fit.structure / np.array([[self.floor**2], [1.0]])
+        if count.sum() <= 0.0:
+            return ""
+        mean = float(products.sum() / count.sum())
+        drawn = (self.weights @ products) / np.maximum(self.weights @ count, 1.0)
+        sure = float(np.quantile(drawn, 0.025))
+        small = mean < (MIN_SHARE * self.whole / self.floor) ** 2
+        if mean < STRUCTURE or sure < STRUCTURE_SURE or small:
+            return ""
+        return f"what is left has structure ({np.sqrt(mean):.2f} noise floors that are not noise)"
+
+    def disagreement(
+        self,
+        baseline: JointFit,
+        final: JointFit,
+        name: str,
+        rivals: Sequence[JointFit],
+        again: JointFit | None,
+    ) -> str:
+        """Why two searches for the final model contradict each other about an effect, or nothing."""
+        if again is None:
+            return ""
+        without = [fit.rmse for fit in rivals if fit is not final and fit.effects[-1:] != (name,)]
+        gain = min([baseline.rmse, *without]) - final.rmse
+        apart = abs(again.rmse - final.rmse)
+        if apart <= max(gain, 0.0) or gain <= 0.0:
+            return ""
+        return (
+            f"two searches for {name} end {1e3 * apart:.2f} mrad apart, more than the {1e3 * gain:.2f} mrad "
+            "that it gains"
+        )
 
     def accept(
         self,
@@ -230,8 +310,9 @@ class Judge:
         name: str,
         rivals: Sequence[JointFit],
         spread: Mapping[str, tuple[float, float]],
+        told: JointFit,
     ) -> Accepted:
-        """Confidence and set of one effect of the final model."""
+        """Confidence and set of one effect of the final model, with the values ``told``."""
         own = next((fit for fit in rivals if fit.effects and fit.effects[-1] == name), None)
         mine = final if own is None or any(fit is final for fit in rivals) else own
         others = [fit for fit in rivals if fit is not mine and fit.effects[-1] != name]
@@ -251,11 +332,30 @@ class Judge:
         return Accepted(
             name=name,
             confidence=share,
-            estimates=_estimates(final, name, spread),
+            estimates=_estimates(told, name, spread),
+            equivalent=tuple(self.equivalent.get(name, ())),
             alternatives=tuple(alternatives),
             tied=tuple(tied),
             at_bound=any(key.startswith(f"{name}.") for key in final.at_bound),
         )
+
+
+def alike(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The candidates that stand for others of the candidates, and for which."""
+    return {
+        name: inside
+        for name, others in EQUIVALENT.items()
+        if name in names and (inside := tuple(other for other in others if other in names))
+    }
+
+
+def stood_for(equivalent: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Candidates that another stands for, with the reason why they are not tried."""
+    return {
+        other: f"leaves the same positions as {name}, which stands for both"
+        for name, others in equivalent.items()
+        for other in others
+    }
 
 
 def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:

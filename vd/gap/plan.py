@@ -202,7 +202,7 @@ def write_plan(result: Plan, folder: Path) -> Path:
 def _targets(report: Report) -> dict[str, tuple[str, ...]]:
     """Joints in question with the effects that compete on each; none means that all do."""
     targets: dict[str, tuple[str, ...]] = {}
-    for group in report.ambiguous:
+    for group in report.open_sets:
         rows = [row for row in report.evidence if row.name in group and row.decision != "rejected"]
         for joint in dict.fromkeys(joint for row in rows for joint in row.joints):
             targets[joint] = group
@@ -393,7 +393,7 @@ def _left_over(difference: np.ndarray, slopes: np.ndarray, floor: float, old: in
 
 
 def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
-    apart = " or ".join(" from ".join(map(plain, group)) for group in report.ambiguous)
+    apart = " or ".join(" from ".join(map(plain, group)) for group in report.open_sets)
     if best.floors < VISIBLE:
         goal = f"tell {apart}" if apart else "show more than these do"
         return (

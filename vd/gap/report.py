@@ -97,7 +97,7 @@ def _headline(page: Page, report: Report) -> None:
             "verdict",
             listing([plain(name) for name in dict.fromkeys(e.name for e in report.effects)])
             if report.effects
-            else listing([", ".join(map(plain, group)) for group in report.ambiguous] or ["nothing named"]),
+            else listing([", ".join(map(plain, group)) for group in report.open_sets] or ["nothing named"]),
         ),
         (mrad(held.baseline_rmse_rad), "gap before", "error on held-out motions, plain servo model fitted"),
     ]

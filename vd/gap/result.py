@@ -17,7 +17,7 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import atomic_path, write_json
-from vd.kernels.effects import BASELINE, EFFECTS, Parameter
+from vd.kernels.effects import BASELINE, EFFECTS, EQUIVALENT, Parameter
 
 FORMAT = "vd-gap-report/1"
 _OPTIONAL = ("hand", "hand_layer", "closing")
@@ -276,6 +276,14 @@ class Report:
             return Report.from_dict(values)
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(f"{path}: not a report of vd-gap ({error})") from error
+
+    @property
+    def open_sets(self) -> tuple[tuple[str, ...], ...]:
+        """The sets in ``ambiguous`` that another recording can split.
+
+        The others hold a named effect and those for which it stands (:data:`EQUIVALENT`).
+        """
+        return tuple(g for g in self.ambiguous if set(g[1:]) - set(EQUIVALENT.get(g[0], ())))
 
     def with_closing(self, closing: Closing) -> "Report":
         """The same report with what the closing simulation showed."""

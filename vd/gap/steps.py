@@ -259,7 +259,7 @@ def _close(analysis: Analysis) -> None:
     )
     curves.write(analysis.out / CLOSING_CURVES)
     (analysis.out / PLAN_JSON).unlink(missing_ok=True)
-    if report.verdict == "under_excited" or report.ambiguous:
+    if report.verdict == "under_excited" or report.open_sets:
         _show("close: looking for the motions that would decide")
         write_plan(plan(report, analysis.recording, analysis.hand, analysis.start), analysis.out)
     write_json(analysis.out / CLOSE, to_dict(closing))

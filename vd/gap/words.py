@@ -95,10 +95,11 @@ def effect_sentence(effect: NamedEffect) -> str:
 def verdict_sentence(report: Report) -> str:
     """The verdict in one or two sentences that need no context."""
     floor, before = mrad(report.noise_floor_rad), mrad(report.held_out.baseline_rmse_rad)
-    sets = [f"{{{', '.join(plain(name) for name in group)}}}" for group in report.ambiguous]
+    sets = [f"{{{', '.join(plain(name) for name in group)}}}" for group in report.open_sets]
     if report.verdict == "effects":
         missing = listing([effect_sentence(effect) for effect in report.effects])
         text = f"The simulation lacks {missing}. {_shrinks(report)}"
+        text += _equivalents(report)
         if sets:
             text += f" Something else remains that this recording cannot tell apart: {listing(sets)}."
         return text
@@ -121,6 +122,16 @@ def verdict_sentence(report: Report) -> str:
     return (
         f"There is a gap ({before} on held-out motions against a noise floor of {floor}), but no effect that "
         "is known here explains it. The cause lies outside the table of effects."
+    )
+
+
+def _equivalents(report: Report) -> str:
+    """What else the names stand for."""
+    groups = [group for group in report.ambiguous if group not in report.open_sets]
+    return "".join(
+        f" {plain(group[0]).capitalize()} stands for {listing([plain(name) for name in group[1:]])} too: "
+        "commands and positions are the same, whichever it is."
+        for group in groups
     )
 
 

@@ -24,7 +24,7 @@ from vd.gap.coordinates import Scales
 from vd.gap.design import design
 from vd.gap.find import findings
 from vd.gap.fit import JointFit, candidates, others_in
-from vd.gap.judge import Explanation, share
+from vd.gap.judge import Explanation, alike, share, stood_for
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S, Chain, chains
@@ -351,16 +351,20 @@ def _explain_all(
     def one(joint: Joint) -> Explanation:
         chain = team.bench.chains[joint.spec.chain]
         rng = np.random.default_rng([options.seed, joint.spec.chain, joint.spec.joint])
+        names = candidates(chain, options.effects)
+        same = alike(names)
         selection = Selection(
             run=lambda calls: team.run(joint.spec, calls),
             joint=joint.spec.joint,
             others=others_in(chain, joint.spec.joint),
-            candidates=candidates(chain, options.effects),
+            candidates=names,
+            equivalent=same,
+            seed=options.seed,
             floor=joint.spec.floor,
             scales=joint.scales,
             weights=resamples(len(joint.spec.trajectories), rng),
             refits=REFITS,
-            vetoes=vetoes(recording, chain, joint.spec, joint.fit.rows),
+            vetoes={**stood_for(same), **vetoes(recording, chain, joint.spec, joint.fit.rows)},
             report=lambda line: progress(f"explain: {joint.name}: {line}"),
         )
         result = selection.explain(joint.fit)
