@@ -143,7 +143,7 @@ def choose_points_kernel(
     """Choose points at random, evenly over the image and each at most once. Launch: [N, K].
 
     With V points and room for K < V, thread k takes a random one of those from k V / K to (k + 1) V / K. With
-    V <= K all are taken, and the rows beyond them repeat them, so that a cloud of K rows is the same set.
+    V <= K all are taken, in order, and the rows beyond are NaN.
 
     Args:
         views: Camera of each world, shape [N].
@@ -158,17 +158,17 @@ def choose_points_kernel(
         tile_first_in: Points before each tile in its row of tiles, shape [N, T].
         row_first_in: Points before each row of tiles, shape [N, Y].
         available_in: Points within the crop, shape [N].
-        points_out: Points in the frame of the camera's body [m]; zero without any point, shape [N, K].
+        points_out: Points in the frame of the camera's body [m], shape [N, K].
     """
     world, k = wp.tid()
     capacity = points_out.shape[1]
     available = available_in[world]
-    if available == 0:
-        points_out[world, k] = wp.vec3(0.0)
+    if k >= available:
+        points_out[world, k] = wp.vec3(wp.nan, wp.nan, wp.nan)
         return
     rows = depth_in.shape[1]
     columns = depth_in.shape[2]
-    wanted = k % available
+    wanted = k
     if available > capacity:
         # 64 bits: k times the pixels of a large image does not fit 32.
         start = int(wp.int64(k) * wp.int64(available) // wp.int64(capacity))

@@ -19,7 +19,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.bench.sim import captured, seconds_per_call
 from vd.paper import PAPER
-from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg, Method
 from vd.sensors.depth_camera import DepthCamera
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import Scene, build_scene
@@ -55,7 +55,7 @@ class DepthRow:
     """That order."""
     newton_refit_share: float
     """Share of its time that refitting its hierarchies takes."""
-    images: dict[str, float] = field(default_factory=dict)
+    images: dict[Method, float] = field(default_factory=dict)
     """Ours, depth images alone, by method."""
     clouds: dict[str, float] = field(default_factory=dict)
     """Ours with a cloud of each image, by method (and block of pixels a ray)."""
@@ -168,10 +168,11 @@ def measure(
     body_q = state.body_q.reshape((worlds, -1))
     camera = scene.hand.camera
 
-    images: dict[str, float] = {}
-    depths: dict[str, np.ndarray] = {}
+    images: dict[Method, float] = {}
+    depths: dict[Method, np.ndarray] = {}
     camera_q = np.empty(0)
-    for method in ("rays", "raster"):
+    methods: tuple[Method, ...] = ("rays", "raster")
+    for method in methods:
         ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method, points=0))
         ours.capture()
         images[method] = rate(worlds, captured(ours.capture, device), device)
@@ -180,7 +181,8 @@ def measure(
 
     clouds: dict[str, float] = {}
     points = 0.0
-    for method, block in (("rays", 1), ("rays", 2), ("rays", 3), ("raster", 1)):
+    variants: tuple[tuple[Method, int], ...] = (("rays", 1), ("rays", 2), ("rays", 3), ("raster", 1))
+    for method, block in variants:
         ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method, block=block))
         ours.capture()
         clouds[method if block == 1 else f"{method}/{block}"] = rate(

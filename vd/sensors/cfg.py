@@ -1,9 +1,11 @@
 """Settings of the depth camera and of its errors; by default a perfect camera at the hand's viewpoint."""
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, get_args
 
 from vd.paper import PAPER
+
+Method = Literal["raster", "rays"]
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class DepthSensorCfg:
 class DepthCameraCfg:
     """A depth camera on the hand's base in every world."""
 
-    method: Literal["raster", "rays"] = "raster"
+    method: Method = "raster"
     """How depth is found. The images are the same; rays can be cast through some of the pixels only."""
     block: int = 1
     """Cast one ray through a random pixel of each block of this many pixels a side (rays only), which can be
@@ -110,7 +112,7 @@ class DepthCameraCfg:
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         self.sensor.validate()
-        if self.method not in ("raster", "rays"):
+        if self.method not in get_args(Method):
             raise ValueError(f"method = {self.method!r}; choose raster or rays")
         if self.block < 1 or self.points < 0:
             raise ValueError(f"block = {self.block} must be at least 1, points = {self.points} at least 0")

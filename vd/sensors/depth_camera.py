@@ -116,7 +116,7 @@ class DepthCamera:
         """Measured depth [m], 0 for none; the same array as ``true_depth`` if the sensor is perfect."""
         self.points = empty(n, cfg.points, dtype=wp.vec3)
         """Points within the crop, in the frame of the camera's body (the hand's base) [m], shape [N, K]. Rows
-        beyond ``count`` repeat the first ones."""
+        beyond ``count`` are NaN, which the voxels ignore."""
         self.count = empty(n, dtype=wp.int32)
         """Points of each cloud, shape [N]."""
         self.available = empty(n, dtype=wp.int32)
