@@ -260,8 +260,9 @@ def finish_joint_kernel(
     history_index: wp.array2d[wp.int32],
     # Out:
     history: wp.array3d[float],
+    speed_history: wp.array3d[float],
 ):
-    """Hold a joint to its velocity limit after a physics step, and remember its position. Launch: [N, D].
+    """Hold a joint to its velocity limit after a physics step, and remember its motion. Launch: [N, D].
 
     The limit acts as in :func:`vd.kernels.actions.limit_joint_velocity_kernel`, here per world.
 
@@ -273,6 +274,7 @@ def finish_joint_kernel(
         joint_qd: Joint velocities after the step [rad/s], shape [N, *].
         history_index: Where in ``history`` the newest position is, shape [N, D].
         history: Past positions [rad], one a physics step, a ring, shape [N, D, R].
+        speed_history: Past velocities [rad/s] likewise, shape [N, D, R].
     """
     world, joint = wp.tid()
     speed = joint_qd[world, joint]
@@ -284,6 +286,7 @@ def finish_joint_kernel(
     index = (history_index[world, joint] + 1) % history.shape[2]
     history_index[world, joint] = index
     history[world, joint, index] = joint_q[world, joint]
+    speed_history[world, joint, index] = joint_qd[world, joint]
 
 
 @wp.kernel
@@ -294,17 +297,21 @@ def measure_joint_kernel(
     dt: float,
     history_index_in: wp.array2d[wp.int32],
     history_in: wp.array3d[float],
+    speed_history_in: wp.array3d[float],
     # Out:
     measured_q_out: wp.array2d[float],
+    measured_qd_out: wp.array2d[float],
 ):
-    """Positions as the servo reports them: old by the read delay, off by the encoder's bias. Launch: [N, D].
+    """What the servo reports: old by the read delay, positions off by the encoder's bias. Launch: [N, D].
 
     Args:
         parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
         dt: Physics time step [s].
         history_index_in: Where in ``history_in`` the newest position is, shape [N, D].
         history_in: Past positions [rad], one a physics step, a ring, shape [N, D, R].
+        speed_history_in: Past velocities [rad/s] likewise, shape [N, D, R].
         measured_q_out: Measured positions [rad], shape [N, D].
+        measured_qd_out: Measured velocities [rad/s], shape [N, D].
     """
     world, joint = wp.tid()
     row = world * measured_q_out.shape[1] + joint
@@ -313,11 +320,15 @@ def measure_joint_kernel(
     whole = int(wp.floor(age))
     part = age - float(whole)
     newest = history_index_in[world, joint] + length
-    value = history_in[world, joint, (newest - whole) % length]
+    slot = (newest - whole) % length
+    value = history_in[world, joint, slot]
+    speed = speed_history_in[world, joint, slot]
     if part > 0.0:
-        older = history_in[world, joint, (newest - whole - 1) % length]
-        value += part * (older - value)
+        slot = (newest - whole - 1) % length
+        value += part * (history_in[world, joint, slot] - value)
+        speed += part * (speed_history_in[world, joint, slot] - speed)
     measured_q_out[world, joint] = value + parameters[row, ENCODER_BIAS]
+    measured_qd_out[world, joint] = speed
 
 
 @wp.kernel
@@ -334,7 +345,9 @@ def reset_joint_kernel(
     transit_count_out: wp.array2d[wp.int32],
     held_out: wp.array2d[float],
     history_out: wp.array3d[float],
+    speed_history_out: wp.array3d[float],
     measured_q_out: wp.array2d[float],
+    measured_qd_out: wp.array2d[float],
 ):
     """Start the servos of chosen worlds: at rest, with one command since long ago. Launch: [N, D].
 
@@ -348,7 +361,9 @@ def reset_joint_kernel(
         transit_count_out: As in :func:`send_command_kernel`.
         held_out: The command that arrived last [rad], shape [N, D].
         history_out: Past positions [rad], shape [N, D, R].
+        speed_history_out: Past velocities [rad/s], shape [N, D, R].
         measured_q_out: Measured positions [rad], shape [N, D].
+        measured_qd_out: Measured velocities [rad/s], shape [N, D].
     """
     world, joint = wp.tid()
     if mask_in[world] == 0:
@@ -361,7 +376,9 @@ def reset_joint_kernel(
     held_out[world, joint] = command_in[world, joint]
     for k in range(history_out.shape[2]):
         history_out[world, joint, k] = position
+        speed_history_out[world, joint, k] = 0.0
     measured_q_out[world, joint] = position + parameters[row, ENCODER_BIAS]
+    measured_qd_out[world, joint] = 0.0
 
 
 @wp.kernel

@@ -98,6 +98,7 @@ def teacher_observation_kernel(
     params: wp.array[ObservationParams],
     # In:
     measured_q_in: wp.array2d[float],
+    measured_qd_in: wp.array2d[float],
     joint_q_in: wp.array2d[float],
     joint_qd_in: wp.array2d[float],
     body_q_in: wp.array2d[wp.transform],
@@ -124,6 +125,7 @@ def teacher_observation_kernel(
         body_com: Centre of mass of each link in its frame [m], shape [B].
         params: Settings, shape [1].
         measured_q_in: Positions of the hand's joints as their encoders report them [rad], shape [N, *].
+        measured_qd_in: Velocities of the hand's joints likewise [rad/s], shape [N, *].
         joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
         joint_qd_in: Hand joints [rad/s], object linear [m/s] and angular [rad/s] velocity, shape [N, D + 6].
         body_q_in: Link poses in the world frame, shape [N, B].
@@ -143,7 +145,7 @@ def teacher_observation_kernel(
         span = joint_upper[joint] - joint_lower[joint]
         above = measured_q_in[world, joint] - joint_lower[joint]
         observation_out[world, joint] = 2.0 * above / span - 1.0
-        observation_out[world, joints + joint] = settings.velocity_scale * joint_qd_in[world, joint]
+        observation_out[world, joints + joint] = settings.velocity_scale * measured_qd_in[world, joint]
 
     position = read_vec3(world, joints, joint_q_in)
     orientation = read_quat(world, joints + 3, joint_q_in)

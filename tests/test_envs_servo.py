@@ -184,6 +184,21 @@ def test_servos_are_drawn_anew_and_started_anew_with_their_world_alone(layer):
     assert np.array_equal(env.measured_q.numpy()[1], joints(env)[1])
 
 
+def test_velocities_are_observed_as_late_as_positions(layer):
+    """A read delay of two control steps shows the joints' motion of then, positions and velocities."""
+    steps, control_dt = 2, make().cfg.sim.control_dt
+    late = make(layer(read_delay={"delay_s": steps * control_dt}))
+    d, seen, true = late.num_actions, [], []
+    for i in range(steps + 4):
+        late.action.fill_(0.8 if i % 2 else -0.8)
+        late.step(late.action)
+        true.append(late.sim.joint_qd.numpy()[0, :d].copy())
+        seen.append(late.measured_qd.numpy()[0, :d].copy())
+    assert np.abs(true).max() > 0.1
+    np.testing.assert_allclose(seen[-1], true[-1 - steps], atol=2e-3 * np.abs(true).max())
+    assert np.abs(seen[-1] - true[-1]).max() > 0.05 * np.abs(true).max()
+
+
 def test_a_torque_limit_bounds_the_torque_that_costs_energy(layer):
     env = make(layer(torque_limit={"tau_max_nm": 0.02}))
     plain = make()

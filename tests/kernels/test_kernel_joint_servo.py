@@ -106,13 +106,13 @@ def test_jitter_delays_in_order_and_drops_its_share(device):
     bias=hundredths(-50, 50),
     limit=hundredths(50, 5000),
 )
-def test_measured_positions_are_old_limited_and_biased(device, positions, delay, bias, limit):
+def test_what_is_measured_is_old_limited_and_biased(device, positions, delay, bias, limit):
     rows = device_array(
         parameter_rows(1, READ_DELAY=delay, ENCODER_BIAS=bias, VELOCITY_LIMIT=limit), float, device
     )
     index = wp.zeros((1, 1), dtype=wp.int32, device=device)
-    history = device_array(np.zeros((1, 1, 10)), float, device)
-    past, before = [0.0] * 12, 0.0
+    history, speed_history = (device_array(np.zeros((1, 1, 10)), float, device) for _ in range(2))
+    past, past_speed, before = [0.0] * 12, [0.0] * 12, 0.0
     for position in positions:
         speed = (position - before) / DT
         allowed = float(np.clip(speed, -limit, limit))
@@ -122,23 +122,25 @@ def test_measured_positions_are_old_limited_and_biased(device, positions, delay,
             finish_joint_kernel,
             dim=(1, 1),
             inputs=[rows, DT, device_array([[before]], float, device), q, qd, index],
-            outputs=[history],
+            outputs=[history, speed_history],
             device=device,
         )
         assert np.allclose(qd.numpy(), allowed, rtol=1e-4, atol=1e-4)
         assert np.allclose(q.numpy(), after, atol=1e-4)
         before = float(q.numpy()[0, 0])
         past.append(before)
-        measured = unwritten((1, 1), float, device)
+        past_speed.append(float(qd.numpy()[0, 0]))
+        measured, measured_speed = (unwritten((1, 1), float, device) for _ in range(2))
         wp.launch(
             measure_joint_kernel,
             dim=(1, 1),
-            inputs=[rows, DT, index, history],
-            outputs=[measured],
+            inputs=[rows, DT, index, history, speed_history],
+            outputs=[measured, measured_speed],
             device=device,
         )
-        expected = np.interp(-delay, np.arange(-len(past) + 1, 1) * DT, past) + bias
-        assert np.allclose(measured.numpy(), expected, atol=1e-3)
+        when = np.arange(-len(past) + 1, 1) * DT
+        assert np.allclose(measured.numpy(), np.interp(-delay, when, past) + bias, atol=1e-3)
+        assert np.allclose(measured_speed.numpy(), np.interp(-delay, when, past_speed), atol=1e-2)
 
 
 def test_inertia_goes_to_its_joint(device):

@@ -44,6 +44,7 @@ def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
         "body_com": draw(floats((bodies, 3), -0.1, 0.1)),
         "q": np.concatenate([draw(floats((worlds, joints + 3))), orientation], axis=1),
         "measured_q": draw(floats((worlds, joints))),
+        "measured_qd": draw(floats((worlds, joints), -5, 5)),
         "qd": draw(floats((worlds, joints + 6), -5, 5)),
         "body_q": draw(transforms((worlds, bodies))),
         "body_qd": draw(floats((worlds, bodies, 6), -3, 3)),
@@ -76,6 +77,7 @@ def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0):
             device_array(scene["body_com"], wp.vec3, device),
             params,
             device_array(scene["measured_q"], float, device),
+            device_array(scene["measured_qd"], float, device),
             device_array(scene["q"], float, device),
             device_array(scene["qd"], float, device),
             device_array(scene["body_q"], wp.transform, device),
@@ -113,7 +115,7 @@ def expected_observation(scene):
     return np.concatenate(
         [
             (scene["measured_q"].astype(np.float64) - middle) / half,
-            0.2 * qd[:, :joints],
+            0.2 * scene["measured_qd"].astype(np.float64),
             q[:, joints:],
             qd[:, joints : joints + 3],
             0.2 * qd[:, joints + 3 :],
@@ -206,6 +208,7 @@ def uniform_scene(fingers, worlds):
         "body_com": np.zeros((joints, 3)),
         "q": np.tile(np.append(np.zeros(joints), pose), (worlds, 1)),
         "measured_q": np.zeros((worlds, joints)),
+        "measured_qd": np.zeros((worlds, joints)),
         "qd": np.zeros((worlds, joints + 6)),
         "body_q": np.tile(pose, (worlds, joints, 1)),
         "body_qd": np.zeros((worlds, joints, 6)),

@@ -72,6 +72,8 @@ class ReorientEnv:
         servo = self.sim.servo
         self.measured_q = self.sim.joint_q if servo is None else servo.measured_q
         """Joint positions as the encoders report them at the end of the step [rad], shape [N, *]."""
+        self.measured_qd = self.sim.joint_qd if servo is None else servo.measured_qd
+        """Joint velocities likewise: as old as the positions [rad/s], shape [N, *]."""
         self.parameters = TaskParameters(cfg, self.device)
 
         self.num_worlds = n = cfg.num_worlds
@@ -372,6 +374,7 @@ class ReorientEnv:
                 self._body_com,
                 self.parameters.observation,
                 self.measured_q,
+                self.measured_qd,
                 sim.joint_q,
                 sim.joint_qd,
                 sim.body_q,

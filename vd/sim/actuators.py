@@ -96,6 +96,8 @@ class JointServo:
         its mean, shape [N, D]."""
         self.measured_q = zeros(n, d)
         """Positions as the servos report them [rad], with read delay and bias, shape [N, D]."""
+        self.measured_qd = zeros(n, d)
+        """Velocities as the servos report them [rad/s], with read delay, shape [N, D]."""
         bounds = {column: PARAMETERS[column][1].upper for column in DELAYS}
         longest = bounds[COMMAND_DELAY] + MAX_JITTER_SIGMAS * bounds[JITTER_SIGMA]
         capacity = math.ceil(longest / control_dt) + 2
@@ -109,6 +111,7 @@ class JointServo:
         self._held = zeros(n, d)
         self._history_index = zeros(n, d, dtype=wp.int32)
         self._history = zeros(n, d, past)
+        self._speed_history = zeros(n, d, past)
         self._rng = zeros(n, dtype=wp.uint32)
         wp.launch(init_rng_kernel, dim=n, inputs=[seed], outputs=[self._rng], device=self.device)
 
@@ -174,7 +177,16 @@ class JointServo:
         self._launch(
             reset_joint_kernel,
             [self.parameters, mask, self._joint_q if command is None else command, self._joint_q],
-            [self.state, head, count, self._held, self._history, self.measured_q],
+            [
+                self.state,
+                head,
+                count,
+                self._held,
+                self._history,
+                self._speed_history,
+                self.measured_q,
+                self.measured_qd,
+            ],
         )
 
     def send(self, command: wp.array2d) -> None:
@@ -212,15 +224,15 @@ class JointServo:
         self._launch(
             finish_joint_kernel,
             [self.parameters, self.dt, previous_q, joint_q, joint_qd, self._history_index],
-            [self._history],
+            [self._history, self._speed_history],
         )
 
     def measure(self) -> None:
-        """Refresh ``measured_q``, once per control step."""
+        """Refresh ``measured_q`` and ``measured_qd``, once per control step."""
         self._launch(
             measure_joint_kernel,
-            [self.parameters, self.dt, self._history_index, self._history],
-            [self.measured_q],
+            [self.parameters, self.dt, self._history_index, self._history, self._speed_history],
+            [self.measured_q, self.measured_qd],
         )
 
     def stateful(self) -> dict[str, wp.array]:
@@ -237,7 +249,9 @@ class JointServo:
             "servo_transit_time": time,
             "servo_history": self._history,
             "servo_history_index": self._history_index,
+            "servo_speed_history": self._speed_history,
             "servo_measured_q": self.measured_q,
+            "servo_measured_qd": self.measured_qd,
         }
 
     def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
