@@ -24,8 +24,8 @@ from vd.train.checkpoint import (
     set_random_state,
     without_worlds,
 )
+from vd.train.ending import Interrupted, TrainingDivergedError
 from vd.train.metrics import GoalWindow, read_progress
-from vd.train.runner import Interrupted, TrainingDivergedError
 
 TIMING = ("elapsed_s", "steps_per_s", "collect_s", "learn_s")
 

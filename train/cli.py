@@ -210,8 +210,8 @@ def _teacher(arguments: list[str], started: float) -> int:
     cfg = parse_teacher(arguments)
 
     from vd.train.distributed import ending_together
+    from vd.train.ending import Interrupted
     from vd.train.progress import waiting
-    from vd.train.runner import Interrupted
 
     main_process = os.environ.get("RANK", "0") == "0"
     with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):

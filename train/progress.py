@@ -1,7 +1,7 @@
 """The live progress of a run: one line in place on a terminal, a line now and then elsewhere."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
@@ -75,6 +75,12 @@ def waiting(message: str, enabled: bool = True) -> Iterator[None]:
         yield
 
 
+Summary = Callable[[Mapping[str, Any], int, float | None], str]
+"""Main figures in a line: of a row of ``progress.jsonl``, all iterations and the time left [s]."""
+Details = Callable[[Mapping[str, Any]], str]
+"""More figures in a second line."""
+
+
 class ProgressLine:
     """Shows the latest iteration; a context manager.
 
@@ -82,10 +88,21 @@ class ProgressLine:
         total: Iterations of the whole run.
         done: Iterations already done by earlier runs.
         enabled: Show anything (false on all ranks but the first).
+        summary: Writes the first line.
+        details: Writes the second line.
     """
 
-    def __init__(self, total: int, *, done: int = 0, enabled: bool = True) -> None:
+    def __init__(
+        self,
+        total: int,
+        *,
+        done: int = 0,
+        enabled: bool = True,
+        summary: Summary = summary,
+        details: Details = reward_line,
+    ) -> None:
         self._total, self._enabled = total, enabled
+        self._summary, self._details = summary, details
         self._console = Console()
         self._bar = Progress(
             TextColumn("{task.percentage:5.1f} %"), BarColumn(bar_width=None), console=self._console
@@ -120,7 +137,9 @@ class ProgressLine:
         if self._live is not None:
             self._bar.update(self._task, completed=row["iteration"])
             self._live.update(
-                Group(Text(summary(row, self._total, left_s)), Text(reward_line(row), "dim"), self._bar)
+                Group(
+                    Text(self._summary(row, self._total, left_s)), Text(self._details(row), "dim"), self._bar
+                )
             )
         elif time.monotonic() - self._printed >= PLAIN_INTERVAL_S:
             self._print()
@@ -133,6 +152,6 @@ class ProgressLine:
     def _print(self) -> None:
         assert self._last is not None
         row, left_s = self._last
-        self._console.print(summary(row, self._total, left_s), highlight=False, soft_wrap=True)
-        self._console.print("  " + reward_line(row), highlight=False, soft_wrap=True)
+        self._console.print(self._summary(row, self._total, left_s), highlight=False, soft_wrap=True)
+        self._console.print("  " + self._details(row), highlight=False, soft_wrap=True)
         self._printed, self._last_printed = time.monotonic(), True

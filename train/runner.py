@@ -4,11 +4,8 @@ import contextlib
 import io
 import math
 import os
-import signal
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import torch
@@ -31,6 +28,7 @@ from vd.train.checkpoint import (
 )
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg, rsl_rl_config, validate
 from vd.train.distributed import Processes, join_processes, watch_iteration
+from vd.train.ending import EndRequest, Interrupted, TrainingDivergedError
 from vd.train.metrics import GoalWindow, ProgressFile, StepMeans
 from vd.train.ppo import TeacherPPO
 from vd.train.progress import ProgressLine
@@ -41,14 +39,6 @@ POLICY_NAME = "policy.pt"
 """The best policy so far, in the run's folder: what vd-eval, vd-play and deployment read."""
 LOWER_RATES = "lower --ppo.actor-learning-rate, --ppo.critic-learning-rate or --ppo.grad-norm"
 """Remedy for networks that diverge."""
-
-
-class TrainingDivergedError(RuntimeError):
-    """Observations, rewards, losses or parameters are no longer finite."""
-
-
-class Interrupted(Exception):  # noqa: N818  # not an error: the run was asked to stop and has saved
-    """Ctrl-C or SIGTERM; the run is saved."""
 
 
 class TeacherRunner(OnPolicyRunner):
@@ -89,7 +79,6 @@ class TeacherRunner(OnPolicyRunner):
     ) -> None:
         validate(ppo, policy, run)
         self.run, self.policy_cfg, self.task = run, policy, task
-        self._deadline = deadline
         # rsl-rl prints its models and observation groups while it builds them.
         with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(env, rsl_rl_config(ppo, policy, env.num_envs), log_dir=None, device=device)
@@ -102,7 +91,7 @@ class TeacherRunner(OnPolicyRunner):
         self._window = GoalWindow(self._window_length)
         self._score = (0.0, 0.0, -math.inf)
         self._best: tuple[float, ...] | None = None
-        self._signal = 0
+        self._end = EndRequest(deadline, device=device, distributed=self.is_distributed)
         self._stagger_due = True
         self.new_episodes = ""
         self.new_inputs = 0
@@ -155,7 +144,7 @@ class TeacherRunner(OnPolicyRunner):
         progress = ProgressLine(total, done=first, enabled=self.is_main)
         saved = first
         try:
-            with self._signals(progress.note), progress:
+            with self._end.signals(progress.note), progress:
                 observation = self.env.get_observations()
                 while self.current_learning_iteration < total:
                     if self.is_distributed:
@@ -165,18 +154,19 @@ class TeacherRunner(OnPolicyRunner):
                         break
                     if log is not None:
                         log.write(row)
-                    progress.update(row, self._time_left(total, first))
+                    done = self.current_learning_iteration - first
+                    progress.update(row, self._end.time_left(done, total - self.current_learning_iteration))
                     if self.current_learning_iteration % self.run.save_every == 0:
                         self._save_periodic()
                         saved = self.current_learning_iteration
-                    if self._should_stop():
+                    if self._end.due():
                         break
                 if saved < self.current_learning_iteration or self.current_learning_iteration == 0:
                     self._save_periodic()
         finally:
             if log is not None:
                 log.close()
-        if self._signal:
+        if self._end.signal:
             raise Interrupted
 
     def _iterate(self, observation: TensorDict) -> tuple[dict[str, Any] | None, TensorDict]:
@@ -189,7 +179,7 @@ class TeacherRunner(OnPolicyRunner):
         with torch.inference_mode():
             for _ in range(self.cfg["num_steps_per_env"]):
                 # With several processes all must do the same collectives, so they stop between iterations.
-                if self._signal and not self.is_distributed:
+                if self._end.signal and not self.is_distributed:
                     self.alg.storage.clear()
                     self._means.clear()
                     return None, observation
@@ -416,44 +406,6 @@ class TeacherRunner(OnPolicyRunner):
     def _last_good(self) -> str:
         folder = self.run.run_dir / CHECKPOINT_FOLDER
         return f"The last checkpoint in {folder} is from before; go on from it with --resume"
-
-    def _time_left(self, total: int, first: int) -> float | None:
-        """Estimate from this run's own pace, and the deadline if that is nearer [s]."""
-        done = self.current_learning_iteration - first
-        pace = (time.monotonic() - self._started) / max(done, 1)
-        left = pace * (total - self.current_learning_iteration)
-        return left if self._deadline is None else min(left, self._deadline - time.monotonic())
-
-    def _should_stop(self) -> bool:
-        """Whether a signal or the deadline asks for the end; all processes agree."""
-        late = self._deadline is not None and time.monotonic() >= self._deadline
-        if not self.is_distributed:
-            return bool(self._signal) or late
-        wishes = torch.tensor([float(self._signal), float(late)], device=self.device)
-        torch.distributed.all_reduce(wishes, op=torch.distributed.ReduceOp.MAX)
-        self._signal = int(wishes[0])
-        return bool(self._signal) or bool(wishes[1])
-
-    @contextlib.contextmanager
-    def _signals(self, note: Callable[[str], None]) -> Iterator[None]:
-        """Turn Ctrl-C and SIGTERM into a request to stop; a second one stops at once, without saving."""
-        self._started = time.monotonic()
-
-        def request(number: int, _frame: FrameType | None) -> None:
-            if self._signal:
-                raise KeyboardInterrupt
-            self._signal = number
-            note("stopping: saving a checkpoint (again to stop at once, without saving)")
-
-        previous = {}
-        with contextlib.suppress(ValueError):  # signals belong to the main thread; elsewhere there are none
-            for number in (signal.SIGINT, signal.SIGTERM):
-                previous[number] = signal.signal(number, request)
-        try:
-            yield
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
 
     def _configure_multi_gpu(self) -> None:
         """As rsl-rl, but with our limits of time, and with gloo where the device is the CPU."""

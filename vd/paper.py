@@ -184,6 +184,22 @@ class StudentConstants:
 
 
 @dataclass(frozen=True)
+class DaggerConstants:
+    """Training of the student by imitation (Methods, student; numbers from the code)."""
+
+    rollout_steps: int = source(80, "C", "control steps of every world between two updates")
+    synthetic_worlds: int = source(400, "C", "stage 1: complete synthetic clouds")
+    synthetic_minibatch: int = source(40, "C", "stage 1: worlds of an optimiser step, whole sequences each")
+    rendered_worlds: int = source(260, "C", "stage 2: rendered clouds")
+    rendered_minibatch: int = source(20, "C", "stage 2: worlds of an optimiser step")
+    epochs: int = source(4, "C", "passes over a rollout")
+    learning_rate: float = source(3e-4, "C", "AdamW with amsgrad, constant")
+    grad_norm: float = source(5.0, "C", "gradient norm is clipped to this")
+    distance_weight: float = source(0.5, "C", "of the squared error of the rotation distance [rad^2]")
+    teacher_share: float = source(0.0, "C", "beta of DAgger: the student acts from the first step on")
+
+
+@dataclass(frozen=True)
 class PaperConstants:
     """All constants; ``PAPER`` is the one instance."""
 
@@ -198,6 +214,7 @@ class PaperConstants:
     camera: CameraConstants = CameraConstants()
     cloud: CloudConstants = CloudConstants()
     student: StudentConstants = StudentConstants()
+    dagger: DaggerConstants = DaggerConstants()
 
 
 PAPER = PaperConstants()

@@ -1,0 +1,77 @@
+"""The ways a run can be asked to end: Ctrl-C, SIGTERM and a deadline, agreed on by all its processes."""
+
+import contextlib
+import signal
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+
+import torch
+
+
+class Interrupted(Exception):  # noqa: N818  # not an error: the run was asked to stop and has saved
+    """Ctrl-C or SIGTERM; the run is saved."""
+
+
+class TrainingDivergedError(RuntimeError):
+    """Observations, rewards, losses or parameters are no longer finite."""
+
+
+class EndRequest:
+    """Whether a run is to end before its last iteration.
+
+    Args:
+        deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
+        device: Torch device of this process.
+        distributed: Whether other processes have to agree.
+
+    Attributes:
+        signal: Number of the signal that asked for the end; 0 if none did.
+    """
+
+    def __init__(self, deadline: float | None, *, device: str, distributed: bool) -> None:
+        self.signal = 0
+        self._deadline, self._device, self._distributed = deadline, device, distributed
+        self._started = time.monotonic()
+
+    @contextlib.contextmanager
+    def signals(self, note: Callable[[str], None]) -> Iterator[None]:
+        """Turn Ctrl-C and SIGTERM into a request to stop; a second one stops at once, without saving."""
+        self._started = time.monotonic()
+
+        def request(number: int, _frame: FrameType | None) -> None:
+            if self.signal:
+                raise KeyboardInterrupt
+            self.signal = number
+            note("stopping: saving a checkpoint (again to stop at once, without saving)")
+
+        previous = {}
+        with contextlib.suppress(ValueError):  # signals belong to the main thread; elsewhere there are none
+            for number in (signal.SIGINT, signal.SIGTERM):
+                previous[number] = signal.signal(number, request)
+        try:
+            yield
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def due(self) -> bool:
+        """Whether a signal or the deadline asks for the end; all processes agree."""
+        late = self._deadline is not None and time.monotonic() >= self._deadline
+        if not self._distributed:
+            return bool(self.signal) or late
+        wishes = torch.tensor([float(self.signal), float(late)], device=self._device)
+        torch.distributed.all_reduce(wishes, op=torch.distributed.ReduceOp.MAX)
+        self.signal = int(wishes[0])
+        return bool(self.signal) or bool(wishes[1])
+
+    def time_left(self, done: int, left: int) -> float | None:
+        """Estimate from this command's own pace, and the deadline if that is nearer [s].
+
+        Args:
+            done: Iterations since the start of this command.
+            left: Iterations to the end.
+        """
+        pace = (time.monotonic() - self._started) / max(done, 1)
+        estimate = pace * left
+        return estimate if self._deadline is None else min(estimate, self._deadline - time.monotonic())
