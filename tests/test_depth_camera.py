@@ -16,6 +16,7 @@ from vd.bench.depth import NewtonCamera, bench_scene, pose
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
+from vd.sensors.depth_cloud import CameraCloud
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import build_scene, hand_mount
 
@@ -321,3 +322,15 @@ def test_a_perfect_sensor_costs_no_image(device, scenes):
 def test_settings_that_cannot_work_are_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         DepthCameraCfg(**settings).validate()
+
+
+def test_a_real_cameras_image_makes_the_same_cloud(device, scenes):
+    scene, state = scenes(device)
+    simulated = make(scene, state)
+    simulated.capture()
+    real = CameraCloud(scene.hand.camera, device=device)
+    points, count = real.make(host(simulated.depth)[0])
+    assert host(count)[0] == host(simulated.count)[0]
+    np.testing.assert_allclose(host(points)[0], host(simulated.points)[0], atol=1e-6)
+    with pytest.raises(ValueError, match="resample"):
+        real.make(np.zeros((90, 160)))

@@ -12,12 +12,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CameraModel
-from vd.kernels.depth_cloud import (
-    choose_points_kernel,
-    count_points_kernel,
-    crop_cells_kernel,
-    next_frame_kernel,
-)
+from vd.kernels.depth_cloud import next_frame_kernel
 from vd.kernels.depth_sensor import (
     DepthSensorParams,
     delay_poses_kernel,
@@ -25,18 +20,13 @@ from vd.kernels.depth_sensor import (
     measure_depth_kernel,
     next_count_kernel,
 )
-from vd.kernels.depth_views import NO_HIT, View, place_camera_kernel, place_meshes_kernel
+from vd.kernels.depth_views import NO_HIT, place_camera_kernel, place_meshes_kernel
 from vd.kernels.rasterise import finish_depth_kernel, rasterise_kernel
-from vd.kernels.raycast import (
-    TILE_COLUMNS,
-    TILE_ROWS,
-    cull_tiles_kernel,
-    order_shapes_kernel,
-    raycast_kernel,
-)
+from vd.kernels.raycast import cull_tiles_kernel, order_shapes_kernel, raycast_kernel
 from vd.kernels.rng import init_rng_kernel
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
+from vd.sensors.depth_cloud import DepthCloud, make_views
 from vd.sensors.surfaces import SurfaceSet, scene_surfaces
 from vd.sim.scene import Scene
 
@@ -84,12 +74,23 @@ class DepthCamera:
         self.num_worlds = n = surfaces.num_worlds
         self._camera_body = camera_body
         self.height, self.width = camera.height, camera.width
-        self.rows, self.columns = math.ceil(self.height / cfg.block), math.ceil(self.width / cfg.block)
-        self._tile_rows, self._tile_columns = (
-            math.ceil(self.rows / int(TILE_ROWS)),
-            math.ceil(self.columns / int(TILE_COLUMNS)),
+        self._cloud = cloud = DepthCloud(
+            camera.height,
+            camera.width,
+            n,
+            points=cfg.points,
+            crop_m=cfg.crop_m,
+            block=cfg.block,
+            device=device,
         )
-        shapes, tiles = surfaces.num_shapes, self._tile_rows * self._tile_columns
+        self.points = cloud.points
+        """Points within the crop, in the frame of the camera's body (the hand's base) [m], shape [N, K]. Rows
+        beyond ``count`` are NaN, which the voxels ignore."""
+        self.count = cloud.count
+        """Points of each cloud, shape [N]."""
+        self.available = cloud.available
+        """Pixels within the crop, of which the points were chosen, shape [N]."""
+        shapes, tiles = surfaces.num_shapes, cloud.tile_rows * cloud.tile_columns
         self._table = _table_box()
         self._lanes = 1 if device == "cpu" else WARP_LANES
         generator = np.random.default_rng(seed)
@@ -97,7 +98,7 @@ class DepthCamera:
         def empty(*shape: int, dtype: type = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self.views = wp.array(_views(camera, generator, cfg, n), dtype=View, device=device)
+        self.views = make_views(camera, 1.0 + cfg.focal_noise * generator.standard_normal(n), device)
         """Focal lengths, principal point [pixel] and range [m] of each camera, shape [N]."""
         self.extrinsics = wp.array(_extrinsics(camera, generator, cfg, n), dtype=wp.transform, device=device)
         """Optical frame of each camera in the frame of the body that carries it, shape [N]."""
@@ -110,17 +111,10 @@ class DepthCamera:
         """Whether each world's table is there, shape [N]."""
         self.camera_q = empty(n, dtype=wp.transform)
         """Optical frames in the world frame at the last capture, shape [N]."""
-        self.true_depth = empty(n, self.rows, self.columns)
+        self.true_depth = empty(n, cloud.rows, cloud.columns)
         """Depth without sensor errors [m], shape [N, H, W]; a row and column for each block of pixels."""
-        self.depth = empty(n, self.rows, self.columns) if cfg.sensor.enabled else self.true_depth
+        self.depth = empty(n, cloud.rows, cloud.columns) if cfg.sensor.enabled else self.true_depth
         """Measured depth [m], 0 for none; the same array as ``true_depth`` if the sensor is perfect."""
-        self.points = empty(n, cfg.points, dtype=wp.vec3)
-        """Points within the crop, in the frame of the camera's body (the hand's base) [m], shape [N, K]. Rows
-        beyond ``count`` are NaN, which the voxels ignore."""
-        self.count = empty(n, dtype=wp.int32)
-        """Points of each cloud, shape [N]."""
-        self.available = empty(n, dtype=wp.int32)
-        """Pixels within the crop, of which the points were chosen, shape [N]."""
         self.rng = wp.empty(n, dtype=wp.uint32, device=device)
         """Random state of each world, shape [N]."""
         wp.launch(init_rng_kernel, dim=n, inputs=[seed], outputs=[self.rng], device=device)
@@ -128,13 +122,7 @@ class DepthCamera:
         self._rotation, self._position = empty(n, shapes, dtype=wp.mat33), empty(n, shapes, dtype=wp.vec3)
         self._window, self._nearest = empty(n, shapes, dtype=wp.vec4), empty(n, shapes)
         self._order = empty(n, shapes, dtype=wp.int32)
-        self._tile_shapes, self._tile_cells = (
-            empty(n, tiles, dtype=wp.uint32),
-            empty(n, tiles, dtype=wp.uint32),
-        )
-        self._tile_first = empty(n, tiles, dtype=wp.int32)
-        self._row_count = empty(n, self._tile_rows, dtype=wp.int32)
-        self._row_first = empty(n, self._tile_rows, dtype=wp.int32)
+        self._tile_shapes = empty(n, tiles, dtype=wp.uint32)
         self._depth_bits = self.true_depth.view(wp.int32)
         self._history: wp.array | None = None
         if cfg.latency_s[1] > 0.0:
@@ -217,7 +205,7 @@ class DepthCamera:
                 [self.depth],
             )
         if self.cfg.points:
-            self._make_clouds()
+            self._cloud.make(self.depth, self.views, self.camera_q, self.extrinsics, self.rng)
         self._launch(next_frame_kernel, n, [self.rng], [])
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
@@ -238,13 +226,13 @@ class DepthCamera:
 
     def _cast(self) -> None:
         n, surfaces = self.num_worlds, self.surfaces
-        tiles = self._tile_rows * self._tile_columns
-        lanes = self._lanes
+        cloud, lanes = self._cloud, self._lanes
+        tiles = cloud.tile_rows * cloud.tile_columns
         self._launch(order_shapes_kernel, self._nearest.shape, [self._nearest], [self._order])
         self._launch(
             cull_tiles_kernel,
             (n, tiles),
-            [self.cfg.block, self._tile_columns, self._window, self._order],
+            [self.cfg.block, cloud.tile_columns, self._window, self._order],
             [self._tile_shapes],
         )
         self._launch(
@@ -259,7 +247,7 @@ class DepthCamera:
                 self.height,
                 self.width,
                 self.cfg.block,
-                self._tile_columns,
+                cloud.tile_columns,
                 lanes,
                 self.table,
                 self.camera_q,
@@ -301,67 +289,12 @@ class DepthCamera:
             [self.true_depth],
         )
 
-    def _make_clouds(self) -> None:
-        n, cfg = self.num_worlds, self.cfg
-        self._launch(
-            crop_cells_kernel,
-            (n, self._tile_rows),
-            [
-                self.views,
-                *cfg.crop_m,
-                self.height,
-                self.width,
-                cfg.block,
-                self._tile_columns,
-                self.camera_q,
-                self.rng,
-                self.depth,
-            ],
-            [self._tile_cells, self._tile_first, self._row_count],
-        )
-        self._launch(
-            count_points_kernel,
-            n,
-            [cfg.points, self._row_count],
-            [self._row_first, self.available, self.count],
-        )
-        self._launch(
-            choose_points_kernel,
-            (n, cfg.points),
-            [
-                self.views,
-                self.height,
-                self.width,
-                cfg.block,
-                self._tile_columns,
-                self.extrinsics,
-                self.rng,
-                self.depth,
-                self._tile_cells,
-                self._tile_first,
-                self._row_first,
-                self.available,
-            ],
-            [self.points],
-        )
-
 
 def _table_box() -> tuple[wp.vec3, wp.vec3]:
     """Lower and upper corner of the paper's table in the world frame [m]."""
     x, y, z = PAPER.scene.table_size_m
     top = PAPER.scene.table_top_m
     return wp.vec3(-0.5 * x, -0.5 * y, top - z), wp.vec3(0.5 * x, 0.5 * y, top)
-
-
-def _views(camera: CameraModel, generator: np.random.Generator, cfg: DepthCameraCfg, n: int) -> list[View]:
-    views = []
-    for factor in 1.0 + cfg.focal_noise * generator.standard_normal(n):
-        view = View()
-        view.fx, view.fy = camera.fx * factor, camera.fy * factor
-        view.cx, view.cy = camera.cx, camera.cy
-        view.near, view.far = camera.near, camera.far
-        views.append(view)
-    return views
 
 
 def _extrinsics(
