@@ -62,6 +62,37 @@ def test_a_resumed_run_equals_one_that_never_stopped(tmp_path):
 
 
 @pytest.mark.slow
+def test_a_blind_run_goes_on_seeing_the_shape_and_its_policy_is_evaluated(tmp_path):
+    import numpy as np
+    import warp as wp
+
+    from vd.evaluate.cli import main as evaluate
+
+    flags = ["teacher", "--smoke", "--num-worlds", "4", "--max-steps", "32", "--run-dir"]
+    assert main([*flags, str(tmp_path / "blind"), "--save-every", "1"]) == 0
+    checkpoint = checkpoint_path(tmp_path / "blind", 1)
+    cfg = smoke()
+    cfg = replace(
+        cfg,
+        init=checkpoint,
+        run=replace(cfg.run, run_dir=tmp_path / "seeing"),
+        env=replace(cfg.env, num_worlds=4, observation=replace(cfg.env.observation, shape="full")),
+    )
+    runner = build_teacher(cfg)
+    assert runner.new_inputs == runner.env.env.num_observations - load_policy(checkpoint).num_observations > 0
+    observation = runner.env.get_observations()
+    blind = load_policy(checkpoint).act(observation["policy"][:, : -runner.new_inputs])
+    with torch.no_grad():
+        assert torch.allclose(runner.alg.actor(observation), blind, atol=1e-5)
+    runner.learn(1)
+    policy = load_policy(tmp_path / "seeing" / "policy.pt")
+    assert policy.task["observation"]["shape"] == "full"
+    assert np.isfinite(policy.act(wp.to_torch(runner.env.env.observation)).numpy()).all()
+    arguments = ["--episodes", "1", "--num-worlds", "1", "--episode-s", "0.5", "--device", "cpu", "--output"]
+    assert evaluate([str(tmp_path / "seeing"), *arguments, str(tmp_path / "eval")]) == 0
+
+
+@pytest.mark.slow
 def test_the_command_trains_saves_on_sigterm_and_resumes(tmp_path):
     command = [sys.executable, "-m", "vd.train.cli", "teacher", "--run-dir", str(tmp_path)]
     run = subprocess.Popen(

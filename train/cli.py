@@ -140,10 +140,10 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
     cfg = replace(cfg, run=replace(cfg.run, device=device))
     present = list_checkpoints(cfg.run.run_dir)
-    if cfg.init is not None and not cfg.init.is_file():
-        raise FileNotFoundError(f"--init: no file {cfg.init}; give a checkpoint of vd-train teacher")
     resume = cfg.resume if cfg.resume != AUTO else "latest" if present else None
     checkpoint = find_checkpoint(cfg.run.run_dir, resume) if resume else None
+    if checkpoint is None and cfg.init is not None and not cfg.init.is_file():
+        raise FileNotFoundError(f"--init: no file {cfg.init}; give a checkpoint of vd-train teacher")
     if checkpoint is None and present:
         raise FileExistsError(
             f"{cfg.run.run_dir} holds a run; add --resume to go on with it, or choose another --run-dir"
