@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
-from vd.bench.sim import captured, seconds_per_call
+from vd.bench.sim import captured, own_kernel_names, seconds_per_call
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg, Method
 from vd.sensors.depth_camera import DepthCamera
@@ -63,6 +63,9 @@ class DepthRow:
     """Ours with a cloud and every error of the sensor, by the faster method."""
     images_over_newton: float = 0.0
     """The faster of ours over Newton's, images alone."""
+    kernels_ms: dict[str, float] = field(default_factory=dict)
+    """Device time of each kernel for one image in every world [ms], both methods with clouds and the sensor's
+    errors; empty on the CPU."""
     points: float = 0.0
     """Points of a cloud, mean over worlds."""
     different: float = 0.0
@@ -193,6 +196,7 @@ def measure(
     ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=best, sensor=DepthSensorCfg.realistic()))
     ours.capture()
     with_sensor = rate(worlds, captured(ours.capture, device), device)
+    kernels = {**_kernel_times(scene, body_q, "rays"), **_kernel_times(scene, body_q, "raster")}
     del ours
 
     newton_rates: dict[str, float] = {}
@@ -221,10 +225,28 @@ def measure(
         clouds=clouds,
         with_sensor=with_sensor,
         images_over_newton=images[best] / fastest,
+        kernels_ms=kernels,
         points=points,
         different=_different(np.where(reference > camera.far, 0.0, reference), depths["rays"]),
         methods_different=_different(depths["raster"], depths["rays"]),
     )
+
+
+def _kernel_times(scene: Scene, body_q: wp.array, method: Method) -> dict[str, float]:
+    """Device time of each kernel of a capture with all errors of the sensor [ms]; empty on the CPU."""
+    camera = DepthCamera.of_scene(
+        scene, body_q, DepthCameraCfg(method=method, sensor=DepthSensorCfg.realistic())
+    )
+    camera.capture()
+    with wp.ScopedTimer("capture", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True) as timer:
+        camera.capture()
+    # Warp reports "forward kernel NAME_HASH".
+    times = [(result.name.split()[-1], float(result.elapsed)) for result in timer.timing_results]
+    return {
+        kernel: round(sum(elapsed for name, elapsed in times if name.startswith(f"{kernel}_")), 4)
+        for kernel in sorted(own_kernel_names())
+        if any(name.startswith(f"{kernel}_") for name, _ in times)
+    }
 
 
 def _different(a: np.ndarray, b: np.ndarray) -> float:
