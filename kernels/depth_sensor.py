@@ -11,6 +11,9 @@ from vd.kernels.depth_views import EMPTY
 
 wp.set_module_options({"enable_backward": False})
 
+SHADOW_NEAREST = wp.constant(0.2)
+"""Nothing nearer than this hides others from the second imager [m]: it bounds the length of a shadow."""
+
 
 @wp.struct
 class DepthSensorParams:
@@ -19,6 +22,8 @@ class DepthSensorParams:
     depth_disparity: Focal length times baseline, depth times disparity [m pixel].
     disparity_std: Standard deviation of the disparity [pixel].
     disparity_step: Rounding of the disparity [pixel].
+    shadow: As depth_disparity, in pixels of the image; what the second imager, to the right, does not see has
+        no value.
     edge_jump: Difference of depth to one of the four neighbours that makes a pixel an edge [m].
     edge_dropout: Probability that an edge pixel has no value.
     flying: Probability that an edge pixel lies somewhere between both surfaces.
@@ -30,6 +35,7 @@ class DepthSensorParams:
     depth_disparity: float
     disparity_std: float
     disparity_step: float
+    shadow: float
     edge_jump: float
     edge_dropout: float
     flying: float
@@ -47,6 +53,24 @@ def depth_behind(depth: wp.array3d[float], world: int, row: int, column: int, fa
     if value <= 0.0:
         return far
     return value
+
+
+@wp.func
+def is_hidden(depth: wp.array3d[float], world: int, row: int, column: int, shadow: float) -> bool:
+    """Whether the second imager, to the right, does not see what a pixel shows.
+
+    It sees a pixel moved to the left by its disparity. Something nearer moves further, and hides what it
+    lands on or passes.
+    """
+    mine = shadow / depth[world, row, column]
+    if float(column) + 0.5 < mine:
+        return True  # out of its image
+    reach = int(shadow / SHADOW_NEAREST - mine)
+    for step in range(1, wp.min(reach, depth.shape[2] - 1 - column) + 1):
+        other = depth[world, row, column + step]
+        if other > 0.0 and shadow / other - mine >= float(step):
+            return True
+    return False
 
 
 @wp.kernel
@@ -76,6 +100,8 @@ def measure_depth_kernel(
         return
 
     lost = wp.randf(rng) < sensor.dropout
+    if sensor.shadow > 0.0 and is_hidden(depth_in, world, row, column, sensor.shadow):
+        lost = True
     if sensor.edge_jump > 0.0:
         other = depth
         for side in range(4):

@@ -313,6 +313,7 @@ def test_a_perfect_sensor_costs_no_image(device, scenes):
     [
         ({"block": 2}, "method = rays"),
         ({"method": "rays", "block": 2, "sensor": DepthSensorCfg(flying=0.1)}, "block = 1"),
+        ({"method": "rays", "block": 2, "sensor": DepthSensorCfg(shadow=True)}, "block = 1"),
         ({"latency_s": (0.2, 0.1)}, "latency_s"),
         ({"crop_m": (0.2, 0.0)}, "crop_m"),
         ({"sensor": DepthSensorCfg(flying=0.6, edge_dropout=0.6)}, "must not exceed 1"),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from kernel_oracle import (
     ALPHA,
@@ -27,6 +27,7 @@ OFF = {
     "depth_disparity": FB,
     "disparity_std": 0.0,
     "disparity_step": 0.0,
+    "shadow": 0.0,
     "edge_jump": 0.0,
     "edge_dropout": 0.0,
     "flying": 0.0,
@@ -148,6 +149,30 @@ def test_a_slope_below_the_jump_is_no_edge(device):
     depth = np.broadcast_to(np.linspace(0.3, 1.2, 80), (1, 50, 80))
     measured = measure(device, depth, edge_jump=0.02, edge_dropout=1.0)
     np.testing.assert_allclose(measured, depth, rtol=3e-7)
+
+
+@EXAMPLES
+@given(
+    near=st.floats(0.3, 0.6),
+    gap=st.floats(0.05, 0.6),
+    left=st.integers(60, 90),
+    width=st.integers(2, 40),
+)
+def test_near_things_throw_a_shadow_to_their_left(device, near, gap, left, width):
+    scale, far = 14.0, near + gap  # focal length in pixels of the image, times baseline
+    depth = np.full((1, 2, 160), far)
+    depth[:, :, left : left + width] = near
+    measured = measure(device, depth, shadow=scale)
+    lost = measured[0, 0] == 0
+    # Seen from the right, the near thing covers what lies behind it and up to this many pixels beside it.
+    parallax = scale / near - scale / far
+    # Where it is a tie, single precision cannot say which pixel is the last.
+    assume(abs(parallax - round(parallax)) > 1e-3 and abs(scale / far % 1 - 0.5) > 1e-3)
+    column = np.arange(160)
+    hidden = (column < left) & (left - column <= parallax)
+    hidden |= column + 0.5 < scale / far  # beyond the border of the second image
+    np.testing.assert_array_equal(lost, hidden)
+    np.testing.assert_array_equal(measured[0, 1], measured[0, 0])
 
 
 def test_dropout_takes_its_share_of_all_pixels(device):

@@ -33,6 +33,9 @@ class DepthSensorCfg:
     of this kind: 0.05 to 0.1."""
     disparity_step_px: float = 0.0
     """Rounding of the disparity [pixel]; the D400 series resolves 1/32."""
+    shadow: bool = False
+    """No depth where the second imager, a baseline to the right, sees nothing: left of near things, and along
+    the left border of the image."""
     edge_jump_m: float = 0.02
     """Difference of depth between neighbouring pixels that makes an edge [m]."""
     edge_dropout: float = 0.0
@@ -46,10 +49,11 @@ class DepthSensorCfg:
 
     @staticmethod
     def realistic() -> "DepthSensorCfg":
-        """A D415 as it is: measured noise, the rounding of its chip, frayed edges, its least distance."""
+        """Much like a D415: its noise, rounding and shadow, frayed edges, a least distance."""
         return DepthSensorCfg(
             disparity_std_px=0.08,
             disparity_step_px=1.0 / 32.0,
+            shadow=True,
             edge_dropout=0.3,
             flying=0.1,
             dropout=0.005,
@@ -58,15 +62,19 @@ class DepthSensorCfg:
 
     @property
     def uses_edges(self) -> bool:
-        """Whether anything depends on a pixel's neighbours."""
+        """Whether edge pixels are treated apart."""
         return self.edge_dropout > 0.0 or self.flying > 0.0
 
     @property
     def enabled(self) -> bool:
         """Whether anything is measured otherwise than it is."""
-        return self.uses_edges or any(
-            value > 0.0
-            for value in (self.disparity_std_px, self.disparity_step_px, self.dropout, self.min_range_m)
+        return (
+            self.uses_edges
+            or self.shadow
+            or any(
+                value > 0.0
+                for value in (self.disparity_std_px, self.disparity_step_px, self.dropout, self.min_range_m)
+            )
         )
 
     def validate(self) -> None:
@@ -118,10 +126,8 @@ class DepthCameraCfg:
             raise ValueError(f"block = {self.block} must be at least 1, points = {self.points} at least 0")
         if self.block > 1 and self.method != "rays":
             raise ValueError(f"block = {self.block} needs method = rays; rasterisation fills whole images")
-        if self.block > 1 and self.sensor.uses_edges:
-            raise ValueError(
-                "sensor.edge_dropout and flying look at neighbouring pixels; they need block = 1"
-            )
+        if self.block > 1 and (self.sensor.uses_edges or self.sensor.shadow):
+            raise ValueError("sensor.edge_dropout, flying and shadow look at neighbours; they need block = 1")
         if self.crop_m[0] > self.crop_m[1]:
             raise ValueError(f"crop_m = {self.crop_m}; name the lower height first")
         if not 0.0 <= self.latency_s[0] <= self.latency_s[1]:

@@ -310,6 +310,7 @@ def _sensor(cfg: DepthSensorCfg, camera: CameraModel) -> DepthSensorParams:
     params = DepthSensorParams()
     params.depth_disparity = cfg.imager.focal_px * cfg.imager.baseline_m
     params.disparity_std, params.disparity_step = cfg.disparity_std_px, cfg.disparity_step_px
+    params.shadow = camera.fx * cfg.imager.baseline_m if cfg.shadow else 0.0
     params.edge_jump = cfg.edge_jump_m if cfg.uses_edges else 0.0
     params.edge_dropout, params.flying, params.dropout = cfg.edge_dropout, cfg.flying, cfg.dropout
     params.min_range, params.max_range = cfg.min_range_m, camera.far
