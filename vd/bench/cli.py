@@ -1,4 +1,4 @@
-"""``vd-bench``: measure speed, physics, depth and the gap workflow; rates are ratios within one run."""
+"""``vd-bench``: measure speed, physics, depth, student and gap workflow; rates are ratios within one run."""
 
 import dataclasses
 import json
@@ -144,6 +144,73 @@ class DepthCommand:
 
 
 @dataclass(frozen=True)
+class StudentCommand:
+    """Latency of the student's control step on the CPU, and on a GPU its clouds per second in training.
+
+    Its encoder is timed beside dense convolutions, and spconv's where installed, on the same voxels.
+    """
+
+    networks: tuple[str, ...] = ("lean", "paper")
+    """Presets to measure."""
+    objects: tuple[str, ...] = ("procedural-150-seed0",)
+    """Object sets."""
+    hand: str = "dclaw4"
+    """Hand."""
+    device: str = "auto"
+    """Device of the training rows: auto is the first GPU, none without one; cpu for a few clouds there."""
+    threads: int = 2
+    """Threads of torch for the latency on the CPU."""
+    calls: int = 300
+    """Control steps to time; 0 leaves the latency out."""
+    worlds: tuple[int, ...] = (10, 40)
+    """Sequences of a minibatch, 80 steps each."""
+    seed: int = 0
+    """Of poses and weights."""
+    json: Path | None = None
+    """Write the rows to this file as JSON."""
+
+    def run(self) -> int:
+        """Measure and print."""
+        import warp as wp
+
+        from vd.assets_usd.objects.model import load_set
+        from vd.bench.student import measure_latency, measure_training
+        from vd.files import write_json
+        from vd.student.cfg import PRESETS
+
+        for name in self.networks:
+            if name not in PRESETS:
+                raise ValueError(f"--networks {name}: no such preset; choose of {', '.join(PRESETS)}")
+        wp.config.log_level = wp.LOG_WARNING
+        device = choose_device(self.device)
+        objects = load_set(list(self.objects))
+        rows: dict[str, list[dict[str, Any]]] = {"latency": [], "training": []}
+
+        def add(kind: str, row: Any) -> None:
+            rows[kind].append(dataclasses.asdict(row))
+            print(json.dumps(rows[kind][-1]), flush=True)
+            if self.json:  # after each row: a later one may not fit the device
+                write_json(self.json, {"device": str(wp.get_device(device).name), **rows})
+
+        for name in self.networks if self.calls else ():
+            add(
+                "latency",
+                measure_latency(
+                    objects, name, hand=self.hand, threads=self.threads, calls=self.calls, seed=self.seed
+                ),
+            )
+        training = device != "cpu" or self.device == "cpu"
+        for name in self.networks if training else ():
+            for worlds in self.worlds:
+                for half in (True, False):
+                    row = measure_training(
+                        objects, name, device, hand=self.hand, worlds=worlds, half=half, seed=self.seed
+                    )
+                    add("training", row)
+        return 0
+
+
+@dataclass(frozen=True)
 class ReplayCommand:
     """Replay the control step in which a state left the finite numbers, physics step by physics step."""
 
@@ -255,6 +322,7 @@ Command = (
     Annotated[SimCommand, tyro.conf.subcommand("sim")]
     | Annotated[PhysicsCommand, tyro.conf.subcommand("physics")]
     | Annotated[DepthCommand, tyro.conf.subcommand("depth")]
+    | Annotated[StudentCommand, tyro.conf.subcommand("student")]
     | Annotated[GapCommand, tyro.conf.subcommand("gap")]
     | Annotated[ReplayCommand, tyro.conf.subcommand("replay")]
 )

@@ -78,12 +78,16 @@ class VoxelEncoder(nn.Module):
         self.final = nn.Linear(2 * cfg.channels[-1], cfg.embedding)
         self.projector = nn.Linear(cfg.embedding, cfg.embedding)
 
-    def forward(self, sites: Sites) -> torch.Tensor:
-        """Embeddings [B, E] of the clouds of ``sites``, which has level 0."""
+    def pooled(self, sites: Sites) -> torch.Tensor:
+        """Largest and mean features of the last stage [B, 2 C], of the clouds of ``sites`` (level 0)."""
         features = self.final.weight.new_full((len(sites), 1), self.feature)
         for stage in self.stages:
             features, sites = stage(features, sites)
-        return torch.relu(self.projector(self.final(global_pool(features, sites))))
+        return global_pool(features, sites)
+
+    def forward(self, sites: Sites) -> torch.Tensor:
+        """Embeddings [B, E] of the clouds of ``sites``, which has level 0."""
+        return torch.relu(self.projector(self.final(self.pooled(sites))))
 
 
 class Student(nn.Module):

@@ -1,0 +1,72 @@
+"""The student's benchmark measures the networks it names, and says what it could not measure."""
+
+import dataclasses
+import json
+import sys
+
+import pytest
+import torch
+
+from vd.assets_usd.objects.model import load_set
+from vd.bench.cli import StudentCommand
+from vd.bench.student import Scenes, measure_training, take_turns
+from vd.bench.student_twins import DenseEncoder, voxels_per_cell
+from vd.student.cfg import LEAN
+from vd.student.clouds import Voxeliser
+
+
+@pytest.fixture
+def threads():
+    """Put the number of threads back that a benchmark changes."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+def test_latency_row_and_what_is_missing(monkeypatch, tmp_path, capsys, threads):
+    monkeypatch.setitem(sys.modules, "spconv", None)
+    monkeypatch.setitem(sys.modules, "spconv.pytorch", None)
+    out = tmp_path / "rows.json"
+    StudentCommand(networks=("lean",), objects=("cube",), hand="dclaw3", calls=2, threads=1, json=out).run()
+    (row,) = json.loads(out.read_text())["latency"]
+    assert row["points"] == 500 + 12 * 500 + 6000
+    assert 1000 < row["voxels"] < row["points"]
+    assert row["sites"] == sorted(row["sites"], reverse=True) and len(row["sites"]) == 5
+    assert 0.0 < row["median_ms"] <= row["p99_ms"]
+    assert set(row["encoder_ms"]) == {"ours", "dense"}
+    assert "spconv" in row["missing"]
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["network"] == "lean"
+
+
+def test_training_row(device):
+    row = measure_training(load_set("cube"), "lean", device, hand="dclaw3", worlds=2, steps=2, calls=1)
+    assert row.clouds == 4 and 1000 < row.voxels < 7000
+    assert set(row.parts_ms) == {"points", "voxels", "maps", "forward", "backward"}
+    # parts are of the minibatch alone, and nothing of it is left out
+    assert sum(row.parts_ms.values()) == pytest.approx(1e3 * row.clouds / row.clouds_per_s, rel=0.2)
+    assert row.act_clouds_per_s > 0.0
+
+
+def test_dense_twin_has_the_encoders_layers(device):
+    """As many weights as the encoder's convolutions and norms have, and pooled features of the same width."""
+    cfg = dataclasses.replace(LEAN.encoder, channels=(4, 8), blocks=1)
+    scenes = Scenes(load_set("cube"), "dclaw3", 1, device, 0)
+    scenes.write()
+    sites = Voxeliser(device=device)(scenes.points)
+    twin = DenseEncoder(cfg).to(sites.device).eval()
+    assert voxels_per_cell(cfg) == 8
+    assert twin(sites).shape == (1, 16)
+    sparse = sum(p.numel() for stage in twin.stages for p in stage.parameters())
+    assert sparse == 27 * (4 + 4 * 8 + 2 * 16 + 2 * 64) + 2 * (4 + 8 + 2 * 4 + 2 * 8)
+
+
+def test_turns_are_taken():
+    order = []
+    times = take_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3)
+    assert order[:4] == ["a", "b", "a", "b"]
+    assert {name: len(values) for name, values in times.items()} == {"a": 3, "b": 3}
+
+
+def test_refuses_an_unknown_network():
+    with pytest.raises(ValueError, match="paper"):
+        StudentCommand(networks=("fat",)).run()
