@@ -22,6 +22,7 @@ from vd.bench.student_twins import DenseEncoder, SpconvEncoder
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
+from vd.sensors.depth_cloud import CameraCloud
 from vd.sim.scene import hand_mount
 from vd.student.cfg import PRESETS, NoiseCfg
 from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
@@ -105,8 +106,10 @@ class ControlStep:
         """Render the depth image of a scene, and prepare everything that does not change."""
         scene, state = bench_scene(objects, 1, hand_name, "cpu", seed)
         body_q = state.body_q.reshape((1, -1))
-        self.camera = DepthCamera.of_scene(scene, body_q, DepthCameraCfg())
-        self.camera.capture()
+        camera = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(points=0))
+        camera.capture()
+        self.image = camera.depth.numpy()[0]
+        self.camera = CameraCloud(scene.hand.camera)
         self.net = net
         self.joint_q = wp.zeros((1, scene.hand.num_joints), dtype=float, device="cpu")
         self.measured_q = state.joint_q.numpy()[None, : scene.hand.num_joints].copy()
@@ -123,7 +126,7 @@ class ControlStep:
             world_scale=scene.world_scale,
             device="cpu",
         )
-        size = self.clouds.item.start + self.camera.points.shape[1]
+        size = self.clouds.item.start + self.camera.cloud.points.shape[1]
         self.points = wp.empty((1, size), dtype=wp.vec3, device="cpu")
         self.voxelise = Voxeliser(net.cfg.voxel_m)
         self.previous = torch.zeros(1, net.num_actions)
@@ -132,8 +135,8 @@ class ControlStep:
 
     def camera_points(self) -> None:
         """Depth image to points."""
-        self.camera.make_clouds()
-        wp.copy(self.points[:, self.clouds.item.start :], self.camera.points)
+        points, _ = self.camera.make(self.image)
+        wp.copy(self.points[:, self.clouds.item.start :], points)
 
     def model_points(self) -> None:
         """Joint positions to the points of hand and goal."""
