@@ -335,3 +335,17 @@ def test_a_real_cameras_image_makes_the_same_cloud(device, scenes):
     np.testing.assert_allclose(host(points)[0], host(simulated.points)[0], atol=1e-6)
     with pytest.raises(ValueError, match="resample"):
         real.make(np.zeros((90, 160)))
+
+
+def test_a_camera_goes_on_where_another_stopped(device, scenes):
+    scene, state = scenes(device)
+    settings = {"sensor": DepthSensorCfg.realistic(), "latency_s": (0.05, 0.1), "points": 300}
+    one, other = make(scene, state, **settings), make(scene, state, **settings)
+    for _ in range(3):
+        one.capture()
+    for name, array in other.stateful().items():
+        array.assign(host(one.stateful()[name]))
+    for camera in (one, other):
+        camera.capture()
+    np.testing.assert_array_equal(host(other.depth), host(one.depth))
+    np.testing.assert_array_equal(host(other.points), host(one.points))

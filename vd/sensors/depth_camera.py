@@ -98,7 +98,8 @@ class DepthCamera:
         def empty(*shape: int, dtype: type = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self.views = make_views(camera, 1.0 + cfg.focal_noise * generator.standard_normal(n), device)
+        focal_scale = 1.0 + cfg.focal_noise * np.asarray(generator.standard_normal(n))
+        self.views = make_views(camera, focal_scale, device)
         """Focal lengths, principal point [pixel] and range [m] of each camera, shape [N]."""
         self.extrinsics = wp.array(_extrinsics(camera, generator, cfg, n), dtype=wp.transform, device=device)
         """Optical frame of each camera in the frame of the body that carries it, shape [N]."""
@@ -172,6 +173,13 @@ class DepthCamera:
         if mask is None:
             mask = wp.ones(self.num_worlds, dtype=wp.int32, device=self.device)
         self._launch(forget_poses_kernel, self.body_q.shape, [mask, self.body_q], [self._history])
+
+    def stateful(self) -> dict[str, wp.array]:
+        """What another camera of the same settings and seed needs to go on as this one would."""
+        state = {"rng": self.rng, "extrinsics": self.extrinsics, "delay": self.delay, "table": self.table}
+        if self._history is not None:
+            state |= {"history": self._history, "frame": self._frame}
+        return state
 
     def capture(self) -> None:
         """Take an image in every world and make its cloud. Launches only; nothing reaches the host."""
