@@ -10,9 +10,11 @@ import torch
 from vd.assets_usd.objects.model import load_set
 from vd.bench.cli import StudentCommand
 from vd.bench.student import Scenes, measure_training, take_turns
-from vd.bench.student_twins import DenseEncoder, voxels_per_cell
+from vd.bench.student_twins import DenseEncoder, scattered, voxels_per_cell
 from vd.student.cfg import LEAN
 from vd.student.clouds import Voxeliser
+from vd.student.network import VoxelEncoder
+from vd.student.sparse import SparseConv3d
 
 
 @pytest.fixture
@@ -33,7 +35,8 @@ def test_latency_row_and_what_is_missing(monkeypatch, tmp_path, capsys, threads)
     assert 1000 < row["voxels"] < 500 + 12 * 500
     assert row["sites"] == sorted(row["sites"], reverse=True) and len(row["sites"]) == 5
     assert 0.0 < row["median_ms"] <= row["p99_ms"]
-    assert set(row["encoder_ms"]) == {"ours", "dense"}
+    assert set(row["encoder_ms"]) == set(row["encoder_cpu_ms"]) == {"ours", "per offset", "dense"}
+    assert row["cpu_ms"] > 0.0
     assert "spconv" in row["missing"]
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["network"] == "lean"
 
@@ -60,11 +63,24 @@ def test_dense_twin_has_the_encoders_layers(device):
     assert sparse == 27 * (4 + 4 * 8 + 2 * 16 + 2 * 64) + 2 * (4 + 8 + 2 * 4 + 2 * 8)
 
 
+def test_scattered_twin_gives_the_same_features(device):
+    scenes = Scenes(load_set("cube"), "dclaw3", 2, device, 0)
+    scenes.write()
+    sites = Voxeliser(device=device)(scenes.points)
+    torch.manual_seed(0)
+    cfg = dataclasses.replace(LEAN.encoder, channels=(4, 8), blocks=1)
+    encoder = VoxelEncoder(cfg).to(sites.device).eval()
+    with torch.inference_mode():
+        expected, twin = encoder.pooled(sites), scattered(encoder)
+        torch.testing.assert_close(twin.pooled(sites), expected, atol=1e-5, rtol=1e-5)
+    assert not any(type(module) is SparseConv3d for module in twin.modules())
+
+
 def test_turns_are_taken():
     order = []
     times = take_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, 3)
     assert order[:4] == ["a", "b", "a", "b"]
-    assert {name: len(values) for name, values in times.items()} == {"a": 3, "b": 3}
+    assert {name: values.shape for name, values in times.items()} == {"a": (3, 2), "b": (3, 2)}
 
 
 def test_refuses_an_unknown_network():

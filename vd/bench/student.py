@@ -9,6 +9,7 @@ sequences: points, voxels, maps, forward and backward; simulation and optimiser 
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ import warp as wp
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.bench.depth import JOINT_SPREAD_RAD, OBJECT_HEIGHT_M, bench_scene
-from vd.bench.student_twins import DenseEncoder, SpconvEncoder
+from vd.bench.student_twins import DenseEncoder, SpconvEncoder, scattered
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
@@ -55,12 +56,14 @@ class LatencyRow:
     """Depth image and joint positions to action."""
     p99_ms: float = 0.0
     """The same, the 99th percentile."""
+    cpu_ms: float = 0.0
+    """The same, processor time of all threads, median: other programs on the machine do not lengthen it."""
     parts_ms: dict[str, float] = field(default_factory=dict)
     """Medians of its parts."""
     encoder_ms: dict[str, float] = field(default_factory=dict)
-    """Voxels to pooled features, maps included: ours, dense, and spconv's; medians."""
-    encoder_p99_ms: dict[str, float] = field(default_factory=dict)
-    """The same, the 99th percentiles."""
+    """Voxels to pooled features, maps included: ours, the others of ``student_twins``; medians."""
+    encoder_cpu_ms: dict[str, float] = field(default_factory=dict)
+    """The same, processor time of all threads."""
     missing: str = ""
     """What could not be measured, and why."""
 
@@ -88,14 +91,14 @@ class TrainingRow:
 
 
 def take_turns(functions: dict[str, Callable[[], Any]], calls: int) -> dict[str, np.ndarray]:
-    """Times [ms] of ``calls`` calls of each function, called in turn."""
-    times: dict[str, list[float]] = {name: [] for name in functions}
+    """Wall and processor time [ms] of ``calls`` calls of each function, called in turn; each [calls, 2]."""
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in functions}
     for call in range(calls + WARM_UP):
         for name, function in functions.items():
-            start = time.perf_counter()
+            wall, busy = time.perf_counter(), time.process_time()
             function()
             if call >= WARM_UP:
-                times[name].append(1e3 * (time.perf_counter() - start))
+                times[name].append((1e3 * (time.perf_counter() - wall), 1e3 * (time.process_time() - busy)))
     return {name: np.array(values) for name, values in times.items()}
 
 
@@ -198,10 +201,13 @@ def measure_latency(
             twins["spconv"] = SpconvEncoder(net.cfg.encoder).eval()
         except ImportError as error:
             missing = f"spconv is not installed ({error})"
+        # Fresh sites each time: their maps are part of the work.
+        offsets = scattered(net.encoder)
         encoders: dict[str, Callable[[], Any]] = {
-            "ours": lambda: net.encoder.pooled(Sites(sites.keys, sites.clouds))
+            "ours": lambda: net.encoder.pooled(Sites(sites.keys, sites.clouds)),
+            "per offset": lambda: offsets.pooled(Sites(sites.keys, sites.clouds)),
         }
-        encoders |= {name: (lambda twin=twin: twin(sites)) for name, twin in twins.items()}
+        encoders |= {name: partial(twin, sites) for name, twin in twins.items()}
         beside = take_turns(encoders, max(WARM_UP, calls // 10))
         parts = take_turns(
             {
@@ -224,11 +230,12 @@ def measure_latency(
         points=step.points.shape[1],
         voxels=len(sites),
         sites=tuple(levels),
-        median_ms=float(np.median(whole)),
-        p99_ms=float(np.percentile(whole, 99)),
-        parts_ms={name: float(np.median(times)) for name, times in parts.items()},
-        encoder_ms={name: float(np.median(times)) for name, times in beside.items()},
-        encoder_p99_ms={name: float(np.percentile(times, 99)) for name, times in beside.items()},
+        median_ms=float(np.median(whole[:, 0])),
+        p99_ms=float(np.percentile(whole[:, 0], 99)),
+        cpu_ms=float(np.median(whole[:, 1])),
+        parts_ms={name: float(np.median(times[:, 0])) for name, times in parts.items()},
+        encoder_ms={name: float(np.median(times[:, 0])) for name, times in beside.items()},
+        encoder_cpu_ms={name: float(np.median(times[:, 1])) for name, times in beside.items()},
         missing=missing,
     )
 

@@ -1,15 +1,45 @@
-"""The student's encoder on other convolutions, for its benchmark: dense ones, and spconv's if installed.
+"""The student's encoder on other convolutions, for its benchmark.
 
-Weights are random and the sums differ; what is compared is the time of the same layers on the same cloud.
+A product for each offset with scattered sums, dense grids, and spconv's layers if installed. What is
+compared is the time of the same layers on the same cloud; the last two have random weights of their own.
 """
 
+import copy
 from typing import Any
 
 import torch
 from torch import nn
 
 from vd.student.cfg import EncoderCfg
+from vd.student.network import VoxelEncoder
 from vd.student.sites import Sites
+from vd.student.sparse import SparseConv3d
+
+
+class ScatteredConv3d(SparseConv3d):
+    """The same sums the other way: for each offset gather its inputs, multiply, and add to its outputs."""
+
+    def forward(self, features: torch.Tensor, sites: Sites) -> torch.Tensor:
+        """As :class:`SparseConv3d`."""
+        table = sites.strided if self.stride == 2 else sites.neighbours
+        pairs = getattr(table, "pairs", None)
+        if pairs is None:
+            rows = [(column < len(sites)).nonzero().flatten() for column in table.t()]
+            pairs = [(row, table[row, k].long()) for k, row in enumerate(rows)]
+            table.pairs = pairs  # type: ignore[attr-defined]  # kept with the map, as its users share it
+        output = features.new_zeros((table.shape[0], self.weight.shape[2]))
+        for k, (row, source) in enumerate(pairs):
+            output.index_add_(0, row, features.index_select(0, source) @ self.weight[k])
+        return output
+
+
+def scattered(encoder: VoxelEncoder) -> VoxelEncoder:
+    """A copy of an encoder with :class:`ScatteredConv3d`."""
+    twin = copy.deepcopy(encoder)
+    for module in twin.modules():
+        if isinstance(module, SparseConv3d):
+            module.__class__ = ScatteredConv3d
+    return twin
 
 
 def voxels_per_cell(cfg: EncoderCfg) -> int:
