@@ -160,6 +160,8 @@ class StudentCommand:
     """Device of the training rows: auto is the first GPU, none without one; cpu for a few clouds there."""
     threads: int = 2
     """Threads of torch for the latency on the CPU."""
+    half: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Encoder in bfloat16 for the latency: for processors that multiply in it."""
     calls: int = 300
     """Control steps to time; 0 leaves the latency out."""
     worlds: tuple[int, ...] = (10, 40)
@@ -196,7 +198,13 @@ class StudentCommand:
             add(
                 "latency",
                 measure_latency(
-                    objects, name, hand=self.hand, threads=self.threads, calls=self.calls, seed=self.seed
+                    objects,
+                    name,
+                    hand=self.hand,
+                    threads=self.threads,
+                    half=self.half,
+                    calls=self.calls,
+                    seed=self.seed,
                 ),
             )
         training = device != "cpu" or self.device == "cpu"

@@ -44,6 +44,8 @@ class LatencyRow:
     """Preset."""
     parameters: int
     """Numbers in the network."""
+    precision: str
+    """Of the encoder: float32 or bfloat16."""
     threads: int
     """Threads of torch; our kernels use one."""
     points: int
@@ -174,6 +176,7 @@ def measure_latency(
     *,
     hand: str = "dclaw4",
     threads: int = 2,
+    half: bool = False,
     calls: int = 300,
     seed: int = 0,
 ) -> LatencyRow:
@@ -184,12 +187,16 @@ def measure_latency(
         network: Preset.
         hand: Hand.
         threads: Threads of torch.
+        half: Encoder in bfloat16; the others it is timed beside stay in float32.
         calls: Control steps to time.
         seed: Of poses and weights.
     """
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     net = Student(PRESETS[network], load_hand(hand).num_joints).eval()
+    offsets = scattered(net.encoder)
+    if half:
+        net.encoder.bfloat16()
     with torch.inference_mode():
         step = ControlStep(objects, hand, net, seed)
         step()
@@ -202,7 +209,6 @@ def measure_latency(
         except ImportError as error:
             missing = f"spconv is not installed ({error})"
         # Fresh sites each time: their maps are part of the work.
-        offsets = scattered(net.encoder)
         encoders: dict[str, Callable[[], Any]] = {
             "ours": lambda: net.encoder.pooled(Sites(sites.keys, sites.clouds)),
             "per offset": lambda: offsets.pooled(Sites(sites.keys, sites.clouds)),
@@ -226,6 +232,7 @@ def measure_latency(
     return LatencyRow(
         network=network,
         parameters=sum(parameter.numel() for parameter in net.parameters()),
+        precision="bfloat16" if half else "float32",
         threads=threads,
         points=step.points.shape[1],
         voxels=len(sites),

@@ -65,7 +65,10 @@ class EncoderStage(nn.Module):
 
 
 class VoxelEncoder(nn.Module):
-    """Occupied voxels to one embedding of each cloud: stages, global max and mean, two linear layers."""
+    """Occupied voxels to one embedding of each cloud: stages, global max and mean, two linear layers.
+
+    ``encoder.bfloat16()`` halves the time on a processor that multiplies in that precision.
+    """
 
     def __init__(self, cfg: EncoderCfg):
         super().__init__()
@@ -83,7 +86,7 @@ class VoxelEncoder(nn.Module):
         features = self.final.weight.new_full((len(sites), 1), self.feature)
         for stage in self.stages:
             features, sites = stage(features, sites)
-        return global_pool(features, sites)
+        return global_pool(features, sites).to(self.final.weight.dtype)
 
     def forward(self, sites: Sites) -> torch.Tensor:
         """Embeddings [B, E] of the clouds of ``sites``, which has level 0."""
@@ -155,10 +158,13 @@ class Student(nn.Module):
                 f"a student with goal = {self.cfg.goal!r} takes "
                 + ("scene and goal voxels" if goal is None else "the voxels of scene and goal as one cloud")
             )
-        embedding = self.encoder(scene)
+        # The encoders may be of lower precision than the rest.
+        precision = self.mean.weight.dtype
+        embedding = self.encoder(scene).to(precision)
         if self.goal_encoder is None or self.merge_goal is None or goal is None:
             return embedding
-        return torch.relu(self.merge_goal(torch.cat([embedding, self.goal_encoder(goal)], dim=-1)))
+        both = torch.cat([embedding, self.goal_encoder(goal).to(precision)], dim=-1)
+        return torch.relu(self.merge_goal(both))
 
     def forward(
         self,
