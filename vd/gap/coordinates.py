@@ -21,6 +21,10 @@ SECONDS_SCALE = 0.02
 """Scale of delays [s]: with ``LINEAR_STEP`` a step of 2 ms, above the time step of the rollouts."""
 SLOWING = ("torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag", "acceleration_limit")
 """Effects whose work a speed limit does in part."""
+SMOOTHING = ("command_filter", "elastic_transmission")
+"""Effects whose work a free inertia does in part: a lag is a lag, on which side of the motor it is."""
+LIGHT = 0.1
+"""An inertia that does none of it, in fitted ones."""
 FREE_SPEED = 3.0
 """A speed limit that does not bind, in largest speeds."""
 FLATTEST = 1e-3
@@ -205,4 +209,6 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
     if effect in SLOWING:
         # The baseline's speed limit took the effect's place: let go of it as well.
         starts += [{**start, "velocity_limit": FREE_SPEED * speed} for start in starts]
+    if effect in SMOOTHING:
+        starts += [{**start, "inertia": LIGHT * scales.inertia} for start in starts]
     return starts

@@ -466,6 +466,8 @@ class JointProblem:
         rows = np.repeat(fit.rows[None], len(starts), axis=0)
         for i, start in enumerate(starts):
             for key, value in start.items():
+                if "." not in key and key not in self.baseline:
+                    continue  # not free in this chain
                 rows[i, self.joint, coordinate(key, scales).column] = value
         change = residual - self.residuals(rows)
         change -= (change @ basis.T) @ basis
