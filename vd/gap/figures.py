@@ -231,7 +231,8 @@ def chosen_overlays(report: Report, curves: Predictions) -> list[tuple[str, int]
 
 
 def _best(rows: list[Candidate]) -> list[Candidate]:
-    return sorted(rows, key=lambda row: -row.gain if math.isfinite(row.gain) else math.inf)[:MAX_BARS]
+    fitted = [row for row in rows if math.isfinite(row.gain)] or rows
+    return sorted(fitted, key=lambda row: -row.gain if math.isfinite(row.gain) else math.inf)[:MAX_BARS]
 
 
 def _lower_limit(group: list[Candidate]) -> float:

@@ -70,6 +70,7 @@ class JointFit:
         step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
         structure: Sum of products of successive residuals in motion, and their number, of each trajectory
             [2, S] [rad^2]: zero on average if only noise is left; None where not estimated.
+        extents: 95 % intervals by key, of parameters for which the matrices do not give them.
     """
 
     effects: tuple[str, ...]
@@ -83,6 +84,7 @@ class JointFit:
     gradient: np.ndarray
     step_error: np.ndarray | None = None
     structure: np.ndarray | None = None
+    extents: Mapping[str, tuple[float, float]] | None = None
 
     @property
     def values(self) -> dict[str, float]:

@@ -30,10 +30,17 @@ LARGEST = 2.0
 DAMPING = 1e-4
 TRUST = 0.5
 """Largest shift of a coordinate of the rest of the model in a round."""
-EVALUATIONS = 40
+EVALUATIONS = 30
 STEP = 0.1
 """Relative step of the finite differences of the likelihood: above the error of the draws."""
 LEAST_DROP = 1e-4
+FACTORS = {"sigma": (0.5, 0.71, 0.85, 1.0, 1.18, 1.41, 2.0), "drop": (0.1, 0.4, 1.0, 2.5, 6.0)}
+"""Multiples of the best values at which the likelihood is looked at for their intervals."""
+NOT_WORSE = 2.0
+"""A pair of values is within the intervals if its likelihood is not worse, by this many standard
+deviations over the trajectories: within one, samples say the same thing over and over."""
+SURE = 1.92
+"""Loss of log-likelihood at the 95 % interval of one parameter, if all samples counted."""
 
 
 class JitterFit:
@@ -117,6 +124,37 @@ class JitterFit:
             self._move(self.shift)
         return self._result(sigma, drop)
 
+    def _extents(self, sigma: float, drop: float, here: np.ndarray) -> dict[str, tuple[float, float]]:
+        """Intervals of both parameters: the values of the pairs that the trajectories do not reject.
+
+        Delays and losses stand in for each other in part, so that the pairs are what is judged; each end
+        is half way to the first value that is rejected with every other.
+        """
+        sigmas = [sigma * f for f in FACTORS["sigma"]]
+        drops = [max(drop, LEAST_DROP) * f for f in FACTORS["drop"]]
+        kept = np.zeros((len(sigmas), len(drops)), bool)
+        for i, one in enumerate(sigmas):
+            for k, other in enumerate(drops):
+                pair = self._limited(one, other)
+                worse = self.losses(*pair) - here
+                spread = np.sqrt(len(worse)) * float(np.std(worse, ddof=1)) if len(worse) > 1 else 0.0
+                kept[i, k] = float(worse.sum()) < SURE + NOT_WORSE * spread
+        kept[FACTORS["sigma"].index(1.0), FACTORS["drop"].index(1.0)] = True
+        ranges = {}
+        for name, values, inside in (
+            ("sigma_s", sigmas, kept.any(axis=1)),
+            ("p_drop", drops, kept.any(axis=0)),
+        ):
+            first, last = int(np.flatnonzero(inside)[0]), int(np.flatnonzero(inside)[-1])
+            low = np.sqrt(values[first] * values[first - 1]) if first > 0 else 0.0
+            high = np.sqrt(values[last] * values[last + 1]) if last + 1 < len(values) else 2.0 * values[last]
+            ranges[f"command_jitter.{name}"] = float(low), float(high)
+        return ranges
+
+    def _limited(self, sigma: float, drop: float) -> tuple[float, float]:
+        limits = [float(c.value(c.upper)) for c in self.coordinates]
+        return min(sigma, limits[0]), min(drop, limits[1])
+
     def _move(self, shift: np.ndarray) -> None:
         """Take the shift of the rest of the model, and linearise it there."""
         x = self.base.x.copy()
@@ -128,9 +166,8 @@ class JitterFit:
         self.jacobian = self.problem.jacobian(self.base)[self.keep]
 
     def _values(self, x: np.ndarray) -> tuple[float, float]:
-        limits = [c.value(c.upper) for c in self.coordinates]
-        sigma, drop = (min(float(np.exp(v)), float(limit)) for v, limit in zip(x, limits, strict=True))
-        return sigma, drop
+        sigma, drop = (float(v) for v in np.exp(x))
+        return self._limited(sigma, drop)
 
     def _result(self, sigma: float, drop: float) -> JointFit:
         """Equivalent errors, and the likelihood's curvature in the place of the Gauss-Newton matrices."""
@@ -169,6 +206,7 @@ class JitterFit:
             count=count,
             gram=gram,
             gradient=gradient,
+            extents=self._extents(sigma, drop, here),
         )
 
 

@@ -368,7 +368,7 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
     for c, x, w in zip(fit.coordinates, fit.x, width, strict=True):
         low, high = max(x - w, c.lower), min(x + w, c.upper)
         result[c.key] = float(c.value(low)), float(c.value(high))
-    return result
+    return {**result, **(fit.extents or {})}
 
 
 def share(explanations: Sequence[Explanation], floors: Sequence[float]) -> list[Explanation]:

@@ -236,7 +236,9 @@ def _models(
             base[index, parameter.column] = parameter.neutral
     for name in group:
         found = [
-            row for row in report.evidence if row.name == name and joint in row.joints and not row.placebo
+            row
+            for row in report.evidence
+            if row.name == name and joint in row.joints and row.parameters and not row.placebo
         ]
         values = {p.column: p.typical for p in EFFECTS[name].parameters}
         for row in found[-1:]:  # the last round is the one in which it is in question

@@ -74,6 +74,8 @@ class Selection(Judge):
     seed: int = 0
     vetoes: Mapping[str, str] = field(default_factory=dict)
     report: Callable[[str], None] = lambda line: None
+    promised: dict[str, float] = field(default_factory=dict)
+    """Share of the squared error that each candidate of the last round could remove at best."""
 
     def explain(self, baseline: JointFit) -> Explanation:
         """Select effects, starting from the fitted baseline."""
@@ -91,7 +93,7 @@ class Selection(Judge):
         trials = self.contradicted(baseline)
         present, rivals, rows = self.search(baseline, baseline)
         trials += rows
-        first = {t.name: t.fit for t in rows if t.round == 1 and not t.placebo}
+        first = {t.name: t.fit for t in rows if t.round == 1 and not t.placebo and np.isfinite(t.gain)}
         for name in sorted(first, key=lambda n: first[n].rmse):
             near = NO_GAP * self.floor < present.held_out_rmse < NEAR * self.floor
             if present.effects and not near:
@@ -155,6 +157,22 @@ class Selection(Judge):
                 break
         return present, rivals, trials
 
+    def screened_out(self, number: int, before: JointFit, fits: Mapping[str, JointFit]) -> list[Trial]:
+        """The rows of candidates that promised too little to be fitted in a round."""
+        unknown = float("nan")
+        return [
+            Trial(
+                number,
+                name,
+                replace(before, held_out=before.held_out * unknown),
+                unknown,
+                (unknown, unknown),
+                reason=f"screened out: promised {100.0 * max(promise, 0.0):.0f} % of the squared error",
+            )
+            for name, promise in sorted(self.promised.items(), key=lambda item: -item[1])
+            if name not in fits
+        ]
+
     def contradicted(self, baseline: JointFit) -> list[Trial]:
         """The rows of candidates that telemetry rules out."""
         unknown = float("nan"), float("nan")
@@ -186,6 +204,7 @@ class Selection(Judge):
             best = self.winner(list(fits.values()))
             accepted, why = self.better(present, best, SEARCH_TAIL)
             trials += self.judge(number, present, fits, best, accepted, why)
+            trials += self.screened_out(number, present, fits)
             if not accepted:
                 break
             name, before, after = best.effects[-1], present.held_out_rmse, best.held_out_rmse
@@ -207,6 +226,9 @@ class Selection(Judge):
         promise = self.run(
             [("promise", {"fit": present, "starts": [s for _, s in flat], "scales": self.scales})]
         )[0]
+        self.promised = {
+            name: max(float(promise[i]) for i, (own, _) in enumerate(flat) if own == name) for name in names
+        }
         order: dict[str, list[int]] = {name: [] for name in names}
         for i in np.argsort(-promise):
             order[flat[i][0]].append(int(i))
