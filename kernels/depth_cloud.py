@@ -1,13 +1,13 @@
 """From a depth image to a point cloud: crop by height, choose a fixed number of points, carry to the base.
 
-The points of a cell image (:mod:`vd.kernels.raycast`): the image's own pixels, or one of each block.
+Its points are those of the cells: the image's own pixels, or one of each block.
 Launch order: ``crop_cells_kernel``, ``count_points_kernel``, ``choose_points_kernel``.
 """
 
 import warp as wp
 
-from vd.kernels.depth_views import View, pixel_direction
-from vd.kernels.raycast import TILE_CELLS, TILE_COLUMNS, TILE_ROWS, cell_pixel
+from vd.kernels.depth_views import View, cell_pixel, pixel_direction
+from vd.kernels.raycast import TILE_CELLS, TILE_COLUMNS, TILE_ROWS
 from vd.kernels.rng import next_stream
 
 wp.set_module_options({"enable_backward": False})

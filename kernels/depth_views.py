@@ -1,8 +1,11 @@
-"""Where meshes and cameras are: the first step of a depth image, shared by ray casting and rasterisation.
+"""What ray casting and rasterisation share: where meshes and cameras are, and the table.
 
 Frames: *optical* is the camera's (x right, y down, z forward); depth is z of that frame, along the optical
 axis, not along the ray. Pixel (column, row) is seen along its centre, (column + 0.5, row + 0.5); the
 principal point is measured from the top left corner of the image. Metres, quaternions xyzw.
+
+Depth is found for *cells*: square blocks of pixels, of which one is looked at. Blocks of one pixel give the
+image; larger ones give a random pixel of each block, which can be all that a point cloud needs.
 """
 
 import warp as wp
@@ -42,6 +45,27 @@ def pixel_direction(view: View, column: int, row: int) -> wp.vec3:
         (float(row) + 0.5 - view.cy) / view.fy,
         1.0,
     )
+
+
+@wp.func
+def cell_pixel(seed: wp.uint32, row: int, column: int, columns: int, block: int, height: int, width: int):
+    """Pixel ``(row, column)`` through which a cell's ray goes: its only one, or a random one of its block.
+
+    Args:
+        seed: Random state of the world in this frame; the same state gives the same pixel.
+        row: Row of the cell.
+        column: Column of the cell.
+        columns: Cells in a row.
+        block: Pixels on a side of a cell.
+        height: Rows of the image.
+        width: Columns of the image.
+    """
+    if block == 1:
+        return row, column
+    rng = wp.rand_init(int(seed), row * columns + column)
+    pixel_row = row * block + wp.randi(rng, 0, wp.min(block, height - row * block))
+    pixel_column = column * block + wp.randi(rng, 0, wp.min(block, width - column * block))
+    return pixel_row, pixel_column
 
 
 @wp.func
@@ -163,3 +187,52 @@ def place_meshes_kernel(
     position_out[world, shape] = wp.transform_get_translation(pose)
     window_out[world, shape] = window
     nearest_out[world, shape] = wp.max(nearest, 0.0)
+
+
+@wp.kernel
+def finish_depth_kernel(
+    # Model:
+    views: wp.array[View],
+    table_lower: wp.vec3,
+    table_upper: wp.vec3,
+    height: int,
+    width: int,
+    block: int,
+    lanes: int,
+    # In:
+    table_in: wp.array[int],
+    camera_q_in: wp.array[wp.transform],
+    rng_in: wp.array[wp.uint32],
+    # In/Out:
+    depth: wp.array3d[float],
+):
+    """Add the table, and write 0 where nothing is within the camera's range. Launch: [N, R, lanes].
+
+    Args:
+        views: Camera of each world, shape [N].
+        table_lower: Lower corner of the table in the world frame [m].
+        table_upper: Upper corner [m].
+        height: Rows of the image.
+        width: Columns of the image.
+        block: Pixels on a side of a cell.
+        lanes: Threads of a row.
+        table_in: Whether the table is there, shape [N].
+        camera_q_in: Optical frames in the world frame, shape [N].
+        rng_in: Random state of each world, shape [N]; not advanced.
+        depth: Depth of the nearest mesh along the optical axis [m], then of anything, shape [N, R, C].
+    """
+    world, row, lane = wp.tid()
+    view = views[world]
+    camera_q = camera_q_in[world]
+    eye = wp.transform_get_translation(camera_q)
+    rotation = wp.quat_to_matrix(wp.transform_get_rotation(camera_q))
+    columns = depth.shape[2]
+    for column in range(lane, columns, lanes):
+        best = depth[world, row, column]
+        if table_in[world] != 0:
+            pixel_row, pixel_column = cell_pixel(rng_in[world], row, column, columns, block, height, width)
+            direction = rotation * pixel_direction(view, pixel_column, pixel_row)
+            best = wp.min(best, box_depth(eye, direction, table_lower, table_upper))
+        if best < view.near or best > view.far:
+            best = EMPTY
+        depth[world, row, column] = best

@@ -4,13 +4,13 @@ The same image as :mod:`vd.kernels.raycast`, by turning the loops around: a mesh
 few pixels with each triangle. A pixel is covered if the ray through its centre meets the triangle, tested
 without dividing by depth, so that triangles beside and behind the camera need no clipping.
 
-Launch order: ``place_camera_kernel``, ``place_meshes_kernel`` (:mod:`vd.kernels.depth_views`),
-``depth.fill_(NO_HIT)``, ``rasterise_kernel``, ``finish_depth_kernel``.
+Launch order: ``place_camera_kernel``, ``place_meshes_kernel``, then ``depth.fill_(NO_HIT)``,
+``rasterise_kernel``, and ``finish_depth_kernel`` (:mod:`vd.kernels.depth_views`).
 """
 
 import warp as wp
 
-from vd.kernels.depth_views import EMPTY, View, box_depth, pixel_direction
+from vd.kernels.depth_views import View
 
 wp.set_module_options({"enable_backward": False})
 
@@ -117,6 +117,7 @@ def rasterise_kernel(
         na, nb, nc, normal, offset = -na, -nb, -nc, -normal, -offset
     nearest = wp.min(a[2], wp.min(b[2], c[2]))
     farthest = wp.max(a[2], wp.max(b[2], c[2]))
+    across = 1.0 / view.fx
     for row in range(top, bottom):
         # Along a row the direction is (x, y, 1) with x alone changing.
         y = (float(row) + 0.5 - view.cy) / view.fy
@@ -125,49 +126,10 @@ def rasterise_kernel(
         kc = nc[1] * y + nc[2]
         kn = normal[1] * y + normal[2]
         for column in range(left, right):
-            x = (float(column) + 0.5 - view.cx) / view.fx
+            x = (float(column) + 0.5 - view.cx) * across
             if na[0] * x + ka >= 0.0 and nb[0] * x + kb >= 0.0 and nc[0] * x + kc >= 0.0:
                 slope = normal[0] * x + kn
                 if slope > 0.0:
                     bits = wp.cast(wp.clamp(offset / slope, nearest, farthest), wp.int32)
                     if bits < depth_bits[world, row, column]:
                         wp.atomic_min(depth_bits, world, row, column, bits)
-
-
-@wp.kernel
-def finish_depth_kernel(
-    # Model:
-    views: wp.array[View],
-    table_lower: wp.vec3,
-    table_upper: wp.vec3,
-    lanes: int,
-    # In:
-    table_in: wp.array[int],
-    camera_q_in: wp.array[wp.transform],
-    # In/Out:
-    depth: wp.array3d[float],
-):
-    """Add the table, and write 0 where nothing is within the camera's range. Launch: [N, H, lanes].
-
-    Args:
-        views: Camera of each world, shape [N].
-        table_lower: Lower corner of the table in the world frame [m].
-        table_upper: Upper corner [m].
-        lanes: Threads of a row.
-        table_in: Whether the table is there, shape [N].
-        camera_q_in: Optical frames in the world frame, shape [N].
-        depth: Depth along the optical axis [m], shape [N, H, W].
-    """
-    world, row, lane = wp.tid()
-    view = views[world]
-    camera_q = camera_q_in[world]
-    eye = wp.transform_get_translation(camera_q)
-    rotation = wp.quat_to_matrix(wp.transform_get_rotation(camera_q))
-    for column in range(lane, depth.shape[2], lanes):
-        best = depth[world, row, column]
-        if table_in[world] != 0:
-            direction = rotation * pixel_direction(view, column, row)
-            best = wp.min(best, box_depth(eye, direction, table_lower, table_upper))
-        if best < view.near or best > view.far:
-            best = EMPTY
-        depth[world, row, column] = best

@@ -1,16 +1,14 @@
 """Depth by ray casting: one ray a pixel against the bounding volume hierarchies of the meshes.
 
-Rays are cast through *cells*: square blocks of pixels, one ray each. Blocks of one pixel give the image;
-larger ones give a random pixel of each block, which is all that a point cloud needs. Cells are gathered
-in tiles, and a tile looks only at meshes whose bounds reach into it, nearest first.
+Cells are gathered in tiles, and a tile looks only at meshes whose bounds reach into it, nearest first.
 
-Launch order: ``place_camera_kernel``, ``place_meshes_kernel`` (:mod:`vd.kernels.depth_views`),
-``order_shapes_kernel``, ``cull_tiles_kernel``, ``raycast_kernel``.
+Launch order: ``place_camera_kernel``, ``place_meshes_kernel``, then ``order_shapes_kernel``,
+``cull_tiles_kernel``, ``raycast_kernel``, and ``finish_depth_kernel`` (:mod:`vd.kernels.depth_views`).
 """
 
 import warp as wp
 
-from vd.kernels.depth_views import EMPTY, NO_HIT, View, box_depth, pixel_direction
+from vd.kernels.depth_views import NO_HIT, View, cell_pixel, pixel_direction
 
 wp.set_module_options({"enable_backward": False})
 
@@ -19,29 +17,12 @@ TILE_ROWS = wp.constant(4)
 TILE_CELLS = wp.constant(32)
 """A tile has one bit of a word, and one thread of a warp, for each of its cells."""
 
+RAY_BLOCK = 128
+"""Threads of a block of rays on a GPU. The search keeps many registers: five such blocks fit a multiprocessor
+of 64 k registers almost without spilling, where two of 256 threads would without the bound."""
+
 MAX_SHAPES = 32
 """Shapes of a world: one bit of a tile's word each."""
-
-
-@wp.func
-def cell_pixel(seed: wp.uint32, row: int, column: int, columns: int, block: int, height: int, width: int):
-    """Pixel ``(row, column)`` through which a cell's ray goes: its only one, or a random one of its block.
-
-    Args:
-        seed: Random state of the world in this frame; the same state gives the same pixel.
-        row: Row of the cell.
-        column: Column of the cell.
-        columns: Cells in a row.
-        block: Pixels on a side of a cell.
-        height: Rows of the image.
-        width: Columns of the image.
-    """
-    if block == 1:
-        return row, column
-    rng = wp.rand_init(int(seed), row * columns + column)
-    pixel_row = row * block + wp.randi(rng, 0, wp.min(block, height - row * block))
-    pixel_column = column * block + wp.randi(rng, 0, wp.min(block, width - column * block))
-    return pixel_row, pixel_column
 
 
 @wp.kernel
@@ -95,23 +76,19 @@ def cull_tiles_kernel(
     tile_shapes_out[world, tile] = word
 
 
-@wp.kernel
+@wp.kernel(launch_bounds=(RAY_BLOCK, 5))
 def raycast_kernel(
     # Model:
     views: wp.array[View],
     mesh_id: wp.array[wp.uint64],
     shape_mesh: wp.array2d[int],
     shape_scale: wp.array2d[float],
-    table_lower: wp.vec3,
-    table_upper: wp.vec3,
     height: int,
     width: int,
     block: int,
     tile_columns: int,
     lanes: int,
     # In:
-    table_in: wp.array[int],
-    camera_q_in: wp.array[wp.transform],
     rotation_in: wp.array2d[wp.mat33],
     position_in: wp.array2d[wp.vec3],
     nearest_in: wp.array2d[float],
@@ -131,29 +108,21 @@ def raycast_kernel(
         mesh_id: Meshes with their hierarchies, shape [M].
         shape_mesh: Mesh of each shape, shape [N, S].
         shape_scale: Size factor of each shape, shape [N, S].
-        table_lower: Lower corner of the table in the world frame [m].
-        table_upper: Upper corner [m].
         height: Rows of the image.
         width: Columns of the image.
         block: Pixels on a side of a cell.
         tile_columns: Tiles in a row of tiles.
         lanes: Threads of a tile, 1 to 32.
-        table_in: Whether the table is there, shape [N].
-        camera_q_in: Optical frames in the world frame, shape [N].
         rotation_in: Rotation from mesh to optical frame, shape [N, S].
         position_in: Origin of the mesh frame in the optical frame [m], shape [N, S].
         nearest_in: Depth that no point of the shape is in front of [m], shape [N, S].
         order_in: Shapes from near to far, shape [N, S].
         tile_shapes_in: Shapes that each tile has to look at, shape [N, T].
         rng_in: Random state of each world, shape [N]; not advanced.
-        depth_out: Depth along the optical axis [m], 0 where there is no surface within the camera's
-            range, shape [N, R, C].
+        depth_out: Depth along the optical axis [m], NO_HIT without a surface, shape [N, R, C].
     """
     world, tile, lane = wp.tid()
     view = views[world]
-    camera_q = camera_q_in[world]
-    eye = wp.transform_get_translation(camera_q)
-    rotation = wp.quat_to_matrix(wp.transform_get_rotation(camera_q))
     rows = depth_out.shape[1]
     columns = depth_out.shape[2]
     first_row = (tile // tile_columns) * TILE_ROWS
@@ -166,8 +135,6 @@ def raycast_kernel(
             pixel_row, pixel_column = cell_pixel(rng_in[world], row, column, columns, block, height, width)
             direction = pixel_direction(view, pixel_column, pixel_row)
             best = wp.float32(NO_HIT)
-            if table_in[world] != 0:
-                best = box_depth(eye, rotation * direction, table_lower, table_upper)
             remaining = word
             rank = wp.int32(0)
             while remaining != wp.uint32(0):
@@ -186,6 +153,4 @@ def raycast_kernel(
                         best = hit.t
                 remaining = remaining >> wp.uint32(1)
                 rank += 1
-            if best < view.near or best > view.far:
-                best = EMPTY
             depth_out[world, row, column] = best

@@ -20,9 +20,9 @@ from vd.kernels.depth_sensor import (
     measure_depth_kernel,
     next_count_kernel,
 )
-from vd.kernels.depth_views import NO_HIT, place_camera_kernel, place_meshes_kernel
-from vd.kernels.rasterise import finish_depth_kernel, rasterise_kernel
-from vd.kernels.raycast import cull_tiles_kernel, order_shapes_kernel, raycast_kernel
+from vd.kernels.depth_views import NO_HIT, finish_depth_kernel, place_camera_kernel, place_meshes_kernel
+from vd.kernels.rasterise import rasterise_kernel
+from vd.kernels.raycast import RAY_BLOCK, cull_tiles_kernel, order_shapes_kernel, raycast_kernel
 from vd.kernels.rng import init_rng_kernel
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
@@ -205,6 +205,22 @@ class DepthCamera:
             self._cast()
         else:
             self._rasterise()
+        self._launch(
+            finish_depth_kernel,
+            (n, self._cloud.rows, self._lanes),
+            [
+                self.views,
+                *self._table,
+                self.height,
+                self.width,
+                self.cfg.block,
+                self._lanes,
+                self.table,
+                self.camera_q,
+                self.rng,
+            ],
+            [self.true_depth],
+        )
         if self.depth is not self.true_depth:
             self._launch(
                 measure_depth_kernel,
@@ -216,8 +232,16 @@ class DepthCamera:
             self._cloud.make(self.depth, self.views, self.camera_q, self.extrinsics, self.rng)
         self._launch(next_frame_kernel, n, [self.rng], [])
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+    def _launch(
+        self,
+        kernel: wp.Kernel,
+        dim: int | tuple[int, ...],
+        inputs: list,
+        outputs: list,
+        *,
+        block_dim: int = 256,
+    ) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
 
     def _late_poses(self) -> wp.array:
         """Body poses that this capture shows."""
@@ -251,14 +275,11 @@ class DepthCamera:
                 surfaces.mesh_id,
                 surfaces.shape_mesh,
                 surfaces.shape_scale,
-                *self._table,
                 self.height,
                 self.width,
                 self.cfg.block,
                 cloud.tile_columns,
                 lanes,
-                self.table,
-                self.camera_q,
                 self._rotation,
                 self._position,
                 self._nearest,
@@ -267,6 +288,7 @@ class DepthCamera:
                 self.rng,
             ],
             [self.true_depth],
+            block_dim=RAY_BLOCK,
         )
 
     def _rasterise(self) -> None:
@@ -289,12 +311,6 @@ class DepthCamera:
                 self._window,
             ],
             [self._depth_bits],
-        )
-        self._launch(
-            finish_depth_kernel,
-            (self.num_worlds, self.height, self._lanes),
-            [self.views, *self._table, self._lanes, self.table, self.camera_q],
-            [self.true_depth],
         )
 
 
