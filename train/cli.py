@@ -1,4 +1,4 @@
-"""Command line of training: ``vd-train teacher``, ``vd-train export``, ``vd-train curves``."""
+"""Command line of training: ``vd-train teacher``, ``student``, ``calibrate``, ``export`` and ``curves``."""
 
 import os
 import sys
@@ -29,6 +29,8 @@ USAGE = """usage: vd-train COMMAND [flags]
 
 commands:
   teacher   train the teacher with PPO           vd-train teacher --preset gpu --run-dir runs/first
+  student   imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
+  calibrate choose when a student stops          vd-train calibrate student.pt --objects SET
   export    write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
             or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
   curves    draw the curves of a run             vd-train curves runs/first
@@ -84,7 +86,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     started = time.monotonic()
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    commands = {"teacher": _teacher, "export": _export, "curves": _curves}
+    commands = {
+        "teacher": _teacher,
+        "student": _student,
+        "calibrate": _calibrate,
+        "export": _export,
+        "curves": _curves,
+    }
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0 if arguments else 2
@@ -115,8 +123,8 @@ def parse_teacher(arguments: Sequence[str]) -> TeacherCfg:
         FileNotFoundError: ``--resume`` names a run without a configuration.
         ValueError: The run's configuration is not one of this version.
     """
-    arguments = _normalise(arguments)
-    preset = _value_of(arguments, "--preset") or "paper"
+    arguments = normalise(arguments, SHORT_FORMS, "env")
+    preset = value_of(arguments, "--preset") or "paper"
     # The second pass refuses an unknown name.
     start = smoke() if "--smoke" in arguments else PRESETS.get(preset, PRESETS["paper"])()
     base = _saved_config(arguments, start) if "--resume" in arguments else start
@@ -241,6 +249,18 @@ def _teacher(arguments: list[str], started: float) -> int:
     return 0
 
 
+def _student(arguments: list[str], started: float) -> int:
+    from vd.train.student.cli import student_command
+
+    return student_command(arguments, started)
+
+
+def _calibrate(arguments: list[str], started: float) -> int:
+    from vd.train.student.cli import calibrate_command
+
+    return calibrate_command(arguments, started)
+
+
 def _export(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(ExportCfg, args=arguments, prog="vd-train export")
 
@@ -268,15 +288,15 @@ def _curves(arguments: list[str], _started: float) -> int:
     return 0
 
 
-def _normalise(arguments: Sequence[str]) -> list[str]:
-    """Spell out short forms, ``--flag=value``, and a bare ``--resume``."""
+def normalise(arguments: Sequence[str], short_forms: Sequence[str], group: str) -> list[str]:
+    """Spell out flags of ``group`` in their short forms, ``--flag=value``, and a bare ``--resume``."""
     result: list[str] = []
     for argument in arguments:
         flag, equals, value = argument.partition("=")
         if argument.startswith("--"):
             flag = flag.replace("_", "-")
-            if flag.removeprefix("--") in SHORT_FORMS:
-                flag = f"--env.{flag.removeprefix('--')}"
+            if flag.removeprefix("--") in short_forms:
+                flag = f"--{group}.{flag.removeprefix('--')}"
             result += [flag, value] if equals else [flag]
         else:
             result.append(argument)
@@ -287,7 +307,7 @@ def _normalise(arguments: Sequence[str]) -> list[str]:
     return result
 
 
-def _value_of(arguments: list[str], flag: str) -> str | None:
+def value_of(arguments: list[str], flag: str) -> str | None:
     """Value after the last ``flag``, or ``None``."""
     places = [index for index, argument in enumerate(arguments[:-1]) if argument == flag]
     return arguments[places[-1] + 1] if places else None
@@ -297,10 +317,10 @@ def _saved_config(arguments: list[str], start: TeacherCfg) -> TeacherCfg:
     """Configuration of the run that ``--resume`` goes on with; ``start`` is that of a new one."""
     import json
 
-    run_dir = Path(_value_of(arguments, "--run-dir") or start.run.run_dir)
+    run_dir = Path(value_of(arguments, "--run-dir") or start.run.run_dir)
     path = run_dir / CONFIG_NAME
     if not path.is_file():
-        if _value_of(arguments, "--resume") == AUTO:
+        if value_of(arguments, "--resume") == AUTO:
             return start
         raise FileNotFoundError(f"--resume: no {path}; give the --run-dir of the run to go on with")
     try:

@@ -1,0 +1,263 @@
+"""From a configuration to a runner: teacher, worlds, network, and where a student begins."""
+
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vd.config import to_dict
+from vd.envs.cfg import ReorientCfg
+from vd.files import write_json
+from vd.paper import PAPER
+from vd.train.student.config import (
+    PRETRAINING,
+    RENDERED,
+    STUDENT_NAME,
+    SYNTHETIC,
+    StudentTrainCfg,
+    validate,
+)
+
+if TYPE_CHECKING:
+    from vd.policy import TrainedPolicy
+    from vd.student.network import Student
+    from vd.student.saved import StudentSpec
+    from vd.train.student.runner import Learner, StudentRunner
+
+CONFIG_NAME = "config.json"
+"""The resolved configuration, in the run's folder, written before training."""
+
+
+def default_init(stage: int, run_dir: Path) -> Path | None:
+    """The student of stage 1 beside a folder of stage 2 (``.../stage1/student.pt``), if there is one."""
+    if stage != RENDERED:
+        return None
+    name = run_dir.name.replace(f"stage{RENDERED}", f"stage{SYNTHETIC}")
+    path = run_dir.with_name(name) / STUDENT_NAME
+    return path if name != run_dir.name and path.is_file() else None
+
+
+def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
+    """The worlds of the student: those of the teacher, which sees their state without noise."""
+    from vd.evaluate.agents import task_for, trained_task
+
+    trained, chosen = trained_task(policy), cfg.task
+    task = task_for(
+        policy,
+        hand=None,
+        objects=chosen.objects or trained.objects,
+        num_worlds=chosen.num_worlds,
+        seed=chosen.seed,
+        stop_tolerance_rad=PAPER.success.rotation_rad,
+        max_goal_angle_rad=chosen.max_goal_angle_rad,
+        episode_s=trained.episode_s,
+        randomised=trained.randomisation.enabled if chosen.randomise is None else chosen.randomise,
+        success_ends_episode=False,
+        at_rest=chosen.at_rest,
+    )
+    exact = replace(
+        task.randomisation,
+        observation_noise_mean=0.0,
+        observation_noise_std=0.0,
+        observation_offset_std=0.0,
+    )
+    return replace(task, randomisation=exact)
+
+
+def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "StudentRunner":
+    """Build worlds, student and learner as ``cfg`` says, save the configuration, and resume if asked.
+
+    Args:
+        cfg: Configuration.
+        started: ``time.monotonic()`` from which ``max_minutes`` counts; now by default.
+
+    Raises:
+        FileExistsError: The run folder holds another run and ``resume`` is not set.
+        FileNotFoundError: There is no such teacher, student or checkpoint.
+        ValueError: The settings do not fit each other, or the student to begin from.
+    """
+    from vd.train.checkpoint import find_checkpoint, list_checkpoints
+    from vd.train.cli import AUTO, resolve_device
+
+    validate(cfg)
+    rank, folder = int(os.environ.get("RANK", "0")), cfg.run.run_dir
+    cfg = replace(cfg, run=replace(cfg.run, device=resolve_device(cfg.run.device)))
+    present = list_checkpoints(folder)
+    resume = cfg.resume if cfg.resume != AUTO else "latest" if present else None
+    checkpoint = find_checkpoint(folder, resume) if resume else None
+    if checkpoint is None and present:
+        raise FileExistsError(
+            f"{folder} holds a run; add --resume to go on with it, or choose another --run-dir"
+        )
+    if cfg.teacher is None:
+        raise ValueError(
+            "--teacher is missing; give the policy to imitate: a policy.pt, a run's folder, or a name"
+        )
+    if checkpoint is None:
+        check_start(cfg)
+
+    import torch
+    import warp as wp
+
+    # A line for each of some hundred kernels would scroll the progress away.
+    wp.config.log_level = wp.LOG_WARNING
+    from vd.evaluate.agents import find_policy
+    from vd.policy import load_policy
+    from vd.student.network import Student
+    from vd.student.saved import StudentSpec
+    from vd.train.distributed import Processes, join_processes
+    from vd.train.student.runner import StudentRunner
+
+    device = cfg.run.device
+    teacher = load_policy(find_policy(cfg.teacher), device)
+    task = student_task(teacher, cfg)
+    if rank == 0:
+        # Before anything is built: a run that fails at once still says what it was.
+        saved = to_dict(replace(cfg, resume=None))
+        saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
+        write_json(folder / CONFIG_NAME, saved)
+    # The network is the same in all processes, what they draw is not.
+    torch.manual_seed(cfg.task.seed)
+    torch.set_float32_matmul_precision("high")
+    student = Student(cfg.network, teacher.num_actions).to(device)
+    if cfg.init is not None:
+        begin_from(cfg.init, student, device)
+    torch.manual_seed(cfg.task.seed + rank)
+    world_size = int(os.environ.get("WORLD_SIZE", "1"))
+    own_task = replace(task, seed=cfg.task.seed + rank)
+    if cfg.stage == PRETRAINING:
+        learner: Learner = _pretrainer(cfg, own_task, student, world_size)
+    else:
+        learner = _dagger(cfg, own_task, student, teacher, world_size, fresh=checkpoint is None)
+    deadline = None
+    if cfg.run.max_minutes is not None:
+        deadline = (time.monotonic() if started is None else started) + 60.0 * cfg.run.max_minutes
+    spec = StudentSpec(
+        network=cfg.network,
+        num_actions=teacher.num_actions,
+        stage=cfg.stage,
+        teacher=str(cfg.teacher),
+        camera=cfg.camera,
+    )
+    runner = StudentRunner(
+        learner,
+        cfg.run,
+        spec=spec,
+        task=to_dict(task),
+        depth=to_dict(cfg.depth),
+        device=device,
+        processes=join_processes(device) if world_size > 1 else Processes(0, 0, 1),
+        deadline=deadline,
+    )
+    if checkpoint is not None:
+        runner.load(checkpoint)
+    return runner
+
+
+def check_start(cfg: StudentTrainCfg) -> None:
+    """Refuse to begin stage 2 from random weights without being told to.
+
+    Raises:
+        FileNotFoundError: ``--init`` is no file.
+        ValueError: There is nothing to begin from, or only a pre-trained encoder.
+    """
+    if cfg.init is None:
+        if cfg.stage == RENDERED and not cfg.from_scratch:
+            raise ValueError(
+                "stage 2 begins from a student of stage 1: give it as --init, or as student.pt in "
+                f"{cfg.run.run_dir.with_name(f'stage{SYNTHETIC}')}; --from-scratch begins without one"
+            )
+        return
+    from vd.student.saved import read_student, saved_spec
+
+    stage = saved_spec(read_student(cfg.init), cfg.init).stage
+    if cfg.stage == RENDERED and stage == PRETRAINING and not cfg.from_scratch:
+        raise ValueError(
+            f"--init {cfg.init} is of stage 0: its encoder is trained, its policy is not. Give a student of "
+            "stage 1, or add --from-scratch"
+        )
+
+
+def begin_from(path: Path, student: "Student", device: str) -> "StudentSpec":
+    """Take over the weights of another student.
+
+    Raises:
+        ValueError: It is of another network or hand.
+    """
+    from vd.student.saved import read_student, saved_spec
+
+    state = read_student(path, device)
+    spec = saved_spec(state, path)
+    if spec.num_actions != student.num_actions:
+        raise ValueError(
+            f"{path} moves {spec.num_actions} joints, the teacher {student.num_actions}; "
+            "give a student of the same hand"
+        )
+    if to_dict(spec.network) != to_dict(student.cfg):
+        raise ValueError(f"{path} is of another network than --network says; leave those flags out")
+    student.load_state_dict(state["student_state_dict"])
+    return spec
+
+
+def _pretrainer(cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", world_size: int) -> Any:
+    import numpy as np
+
+    from vd.assets_usd.hands import load_hand
+    from vd.assets_usd.objects.model import load_set
+    from vd.train.student.pretrain import Pretrainer, RandomScenes
+
+    objects, random = load_set(list(task.objects)), task.randomisation
+    scales = np.linspace(*random.object_scale, random.object_scale_count) if random.enabled else [1.0]
+    scenes = RandomScenes(
+        load_hand(task.hand, task.fingertip, task.hand_layer),
+        objects,
+        cfg.network,
+        scales=[float(scale) for scale in scales],
+        near_share=cfg.pretrain.near_share,
+        noise=cfg.noise,
+        batch=cfg.pretrain.batch,
+        seed=task.seed,
+        device=cfg.run.device,
+    )
+    return Pretrainer(scenes, student, len(objects), cfg.pretrain, world_size=world_size)
+
+
+def _dagger(
+    cfg: StudentTrainCfg,
+    task: ReorientCfg,
+    student: "Student",
+    teacher: "TrainedPolicy",
+    world_size: int,
+    *,
+    fresh: bool,
+) -> Any:
+    import torch
+
+    from vd.envs.reorient import ReorientEnv
+    from vd.train.student.dagger import Dagger
+    from vd.train.vec_env import ReorientVecEnv
+    from vd.vision import StudentView
+
+    simulation = ReorientEnv(task, cfg.run.device)
+    if simulation.num_observations != teacher.num_observations:
+        raise ValueError(
+            f"the teacher observes {teacher.num_observations} values, its worlds give "
+            f"{simulation.num_observations}; take a policy of this version"
+        )
+    simulation.dump_dir = cfg.run.run_dir
+    env = ReorientVecEnv(simulation)
+    if fresh and cfg.run.stagger and not cfg.dagger.reset:
+        steps = env.episode_length_buf
+        env.episode_length_buf = torch.randint_like(steps, high=int(env.max_episode_length))
+    view = StudentView(
+        simulation,
+        cfg.network,
+        rendered=cfg.stage == RENDERED,
+        depth=cfg.depth,
+        camera=cfg.camera,
+        noise=cfg.noise,
+        batch=cfg.dagger.minibatch_worlds * cfg.dagger.rollout_steps,
+        seed=task.seed,
+    )
+    return Dagger(env, view, student, teacher, cfg.dagger, world_size=world_size)

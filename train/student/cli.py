@@ -1,0 +1,179 @@
+"""Command lines of the student: ``vd-train student`` and ``vd-train calibrate``."""
+
+import json
+import os
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, cast
+
+import tyro
+
+from vd.config import from_dict
+from vd.paper import PAPER
+from vd.train.student.build import CONFIG_NAME, build_student, default_init
+from vd.train.student.config import PRESETS, Stage, StudentTrainCfg
+
+HELP = """Train the student: imitate the teacher from point clouds.
+
+Stage 0 pre-trains the encoder on random scenes, stage 1 imitates on complete synthetic clouds, stage 2 on
+those of a depth camera. Flags start from --preset and --stage, or with --resume from the run's config.json; the
+network from --init. Short forms: --objects, --num-worlds and --seed stand for --task.objects and so on.
+Ctrl-C saves."""
+
+SHORT_FORMS = ("objects", "num-worlds", "seed")
+"""Fields of the task that are flags without the ``--task.`` prefix too."""
+
+
+@dataclass
+class CalibrateCfg:
+    """Choose when a student stops, on episodes with validation objects, and store it in its file."""
+
+    student: Annotated[Path, tyro.conf.Positional]
+    """student.pt of vd-train student."""
+    objects: tuple[str, ...] = ()
+    """Object sets to calibrate on, not those of the training; the training's by default."""
+    episodes: int = 256
+    """Episodes, all side by side."""
+    tolerance_rad: float = PAPER.success.rotation_rad
+    """Largest true distance that counts as right [rad]."""
+    randomise: bool = False
+    """Domain randomisation and disturbances."""
+    seed: int = 1000
+    """Of starts, goals and sensor errors."""
+    device: str = "auto"
+    """cpu, cuda:0, ... or auto."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the outcome as JSON."""
+
+
+def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
+    """The configuration that command-line flags ask for.
+
+    The first pass finds where to start from (``--preset`` and ``--stage``, the run's own configuration with
+    ``--resume``, the network of ``--init``), the second reads every flag with those values as defaults.
+
+    Raises:
+        FileNotFoundError: ``--resume`` or ``--init`` name what is not there.
+        ValueError: What they name is not of this version.
+    """
+    from vd.train.cli import normalise, value_of
+
+    arguments = normalise(arguments, SHORT_FORMS, "task")
+    preset, stage = value_of(arguments, "--preset") or "gpu", value_of(arguments, "--stage") or "1"
+    # The second pass refuses unknown names.
+    number = cast(Stage, int(stage)) if stage in ("0", "1", "2") else 1
+    base = PRESETS.get(preset, PRESETS["gpu"])(number)
+    if "--resume" in arguments:
+        base = _saved_config(arguments, base)
+    elif "--help" not in arguments and "-h" not in arguments:
+        base = _with_init(arguments, base)
+    return tyro.cli(StudentTrainCfg, args=arguments, default=base, prog="vd-train student", description=HELP)
+
+
+def student_command(arguments: list[str], started: float) -> int:
+    """``vd-train student``; the exit status."""
+    cfg = parse_student(arguments)
+
+    from vd.train.cli import INTERRUPTED
+    from vd.train.distributed import ending_together
+    from vd.train.ending import Interrupted
+    from vd.train.progress import waiting
+
+    main_process = os.environ.get("RANK", "0") == "0"
+    with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):
+        runner = build_student(cfg, started=started)
+    folder = cfg.run.run_dir
+    if main_process and runner.iteration:
+        print(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
+        if runner.new_episodes:
+            print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
+    elif main_process and cfg.init is not None:
+        print(f"begins with the weights of {cfg.init}")
+    interrupted = False
+    try:
+        with ending_together(Interrupted) if runner.is_distributed else nullcontext():
+            runner.learn()
+    except Interrupted:
+        interrupted = True
+    finally:
+        runner.learner.close()
+    runner.shutdown()
+    if interrupted:
+        if main_process:
+            print(f"saved in {folder}; go on with: vd-train student --run-dir {folder} --resume")
+        return INTERRUPTED
+    if main_process:
+        print(f"done: {folder}/student.pt is the student, vd-train curves {folder} draws the curves")
+    return 0
+
+
+def calibrate_command(arguments: list[str], _started: float) -> int:
+    """``vd-train calibrate``; the exit status."""
+    cfg = tyro.cli(CalibrateCfg, args=arguments, prog="vd-train calibrate")
+
+    from vd.config import to_dict
+    from vd.train.cli import resolve_device
+    from vd.train.progress import waiting
+    from vd.train.student.calibrate import calibrate_student
+
+    with waiting("running the episodes", not cfg.json):
+        result = calibrate_student(
+            cfg.student,
+            objects=cfg.objects,
+            episodes=cfg.episodes,
+            tolerance_rad=cfg.tolerance_rad,
+            randomise=cfg.randomise,
+            seed=cfg.seed,
+            device=resolve_device(cfg.device),
+        )
+    if cfg.json:
+        print(json.dumps(to_dict(result), indent=1))
+        return 0
+    rule = result.rule
+    print(
+        f"{cfg.student}: stop below {rule.distance_rad:.3f} rad predicted and an action norm of "
+        f"{rule.action_norm:.3f}. Of {result.episodes} episodes {result.success:.1%} stop within "
+        f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} came that near"
+    )
+    return 0
+
+
+def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
+    """``base`` with the student to begin from, its network, and for stage 2 its camera."""
+    from vd.train.cli import value_of
+
+    given, run_dir = value_of(arguments, "--init"), value_of(arguments, "--run-dir")
+    if given is None and "--from-scratch" in arguments:
+        return base
+    path = Path(given) if given else default_init(base.stage, Path(run_dir) if run_dir else base.run.run_dir)
+    if path is None:
+        return base
+    from vd.student.saved import read_student, saved_spec
+
+    spec = saved_spec(read_student(path), path)
+    camera = None if spec.camera is None or base.stage != 2 else spec.camera
+    assert camera is None or len(camera) == 7
+    return replace(
+        base, init=path, network=spec.network, camera=camera, teacher=base.teacher or spec.teacher or None
+    )
+
+
+def _saved_config(arguments: list[str], start: StudentTrainCfg) -> StudentTrainCfg:
+    """Configuration of the run that ``--resume`` goes on with; ``start`` is that of a new one."""
+    from vd.train.cli import AUTO, value_of
+
+    run_dir = Path(value_of(arguments, "--run-dir") or start.run.run_dir)
+    path = run_dir / CONFIG_NAME
+    if not path.is_file():
+        if value_of(arguments, "--resume") == AUTO:
+            return _with_init(arguments, start)
+        raise FileNotFoundError(f"--resume: no {path}; give the --run-dir of the run to go on with")
+    try:
+        cfg = from_dict(StudentTrainCfg, json.loads(path.read_text()))
+    except ValueError as error:
+        raise ValueError(
+            f"{path}: {error}; it was written by another version, start anew or edit it"
+        ) from error
+    return replace(cfg, run=replace(cfg.run, run_dir=run_dir))

@@ -1,0 +1,246 @@
+"""Settings of the student's training and their presets. Pure data, cheap to import."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from vd.paper import PAPER
+from vd.sensors.cfg import DepthCameraCfg
+from vd.student.cfg import LEAN, PAPER_NETWORK, EncoderCfg, NoiseCfg, StudentCfg
+from vd.train.config import RunCfg
+
+Stage = Literal[0, 1, 2]
+PresetName = Literal["gpu", "paper", "cpu-demo"]
+
+PRETRAINING, SYNTHETIC, RENDERED = 0, 1, 2
+"""Stages: random scenes without simulation; complete clouds; clouds of a depth camera."""
+STUDENT_NAME = "student.pt"
+"""The student of a run, in its folder: what later stages start from, without optimiser and worlds."""
+RUNS = Path("runs/student")
+"""Parent of the default folders stage0, stage1 and stage2."""
+
+
+@dataclass
+class DaggerCfg:
+    """Imitation of the teacher on what the student does (DAgger), stages 1 and 2."""
+
+    rollout_steps: int = PAPER.dagger.rollout_steps
+    """Control steps of every world between two updates; gradients flow through all of them."""
+    minibatch_worlds: int = PAPER.dagger.synthetic_minibatch
+    """Worlds of an optimiser step on one GPU, whole sequences each."""
+    epochs: int = PAPER.dagger.epochs
+    """Passes over a rollout."""
+    learning_rate: float = PAPER.dagger.learning_rate
+    """Of AdamW with amsgrad, constant."""
+    grad_norm: float = PAPER.dagger.grad_norm
+    """Gradient norm is clipped to this."""
+    imitation: Literal["likelihood", "squared"] = "likelihood"
+    """Loss: likelihood of the teacher's mean action under the student's distribution (released code), or the
+    squared error of the student's mean, which teaches no standard deviation: it then acts by its mean."""
+    distance_weight: float = PAPER.dagger.distance_weight
+    """Weight of the squared error of the predicted rotation distance [rad^2], the mean over the heads."""
+    clip_labels: bool = False
+    """Clip the teacher's mean to [-1, 1], where the environment clips actions; the released code does not."""
+    teacher_share: float = PAPER.dagger.teacher_share
+    """Share of worlds and steps in which the teacher acts in the first iteration (beta of DAgger)."""
+    teacher_share_iterations: int = 0
+    """Iterations over which that share falls to 0, linearly."""
+    reset: bool = True
+    """Begin new episodes in all worlds with every rollout (released code): no step later than rollout_steps
+    is ever seen. Otherwise episodes go on, and each rollout starts with the memory of the one before."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """Of the network's products; losses and weights stay in fp32."""
+
+
+@dataclass
+class PretrainCfg:
+    """Stage 0: random joints, objects, poses and goals, without simulation."""
+
+    batch: int = 512
+    """Clouds of an optimiser step on one GPU."""
+    steps: int = 50
+    """Optimiser steps of an iteration."""
+    learning_rate: float = PAPER.dagger.learning_rate
+    """Of AdamW with amsgrad, constant."""
+    grad_norm: float = PAPER.dagger.grad_norm
+    """Gradient norm is clipped to this."""
+    distance: Literal["scalar", "6d"] = "scalar"
+    """Predict the angle to the goal, or the relative rotation by two columns of its matrix (Zhou 2019)."""
+    embedding: Literal["single", "split"] = "single"
+    """All predictions from the whole embedding, or each from parts of it: object, goal, hand."""
+    category_weight: float = 1.0
+    """Weight of the cross-entropy of the object's category; 0 leaves the prediction out."""
+    distance_weight: float = 1.0
+    """Weight of the squared error of the distance (or of the two columns); 0 leaves it out."""
+    joint_weight: float = 1.0
+    """Weight of the squared error of joint positions, scaled to [-1, 1]; 0 leaves it out."""
+    near_share: float = 0.0
+    """Share of goals at an angle uniform in [0, pi]. The others are uniform on SO(3), where near goals are
+    rare: 1 in 300 lies within 0.4 rad."""
+    precision: Literal["fp32", "bf16"] = "fp32"
+    """Of the network's products."""
+
+
+@dataclass
+class StudentTaskCfg:
+    """The worlds; physics, actions and hand are those of the teacher's training."""
+
+    objects: tuple[str, ...] = ()
+    """Object sets: names or folders of object USDs; the teacher's by default."""
+    num_worlds: int = PAPER.dagger.synthetic_worlds
+    """Worlds simulated side by side."""
+    seed: int = 0
+    """Seed of every random draw."""
+    randomise: bool | None = None
+    """Domain randomisation and disturbances; as the teacher was trained by default. The teacher always sees
+    the state without noise."""
+    at_rest: bool | None = None
+    """Start objects at rest on the table; as the teacher was trained by default."""
+    max_goal_angle_rad: float | None = None
+    """Largest angle from object to goal [rad]; as the teacher was trained by default."""
+
+
+@dataclass
+class StudentTrainCfg:
+    """Train the student."""
+
+    preset: PresetName = "gpu"
+    """Settings to start from; every other flag overrides one of them."""
+    stage: Stage = 1
+    """0: pre-train the encoder on random scenes; 1: imitate on complete synthetic clouds; 2: on clouds of a
+    depth camera and of the hand's own joints."""
+    teacher: str | None = None
+    """Policy to imitate, also the source of hand and task: a policy.pt, a run's folder, or the name of an
+    installed one."""
+    init: Path | None = None
+    """Student to begin from: student.pt or a checkpoint. Stage 2 takes ../stage1/student.pt of --run-dir by
+    default."""
+    from_scratch: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Let stage 2 begin with a policy of random weights: several times slower than stage 1 first."""
+    resume: str | None = None
+    """Go on from a checkpoint of --run-dir: latest (a bare --resume), a file, or auto: the latest, and a new
+    run where there is none."""
+    camera: tuple[float, float, float, float, float, float, float] | None = None
+    """Pose of the optical frame (x right, y down, z forward) in the hand's base frame, for stage 2: position
+    [m] and quaternion xyzw; the hand's own camera by default."""
+    run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
+    dagger: DaggerCfg = field(default_factory=DaggerCfg)
+    pretrain: PretrainCfg = field(default_factory=PretrainCfg)
+    task: StudentTaskCfg = field(default_factory=StudentTaskCfg)
+    network: StudentCfg = field(default_factory=StudentCfg)
+    noise: NoiseCfg = field(default_factory=NoiseCfg)
+    depth: DepthCameraCfg = field(default_factory=DepthCameraCfg)
+
+
+def paper(stage: Stage) -> StudentTrainCfg:
+    """Network and numbers of the paper's released code."""
+    rendered = stage == RENDERED
+    constants = PAPER.dagger
+    return StudentTrainCfg(
+        preset="paper",
+        stage=stage,
+        run=RunCfg(run_dir=RUNS / f"stage{stage}", save_every=20),
+        dagger=DaggerCfg(
+            minibatch_worlds=constants.rendered_minibatch if rendered else constants.synthetic_minibatch
+        ),
+        task=StudentTaskCfg(num_worlds=constants.rendered_worlds if rendered else constants.synthetic_worlds),
+        network=PAPER_NETWORK,
+    )
+
+
+def gpu(stage: Stage) -> StudentTrainCfg:
+    """One GPU: the lean network, whose distance head remembers, half precision, near goals in stage 0."""
+    start = paper(stage)
+    return replace(
+        start,
+        preset="gpu",
+        dagger=replace(start.dagger, clip_labels=True, precision="bf16"),
+        pretrain=PretrainCfg(near_share=0.5, precision="bf16"),
+        network=LEAN,
+    )
+
+
+def cpu_demo(stage: Stage) -> StudentTrainCfg:
+    """Two CPU cores and minutes: a cube, near goals, a small network on coarse voxels, short sequences."""
+    return StudentTrainCfg(
+        preset="cpu-demo",
+        stage=stage,
+        teacher="dclaw4-cube",
+        run=RunCfg(run_dir=RUNS / f"cpu-stage{stage}", device="cpu", save_every=5, max_minutes=4.0),
+        dagger=DaggerCfg(
+            rollout_steps=20,
+            minibatch_worlds=4,
+            epochs=2,
+            learning_rate=1e-3,
+            clip_labels=True,
+        ),
+        pretrain=PretrainCfg(batch=64, steps=10, learning_rate=1e-3, near_share=0.5),
+        task=StudentTaskCfg(num_worlds=16),
+        network=SMALL_NETWORK,
+        depth=DepthCameraCfg(points=2000),
+    )
+
+
+SMALL_NETWORK = StudentCfg(
+    encoder=EncoderCfg(channels=(16, 32, 32), blocks=1, embedding=64),
+    voxel_m=0.01,
+    action_hidden=16,
+    memory=64,
+    head_hidden=64,
+    distance_hidden=32,
+)
+"""A hundredth of the paper's network, on voxels of 1 cm."""
+
+PRESETS: dict[str, Callable[[Stage], StudentTrainCfg]] = {"gpu": gpu, "paper": paper, "cpu-demo": cpu_demo}
+
+
+def validate(cfg: StudentTrainCfg) -> None:
+    """Refuse settings that cannot train.
+
+    Raises:
+        ValueError: The flag, its value and what it has to be.
+    """
+    dagger, pretrain, run = cfg.dagger, cfg.pretrain, cfg.run
+    positive = {
+        "--dagger.rollout-steps": dagger.rollout_steps,
+        "--dagger.minibatch-worlds": dagger.minibatch_worlds,
+        "--dagger.epochs": dagger.epochs,
+        "--dagger.learning-rate": dagger.learning_rate,
+        "--dagger.grad-norm": dagger.grad_norm,
+        "--pretrain.batch": pretrain.batch,
+        "--pretrain.steps": pretrain.steps,
+        "--pretrain.learning-rate": pretrain.learning_rate,
+        "--pretrain.grad-norm": pretrain.grad_norm,
+        "--num-worlds": cfg.task.num_worlds,
+        "--max-steps": run.max_steps,
+        "--save-every": run.save_every,
+        "--keep-last": run.keep_last,
+        "--max-minutes": 1.0 if run.max_minutes is None else run.max_minutes,
+    }
+    for flag, value in positive.items():
+        if not value > 0:
+            raise ValueError(f"{flag} is {value}; it has to be positive")
+    weights = {
+        "--dagger.distance-weight": dagger.distance_weight,
+        "--dagger.teacher-share-iterations": dagger.teacher_share_iterations,
+        "--pretrain.category-weight": pretrain.category_weight,
+        "--pretrain.distance-weight": pretrain.distance_weight,
+        "--pretrain.joint-weight": pretrain.joint_weight,
+    }
+    for flag, value in weights.items():
+        if value < 0:
+            raise ValueError(f"{flag} is {value}; it must not be negative")
+    shares = {"--dagger.teacher-share": dagger.teacher_share, "--pretrain.near-share": pretrain.near_share}
+    for flag, share in shares.items():
+        if not 0.0 <= share <= 1.0:
+            raise ValueError(f"{flag} is {share}; it has to be in [0, 1]")
+    if dagger.teacher_share > 0.0 and dagger.teacher_share_iterations == 0:
+        raise ValueError("--dagger.teacher-share needs --dagger.teacher-share-iterations: when it is to end")
+    if cfg.camera is not None and cfg.stage != RENDERED:
+        raise ValueError("--camera is for --stage 2; the other stages see complete clouds")
+    cfg.network.validate()
+    cfg.noise.validate()
+    cfg.depth.validate()

@@ -1,0 +1,193 @@
+"""What the student sees of an environment: frames of poses or camera points, and their voxels when needed.
+
+A frame holds poses, not clouds: a cloud is a hundred times as large, and is made again from its frame, with
+new noise, whenever a batch needs it. N worlds, B bodies, D actions, K camera points; R rows are frames of any
+worlds at any times. World frame: z up, table top at z = 0; quaternions xyzw.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from vd.envs.reorient import ReorientEnv
+from vd.sensors.cfg import DepthCameraCfg
+from vd.sensors.depth_camera import DepthCamera
+from vd.sensors.surfaces import scene_surfaces
+from vd.student.cfg import NoiseCfg, StudentCfg
+from vd.student.clouds import SceneClouds, Voxeliser
+from vd.student.sites import Sites
+
+Frame = dict[str, torch.Tensor]
+"""Tensors of N worlds: ``body_q`` [N, B, 7], ``goal_quat`` [N, 4], ``action`` [N, D] (smoothed, of the step
+before), ``distance`` [N] (true angle to the goal [rad]) and, with a camera, ``points`` [N, K, 3] (base frame
+[m])."""
+
+
+def rotation_distance(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """Angle between orientations, quaternions xyzw [..., 4], in [0, pi] [rad]."""
+    vector = torch.linalg.vector_norm(relative_rotation(first, second)[..., :3], dim=-1)
+    return 2.0 * torch.asin(vector.clamp(max=1.0))
+
+
+def relative_rotation(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
+    """``first * conj(second)``, quaternions xyzw [..., 4]."""
+    a, aw, b, bw = first[..., :3], first[..., 3:], -second[..., :3], second[..., 3:]
+    vector = aw * b + bw * a + torch.linalg.cross(a, b)
+    return torch.cat([vector, aw * bw - (a * b).sum(dim=-1, keepdim=True)], dim=-1)
+
+
+def voxels(points: torch.Tensor, goal: slice, voxelise: Voxeliser, *, separate: bool, augment: bool) -> tuple:
+    """Voxels of clouds as the student takes them: of all points, or of scene and goal apart.
+
+    Args:
+        points: Points [m], shape [R, P, 3], the goal's first.
+        goal: Columns of the goal.
+        voxelise: Makes the voxels.
+        separate: Whether the goal is a cloud of its own.
+        augment: Add noise, as in training.
+
+    Returns:
+        Arguments of :meth:`vd.student.network.Student.encode`.
+    """
+    if not separate:
+        return (voxelise(points, augment=augment),)
+    parts = (points[:, goal.stop :].contiguous(), points[:, goal].contiguous())
+    return tuple(voxelise(part, augment=augment) for part in parts)
+
+
+class StudentView:
+    """The student's eyes in every world of an environment.
+
+    Stage 1 sees complete clouds of hand and object; stage 2 sees a depth camera's points, and the hand's own
+    cloud from its joints. Both see the goal beside the scene.
+    """
+
+    def __init__(
+        self,
+        env: ReorientEnv,
+        network: StudentCfg,
+        *,
+        rendered: bool,
+        depth: DepthCameraCfg | None = None,
+        camera: Sequence[float] | None = None,
+        noise: NoiseCfg | None = None,
+        batch: int = 0,
+        seed: int = 0,
+    ):
+        """Put samples and cameras on the environment's device.
+
+        Args:
+            env: The environment.
+            network: What of the student concerns its clouds.
+            rendered: See by a depth camera.
+            depth: Its settings.
+            camera: Pose of its optical frame in the hand's base frame, position [m] and quaternion xyzw; the
+                hand's camera by default.
+            noise: Noise of training; None where there will be none.
+            batch: Clouds of a training batch at most.
+            seed: Of noise and camera.
+        """
+        self.env = env
+        self.device = wp.device_to_torch(env.device)
+        scene = env.scene
+        self._separate = network.goal == "separate"
+        self._clouds = SceneClouds(
+            env.hand,
+            env.objects,
+            link_body=scene.link_body,
+            object_body=scene.object_body,
+            world_object=scene.world_object,
+            world_scale=scene.world_scale,
+            device=env.device,
+        )
+        self._voxelise = Voxeliser(
+            network.voxel_m, noise=noise, clouds=max(batch, env.num_worlds), seed=seed, device=env.device
+        )
+        self.camera: DepthCamera | None = None
+        if rendered:
+            model = scene.hand.camera
+            if camera is not None:
+                turn = np.asarray(camera[3:], dtype=float)
+                if not np.linalg.norm(turn) > 0.0:
+                    raise ValueError(f"camera = {tuple(camera)}; its last four values must be a quaternion")
+                model = replace(
+                    model, position=np.asarray(camera[:3]), quaternion=turn / np.linalg.norm(turn)
+                )
+            self.camera = DepthCamera(
+                scene_surfaces(scene),
+                model,
+                env.sim.body_q,
+                cfg=depth,
+                camera_body=int(scene.link_body[0]),
+                frame_s=env.cfg.sim.control_dt,
+                seed=seed,
+            )
+        self._body_q = wp.to_torch(env.sim.body_q)
+        self._goal = wp.to_torch(env.goal_quat)
+        self._smoothed = wp.to_torch(env.smoothed)
+        self._steps = wp.to_torch(env.step_count)
+        self._object = scene.object_body
+
+    def frame(self) -> Frame:
+        """What there is to see before the next action: copies, so that later steps do not change them."""
+        frame = {
+            "body_q": self._body_q.clone(),
+            "goal_quat": self._goal.clone(),
+            "action": self._smoothed.clone(),
+            "distance": rotation_distance(self._body_q[:, self._object, 3:], self._goal),
+        }
+        if self.camera is not None:
+            # A late image must not show what was before a reset.
+            self.camera.reset(wp.from_torch((self._steps == 0).int()))
+            self.camera.capture()
+            points = wp.to_torch(self.camera.points).clone()
+            # Without a pixel in the crop the cloud is one false point at the origin: it counts for nothing.
+            unseen = wp.to_torch(self.camera.count) == 0
+            frame["points"] = points.masked_fill_(unseen[:, None, None], torch.nan)
+        return frame
+
+    def sites(
+        self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None, *, augment: bool
+    ) -> tuple[Sites, ...]:
+        """Voxels of frames.
+
+        Args:
+            frame: ``body_q`` [R, B, 7], ``goal_quat`` [R, 4] and, with a camera, ``points`` [R, K, 3].
+            worlds: World of each row [R]; row i is of world i by default.
+            augment: Add noise, as in training.
+
+        Returns:
+            Arguments of :meth:`vd.student.network.Student.encode`.
+        """
+        rows, columns = frame["body_q"].shape[0], self._clouds.item
+        seen = frame["points"].shape[1] if self.camera is not None else columns.stop - columns.start
+        points = torch.empty((rows, columns.start + seen, 3), device=self.device)
+        self._clouds.write(
+            wp.from_torch(points, dtype=wp.vec3),
+            wp.from_torch(frame["body_q"].contiguous(), dtype=wp.transform),
+            wp.from_torch(frame["goal_quat"].contiguous(), dtype=wp.quat),
+            with_object=self.camera is None,
+            worlds=None if worlds is None else wp.from_torch(worlds.int()),
+        )
+        if self.camera is not None:
+            points[:, columns.start :] = frame["points"]
+        return voxels(points, self._clouds.goal, self._voxelise, separate=self._separate, augment=augment)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Random states and what the camera remembers, as NumPy arrays."""
+        return {name: array.numpy().copy() for name, array in self._stateful().items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        for name, array in self._stateful().items():
+            array.assign(state[name])
+
+    def _stateful(self) -> dict[str, wp.array]:
+        arrays = {"noise": self._voxelise.rng}
+        if self.camera is not None:
+            arrays |= self.camera.stateful()
+        return arrays
