@@ -156,8 +156,8 @@ def test_init_keeps_the_flags_and_names_a_missing_file(tmp_path, capsys):
 
 
 def test_unknown_commands_devices_and_missing_files_are_explained(tmp_path, capsys):
-    assert main(["student"]) == 2
-    assert "no command 'student'" in capsys.readouterr().err
+    assert main(["pupil"]) == 2
+    assert "no command 'pupil'" in capsys.readouterr().err
     assert main(["curves", str(tmp_path)]) == 1
     assert "progress.jsonl" in capsys.readouterr().err
     assert main(["export", str(tmp_path / "x.pt")]) == 1

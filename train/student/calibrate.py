@@ -86,6 +86,7 @@ def calibrate_student(
     Raises:
         ValueError: The student is one of stage 0, which cannot act.
     """
+    wp.config.log_level = wp.LOG_WARNING
     saved = load_student(path, device)
     spec = saved.spec
     if spec.stage == PRETRAINING:

@@ -18,8 +18,8 @@ from vd.train.student.config import PRESETS, Stage, StudentTrainCfg
 HELP = """Train the student: imitate the teacher from point clouds.
 
 Stage 0 pre-trains the encoder on random scenes, stage 1 imitates on complete synthetic clouds, stage 2 on
-those of a depth camera. Flags start from --preset and --stage, or with --resume from the run's config.json; the
-network from --init. Short forms: --objects, --num-worlds and --seed stand for --task.objects and so on.
+those of a depth camera. Flags start from --preset and --stage, or with --resume from the run's config.json;
+the network from --init. Short forms: --objects, --num-worlds and --seed stand for --task.objects and so on.
 Ctrl-C saves."""
 
 SHORT_FORMS = ("objects", "num-worlds", "seed")

@@ -13,6 +13,9 @@ from vd.student.cfg import EncoderCfg, StudentCfg
 from vd.student.sites import Sites
 from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool
 
+BROAD = 2.0
+"""Bias with which a bounded standard deviation starts in the upper part of its (logarithmic) range."""
+
 
 @dataclass(frozen=True)
 class StudentOutput:
@@ -128,6 +131,9 @@ class Student(nn.Module):
         self.head = nn.Sequential(nn.Linear(cfg.memory, cfg.head_hidden), nn.GELU())
         self.mean = nn.Linear(cfg.head_hidden, num_actions)
         self.log_std = nn.Linear(cfg.head_hidden, num_actions)
+        if cfg.std_range is not None:
+            # Broad at first, as without bounds: the likelihood weighs the error of random means by 1 / std^2.
+            nn.init.constant_(self.log_std.bias, BROAD)
         self.distance = nn.ModuleDict(
             {
                 place: nn.Sequential(

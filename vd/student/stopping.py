@@ -67,7 +67,7 @@ def calibrate(
         candidates: Values tried of each bound.
 
     Raises:
-        ValueError: There is no step to choose from.
+        ValueError: There is no step to choose from, or no episode that any rule stops within the tolerance.
     """
     if not alive.any():
         raise ValueError("no episode has a step to calibrate the stopping rule on; give more episodes")
@@ -88,6 +88,12 @@ def calibrate(
             if best is None or score > best:
                 best = score
     assert best is not None
+    if best[0] == 0.0:
+        near = int(right.any(axis=0).sum())
+        raise ValueError(
+            f"no rule stops any of {true.shape[1]} episodes within {tolerance_rad:g} rad ({near} came near); "
+            "train longer, or calibrate on more episodes"
+        )
     return Calibration(
         rule=StoppingRule(distance_rad=-best[2], action_norm=-best[3]),
         tolerance_rad=tolerance_rad,
