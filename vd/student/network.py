@@ -19,7 +19,7 @@ BROAD = 2.0
 
 @dataclass(frozen=True)
 class StudentOutput:
-    """What the network says of a step, leading shape [N] or [T, N]."""
+    """What the network says of a step, leading shape [N] or [T, N]; in the precision of its weights."""
 
     mean: torch.Tensor
     """Mean of the actions, not clipped [.., D]."""
@@ -196,7 +196,14 @@ class Student(nn.Module):
         if self.cfg.std_range is not None:
             low, high = (math.log(bound) for bound in self.cfg.std_range)
             log_std = low + (high - low) * torch.sigmoid(log_std)
-        return StudentOutput(self.mean(features), log_std, torch.cat(distance, dim=-1), hidden)
+        # Autocast may have computed in half precision; losses and the next step should not have to.
+        precision = self.mean.weight.dtype
+        return StudentOutput(
+            self.mean(features).to(precision),
+            log_std.to(precision),
+            torch.cat(distance, dim=-1).to(precision),
+            hidden.to(precision),
+        )
 
     def act(
         self, scene: Sites, previous_action: torch.Tensor, hidden: torch.Tensor, goal: Sites | None = None

@@ -2,9 +2,9 @@
 
 A convolution gathers the rows under its kernel into one matrix [M, K C_in] and multiplies it once with
 the weights [K C_in, C_out]. At this network's few sites a cloud that is faster than a product for
-every offset with scattered sums, on the CPU by several times, although it multiplies zeros
-(docs/results/student.md). No sum is scattered in the backward pass either: the gradient of the input
-is a gather too, with the reverse map, so results do not depend on the order of atomic additions.
+every offset with scattered sums, although it multiplies zeros (docs/student.md). No sum is scattered
+in the backward pass either: the gradient of the input is a gather too, with the reverse map, so
+results do not depend on the order of atomic additions.
 """
 
 import math
