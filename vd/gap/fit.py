@@ -47,6 +47,8 @@ MOVING_COUNTS = 1.5
 OTHER_STARTS = 4
 OTHER_SPREAD = 0.2
 """Standard deviation of the logarithm of the baseline's parameters at other starts."""
+EFFECT_SPREAD = 0.5
+"""The same of the effects' parameters."""
 OTHER_ITERATIONS = 16
 
 Trajectories = Sequence[int] | np.ndarray | None
@@ -427,7 +429,7 @@ class JointProblem:
             fit: What the first search found.
             scales: Sizes of the joint's motion.
             seed: Of the starts: the baseline's parameters at random about what was found, every effect
-                at one of its starting sizes.
+                at one of its starting sizes or, in every other start, at random about what was found too.
 
         Returns:
             The best of ``OTHER_STARTS`` fits, without held-out errors.
@@ -435,11 +437,16 @@ class JointProblem:
         rng = np.random.default_rng(seed)
         others = others_in(self.rollouts.chain, self.joint)
         starts = []
-        for _ in range(OTHER_STARTS):
+        for number in range(OTHER_STARTS):
             start = {key: fit.values[key] * np.exp(rng.normal(0.0, OTHER_SPREAD)) for key in self.baseline}
             for effect in fit.effects:
                 options = sizes(effect, others, scales)
                 start.update(options[int(rng.integers(len(options)))])
+            if number % 2:
+                inside = [key for key in fit.values if "." in key]
+                start.update(
+                    {key: fit.values[key] * np.exp(rng.normal(0.0, EFFECT_SPREAD)) for key in inside}
+                )
             starts.append(start)
         return self.fit(
             fit.rows,
