@@ -1,0 +1,256 @@
+"""Imitation: losses fall, gradients go where they should, runs stop and go on as if nothing had happened."""
+
+import math
+import os
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from student_dummy import TINY, DummyTeacher, make_dagger, make_student_runner, weights
+
+from vd.student.cfg import NoiseCfg
+from vd.student.network import Student
+from vd.student.saved import load_student
+from vd.train.checkpoint import list_checkpoints
+from vd.train.ending import Interrupted, TrainingDivergedError
+from vd.train.metrics import read_progress
+from vd.train.student.losses import distance_loss, imitation_loss
+
+
+def test_the_losses_fall_on_one_rollout():
+    dagger = make_dagger(epochs=1, rollout_steps=4)
+    rollout = dagger.collect()
+    first = dagger.update(rollout)
+    for _ in range(40):
+        last = dagger.update(rollout)
+    assert last["loss/imitation"] < first["loss/imitation"] - 1.0
+    assert last["loss/distance"] < 0.3 * first["loss/distance"]
+
+
+def test_the_student_acts_more_and_more_like_the_teacher(tmp_path):
+    runner = make_student_runner(tmp_path, make_dagger(worlds=16, epochs=4))
+    runner.learn(16)
+    errors = [row["student/action_error"] for row in read_progress(tmp_path / "progress.jsonl")]
+    assert np.mean(errors[-3:]) < 0.6 * np.mean(errors[:3])
+
+
+@pytest.mark.parametrize("kind", ["likelihood", "squared"])
+def test_gradients_equal_those_of_an_unrolled_loop(kind):
+    """The oracle encodes step by step and writes the gates of the memory out; ends of episodes clear it."""
+    dagger = make_dagger(worlds=3, rollout_steps=5, imitation=kind)
+    rollout = dagger.collect()
+    rollout.done = torch.tensor([[0, 1, 0], [0, 0, 0], [1, 1, 0], [0, 0, 0], [0, 0, 1]], dtype=torch.bool)
+    rollout.hidden = torch.randn(3, TINY.memory)
+    student, worlds = dagger.student.eval(), torch.arange(3)  # one batch or five: the same statistics
+    imitation, distance = dagger.losses(rollout, worlds)
+    (imitation + 0.5 * distance).backward()
+    found = {name: p.grad.clone() for name, p in student.named_parameters() if p.grad is not None}
+
+    student.zero_grad()
+    gru, hidden, total = student.memory, rollout.hidden, torch.zeros(())
+    for step in range(5):
+        frame = {name: value[step] for name, value in rollout.frames.items()}
+        embedding = student.encode(*dagger.view.sites(frame, augment=True))
+        inputs = student.merge_action(torch.cat([embedding, student.action_layers(frame["action"])], dim=-1))
+        gates_in = (inputs @ gru.weight_ih_l0.T + gru.bias_ih_l0).chunk(3, dim=-1)
+        gates_hidden = (hidden @ gru.weight_hh_l0.T + gru.bias_hh_l0).chunk(3, dim=-1)
+        reset, update = (torch.sigmoid(gates_in[i] + gates_hidden[i]) for i in range(2))
+        new = torch.tanh(gates_in[2] + reset * gates_hidden[2])
+        hidden = (1.0 - update) * new + update * hidden
+        features = student.head(hidden)
+        mean = student.mean(features)
+        low, high = (math.log(bound) for bound in TINY.std_range)
+        std = torch.exp(low + (high - low) * torch.sigmoid(student.log_std(features)))
+        if kind == "likelihood":
+            own = -torch.distributions.Normal(mean, std).log_prob(rollout.label[step]).sum(-1).mean()
+        else:
+            own = (mean - rollout.label[step]).square().sum(-1).mean()
+        heads = [student.distance["before"](embedding), student.distance["after"](hidden)]
+        errors = torch.cat(heads, dim=-1) - frame["distance"][:, None]
+        total = total + (own + 0.5 * errors.square().mean()) / 5
+        hidden = torch.where(rollout.done[step][:, None], 0.0, hidden)
+    total.backward()
+    torch.testing.assert_close(imitation + 0.5 * distance, total)
+    wanted = {name: p.grad for name, p in student.named_parameters() if p.grad is not None}
+    assert found.keys() == wanted.keys()
+    for name, gradient in wanted.items():
+        scale = float(gradient.abs().max()) + 1e-6
+        assert float((found[name] - gradient).abs().max()) < 2e-4 * scale, name
+
+
+def test_no_gradient_crosses_the_end_of_an_episode():
+    """What a world did before its end does not move what is learned after it; in another world it does."""
+    dagger = make_dagger(worlds=2, rollout_steps=4, imitation="squared")
+    rollout = dagger.collect()
+    rollout.done = torch.zeros((4, 2), dtype=torch.bool)
+    rollout.done[0, 0] = True
+    action = rollout.frames["action"].clone().requires_grad_()
+    rollout.frames["action"] = action
+    student = dagger.student.eval()
+    with torch.no_grad():
+        frames = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
+        embedding = student.encode(*dagger.view.sites(frames, augment=True)).view(4, 2, -1)
+        output = student(embedding, action, rollout.hidden, rollout.done)
+        rollout.label[0] = output.mean[0]  # no error in the first step: its own loss has no gradient
+    imitation, _ = dagger.losses(rollout, torch.arange(2))
+    (gradient,) = torch.autograd.grad(imitation, action)
+    assert float(gradient[0, 0].abs().max()) < 1e-9 < 1e-6 < float(gradient[0, 1].abs().max())
+    assert float(gradient[1, 0].abs().max()) > 1e-6
+
+
+def test_losses_are_what_they_say():
+    torch.manual_seed(0)
+    dagger = make_dagger(worlds=2, rollout_steps=3)
+    rollout = dagger.collect()
+    frames = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
+    embedding = dagger.student.encode(*dagger.view.sites(frames, augment=True)).view(3, 2, -1)
+    output = dagger.student(embedding, rollout.frames["action"], rollout.hidden, rollout.done)
+    normal = torch.distributions.Normal(output.mean, output.log_std.exp())
+    expected = -normal.log_prob(rollout.label).sum(-1).mean()
+    torch.testing.assert_close(imitation_loss(output, rollout.label, "likelihood"), expected)
+    squared = (output.mean - rollout.label).square().sum(-1).mean()
+    torch.testing.assert_close(imitation_loss(output, rollout.label, "squared"), squared)
+    assert float(distance_loss(torch.tensor([[[1.0, 3.0]]]), torch.tensor([[1.0]]))) == 2.0
+
+
+def test_minibatches_hold_every_world_once_a_pass():
+    dagger = make_dagger(worlds=10, minibatch_worlds=4, epochs=3)
+    batches = [batch.tolist() for batch in dagger.minibatches()]
+    assert [len(batch) for batch in batches] == [4, 4, 2] * 3
+    passes = [[world for batch in batches[i : i + 3] for world in batch] for i in (0, 3, 6)]
+    assert all(sorted(one) == list(range(10)) for one in passes)
+    assert len({tuple(one) for one in passes}) == 3
+
+
+def test_a_rollout_pairs_each_frame_with_its_label_and_end():
+    dagger = make_dagger(rollout_steps=12)
+    rollout = dagger.collect()
+    assert torch.equal(rollout.label, rollout.frames["target"])
+    assert not rollout.hidden.any() and rollout.done.any()
+    ended = rollout.done[:-1]
+    changed = (rollout.label[1:] != rollout.label[:-1]).any(dim=-1)
+    assert torch.equal(changed, ended)  # the dummy draws a target where, and only where, something ended
+
+
+def test_the_memory_is_cleared_in_rollouts_and_kept_between_them():
+    dagger = make_dagger(reset=False, rollout_steps=2)
+    first = dagger.collect()
+    assert not first.hidden.any()
+    second = dagger.collect()
+    ended = first.done[-1]
+    assert second.hidden[~ended].any(dim=-1).all() and not second.hidden[ended].any()
+    assert not make_dagger(rollout_steps=2).collect().hidden.any()
+
+
+def test_the_teacher_acts_in_its_share_which_falls_to_none():
+    dagger = make_dagger(teacher_share=1.0, teacher_share_iterations=4)
+    shares = []
+    for dagger.iteration in range(6):
+        shares.append(dagger.teacher_share())
+    assert shares == [1.0, 0.75, 0.5, 0.25, 0.0, 0.0]
+    dagger.iteration = 0
+    rollout = dagger.collect()
+    # the action before a step is the label of the step before: the teacher's own
+    assert torch.equal(rollout.frames["action"][1:], rollout.label[:-1])
+    dagger.iteration = 4
+    assert not torch.equal(*(lambda r: (r.frames["action"][1:], r.label[:-1]))(dagger.collect()))
+
+
+def test_squared_errors_let_the_student_act_by_its_mean():
+    one, two = (make_dagger(imitation="squared") for _ in range(2))
+    torch.manual_seed(1)
+    first = one.collect().frames["action"]
+    torch.manual_seed(2)
+    assert torch.equal(first, two.collect().frames["action"])
+
+
+def test_labels_are_clipped_where_asked_for():
+    class Loud(DummyTeacher):
+        def act(self, observation):
+            return 10.0 * observation[:, :2]
+
+    dagger = make_dagger(clip_labels=True)
+    dagger.teacher = Loud()
+    assert float(dagger.collect().label.abs().max()) == 1.0
+
+
+def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
+    for reset in (True, False):
+        options = {"noise": NoiseCfg(), "reset": reset}
+        whole = make_student_runner(tmp_path / f"whole{reset}", make_dagger(**options))
+        whole.learn(4)
+        make_student_runner(tmp_path / f"parts{reset}", make_dagger(**options)).learn(2)
+        torch.manual_seed(99)  # whatever happened in between
+        again = make_student_runner(tmp_path / f"parts{reset}", make_dagger(**options, seed=5))
+        again.load(list_checkpoints(tmp_path / f"parts{reset}")[-1])
+        assert again.new_episodes == "" and again.iteration == 2
+        again.learn(2)
+        np.testing.assert_array_equal(weights(again.learner.student), weights(whole.learner.student))
+        rows = [read_progress(tmp_path / f"{name}{reset}" / "progress.jsonl") for name in ("whole", "parts")]
+        assert [row["iteration"] for row in rows[1]] == [1, 2, 3, 4]
+        for first, second in zip(*rows, strict=True):
+            assert first["loss/imitation"] == second["loss/imitation"]
+
+
+def test_other_worlds_start_anew(tmp_path):
+    make_student_runner(tmp_path).learn(2)
+    again = make_student_runner(tmp_path, make_dagger(worlds=6))
+    again.load(list_checkpoints(tmp_path)[-1])
+    assert "8 worlds" in again.new_episodes
+    again.learn(1)
+    assert again.iteration == 3
+
+
+def test_a_student_comes_back_from_its_file(tmp_path):
+    runner = make_student_runner(tmp_path)
+    runner.learn(1)
+    saved = load_student(tmp_path / "student.pt")
+    np.testing.assert_array_equal(weights(saved.network), weights(runner.learner.student))
+    assert saved.spec.network == TINY and saved.iteration == 1 and not saved.network.training
+    assert "optimizer" not in torch.load(tmp_path / "student.pt", weights_only=True)
+
+
+def test_ctrl_c_saves_within_a_rollout(tmp_path):
+    dagger = make_dagger(rollout_steps=50)
+    step, calls = dagger.env.step, []
+
+    def interrupt(action):
+        calls.append(1)
+        if len(calls) == 60:  # in the second rollout
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(action)
+
+    dagger.env.step = interrupt
+    with pytest.raises(Interrupted):
+        make_student_runner(tmp_path, dagger, save_every=100).learn(5)
+    assert len(calls) == 60  # at once, not at the end of the rollout
+    again = make_student_runner(tmp_path, make_dagger(rollout_steps=50))
+    again.load(list_checkpoints(tmp_path)[-1])
+    assert again.iteration == 1
+
+
+def test_values_that_are_not_finite_stop_the_run_with_a_remedy(tmp_path):
+    runner = make_student_runner(tmp_path)
+    runner.learn(2)
+    with torch.no_grad():
+        runner.learner.student.mean.weight[0, 0] = torch.nan
+    before = list_checkpoints(tmp_path)
+    with pytest.raises(TrainingDivergedError, match=r"iteration 3: .*--dagger\.learning-rate.*--resume"):
+        runner.learn(2)
+    assert list_checkpoints(tmp_path) == before
+
+
+def test_clouds_are_augmented_in_training():
+    dagger = make_dagger()
+    dagger.update(dagger.collect())
+    assert all(dagger.view.asked)
+
+
+def test_weights_of_another_network_are_refused(tmp_path):
+    make_student_runner(tmp_path).learn(1)
+    other = make_dagger()
+    other.student = Student(replace(TINY, memory=8), 2)
+    with pytest.raises(ValueError, match="does not fit this run's network"):
+        make_student_runner(tmp_path, other).load(list_checkpoints(tmp_path)[-1])
