@@ -62,6 +62,33 @@ def test_the_whole_battery_is_what_the_goals_ask_for():
     assert sorted(c.name for s in shards for c in s) == sorted(c.name for c in cases)
 
 
+def test_any_first_part_of_the_battery_is_a_fair_sample():
+    cases = gap.battery("dclaw3")
+    part = cases[: len(cases) // 5]
+    for kind in KINDS:
+        share = sum(c.kind == kind for c in part) / sum(c.kind == kind for c in cases)
+        assert share == pytest.approx(0.2, abs=0.02), kind
+    single = [c for c in part if c.kind == "single"]
+    assert {c.size for c in single} == {0, 1, 2, 3} and {c.seed for c in single} == set(range(5))
+    assert cases == gap.battery("dclaw3"), "the order is always the same: a run can be resumed"
+    fresh = gap.battery("servo", first_seed=500, seeds=2, nothing=3, pairs=4)
+    assert min(c.seed for c in fresh) == 500
+    assert sum(c.kind == "pair" for c in fresh) == 4 and sum(c.kind == "none" for c in fresh) == 3
+
+
+def test_the_effect_that_stands_for_another_is_right_if_the_report_says_so():
+    one = case("read_delay")
+    truth = {**TRUTH, "effects": {"read_delay": {"joints": ["joint"], "parameters": {}}}}
+    said = score(one, report("command_delay", sets=[("command_delay", "read_delay")]), truth)
+    silent = score(one, report("command_delay"), truth)
+    more = score(one, report("command_delay", "backlash", sets=[("command_delay", "read_delay")]), truth)
+    results = [said, silent, more]
+    assert [value([r], "first name right").value for r in results] == [1.0, 0.0, 0.0]
+    assert [value([r], "single: a wrong name").value for r in results] == [0.0, 1.0, 1.0]
+    assert value([said], "size of the set").value == 1.0
+    assert value(results, "right, or in the named set").value == pytest.approx(2 / 3)
+
+
 def test_bad_requests_are_refused():
     for options, words in (
         ({"kinds": ("triple",)}, "triple"),

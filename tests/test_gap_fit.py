@@ -117,6 +117,49 @@ def test_effect_is_recovered_with_the_baseline(effect: str, column: int, value: 
     assert fits[0].rmse <= fits[1].rmse
 
 
+def test_a_refined_fit_depends_less_on_the_step() -> None:
+    """Values at a coarse step come near those at a fine one, and say how near."""
+    problem = problem_of(recorded({servo.COULOMB_TORQUE: 0.1}))
+    (chain,) = chains(problem.rollouts.recording)
+    scales = problem.scales(chain.start_row[0], 1e-2)
+    start = {"kp": 3.0, "kd": 0.25, "velocity_limit": 7.0, "inertia": 2.5e-3}
+    start["coulomb_friction.tau_c_nm"] = 0.1
+    coarse_dt = 1 / 60
+    problem.rollouts = problem.rollouts.at(coarse_dt)
+    coarse = problem.fit(chain.start_row, ("coulomb_friction",), [start], scales)[0]
+    refined = problem.refine(coarse, scales)
+    assert problem.rollouts.dt == coarse_dt, "the problem's own step is back"
+    off = [abs(fit.values["inertia"] / 2.5e-3 - 1.0) for fit in (coarse, refined)]
+    assert off[0] > 0.05 and off[1] < 0.4 * off[0]
+    assert (refined.step_error > 0.0).all()
+    np.testing.assert_array_equal(refined.held_out, coarse.held_out)
+    products, count = refined.structure
+    assert count.sum() > 200 and abs(products.sum() / count.sum()) < 0.15 * problem.floor**2
+
+
+def test_a_wrong_model_leaves_structure() -> None:
+    problem = problem_of(recorded({servo.LOAD_FRICTION: 0.3}))
+    (chain,) = chains(problem.rollouts.recording)
+    scales = problem.scales(chain.start_row[0], 1e-2)
+    start = {"kp": 3.0, "kd": 0.25, "velocity_limit": 7.0, "inertia": 2.5e-3}
+    fit = problem.fit(chain.start_row, ("dead_zone",), [start], scales)[0]
+    products, count = problem.refine(fit, scales).structure
+    assert products.sum() / count.sum() > 0.15 * problem.floor**2
+
+
+def test_another_search_finds_the_same() -> None:
+    problem = problem_of(recorded({servo.COULOMB_TORQUE: 0.1}))
+    (chain,) = chains(problem.rollouts.recording)
+    scales = problem.scales(chain.start_row[0], 1e-2)
+    start = {"kp": 3.0, "kd": 0.25, "velocity_limit": 7.0, "inertia": 2.5e-3}
+    start["coulomb_friction.tau_c_nm"] = 0.08
+    fit = problem.fit(chain.start_row, ("coulomb_friction",), [start], scales)[0]
+    again = problem.again(fit, scales, seed=1)
+    assert again.rmse == pytest.approx(fit.rmse, rel=0.02)
+    other = problem.again(fit, scales, seed=2)
+    assert other.values != again.values, "another seed is another search"
+
+
 def test_promise_ranks_the_hidden_effect_first() -> None:
     problem = problem_of(recorded({servo.COULOMB_TORQUE: 0.06}))
     base = problem.rollouts.chain.start_row.copy()

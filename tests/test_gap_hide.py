@@ -1,13 +1,14 @@
 """The hidden plant obeys closed forms and another engine; recordings hide what they hide."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from vd.gap.excitations import MENU, JointRange, excitation_set
 from vd.gap.hidden_finger import FingerBody
-from vd.gap.hidden_plant import OUTSIDE, Plant, Run, simulate
+from vd.gap.hidden_plant import OUTSIDE, STEP_S, Plant, Run, simulate
 from vd.gap.hide import (
     ENCODER_COUNT,
     Hiding,
@@ -183,6 +184,32 @@ def test_motors_give_no_more_than_their_limits():
     assert np.diff(fast[:, 0]).max() * 500.0 < 1.02
     _, capped = answer(servo(limit=0.7), step)
     assert np.diff(capped[:, 0]).max() * 500.0 == pytest.approx(0.7, rel=1e-3)
+
+
+def test_a_motor_at_its_limit_acts_when_the_command_comes():
+    """The answer to a step does not depend on where in a time step of the plant the command falls."""
+    limited = {"torque_limit": {"tau_max_nm": 0.2}}
+    paths = []
+    for shift in (0.0, 0.5, 0.9):
+        time = np.arange(0.0, 1.0, 0.01)
+        time[1:] += shift * STEP_S
+        command = np.where(np.arange(len(time)) < 20, 0.0, 0.8)[:, None]
+        run = Run(servo(**limited), time, command, np.ones(command.shape, bool))
+        paths.append(simulate([run])[0][:, 0])
+    assert np.ptp(paths[0]) > 0.5
+    assert max(np.abs(path - paths[0]).max() for path in paths[1:]) < 2e-4
+
+
+def test_a_hands_drives_give_no_more_than_their_effort():
+    weak = replace(servo(), effort=np.array([0.2]))
+    time = np.arange(0.0, 1.0, 0.01)
+    command = np.where(time < 0.2, 0.0, 0.8)[:, None]
+    run = Run(weak, time, command, np.ones(command.shape, bool))
+    same = replace(run, plant=servo(torque_limit={"tau_max_nm": 0.2}))
+    free = replace(run, plant=servo())
+    one, other, third = simulate([run, same, free])
+    np.testing.assert_array_equal(one, other)
+    assert np.abs(one - third).max() > 0.05
 
 
 def test_a_warming_motor_droops_more_as_time_goes():

@@ -10,12 +10,14 @@ from test_gap_fit import recorded
 import vd.kernels.actuators as servo
 from vd.gap.coordinates import Coordinate
 from vd.gap.fit import JointFit
-from vd.gap.judge import Accepted, Explanation, Judge, share
+from vd.gap.judge import Accepted, Explanation, Judge, intervals, share
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import vetoes
+from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain, find
+from vd.kernels.effects import EFFECTS
 
 FLOOR = 1e-3
 COUNT = np.full(10, 500.0)
@@ -112,6 +114,76 @@ def test_sets_of_several_joints_meet_in_one_name() -> None:
     assert names(one, explanation("dead_zone")) == ["dead_zone", "dead_zone"]
     assert names(one, explanation("thermal_drift")) == ["?", "thermal_drift"]
     assert names(one) == ["?"]
+
+
+def concluded(judge: Judge, **options: object) -> Explanation:
+    """A conclusion about Coulomb friction that is beyond doubt but for ``options``."""
+    baseline, final = made_up((), 0.010), made_up(("coulomb_friction",), FLOOR)
+    rivals = {"coulomb_friction": [final, made_up(("backlash",), 0.004)]}
+    return judge.conclude(baseline, final, rivals, [], "", **options)  # type: ignore[arg-type]
+
+
+def test_two_searches_that_disagree_by_more_than_the_gain_give_no_name(judge: Judge) -> None:
+    assert [a.named for a in concluded(judge).accepted] == [True]
+    # Its gain is what the next best leaves: 4 - 1 mrad.
+    near = concluded(judge, again=made_up(("coulomb_friction",), 0.0035))
+    assert near.verdict == "effects" and near.accepted[0].named
+    far = concluded(judge, again=made_up(("coulomb_friction",), 0.0045))
+    assert far.verdict == "unknown" and not far.accepted[0].named
+    assert "two searches" in far.reason and "3.50 mrad" in far.reason
+
+
+def test_what_has_structure_is_not_explained(judge: Judge) -> None:
+    final = made_up(("coulomb_friction",), FLOOR)
+    pairs = np.full(10, 400.0)
+
+    def with_structure(share: float | np.ndarray, rms: float = 1.1 * FLOOR) -> Explanation:
+        left = replace(final, sse=COUNT * rms**2, structure=np.stack([share * FLOOR**2 * pairs, pairs]))
+        return concluded(judge, refined=left)
+
+    assert with_structure(0.03).verdict == "effects", "what the right models leave"
+    lacking = with_structure(0.3)
+    assert lacking.verdict == "unknown" and "structure" in lacking.reason
+    once = np.zeros(10)
+    once[0] = 3.0  # a single motion is no rule
+    assert with_structure(once).verdict == "effects"
+    # Far from the floor a real machine's repeatability is not known.
+    assert with_structure(8.0, rms=5.0 * FLOOR).verdict == "effects"
+
+
+def test_what_the_time_step_leaves_open_widens_the_interval(judge: Judge) -> None:
+    fit = made_up((), FLOOR)
+    plain = intervals(fit, FLOOR)["p0"]
+    wide = intervals(replace(fit, step_error=np.full(3, 0.5)), FLOOR)["p0"]
+    half = 0.5 * (plain[1] - plain[0])
+    assert 0.5 * (wide[1] - wide[0]) == pytest.approx(np.hypot(half, 0.5))
+    given = replace(fit, extents={"p0": (-1.0, 3.0)})
+    assert intervals(given, FLOOR)["p0"] == (-1.0, 3.0)
+
+
+def test_one_delay_stands_for_both(tmp_path: Path) -> None:
+    """A late reading moves the positions as a late command does: one name, and the set that it stands for."""
+    for column in (servo.COMMAND_DELAY, servo.READ_DELAY):
+        data = recorded({column: 0.025})
+        chosen = ("command_delay", "read_delay", "coulomb_friction")
+        report = analysed(data, tmp_path / str(column), effects=chosen)
+        assert [e.name for e in report.effects] == ["command_delay"]
+        assert report.effects[0].parameters["delay_s"].value == pytest.approx(0.025, rel=0.02)
+        assert report.ambiguous == (("command_delay", "read_delay"),)
+        assert report.open_sets == () and report.next_experiment == ""
+        assert "stands for read delay too" in verdict_sentence(report)
+        (row,) = [row for row in report.evidence if row.name == "read_delay"]
+        assert "stands for both" in row.reason
+    alone = analysed(data, tmp_path / "alone", effects=("read_delay", "coulomb_friction"))
+    assert [e.name for e in alone.effects] == ["read_delay"] and not alone.ambiguous
+
+
+def test_the_evidence_says_what_the_screening_left_out(tmp_path: Path) -> None:
+    report = analysed(recorded({servo.COMMAND_DELAY: 0.03}), tmp_path, effects=tuple(EFFECTS))
+    out = [row for row in report.evidence if row.reason.startswith("screened out: promised")]
+    first = {row.name for row in report.evidence if row.round == 1}
+    assert out and all(np.isnan(row.held_out_rmse_rad) and row.decision == "rejected" for row in out)
+    assert {"load_friction", "encoder_bias", "command_delay"} <= first
 
 
 def analysed(recording: Recording, out: Path, **options: object) -> Report:
