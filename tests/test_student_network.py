@@ -213,11 +213,12 @@ def test_it_can_tell_two_shapes_apart(device):
 
 
 def test_presets_survive_a_dictionary():
-    assert PRESETS == {"paper": PAPER_NETWORK, "lean": LEAN}
+    assert {"paper", "lean", "small"} <= set(PRESETS)
     for cfg in PRESETS.values():
         cfg.validate()
         assert from_dict(StudentCfg, to_dict(cfg)) == cfg
-    assert count(Student(LEAN, ACTIONS)) < 0.5 * count(Student(PAPER_NETWORK, ACTIONS))
+    sizes = [count(Student(PRESETS[name], ACTIONS)) for name in ("paper", "lean", "small")]
+    assert sizes[1] < 0.5 * sizes[0] and sizes[2] < 0.1 * sizes[1]
 
 
 @pytest.mark.parametrize(

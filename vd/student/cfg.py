@@ -1,4 +1,4 @@
-"""Configuration of the student: its clouds, and its network with the presets ``paper`` and ``lean``."""
+"""Configuration of the student: its clouds, and its network with the presets ``paper``, ``lean``, ``small``."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -116,5 +116,14 @@ PAPER_NETWORK = replace(
 )
 """The network of the paper, sizes as in its released code."""
 
-PRESETS = {"paper": PAPER_NETWORK, "lean": LEAN}
+SMALL = replace(
+    LEAN,
+    encoder=EncoderCfg(channels=(16, 32, 32, 32), blocks=1, embedding=64),
+    memory=64,
+    head_hidden=64,
+    distance_hidden=64,
+)
+"""For processors: trains in minutes what it can."""
+
+PRESETS = {"paper": PAPER_NETWORK, "lean": LEAN, "small": SMALL}
 """Networks by name."""
