@@ -1,4 +1,4 @@
-"""Configuration of the student: its clouds, and its network with the presets ``paper``, ``lean``, ``small``."""
+"""Configuration of the student: noise of its clouds, and its network with presets."""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
