@@ -26,7 +26,7 @@ class ScatteredConv3d(SparseConv3d):
         if pairs is None:
             rows = [(column < len(sites)).nonzero().flatten() for column in table.t()]
             pairs = [(row, table[row, k].long()) for k, row in enumerate(rows)]
-            table.pairs = pairs  # type: ignore[attr-defined]  # kept with the map, as its users share it
+            table.pairs = pairs  # kept with the map, as its users share it
         output = features.new_zeros((table.shape[0], self.weight.shape[2]))
         for k, (row, source) in enumerate(pairs):
             output.index_add_(0, row, features.index_select(0, source) @ self.weight[k])
