@@ -242,6 +242,14 @@ def test_values_that_are_not_finite_stop_the_run_with_a_remedy(tmp_path):
     assert list_checkpoints(tmp_path) == before
 
 
+def test_one_scene_begins_every_rollout():
+    dagger = make_dagger(same_scene=True)
+    first, second = dagger.collect(), dagger.collect()
+    assert torch.equal(first.label[0], second.label[0])
+    other = make_dagger()
+    assert not torch.equal(other.collect().label[0], other.collect().label[0])
+
+
 def test_clouds_are_augmented_in_training():
     dagger = make_dagger()
     dagger.update(dagger.collect())

@@ -13,7 +13,7 @@ from vd.student.cfg import LEAN, PAPER_NETWORK, EncoderCfg, NoiseCfg, StudentCfg
 from vd.train.config import RunCfg
 
 Stage = Literal[0, 1, 2]
-PresetName = Literal["gpu", "paper", "cpu-demo"]
+PresetName = Literal["gpu", "paper", "cpu-demo", "cpu-overfit"]
 
 PRETRAINING, SYNTHETIC, RENDERED = 0, 1, 2
 """Stages: random scenes without simulation; complete clouds; clouds of a depth camera."""
@@ -51,6 +51,8 @@ class DaggerCfg:
     reset: bool = True
     """Begin new episodes in all worlds with every rollout (released code): no step later than rollout_steps
     is ever seen. Otherwise episodes go on, and each rollout starts with the memory of the one before."""
+    same_scene: bool = False
+    """Begin every rollout in the same states, with the same disturbances: can they be learned by heart?"""
     precision: Literal["fp32", "bf16"] = "fp32"
     """Of the network's products; losses and weights stay in fp32."""
 
@@ -184,6 +186,18 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
     )
 
 
+def cpu_overfit(stage: Stage) -> StudentTrainCfg:
+    """One scene again and again, on the CPU: a check that all between clouds and labels is joined up."""
+    start = cpu_demo(stage)
+    return replace(
+        start,
+        preset="cpu-overfit",
+        run=replace(start.run, run_dir=RUNS / f"cpu-overfit-stage{stage}", max_minutes=2.0),
+        dagger=replace(start.dagger, minibatch_worlds=1, epochs=8, same_scene=True),
+        task=replace(start.task, num_worlds=1),
+    )
+
+
 SMALL_NETWORK = StudentCfg(
     encoder=EncoderCfg(channels=(16, 32, 32), blocks=1, embedding=64),
     voxel_m=0.01,
@@ -194,7 +208,12 @@ SMALL_NETWORK = StudentCfg(
 )
 """A hundredth of the paper's network, on voxels of 1 cm."""
 
-PRESETS: dict[str, Callable[[Stage], StudentTrainCfg]] = {"gpu": gpu, "paper": paper, "cpu-demo": cpu_demo}
+PRESETS: dict[str, Callable[[Stage], StudentTrainCfg]] = {
+    "gpu": gpu,
+    "paper": paper,
+    "cpu-demo": cpu_demo,
+    "cpu-overfit": cpu_overfit,
+}
 
 
 def validate(cfg: StudentTrainCfg) -> None:
@@ -239,6 +258,10 @@ def validate(cfg: StudentTrainCfg) -> None:
             raise ValueError(f"{flag} is {share}; it has to be in [0, 1]")
     if dagger.teacher_share > 0.0 and dagger.teacher_share_iterations == 0:
         raise ValueError("--dagger.teacher-share needs --dagger.teacher-share-iterations: when it is to end")
+    if dagger.same_scene and not dagger.reset:
+        raise ValueError(
+            "--dagger.same-scene begins episodes with every rollout; leave --dagger.no-reset out"
+        )
     if cfg.camera is not None and cfg.stage != RENDERED:
         raise ValueError("--camera is for --stage 2; the other stages see complete clouds")
     cfg.network.validate()

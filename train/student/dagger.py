@@ -99,6 +99,7 @@ class Dagger:
         self._hidden = student.initial_hidden(env.num_envs)
         self._window = GoalWindow(math.ceil(2 * env.max_episode_length / cfg.rollout_steps))
         self._means = StepMeans()
+        self._scene: dict[str, Any] | None = None
 
     def iterate(self, stopping: Callable[[], bool]) -> dict[str, float | None] | None:
         """One rollout and update.
@@ -131,7 +132,7 @@ class Dagger:
         cfg, worlds = self.cfg, self.env.num_envs
         self.student.eval()
         if cfg.reset:
-            self.env.env.reset()
+            self._begin_episodes()
             self._hidden = self.student.initial_hidden(worlds)
         first, share = self._hidden, self.teacher_share()
         frames: dict[str, torch.Tensor] = {}
@@ -218,13 +219,19 @@ class Dagger:
 
     def local_state(self) -> dict[str, Any]:
         """What belongs to this process: its worlds, their random states and the student's memory of them."""
-        return {"env": self.env.state_dict(), "view": self.view.state_dict(), "hidden": self._hidden.cpu()}
+        return {
+            "env": self.env.state_dict(),
+            "view": self.view.state_dict(),
+            "hidden": self._hidden.cpu(),
+            "scene": self._scene,
+        }
 
     def load_local_state(self, state: dict[str, Any]) -> None:
         """Restore what :meth:`local_state` gave."""
         self.env.load_state_dict(state["env"])
         self.view.load_state_dict(state["view"])
         self._hidden = state["hidden"].to(self.device)
+        self._scene = state["scene"]
 
     def fits(self, ranks: list[dict[str, Any]]) -> str:
         """Why the worlds of a checkpoint cannot be restored; empty if they can."""
@@ -238,6 +245,14 @@ class Dagger:
     def close(self) -> None:
         """Release the simulation."""
         self.env.close()
+
+    def _begin_episodes(self) -> None:
+        if self._scene is not None:
+            self.env.load_state_dict(self._scene)
+            return
+        self.env.env.reset()
+        if self.cfg.same_scene:
+            self._scene = self.env.state_dict()
 
     def _label(self, observation: torch.Tensor) -> torch.Tensor:
         label = self.teacher.act(observation)

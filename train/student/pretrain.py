@@ -44,7 +44,7 @@ class RandomScenes:
         network: What of the student concerns its clouds.
         scales: Sizes of objects, factors; each is as likely as the others.
         near_share: Share of goals at an angle uniform in [0, pi].
-        noise: Augmentation.
+        noise: Augmentation; none by default.
         batch: R.
         seed: Of the augmentation; scenes come from torch's generator.
         device: Warp device.
@@ -66,7 +66,7 @@ class RandomScenes:
         links = len(hand.link_names)
         self._objects, self._batch, self._near_share = len(objects), batch, near_share
         self._device, self._separate = torch.device(wp.device_to_torch(device)), network.goal == "separate"
-        self._scales = len(scales)
+        self._scales, self._augment = len(scales), noise is not None
         # A "world" for each object in each size.
         self._clouds = SceneClouds(
             hand,
@@ -117,7 +117,7 @@ class RandomScenes:
             self._clouds.goal,
             self._voxelise,
             separate=self._separate,
-            augment=True,
+            augment=self._augment,
         )
         targets = {
             "category": worlds // self._scales,

@@ -1,0 +1,76 @@
+"""The stopping rule: what it stops, and how its bounds are chosen."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from vd.student.stopping import StoppingRule, calibrate
+
+TOLERANCE = 0.4
+
+
+def outcome(predicted, norm, true, alive, distance, limit):
+    """Shares of episodes that stop right and wrong, step by step."""
+    right = wrong = 0
+    for episode in range(true.shape[1]):
+        for step in range(true.shape[0]):
+            if not alive[step, episode]:
+                continue
+            if predicted[step, episode] < distance and norm[step, episode] < limit:
+                right += true[step, episode] <= TOLERANCE
+                wrong += true[step, episode] > TOLERANCE
+                break
+    return right / true.shape[1], wrong / true.shape[1]
+
+
+def episodes(seed, *, bias=0.0, noise=0.1, steps=40, count=60):
+    """Objects that near the goal while the action calms down, seen with an error."""
+    rng = np.random.default_rng(seed)
+    start, floor = rng.uniform(1.0, 3.0, count), rng.uniform(0.0, 0.8, count)
+    decay = np.exp(-np.arange(steps)[:, None] / 8.0)
+    true = floor + (start - floor) * decay + 0.05 * rng.random((steps, count))
+    norm = 0.2 + 2.0 * decay * rng.random((steps, count))
+    predicted = np.clip(true + bias + noise * rng.standard_normal((steps, count)), 0.0, None)
+    alive = np.arange(steps)[:, None] < rng.integers(5, 80, count)
+    return predicted, norm, true, alive
+
+
+def test_both_bounds_have_to_hold():
+    rule = StoppingRule(distance_rad=0.3, action_norm=1.0)
+    predicted = torch.tensor([0.2, 0.2, 0.4, 0.3])
+    action = torch.tensor([[0.5, 0.5], [2.0, 0.0], [0.1, 0.1], [0.0, 0.0]])
+    assert rule.stops(predicted, action).tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize(("seed", "bias"), [(0, 0.0), (1, 0.25), (2, -0.25)])
+def test_the_rule_gives_what_it_says_and_nothing_on_a_grid_is_better(seed, bias):
+    data = episodes(seed, bias=bias)
+    found = calibrate(*data, tolerance_rad=TOLERANCE)
+    right, wrong = outcome(*data, found.rule.distance_rad, found.rule.action_norm)
+    assert (found.success, found.wrong) == (pytest.approx(right), pytest.approx(wrong))
+    for distance, limit in itertools.product(np.arange(1, 25) / 24 * 0.8, np.linspace(0.3, 2.2, 6)):
+        # the other grid has no action bounds in common: allow for what lies between two of them
+        assert outcome(*data, distance, limit)[0] <= found.success + 2 / 60
+    assert found.success <= found.reachable and found.episodes == 60
+
+
+def test_a_predictor_that_says_too_much_gets_a_wider_bound():
+    high, low = (calibrate(*episodes(3, bias=bias, noise=0.0)).rule for bias in (0.3, -0.1))
+    assert high.distance_rad > low.distance_rad
+
+
+def test_steps_after_a_fall_count_for_nothing():
+    predicted, norm, true, alive = episodes(4)
+    cut = calibrate(predicted, norm, true, alive)
+    true, predicted = np.where(alive, true, 0.0), np.where(alive, predicted, 0.0)
+    assert calibrate(predicted, norm, true, alive) == cut
+
+
+def test_nothing_to_calibrate_on_is_an_error():
+    predicted, norm, true, alive = episodes(5)
+    with pytest.raises(ValueError, match="no episode has a step"):
+        calibrate(predicted, norm, true, np.zeros_like(alive))
+    with pytest.raises(ValueError, match="no rule stops any of 60 episodes"):
+        calibrate(predicted, norm, true + 2.0, alive)
