@@ -27,6 +27,7 @@ from vd.kernels.actuators import (
     LOAD_FRICTION,
     PAYLOAD_INERTIA,
     READ_DELAY,
+    STATE_TIME,
     VELOCITY_LIMIT,
     drive_joint,
     shape_command,
@@ -71,7 +72,7 @@ class Links:
 class Samples:
     """Recorded trajectories, one after the other; S rows (time stamps) in all.
 
-    step: Time stamp in whole steps [S].
+    step: Time stamp in whole steps [S]. A trajectory need not begin at 0: a piece of a longer one.
     fraction: And the rest, in [0, 1] [S].
     command: Commanded positions [S, n] [rad].
     power: Factor on the controller's gains, 0 with the torque off [S, n].
@@ -303,6 +304,7 @@ def rollout_kernel(
         held[j] = samples.command[begin, j]
         held_power[j] = samples.power[begin, j]
         start_servo(held[j], q[j], row, state)
+        state[row, STATE_TIME] = dt * float(samples.step[begin])
         step, fraction, kept = arrival(samples, begin, stream[run], parameters, row, dt)
         due_step[j] = step
         due_fraction[j] = fraction
@@ -313,10 +315,10 @@ def rollout_kernel(
         read_step[j] = step
         read_fraction[j] = fraction
 
-    for k in range(samples.step[end - 1] + 1):
+    for k in range(samples.step[begin], samples.step[end - 1] + 1):
         # From rest at the first position to the velocity half a step later.
         kick = dt
-        if k == 0:
+        if k == samples.step[begin]:
             kick = CENTRED * dt
         torque = wp.vec3(0.0)
         damping = wp.vec3(0.0)

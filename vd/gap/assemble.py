@@ -49,7 +49,7 @@ class Analysed:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Squared errors of one joint in the trajectories that excite it [S]."""
+    """Squared errors of one joint in what was analysed of the trajectories that excite it [S]."""
 
     trajectories: np.ndarray
     count: np.ndarray
@@ -156,11 +156,20 @@ def _excited(joint: Analysed, predictions: Predictions) -> np.ndarray:
     return np.array(own)
 
 
+def _analysed(joint: Analysed, predictions: Predictions, index: int) -> np.ndarray:
+    """The samples of a trajectory that were analysed for a joint, or all if none was fitted."""
+    rows = np.flatnonzero(predictions.trajectory == index)
+    parts = dict(zip(joint.spec.trajectories, joint.spec.pieces, strict=bool(joint.spec.pieces)))
+    first, end = parts.get(index, (0, len(rows)))
+    return rows[first:end]
+
+
 def _errors(joint: Analysed, predictions: Predictions) -> Errors:
     """Held-out errors where the trajectory was in a fold, errors of the full fit where it was in no fit."""
     column = predictions.joints.index(joint.name)
     own = _excited(joint, predictions)
-    count = np.array([(predictions.trajectory == i).sum() for i in own], float)
+    samples = {int(i): _analysed(joint, predictions, int(i)) for i in own}
+    count = np.array([len(rows) for rows in samples.values()], float)
     result = []
     for fit, curve in (
         (joint.explanation.baseline, predictions.baseline),
@@ -168,20 +177,19 @@ def _errors(joint: Analysed, predictions: Predictions) -> Errors:
     ):
         known = dict(zip(joint.spec.trajectories, fit.held_out, strict=True))
         sums = []
-        for i in own:
-            rows = predictions.trajectory == i
+        for i, rows in samples.items():
             free = np.sum((predictions.measured[rows, column] - curve[rows, column]) ** 2)
-            sums.append(known.get(int(i), float(free)))
+            sums.append(known.get(i, float(free)))
         result.append(np.array(sums))
     return Errors(own, count, *result)
 
 
 def _fit(joints: Sequence[Analysed], predictions: Predictions, curve: np.ndarray, which: str) -> Fit:
-    """Errors on all trajectories, and the baseline's parameters, of one of the two models."""
+    """Errors on everything analysed, and the baseline's parameters, of one of the two models."""
     residuals = {}
     for joint in joints:
         column = predictions.joints.index(joint.name)
-        rows = np.isin(predictions.trajectory, _excited(joint, predictions))
+        rows = np.concatenate([_analysed(joint, predictions, int(i)) for i in _excited(joint, predictions)])
         residuals[joint.name] = predictions.measured[rows, column] - curve[rows, column]
     everything = np.concatenate(list(residuals.values()))
     return Fit(

@@ -1,17 +1,22 @@
 """Which trajectories speak about a joint, and how they are held out."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Chain
+from vd.gap.statistics import held
 
 MAX_FOLDS = 6
 BYSTANDERS = 2
 """Trajectories of each other joint of the chain in which a joint's own rest is fitted too."""
 CONDITION_VALUES = 3
 """Values of a condition from which on its values, not the motions, are held out."""
-MAX_SAMPLES = 15_000
-"""Samples of a joint that are fitted; the rest is held out for good."""
+MAX_MOTION_S = 150.0
+"""Motion of a joint that is fitted [s]: twice what the paper records; the rest is held out for good."""
+MIN_PIECE_S = 5.0
+"""Shortest piece of a trajectory that is worth fitting [s]."""
 
 
 def design(recording: Recording, chain: Chain, joint: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -53,19 +58,49 @@ def _largest(recording: Recording, name: str, column: int) -> list[int]:
 
 
 def _within_budget(recording: Recording, own: list[int]) -> list[int]:
-    """As many trajectories as the budget of samples allows, spread over the recording."""
-    total = sum(len(recording.trajectories[i].time) for i in own)
-    if total <= MAX_SAMPLES:
+    """As many trajectories as leave each a piece that is worth fitting, spread over the recording."""
+    most = int(MAX_MOTION_S / MIN_PIECE_S)
+    if len(own) <= most or sum(_length(recording, i) for i in own) <= MAX_MOTION_S:
         return own
-    # Short ones first: different motions say more than long ones.
-    kept: list[int] = []
-    used = 0
-    for i in sorted(own, key=lambda i: len(recording.trajectories[i].time)):
-        used += len(recording.trajectories[i].time)
-        if used > MAX_SAMPLES and len(kept) >= MAX_FOLDS:
+    return [own[i] for i in np.linspace(0, len(own) - 1, most).round().astype(int)]
+
+
+def pieces(recording: Recording, chain: Chain, trajectories: Sequence[int]) -> tuple[tuple[int, int], ...]:
+    """What is analysed of each trajectory, samples ``(first, end)``; empty for a recording taken whole.
+
+    Different motions say more than long ones: of a long recording, a piece of every trajectory, the one in
+    which the commands travel farthest of those that begin at rest, as a simulation must.
+    """
+    lengths = np.array([_length(recording, i) for i in trajectories])
+    if lengths.sum() <= MAX_MOTION_S:
+        return ()
+    left, share = MAX_MOTION_S, 0.0
+    for done, length in enumerate(np.sort(lengths)):
+        share = left / (len(lengths) - done)
+        if length > share:
             break
-        kept.append(i)
-    return sorted(kept)
+        left -= length
+    return tuple(_busiest(recording, chain, recording.trajectories[i], share) for i in trajectories)
+
+
+def _busiest(recording: Recording, chain: Chain, trajectory: Trajectory, share: float) -> tuple[int, int]:
+    """The piece of ``share`` seconds from rest in which the chain's commands travel farthest."""
+    time = trajectory.time
+    if time[-1] <= share:
+        return 0, len(time)
+    columns = [int(column) for column in chain.columns]
+    rest = np.logical_and.reduce([held(trajectory, c, recording.encoder_resolution_rad) for c in columns])
+    rest[0] = True
+    starts = np.flatnonzero(rest & (time <= time[-1] - share))
+    ends = np.searchsorted(time, time[starts] + share)
+    steps = np.abs(np.diff(trajectory.command[:, columns], axis=0, prepend=trajectory.command[:1, columns]))
+    travelled = np.cumsum(steps.sum(axis=1))
+    best = int(np.argmax(travelled[ends - 1] - travelled[starts]))
+    return int(starts[best]), int(ends[best])
+
+
+def _length(recording: Recording, index: int) -> float:
+    return float(recording.trajectories[index].time[-1])
 
 
 def _varied(trajectories: list[Trajectory]) -> str | None:

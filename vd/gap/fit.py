@@ -178,7 +178,7 @@ class JointProblem:
             time, position = trajectory.time, trajectory.position[:, column]
             torques.append(row[servo.KP] * np.abs(trajectory.command[:, column] - position))
             # Motion over 50 ms: encoder counts do not look like speed.
-            grid = np.arange(0.0, time[-1], 0.05)
+            grid = np.arange(time[0], time[-1], 0.05)
             smooth = np.interp(grid, time, position)
             speed = np.diff(smooth) / 0.05
             speeds.append(np.abs(speed))

@@ -50,7 +50,7 @@ class Trajectory:
         excitation: Kind of motion (steps, sine_0.50hz ...); the unit of held-out splits.
         joints: Joints that were excited, a subset of the recording's.
         conditions: What was varied on purpose (``p_gain``, ``payload_kg``, ``supply_v`` ...).
-        time: Time stamps [T] [s], float64, starting at 0.
+        time: Time stamps [T] [s], float64, starting at 0 (:meth:`piece`: later).
         command: Commanded positions [T, J] [rad].
         position: Measured positions [T, J] [rad].
         velocity: Measured velocities [T, J] [rad/s], or None; NaN for joints without the column.
@@ -74,6 +74,11 @@ class Trajectory:
     pwm: np.ndarray | None = None
     voltage: np.ndarray | None = None
     temperature: np.ndarray | None = None
+
+    def piece(self, first: int, end: int) -> "Trajectory":
+        """Samples ``first`` to ``end`` (not included), with the times that they have in the whole."""
+        arrays = {name: getattr(self, name) for name in ("time", *CHANNELS)}
+        return replace(self, **{name: a[first:end] for name, a in arrays.items() if a is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +104,15 @@ class Recording:
     def subset(self, indices: Sequence[int]) -> "Recording":
         """The same recording with only these trajectories, in this order."""
         return replace(self, trajectories=tuple(self.trajectories[i] for i in indices))
+
+    def cut(self, pieces: Mapping[int, tuple[int, int]]) -> "Recording":
+        """The same recording with pieces in the place of some trajectories.
+
+        Args:
+            pieces: Index of the trajectory -> samples ``(first, end)``.
+        """
+        parts = enumerate(self.trajectories)
+        return replace(self, trajectories=tuple(t.piece(*pieces[i]) if i in pieces else t for i, t in parts))
 
 
 def read_recording(path: str | Path) -> Recording:

@@ -29,6 +29,7 @@ class JointSpec:
         folds: Fold of each.
         floor: Noise floor [rad].
         baseline: Keys of the fitted baseline parameters.
+        pieces: Samples ``(first, end)`` of each trajectory that are analysed; empty: all.
     """
 
     chain: int
@@ -37,6 +38,7 @@ class JointSpec:
     folds: tuple[int, ...]
     floor: float
     baseline: tuple[str, ...]
+    pieces: tuple[tuple[int, int], ...] = ()
 
 
 class Bench:
@@ -44,18 +46,21 @@ class Bench:
 
     def __init__(self, recording: Recording, chains: Sequence[Chain], dt: float, device: str):
         self.recording, self.chains, self.dt, self.device = recording, chains, dt, device
-        self._rollouts: dict[int, Rollouts] = {}
+        self._rollouts: dict[tuple[int, int | None], Rollouts] = {}
         self._problems: dict[tuple[int, int], JointProblem] = {}
 
     def problem(self, spec: JointSpec) -> JointProblem:
         """The problem of a joint."""
         key = spec.chain, spec.joint
-        if spec.chain not in self._rollouts:
-            chain = self.chains[spec.chain]
-            self._rollouts[spec.chain] = Rollouts(chain, self.recording, dt=self.dt, device=self.device)
         if key not in self._problems:
+            # Whole trajectories are shared by the joints of a chain, pieces are each joint's own.
+            shared = spec.chain, None if not spec.pieces else spec.joint
+            if shared not in self._rollouts:
+                parts = dict(zip(spec.trajectories, spec.pieces, strict=bool(spec.pieces)))
+                recording, chain = self.recording.cut(parts), self.chains[spec.chain]
+                self._rollouts[shared] = Rollouts(chain, recording, dt=self.dt, device=self.device)
             self._problems[key] = JointProblem(
-                self._rollouts[spec.chain],
+                self._rollouts[shared],
                 spec.joint,
                 spec.trajectories,
                 spec.folds,

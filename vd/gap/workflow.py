@@ -21,7 +21,7 @@ from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.coordinates import Scales
-from vd.gap.design import design
+from vd.gap.design import design, pieces
 from vd.gap.find import findings
 from vd.gap.fit import JointFit, candidates, others_in
 from vd.gap.judge import Explanation, alike, share, stood_for
@@ -35,7 +35,7 @@ from vd.gap.telemetry import vetoes
 from vd.kernels.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"
-VERSION = 1
+VERSION = 2
 """Of the method; a result of another version is not resumed."""
 CMA_GENERATIONS = 20
 BASELINE_ITERATIONS = 15
@@ -266,7 +266,8 @@ def _specs(recording: Recording, parts: Sequence[Chain]) -> list[JointSpec]:
             trajectories, folds = design(recording, chain, joint)
             if trajectories:
                 floor = noise_floor(recording, int(chain.columns[joint]))
-                specs.append(JointSpec(index, joint, trajectories, folds, floor, baseline_of(chain)))
+                parts = pieces(recording, chain, trajectories)
+                specs.append(JointSpec(index, joint, trajectories, folds, floor, baseline_of(chain), parts))
     return specs
 
 
