@@ -17,6 +17,8 @@ MAX_MOTION_S = 150.0
 """Motion of a joint that is fitted [s]: twice what the paper records; the rest is held out for good."""
 MIN_PIECE_S = 5.0
 """Shortest piece of a trajectory that is worth fitting [s]."""
+NEARLY = 0.95
+"""Share of the widest range that a piece must cover to be taken for being the earliest."""
 
 
 def design(recording: Recording, chain: Chain, joint: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -68,8 +70,8 @@ def _within_budget(recording: Recording, own: list[int]) -> list[int]:
 def pieces(recording: Recording, chain: Chain, trajectories: Sequence[int]) -> tuple[tuple[int, int], ...]:
     """What is analysed of each trajectory, samples ``(first, end)``; empty for a recording taken whole.
 
-    Different motions say more than long ones: of a long recording, a piece of every trajectory, the one in
-    which the commands travel farthest of those that begin at rest, as a simulation must.
+    Different motions say more than long ones: of a long recording, a piece of every trajectory, the one that
+    covers the widest range of those that begin at rest, as a simulation must.
     """
     lengths = np.array([_length(recording, i) for i in trajectories])
     if lengths.sum() <= MAX_MOTION_S:
@@ -80,11 +82,11 @@ def pieces(recording: Recording, chain: Chain, trajectories: Sequence[int]) -> t
         if length > share:
             break
         left -= length
-    return tuple(_busiest(recording, chain, recording.trajectories[i], share) for i in trajectories)
+    return tuple(_widest(recording, chain, recording.trajectories[i], share) for i in trajectories)
 
 
-def _busiest(recording: Recording, chain: Chain, trajectory: Trajectory, share: float) -> tuple[int, int]:
-    """The piece of ``share`` seconds from rest in which the chain's commands travel farthest."""
+def _widest(recording: Recording, chain: Chain, trajectory: Trajectory, share: float) -> tuple[int, int]:
+    """The first piece of ``share`` seconds from rest in which the joints cover about the most they do."""
     time = trajectory.time
     if time[-1] <= share:
         return 0, len(time)
@@ -93,9 +95,10 @@ def _busiest(recording: Recording, chain: Chain, trajectory: Trajectory, share: 
     rest[0] = True
     starts = np.flatnonzero(rest & (time <= time[-1] - share))
     ends = np.searchsorted(time, time[starts] + share)
-    steps = np.abs(np.diff(trajectory.command[:, columns], axis=0, prepend=trajectory.command[:1, columns]))
-    travelled = np.cumsum(steps.sum(axis=1))
-    best = int(np.argmax(travelled[ends - 1] - travelled[starts]))
+    position = trajectory.position[:, columns]
+    parts = zip(starts, ends, strict=True)
+    covered = np.array([np.ptp(position[first:end], axis=0).sum() for first, end in parts])
+    best = int(np.argmax(covered >= NEARLY * covered.max()))
     return int(starts[best]), int(ends[best])
 
 

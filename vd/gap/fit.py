@@ -39,6 +39,9 @@ CMA_SIGMA = 0.7
 CMA_TRAJECTORIES = 4
 CMA_POPULATION = 16
 
+ONE_SIDED, DRY = "asymmetric_friction", ("coulomb_friction", "stribeck_friction")
+"""The friction that can have a direction without any, and those that fill it up."""
+
 FINER = (2, 4)
 """Divisors of the time step at which an estimate is finished: what the last one changes is its error."""
 FINER_ITERATIONS = 4
@@ -107,7 +110,12 @@ class JointFit:
     def at_bound(self) -> tuple[str, ...]:
         """Keys of effect parameters that ended at a bound."""
         pairs = zip(self.coordinates, self.x, strict=True)
-        return tuple(c.key for c, x in pairs if "." in c.key and c.bound(float(x)))
+        bound = [c.key for c, x in pairs if "." in c.key and c.bound(float(x))]
+        if ONE_SIDED in self.effects and not set(DRY) & set(self.effects):
+            # No dry friction spares one direction: what does is a load, and a greater one would push.
+            sides = [key for key, value in self.values.items() if key.startswith(ONE_SIDED)]
+            bound += [key for key in sides if self.values[key] <= 0.0]
+        return tuple(bound)
 
 
 class JointProblem:

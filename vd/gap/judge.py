@@ -324,8 +324,10 @@ class Judge:
             other = fit.effects[-1]
             same, ci = self.tied(mine, fit)
             alternatives.append((other, fit.held_out_rmse, ci))
-            if same and name not in NESTED.get(other, ()):
+            if same:
                 tied.append(other)
+        # In a tie the simpler one is meant: none beside an effect that it contains.
+        tied = [other for other in tied if not {name, *tied} & set(NESTED.get(other, ()))]
         if share < NAMED and not tied:
             rival = int(np.argmax(np.bincount(choice, minlength=len(others) + 1)[1:]))
             tied.append(others[rival].effects[-1])

@@ -16,6 +16,8 @@ from vd.kernels.effects import EFFECTS
 
 MIN_TRAJECTORIES = 3
 MAX_EFFECTS = 3
+FRICTION_AND_LOAD = "asymmetric_friction"
+"""The effect that is also what two others do together (:meth:`Selection.take_apart`)."""
 MAX_ROUNDS = 6
 """Rounds in all, with those after a revision."""
 SHORT_LIST = 10
@@ -207,6 +209,15 @@ class Selection(Judge):
             trials += self.screened_out(number, present, fits)
             if not accepted:
                 break
+            if FRICTION_AND_LOAD in fits and len(present.effects) + 2 <= MAX_EFFECTS:
+                apart = self.take_apart(present, fits[FRICTION_AND_LOAD])
+                pair = self.winner(apart) if apart else best
+                if int(np.argmin(self.scores([best, pair]))) == 1:
+                    before, after = present.held_out_rmse, pair.held_out_rmse
+                    names = " and ".join(pair.effects[-2:])
+                    self.report(f"+ {names}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
+                    present = pair
+                    break
             name, before, after = best.effects[-1], present.held_out_rmse, best.held_out_rmse
             self.report(f"+ {name}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
             rivals[name] = list(fits.values())
@@ -214,6 +225,33 @@ class Selection(Judge):
             if present.held_out_rmse < NO_GAP * self.floor or len(present.effects) >= MAX_EFFECTS:
                 break
         return present, rivals, trials
+
+    def take_apart(self, present: JointFit, asymmetric: JointFit) -> list[JointFit]:
+        """Fits with asymmetric friction taken apart: dry friction, and what a load or an offset does.
+
+        Friction that differs between the directions is the same as friction that does not and a constant
+        torque. Each alone can make motions worse, so that one after the other they would not be found.
+        """
+        plus, minus = (asymmetric.values[f"{FRICTION_AND_LOAD}.tau_{side}_nm"] for side in ("plus", "minus"))
+        load = 0.5 * (minus - plus)
+        level = {"coulomb_friction.tau_c_nm": 0.5 * (plus + minus)}
+        base = {k: v for k, v in asymmetric.values.items() if not k.startswith(FRICTION_AND_LOAD)}
+        starts = {
+            "gravity_load": {
+                "gravity_load.tau_g_nm": abs(load),
+                "gravity_load.phase_rad": -0.5 * np.pi * np.sign(load),
+            },
+            "encoder_bias": {"encoder_bias.bias_rad": load / self.scales.kp},
+        }
+        usable = {*self.candidates} - {*present.effects, *self.vetoes}
+        names = [name for name in starts if {name, "coulomb_friction"} <= usable]
+        calls = []
+        for name in names:
+            others = sizes(name, self.others, self.scales)
+            given = [{**base, **level, **start} for start in (starts[name], *others)]
+            call = self.call(present, "coulomb_friction", given, FULL_ITERATIONS)
+            calls.append(("fit", {**call[1], "effects": (*present.effects, "coulomb_friction", name)}))
+        return [fits[0] for fits in self.run(calls)]
 
     def fit_candidates(self, present: JointFit, skip: Sequence[str] = ()) -> dict[str, JointFit]:
         """Fits with each promising further effect, the finalists to convergence, by name."""
@@ -358,7 +396,8 @@ class Selection(Judge):
                     break
                 rivals[name] = self.rivals(present, name, without)
                 best = self.winner(rivals[name])
-                if best is not present and not self.tied(best, present)[0]:
+                simpler = best.effects[-1] in NESTED.get(name, ())
+                if best is not present and (simpler or not self.tied(best, present)[0]):
                     self.report(f"~ {name} exchanged for {best.effects[-1]}")
                     present, changed = best, True
                     break
