@@ -9,6 +9,7 @@ import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
+from vd.gap.design import varied
 from vd.gap.judge import Accepted, Explanation
 from vd.gap.recording import Recording
 from vd.gap.result import (
@@ -19,6 +20,7 @@ from vd.gap.result import (
     Fit,
     HeldOut,
     JointGap,
+    LeftOut,
     NamedEffect,
     Predictions,
     Report,
@@ -49,12 +51,14 @@ class Analysed:
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Squared errors of one joint in what was analysed of the trajectories that excite it [S]."""
+    """Sums of squared and absolute errors of one joint in what was analysed of each trajectory [S]."""
 
     trajectories: np.ndarray
     count: np.ndarray
     baseline: np.ndarray
     identified: np.ndarray
+    baseline_abs: np.ndarray
+    identified_abs: np.ndarray
 
 
 def curves(
@@ -170,18 +174,21 @@ def _errors(joint: Analysed, predictions: Predictions) -> Errors:
     own = _excited(joint, predictions)
     samples = {int(i): _analysed(joint, predictions, int(i)) for i in own}
     count = np.array([len(rows) for rows in samples.values()], float)
-    result = []
+    squares, absolutes = [], []
     for fit, curve in (
         (joint.explanation.baseline, predictions.baseline),
         (joint.explanation.final, predictions.identified),
     ):
-        known = dict(zip(joint.spec.trajectories, fit.held_out, strict=True))
+        absolute = np.full(len(fit.held_out), np.nan) if fit.held_out_abs is None else fit.held_out_abs
+        pairs = zip(fit.held_out, absolute, strict=True)
+        known = dict(zip(joint.spec.trajectories, pairs, strict=True))
         sums = []
         for i, rows in samples.items():
-            free = np.sum((predictions.measured[rows, column] - curve[rows, column]) ** 2)
-            sums.append(known.get(i, float(free)))
-        result.append(np.array(sums))
-    return Errors(own, count, *result)
+            free = predictions.measured[rows, column] - curve[rows, column]
+            sums.append(known.get(i, (float(free @ free), float(np.abs(free).sum()))))
+        squares.append(np.array([pair[0] for pair in sums]))
+        absolutes.append(np.array([pair[1] for pair in sums]))
+    return Errors(own, count, *squares, *absolutes)
 
 
 def _fit(joints: Sequence[Analysed], predictions: Predictions, curve: np.ndarray, which: str) -> Fit:
@@ -222,7 +229,22 @@ def _held_out(recording: Recording, errors: Sequence[Errors], rng: np.random.Gen
     before, after, reduction, samples = _ratio(errors, rng)
     used = sorted({int(i) for e in errors for i in e.trajectories})
     files = tuple(recording.trajectories[i].file for i in used)
-    return HeldOut(files, before, after, reduction, interval(samples))
+    count, old, new, where = (
+        np.concatenate([getattr(e, name) for e in errors])
+        for name in ("count", "baseline_abs", "identified_abs", "trajectories")
+    )
+    conditions = [recording.trajectories[int(i)].conditions for i in where]
+    condition = varied([recording.trajectories[i] for i in used])
+    values = [str(each.get(condition)) for each in conditions] if condition else []
+    left_out = []
+    for value in sorted(set(values)):
+        of = np.array(values) == value
+        total = float(count[of].sum())
+        left_out.append(
+            LeftOut(str(condition), value, float(old[of].sum()) / total, float(new[of].sum()) / total)
+        )
+    mae = (float(part.sum() / count.sum()) for part in (old, new))
+    return HeldOut(files, before, after, reduction, interval(samples), *mae, tuple(left_out))
 
 
 def _gap(joint: Analysed, errors: Errors, rng: np.random.Generator) -> JointGap:
@@ -363,7 +385,8 @@ def _evidence(joint: Analysed) -> list[Candidate]:
 
 
 def _trajectories(recording: Recording, joint: Analysed, errors: Errors) -> list[TrajectoryError]:
-    rows = zip(errors.trajectories, errors.count, errors.baseline, errors.identified, strict=True)
+    sums = errors.baseline, errors.identified, errors.baseline_abs, errors.identified_abs
+    rows = zip(errors.trajectories, errors.count, zip(*sums, strict=True), strict=True)
     return [
         TrajectoryError(
             file=recording.trajectories[int(i)].file,
@@ -372,6 +395,8 @@ def _trajectories(recording: Recording, joint: Analysed, errors: Errors) -> list
             held_out=True,
             baseline_rmse_rad=float(np.sqrt(old / count)),
             identified_rmse_rad=float(np.sqrt(new / count)),
+            baseline_mae_rad=float(old_abs / count),
+            identified_mae_rad=float(new_abs / count),
         )
-        for i, count, old, new in rows
+        for i, count, (old, new, old_abs, new_abs) in rows
     ]

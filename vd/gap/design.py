@@ -45,7 +45,7 @@ def design(recording: Recording, chain: Chain, joint: int) -> tuple[tuple[int, .
         if other != joint:
             chosen |= set(_largest(recording, chain.joints[other], int(chain.columns[other]))[:BYSTANDERS])
     trajectories = sorted(chosen)
-    condition = _varied([recording.trajectories[i] for i in own])
+    condition = varied([recording.trajectories[i] for i in own])
     labels = [_label(recording.trajectories[i], condition) for i in trajectories]
     kinds = sorted(set(labels))
     if len(kinds) < 2:
@@ -106,7 +106,7 @@ def _length(recording: Recording, index: int) -> float:
     return float(recording.trajectories[index].time[-1])
 
 
-def _varied(trajectories: list[Trajectory]) -> str | None:
+def varied(trajectories: list[Trajectory]) -> str | None:
     """The condition whose values are held out: the one with the most values, if they are enough."""
     names = sorted({name for t in trajectories for name in t.conditions})
     counts = {

@@ -72,6 +72,7 @@ class JointFit:
         count: Samples of each trajectory [S].
         gram: J^T J of each trajectory, [S, P, P].
         gradient: J^T r of each trajectory, [S, P].
+        held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad]; None where not taken.
         step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
         structure: Sum of products of successive residuals in motion, and their number, of each trajectory
             [2, S] [rad^2]: zero on average if only noise is left; None where not estimated.
@@ -87,6 +88,7 @@ class JointFit:
     count: np.ndarray
     gram: np.ndarray
     gradient: np.ndarray
+    held_out_abs: np.ndarray | None = None
     step_error: np.ndarray | None = None
     structure: np.ndarray | None = None
     extents: Mapping[str, tuple[float, float]] | None = None
@@ -247,7 +249,8 @@ class JointProblem:
         ]
         fits.sort(key=lambda fit: float(fit.sse.sum()))
         if trajectories is None:
-            fits[0] = replace(fits[0], held_out=self.cross_validate(fits[0], scales, refits))
+            squares, absolutes = self.cross_validate(fits[0], scales, refits)
+            fits[0] = replace(fits[0], held_out=squares, held_out_abs=absolutes)
         return fits
 
     def fitted(self, effects: Sequence[str]) -> list[str]:
@@ -361,13 +364,15 @@ class JointProblem:
             gradient=np.stack([j @ e for j, e in zip(parts, errors, strict=True)]),
         )
 
-    def cross_validate(self, fit: JointFit, scales: Scales, iterations: int = 0) -> np.ndarray:
-        """Squared errors of each trajectory, predicted by a fit without its fold, shape [S].
+    def cross_validate(
+        self, fit: JointFit, scales: Scales, iterations: int = 0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Squared and absolute errors of each trajectory, predicted by a fit without its fold, [S] each.
 
         The refit is one Gauss-Newton step from the full fit, or ``iterations`` of
         Levenberg-Marquardt if given.
         """
-        result = np.zeros(len(self.trajectories))
+        squares, absolutes = np.zeros((2, len(self.trajectories)))
         lower = np.array([c.lower for c in fit.coordinates])
         upper = np.array([c.upper for c in fit.coordinates])
         logarithmic = np.array([c.log for c in fit.coordinates])
@@ -392,8 +397,10 @@ class JointProblem:
                 x = np.clip(fit.x + np.clip(step, -trust, trust), lower, upper)
             rows = self.rows(fit.rows, fit.coordinates, x[None])
             chosen = self.trajectories[out]
-            result[out] = self.sums(self.residuals(rows, chosen), chosen)[0]
-        return result
+            parts = self.split(self.residuals(rows, chosen)[0], chosen)
+            squares[out] = [part @ part for part in parts]
+            absolutes[out] = [np.abs(part).sum() for part in parts]
+        return squares, absolutes
 
     def refine(self, fit: JointFit, scales: Scales) -> JointFit:
         """The same model fitted on with finer time steps, for values that do not depend on the step.
@@ -419,7 +426,8 @@ class JointProblem:
         finally:
             self.rollouts = rollouts
         structure = self._structure(residual)
-        return replace(result, held_out=fit.held_out, step_error=error, structure=structure)
+        held_out = {"held_out": fit.held_out, "held_out_abs": fit.held_out_abs}
+        return replace(result, **held_out, step_error=error, structure=structure)
 
     def _structure(self, residual: np.ndarray) -> np.ndarray:
         """Products of successive residuals in motion [2, S]; at rest the rounding to counts repeats."""

@@ -51,9 +51,11 @@ STRUCTURE = 0.09
 something: the right ones leave 0.05 at most (the noise of the first sample, which starts a rollout)."""
 STRUCTURE_SURE = 0.02
 """The same for the low end of its interval over trajectories."""
-REPEATABLE = 3.0
+REPEATABLE = 2.0
 """Final error, in noise floors, up to which residuals are held against noise alone. A real machine that is
 farther from it does not repeat its motions that well; how well is not known from one recording of each."""
+FORMS = {"torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag"}
+"""Forms of one loss, of torque where much is asked."""
 RANDOM = "command_jitter"
 """The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
 DETERMINED = ("kp", "kd", "inertia")
@@ -123,12 +125,14 @@ class Judge:
         weights: Bootstrap weights of the trajectories [R, S].
         whole: Held-out RMSE of the baseline [rad]; what is small beside it is the model's own error.
         equivalent: Effects that one stands for, since the recording cannot tell them apart.
+        without: Held-out RMSE of the present model without each of its effects [rad].
     """
 
     floor: float
     weights: np.ndarray
     whole: float = 0.0
     equivalent: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    without: dict[str, float] = field(default_factory=dict)
 
     def scores(self, fits: Sequence[JointFit], weights: np.ndarray | None = None) -> np.ndarray:
         """Log of held-out RMSE plus the price of parameters, shape [C] or [C, R]."""
@@ -186,6 +190,17 @@ class Judge:
             excess = other.rmse**2 - winner.rmse**2
             return excess < (EXCESS_FLOORS * self.floor) ** 2, (low, high)
         return float(np.quantile(error - best, TIE_TAIL)) <= 0.0, (low, high)
+
+    def same_loss(self, name: str, mine: JointFit, fit: JointFit) -> bool:
+        """Whether another form of a loss does most of what this one does in a model far from the floor.
+
+        What such a model lacks elsewhere is more than the forms differ by, and would decide between them.
+        """
+        if not {name, fit.effects[-1]} <= FORMS or name not in self.without:
+            return False
+        gap = self.without[name] ** 2
+        done, needed = gap - fit.held_out_rmse**2, gap - mine.held_out_rmse**2
+        return mine.held_out_rmse > REPEATABLE * self.floor and done > RECOVERED * needed > 0.0
 
     def undetermined(self, fit: JointFit) -> str:
         """Which parameter of the baseline the motions leave open, in words; empty if none."""
@@ -324,7 +339,7 @@ class Judge:
             other = fit.effects[-1]
             same, ci = self.tied(mine, fit)
             alternatives.append((other, fit.held_out_rmse, ci))
-            if same:
+            if same or self.same_loss(name, mine, fit):
                 tied.append(other)
         # In a tie the simpler one is meant: none beside an effect that it contains.
         tied = [other for other in tied if not {name, *tied} & set(NESTED.get(other, ()))]

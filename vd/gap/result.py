@@ -102,6 +102,20 @@ class HeldOut:
     """1 - identified / baseline."""
     ci95: Interval
     """Of the reduction, trajectories resampled."""
+    baseline_mae_rad: float = math.nan
+    identified_mae_rad: float = math.nan
+    left_out: tuple["LeftOut", ...] = ()
+    """By the value of a condition that was left out as a whole, where one was varied."""
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Mean absolute errors at one value of a condition, by models that were fitted at the others."""
+
+    condition: str
+    value: str
+    baseline_mae_rad: float
+    identified_mae_rad: float
 
 
 @dataclass(frozen=True)
@@ -151,6 +165,8 @@ class TrajectoryError:
     held_out: bool
     baseline_rmse_rad: float
     identified_rmse_rad: float
+    baseline_mae_rad: float = math.nan
+    identified_mae_rad: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import numpy as np
 from vd.gap.coordinates import Scales, sizes
 from vd.gap.fit import JointFit
 from vd.gap.judge import EXPLAINED, NESTED, NO_GAP, RANDOM, Explanation, Judge, Trial
+from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.effects import EFFECTS
 
 MIN_TRAJECTORIES = 3
@@ -113,7 +114,8 @@ class Selection(Judge):
             if not earned:
                 self.report(f"taken back: {why}")
                 present, rivals = baseline, {}
-        if len(present.effects) > 1 and set(rivals) != set(present.effects):
+        behind = set(BEHIND_SENSOR) & set(self.vetoes) & set(self.candidates)
+        if present.effects and (behind or (len(present.effects) > 1 and set(rivals) != set(present.effects))):
             rivals = {name: self.rivals(present, name) for name in present.effects}
         if present.held_out_rmse > NO_GAP * self.floor:
             chance, rows = self.try_random(baseline, present)
@@ -130,7 +132,15 @@ class Selection(Judge):
             present = self.refit(again, again.effects)
             rivals = {k: [present if fit is found else fit for fit in fits] for k, fits in rivals.items()}
         refined = self.run([("refine", {"fit": present, "scales": self.scales})])[0]
-        return self.conclude(baseline, present, rivals, evidence, loose, refined, again)
+        return self.explained(self.conclude(baseline, present, rivals, evidence, loose, refined, again))
+
+    def explained(self, explanation: Explanation) -> Explanation:
+        """The explanation with what a member of a set means that telemetry contradicts by its name."""
+        tied = {name for one in explanation.accepted for name in one.tied}
+        notes = [
+            f"{name} {BEHIND_SENSOR[name]}" for name in sorted(tied & set(BEHIND_SENSOR) & set(self.vetoes))
+        ]
+        return replace(explanation, reason="; ".join([explanation.reason, *notes]))
 
     def search(
         self, baseline: JointFit, start: JointFit
@@ -253,9 +263,17 @@ class Selection(Judge):
             calls.append(("fit", {**call[1], "effects": (*present.effects, "coulomb_friction", name)}))
         return [fits[0] for fits in self.run(calls)]
 
-    def fit_candidates(self, present: JointFit, skip: Sequence[str] = ()) -> dict[str, JointFit]:
-        """Fits with each promising further effect, the finalists to convergence, by name."""
-        out = {*present.effects, *self.vetoes, *skip, RANDOM}
+    def fit_candidates(
+        self, present: JointFit, skip: Sequence[str] = (), vetoed: Sequence[str] = ()
+    ) -> dict[str, JointFit]:
+        """Fits with each promising further effect, the finalists to convergence, by name.
+
+        Args:
+            present: Model to which they are added.
+            skip: Effects to leave out.
+            vetoed: Effects to try in spite of a veto.
+        """
+        out = {*present.effects, *(set(self.vetoes) - set(vetoed)), *skip, RANDOM}
         names = [name for name in self.candidates if name not in out]
         starts = {name: sizes(name, self.others, self.scales) for name in names}
         flat = [(name, start) for name in names for start in starts[name]]
@@ -395,7 +413,7 @@ class Selection(Judge):
                     present, changed = without, True
                     break
                 rivals[name] = self.rivals(present, name, without)
-                best = self.winner(rivals[name])
+                best = self.winner([fit for fit in rivals[name] if not set(fit.effects) & set(self.vetoes)])
                 simpler = best.effects[-1] in NESTED.get(name, ())
                 if best is not present and (simpler or not self.tied(best, present)[0]):
                     self.report(f"~ {name} exchanged for {best.effects[-1]}")
@@ -409,9 +427,11 @@ class Selection(Judge):
         """The model itself, and fits with other effects in the place of one of its own."""
         if without is None:
             without = self.refit(present, [e for e in present.effects if e != name])
+        self.without[name] = without.held_out_rmse
         # Beside Coulomb friction, a friction that contains it is no other cause.
         contains = [c for c, simpler in NESTED.items() if set(simpler) & set(without.effects)]
-        return [present, *self.fit_candidates(without, skip=(name, *contains)).values()]
+        fits = self.fit_candidates(without, skip=(name, *contains), vetoed=tuple(BEHIND_SENSOR))
+        return [present, *fits.values()]
 
     def refit(self, present: JointFit, effects: Sequence[str]) -> JointFit:
         """The fit with only some of a model's effects."""

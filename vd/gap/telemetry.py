@@ -29,6 +29,10 @@ UPSTREAM = (
     "integral_action",
 )
 """Effects between command and controller output; the duty cycle shows each of them."""
+BEHIND_SENSOR = {
+    "supply_sag": "only as a resistance behind the voltage sensor, which loses torque like a sagging supply"
+}
+"""Effects whose cause telemetry contradicts, but not a loss of the same form where it has no sensor."""
 REFERENCE_SIDE = "backlash"
 """Play of the reference, as the servo model has it; play behind the motor does not show."""
 
