@@ -243,8 +243,16 @@ def _held_out(recording: Recording, errors: Sequence[Errors], rng: np.random.Gen
         left_out.append(
             LeftOut(str(condition), value, float(old[of].sum()) / total, float(new[of].sum()) / total)
         )
-    mae = (float(part.sum() / count.sum()) for part in (old, new))
-    return HeldOut(files, before, after, reduction, interval(samples), *mae, tuple(left_out))
+    return HeldOut(
+        files,
+        before,
+        after,
+        reduction,
+        interval(samples),
+        baseline_mae_rad=float(old.sum() / count.sum()),
+        identified_mae_rad=float(new.sum() / count.sum()),
+        left_out=tuple(left_out),
+    )
 
 
 def _gap(joint: Analysed, errors: Errors, rng: np.random.Generator) -> JointGap:

@@ -426,8 +426,13 @@ class JointProblem:
         finally:
             self.rollouts = rollouts
         structure = self._structure(residual)
-        held_out = {"held_out": fit.held_out, "held_out_abs": fit.held_out_abs}
-        return replace(result, **held_out, step_error=error, structure=structure)
+        return replace(
+            result,
+            held_out=fit.held_out,
+            held_out_abs=fit.held_out_abs,
+            step_error=error,
+            structure=structure,
+        )
 
     def _structure(self, residual: np.ndarray) -> np.ndarray:
         """Products of successive residuals in motion [2, S]; at rest the rounding to counts repeats."""

@@ -222,7 +222,8 @@ class Selection(Judge):
             if FRICTION_AND_LOAD in fits and len(present.effects) + 2 <= MAX_EFFECTS:
                 apart = self.take_apart(present, fits[FRICTION_AND_LOAD])
                 pair = self.winner(apart) if apart else best
-                if int(np.argmin(self.scores([best, pair]))) == 1:
+                better = int(np.argmin(self.scores([best, pair]))) == 1
+                if better and not self.tied(pair, best)[0]:  # in a tie one effect is simpler than two
                     before, after = present.held_out_rmse, pair.held_out_rmse
                     names = " and ".join(pair.effects[-2:])
                     self.report(f"+ {names}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")

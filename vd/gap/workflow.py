@@ -266,8 +266,10 @@ def _specs(recording: Recording, parts: Sequence[Chain]) -> list[JointSpec]:
             trajectories, folds = design(recording, chain, joint)
             if trajectories:
                 floor = noise_floor(recording, int(chain.columns[joint]))
-                parts = pieces(recording, chain, trajectories)
-                specs.append(JointSpec(index, joint, trajectories, folds, floor, baseline_of(chain), parts))
+                analysed = pieces(recording, chain, trajectories)
+                specs.append(
+                    JointSpec(index, joint, trajectories, folds, floor, baseline_of(chain), analysed)
+                )
     return specs
 
 
