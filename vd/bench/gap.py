@@ -187,7 +187,7 @@ def run_battery(
             finished(case, work(case), "")
         return [result for result in done.values() if result is not None]
     if open_cases:
-        _compile(device)
+        _prepare(device, {case.model for case in open_cases})
     gpu = device.startswith("cuda")
     left = run_tasks(
         work, open_cases, finished, jobs=jobs, limit_s=limit_s, stop_after_s=stop_after_s, gpu=gpu
@@ -197,11 +197,15 @@ def run_battery(
     return [result for result in done.values() if result is not None]
 
 
-def _compile(device: str) -> None:
-    """Fill Warp's cache before many processes want the same kernels at once."""
+def _prepare(device: str, models: set[str]) -> None:
+    """Fill the caches of kernels and hands before many processes want the same at once."""
     import warp as wp
 
     import vd.kernels.chains
+    from vd.assets_usd.hands import load_hand
+
+    for model in models - set(BARE_MODELS):
+        load_hand(model)
 
     wp.config.log_level = wp.LOG_WARNING
     wp.load_module(vd.kernels.chains, device=device)
