@@ -13,6 +13,7 @@ from vd.gap.fit import JointFit
 from vd.gap.judge import Accepted, Explanation, Judge, intervals, share
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
+from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import vetoes
 from vd.gap.words import verdict_sentence
@@ -176,6 +177,32 @@ def test_one_delay_stands_for_both(tmp_path: Path) -> None:
         assert "stands for both" in row.reason
     alone = analysed(data, tmp_path / "alone", effects=("read_delay", "coulomb_friction"))
     assert [e.name for e in alone.effects] == ["read_delay"] and not alone.ambiguous
+
+
+def test_a_baseline_gone_astray_does_not_hold_the_search() -> None:
+    """Fits with a further effect start from the nominal model too, torques in its unit."""
+    chosen = Selection(
+        floor=FLOOR,
+        weights=resamples(10, np.random.default_rng(0)),
+        run=lambda calls: [],
+        joint=0,
+        others=(),
+        candidates=SMALL,
+        scales=None,  # type: ignore[arg-type]
+        nominal={"kp": 3.0, "kd": 0.3},
+    )
+    far = made_up(("load_friction",), 0.01)
+    names = ("kp", "kd", "velocity_limit", "load_friction.k_load")
+    values = {"kp": 60.0, "kd": 8.0, "velocity_limit": 5.0, "load_friction.k_load": 0.2}
+    coordinates = tuple(Coordinate(name, i, False, 1.0, -99.0, 99.0) for i, name in enumerate(names))
+    far = replace(far, coordinates=coordinates, x=np.array([values[name] for name in names]))
+    added = [{"coulomb_friction.tau_c_nm": 2.0}, {"coulomb_friction.tau_c_nm": 8.0}]
+    first, second, nominal = chosen.starts(far, added)
+    assert first == {**values, **added[0]} and second == {**values, **added[1]}
+    expected = {**values, "kp": 3.0, "kd": 0.3, "coulomb_friction.tau_c_nm": 2.0 * 3.0 / 60.0}
+    assert nominal == pytest.approx(expected)
+    near = replace(far, x=np.array([3.3, 0.25, 5.0, 0.2]))
+    assert len(chosen.starts(near, added)) == 2
 
 
 def test_the_evidence_says_what_the_screening_left_out(tmp_path: Path) -> None:

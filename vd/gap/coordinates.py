@@ -114,6 +114,15 @@ def coordinate(key: str, scales: Scales) -> Coordinate:
     return Coordinate(key, parameter.column, False, scale, low / scale, parameter.upper / scale)
 
 
+def torque_power(key: str) -> int:
+    """Power with which an effect's parameter follows the unit of torque: 1, 0, or -1."""
+    effect, _, name = key.rpartition(".")
+    unit = next((p.unit for p in EFFECTS[effect].parameters if p.name == name), "") if effect else ""
+    if unit == "1/(N m)":
+        return -1
+    return int("N m" in unit or "kg" in unit)
+
+
 def keys(effects: Sequence[str], baseline: Sequence[str]) -> list[str]:
     """Keys of all fitted parameters of a model: the baseline's, then the effects'."""
     return [*baseline, *(f"{name}.{p.name}" for name in effects for p in EFFECTS[name].parameters)]

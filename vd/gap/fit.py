@@ -11,7 +11,7 @@ import cma
 import numpy as np
 
 import vd.kernels.actuators as servo
-from vd.gap.coordinates import Coordinate, Scales, coordinate, keys, sizes
+from vd.gap.coordinates import BASELINE_PARAMETERS, Coordinate, Scales, coordinate, keys, sizes
 from vd.gap.rollout import Chain, Rollouts
 from vd.gap.statistics import rmse
 from vd.kernels.chains import MAX_JOINTS
@@ -459,7 +459,8 @@ class JointProblem:
         others = others_in(self.rollouts.chain, self.joint)
         starts = []
         for number in range(OTHER_STARTS):
-            start = {key: fit.values[key] * np.exp(rng.normal(0.0, OTHER_SPREAD)) for key in self.baseline}
+            middle = fit.values if number < OTHER_STARTS - 1 else self._nominal()
+            start = {key: middle[key] * np.exp(rng.normal(0.0, OTHER_SPREAD)) for key in self.baseline}
             for effect in fit.effects:
                 options = sizes(effect, others, scales)
                 start.update(options[int(rng.integers(len(options)))])
@@ -477,6 +478,10 @@ class JointProblem:
             iterations=OTHER_ITERATIONS,
             trajectories=self.trajectories,
         )[0]
+
+    def _nominal(self) -> dict[str, float]:
+        row = self.rollouts.chain.start_row[self.joint]
+        return {key: float(row[BASELINE_PARAMETERS[key].column]) for key in self.baseline}
 
     def promise(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> np.ndarray:
         """Share of the squared error that each start could remove, the present parameters readjusted.

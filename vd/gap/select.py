@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.coordinates import Scales, sizes
+from vd.gap.coordinates import Scales, sizes, torque_power
 from vd.gap.fit import JointFit
 from vd.gap.judge import EXPLAINED, NESTED, NO_GAP, RANDOM, Explanation, Judge, Trial
 from vd.gap.telemetry import BEHIND_SENSOR
@@ -36,6 +36,8 @@ FULL_ITERATIONS = 12
 JITTER_START_S = 0.005
 NEAR = 4.0
 """A final error between ``NO_GAP`` and this, in noise floors, is worth a search from another first effect."""
+ASTRAY = 2.0
+"""Factor from the nominal model beyond which a fit starts from that as well."""
 BETTER = 0.98
 """Share of the error from which another search for the same model has found a better one."""
 SEARCH_TAIL = 0.4
@@ -77,6 +79,8 @@ class Selection(Judge):
     seed: int = 0
     vetoes: Mapping[str, str] = field(default_factory=dict)
     report: Callable[[str], None] = lambda line: None
+    nominal: Mapping[str, float] = field(default_factory=dict)
+    """Nominal values of the baseline's parameters, by key."""
     promised: dict[str, float] = field(default_factory=dict)
     """Share of the squared error that each candidate of the last round could remove at best."""
 
@@ -296,7 +300,7 @@ class Selection(Judge):
                 self.call(
                     present,
                     name,
-                    [{**present.values, **start} for start in _two([flat[i][1] for i in order[name]])],
+                    self.starts(present, _two([flat[i][1] for i in order[name]])),
                     SCREEN_ITERATIONS,
                 )
                 for name in chosen
@@ -351,6 +355,20 @@ class Selection(Judge):
                 f"before {1e3 * present.held_out_rmse:.2f}"
             )
         return (best if accepted else present), [row]
+
+    def starts(self, present: JointFit, added: Sequence[dict[str, float]]) -> list[dict[str, float]]:
+        """Where a fit with a further effect starts: at the present model, and from the nominal one.
+
+        Without the effect, the baseline may have gone far to imitate it (an unmodelled delay is best met
+        by a servo twenty times as stiff), and from there no descent comes back.
+        """
+        result = [{**present.values, **start} for start in added]
+        away = {key: present.values[key] / value for key, value in self.nominal.items() if value > 0.0}
+        if any(not 1.0 / ASTRAY < ratio < ASTRAY for ratio in away.values()):
+            torque = 1.0 / away.get("kp", 1.0)
+            start = {key: value * torque ** torque_power(key) for key, value in result[0].items()}
+            result.append({**start, **self.nominal})
+        return result
 
     def call(
         self, present: JointFit, name: str, starts: Sequence[Mapping[str, float]], iterations: int

@@ -20,7 +20,7 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
-from vd.gap.coordinates import Scales
+from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.design import design, pieces
 from vd.gap.find import findings
 from vd.gap.fit import JointFit, candidates, others_in
@@ -363,6 +363,10 @@ def _explain_all(
             candidates=names,
             equivalent=same,
             seed=options.seed,
+            nominal={
+                key: float(chain.start_row[joint.spec.joint, BASELINE_PARAMETERS[key].column])
+                for key in joint.spec.baseline
+            },
             floor=joint.spec.floor,
             scales=joint.scales,
             weights=resamples(len(joint.spec.trajectories), rng),
