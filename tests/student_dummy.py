@@ -79,7 +79,9 @@ class DummyView:
         self._voxelise.rng.assign(state["noise"])
 
 
-def make_dagger(*, worlds: int = 8, seed: int = 0, noise: NoiseCfg | None = STILL, **settings) -> Dagger:
+def make_dagger(
+    *, worlds: int = 8, seed: int = 0, noise: NoiseCfg | None = STILL, world_size: int = 1, **settings
+) -> Dagger:
     """An imitation learner on the dummy, deterministic from ``seed``."""
     torch.manual_seed(seed)
     env = DummyEnv(num_worlds=worlds, seed=seed)
@@ -89,10 +91,13 @@ def make_dagger(*, worlds: int = 8, seed: int = 0, noise: NoiseCfg | None = STIL
         Student(TINY, 2),
         DummyTeacher(),
         replace(QUICK, **settings),
+        world_size=world_size,
     )
 
 
-def make_student_runner(run_dir, dagger: Dagger | None = None, *, deadline=None, **run) -> StudentRunner:
+def make_student_runner(
+    run_dir, dagger: Dagger | None = None, *, deadline=None, processes=None, **run
+) -> StudentRunner:
     """A runner around :func:`make_dagger`."""
     dagger = dagger or make_dagger()
     settings = RunCfg(run_dir=run_dir, device="cpu", **{"save_every": 2, "tensorboard": False, **run})
@@ -103,6 +108,7 @@ def make_student_runner(run_dir, dagger: Dagger | None = None, *, deadline=None,
         task={"hand": "dummy"},
         depth=to_dict(STILL),
         device="cpu",
+        processes=processes,
         deadline=deadline,
     )
 
