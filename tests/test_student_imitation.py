@@ -262,3 +262,15 @@ def test_weights_of_another_network_are_refused(tmp_path):
     other.student = Student(replace(TINY, memory=8), 2)
     with pytest.raises(ValueError, match="does not fit this run's network"):
         make_student_runner(tmp_path, other).load(list_checkpoints(tmp_path)[-1])
+
+
+def test_half_precision_of_the_encoder_hardly_changes_the_losses():
+    single, half = (make_dagger(worlds=4, precision=precision) for precision in ("fp32", "bf16"))
+    rollout, worlds = single.collect(), torch.arange(4)
+    for dagger in (single, half):
+        dagger.student.eval()
+    for one, two in zip(single.losses(rollout, worlds), half.losses(rollout, worlds), strict=True):
+        assert one.dtype == two.dtype == torch.float32
+        assert two.item() == pytest.approx(one.item(), rel=0.05) and two.item() != one.item()
+    half.update(half.collect())
+    assert half.student.mean.weight.dtype == torch.float32

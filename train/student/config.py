@@ -54,7 +54,7 @@ class DaggerCfg:
     same_scene: bool = False
     """Begin every rollout in the same states, with the same disturbances: can they be learned by heart?"""
     precision: Literal["fp32", "bf16"] = "fp32"
-    """Of the network's products; losses and weights stay in fp32."""
+    """Of the encoder's products; memory, heads, losses and weights stay in fp32."""
 
 
 @dataclass
@@ -83,7 +83,7 @@ class PretrainCfg:
     """Share of goals at an angle uniform in [0, pi]. The others are uniform on SO(3), where near goals are
     rare: 1 in 300 lies within 0.4 rad."""
     precision: Literal["fp32", "bf16"] = "fp32"
-    """Of the network's products."""
+    """Of the encoder's products."""
 
 
 @dataclass

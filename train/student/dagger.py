@@ -151,19 +151,18 @@ class Dagger:
                     frames[name][step] = value
                 labels.append(self._label(observation[OBSERVATION_GROUP]))
                 sites = self.view.sites(frame, augment=True)
-                with self._precision():
-                    output = self.student.act(sites[0], frame["action"], self._hidden, *sites[1:])
-                action = output.mean.float()
-                log = imitation_log(output.distance[:, -1].float(), frame["distance"], action, labels[-1])
+                output = self.student(self._encode(sites)[None], frame["action"][None], self._hidden)
+                action, std = output.mean[0], output.log_std[0].exp()
+                log = imitation_log(output.distance[0, :, -1], frame["distance"], action, labels[-1])
                 if cfg.imitation == "likelihood":
-                    action = action + output.log_std.float().exp() * torch.randn_like(action)
+                    action = action + std * torch.randn_like(action)
                 if share > 0.0:
                     teacher = torch.rand((worlds, 1), device=self.device) < share
                     action = torch.where(teacher, labels[-1], action)
                 observation, _, ended, extras = self.env.step(action)
                 done[step] = ended.bool()
-                self._hidden = output.hidden.float().masked_fill(done[step, :, None], 0.0)
-                self._means.add(extras["log"] | log | {"policy/std": output.log_std.float().exp().mean()})
+                self._hidden = output.hidden.masked_fill(done[step, :, None], 0.0)
+                self._means.add(extras["log"] | log | {"policy/std": std.mean()})
         rollout = Rollout(frames, torch.stack(labels), done, first)
         self._check_rollout(rollout)
         return rollout
@@ -196,14 +195,8 @@ class Dagger:
         steps, count = frames["action"].shape[:2]
         flat = {name: value.flatten(0, 1) for name, value in frames.items()}
         sites = self.view.sites(flat, worlds.repeat(steps), augment=True)
-        with self._precision():
-            embedding = self.student.encode(*sites).view(steps, count, -1)
-            output = self.student(
-                embedding, frames["action"], rollout.hidden[worlds], rollout.done[:, worlds]
-            )
-        output = type(output)(
-            output.mean.float(), output.log_std.float(), output.distance.float(), output.hidden
-        )
+        embedding = self._encode(sites).view(steps, count, -1)
+        output = self.student(embedding, frames["action"], rollout.hidden[worlds], rollout.done[:, worlds])
         imitation = imitation_loss(output, rollout.label[:, worlds], self.cfg.imitation)
         return imitation, distance_loss(output.distance, frames["distance"])
 
@@ -258,8 +251,10 @@ class Dagger:
         label = self.teacher.act(observation)
         return label.clamp(-1.0, 1.0) if self.cfg.clip_labels else label
 
-    def _precision(self) -> torch.autocast:
-        return autocast(self.device, self.cfg.precision)
+    def _encode(self, sites: tuple[Sites, ...]) -> torch.Tensor:
+        """Embeddings; what follows the encoder is small, and stays in single precision."""
+        with autocast(self.device, self.cfg.precision):
+            return self.student.encode(*sites).float()
 
     def _minibatch_step(self, rollout: Rollout, worlds: torch.Tensor) -> torch.Tensor:
         """One optimiser step; :data:`STATISTICS` on the device."""

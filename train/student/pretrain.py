@@ -187,9 +187,9 @@ class PretrainHeads(nn.Module):
                 "rotation": pair,
                 "joints": embedding[:, 2 * part :],
             }
-        predictions = {name: head(inputs[name]).float() for name, head in self.heads.items()}
+        predictions = {name: head(inputs[name]) for name, head in self.heads.items()}
         if self._student_head:
-            predictions["distance"] = student.distance["before"](embedding).float()
+            predictions["distance"] = student.distance["before"](embedding)
         return predictions
 
 
@@ -250,7 +250,8 @@ class Pretrainer:
         """Weighted loss of a batch, and figures to log."""
         cfg = self.cfg
         with autocast(sites[0].device, cfg.precision):
-            predictions = self.heads(self.student.encode(*sites), self.student)
+            embedding = self.student.encode(*sites).float()
+        predictions = self.heads(embedding, self.student)
         total = targets["distance"].new_zeros(())
         figures: dict[str, torch.Tensor] = {}
         if "category" in predictions:
