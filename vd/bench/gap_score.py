@@ -24,7 +24,9 @@ NEIGHBOURS: Mapping[str, tuple[str, ...]] = {
     CABLE: ("gravity_load",),
     WARMING: ("coulomb_friction", "stribeck_friction", "asymmetric_friction", "load_friction"),
 }
-"""Effects of the table that do what one outside does, in part: naming them is no error."""
+"""Effects of the table that are of the kind of one outside, so that naming them is no error: a cable pulls
+with the position, as only gravity does in the table; friction that falls as the joint warms is friction, of
+one form or another; torque ripple is like nothing in it."""
 STANDS_FOR: Mapping[str, str] = {other: name for name, others in EQUIVALENT.items() for other in others}
 """Effects of which positions alone cannot show that they are not another, which is named for both."""
 MASS_EFFECTS = ("gravity_load", "payload_inertia")
