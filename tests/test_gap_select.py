@@ -286,3 +286,15 @@ def test_telemetry_contradicts_a_cause() -> None:
         replace(t, voltage=7.4 - 2.0 * np.abs(t.command - t.position)) for t in recording.trajectories
     )
     assert "supply_sag" not in vetoes(replace(recording, trajectories=falling), chain, spec, chain.start_row)
+
+
+def test_a_model_with_chance_in_it_is_judged_by_its_likelihood(judge: Judge) -> None:
+    """A few motions hold most of the squared error; what matters is how surely all are known."""
+    errors = np.full(10, 1e-3)
+    errors[:2] = 6e-3
+    before = made_up((), errors)
+    spread = errors.copy()
+    spread[0] *= 1.05  # one motion a little worse
+    after = made_up(("command_jitter",), 0.9 * spread)
+    assert judge.better(before, after)[0]
+    assert not judge.better(before, made_up(("command_jitter",), errors.mean() * 2.0))[0]

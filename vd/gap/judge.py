@@ -166,7 +166,10 @@ class Judge:
         """
         old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
         gain = 1.0 - after.held_out_rmse / before.held_out_rmse
-        low = float(np.quantile(1.0 - new / old, tail))
+        sampled = (
+            _likelihood_gain(before, after, self.weights) if RANDOM in after.effects else 1.0 - new / old
+        )
+        low = float(np.quantile(sampled, tail))
         closed = np.sqrt(max(before.held_out_rmse**2 - after.held_out_rmse**2, 0.0))
         if gain < MIN_GAIN:
             return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
@@ -355,6 +358,19 @@ class Judge:
             tied=tuple(tied),
             at_bound=any(key.startswith(f"{name}.") for key in final.at_bound),
         )
+
+
+def _likelihood_gain(before: JointFit, after: JointFit, weights: np.ndarray) -> np.ndarray:
+    """Gain in log-likelihood of a model with chance in it over one without, per resample.
+
+    What chance moves is in few motions, whose squared errors would decide all; their likelihood, of a
+    width that follows the motion, weighs every sample by how surely it is known.
+    """
+    count = before.count
+    square = before.held_out.sum() / count.sum()
+    plain = 0.5 * (count * np.log(square) + before.held_out / square)
+    spread = 0.5 * count * (np.log(after.held_out / count) + 1.0)
+    return weights @ (plain - spread)
 
 
 def alike(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
