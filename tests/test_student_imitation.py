@@ -134,6 +134,15 @@ def test_a_rollout_pairs_each_frame_with_its_label_and_end():
     assert torch.equal(changed, ended)  # the dummy draws a target where, and only where, something ended
 
 
+def test_goals_that_the_end_of_a_rollout_cuts_off_are_counted():
+    dagger = make_dagger(rollout_steps=5)
+    rollout = dagger.collect()
+    means = dagger._means.read()
+    ended = sum(means[f"task/{how}"] for how in ("reached", "dropped", "timed_out")) * 5 * 8
+    assert ended == pytest.approx(int(rollout.done.sum()) + int((~rollout.done[-1]).sum()))
+    assert ended > 8
+
+
 def test_the_memory_is_cleared_in_rollouts_and_kept_between_them():
     dagger = make_dagger(reset=False, rollout_steps=2)
     first = dagger.collect()

@@ -144,7 +144,7 @@ def paper(stage: Stage) -> StudentTrainCfg:
     return StudentTrainCfg(
         preset="paper",
         stage=stage,
-        run=RunCfg(run_dir=RUNS / f"stage{stage}", save_every=20),
+        run=RunCfg(run_dir=RUNS / f"stage{stage}", save_every=20, max_steps=100_000_000),
         dagger=DaggerCfg(
             minibatch_worlds=constants.rendered_minibatch if rendered else constants.synthetic_minibatch
         ),
@@ -171,11 +171,13 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
         preset="cpu-demo",
         stage=stage,
         teacher="dclaw4-cube",
-        run=RunCfg(run_dir=RUNS / f"cpu-stage{stage}", device="cpu", save_every=5, max_minutes=4.0),
+        run=RunCfg(
+            run_dir=RUNS / f"cpu-stage{stage}", device="cpu", save_every=5, max_minutes=4.0, max_steps=16_000
+        ),
         dagger=DaggerCfg(
             rollout_steps=20,
             minibatch_worlds=4,
-            epochs=2,
+            epochs=4,
             learning_rate=1e-3,
             clip_labels=True,
         ),
@@ -187,13 +189,23 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
 
 
 def cpu_overfit(stage: Stage) -> StudentTrainCfg:
-    """One scene again and again, on the CPU: a check that all between clouds and labels is joined up."""
+    """One scene again and again, on the CPU: a check that all between clouds and labels is joined up.
+
+    At first the teacher acts, so that there is one sequence to learn; then more and more the student.
+    """
     start = cpu_demo(stage)
     return replace(
         start,
         preset="cpu-overfit",
-        run=replace(start.run, run_dir=RUNS / f"cpu-overfit-stage{stage}", max_minutes=2.0),
-        dagger=replace(start.dagger, minibatch_worlds=1, epochs=8, same_scene=True),
+        run=replace(start.run, run_dir=RUNS / f"cpu-overfit-stage{stage}", max_minutes=2.0, max_steps=800),
+        dagger=replace(
+            start.dagger,
+            minibatch_worlds=1,
+            epochs=8,
+            teacher_share=1.0,
+            teacher_share_iterations=30,
+            same_scene=True,
+        ),
         task=replace(start.task, num_worlds=1),
     )
 

@@ -4,6 +4,7 @@ T steps, N worlds, D actions, G the student's memory.
 """
 
 import math
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -113,13 +114,22 @@ class Dagger:
         Raises:
             TrainingDivergedError: Something is not finite any more.
         """
+        start = time.perf_counter()
         rollout = self.collect(stopping)
         if rollout is None:
             return None
         means = self._means.read(self._world_size)
+        collected = time.perf_counter()
         losses = self.update(rollout)
         self.iteration += 1
-        return {**self._window.add(means), **means, **self.env.end_iteration(), **losses}
+        return {
+            "collect_s": round(collected - start, 4),
+            "learn_s": round(time.perf_counter() - collected, 4),
+            **self._window.add(means),
+            **means,
+            **self.env.end_iteration(),
+            **losses,
+        }
 
     def teacher_share(self) -> float:
         """Share of worlds and steps in which the teacher acts in this iteration."""
@@ -162,7 +172,11 @@ class Dagger:
                 observation, _, ended, extras = self.env.step(action)
                 done[step] = ended.bool()
                 self._hidden = output.hidden.masked_fill(done[step, :, None], 0.0)
-                self._means.add(extras["log"] | log | {"policy/std": std.mean()})
+                log |= extras["log"]
+                if cfg.reset and step == cfg.rollout_steps - 1:
+                    # Goals that the end of the rollout cuts off would be in no count otherwise.
+                    log["task/timed_out"] = log["task/timed_out"] + (~done[step]).float().mean()
+                self._means.add(log | {"policy/std": std.mean()})
         rollout = Rollout(frames, torch.stack(labels), done, first)
         self._check_rollout(rollout)
         return rollout
