@@ -34,8 +34,10 @@ EVALUATIONS = 30
 STEP = 0.1
 """Relative step of the finite differences of the likelihood: above the error of the draws."""
 LEAST_DROP = 1e-4
-FACTORS = {"sigma": (0.5, 0.71, 0.85, 1.0, 1.18, 1.41, 2.0), "drop": (0.1, 0.4, 1.0, 2.5, 6.0)}
-"""Multiples of the best values at which the likelihood is looked at for their intervals."""
+FACTORS = (0.5, 0.71, 0.85, 1.0, 1.18, 1.41, 2.0)
+"""Multiples of the best standard deviation at which the likelihood is looked at for the intervals ..."""
+DROPS = (0.003, 0.01, 0.03, 0.1, 0.3)
+"""... and shares of commands dropped."""
 NOT_WORSE = 2.0
 """A pair of values is within the intervals if its likelihood is not worse, by this many standard
 deviations over the trajectories: within one, samples say the same thing over and over."""
@@ -130,8 +132,8 @@ class JitterFit:
         Delays and losses stand in for each other in part, so that the pairs are what is judged; each end
         is half way to the first value that is rejected with every other.
         """
-        sigmas = [sigma * f for f in FACTORS["sigma"]]
-        drops = [max(drop, LEAST_DROP) * f for f in FACTORS["drop"]]
+        sigmas = [sigma * f for f in FACTORS]
+        drops = sorted({max(drop, LEAST_DROP), *DROPS})
         kept = np.zeros((len(sigmas), len(drops)), bool)
         for i, one in enumerate(sigmas):
             for k, other in enumerate(drops):
@@ -139,7 +141,7 @@ class JitterFit:
                 worse = self.losses(*pair) - here
                 spread = np.sqrt(len(worse)) * float(np.std(worse, ddof=1)) if len(worse) > 1 else 0.0
                 kept[i, k] = float(worse.sum()) < SURE + NOT_WORSE * spread
-        kept[FACTORS["sigma"].index(1.0), FACTORS["drop"].index(1.0)] = True
+        kept[FACTORS.index(1.0), drops.index(max(drop, LEAST_DROP))] = True
         ranges = {}
         for name, values, inside in (
             ("sigma_s", sigmas, kept.any(axis=1)),
