@@ -17,15 +17,16 @@ from vd.student.network import VoxelEncoder
 from vd.student.sparse import SparseConv3d
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def threads():
-    """Put the number of threads back that a benchmark changes."""
+    """One thread, quicker for so little on busy cores; put back what it was, and what a benchmark changes."""
     before = torch.get_num_threads()
+    torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
 
 
-def test_latency_row_and_what_is_missing(monkeypatch, tmp_path, capsys, threads):
+def test_latency_row_and_what_is_missing(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "spconv", None)
     monkeypatch.setitem(sys.modules, "spconv.pytorch", None)
     out = tmp_path / "rows.json"

@@ -24,6 +24,15 @@ SMALL = StudentCfg(
 )
 
 
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Small products: threads would only wait for each other on busy cores."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 def clouds(count: int, points: int = 200, seed: int = 0) -> np.ndarray:
     """Points [count, points, 3] on spheres of different sizes."""
     generator = np.random.default_rng(seed)
