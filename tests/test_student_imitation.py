@@ -14,6 +14,7 @@ from vd.student.cfg import NoiseCfg
 from vd.student.network import Student
 from vd.student.saved import load_student
 from vd.train.checkpoint import list_checkpoints
+from vd.train.cli import main
 from vd.train.ending import Interrupted, TrainingDivergedError
 from vd.train.metrics import read_progress
 from vd.train.student.losses import distance_loss, imitation_loss
@@ -159,6 +160,7 @@ def test_the_teacher_acts_in_its_share_which_falls_to_none():
     for dagger.iteration in range(6):
         shares.append(dagger.teacher_share())
     assert shares == [1.0, 0.75, 0.5, 0.25, 0.0, 0.0]
+    assert make_dagger(teacher_share=0.5).teacher_share() == 0.5
     dagger.iteration = 0
     rollout = dagger.collect()
     # the action before a step is the label of the step before: the teacher's own
@@ -201,6 +203,12 @@ def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
         assert [row["iteration"] for row in rows[1]] == [1, 2, 3, 4]
         for first, second in zip(*rows, strict=True):
             assert first["loss/imitation"] == second["loss/imitation"]
+
+
+def test_curves_of_a_student_are_drawn(tmp_path):
+    make_student_runner(tmp_path).learn(3)
+    assert main(["curves", str(tmp_path)]) == 0
+    assert (tmp_path / "curves.png").stat().st_size > 20_000
 
 
 def test_other_worlds_start_anew(tmp_path):

@@ -278,12 +278,15 @@ def _export(arguments: list[str], _started: float) -> int:
 def _curves(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(CurvesCfg, args=arguments, prog="vd-train curves")
 
-    from vd.train.curves import plot_curves
+    from vd.train.curves import plot_curves, read_runs
     from vd.train.metrics import PROGRESS_FILE
+    from vd.train.student.curves import plot_student_curves
 
     files = [run / PROGRESS_FILE if run.is_dir() else run for run in cfg.runs]
     output = cfg.output or files[0].with_name("curves.png")
-    plot_curves(files, output)
+    first = next(iter(read_runs(files).values()))[0]
+    plot = plot_student_curves if any(key.startswith("student/") for key in first) else plot_curves
+    plot(files, output)
     print(output)
     return 0
 

@@ -33,14 +33,7 @@ def plot_curves(progress: Path | Sequence[Path], output: Path) -> None:
     from matplotlib import pyplot as plt
 
     files = [Path(progress)] if isinstance(progress, (str, Path)) else [Path(p) for p in progress]
-    runs = {}
-    for path in files:
-        if not path.is_file():
-            raise FileNotFoundError(f"no {path}; give the folder of a run of vd-train teacher")
-        rows = read_progress(path)
-        if not rows:
-            raise ValueError(f"{path} has no iteration yet; wait for the first one")
-        runs[path.parent.name or path.stem] = rows
+    runs = read_runs(files)
     steps_max = max(rows[-1]["env_steps"] for rows in runs.values())
     scale, unit = (1e6, "million") if steps_max >= 1e6 else (1e3, "thousand")
 
@@ -56,12 +49,12 @@ def plot_curves(progress: Path | Sequence[Path], output: Path) -> None:
     ]
     for axis, key, title, factor in panels:
         for index, (name, rows) in enumerate(runs.items()):
-            _line(axis, rows, key, scale, factor=factor, color=f"C{index}", label=name)
+            draw_line(axis, rows, key, scale, factor=factor, color=f"C{index}", label=name)
         axis.set_title(title)
     first = next(iter(runs.values()))
     terms = [key for key in first[-1] if key.startswith("reward/") and key != "reward/total"]
     for index, key in enumerate(terms):
-        _line(axes[0, 2], first, key, scale, color=f"C{index}", label=key.removeprefix("reward/"))
+        draw_line(axes[0, 2], first, key, scale, color=f"C{index}", label=key.removeprefix("reward/"))
     axes[0, 2].set_title("reward terms per control step, before scaling")
     # Terms span orders of magnitude around zero.
     axes[0, 2].set_yscale("symlog", linthresh=1e-2)
@@ -79,7 +72,28 @@ def plot_curves(progress: Path | Sequence[Path], output: Path) -> None:
     plt.close(figure)
 
 
-def _line(
+def read_runs(progress: Sequence[Path]) -> dict[str, list[dict[str, Any]]]:
+    """Rows of runs by the name of their folder.
+
+    Args:
+        progress: ``progress.jsonl`` files.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: A file has no iteration.
+    """
+    runs = {}
+    for path in progress:
+        if not path.is_file():
+            raise FileNotFoundError(f"no {path}; give the folder of a run of vd-train")
+        rows = read_progress(path)
+        if not rows:
+            raise ValueError(f"{path} has no iteration yet; wait for the first one")
+        runs[path.parent.name or path.stem] = rows
+    return runs
+
+
+def draw_line(
     axis: Any,
     rows: list[dict[str, Any]],
     key: str,

@@ -134,7 +134,7 @@ class Dagger:
     def teacher_share(self) -> float:
         """Share of worlds and steps in which the teacher acts in this iteration."""
         if self.cfg.teacher_share_iterations == 0:
-            return 0.0
+            return self.cfg.teacher_share
         return self.cfg.teacher_share * max(0.0, 1.0 - self.iteration / self.cfg.teacher_share_iterations)
 
     def collect(self, stopping: Callable[[], bool] = lambda: False) -> Rollout | None:
