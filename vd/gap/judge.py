@@ -56,6 +56,8 @@ REPEATABLE = 2.0
 farther from it does not repeat its motions that well; how well is not known from one recording of each."""
 FORMS = {"torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag"}
 """Forms of one loss, of torque where much is asked."""
+OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}
+"""What all joints of a machine have or have not: its bus, its supply, gravity."""
 RANDOM = "command_jitter"
 """The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
 DETERMINED = ("kp", "kd", "inertia")
@@ -404,18 +406,38 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
     return {**result, **(fit.extents or {})}
 
 
-def share(explanations: Sequence[Explanation], floors: Sequence[float]) -> list[Explanation]:
+def share(
+    explanations: Sequence[Explanation], floors: Sequence[float], groups: Sequence[int] | None = None
+) -> list[Explanation]:
     """Name on a joint that member of a set which another joint names, or which all such sets share.
 
-    A machine's joints are alike: one cause on all of them is simpler than another on each.
+    The joints of a finger are built alike: one cause on all of them is simpler than another on each. Joints
+    that have nothing in common but the machine share its bus, its supply, and that it stands in gravity, but
+    not the friction or the play of one gear.
+
+    Args:
+        explanations: Of the joints.
+        floors: Their noise floors [rad].
+        groups: Number of the finger of each joint; one for all if None.
     """
+    fingers = [0] * len(explanations) if groups is None else groups
+    result = []
+    for explanation, floor, finger in zip(explanations, floors, fingers, strict=True):
+        alike = [e for e, other in zip(explanations, fingers, strict=True) if other == finger]
+        named = _named(alike) | (_named(explanations) & OF_THE_MACHINE)
+        result.append(_adopt(explanation, named, floor))
+    return result
+
+
+def _named(explanations: Sequence[Explanation]) -> set[str]:
+    """What some joint names, and the only effect that is in the set of every joint that has one set."""
     named = {a.name for e in explanations for a in e.accepted if a.named}
     open_sets = [[{a.name, *a.tied} for a in e.accepted if a.tied and not a.at_bound] for e in explanations]
     sets = [of_joint[0] for of_joint in open_sets if len(of_joint) == 1]
     if len(sets) > 1:
         common = set.intersection(*sets)
         named |= common if len(common) == 1 else set()
-    return [_adopt(e, named, floor) for e, floor in zip(explanations, floors, strict=True)]
+    return named
 
 
 def _adopt(explanation: Explanation, named: set[str], floor: float) -> Explanation:

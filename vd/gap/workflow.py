@@ -378,7 +378,8 @@ def _explain_all(
         progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
         return result
 
-    return share(_parallel(one, joints), [joint.spec.floor for joint in joints])
+    floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))
+    return share(_parallel(one, joints), floors, fingers)
 
 
 def replace_baseline(explanation: Explanation, baseline: JointFit) -> Explanation:
