@@ -12,12 +12,10 @@ import numpy as np
 import pytest
 
 from vd.gap.design import MAX_MOTION_S, design, pieces
-from vd.gap.fit import JointFit
-from vd.gap.judge import Judge
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Report
 from vd.gap.rollout import chains
-from vd.gap.statistics import held, resamples
+from vd.gap.statistics import held
 from vd.gap.workflow import explain
 
 whole = pytest.mark.skipif(not os.environ.get("VD_ACCEPTANCE"), reason="minutes long; set VD_ACCEPTANCE=1")
@@ -125,33 +123,3 @@ def test_whole_pendulum(shared_dir, tmp_path):
     assert "load_friction" in names(report, "pendulum")
     assert "torque_saturation" not in names(report, "pendulum")
     assert report.held_out.identified_mae_rad < 0.040
-
-
-def made_up(error: float, effect: str, *, spread: np.ndarray) -> JointFit:
-    """A fit with a held-out RMSE, of trajectories of one sample."""
-    squares = error**2 * spread
-    empty = np.zeros((len(spread), 0, 0))
-    return JointFit(
-        effects=(effect,),
-        coordinates=(),
-        x=np.zeros(0),
-        rows=np.zeros((1, 1)),
-        sse=squares,
-        held_out=squares,
-        count=np.ones(len(spread)),
-        gram=empty,
-        gradient=np.zeros((len(spread), 0)),
-    )
-
-
-@pytest.mark.parametrize(("floor", "tied"), [(0.1, True), (1.0, False)])
-def test_forms_of_one_loss_are_a_set_only_far_from_the_floor(floor, tied):
-    spread = np.ones(12)
-    judge = Judge(floor=floor, weights=resamples(12, np.random.default_rng(0)))
-    judge.without["torque_saturation"] = 4.0
-    soft, sag, delay = (
-        made_up(error, name, spread=spread)
-        for error, name in ((1.2, "torque_saturation"), (2.0, "supply_sag"), (2.0, "command_delay"))
-    )
-    accepted = judge.accept(soft, "torque_saturation", [soft, sag, delay], {}, soft)
-    assert accepted.tied == (("supply_sag",) if tied else ())

@@ -105,8 +105,8 @@ def test_sets_of_several_joints_meet_in_one_name() -> None:
         verdict = "ambiguous" if tied else "effects"
         return Explanation(made_up((), 0.02), fits[0], verdict, "", (accepted,), (), {name: fits})
 
-    def names(*explanations: Explanation) -> list[str]:
-        shared = share(explanations, [FLOOR] * len(explanations))
+    def names(*explanations: Explanation, groups: list[int] | None = None) -> list[str]:
+        shared = share(explanations, [FLOOR] * len(explanations), groups)
         return [e.accepted[0].name if e.accepted[0].named else "?" for e in shared]
 
     one, other = explanation("backlash", "dead_zone"), explanation("backlash", "coulomb_friction")
@@ -115,6 +115,48 @@ def test_sets_of_several_joints_meet_in_one_name() -> None:
     assert names(one, explanation("dead_zone")) == ["dead_zone", "dead_zone"]
     assert names(one, explanation("thermal_drift")) == ["?", "thermal_drift"]
     assert names(one) == ["?"]
+    # Separate servos share gravity, not the play of one gear.
+    assert names(one, explanation("backlash"), groups=[0, 1]) == ["?", "backlash"]
+    loaded = explanation("encoder_bias", "gravity_load")
+    assert names(loaded, explanation("gravity_load"), groups=[0, 1]) == ["gravity_load", "gravity_load"]
+
+
+@pytest.mark.parametrize(("floor", "tied"), [(FLOOR, ("supply_sag",)), (10.0 * FLOOR, ())])
+def test_forms_of_one_loss_are_a_set_only_far_from_the_floor(floor: float, tied: tuple[str, ...]) -> None:
+    judge = Judge(floor=floor, weights=resamples(10, np.random.default_rng(0)))
+    judge.without["torque_saturation"] = 0.040
+    soft, sag, delay, limit = (
+        made_up((name,), error)
+        for name, error in (
+            ("torque_saturation", 0.012),
+            ("supply_sag", 0.020),
+            ("command_delay", 0.020),
+            ("torque_limit", 0.035),
+        )
+    )
+    accepted = judge.accept(soft, "torque_saturation", [soft, sag, delay, limit], {}, soft)
+    assert accepted.tied == tied
+
+
+def test_friction_of_one_direction_alone_is_a_load() -> None:
+    def fit(plus: float, minus: float, *others: str) -> JointFit:
+        plain = made_up((*others, "asymmetric_friction"), 0.01)
+        keys = [f"asymmetric_friction.tau_{side}_nm" for side in ("plus", "minus")]
+        sides = tuple(Coordinate(key, 0, False, 1.0, 0.0, 9.0) for key in keys)
+        return replace(
+            plain, coordinates=(*plain.coordinates[:-2], *sides), x=np.array([*plain.x[:-2], plus, minus])
+        )
+
+    assert fit(0.0, 0.2).at_bound == ("asymmetric_friction.tau_plus_nm",)
+    assert fit(0.05, 0.2).at_bound == ()
+    assert fit(0.0, 0.2, "coulomb_friction").at_bound == ()
+
+
+def test_load_and_friction_are_found_together(tmp_path: Path) -> None:
+    hidden = {servo.GRAVITY_TORQUE: 0.3, servo.GRAVITY_PHASE: -1.0, servo.COULOMB_TORQUE: 0.08}
+    effects = ("coulomb_friction", "asymmetric_friction", "gravity_load", "encoder_bias")
+    report = analysed(recorded(hidden), tmp_path, effects=effects)
+    assert {effect.name for effect in report.effects} == {"coulomb_friction", "gravity_load"}
 
 
 def concluded(judge: Judge, **options: object) -> Explanation:
