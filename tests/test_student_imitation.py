@@ -17,6 +17,7 @@ from vd.train.checkpoint import list_checkpoints
 from vd.train.cli import main
 from vd.train.ending import Interrupted, TrainingDivergedError
 from vd.train.metrics import read_progress
+from vd.train.student.dagger import merged
 from vd.train.student.losses import distance_loss, imitation_loss
 
 
@@ -118,11 +119,24 @@ def test_losses_are_what_they_say():
 
 def test_minibatches_hold_every_world_once_a_pass():
     dagger = make_dagger(worlds=10, minibatch_worlds=4, epochs=3)
-    batches = [batch.tolist() for batch in dagger.minibatches()]
+    batches = [batch.tolist() for batch in dagger.minibatches(10)]
     assert [len(batch) for batch in batches] == [4, 4, 2] * 3
     passes = [[world for batch in batches[i : i + 3] for world in batch] for i in (0, 3, 6)]
     assert all(sorted(one) == list(range(10)) for one in passes)
     assert len({tuple(one) for one in passes}) == 3
+
+
+def test_kept_rollouts_are_learned_from_too():
+    dagger = make_dagger(worlds=3, minibatch_worlds=2, keep_rollouts=3, epochs=1)
+    rollouts = [dagger.collect() for _ in range(2)]
+    together = merged(rollouts)
+    parts = [dagger.student.eval() and dagger.losses(one, torch.arange(3)) for one in rollouts]
+    whole = dagger.losses(together, torch.arange(6))
+    for loss, (first, second) in zip(whole, zip(*parts, strict=True), strict=True):
+        torch.testing.assert_close(loss, 0.5 * (first + second))
+    drawn = torch.cat([batch for _ in range(40) for batch in dagger.minibatches(6)])
+    assert len(drawn) == 120 and set(drawn.tolist()) == set(range(6))
+    assert [len(dagger._kept) for _ in range(4) if dagger.iterate(lambda: False)] == [1, 2, 3, 3]
 
 
 def test_a_rollout_pairs_each_frame_with_its_label_and_end():
@@ -189,7 +203,7 @@ def test_labels_are_clipped_where_asked_for():
 
 def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
     for reset in (True, False):
-        options = {"noise": NoiseCfg(), "reset": reset}
+        options = {"noise": NoiseCfg(), "reset": reset, "keep_rollouts": 1 if reset else 2}
         whole = make_student_runner(tmp_path / f"whole{reset}", make_dagger(**options))
         whole.learn(4)
         make_student_runner(tmp_path / f"parts{reset}", make_dagger(**options)).learn(2)

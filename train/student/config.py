@@ -48,6 +48,9 @@ class DaggerCfg:
     """Share of worlds and steps in which the teacher acts in the first iteration (beta of DAgger)."""
     teacher_share_iterations: int = 0
     """Iterations over which that share falls to 0, linearly; 0: it stays."""
+    keep_rollouts: int = 1
+    """Rollouts to learn from, the latest and those before it; the released code keeps the latest alone.
+    Passes stay as long: they take sequences at random from all that are kept."""
     reset: bool = True
     """Begin new episodes in all worlds with every rollout (released code): no step later than rollout_steps
     is ever seen. Otherwise episodes go on, and each rollout starts with the memory of the one before."""
@@ -179,6 +182,7 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
             minibatch_worlds=4,
             epochs=4,
             learning_rate=1e-3,
+            keep_rollouts=50,
             clip_labels=True,
         ),
         pretrain=PretrainCfg(batch=64, steps=10, learning_rate=1e-3, near_share=0.5),
@@ -202,6 +206,7 @@ def cpu_overfit(stage: Stage) -> StudentTrainCfg:
             start.dagger,
             minibatch_worlds=1,
             epochs=8,
+            keep_rollouts=1,
             teacher_share=1.0,
             same_scene=True,
         ),
@@ -238,6 +243,7 @@ def validate(cfg: StudentTrainCfg) -> None:
         "--dagger.rollout-steps": dagger.rollout_steps,
         "--dagger.minibatch-worlds": dagger.minibatch_worlds,
         "--dagger.epochs": dagger.epochs,
+        "--dagger.keep-rollouts": dagger.keep_rollouts,
         "--dagger.learning-rate": dagger.learning_rate,
         "--dagger.grad-norm": dagger.grad_norm,
         "--pretrain.batch": pretrain.batch,

@@ -10,7 +10,7 @@ from vd.train.curves import draw_line, read_runs
 PANELS = (
     (
         "student/action_error",
-        "error of the student's mean action,\nroot mean square, in its own rollouts",
+        "error of the student's mean action,\nroot mean square, in rollouts",
         1.0,
     ),
     ("student/distance_error", "mean error of the predicted distance [rad]", 1.0),

@@ -5,8 +5,9 @@ T steps, N worlds, D actions, G the student's memory.
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import torch
@@ -51,7 +52,7 @@ class View(Protocol):
 
 @dataclass
 class Rollout:
-    """What an update needs of T steps of N worlds."""
+    """What an update needs of N sequences of T steps."""
 
     frames: dict[str, torch.Tensor]
     """Frames before each step, tensors [T, N, ...]."""
@@ -61,6 +62,8 @@ class Rollout:
     """Where the goal or the episode ended with the step [T, N], bool."""
     hidden: torch.Tensor
     """The student's memory before the first step [N, G]."""
+    worlds: torch.Tensor
+    """World of each sequence [N]."""
 
 
 class Dagger:
@@ -68,8 +71,8 @@ class Dagger:
 
     One iteration: the student acts T steps in N worlds and the teacher labels every state; then some passes
     over the worlds, whole sequences in each minibatch, gradients through all T steps except across ends of
-    episodes. As in the released code only the latest rollout is learned from. In rollouts batch norms use
-    their running statistics, as they do where the student is deployed.
+    episodes. As in the released code only the latest rollout is learned from, unless more are to be kept. In
+    rollouts batch norms use their running statistics, as they do where the student is deployed.
 
     Args:
         env: The worlds.
@@ -101,6 +104,7 @@ class Dagger:
         self._window = GoalWindow(math.ceil(2 * env.max_episode_length / cfg.rollout_steps))
         self._means = StepMeans()
         self._scene: dict[str, Any] | None = None
+        self._kept: deque[Rollout] = deque(maxlen=cfg.keep_rollouts)
 
     def iterate(self, stopping: Callable[[], bool]) -> dict[str, float | None] | None:
         """One rollout and update.
@@ -120,7 +124,8 @@ class Dagger:
             return None
         means = self._means.read(self._world_size)
         collected = time.perf_counter()
-        losses = self.update(rollout)
+        self._kept.append(rollout)
+        losses = self.update(merged(self._kept))
         self.iteration += 1
         return {
             "collect_s": round(collected - start, 4),
@@ -177,14 +182,15 @@ class Dagger:
                     # Goals that the end of the rollout cuts off would be in no count otherwise.
                     log["task/timed_out"] = log["task/timed_out"] + (~done[step]).float().mean()
                 self._means.add(log | {"policy/std": std.mean()})
-        rollout = Rollout(frames, torch.stack(labels), done, first)
+        rollout = Rollout(frames, torch.stack(labels), done, first, torch.arange(worlds, device=self.device))
         self._check_rollout(rollout)
         return rollout
 
     def update(self, rollout: Rollout) -> dict[str, float]:
         """All passes over a rollout; means of :data:`STATISTICS` over its minibatches."""
         self.student.train()
-        steps = torch.stack([self._minibatch_step(rollout, worlds) for worlds in self.minibatches()])
+        batches = self.minibatches(len(rollout.worlds))
+        steps = torch.stack([self._minibatch_step(rollout, sequences) for sequences in batches])
         if self._world_size > 1:
             # Each process averaged its own batch statistics; from here on all use those of the first.
             for buffer in self.student.buffers():
@@ -197,21 +203,25 @@ class Dagger:
             )
         return losses
 
-    def minibatches(self) -> Iterator[torch.Tensor]:
-        """Worlds of each optimiser step: every world once a pass, in a new order; the last may be fewer."""
+    def minibatches(self, sequences: int) -> Iterator[torch.Tensor]:
+        """Sequences of each optimiser step: as many a pass as there are worlds, none twice, in a new order.
+
+        Of the latest rollout alone that is every world once. The last minibatch of a pass may be smaller.
+        """
         for _ in range(self.cfg.epochs):
-            order = torch.randperm(self.env.num_envs, device=self.device)
+            order = torch.randperm(sequences, device=self.device)[: self.env.num_envs]
             yield from order.split(self.cfg.minibatch_worlds)
 
-    def losses(self, rollout: Rollout, worlds: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Imitation and distance loss of the sequences of some worlds, with new noise on their clouds."""
-        frames = {name: value[:, worlds] for name, value in rollout.frames.items()}
+    def losses(self, rollout: Rollout, sequences: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Imitation and distance loss of some sequences, with new noise on their clouds."""
+        frames = {name: value[:, sequences] for name, value in rollout.frames.items()}
         steps, count = frames["action"].shape[:2]
         flat = {name: value.flatten(0, 1) for name, value in frames.items()}
-        sites = self.view.sites(flat, worlds.repeat(steps), augment=True)
+        sites = self.view.sites(flat, rollout.worlds[sequences].repeat(steps), augment=True)
         embedding = self._encode(sites).view(steps, count, -1)
-        output = self.student(embedding, frames["action"], rollout.hidden[worlds], rollout.done[:, worlds])
-        imitation = imitation_loss(output, rollout.label[:, worlds], self.cfg.imitation)
+        hidden, done = rollout.hidden[sequences], rollout.done[:, sequences]
+        output = self.student(embedding, frames["action"], hidden, done)
+        imitation = imitation_loss(output, rollout.label[:, sequences], self.cfg.imitation)
         return imitation, distance_loss(output.distance, frames["distance"])
 
     def state_dict(self) -> dict[str, Any]:
@@ -225,12 +235,15 @@ class Dagger:
         self.iteration = iteration
 
     def local_state(self) -> dict[str, Any]:
-        """What belongs to this process: its worlds, their random states and the student's memory of them."""
+        """What belongs to this process: its worlds, random states, the student's memory, kept rollouts."""
+        # The next iteration drops the oldest: one that stands alone, or the first of a full store.
+        kept = list(self._kept)[-(self.cfg.keep_rollouts - 1) :] if self.cfg.keep_rollouts > 1 else []
         return {
             "env": self.env.state_dict(),
             "view": self.view.state_dict(),
             "hidden": self._hidden.cpu(),
             "scene": self._scene,
+            "rollouts": [moved(rollout, "cpu") for rollout in kept],
         }
 
     def load_local_state(self, state: dict[str, Any]) -> None:
@@ -239,6 +252,8 @@ class Dagger:
         self.view.load_state_dict(state["view"])
         self._hidden = state["hidden"].to(self.device)
         self._scene = state["scene"]
+        self._kept.clear()
+        self._kept.extend(Rollout(**moved(rollout, self.device)) for rollout in state["rollouts"])
 
     def fits(self, ranks: list[dict[str, Any]]) -> str:
         """Why the worlds of a checkpoint cannot be restored; empty if they can."""
@@ -270,9 +285,9 @@ class Dagger:
         with autocast(self.device, self.cfg.precision):
             return self.student.encode(*sites).float()
 
-    def _minibatch_step(self, rollout: Rollout, worlds: torch.Tensor) -> torch.Tensor:
+    def _minibatch_step(self, rollout: Rollout, sequences: torch.Tensor) -> torch.Tensor:
         """One optimiser step; :data:`STATISTICS` on the device."""
-        imitation, distance = self.losses(rollout, worlds)
+        imitation, distance = self.losses(rollout, sequences)
         norm = descend(
             self.student,
             self.optimizer,
@@ -292,6 +307,28 @@ class Dagger:
             self.env.check()  # says more, if the simulation is the cause
             what = ", ".join(bad) or "the student's memory"
             raise TrainingDivergedError(f"{what} not finite in the rollout; {LOWER_RATES}")
+
+
+def merged(rollouts: Sequence[Rollout]) -> Rollout:
+    """The sequences of several rollouts of equal length as one."""
+    if len(rollouts) == 1:
+        return rollouts[0]
+    return Rollout(
+        {name: torch.cat([one.frames[name] for one in rollouts], dim=1) for name in rollouts[0].frames},
+        torch.cat([one.label for one in rollouts], dim=1),
+        torch.cat([one.done for one in rollouts], dim=1),
+        torch.cat([one.hidden for one in rollouts]),
+        torch.cat([one.worlds for one in rollouts]),
+    )
+
+
+def moved(rollout: Rollout | dict[str, Any], device: str | torch.device) -> dict[str, Any]:
+    """A rollout, or the dictionary of one, as a dictionary of tensors on ``device``."""
+    values = rollout if isinstance(rollout, dict) else asdict(rollout)
+    return {
+        name: moved(value, device) if isinstance(value, dict) else value.to(device)
+        for name, value in values.items()
+    }
 
 
 def imitation_log(
