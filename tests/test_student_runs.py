@@ -117,6 +117,22 @@ def test_a_cloud_without_a_seen_point_has_the_hand_and_goal_only(env):
     assert not origin.any()
 
 
+def test_the_hand_is_seen_where_the_encoders_say(env):
+    env.reset()
+    true = StudentView(env, NETWORK, rendered=False).frame()["body_q"]
+    exact, env.measured_q = env.measured_q, wp.clone(env.sim.joint_q)
+    try:
+        view = StudentView(env, NETWORK, rendered=False)
+        torch.testing.assert_close(view.frame()["body_q"], true, atol=1e-5, rtol=0.0)
+        wp.to_torch(env.measured_q)[:, 0] += 0.3
+        moved = (view.frame()["body_q"] - true).abs().amax(dim=(0, 2))
+    finally:
+        env.measured_q = exact
+    links = env.scene.link_body
+    assert (moved[links[1:4]] > 1e-3).all()  # the first finger, not the others and not the object
+    assert (np.delete(moved.numpy(), links[1:4]) < 1e-5).all()
+
+
 def test_random_states_of_a_view_come_back(env):
     env.reset()
     always = NoiseCfg(jitter_probability=1.0, dropout_probability=1.0)

@@ -17,8 +17,9 @@ from vd.envs.reorient import ReorientEnv
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sensors.surfaces import scene_surfaces
+from vd.sim.scene import hand_mount
 from vd.student.cfg import NoiseCfg, StudentCfg
-from vd.student.clouds import SceneClouds, Voxeliser
+from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
 from vd.student.sites import Sites
 
 Frame = dict[str, torch.Tensor]
@@ -63,7 +64,7 @@ class StudentView:
     """The student's eyes in every world of an environment.
 
     Stage 1 sees complete clouds of hand and object; stage 2 sees a depth camera's points, and the hand's own
-    cloud from its joints. Both see the goal beside the scene.
+    cloud from its joints as the encoders report them. Both see the goal beside the scene.
     """
 
     def __init__(
@@ -126,6 +127,12 @@ class StudentView:
                 frame_s=env.cfg.sim.control_dt,
                 seed=seed,
             )
+        # Encoders that read late or wrong show the hand where they say it is, as they do on the robot.
+        self._kinematics: HandKinematics | None = None
+        if env.measured_q is not env.sim.joint_q:
+            self._kinematics = HandKinematics(
+                env.hand, link_body=scene.link_body, base=hand_mount(), device=env.device
+            )
         self._body_q = wp.to_torch(env.sim.body_q)
         self._goal = wp.to_torch(env.goal_quat)
         self._smoothed = wp.to_torch(env.smoothed)
@@ -134,8 +141,11 @@ class StudentView:
 
     def frame(self) -> Frame:
         """What there is to see before the next action: copies, so that later steps do not change them."""
+        body_q = self._body_q.clone()
+        if self._kinematics is not None:
+            self._kinematics.write(self.env.measured_q, wp.from_torch(body_q, dtype=wp.transform))
         frame = {
-            "body_q": self._body_q.clone(),
+            "body_q": body_q,
             "goal_quat": self._goal.clone(),
             "action": self._smoothed.clone(),
             "distance": rotation_distance(self._body_q[:, self._object, 3:], self._goal),
