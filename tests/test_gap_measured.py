@@ -57,6 +57,8 @@ def test_losses_of_the_pendulum_are_load_friction_and_a_set(pendulum):
     assert "load_friction" in names(pendulum, joint)
     assert not {"torque_saturation", "supply_sag", "command_delay", "backlash"} & names(pendulum, joint)
     assert any("torque_saturation" in members for members in pendulum.ambiguous)
+    # What hangs on the arm is known, not fitted, and belongs to the model all the same.
+    assert pendulum.identified.parameters[joint]["tau_g_nm"] == pytest.approx(0.49 * 9.81 * 0.1)
 
 
 def test_telemetry_speaks_against_sag_latency_and_backlash(pendulum):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
+from vd.gap.coordinates import BASELINE_PARAMETERS, GRAVITY, Scales
 from vd.gap.design import varied
 from vd.gap.judge import Accepted, Explanation
 from vd.gap.recording import Recording
@@ -208,9 +208,12 @@ def _fit(joints: Sequence[Analysed], predictions: Predictions, curve: np.ndarray
 
 
 def _baseline_values(joint: Analysed, which: str) -> dict[str, float]:
-    rows = getattr(joint.explanation, which).rows
-    names = ["kp", "kd", "velocity_limit"]
-    names += [n for n in ("inertia", "tau_g_nm") if n in joint.spec.baseline]
+    fit = getattr(joint.explanation, which)
+    rows, names = fit.rows, ["kp", "kd", "velocity_limit"]
+    names += [n for n in ("inertia",) if n in joint.spec.baseline]
+    # A pendulum's known load is not fitted, but without it the rest means nothing.
+    if "gravity_load" not in fit.effects and rows[joint.spec.joint, GRAVITY.column] > 0.0:
+        names.append(GRAVITY.name)
     return {name: float(rows[joint.spec.joint, BASELINE_PARAMETERS[name].column]) for name in names}
 
 
