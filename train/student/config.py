@@ -175,7 +175,7 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
         stage=stage,
         teacher="dclaw4-cube",
         run=RunCfg(
-            run_dir=RUNS / f"cpu-stage{stage}", device="cpu", save_every=5, max_minutes=4.0, max_steps=16_000
+            run_dir=RUNS / f"cpu-stage{stage}", device="cpu", save_every=5, max_minutes=7.0, max_steps=16_000
         ),
         dagger=DaggerCfg(
             rollout_steps=20,
