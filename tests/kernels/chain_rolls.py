@@ -1,0 +1,119 @@
+"""Small chains and their rollouts, for the tests of :mod:`vd.kernels.chains`."""
+
+import numpy as np
+import warp as wp
+from kernel_oracle import device_array, unwritten
+
+from vd.kernels import actuators as servo
+from vd.kernels.chains import Links, Samples, rollout_kernel
+from vd.kernels.effects import neutral_row
+
+DT = 1 / 480
+FINE = 10
+"""The oracle's steps in one of the kernel's."""
+PLAIN = {servo.KP: 3.0, servo.KD: 0.3, servo.VELOCITY_LIMIT: 50.0, servo.INERTIA: 2e-3}
+GRAVITY = np.array([1.0, -2.0, 9.0])
+
+
+def random_bodies(rng, n):
+    """Axes, offsets, masses, centres of mass, inertias of a finger-sized chain."""
+    axis = rng.normal(size=(n, 3))
+    turn = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    moments = rng.uniform(5e-6, 1e-5, (n, 3)) + 5e-6
+    return {
+        "axis": axis / np.linalg.norm(axis, axis=1, keepdims=True),
+        "offset": rng.uniform(-0.07, 0.07, (n, 3)),
+        "mass": rng.uniform(0.02, 0.1, n),
+        "com": rng.uniform(-0.05, 0.05, (n, 3)),
+        "inertia": np.einsum("nij,nj,nkj->nik", turn, moments, turn),
+    }
+
+
+def links_struct(bodies, gravity, device):
+    links = Links()
+    for name, dtype in (
+        ("axis", wp.vec3),
+        ("offset", wp.vec3),
+        ("mass", float),
+        ("com", wp.vec3),
+        ("inertia", wp.mat33),
+    ):
+        setattr(links, name, device_array(bodies[name], dtype, device))
+    links.gravity = wp.vec3(*gravity)
+    return links
+
+
+def rows_of(*settings, n=1):
+    """Parameter rows [C, n, P] of the plain servo with settings by column."""
+    rows = np.tile(neutral_row(), (len(settings), n, 1))
+    for row, values in zip(rows, settings, strict=True):
+        for column, value in {**PLAIN, **values}.items():
+            row[:, column] = value
+    return rows
+
+
+def roll(
+    device,
+    rows,
+    time,
+    command,
+    start,
+    *,
+    bodies=None,
+    gravity=GRAVITY,
+    dt=DT,
+    power=None,
+    stops=1e6,
+    effort=1e6,
+):
+    """Roll trajectories out; time [T], command [R, T, n], start [R, n]. Returns [C, R, T, n]."""
+    runs, count, n = command.shape
+    sets = len(rows)
+    steps = np.tile(time / dt, runs)
+    samples = Samples()
+    samples.step = device_array(np.floor(steps), int, device)
+    samples.fraction = device_array(steps - np.floor(steps), float, device)
+    samples.command = device_array(command.reshape(-1, n), float, device)
+    power = np.ones_like(command) if power is None else power
+    samples.power = device_array(power.reshape(-1, n), float, device)
+    first = device_array(np.arange(runs) * count, int, device)
+    links = Links() if bodies is None else links_struct(bodies, gravity, device)
+    parameters = np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS)
+    predicted = unwritten((sets, runs * count, n), float, device)
+    wp.launch(
+        rollout_kernel,
+        dim=(sets, runs),
+        inputs=[
+            samples,
+            first,
+            device_array(np.full(runs, count), int, device),
+            first,
+            device_array(np.arange(runs), int, device),
+            device_array(start, float, device),
+            device_array(np.arange(n), int, device),
+            device_array(np.full(n, -stops), float, device),
+            device_array(np.full(n, stops), float, device),
+            device_array(np.full(n, effort), float, device),
+            int(bodies is not None),
+            links,
+            device_array(parameters, float, device),
+            dt,
+        ],
+        outputs=[unwritten((len(parameters), servo.STATE_COLUMNS), float, device), predicted],
+        device=device,
+    )
+    result = predicted.numpy().astype(float)
+    assert np.isfinite(result).all(), "a sample was not written, or is no number"
+    return result.reshape(sets, runs, count, n)
+
+
+def one_joint(device, rows, time, command, start=0.0, **options):
+    """One joint, one trajectory: [C, T]."""
+    return roll(device, rows, time, command[None, :, None], np.full((1, 1), start), **options)[:, 0, :, 0]
+
+
+def excitation(rng, seconds=2.0):
+    """Irregular stamps, and steps and a sine as command."""
+    time = np.concatenate([[0.0], np.cumsum(rng.uniform(0.004, 0.03, int(seconds / 0.017)))])
+    steps = rng.uniform(-0.5, 0.5, 8)[np.minimum((time / (seconds / 8)).astype(int), 7)]
+    return time, np.where(time < 0.75 * seconds, steps, 0.4 * np.sin(2 * np.pi * 2.0 * time))
