@@ -4,7 +4,6 @@ import os
 import sys
 import time
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -217,8 +216,7 @@ def resolve_device(name: str) -> str:
 def _teacher(arguments: list[str], started: float) -> int:
     cfg = parse_teacher(arguments)
 
-    from vd.train.distributed import ending_together
-    from vd.train.ending import Interrupted
+    from vd.train.ending import finished
     from vd.train.progress import waiting
 
     main_process = os.environ.get("RANK", "0") == "0"
@@ -231,16 +229,9 @@ def _teacher(arguments: list[str], started: float) -> int:
             print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
         if runner.new_inputs:
             print(f"{runner.new_inputs} observed values are new to the networks and start without effect")
-    interrupted = False
-    try:
-        with ending_together(Interrupted) if runner.is_distributed else nullcontext():
-            runner.learn()
-    except Interrupted:
-        interrupted = True
-    finally:
-        runner.env.close()
+    whole = finished(runner.learn, runner.env.close, distributed=runner.is_distributed)
     runner.shutdown()
-    if interrupted:
+    if not whole:
         if main_process:
             print(f"saved in {folder}; go on with: vd-train teacher --run-dir {folder} --resume")
         return INTERRUPTED

@@ -8,6 +8,8 @@ from types import FrameType
 
 import torch
 
+from vd.train.distributed import ending_together
+
 
 class Interrupted(Exception):  # noqa: N818  # not an error: the run was asked to stop and has saved
     """Ctrl-C or SIGTERM; the run is saved."""
@@ -75,3 +77,24 @@ class EndRequest:
         pace = (time.monotonic() - self._started) / max(done, 1)
         estimate = pace * left
         return estimate if self._deadline is None else min(estimate, self._deadline - time.monotonic())
+
+
+def finished(learn: Callable[[], None], close: Callable[[], None], *, distributed: bool) -> bool:
+    """Run a training to its end and close what it simulates.
+
+    Args:
+        learn: Trains; raises :class:`Interrupted` once a run that was asked to stop has saved.
+        close: Releases the worlds, however the training ends.
+        distributed: Whether a failure must end the other processes as well.
+
+    Returns:
+        Whether it came to its own end, rather than being interrupted.
+    """
+    try:
+        with ending_together(Interrupted) if distributed else contextlib.nullcontext():
+            learn()
+    except Interrupted:
+        return False
+    finally:
+        close()
+    return True

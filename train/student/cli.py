@@ -3,7 +3,6 @@
 import json
 import os
 from collections.abc import Sequence
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, cast
@@ -77,8 +76,7 @@ def student_command(arguments: list[str], started: float) -> int:
     cfg = parse_student(arguments)
 
     from vd.train.cli import INTERRUPTED
-    from vd.train.distributed import ending_together
-    from vd.train.ending import Interrupted
+    from vd.train.ending import finished
     from vd.train.progress import waiting
 
     main_process = os.environ.get("RANK", "0") == "0"
@@ -91,16 +89,9 @@ def student_command(arguments: list[str], started: float) -> int:
             print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
     elif main_process and cfg.init is not None:
         print(f"begins with the weights of {cfg.init}")
-    interrupted = False
-    try:
-        with ending_together(Interrupted) if runner.is_distributed else nullcontext():
-            runner.learn()
-    except Interrupted:
-        interrupted = True
-    finally:
-        runner.learner.close()
+    whole = finished(runner.learn, runner.learner.close, distributed=runner.is_distributed)
     runner.shutdown()
-    if interrupted:
+    if not whole:
         if main_process:
             print(f"saved in {folder}; go on with: vd-train student --run-dir {folder} --resume")
         return INTERRUPTED
