@@ -30,15 +30,60 @@ def test_sim_rows_add_up(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["worlds"] == 4
 
 
-def test_the_allegro_example_that_cannot_be_fetched_is_reported(monkeypatch):
-    from vd.bench.allegro import allegro_rate
-
-    def offline(*_args: object, **_kwargs: object) -> None:
+@pytest.fixture
+def offline(monkeypatch):
+    def fetch(*_args: object, **_kwargs: object) -> None:
         raise OSError("no network")
 
-    monkeypatch.setattr("newton.utils.download_asset", offline)
-    with pytest.raises(RuntimeError, match="no network"):
-        allegro_rate(1, "cpu")
+    monkeypatch.setattr("newton.utils.download_asset", fetch)
+
+
+def test_the_allegro_example_runs_with_a_hand_of_boxes_where_its_own_cannot_be_fetched(offline, tmp_path):
+    out = tmp_path / "rows.json"
+    SimCommand(worlds=(2,), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
+    (row,) = json.loads(out.read_text())["rows"]
+    assert row["allegro_hand"] == "boxes of the Allegro's size"
+    assert row["allegro_dt_s"] == pytest.approx(1.0 / 400.0)
+    assert row["physics_steps_over_allegro"] == pytest.approx(
+        row["physics_only"] * 10 / row["allegro_physics_steps_s"]
+    )
+
+
+def test_the_hand_of_boxes_passes_the_examples_own_test():
+    """Its success criteria: fingers follow their targets, all hands move alike, no cube leaves its palm."""
+    from vd.bench import allegro
+
+    with allegro._in_place_of_the_asset(allegro.add_hand_of_boxes):
+        example = allegro.make_example(2)
+    assert example.hand_dof_count == 16
+    assert example.model.body_mass.numpy()[:17].sum() == pytest.approx(1.0, abs=0.1)
+    for _ in range(60):
+        example.step()
+        example.test_post_step()
+    example.test_final()
+    assert (example.solver.mjw_data.nefc.numpy() > 0).all(), "the cubes lie in the hands"
+
+
+def test_the_example_is_as_it_was_after_a_hand_that_fails():
+    import newton
+
+    from vd.bench import allegro
+
+    before = newton.ModelBuilder.add_usd, newton.utils.download_asset
+    with pytest.raises(ZeroDivisionError), allegro._in_place_of_the_asset(lambda builder: 1 / 0):
+        allegro.make_example(1)
+    assert (newton.ModelBuilder.add_usd, newton.utils.download_asset) == before
+
+
+def test_a_file_that_cannot_be_an_allegro_hand_is_refused(tmp_path):
+    from vd.bench.allegro import allegro_rate
+
+    with pytest.raises(ValueError, match=r"--allegro-file .*hand\.txt"):
+        allegro_rate(1, "cpu", file=tmp_path / "hand.txt")
+    broken = tmp_path / "hand.urdf"
+    broken.write_text("<robot")
+    with pytest.raises(RuntimeError, match="cannot run here"):
+        allegro_rate(1, "cpu", file=broken)
 
 
 def test_a_missing_allegro_example_is_reported_in_the_row(monkeypatch, tmp_path):

@@ -26,7 +26,10 @@ class SimCommand:
     randomise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
     """Domain randomisation on."""
     allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Also step Newton's own Allegro example at the same world counts (needs its asset)."""
+    """Also step Newton's own Allegro example at the same world counts; where its asset cannot be fetched,
+    with a hand of boxes of that size."""
+    allegro_file: Path | None = None
+    """URDF of an Allegro hand for that example in place of its asset."""
     json: Path | None = None
     """Write the rows to this file as JSON."""
 
@@ -46,10 +49,13 @@ class SimCommand:
             substeps = round(task(self.objects, worlds, self.hand, True).sim.physics_hz / 12.0)
             if self.allegro:
                 try:
-                    rate, dt = allegro_rate(worlds, device)
-                    record["allegro_physics_steps_s"] = rate
-                    record["allegro_dt_s"] = dt
-                    record["physics_steps_over_allegro"] = row.physics_only * substeps / rate
+                    beside = allegro_rate(worlds, device, file=self.allegro_file)
+                    record["allegro_hand"] = beside.hand
+                    record["allegro_physics_steps_s"] = beside.physics_steps_s
+                    record["allegro_dt_s"] = beside.dt_s
+                    record["physics_steps_over_allegro"] = (
+                        row.physics_only * substeps / beside.physics_steps_s
+                    )
                 except RuntimeError as error:
                     record["allegro"] = str(error)
             rows.append(record)
