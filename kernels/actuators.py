@@ -278,6 +278,37 @@ def start_servo(command: float, position: float, row: int, state: wp.array2d[flo
 
 
 @wp.func
+def rest_play(
+    command: float,
+    position: float,
+    load: float,
+    power: float,
+    parameters: wp.array2d[float],
+    row: int,
+    state: wp.array2d[float],
+):
+    """Put the play where a joint at rest has it, which depends on how it came there.
+
+    Dry friction aside, a joint rests where its drive carries its load; without friction and dead zone
+    nothing but the play says how far that is from the command.
+
+    Args:
+        command: Command in force [rad].
+        position: Position at which the joint rests [rad].
+        load: Torque on the joint besides the drive's and :func:`servo`'s own gravity load [N m].
+        power: As in :func:`drive_joint`; with the torque off the play stays at the command.
+        parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
+        row: The joint's row.
+        state: State rows, shape [R, STATE_COLUMNS]; the play of the joint's row is written.
+    """
+    stiffness = power * parameters[row, KP]
+    if stiffness > 0.0:
+        weight = parameters[row, GRAVITY_TORQUE] * wp.sin(position + parameters[row, GRAVITY_PHASE])
+        reference = position + (weight - load) / stiffness
+        state[row, STATE_PLAY] = play(reference, command, parameters[row, BACKLASH_WIDTH])
+
+
+@wp.func
 def shape_command(
     command: float, dt: float, parameters: wp.array2d[float], row: int, state: wp.array2d[float]
 ) -> float:

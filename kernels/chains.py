@@ -24,12 +24,14 @@ from vd.kernels.actuators import (
     INERTIA,
     JITTER_DROP,
     JITTER_SIGMA,
+    KP,
     LOAD_FRICTION,
     PAYLOAD_INERTIA,
     READ_DELAY,
     STATE_TIME,
     VELOCITY_LIMIT,
     drive_joint,
+    rest_play,
     shape_command,
     start_servo,
 )
@@ -314,6 +316,17 @@ def rollout_kernel(
         )
         read_step[j] = step
         read_fraction[j] = fraction
+    weight = wp.vec3(0.0)
+    if bodies != 0:
+        _resting, weight = chain_dynamics(q, wp.vec3(0.0), count, links)
+    for j in range(count):
+        row = base_row + j
+        # What coupled joints add to the reference is a load in the units of the drive.
+        load = -weight[j]
+        for i in range(count):
+            if i != j:
+                load += held_power[j] * parameters[row, KP] * parameters[row, COUPLING_0 + slot[i]] * q[i]
+        rest_play(held[j], q[j], load, held_power[j], parameters, row, state)
 
     for k in range(samples.step[begin], samples.step[end - 1] + 1):
         # From rest at the first position to the velocity half a step later.

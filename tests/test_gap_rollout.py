@@ -124,6 +124,45 @@ def test_a_rollout_starts_where_it_was_measured():
     np.testing.assert_allclose(got, 0.25, atol=1e-6)
 
 
+def test_play_begins_where_the_joint_rests():
+    """Between the ends of its play a joint stays where it is; from beyond them its drive takes it to one."""
+    start = np.array([0.18, 0.21, 0.3])
+    motions = [
+        trajectory(str(i), np.full((200, 1), 0.2), position=np.full((200, 1), at))
+        for i, at in enumerate(start)
+    ]
+    data = recording("servo", ("j",), *motions)
+    (chain,) = chains(data)
+    row = chain.start_row.copy()
+    row[0, servo.BACKLASH_WIDTH] = 0.06
+    got = Rollouts(chain, data).predict(row[None])[0, :, 0].reshape(3, 200)
+    np.testing.assert_allclose(got[:2], np.repeat(start[:2, None], 200, axis=1), atol=1e-6)
+    assert got[2, -1] == pytest.approx(0.23, abs=1e-4)
+    # A load moves the ends: the same holds for where the drive carries it.
+    row[0, servo.GRAVITY_TORQUE], row[0, servo.GRAVITY_PHASE] = 0.04 * row[0, servo.KP], 0.5 * np.pi
+    got = Rollouts(chain, data).predict(row[None])[0, :, 0].reshape(3, 200)
+    droop = 0.04 * np.cos(got[:, -1])
+    np.testing.assert_allclose(got[0], start[0], atol=1e-6)
+    np.testing.assert_allclose(got[1:, -1] + droop[1:], 0.23, atol=1e-4)
+
+
+def test_a_finger_with_play_rests_where_its_weight_asks(hand):
+    """What a finger without play comes to rest at, one with play keeps."""
+    names = tuple(hand.joint_names[:3])
+    target = np.array([0.3, 0.5, -0.7])
+    command = np.tile(target, (200, 1))
+    (chain,) = chains(recording("dclaw3", names, trajectory("a", command, position=command)), hand)
+    data = recording("dclaw3", names, trajectory("a", command, position=command))
+    rest = Rollouts(chain, data).predict(chain.start_row[None])[0, -1]
+    assert np.abs(rest - target).max() > 2e-3
+    again = recording("dclaw3", names, trajectory("a", command, position=np.tile(rest, (200, 1))))
+    row = chain.start_row.copy()
+    row[:, servo.BACKLASH_WIDTH] = 0.05
+    np.testing.assert_allclose(
+        Rollouts(chain, again).predict(row[None])[0], np.tile(rest, (200, 1)), atol=1e-4
+    )
+
+
 def test_a_finger_droops_as_its_weight_asks(hand):
     """In rest the springs carry the weight: the gradient of the potential energy by the hand's kinematics."""
     names = ("f1_j3", "f1_j1", "f1_j2")  # columns in another order than the finger's
