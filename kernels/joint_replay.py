@@ -9,7 +9,7 @@ after the other, J recorded joints. Times, delays and lost commands are those of
 
 import warp as wp
 
-from vd.kernels.actuators import ENCODER_BIAS, READ_DELAY, shape_command
+from vd.kernels.actuators import COUPLING_0, ENCODER_BIAS, KP, READ_DELAY, rest_play, shape_command
 from vd.kernels.chains import Samples, arrival, split_steps
 from vd.kernels.joint_servo import JOINTS_PER_FINGER
 
@@ -30,6 +30,40 @@ class Tracks:
     first: wp.array2d[int]
     last: wp.array2d[int]
     stream: wp.array2d[int]
+
+
+@wp.kernel
+def rest_play_kernel(
+    # Model:
+    parameters: wp.array2d[float],
+    # In:
+    held_in: wp.array2d[float],
+    power_in: wp.array2d[float],
+    load_in: wp.array2d[float],
+    joint_q_in: wp.array2d[float],
+    # Out:
+    state_out: wp.array2d[float],
+):
+    """Start the play of every servo where the joint rests. Launch: [W, D].
+
+    Args:
+        parameters: Parameter rows, shape [W D, PARAMETER_COLUMNS].
+        held_in: Commands in force [rad], shape [W, D].
+        power_in: Their power factors, shape [W, D].
+        load_in: Torques of gravity on the joints, shape [W, D] [N m].
+        joint_q_in: Joint positions [rad], shape [W, *].
+        state_out: State rows, shape [W D, STATE_COLUMNS].
+    """
+    world, joint = wp.tid()
+    row = world * held_in.shape[1] + joint
+    power = power_in[world, joint]
+    first = joint - joint % JOINTS_PER_FINGER
+    coupled = wp.float32(0.0)
+    for slot in range(JOINTS_PER_FINGER):
+        if first + slot != joint:
+            coupled += parameters[row, COUPLING_0 + slot] * joint_q_in[world, first + slot]
+    load = load_in[world, joint] + power * parameters[row, KP] * coupled
+    rest_play(held_in[world, joint], joint_q_in[world, joint], load, power, parameters, row, state_out)
 
 
 @wp.kernel

@@ -158,8 +158,10 @@ def integrate(rows, time, command, start, dt):
     p = {name: rows[:, getattr(servo, name)] for name in names if name != "PARAMETER_COLUMNS"}
     q = start - p["ENCODER_BIAS"]
     v, work = np.zeros_like(q), np.zeros_like(q)
-    smooth, profile, profile_speed, played = (np.full_like(q, command[0]) for _ in range(4))
+    smooth, profile = (np.full_like(q, command[0]) for _ in range(2))
     profile_speed = np.zeros_like(q)
+    # The play is where the joint rests, unless that is more than its width from the command.
+    played = q + p["GRAVITY_TORQUE"] * np.sin(q + p["GRAVITY_PHASE"]) / p["KP"]
     other, other_speed = q.copy(), np.zeros_like(q)
     history = [q]
     mass = p["INERTIA"] + p["PAYLOAD_INERTIA"]

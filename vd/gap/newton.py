@@ -18,14 +18,21 @@ import mujoco
 import newton
 import numpy as np
 import warp as wp
+from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_model import HandModel
 from vd.gap.recording import Recording, Trajectory
-from vd.gap.rollout import STREAM_BITS
-from vd.kernels.actuators import ENCODER_BIAS, KD, KP, VELOCITY_LIMIT
+from vd.gap.rollout import DOWN_IN_BASE, GRAVITY_M_S2, STREAM_BITS
+from vd.kernels.actuators import BACKLASH_WIDTH, ENCODER_BIAS, KD, KP, VELOCITY_LIMIT
 from vd.kernels.chains import Samples
 from vd.kernels.effects import BASELINE
-from vd.kernels.joint_replay import Tracks, replay_command_kernel, sample_position_kernel, tick_kernel
+from vd.kernels.joint_replay import (
+    Tracks,
+    replay_command_kernel,
+    rest_play_kernel,
+    sample_position_kernel,
+    tick_kernel,
+)
 from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import build_hand, new_builder
@@ -38,6 +45,8 @@ CONSTRAINT_ROWS = 32
 """Rows of a hand without contacts: one per joint for its limit and one for its friction."""
 CONTACTS = 4
 """The solver wants room for some contacts even if there are none."""
+GRADIENT_STEP = 1.0e-5
+"""Step of central differences [rad]: rounding and curvature are both far below a servo's torques."""
 GRAPH_STEPS = 16
 """Physics steps per CUDA graph; even, since states are swapped every step."""
 SEARCHED = (KP, KD, VELOCITY_LIMIT)
@@ -192,6 +201,13 @@ class HandReplay:
         self._held_power.assign(self._start_power.astype(np.float32))
         wp.copy(self.servo.power, self._held_power)
         self.servo.reset(wp.ones(self.num_worlds, dtype=wp.int32, device=self.device), command=self._held)
+        if rows[..., BACKLASH_WIDTH].any():
+            load = wp.array(gravity_load(self.hand, start), dtype=float, device=self.device)
+            inputs = [self.servo.parameters, self._held, self._held_power, load, self._q[0]]
+            shape = (self.num_worlds, self.num_joints)
+            wp.launch(
+                rest_play_kernel, dim=shape, inputs=inputs, outputs=[self.servo.state], device=self.device
+            )
         for array in (self._step, self.squared_error, self._due_step, self._due_fraction):
             array.zero_()
         self._write.assign(self._first_sample)
@@ -245,6 +261,22 @@ class HandReplay:
                 device=self.device,
             )
             wp.launch(tick_kernel, dim=1, inputs=[self._step], device=self.device)
+
+
+def gravity_load(hand: HandModel, q: np.ndarray) -> np.ndarray:
+    """Torques of gravity on the joints [N m], shape [W, D], at positions [W, D] [rad].
+
+    The gradient of the potential energy by central differences.
+    """
+    q = np.asarray(q, dtype=float)[..., : hand.num_joints]
+    moved = q[:, None] + GRADIENT_STEP * np.concatenate([np.eye(hand.num_joints), -np.eye(hand.num_joints)])
+    poses = hand.forward_kinematics(moved)
+    turns = Rotation.from_quat(poses[..., 3:].reshape(-1, 4))
+    arms = turns.apply(np.broadcast_to(hand.link_com, (*poses.shape[:-1], 3)).reshape(-1, 3))
+    fallen = (poses[..., :3] + arms.reshape(poses[..., :3].shape)) @ DOWN_IN_BASE
+    work = GRAVITY_M_S2 * fallen @ hand.link_mass
+    plus, minus = np.split(work, 2, axis=1)
+    return (plus - minus) / (2.0 * GRADIENT_STEP)
 
 
 def random_stream(trajectory: Trajectory) -> int:
