@@ -22,7 +22,12 @@ WINDOW = 8
 """Cells of a 2x2x2 window."""
 SLOTS_PER_SITE = 2
 """Slots of the hash table for each site, at least: half of them stay empty, so searches are short."""
+KEYS_PER_THREAD = wp.constant(256)
+"""Keys that one thread counts before it adds to the sums of all."""
 
+_Counts = wp.types.vector(length=AXIS_BITS, dtype=int)
+_LEVELS = wp.constant(AXIS_BITS)
+_ALL_DIFFER = wp.constant(wp.int64((1 << 62) - 1))
 _NONE = wp.constant(wp.int64(-1))
 """Key of an empty slot, or of a cell beyond the grid."""
 _KEY_SHIFT = wp.constant(wp.int64(CLOUD_SHIFT))
@@ -195,13 +200,67 @@ def window_kernel(
     table_out[coarse_place_in[row] - 1, int(fine_key_in[row] & wp.int64(7))] = row
 
 
-def coarsen(keys: wp.array) -> tuple[wp.array, wp.array]:
+@wp.kernel
+def level_count_kernel(
+    # In:
+    key_in: wp.array[wp.int64],
+    threads: int,
+    # In/Out:
+    count: wp.array[int],
+):
+    """Count the cells of every coarser level, before any is made. Launch: [threads].
+
+    A cell of a level begins where a key differs from the one before in more than the level's bits.
+
+    Args:
+        key_in: Sorted keys, each once, shape [M].
+        threads: Threads of the launch.
+        count: Cells one level up, two, and so on, shape [AXIS_BITS], zeros before.
+    """
+    counts = _Counts()
+    i = wp.tid()
+    while i < key_in.shape[0]:
+        changed = _ALL_DIFFER
+        if i > 0:
+            changed = key_in[i] ^ key_in[i - 1]
+        changed = changed >> wp.int64(3)
+        level = wp.int32(0)
+        while changed != wp.int64(0) and level < _LEVELS:
+            counts[level] += 1
+            changed = changed >> wp.int64(3)
+            level += 1
+        i += threads
+    for level in range(_LEVELS):
+        if counts[level] > 0:
+            wp.atomic_add(count, level, counts[level])
+
+
+def level_counts(keys: wp.array) -> list[int]:
+    """Numbers of sites that :func:`coarsen` would give, once, twice and so on, waiting for the device once.
+
+    Args:
+        keys: Keys of a level, sorted, each once [M].
+
+    Returns:
+        One number for each bit of a coordinate.
+    """
+    counts = wp.zeros(AXIS_BITS, dtype=int, device=keys.device)
+    threads = -(-keys.shape[0] // KEYS_PER_THREAD)
+    wp.launch(level_count_kernel, dim=threads, inputs=[keys, threads, counts], device=keys.device)
+    return counts.numpy().tolist()
+
+
+def coarsen(keys: wp.array, count: int | None = None) -> tuple[wp.array, wp.array]:
     """Sites of the grid of half the resolution: floor(c / 2) of every site, each once, ascending.
+
+    Args:
+        keys: Keys of the level, sorted, each once [F].
+        count: M, where it is known (:func:`level_counts`); else the device is waited for.
 
     Returns:
         Their keys [M], and the place of each finer site's cell among them, counted from 1 [F].
     """
-    return unique_keys(keys, keys.shape[0], limit=2**63 - 1, shift=3)
+    return unique_keys(keys, keys.shape[0], limit=2**63 - 1, shift=3, kept=count)
 
 
 def hash_table(keys: wp.array) -> tuple[wp.array, wp.array]:

@@ -293,7 +293,9 @@ def draw_noise(noise: wp.array, rng: wp.array) -> NoiseDraw:
     return draw
 
 
-def unique_keys(keys: wp.array, count: int, *, limit: int, shift: int = 0) -> tuple[wp.array, wp.array]:
+def unique_keys(
+    keys: wp.array, count: int, *, limit: int, shift: int = 0, kept: int | None = None
+) -> tuple[wp.array, wp.array]:
     """Each of the first ``count`` sorted keys once, ascending.
 
     Args:
@@ -301,6 +303,7 @@ def unique_keys(keys: wp.array, count: int, *, limit: int, shift: int = 0) -> tu
         count: K.
         limit: Keys from here on are ignored.
         shift: Bits by which keys are shifted to the right.
+        kept: M, where it is known; else the device is waited for.
 
     Returns:
         The keys [M], and for each key given its place among them, counted from 1 [K].
@@ -317,15 +320,17 @@ def unique_keys(keys: wp.array, count: int, *, limit: int, shift: int = 0) -> tu
         device=device,
     )
     wp.utils.array_scan(run, run, inclusive=True)
-    kept = wp.empty(int(run[count - 1 :].numpy()[0]), dtype=wp.int64, device=device)
+    if kept is None:
+        kept = int(run[count - 1 :].numpy()[0])
+    unique = wp.empty(kept, dtype=wp.int64, device=device)
     wp.launch(
         keep_starts_kernel,
         dim=count,
         inputs=[keys, wp.int64(limit), wp.int64(shift), run],
-        outputs=[kept],
+        outputs=[unique],
         device=device,
     )
-    return kept, run
+    return unique, run
 
 
 def voxelise(points: wp.array, voxel_size: float, noise: NoiseDraw | None = None) -> wp.array:

@@ -77,6 +77,16 @@ def test_convolution_equals_a_dense_one_masked_to_the_sites(device, stride, monk
     torch.testing.assert_close(result, at_sites(dense, outputs, EXTENT // stride), atol=1e-5, rtol=1e-5)
 
 
+def test_only_one_coarser_level_waits_for_the_device(device, monkeypatch):
+    sites, waits, read = random_sites(device), [], wp.array.numpy
+    monkeypatch.setattr(wp.array, "numpy", lambda array: waits.append(array.shape) or read(array))
+    level = sites
+    for _ in range(4):
+        _ = level.neighbours, level.strided, level.strided_back, level.windows, level.offsets
+        level = level.coarser
+    assert len(waits) == 1
+
+
 def test_pooling_equals_a_dense_one(device):
     sites = random_sites(device)
     values = features_of(sites, 6)

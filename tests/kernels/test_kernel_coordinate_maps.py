@@ -10,6 +10,7 @@ from kernel_oracle import EXAMPLES, device_array
 from vd.kernels.coordinate_maps import (
     coarsen,
     hash_table,
+    level_counts,
     neighbour_table,
     strided_table,
     window_table,
@@ -63,6 +64,33 @@ def test_coarse_sites_are_the_floors_of_halves(device, cells, level):
     np.testing.assert_array_equal(found[place.numpy() - 1], expected)
 
 
+def assert_counts(keys):
+    """``level_counts`` foretells what coarsening gives, and coarsening told so gives the same."""
+    counts = level_counts(keys)
+    assert len(counts) == 12
+    for count in counts:
+        told, place = coarsen(keys, count)
+        keys, expected = coarsen(keys)
+        assert count == len(keys)
+        np.testing.assert_array_equal(told.numpy(), keys.numpy())
+        np.testing.assert_array_equal(place.numpy(), expected.numpy())
+
+
+@EXAMPLES
+@given(cells=grids(), level=st.integers(0, 2))
+def test_sizes_of_all_coarser_levels_are_known_at_once(device, cells, level):
+    keys, _ = sites(cells, device, level)
+    # twelve halvings of the finest grid leave one cell; of a coarser one that cell stays
+    if level == 0:
+        assert_counts(keys)
+    assert level_counts(keys)[0] == len(coarsen(keys)[0])
+
+
+def test_sizes_of_many_sites_are_summed_over_threads(device):
+    cells = np.random.default_rng(0).integers(-60, 60, (4, 5000, 3))
+    assert_counts(sites(cells, device, 0)[0])
+
+
 @EXAMPLES
 @given(cells=grids(), level=st.integers(0, 2))
 def test_neighbours_are_all_the_sites_at_each_offset(device, cells, level):
@@ -113,6 +141,7 @@ def test_no_sites_give_empty_maps(device):
     keys = wp.empty(0, dtype=wp.int64, device=device)
     coarse, place = coarsen(keys)
     assert coarse.shape == place.shape == (0,)
+    assert level_counts(keys) == [0] * 12
     assert neighbour_table(keys, 0).shape == (0, 27)
     assert (
         strided_table(keys, coarse, 0).shape == strided_table(keys, coarse, 0, reverse=True).shape == (0, 27)

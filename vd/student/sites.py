@@ -1,11 +1,12 @@
 """Occupied cells of a batch of voxelised clouds, and the maps that sparse layers read, each built once."""
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import torch
 import warp as wp
 
-from vd.kernels.coordinate_maps import coarsen, neighbour_table, strided_table, window_table
+from vd.kernels.coordinate_maps import coarsen, level_counts, neighbour_table, strided_table, window_table
 from vd.kernels.voxels import cloud_offsets, coordinates
 
 
@@ -13,7 +14,8 @@ class Sites:
     """M occupied cells of B clouds on one level of a grid; the cells of level l are 2^l voxels wide.
 
     Rows are sorted by cloud. Maps and coarser levels are built when first asked for and kept, so that
-    all layers of a level, forward and backward, share them.
+    all layers of a level, forward and backward, share them. Only the first coarser level waits for the
+    device, to learn the sizes of all.
 
     Attributes:
         keys: Sorted keys of the cells (:mod:`vd.kernels.voxels`), shape [M].
@@ -21,10 +23,19 @@ class Sites:
         level: l.
     """
 
-    def __init__(self, keys: wp.array, clouds: int, level: int = 0):
+    def __init__(self, keys: wp.array, clouds: int, level: int = 0, *, sizes: Sequence[int] = ()):
+        """Take the cells.
+
+        Args:
+            keys: Sorted keys of the cells, each once, shape [M].
+            clouds: B.
+            level: l.
+            sizes: Numbers of cells of the coarser levels, as far as they are known.
+        """
         self.keys = keys
         self.clouds = clouds
         self.level = level
+        self._sizes = sizes
 
     def __len__(self) -> int:
         return int(self.keys.shape[0])
@@ -46,8 +57,9 @@ class Sites:
 
     @cached_property
     def _coarser(self) -> tuple["Sites", wp.array]:
-        keys, place = coarsen(self.keys)
-        return Sites(keys, self.clouds, self.level + 1), place
+        size, *sizes = self._sizes or level_counts(self.keys)
+        keys, place = coarsen(self.keys, size)
+        return Sites(keys, self.clouds, self.level + 1, sizes=sizes), place
 
     @property
     def coarser(self) -> "Sites":
