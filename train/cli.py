@@ -1,4 +1,4 @@
-"""Command line of training: ``vd-train teacher``, ``student``, ``calibrate``, ``export`` and ``curves``."""
+"""Command line of training: ``vd-train teacher``, ``student``, ``calibrate``, ``export``, ``bundle`` ..."""
 
 import os
 import sys
@@ -32,6 +32,8 @@ commands:
   calibrate choose when a student stops          vd-train calibrate student.pt --objects SET
   export    write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
             or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
+            or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
+  bundle    write a policy as it is deployed     vd-train bundle student.pt bundles/first
   curves    draw the curves of a run             vd-train curves runs/first
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset multi-gpu
@@ -56,15 +58,31 @@ SHORT_FORMS = ("hand", "hand-layer", "objects", "num-worlds", "seed")
 
 @dataclass
 class ExportCfg:
-    """Write the policy of a checkpoint without optimiser and training state, or a small checkpoint."""
+    """Write the policy of a checkpoint without its training state, as ONNX, or a small checkpoint."""
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
-    """Checkpoint of vd-train teacher."""
+    """Checkpoint of vd-train teacher, or its policy.pt."""
     output: Annotated[Path, tyro.conf.Positional] = Path("policy.pt")
-    """File to write."""
+    """File to write. A name that ends in .onnx gets the network from observation to mean action, checked
+    against onnxruntime where that is installed."""
     resumable: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Write a checkpoint for --resume instead, all but the state of the worlds: a run that moves to another
     machine or number of GPUs starts its episodes anew anyway."""
+
+
+@dataclass
+class BundleCfg:
+    """Write a policy as it is deployed: weights, a contract in JSON, golden inputs and outputs, in a folder.
+
+    vd-eval takes the folder in place of a policy, and refuses it for a hand that it was not made for.
+    """
+
+    policy: Annotated[str, tyro.conf.Positional]
+    """policy.pt, student.pt, a checkpoint, a run's folder, or the name of an installed policy."""
+    output: Annotated[Path, tyro.conf.Positional]
+    """Folder to write; a bundle that is there is replaced."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the contract."""
 
 
 @dataclass
@@ -90,6 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "student": _student,
         "calibrate": _calibrate,
         "export": _export,
+        "bundle": _bundle,
         "curves": _curves,
     }
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -258,11 +277,46 @@ def _export(arguments: list[str], _started: float) -> int:
     from vd.policy import policy_export
     from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
 
+    if cfg.output.suffix == ".onnx":
+        return _export_onnx(cfg)
     state = load_checkpoint(cfg.checkpoint)
     if cfg.resumable and "optimizer_state_dict" not in state:
         raise ValueError(f"{cfg.checkpoint} is a policy, not a checkpoint; nothing can go on from it")
     save_checkpoint(cfg.output, without_worlds(state) if cfg.resumable else policy_export(state))
     print(cfg.output)
+    return 0
+
+
+def _export_onnx(cfg: ExportCfg) -> int:
+    from vd.policy import load_policy
+    from vd.train.onnx_export import export_onnx, onnx_difference
+
+    if cfg.resumable:
+        raise ValueError(f"--resumable writes a checkpoint, which {cfg.output} is not; leave one of them out")
+    policy = load_policy(cfg.checkpoint)
+    export_onnx(policy, cfg.output)
+    worst = onnx_difference(policy, cfg.output)
+    if worst is None:
+        print("onnxruntime is not installed: not checked (pip install 'visual-dexterity[export]')")
+    else:
+        print(f"onnxruntime gives the same actions within {worst:.1e}")
+    print(cfg.output)
+    return 0
+
+
+def _bundle(arguments: list[str], _started: float) -> int:
+    import json
+
+    cfg = tyro.cli(BundleCfg, args=arguments, prog="vd-train bundle")
+
+    from vd.bundle.write import write_bundle
+
+    contract = write_bundle(cfg.policy, cfg.output)
+    if cfg.json:
+        print(json.dumps(to_dict(contract), indent=1))
+    else:
+        hand = contract.interface.hand
+        print(f"{cfg.output}: {contract.kind} for {hand.name}, {len(hand.joint_names)} joints")
     return 0
 
 

@@ -167,10 +167,10 @@ def _open_task(
     """The whole task of a training, without its curriculum, and the policy that came out."""
     from vd.envs.cfg import CurriculumCfg
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.agents import open_policy, trained_task
+    from vd.evaluate.agents import open_teacher, trained_task
 
     name = "cuda:0" if device == "cuda" else "cpu"
-    trained = open_policy(str(run_dir), name)
+    trained = open_teacher(str(run_dir), name)
     task = replace(
         trained_task(trained),
         objects=objects,

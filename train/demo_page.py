@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from vd.config import to_dict
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import open_policy, trained_task
+from vd.evaluate.agents import open_teacher, trained_task
 from vd.evaluate.report import number, percent
 from vd.evaluate.result import EvalResult
 from vd.page import Page
@@ -44,7 +44,7 @@ STAGE_NAMES = {
 
 def write_page(results: "DemoResults", path: Path) -> None:
     """Write the demo's page."""
-    task = trained_task(open_policy(str(results.run_dir), "cpu"))
+    task = trained_task(open_teacher(str(results.run_dir), "cpu"))
     rows = read_progress(results.run_dir / PROGRESS_FILE)
     page = Page(
         "Visual Dexterity: the demo",

@@ -56,6 +56,8 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
     """``value`` as the type ``hint`` asks for: nested dataclasses, tuples, paths and unions of them."""
+    if hint is Any:
+        return value
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is typing.Annotated:
         return _convert(args[0], value, where)

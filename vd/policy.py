@@ -49,6 +49,35 @@ class PolicySpec:
     normalise_observations: bool
 
 
+class MeanAction(nn.Module):
+    """Normalisation of observations, if it belongs to the actor, its perceptron, and the mean it gives.
+
+    Args:
+        spec: Shape of the network.
+        weights: As of :class:`TrainedPolicy`.
+    """
+
+    def __init__(self, spec: PolicySpec, weights: dict[str, torch.Tensor]) -> None:
+        super().__init__()
+        self.num_actions = spec.num_actions
+        offset, scale = torch.zeros(1, spec.num_observations), torch.ones(1, spec.num_observations)
+        if spec.normalise_observations:
+            offset = weights["obs_normalizer._mean"].clone()
+            scale = weights["obs_normalizer._std"] + _NORMALISER_EPSILON
+        self.register_buffer("offset", offset)
+        self.register_buffer("scale", scale)
+        self.layers = _network(spec)
+        inside = {key.removeprefix("mlp."): value for key, value in weights.items() if key.startswith("mlp.")}
+        self.layers.load_state_dict(inside)
+        self.eval().requires_grad_(False)
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        """Mean actions [N, D] of observations [N, O]."""
+        output = self.layers((observation - self.offset) / self.scale)
+        # A state-dependent std is the second half of the output.
+        return output[:, : self.num_actions]
+
+
 class TrainedPolicy:
     """The deterministic policy of a trained actor: the mean of its action distribution.
 
@@ -62,6 +91,8 @@ class TrainedPolicy:
 
     Attributes:
         hand: Name of the hand it moves, as ``task`` says ("" if it does not).
+        weights: What it was built from.
+        network: From observations [N, O] to mean actions [N, D]; what an exporter needs.
     """
 
     def __init__(
@@ -77,15 +108,8 @@ class TrainedPolicy:
         self.spec, self.task, self.iteration, self.env_steps = spec, task, iteration, env_steps
         self.hand = str(task.get("hand", ""))
         self.num_observations, self.num_actions = spec.num_observations, spec.num_actions
-        self._mean: torch.Tensor | None = None
-        self._scale: torch.Tensor | None = None
-        if spec.normalise_observations:
-            self._mean = weights["obs_normalizer._mean"].to(device)
-            self._scale = weights["obs_normalizer._std"].to(device) + _NORMALISER_EPSILON
-        self._network = _network(spec).to(device)
-        inside = {key.removeprefix("mlp."): value for key, value in weights.items() if key.startswith("mlp.")}
-        self._network.load_state_dict(inside)
-        self._network.requires_grad_(False)
+        self.weights = weights
+        self.network = MeanAction(spec, weights).to(device)
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """Mean action.
@@ -105,11 +129,7 @@ class TrainedPolicy:
                 f"'{self.hand}', but got {tuple(observation.shape)}; use the hand it was trained for"
             )
         with torch.no_grad():
-            if self._mean is not None:
-                observation = (observation - self._mean) / self._scale
-            output = self._network(observation)
-        # A state-dependent std is the second half of the output.
-        return output[:, : self.num_actions]
+            return self.network(observation)
 
 
 class ZeroPolicy:

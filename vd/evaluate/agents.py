@@ -2,10 +2,15 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from vd.bundle import is_bundle
 from vd.config import from_dict
 from vd.envs.cfg import CurriculumCfg, ReorientCfg, SuccessCfg
+
+if TYPE_CHECKING:
+    from vd.policy import TrainedPolicy
+    from vd.student.saved import SavedStudent
 
 BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
@@ -23,7 +28,7 @@ LAYER_HELP = (
 )
 """What --hand-layer means on the command lines of vd-eval and vd-play."""
 # What a run's folder holds, best first.
-_RUN_FILES = ("policy.pt", "checkpoints/best.pt")
+_RUN_FILES = ("policy.pt", "student.pt", "checkpoints/best.pt")
 
 
 def find_policy(name: str | Path) -> Path:
@@ -37,12 +42,13 @@ def find_policy(name: str | Path) -> Path:
     if str(name) in SHIPPED_POLICIES:
         return SHIPPED_POLICIES[str(name)]
     path = Path(name)
-    if path.is_file():
+    if path.is_file() or is_bundle(path):
         return path
     if not path.is_dir():
         raise FileNotFoundError(
-            f"no policy at {path}; give a policy.pt, a file of a run's checkpoints folder, a run's folder, "
-            f"or the name of an installed policy: {', '.join(SHIPPED_POLICIES)}"
+            f"no policy at {path}; give a policy.pt, a student.pt, a bundle's folder, a file of a run's "
+            f"checkpoints folder, a run's folder, or the name of an installed policy: "
+            f"{', '.join(SHIPPED_POLICIES)}"
         )
     for candidate in _RUN_FILES:
         if (path / candidate).is_file():
@@ -55,11 +61,12 @@ def trained_task(policy: Any) -> ReorientCfg:
     return from_dict(ReorientCfg, policy.task, where="task of the policy")
 
 
-def open_policy(name: str, device: str) -> Any | None:
+def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | None":
     """Load a trained policy; None for a built-in agent, which needs the number of actions first.
 
     Args:
-        name: ``zero``, ``random``, the name of an installed policy, a policy file, or a run's folder.
+        name: ``zero``, ``random``, the name of an installed policy, a policy or student file, a bundle's
+            folder, or a run's folder.
         device: Torch device.
 
     Raises:
@@ -69,8 +76,44 @@ def open_policy(name: str, device: str) -> Any | None:
     if name in BUILT_IN:
         return None
     from vd.policy import load_policy
+    from vd.student.saved import is_student, load_student
 
-    return load_policy(find_policy(name), device=device)
+    path = find_policy(name)
+    if is_bundle(path):
+        from vd.bundle.store import read_bundle
+
+        bundle = read_bundle(path, device)
+        return bundle.student if bundle.teacher is None else bundle.teacher
+    return load_student(path, device) if is_student(path) else load_policy(path, device)
+
+
+def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
+    """:func:`open_policy` where only a teacher, which sees the simulator's state, will do.
+
+    Raises:
+        ValueError: It is a student.
+    """
+    from vd.policy import TrainedPolicy
+
+    policy = open_policy(name, device)
+    if policy is not None and not isinstance(policy, TrainedPolicy):
+        raise ValueError(f"{name} is a student, which sees point clouds; give a teacher, or use vd-eval")
+    return policy
+
+
+def check_bundle(name: str, task: ReorientCfg) -> None:
+    """Refuse a bundle that was made for another hand than that of ``task``; other policies pass.
+
+    Raises:
+        vd.bundle.contract.ContractError: Names field, found, expected and remedy.
+    """
+    if name in BUILT_IN or not is_bundle(path := find_policy(name)):
+        return
+    from vd.assets_usd.hands import load_hand
+    from vd.bundle.contract import check_hand
+    from vd.bundle.store import read_contract
+
+    check_hand(read_contract(path), load_hand(task.hand, task.fingertip, task.hand_layer), path)
 
 
 def start_at_rest(yes: bool, no: bool) -> bool | None:

@@ -145,13 +145,13 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
 
     from vd.assets_usd.objects.model import load_set
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.agents import built_in, open_policy, task_for
+    from vd.evaluate.agents import built_in, check_bundle, open_teacher, task_for
     from vd.evaluate.report import write_report
     from vd.evaluate.result import Protocol, summarise
     from vd.evaluate.rollout import collect, collect_drawn, draw_starts_and_goals
 
     device = resolve_device(cfg.device)
-    trained = open_policy(cfg.agent_name, device)
+    trained = open_teacher(cfg.agent_name, device)
     count = len(load_set(list(cfg.objects)))
     task = task_for(
         trained,
@@ -167,6 +167,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
     )
+    check_bundle(cfg.agent_name, task)
     print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
     env = ReorientEnv(task, device)
     policy = trained or built_in(cfg.agent_name, env.num_actions, seed=cfg.seed, device=device)

@@ -193,14 +193,14 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
     wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would scroll the rest away
     from vd.assets_usd.objects.model import load_set
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.agents import open_policy, task_for
+    from vd.evaluate.agents import check_bundle, open_teacher, task_for
     from vd.evaluate.cli import resolve_device
 
     device = resolve_device(cfg.device)
     count = len(load_set(list(cfg.objects)))
     if device == "cpu" and count > FAST_WORLDS_CPU:
         print(f"vd-play: {count} objects are {count} worlds, slow on a CPU; name fewer with --objects")
-    trained = open_policy(cfg.agent_name, device)
+    trained = open_teacher(cfg.agent_name, device)
     task = task_for(
         trained,
         hand=cfg.hand,
@@ -215,6 +215,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
     )
+    check_bundle(cfg.agent_name, task)
     return ReorientEnv(task, device), trained, device
 
 

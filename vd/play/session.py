@@ -93,13 +93,13 @@ def agent_choices(
         device: Torch device.
         others: More policy files.
     """
-    from vd.evaluate.agents import BUILT_IN, built_in, open_policy
+    from vd.evaluate.agents import BUILT_IN, built_in, open_teacher
 
     choices: dict[str, Callable[[], Any]] = {}
     if policy is not None:
         choices[named] = lambda: policy
     for other in others:
-        choices.setdefault(other, partial(open_policy, other, device))
+        choices.setdefault(other, partial(open_teacher, other, device))
     for name in BUILT_IN:
         choices[name] = partial(built_in, name, num_actions, seed=seed, device=device)
     return choices

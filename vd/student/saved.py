@@ -51,6 +51,15 @@ class SavedStudent:
     """Control steps it was trained for (clouds in stage 0)."""
 
 
+def is_student(path: Path) -> bool:
+    """Whether a file is a student, as far as it can be read."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception:  # whoever reads it says what is wrong with it
+        return False
+    return isinstance(state, dict) and "student_state_dict" in state
+
+
 def student_export(state: dict[str, Any]) -> dict[str, Any]:
     """The part of a checkpoint that :func:`load_student` needs."""
     kept = ("spec", "task", "depth", "iter", "env_steps")

@@ -1,0 +1,282 @@
+"""Bundles on disk: a folder with weights, contract and golden values. Reading one executes nothing in it."""
+
+import hashlib
+import json
+import shutil
+import tempfile
+from dataclasses import dataclass, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from vd.assets_usd.hand_data import HandModel
+from vd.bundle import CONTRACT_FILE, is_bundle
+from vd.bundle.contract import (
+    BUNDLE_FORMAT,
+    Contract,
+    ContractError,
+    Provenance,
+    StoppingPart,
+    derive_interface,
+)
+from vd.bundle.golden import (
+    TOLERANCE,
+    Golden,
+    student_golden,
+    student_outputs,
+    teacher_golden,
+    teacher_outputs,
+    worst_difference,
+)
+from vd.config import from_dict, to_dict
+from vd.envs.cfg import ReorientCfg
+from vd.files import write_json
+from vd.policy import PolicySpec, TrainedPolicy
+from vd.sensors.cfg import DepthCameraCfg
+
+if TYPE_CHECKING:
+    from vd.student.saved import SavedStudent
+
+WEIGHTS_FILE, GOLDEN_FILE = "weights.safetensors", "golden.safetensors"
+FILE_MODE, FOLDER_MODE = 0o644, 0o755
+"""A bundle is for others to read."""
+RENDERED = 2
+"""Stage of students that see a depth camera."""
+_PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A bundle that was read: its contract, and the policy, a teacher's or a student."""
+
+    contract: Contract
+    teacher: TrainedPolicy | None
+    student: "SavedStudent | None"
+
+
+def write_teacher(folder: Path, policy: TrainedPolicy, hand: HandModel) -> Contract:
+    """Write the bundle of a teacher.
+
+    Args:
+        folder: To write; a bundle that is there is replaced.
+        policy: The teacher.
+        hand: The hand of its training.
+    """
+    task = from_dict(ReorientCfg, policy.task, where="task of the policy")
+    contract = Contract(
+        kind="teacher",
+        interface=derive_interface(hand, task),
+        network=to_dict(policy.spec),
+        stopping=None,
+        provenance=_provenance(policy.task, "", None, policy.iteration, policy.env_steps),
+        software=_software(),
+    )
+    _write(folder, contract, policy.weights, teacher_golden(policy))
+    return contract
+
+
+def write_student(folder: Path, student: "SavedStudent", hand: HandModel) -> Contract:
+    """Write the bundle of a student.
+
+    Args:
+        folder: To write; a bundle that is there is replaced.
+        student: The student, on the CPU.
+        hand: The hand of its training.
+    """
+    spec = student.spec
+    rendered = spec.stage == RENDERED
+    depth = (
+        from_dict(DepthCameraCfg, student.depth, where="depth camera of the student") if rendered else None
+    )
+    contract = Contract(
+        kind="student",
+        interface=derive_interface(
+            hand,
+            from_dict(ReorientCfg, student.task, where="task of the student"),
+            network=spec.network,
+            depth=depth,
+            camera=spec.camera,
+        ),
+        network=to_dict(spec.network),
+        stopping=StoppingPart(spec.stopping.distance_rad, spec.stopping.action_norm, spec.calibrated_on),
+        provenance=replace(
+            _provenance(student.task, spec.teacher, spec.stage, student.iteration, student.env_steps),
+            depth=student.depth if rendered else {},
+        ),
+        software=_software(),
+    )
+    _write(folder, contract, student.network.state_dict(), student_golden(student, hand))
+    return contract
+
+
+def read_contract(folder: str | Path) -> Contract:
+    """The contract of a bundle.
+
+    Raises:
+        FileNotFoundError: There is no bundle.
+        ContractError: The contract is damaged, or of another version.
+    """
+    path = Path(folder) / CONTRACT_FILE
+    if not path.is_file():
+        raise FileNotFoundError(f"no bundle at {folder}: there is no {path}; vd-train bundle writes one")
+    try:
+        values = json.loads(path.read_text())
+        found = values.get("format") if isinstance(values, dict) else None
+        if found != BUNDLE_FORMAT:
+            raise ContractError(
+                f"{path}: format is {found!r}, this version reads {BUNDLE_FORMAT!r}; "
+                "write the bundle again with vd-train bundle"
+            )
+        return from_dict(Contract, values)
+    except ContractError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise ContractError(f"{path}: {error}; write the bundle again with vd-train bundle") from error
+
+
+def read_bundle(folder: str | Path, device: str = "cpu") -> Bundle:
+    """Read a bundle, and see that its policy answers the golden inputs as it did when it was written.
+
+    Args:
+        folder: The bundle.
+        device: Torch device of the policy.
+
+    Raises:
+        FileNotFoundError: A file is missing.
+        ContractError: A file is damaged or changed, the weights do not fit the network, or the policy answers
+            otherwise.
+    """
+    folder = Path(folder)
+    contract = read_contract(folder)
+    weights = _tensors(folder / WEIGHTS_FILE, contract, device)
+    golden = _tensors(folder / GOLDEN_FILE, contract, "cpu")
+    try:
+        bundle = _build(contract, weights, device)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise ContractError(
+            f"{folder}: the weights do not fit the network of {CONTRACT_FILE} ({error}); "
+            "write the bundle again with vd-train bundle"
+        ) from error
+    if bundle.teacher is not None:
+        on_device = {name: value.to(device) for name, value in golden.items()}
+        outputs = teacher_outputs(bundle.teacher, on_device)
+    else:
+        assert bundle.student is not None
+        outputs = student_outputs(bundle.student, golden)
+    worst = worst_difference(outputs, golden)
+    if worst > TOLERANCE:
+        raise ContractError(
+            f"{folder}: the policy's outputs differ by {worst:.2g} from those in {GOLDEN_FILE} (at most "
+            f"{TOLERANCE:g}); it was written by other software ({contract.software}): write it again"
+        )
+    return bundle
+
+
+def _build(contract: Contract, weights: dict[str, torch.Tensor], device: str) -> Bundle:
+    """The policy of a contract with weights."""
+    source = contract.provenance
+    if contract.kind == "teacher":
+        policy = TrainedPolicy(
+            from_dict(PolicySpec, contract.network, where="network"),
+            weights,
+            task=source.task,
+            iteration=source.iterations,
+            env_steps=source.env_steps,
+            device=device,
+        )
+        return Bundle(contract, policy, None)
+    from vd.student.cfg import StudentCfg
+    from vd.student.network import Student
+    from vd.student.saved import SavedStudent, StudentSpec
+    from vd.student.stopping import StoppingRule
+
+    assert contract.stopping is not None and source.stage is not None
+    camera, stopping = contract.interface.camera, contract.stopping
+    spec = StudentSpec(
+        network=from_dict(StudentCfg, contract.network, where="network"),
+        num_actions=len(contract.interface.hand.joint_names),
+        stage=source.stage,
+        teacher=source.teacher,
+        camera=camera.pose_in_base if camera is not None and camera.source == "policy" else None,
+        stopping=StoppingRule(stopping.distance_rad, stopping.action_norm),
+        calibrated_on=stopping.calibrated_on,
+    )
+    network = Student(spec.network, spec.num_actions).to(device)
+    network.load_state_dict(weights)
+    network.eval().requires_grad_(False)
+    student = SavedStudent(spec, network, source.task, source.depth, source.iterations, source.env_steps)
+    return Bundle(contract, None, student)
+
+
+def _provenance(
+    task: dict[str, Any], teacher: str, stage: int | None, iterations: int, env_steps: int
+) -> Provenance:
+    """Where a policy comes from, without folders of the machine it was trained on."""
+    objects = tuple(Path(name).name for name in task.get("objects", ()))
+    return Provenance(
+        teacher=Path(teacher).name if "/" in teacher else teacher,
+        stage=stage,
+        objects=objects,
+        iterations=iterations,
+        env_steps=env_steps,
+        task={**task, "objects": list(objects)},
+    )
+
+
+def _software() -> dict[str, str]:
+    found = {}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def _write(folder: Path, contract: Contract, weights: dict[str, Any], golden: Golden) -> None:
+    """Write the files beside the place of the bundle, then put them there at once."""
+    from safetensors.torch import save_file
+
+    folder = Path(folder)
+    if folder.exists() and not is_bundle(folder) and (not folder.is_dir() or any(folder.iterdir())):
+        raise FileExistsError(f"{folder} exists and is no bundle; choose another name")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        temporary.chmod(FOLDER_MODE)
+        for name, tensors in ((WEIGHTS_FILE, weights), (GOLDEN_FILE, golden)):
+            plain = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
+            save_file(plain, temporary / name)
+            (temporary / name).chmod(FILE_MODE)  # the library writes for the owner's eyes only
+        digests = {name: _digest(temporary / name) for name in (WEIGHTS_FILE, GOLDEN_FILE)}
+        write_json(temporary / CONTRACT_FILE, to_dict(replace(contract, files=digests)))
+        if folder.exists():
+            shutil.rmtree(folder)
+        temporary.replace(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _tensors(path: Path, contract: Contract, device: str) -> dict[str, torch.Tensor]:
+    """Tensors of a file of the bundle, after its digest was compared."""
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    if not path.is_file():
+        raise FileNotFoundError(f"the bundle has no {path}; copy the whole folder again")
+    wanted = contract.files.get(path.name)
+    if _digest(path) != wanted:
+        raise ContractError(
+            f"{path} is not the file that {CONTRACT_FILE} was written with (its SHA-256 differs); "
+            "copy the whole folder again"
+        )
+    try:
+        return load_file(path, device=device)
+    except SafetensorError as error:
+        raise ContractError(f"{path} is damaged ({error}); copy the whole folder again") from error
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
