@@ -1,4 +1,4 @@
-"""Golden values: inputs that a reader of a bundle can give its policy, and the outputs that must come back."""
+"""Golden values: inputs for the policy of a bundle, and the outputs that have to come back."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
