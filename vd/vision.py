@@ -93,6 +93,7 @@ class StudentView:
             seed: Of noise and camera.
         """
         self.env = env
+        env.acts_in_view = False  # the student sees the world as it is, whatever its teacher does
         self.device = wp.device_to_torch(env.device)
         scene = env.scene
         self._separate = network.goal == "separate"

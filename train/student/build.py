@@ -238,6 +238,7 @@ def _dagger(
     import torch
 
     from vd.envs.reorient import ReorientEnv
+    from vd.envs.symmetry import WorldOrder
     from vd.train.student.dagger import Dagger
     from vd.train.vec_env import ReorientVecEnv
     from vd.vision import StudentView
@@ -263,4 +264,4 @@ def _dagger(
         batch=cfg.dagger.minibatch_worlds * cfg.dagger.rollout_steps,
         seed=task.seed,
     )
-    return Dagger(env, view, student, teacher, cfg.dagger, world_size=world_size)
+    return Dagger(env, view, student, WorldOrder(teacher, simulation), cfg.dagger, world_size=world_size)

@@ -76,6 +76,10 @@ class ObservationCfg:
     """none: nothing of the object's shape, as in the paper. full: the vector from each fingertip to the
     nearest point of the surface, and how far the object extends in 9 directions for each finger, up and
     down, now and at the goal; exact, privileged."""
+    view: Literal["world", "goal"] = "world"
+    """world: one frame for all goals, as in the paper. goal: for each goal the scene is seen turned about the
+    vertical from finger to finger, and the fingers renamed, so that the axis of the wanted rotation lies in
+    one sector: an F-th of the goals to learn. The fingers must be spaced evenly."""
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from vd.envs.randomise import Randomiser
 from vd.envs.servo import needs_servo, servo_ranges
 from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
+from vd.envs.symmetry import Views
 from vd.kernels.actions import apply_action_kernel, joint_effort_kernel
 from vd.kernels.observations import fingertip_kernel, teacher_observation_kernel, teacher_observation_size
 from vd.kernels.resets import episode_kernel, reset_kernel
@@ -79,8 +80,8 @@ class ReorientEnv:
         self.num_worlds = n = cfg.num_worlds
         self.num_fingers = f = self.hand.num_fingers
         self.num_actions = d = self.hand.num_joints
-        sees_shape = cfg.observation.shape != "none"
-        self.num_observations = teacher_observation_size(f) + sees_shape * shape_observation_size(f)
+        self.sees_shape = cfg.observation.shape != "none"
+        self.num_observations = teacher_observation_size(f) + self.sees_shape * shape_observation_size(f)
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
         self.reward_term_names = REWARD_TERMS
@@ -142,7 +143,13 @@ class ReorientEnv:
         """Fingertip frames in the frames of their links, shape [F]."""
         self._body_com = wp.clone(self.sim.model.body_com[: self.scene.bodies_per_world])
         self._reset_q = array(np.tile(PAPER.scene.reset_joint_rad, f))
-        self._shapes = ShapeObserver(self) if sees_shape else None
+        self.views = Views(self) if cfg.observation.view == "goal" else None
+        """The views in which the policy observes and acts; None where that is the world frame."""
+        self.world_observation = self.observation if self.views is None else self.views.observation
+        """Observation in the world frame, shape [N, O]."""
+        self.acts_in_view = True
+        """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
+        self._shapes = ShapeObserver(self) if self.sees_shape else None
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
         self.randomiser = Randomiser(self)
 
@@ -212,6 +219,9 @@ class ReorientEnv:
 
     def _apply_action(self) -> None:
         p, sim = self.parameters, self.sim
+        action = self.action
+        if self.views is not None and self.acts_in_view:
+            action = self.views.world_action(action)
         wp.launch(
             apply_action_kernel,
             dim=self.num_worlds,
@@ -219,7 +229,7 @@ class ReorientEnv:
                 self._lower,
                 self._upper,
                 p.action,
-                self.action,
+                action,
                 self.randomiser.action_offset,
                 self.measured_q,
                 self.smoothed,
@@ -318,6 +328,8 @@ class ReorientEnv:
             ],
             device=self.device,
         )
+        if self.views is not None:
+            self.views.choose(self._reset, self._new_goal)
         # The solver warm-starts from the last accelerations, which mean nothing after a reset.
         wp.launch(
             world_mask_kernel,
@@ -384,11 +396,13 @@ class ReorientEnv:
                 self.randomiser.observation_offset,
                 self.rng,
             ],
-            outputs=[self.observation],
+            outputs=[self.world_observation],
             device=self.device,
         )
         if self._shapes is not None:
             self._shapes.launch()
+        if self.views is not None:
+            self.views.observe()
 
     # Reading
 
@@ -455,6 +469,7 @@ class ReorientEnv:
             "goal_counts": self.goal_counts,
             "observation": self.observation,
             "rng": self.rng,
+            **({} if self.views is None else {"view": self.views.view}),
             **self.randomiser.stateful(),
             **({} if self.sim.servo is None else self.sim.servo.stateful()),
         }
@@ -472,8 +487,9 @@ class ReorientEnv:
         """
         if state["arrays"].keys() != self._stateful().keys():
             raise ValueError(
-                "the saved environment has other servos; resume with hand_layer and randomisation.effects "
-                "of the checkpoint, or from one without worlds (vd-train export --resumable)"
+                "the saved environment has other servos or views; resume with hand_layer, observation.view "
+                "and randomisation.effects of the checkpoint, or from one without worlds "
+                "(vd-train export --resumable)"
             )
         for name, array in self._stateful().items():
             saved = state["arrays"][name]

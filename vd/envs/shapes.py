@@ -51,7 +51,7 @@ class ShapeObserver:
                 env.sim.joint_q,
                 env.sim.body_q,
             ],
-            outputs=[env.observation],
+            outputs=[env.world_observation],
             device=env.device,
         )
         wp.launch(
@@ -67,6 +67,6 @@ class ShapeObserver:
                 env.sim.joint_q,
                 env.goal_quat,
             ],
-            outputs=[env.observation],
+            outputs=[env.world_observation],
             device=env.device,
         )

@@ -1,0 +1,104 @@
+"""A hand with evenly spaced fingers looks the same after a turn from finger to finger: views of one world.
+
+World frame (z up), quaternions xyzw. F views: view k is the world turned about the vertical by k / F of a
+full turn, with the fingers renamed. A policy that always takes the view in which the axis of the wanted
+rotation lies in the same sector has an F-th of the goals to learn.
+"""
+
+import warp as wp
+
+from vd.kernels.columns import read_quat
+from vd.kernels.transforms import rotation_difference
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def choose_view_kernel(
+    # Model:
+    sector: wp.array[wp.vec3],
+    object_column: int,
+    # In:
+    reset_in: wp.array[int],
+    new_goal_in: wp.array[int],
+    joint_q_in: wp.array2d[float],
+    goal_quat_in: wp.array[wp.quat],
+    # In/Out:
+    view: wp.array[int],
+):
+    """Choose the view of every world that has a new goal, and keep it until the next. Launch: [N].
+
+    It is the view that turns the axis of the rotation to the goal nearest to one fixed direction. Chosen once
+    for a goal: an axis of small rotations wanders, and fingers would change their parts with it.
+
+    Args:
+        sector: The fixed direction as each view turns it back, unit vectors, shape [F].
+        object_column: Column of the object's position in ``joint_q_in``; its quaternion follows.
+        reset_in: 1 where the world was reset, shape [N].
+        new_goal_in: 1 where only the goal is new, shape [N].
+        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
+        goal_quat_in: Wanted orientation of the object, shape [N].
+        view: View of each world, shape [N].
+    """
+    world = wp.tid()
+    if reset_in[world] == 0 and new_goal_in[world] == 0:
+        return
+    turn = rotation_difference(goal_quat_in[world], read_quat(world, object_column + 3, joint_q_in))
+    axis = wp.vec3(turn[0], turn[1], turn[2])
+    if turn[3] < 0.0:
+        axis = -axis
+    best = wp.int32(0)
+    for k in range(1, sector.shape[0]):
+        if wp.dot(sector[k], axis) > wp.dot(sector[best], axis):
+            best = k
+    view[world] = best
+
+
+@wp.kernel
+def view_observation_kernel(
+    # Model:
+    source: wp.array3d[int],
+    factor: wp.array3d[float],
+    # In:
+    view_in: wp.array[int],
+    world_in: wp.array2d[float],
+    # Out:
+    observation_out: wp.array2d[float],
+):
+    """Observations as the worlds' views show them. Launch: [N, O].
+
+    Args:
+        source: Values of the world frame that make each value of a view, shape [F, O, T].
+        factor: Their factors, shape [F, O, T].
+        view_in: View of each world, shape [N].
+        world_in: Observation in the world frame, shape [N, O].
+        observation_out: Observation in the view, shape [N, O].
+    """
+    world, column = wp.tid()
+    k = view_in[world]
+    value = wp.float32(0.0)
+    for term in range(source.shape[2]):
+        value += factor[k, column, term] * world_in[world, source[k, column, term]]
+    observation_out[world, column] = value
+
+
+@wp.kernel
+def world_action_kernel(
+    # Model:
+    source: wp.array2d[int],
+    # In:
+    view_in: wp.array[int],
+    action_in: wp.array2d[float],
+    # Out:
+    action_out: wp.array2d[float],
+):
+    """Actions of views, by the fingers' names in the world. Launch: [N, D].
+
+    Args:
+        source: Joint of the view that is each joint of the world, shape [F, D].
+        view_in: View of each world, shape [N].
+        action_in: Action in the view, shape [N, D].
+        action_out: Action in the world, shape [N, D]; not ``action_in``.
+    """
+    world, joint = wp.tid()
+    action_out[world, joint] = action_in[world, source[view_in[world], joint]]

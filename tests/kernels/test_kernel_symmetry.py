@@ -1,0 +1,94 @@
+import numpy as np
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_oracle import EXAMPLES, SENTINEL, device_array, floats, quaternions, unwritten
+from scipy.spatial.transform import Rotation
+
+from vd.kernels.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
+
+
+@st.composite
+def worlds(draw: st.DrawFn) -> dict[str, np.ndarray]:
+    """N worlds with new goals or old ones, and F directions."""
+    count, views, joints = draw(st.integers(1, 6)), draw(st.integers(1, 4)), draw(st.integers(0, 4))
+    flags = st.lists(st.integers(0, 1), min_size=count, max_size=count)
+    orientation = draw(quaternions((count,)))
+    return {
+        "sector": draw(floats((views, 3), -1.0, 1.0)),
+        "reset": np.array(draw(flags)),
+        "new_goal": np.array(draw(flags)),
+        "q": np.concatenate([draw(floats((count, joints + 3))), orientation], axis=1),
+        "goal": draw(quaternions((count,))),
+    }
+
+
+@EXAMPLES
+@given(scene=worlds())
+def test_a_new_goal_gets_the_view_that_turns_its_axis_nearest(device, scene):
+    count, joints = len(scene["reset"]), scene["q"].shape[1] - 7
+    view = wp.full(count, SENTINEL, dtype=wp.int32, device=device)
+    wp.launch(
+        choose_view_kernel,
+        dim=count,
+        inputs=[
+            device_array(scene["sector"], wp.vec3, device),
+            joints,
+            device_array(scene["reset"], int, device),
+            device_array(scene["new_goal"], int, device),
+            device_array(scene["q"], float, device),
+            device_array(scene["goal"], wp.quat, device),
+        ],
+        outputs=[view],
+        device=device,
+    )
+    turn = Rotation.from_quat(scene["goal"]) * Rotation.from_quat(scene["q"][:, -4:]).inv()
+    half = np.sin(turn.magnitude() / 2.0)[:, None]
+    axis = turn.as_rotvec() / np.maximum(turn.magnitude(), 1e-12)[:, None] * half
+    score = axis @ scene["sector"].astype(float).T
+    for world, chosen in enumerate(view.numpy()):
+        if not scene["reset"][world] and not scene["new_goal"][world]:
+            assert chosen == SENTINEL, "a view lasts as long as its goal"
+        elif abs(turn.magnitude()[world] - np.pi) > 1e-3:  # at pi both axes are right
+            assert score[world, chosen] > score[world].max() - 1e-5
+
+
+@EXAMPLES
+@given(data=st.data())
+def test_views_take_observations_apart_and_put_actions_together(device, data):
+    count, views = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 3))
+    width, terms = data.draw(st.integers(1, 6)), data.draw(st.integers(1, 3))
+    source = data.draw(st.lists(st.integers(0, width - 1), min_size=views * width * terms,
+                                max_size=views * width * terms))  # fmt: skip
+    source = np.array(source).reshape(views, width, terms)
+    factor = data.draw(floats((views, width, terms)))
+    view = np.array(data.draw(st.lists(st.integers(0, views - 1), min_size=count, max_size=count)))
+    values = data.draw(floats((count, width)))
+    seen, done = (unwritten((count, width), float, device) for _ in range(2))
+    wp.launch(
+        view_observation_kernel,
+        dim=(count, width),
+        inputs=[
+            device_array(source, int, device),
+            device_array(factor, float, device),
+            device_array(view, int, device),
+            device_array(values, float, device),
+        ],
+        outputs=[seen],
+        device=device,
+    )
+    wp.launch(
+        world_action_kernel,
+        dim=(count, width),
+        inputs=[
+            device_array(source[:, :, 0], int, device),
+            device_array(view, int, device),
+            device_array(values, float, device),
+        ],
+        outputs=[done],
+        device=device,
+    )
+    for world, k in enumerate(view):
+        expected = (factor[k].astype(float) * values[world][source[k]]).sum(axis=1)
+        np.testing.assert_allclose(seen.numpy()[world], expected, atol=1e-5)
+        assert np.array_equal(done.numpy()[world], values[world][source[k, :, 0]])
