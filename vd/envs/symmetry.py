@@ -108,7 +108,7 @@ def _tips(env: "ReorientEnv") -> np.ndarray:
     env.sim.forward_kinematics()
     bodies = env.sim.body_q.numpy()[0]
     pairs = zip(bodies[env.tip_body.numpy()], env.tip_offset.numpy(), strict=True)
-    tips = [wp.transform_multiply(wp.transform(*body), wp.transform(*tip)) for body, tip in pairs]
+    tips: list[Any] = [wp.transform_multiply(wp.transform(*body), wp.transform(*tip)) for body, tip in pairs]
     return np.array([[tip[i] for i in range(7)] for tip in tips])
 
 
