@@ -1,4 +1,4 @@
-"""Rollouts of one chain of one to three revolute joints, one thread per parameter set and trajectory.
+"""Rollouts of one chain of one to three revolute joints, one thread per trajectory and parameter set.
 
 The joints carry the servos of :mod:`vd.kernels.actuators`. Without bodies a joint is its own inertia
 (a bare servo, a pendulum); with bodies the chain is a finger: mass matrix and bias forces in 3-D.
@@ -245,6 +245,7 @@ def rollout_kernel(
     first_output: wp.array[int],
     stream: wp.array[int],
     start: wp.array2d[float],
+    wanted: wp.array[int],
     slot: wp.array[int],
     lower: wp.array[float],
     upper: wp.array[float],
@@ -255,34 +256,36 @@ def rollout_kernel(
     dt: float,
     # Out:
     state: wp.array2d[float],
-    predicted: wp.array3d[float],
+    predicted: wp.array2d[float],
 ):
-    """Simulate trajectories with parameter sets. Launch: [C, R].
+    """Simulate trajectories with parameter sets. Launch: [R].
 
     Args:
         samples: What was recorded.
-        first_sample: Row of ``samples`` where each trajectory begins, shape [R].
+        first_sample: Row of ``samples`` where each rollout's trajectory begins, shape [R].
         sample_count: Rows of each trajectory, shape [R].
-        first_output: Row of ``predicted`` where each trajectory begins, shape [R].
+        first_output: Row of ``predicted`` where each rollout begins, shape [R].
         stream: Number of each trajectory's random stream, shape [R].
         start: Measured positions at the start, where the joints are at rest, shape [R, n] [rad].
+        wanted: Joint whose positions are kept, in column 0; -1 for all, each in its own, shape [R].
         slot: Place of each joint in the finger, which is its column of the coupling, shape [n].
         lower: Lower stops, shape [n] [rad].
         upper: Upper stops, shape [n] [rad].
         effort: Largest torques of the drives, shape [n] [N m].
         bodies: 1 if the links have mass, 0 if each joint is its own inertia.
         links: The links, if they have mass.
-        parameters: Parameter rows by set, trajectory, joint, shape [C R n, PARAMETER_COLUMNS].
+        parameters: Parameter rows by rollout and joint, shape [R n, PARAMETER_COLUMNS].
         dt: Time step [s].
-        state: Working memory, shape [C R n, STATE_COLUMNS].
-        predicted: Positions as the servo would have reported them, shape [C, S', n] [rad].
+        state: Working memory, shape [R n, STATE_COLUMNS].
+        predicted: Positions as the servo would have reported them, shape [S', n] or [S', 1] [rad].
     """
-    candidate, run = wp.tid()
+    run = wp.tid()
     count = slot.shape[0]
-    base_row = (candidate * first_sample.shape[0] + run) * count
+    base_row = run * count
     begin = first_sample[run]
     end = begin + sample_count[run]
     to_output = first_output[run] - begin
+    only = wanted[run]
 
     q = wp.vec3(0.0)
     q_start = wp.vec3(0.0)
@@ -437,9 +440,11 @@ def rollout_kernel(
                 share = 0.0
                 if read_step[j] == k:
                     share = read_fraction[j]
-                predicted[candidate, to_output + read[j], j] = (
-                    last + share * (after - last) + parameters[row, ENCODER_BIAS]
-                )
+                position = last + share * (after - last) + parameters[row, ENCODER_BIAS]
+                if only < 0:
+                    predicted[to_output + read[j], j] = position
+                elif only == j:
+                    predicted[to_output + read[j], 0] = position
                 read[j] = read[j] + 1
                 if read[j] < end:
                     step, fraction = split_steps(

@@ -103,6 +103,10 @@ def test_trajectories_come_in_the_order_asked_for():
     everything = rollouts.predict(rows)
     parts = [everything[:, rollouts.sample_trajectory == t] for t in (2, 0)]
     np.testing.assert_array_equal(rollouts.predict(rows, [2, 0]), np.concatenate(parts, axis=1))
+    keep = np.array([[True, False], [True, True]])
+    some = rollouts.predict(rows, [2, 0], joint=0, keep=keep)
+    simulated = np.repeat(keep, 100, axis=1)
+    np.testing.assert_array_equal(some, np.where(simulated, np.concatenate(parts, axis=1)[..., 0], 0.0))
     assert rollouts.predict(rows[:0]).shape == (0, 300, 1)
     again = pickle.loads(pickle.dumps(rollouts))
     np.testing.assert_array_equal(again.predict(rows), everything)

@@ -76,20 +76,26 @@ def roll(
     samples.command = device_array(command.reshape(-1, n), float, device)
     power = np.ones_like(command) if power is None else power
     samples.power = device_array(power.reshape(-1, n), float, device)
-    first = device_array(np.arange(runs) * count, int, device)
+    rolls = sets * runs
+
+    def by_roll(values, dtype=int):
+        """What belongs to a trajectory, for the rollouts of all sets."""
+        return device_array(np.concatenate([values] * sets), dtype, device)
+
     links = Links() if bodies is None else links_struct(bodies, gravity, device)
     parameters = np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS)
-    predicted = unwritten((sets, runs * count, n), float, device)
+    predicted = unwritten((rolls * count, n), float, device)
     wp.launch(
         rollout_kernel,
-        dim=(sets, runs),
+        dim=rolls,
         inputs=[
             samples,
-            first,
-            device_array(np.full(runs, count), int, device),
-            first,
-            device_array(np.arange(runs), int, device),
-            device_array(start, float, device),
+            by_roll(np.arange(runs) * count),
+            by_roll(np.full(runs, count)),
+            device_array(np.arange(rolls) * count, int, device),
+            by_roll(np.arange(runs)),
+            by_roll(start, float),
+            by_roll(np.full(runs, -1)),
             device_array(np.arange(n), int, device),
             device_array(np.full(n, -stops), float, device),
             device_array(np.full(n, stops), float, device),

@@ -12,6 +12,7 @@ import numpy as np
 
 import vd.kernels.actuators as servo
 from vd.gap.coordinates import BASELINE_PARAMETERS, Coordinate, Scales, coordinate, keys, sizes
+from vd.gap.descent import FIRST_DAMPING, LOG_TRUST, Descent, LeastSquares
 from vd.gap.rollout import Chain, Rollouts
 from vd.gap.statistics import rmse
 from vd.kernels.chains import MAX_JOINTS
@@ -20,20 +21,6 @@ from vd.kernels.effects import EFFECTS
 RIDGE = 0.01
 """Pull towards the start, as information in units of the noise floor: holds directions that the data
 leave free (the torque scale of a bare servo), moves no others."""
-LAMBDAS = (0.1, 1.0, 10.0)
-"""Factors on the damping that are tried in each step of Levenberg-Marquardt."""
-FIRST_DAMPING = 1e-3
-WIDEN = -3.0
-"""Factor on the finite-difference steps after a step that fails, with the other sign: dry friction makes
-the squared error rugged at the scale of the smallest steps."""
-FAILURES = 4
-"""Failed steps in a row that end a fit."""
-LOG_TRUST = 1.5
-"""Largest change of a logarithmic coordinate in one step."""
-LINEAR_TRUST = 5.0
-"""Largest change of a linear coordinate in one step, plus its size."""
-TOLERANCE = 1e-4
-"""Relative improvement of the squared error at which a fit has converged."""
 CMA_SIGMA = 0.7
 """First step of CMA-ES in logarithmic coordinates."""
 CMA_TRAJECTORIES = 4
@@ -153,12 +140,31 @@ class JointProblem:
         }
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
 
-    def residuals(self, rows: np.ndarray, trajectories: Trajectories = None) -> np.ndarray:
-        """Measured minus predicted position of the joint for C chains [C, n, PARAMETER_COLUMNS]: [C, N]."""
+    def residuals(
+        self, rows: np.ndarray, trajectories: Trajectories = None, keep: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Measured minus predicted position of the joint for C chains [C, n, PARAMETER_COLUMNS]: [C, N].
+
+        What ``keep`` [C, S] leaves out of the trajectories is not simulated, and is 0.
+        """
         chosen = [int(t) for t in (self.trajectories if trajectories is None else trajectories)]
-        predicted = self.rollouts.predict(rows, chosen)[:, :, self.joint]
-        self.simulated += len(rows) * len(chosen)
-        return np.concatenate([self._measured[t] for t in chosen])[None] - predicted
+        measured = np.concatenate([self._measured[t] for t in chosen])
+        predicted = self.rollouts.predict(rows, chosen, joint=self.joint, keep=keep)
+        self.simulated += len(rows) * len(chosen) if keep is None else int(keep.sum())
+        residual = measured - predicted
+        if keep is not None:
+            residual *= np.repeat(keep, [len(self._measured[t]) for t in chosen], axis=1)
+        return residual
+
+    def squares(
+        self, base: np.ndarray, coordinates: Sequence[Coordinate], trajectories: Trajectories = None
+    ) -> LeastSquares:
+        """The squared error of the model whose other parameters are those of ``base``."""
+
+        def residuals(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
+            return self.residuals(self.rows(base, coordinates, x), trajectories, keep)
+
+        return LeastSquares(coordinates, residuals, RIDGE * self.floor**2)
 
     def rows(self, base: np.ndarray, coordinates: Sequence[Coordinate], x: np.ndarray) -> np.ndarray:
         """Chains [C, n, PARAMETER_COLUMNS] with this joint's parameters at coordinates [C, P]."""
@@ -242,14 +248,15 @@ class JointProblem:
             ]
         )
         chosen = self.trajectories if trajectories is None else np.asarray(trajectories)
-        x, residual, jacobian = self._descend(base, coordinates, x0, iterations, chosen)
+        found = self.squares(base, coordinates, chosen).descend(x0, iterations)
         fits = [
-            self._result(base, effects, coordinates, x[i], residual[i], jacobian[i], chosen)
-            for i in range(len(x))
+            self._result(base, effects, coordinates, *each, chosen)
+            for each in zip(found.x, found.residual, found.jacobian, strict=True)
         ]
-        fits.sort(key=lambda fit: float(fit.sse.sum()))
+        order = sorted(range(len(fits)), key=lambda i: float(fits[i].sse.sum()))
+        fits = [fits[i] for i in order]
         if trajectories is None:
-            squares, absolutes = self.cross_validate(fits[0], scales, refits)
+            squares, absolutes = self.cross_validate(fits[0], found.at(order[0], 1), refits)
             fits[0] = replace(fits[0], held_out=squares, held_out_abs=absolutes)
         return fits
 
@@ -259,86 +266,10 @@ class JointProblem:
         absent = {f"joint_coupling.from_{slot + 1}" for slot in range(MAX_JOINTS) if slot not in others}
         return [key for key in keys(effects, self.baseline) if key not in absent]
 
-    def _descend(
-        self,
-        base: np.ndarray,
-        coordinates: Sequence[Coordinate],
-        x: np.ndarray,
-        iterations: int,
-        chosen: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Levenberg-Marquardt from B starts [B, P] in lockstep: coordinates, residuals, Jacobians."""
-        lower = np.array([c.lower for c in coordinates])
-        upper = np.array([c.upper for c in coordinates])
-        logarithmic = np.array([c.log for c in coordinates])
-        ridge = RIDGE * self.floor**2
-        origin = x.copy()
-        residual = self.residuals(self.rows(base, coordinates, x), chosen)
-        cost = np.einsum("bn,bn->b", residual, residual) + ridge * ((x - origin) ** 2).sum(1)
-        damping, failures = np.full(len(x), FIRST_DAMPING), np.zeros(len(x), int)
-        jacobian = np.zeros((len(x), x.shape[1], residual.shape[1]))
-        active = np.arange(len(x))
-        for _ in range(iterations):
-            widened = WIDEN ** failures[active]
-            jacobian[active] = self._jacobian(base, coordinates, x[active], residual[active], chosen, widened)
-            trials = np.empty((len(active), len(LAMBDAS), x.shape[1]))
-            for i, b in enumerate(active):
-                gram = jacobian[b] @ jacobian[b].T + ridge * np.eye(x.shape[1])
-                gradient = jacobian[b] @ residual[b] - ridge * (x[b] - origin[b])
-                free = ~(((x[b] <= lower) & (gradient < 0.0)) | ((x[b] >= upper) & (gradient > 0.0)))
-                for k, factor in enumerate(LAMBDAS):
-                    step = np.zeros_like(x[b])
-                    part = gram[np.ix_(free, free)]
-                    damped = part + np.diag(damping[b] * factor * np.diag(part))
-                    step[free] = np.linalg.solve(damped, gradient[free])
-                    limit = np.where(logarithmic, LOG_TRUST, LINEAR_TRUST + np.abs(x[b]))
-                    trials[i, k] = np.clip(x[b] + np.clip(step, -limit, limit), lower, upper)
-            flat = trials.reshape(-1, x.shape[1])
-            answers = self.residuals(self.rows(base, coordinates, flat), chosen)
-            offset = flat - np.repeat(origin[active], len(LAMBDAS), axis=0)
-            costs = np.einsum("bn,bn->b", answers, answers) + ridge * (offset**2).sum(1)
-            going = []
-            for i, b in enumerate(active):
-                k = int(np.argmin(costs[i * len(LAMBDAS) : (i + 1) * len(LAMBDAS)]))
-                best = i * len(LAMBDAS) + k
-                gain = (cost[b] - costs[best]) / max(cost[b], 1e-300)
-                if gain > 0.0:
-                    x[b], residual[b], cost[b] = flat[best], answers[best], costs[best]
-                    damping[b] = max(damping[b] * LAMBDAS[k] * 0.3, 1e-7)
-                failures[b] = 0 if gain > TOLERANCE else failures[b] + 1
-                if gain <= 0.0:
-                    damping[b] *= 3.0
-                if failures[b] < FAILURES:
-                    going.append(b)
-            active = np.array(going, int)
-            if not len(active):
-                break
-        jacobian = self._jacobian(base, coordinates, x, residual, chosen, np.ones(len(x)))
-        return x, residual, jacobian
-
     def jacobian(self, fit: JointFit) -> np.ndarray:
         """d(predicted)/dx at a fit, shape [P, N]."""
-        here = fit.x[None]
         residual = self.residuals(fit.rows[None])
-        return self._jacobian(fit.rows, fit.coordinates, here, residual, self.trajectories, np.ones(1))[0]
-
-    def _jacobian(
-        self,
-        base: np.ndarray,
-        coordinates: Sequence[Coordinate],
-        x: np.ndarray,
-        residual: np.ndarray,
-        chosen: np.ndarray,
-        widened: np.ndarray,
-    ) -> np.ndarray:
-        """d(predicted)/dx of B parameter sets, shape [B, P, N], with steps times ``widened`` [B]."""
-        size = x.shape[1]
-        steps = np.stack([c.step(x[:, i], widened) for i, c in enumerate(coordinates)], axis=1)
-        moved = np.repeat(x[:, None], size, axis=1)
-        moved[:, np.arange(size), np.arange(size)] += steps
-        answers = self.residuals(self.rows(base, coordinates, moved.reshape(-1, size)), chosen)
-        answers = answers.reshape(len(x), size, -1)
-        return (residual[:, None] - answers) / steps[:, :, None]
+        return self.squares(fit.rows, fit.coordinates).jacobian(fit.x[None], residual)[0]
 
     def _result(
         self,
@@ -365,42 +296,44 @@ class JointProblem:
         )
 
     def cross_validate(
-        self, fit: JointFit, scales: Scales, iterations: int = 0
+        self, fit: JointFit, found: Descent, iterations: int = 0
     ) -> tuple[np.ndarray, np.ndarray]:
         """Squared and absolute errors of each trajectory, predicted by a fit without its fold, [S] each.
 
-        The refit is one Gauss-Newton step from the full fit, or ``iterations`` of
-        Levenberg-Marquardt if given.
+        Args:
+            fit: The fit to all folds.
+            found: Its residual and Jacobian.
+            iterations: Steps of Levenberg-Marquardt of each refit; 0: one Gauss-Newton step.
         """
-        squares, absolutes = np.zeros((2, len(self.trajectories)))
+        out = np.unique(self.folds)[:, None] == self.folds
+        model = self.squares(fit.rows, fit.coordinates)
+        if iterations:
+            inside = np.repeat(~out, self.count.astype(int), axis=1)
+            start = found.at(0, len(out))
+            start = replace(
+                start, residual=start.residual * inside, jacobian=start.jacobian * inside[:, None]
+            )
+            x = model.descend(start.x, iterations, keep=~out, known=start, finish=False).x
+        else:
+            x = np.stack([self._without(fit, fold) for fold in out])
+        residual = self.residuals(self.rows(fit.rows, fit.coordinates, x), keep=out)
+        parts = self.split(residual.sum(0))
+        return np.array([part @ part for part in parts]), np.array([np.abs(part).sum() for part in parts])
+
+    def _without(self, fit: JointFit, out: np.ndarray) -> np.ndarray:
+        """Coordinates one Gauss-Newton step from a fit, towards the one without some trajectories [S]."""
         lower = np.array([c.lower for c in fit.coordinates])
         upper = np.array([c.upper for c in fit.coordinates])
         logarithmic = np.array([c.log for c in fit.coordinates])
         trust = np.where(logarithmic, 0.3 * LOG_TRUST, 1.0 + 0.5 * np.abs(fit.x))
-        ridge = RIDGE * self.floor**2 * np.eye(len(fit.x))
-        for fold in np.unique(self.folds):
-            out = self.folds == fold
-            if iterations:
-                inside = self.trajectories[~out]
-                refit = self.fit(
-                    fit.rows, fit.effects, [fit.values], scales, iterations=iterations, trajectories=inside
-                )[0]
-                x = refit.x
-            else:
-                gram, gradient = fit.gram[~out].sum(0) + ridge, fit.gradient[~out].sum(0)
-                fixed = ((fit.x <= lower) & (gradient < 0.0)) | ((fit.x >= upper) & (gradient > 0.0))
-                step = np.zeros(len(fit.x))
-                free = ~fixed
-                damped = gram[np.ix_(free, free)]
-                damped = damped + np.diag(FIRST_DAMPING * np.diag(damped))
-                step[free] = np.linalg.solve(damped, gradient[free])
-                x = np.clip(fit.x + np.clip(step, -trust, trust), lower, upper)
-            rows = self.rows(fit.rows, fit.coordinates, x[None])
-            chosen = self.trajectories[out]
-            parts = self.split(self.residuals(rows, chosen)[0], chosen)
-            squares[out] = [part @ part for part in parts]
-            absolutes[out] = [np.abs(part).sum() for part in parts]
-        return squares, absolutes
+        gram = fit.gram[~out].sum(0) + RIDGE * self.floor**2 * np.eye(len(fit.x))
+        gradient = fit.gradient[~out].sum(0)
+        free = ~(((fit.x <= lower) & (gradient < 0.0)) | ((fit.x >= upper) & (gradient > 0.0)))
+        step = np.zeros(len(fit.x))
+        damped = gram[np.ix_(free, free)]
+        damped = damped + np.diag(FIRST_DAMPING * np.diag(damped))
+        step[free] = np.linalg.solve(damped, gradient[free])
+        return np.clip(fit.x + np.clip(step, -trust, trust), lower, upper)
 
     def refine(self, fit: JointFit, scales: Scales) -> JointFit:
         """The same model fitted on with finer time steps, for values that do not depend on the step.

@@ -67,6 +67,7 @@ class JitterFit:
             replace(recording, trajectories=copies),
             dt=problem.rollouts.dt,
             device=problem.rollouts.device,
+            crowd=problem.rollouts.crowd,
         )
         self.measured = np.concatenate([t.position[:, self._column] for t in chosen])
         self.ends = np.cumsum([len(t.time) for t in chosen])[:-1]
@@ -93,7 +94,7 @@ class JitterFit:
 
         The rest of the model moves along, to first order, by weighted least squares.
         """
-        predicted = self.rollouts.predict(self.row(sigma, drop)[None])[0, :, self.problem.joint]
+        predicted = self.rollouts.predict(self.row(sigma, drop)[None], joint=self.problem.joint)[0]
         self.problem.simulated += DRAWS * self.size
         draws = predicted.reshape(DRAWS, -1).astype(float)
         error = self.measured - draws.mean(axis=0)

@@ -4,6 +4,7 @@ A bare servo and a pendulum are one joint with its own inertia; a finger is a ch
 the hand's USD, hanging palm down as in the simulator. Physics: :mod:`vd.kernels.chains`.
 """
 
+import threading
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel
+from vd.gap.crowd import Crowd
 from vd.gap.recording import Recording
 from vd.kernels import actuators as servo
 from vd.kernels.chains import Links, Samples, rollout_kernel
@@ -30,6 +32,10 @@ FREE = 1.0e6
 """A position [rad] that no joint and a torque [N m] that no drive reaches: the bound of one that has none."""
 STREAM_BITS = 28
 """Bits of the number of a trajectory's random stream."""
+CUDA_BLOCK = 32
+"""Threads of a block: few, so that the few thousand rollouts of a launch are spread over all processors."""
+CPU_BLOCK = 256
+_MAKING = threading.Lock()
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,6 +252,23 @@ def _finger(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Call:
+    """One call of :meth:`Rollouts.predict`.
+
+    Attributes:
+        rows: Parameter rows [C, n, PARAMETER_COLUMNS], float32.
+        chosen: Indices of trajectories.
+        joint: The only joint wanted, or None for all.
+        keep: Which trajectories each set is simulated on [C, trajectories]; None for all.
+    """
+
+    rows: np.ndarray
+    chosen: np.ndarray
+    joint: int | None
+    keep: np.ndarray | None
+
+
 class Rollouts:
     """Predictions of a recording's trajectories for one chain. S samples in all, n joints.
 
@@ -262,7 +285,15 @@ class Rollouts:
         excited: Whether each joint was excited in the sample's trajectory [S, n].
     """
 
-    def __init__(self, chain: Chain, recording: Recording, *, dt: float = STEP_S, device: str = "cpu"):
+    def __init__(
+        self,
+        chain: Chain,
+        recording: Recording,
+        *,
+        dt: float = STEP_S,
+        device: str = "cpu",
+        crowd: Crowd | None = None,
+    ):
         """Prepare the trajectories.
 
         Args:
@@ -270,6 +301,7 @@ class Rollouts:
             recording: The recording.
             dt: Time step [s].
             device: Warp device.
+            crowd: Threads whose calls are simulated together; None simulates each at once.
 
         Raises:
             ValueError: ``dt`` is not positive.
@@ -277,10 +309,13 @@ class Rollouts:
         if not dt > 0.0:
             raise ValueError(f"dt is {dt}; give a positive time step in seconds")
         self.chain, self.recording, self.dt, self.device = chain, recording, dt, device
+        self.crowd = crowd
+        self._finer: dict[float, Rollouts] = {}
         self.num_joints = len(chain.joints)
         trajectories = recording.trajectories
         counts = [len(t.time) for t in trajectories]
         self._count = np.array(counts, np.int32)
+        self._steps = np.array([(t.time[-1] - t.time[0]) / dt for t in trajectories])
         self._first = np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int32)
         self._stream = np.array(
             [zlib.crc32(t.file.encode()) & ((1 << STREAM_BITS) - 1) for t in trajectories], np.int32
@@ -292,12 +327,18 @@ class Rollouts:
         self.excited = excited[self.sample_trajectory]
 
     def at(self, dt: float) -> "Rollouts":
-        """The same with another time step [s]."""
-        return Rollouts(self.chain, self.recording, dt=dt, device=self.device)
+        """The same with another time step [s]; kept, so that who asks again simulates with the same."""
+        with _MAKING:
+            if dt not in self._finer:
+                self._finer[dt] = Rollouts(
+                    self.chain, self.recording, dt=dt, device=self.device, crowd=self.crowd
+                )
+            return self._finer[dt]
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the device's arrays behind: another process makes its own."""
-        return {key: value for key, value in self.__dict__.items() if key not in ("_samples", "_links")}
+        kept = {key: value for key, value in self.__dict__.items() if key not in ("_samples", "_links")}
+        return {**kept, "crowd": None, "_finer": {}}
 
     @cached_property
     def _samples(self) -> Samples:
@@ -339,64 +380,124 @@ class Rollouts:
         lower, upper, effort = (wp.array(v, dtype=float, device=self.device) for v in bounds)
         return links, slot, lower, upper, effort
 
-    def predict(self, rows: np.ndarray, trajectories: Sequence[int] | None = None) -> np.ndarray:
+    def predict(
+        self,
+        rows: np.ndarray,
+        trajectories: Sequence[int] | None = None,
+        *,
+        joint: int | None = None,
+        keep: np.ndarray | None = None,
+    ) -> np.ndarray:
         """Recorded positions as each parameter set would have them, in one launch.
 
         Joints start at rest where they were measured. A rollout that diverges stays finite, far away.
 
         Args:
             rows: Parameter rows of C sets [C, n, PARAMETER_COLUMNS].
-            trajectories: Indices of R trajectories, in the order wanted; all by default.
+            trajectories: Indices of the trajectories, in the order wanted; all by default.
+            joint: The only joint whose positions are wanted.
+            keep: Which of the trajectories to simulate with each set [C, trajectories]; all by default.
 
         Returns:
-            Positions [C, S', n] [rad], float32, S' samples of the chosen trajectories one after the other.
+            Positions [C, S', n] [rad], or [C, S'] of one joint, float32, S' samples of the chosen
+            trajectories one after the other; 0 in those not simulated.
 
         Raises:
             ValueError: ``rows`` has another shape.
         """
-        rows = np.asarray(rows, np.float32)
         n = self.num_joints
+        rows = np.asarray(rows, np.float32)
         if rows.ndim != 3 or rows.shape[1:] != (n, servo.PARAMETER_COLUMNS):
             raise ValueError(f"rows has shape {rows.shape}; it must be (C, {n}, {servo.PARAMETER_COLUMNS})")
         chosen = np.arange(len(self._count)) if trajectories is None else np.asarray(trajectories, int)
-        sets, runs = len(rows), len(chosen)
-        total = int(self._count[chosen].sum())
-        predicted = wp.empty((sets, total, n), dtype=float, device=self.device)
-        if predicted.size == 0:
-            return predicted.numpy()
-        parameters = np.repeat(rows[:, None], runs, axis=1)
-        self._scale_loads(parameters, chosen)
-        state = wp.empty((sets * runs * n, servo.STATE_COLUMNS), dtype=float, device=self.device)
+        call = Call(rows, chosen, joint, keep)
+        return self.simulate([call])[0] if self.crowd is None else self.crowd.simulate(self, call)
+
+    def simulate(self, calls: Sequence["Call"]) -> list[np.ndarray]:
+        """The answers to calls of :meth:`predict`, in one launch if all want one joint, or all want all."""
+        wide = [call.joint is None for call in calls]
+        if any(wide) and not all(wide):
+            return [self.simulate([call])[0] for call in calls]
+        width = self.num_joints if any(wide) else 1
+        lengths = [int(self._count[call.chosen].sum()) for call in calls]
+        ends = np.cumsum([len(call.rows) * length for call, length in zip(calls, lengths, strict=True)])
+        parts = [
+            self._rolls(call, int(end) - len(call.rows) * length)
+            for call, length, end in zip(calls, lengths, ends, strict=True)
+        ]
+        parameters, trajectory, output, wanted = (np.concatenate(each) for each in zip(*parts, strict=True))
+        empty = wp.empty if all(call.keep is None for call in calls) else wp.zeros
+        predicted = empty((int(ends[-1]), width), dtype=float, device=self.device)
+        if len(trajectory):
+            self._launch(parameters, trajectory, output, wanted, predicted)
+        answers = np.split(predicted.numpy(), ends[:-1])
+        shapes = [
+            (len(call.rows), length) if call.joint is not None else (len(call.rows), length, width)
+            for call, length in zip(calls, lengths, strict=True)
+        ]
+        return [answer.reshape(shape) for answer, shape in zip(answers, shapes, strict=True)]
+
+    def _rolls(self, call: "Call", first: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Parameters, trajectory, row of the output (after ``first``), and joint of a call's rollouts."""
+        counts = self._count[call.chosen]
+        keep = np.ones((len(call.rows), len(counts)), bool) if call.keep is None else call.keep
+        index, place = np.nonzero(keep)
+        trajectory = call.chosen[place]
+        parameters = call.rows[index]
+        self._scale_loads(parameters, trajectory)
+        output = first + index * int(counts.sum()) + (np.cumsum(counts) - counts)[place]
+        return parameters, trajectory, output, np.full(len(index), -1 if call.joint is None else call.joint)
+
+    def _launch(
+        self,
+        parameters: np.ndarray,
+        trajectory: np.ndarray,
+        output: np.ndarray,
+        wanted: np.ndarray,
+        predicted: wp.array,
+    ) -> None:
+        """Simulate R rollouts: parameters [R, n, PARAMETER_COLUMNS], and the rest [R]."""
+        device, block = self.device, CPU_BLOCK
+        if wp.get_device(device).is_cuda:
+            # Threads of a warp wait for the slowest: the same trajectory for all of them, the longest first.
+            order = np.lexsort((trajectory, -self._steps[trajectory]))
+            parameters, trajectory, output, wanted = (
+                each[order] for each in (parameters, trajectory, output, wanted)
+            )
+            block = CUDA_BLOCK
+        state = wp.empty((len(trajectory) * self.num_joints, servo.STATE_COLUMNS), dtype=float, device=device)
         links, slot, lower, upper, effort = self._links
 
         def integers(values: np.ndarray) -> wp.array:
-            return wp.array(values, dtype=int, device=self.device)
+            return wp.array(values, dtype=int, device=device)
 
+        first = self._first[trajectory]
         wp.launch(
             rollout_kernel,
-            dim=(sets, runs),
+            dim=len(trajectory),
             inputs=[
                 self._samples,
-                integers(self._first[chosen]),
-                integers(self._count[chosen]),
-                integers(np.concatenate([[0], np.cumsum(self._count[chosen])[:-1]])),
-                integers(self._stream[chosen]),
-                wp.array(self.measured[self._first[chosen]], dtype=float, device=self.device),
+                integers(first),
+                integers(self._count[trajectory]),
+                integers(output),
+                integers(self._stream[trajectory]),
+                wp.array(self.measured[first], dtype=float, device=device),
+                integers(wanted),
                 slot,
                 lower,
                 upper,
                 effort,
                 int(self.chain.bodies),
                 links,
-                wp.array(parameters.reshape(-1, servo.PARAMETER_COLUMNS), dtype=float, device=self.device),
+                wp.array(parameters.reshape(-1, servo.PARAMETER_COLUMNS), dtype=float, device=device),
                 self.dt,
             ],
             outputs=[state, predicted],
-            device=self.device,
+            device=device,
+            block_dim=block,
         )
-        return predicted.numpy()
 
-    def _scale_loads(self, parameters: np.ndarray, chosen: np.ndarray) -> None:
+    def _scale_loads(self, parameters: np.ndarray, trajectory: np.ndarray) -> None:
         """Turn inertia and gravity torque from the reference load's to each trajectory's, in place.
 
         The gravity torque scales with mass times arm. The inertia changes by the difference of the point
@@ -405,12 +506,12 @@ class Rollouts:
         reference = self.chain.reference_load
         if reference is None:
             return
-        for i, trajectory in enumerate(chosen):
-            load = _load(self.recording.trajectories[trajectory].conditions)
+        for index in np.unique(trajectory):
+            load = _load(self.recording.trajectories[index].conditions)
             if load is None or (load.mass_kg, load.arm_m) == (reference.mass_kg, reference.arm_m):
                 continue
-            torque = parameters[:, i, :, servo.GRAVITY_TORQUE]
-            unit = torque / reference.torque
-            inertia = parameters[:, i, :, servo.INERTIA] + unit * (load.inertia - reference.inertia)
-            parameters[:, i, :, servo.INERTIA] = np.maximum(inertia, 0.0)
-            parameters[:, i, :, servo.GRAVITY_TORQUE] = unit * load.torque
+            here = trajectory == index
+            unit = parameters[here, :, servo.GRAVITY_TORQUE] / reference.torque
+            inertia = parameters[here, :, servo.INERTIA] + unit * (load.inertia - reference.inertia)
+            parameters[here, :, servo.INERTIA] = np.maximum(inertia, 0.0)
+            parameters[here, :, servo.GRAVITY_TORQUE] = unit * load.torque

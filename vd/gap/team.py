@@ -1,21 +1,27 @@
-"""Worker processes that fit: each holds the recording and simulates joints on request."""
+"""Who fits: worker processes that each hold the recording, or on a GPU threads that simulate together."""
 
+import copy
 import multiprocessing
 import threading
 import time
 from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
 import warp as wp
 
+from vd.gap.crowd import Crowd
 from vd.gap.fit import JointProblem
 from vd.gap.jitter import fit_jitter
 from vd.gap.recording import Recording
 from vd.gap.rollout import Chain, Rollouts
 
 Call = tuple[str, dict[str, Any]]
+SHORT_S = 0.1
+"""Kinds of calls that took less in all are not worth a word."""
+THREADS = 128
+"""Calls side by side on a GPU: more than the candidates of all joints of a hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,11 +47,36 @@ class JointSpec:
     pieces: tuple[tuple[int, int], ...] = ()
 
 
-class Bench:
-    """The problems of a recording, made when they are first asked for."""
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What a call returned, how many trajectories it simulated, and how long it took [s]."""
 
-    def __init__(self, recording: Recording, chains: Sequence[Chain], dt: float, device: str):
+    result: Any
+    simulated: int
+    seconds: float
+
+
+class Bench:
+    """The problems of a recording, made when they are first asked for.
+
+    Args:
+        recording: The recording.
+        chains: Its chains.
+        dt: Time step of the rollouts [s].
+        device: Warp device.
+        crowd: Threads whose simulations are made together.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        chains: Sequence[Chain],
+        dt: float,
+        device: str,
+        crowd: Crowd | None = None,
+    ):
         self.recording, self.chains, self.dt, self.device = recording, chains, dt, device
+        self.crowd = crowd
         self._rollouts: dict[tuple[int, int | None], Rollouts] = {}
         self._problems: dict[tuple[int, int], JointProblem] = {}
 
@@ -58,7 +89,9 @@ class Bench:
             if shared not in self._rollouts:
                 parts = dict(zip(spec.trajectories, spec.pieces, strict=bool(spec.pieces)))
                 recording, chain = self.recording.cut(parts), self.chains[spec.chain]
-                self._rollouts[shared] = Rollouts(chain, recording, dt=self.dt, device=self.device)
+                self._rollouts[shared] = Rollouts(
+                    chain, recording, dt=self.dt, device=self.device, crowd=self.crowd
+                )
             self._problems[key] = JointProblem(
                 self._rollouts[shared],
                 spec.joint,
@@ -69,15 +102,15 @@ class Bench:
             )
         return self._problems[key]
 
-    def call(self, spec: JointSpec, call: Call) -> tuple[Any, int]:
-        """Run a method of the problem: its result, and the trajectories simulated."""
-        problem = self.problem(spec)
-        before = problem.simulated
+    def call(self, spec: JointSpec, call: Call) -> Answer:
+        """Run a method of the problem."""
+        problem = copy.copy(self.problem(spec))  # calls side by side count, and change the time step
+        problem.simulated, begin = 0, time.perf_counter()
         if call[0] == "fit_jitter":
             result = fit_jitter(problem, **call[1])
         else:
             result = getattr(problem, call[0])(**call[1])
-        return result, problem.simulated - before
+        return Answer(result, problem.simulated, time.perf_counter() - begin)
 
 
 _bench: Bench | None = None
@@ -90,28 +123,30 @@ def _start(bench: Bench) -> None:
     _bench = bench
 
 
-def _work(spec: JointSpec, call: Call) -> tuple[Any, int]:
+def _work(spec: JointSpec, call: Call) -> Answer:
     assert _bench is not None
     return _bench.call(spec, call)
 
 
 class Team:
-    """Runs calls in worker processes, or in this one with ``workers`` below 2.
+    """Runs calls in worker processes, on a GPU in threads, or one by one with ``workers`` below 2.
 
     Attributes:
         simulated: Trajectories simulated so far.
-        busy_s: Time in which some call was running [s].
+        spent: Trajectories simulated and time taken [s], summed over workers, by kind of call.
     """
 
     def __init__(self, bench: Bench, workers: int):
         self.bench, self.workers = bench, workers
         self.simulated = 0
+        self.spent: dict[str, tuple[int, float]] = {}
         self._lock = threading.Lock()
-        self._begun = time.perf_counter()
-        self._pool: ProcessPoolExecutor | None = None
+        self._pool: Executor | None = None
 
     def __enter__(self) -> "Team":
-        if self.workers > 1:
+        if self.bench.crowd is not None:
+            self._pool = ThreadPoolExecutor(THREADS)
+        elif self.workers > 1:
             # Not forked: Warp and its threads may be running.
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(
@@ -124,9 +159,11 @@ class Team:
             self._pool.shutdown(cancel_futures=True)
 
     @property
-    def rate(self) -> float:
-        """Simulated trajectories per second of wall time."""
-        return self.simulated / max(time.perf_counter() - self._begun, 1e-9)
+    def summary(self) -> str:
+        """Where the time went, in words."""
+        parts = sorted(self.spent.items(), key=lambda item: -item[1][1])
+        times = [f"{name} {seconds:.1f} s ({rolls})" for name, (rolls, seconds) in parts if seconds > SHORT_S]
+        return f"{self.simulated} motions simulated; summed over workers: {', '.join(times)}"
 
     def run(self, spec: JointSpec, calls: Sequence[Call]) -> list[Any]:
         """Results of the calls, in order. May be used from several threads."""
@@ -134,8 +171,24 @@ class Team:
             with self._lock:
                 answers = [self.bench.call(spec, call) for call in calls]
         else:
-            waiting: list[Future] = [self._pool.submit(_work, spec, call) for call in calls]
+            if self.bench.crowd is not None:
+                with self._lock:
+                    self.bench.problem(spec)  # made once, before threads ask for it
+                self.bench.crowd.join(len(calls))
+            work = _work if self.bench.crowd is None else self._together
+            waiting: list[Future] = [self._pool.submit(work, spec, call) for call in calls]
             answers = [future.result() for future in waiting]
         with self._lock:
-            self.simulated += sum(count for _, count in answers)
-        return [result for result, _ in answers]
+            for (name, _), answer in zip(calls, answers, strict=True):
+                rollouts, seconds = self.spent.get(name, (0, 0.0))
+                self.spent[name] = rollouts + answer.simulated, seconds + answer.seconds
+                self.simulated += answer.simulated
+        return [answer.result for answer in answers]
+
+    def _together(self, spec: JointSpec, call: Call) -> Answer:
+        """Run a call in one of the threads that simulate together."""
+        assert self.bench.crowd is not None
+        try:
+            return self.bench.call(spec, call)
+        finally:
+            self.bench.crowd.leave()

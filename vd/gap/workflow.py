@@ -21,6 +21,7 @@ from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
+from vd.gap.crowd import Crowd
 from vd.gap.design import design, pieces
 from vd.gap.find import findings
 from vd.gap.fit import JointFit, candidates, others_in
@@ -142,6 +143,7 @@ def find(
             "simulated": team.simulated,
             "seconds": time.perf_counter() - begin,
         }
+        progress(f"find: {team.summary}")
     write_json(out / "find.json", value)
     for finding in found:
         progress(f"  {finding.where}")
@@ -201,6 +203,7 @@ def explain(
             seconds=seconds,
             simulated=simulated,
         )
+        progress(f"explain: {team.summary}")
     predictions.write(out / "predictions.npz")
     report.write(out / "explain.json")
     write_json(out / "explain.key.json", {"key": key})
@@ -249,7 +252,8 @@ def _team(recording: Recording, hand: HandModel | None, options: Options) -> Tea
     length = sum(float(t.time[-1]) for t in recording.trajectories)
     dt = LONG_STEP_S if length > LONG_S else STEP_S
     parts = [_started(chain, options.start) for chain in chains(recording, hand)]
-    return Team(Bench(recording, parts, dt, options.device), options.processes)
+    crowd = None if options.device == "cpu" else Crowd()
+    return Team(Bench(recording, parts, dt, options.device, crowd), options.processes)
 
 
 def _started(chain: Chain, start: Mapping[str, np.ndarray]) -> Chain:

@@ -1,0 +1,60 @@
+"""Calls one after the other, and in threads that simulate together: the same results."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from test_gap_fit import TRUE, recorded
+
+import vd.kernels.actuators as servo
+from vd.gap.crowd import Crowd
+from vd.gap.design import design
+from vd.gap.rollout import STEP_S, Rollouts, chains
+from vd.gap.statistics import noise_floor
+from vd.gap.team import Bench, Call, JointSpec, Team
+from vd.gap.workflow import baseline_of
+
+EFFECTS = ("coulomb_friction", "backlash", "load_friction")
+
+
+def answers(team: Team, spec: JointSpec) -> list[Any]:
+    base = team.bench.chains[0].start_row.copy()
+    for column, value in TRUE.items():
+        base[0, column] = 1.1 * value
+    scales = team.run(spec, [("scales", {"row": base[0], "residual": 0.02})])[0]
+    given = {"base": base, "starts": [{}], "scales": scales, "iterations": 3, "refits": 2}
+    calls: list[Call] = [("fit", {**given, "effects": (effect,)}) for effect in EFFECTS]
+    return [fits[0] for fits in team.run(spec, calls)]
+
+
+def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
+    recording = recorded({servo.COULOMB_TORQUE: 0.06})
+    (chain,) = chains(recording)
+    trajectories, folds = design(recording, chain, 0)
+    spec = JointSpec(0, 0, trajectories, folds, noise_floor(recording, 0), baseline_of(chain))
+    with Team(Bench(recording, [chain], STEP_S, "cpu"), workers=1) as team:
+        alone, simulated = answers(team, spec), team.simulated
+    crowd = Crowd()
+    with Team(Bench(recording, [chain], STEP_S, "cpu", crowd), workers=1) as team:
+        together = answers(team, spec)
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one.x, other.x)
+        np.testing.assert_array_equal(one.held_out, other.held_out)
+    assert team.simulated == simulated, "every call counts its own"
+    assert team.spent["fit"][0] == simulated
+    # Steps: 3 of Jacobian and trials, start and end; a refit knows its first Jacobian; one prediction.
+    assert crowd.launches <= 1 + 2 * 3 + 1 + (2 * 2 - 1) + 1
+
+
+def test_a_failure_reaches_all_who_wait() -> None:
+    recording = recorded({})
+    (chain,) = chains(recording)
+    crowd = Crowd()
+    rollouts = Rollouts(chain, recording, crowd=crowd)
+    crowd.join(1)
+    with pytest.raises(IndexError):
+        rollouts.predict(chain.start_row[None], [99])
+    crowd.leave()
+    np.testing.assert_array_equal(
+        rollouts.predict(chain.start_row[None]), Rollouts(chain, recording).predict(chain.start_row[None])
+    )

@@ -1,0 +1,82 @@
+"""Threads that simulate together: what all of them wait for goes through one launch.
+
+A rollout on a GPU takes as long as its time steps, one after the other, and thousands take no longer than
+one. So fits that run side by side wait for each other at every simulation: one launch for the perturbed
+parameters of every candidate, start, fold and joint.
+"""
+
+import threading
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from vd.gap.rollout import Call, Rollouts
+
+
+class _Waiting:
+    """A call that waits for its answer."""
+
+    def __init__(self, rollouts: "Rollouts", call: "Call"):
+        self.rollouts, self.call = rollouts, call
+        self.answer: np.ndarray | Exception | None = None
+
+
+class Crowd:
+    """Threads whose calls are simulated together once all that are at work wait for one.
+
+    Attributes:
+        launches: Launches so far.
+    """
+
+    def __init__(self) -> None:
+        self.launches = 0
+        self._condition = threading.Condition()
+        self._working = 0
+        self._waiting: list[_Waiting] = []
+
+    def join(self, threads: int) -> None:
+        """Threads are about to start, and the others wait for them at every simulation."""
+        with self._condition:
+            self._working += threads
+
+    def leave(self) -> None:
+        """One of them has finished."""
+        with self._condition:
+            self._working -= 1
+            self._launch_if_all_wait()
+
+    def simulate(self, rollouts: "Rollouts", call: "Call") -> np.ndarray:
+        """The answer to a call, once the others that are at work have made theirs.
+
+        Raises:
+            Exception: Whatever the launch raised.
+        """
+        own = _Waiting(rollouts, call)
+        with self._condition:
+            self._waiting.append(own)
+            self._launch_if_all_wait()
+            while own.answer is None:
+                self._condition.wait()
+        if isinstance(own.answer, Exception):
+            raise own.answer
+        return own.answer
+
+    def _launch_if_all_wait(self) -> None:
+        if not self._waiting or len(self._waiting) < self._working:
+            return
+        groups: dict[int, list[_Waiting]] = {}
+        for each in self._waiting:
+            groups.setdefault(id(each.rollouts), []).append(each)
+        self._waiting = []
+        for group in groups.values():
+            self.launches += 1
+            try:
+                answers: list[np.ndarray | Exception] = list(
+                    group[0].rollouts.simulate([each.call for each in group])
+                )
+            except Exception as error:  # each of those who wait has to hear of it
+                answers = [error] * len(group)
+            for each, answer in zip(group, answers, strict=True):
+                each.answer = answer
+        self._condition.notify_all()

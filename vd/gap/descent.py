@@ -1,0 +1,174 @@
+"""Levenberg-Marquardt from several starts in lockstep: a step simulates all of them in two calls."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vd.gap.coordinates import Coordinate
+
+LAMBDAS = np.array([0.1, 1.0, 10.0])
+"""Factors on the damping that are tried in each step."""
+FIRST_DAMPING = 1e-3
+LEAST_DAMPING = 1e-7
+WIDEN = -3.0
+"""Factor on the finite-difference steps after a step that fails, with the other sign: dry friction makes
+the squared error rugged at the scale of the smallest steps."""
+FAILURES = 4
+"""Failed steps in a row that end a fit."""
+LOG_TRUST = 1.5
+"""Largest change of a logarithmic coordinate in one step."""
+LINEAR_TRUST = 5.0
+"""Largest change of a linear coordinate in one step, plus its size."""
+TOLERANCE = 1e-4
+"""Relative improvement of the squared error at which a fit has converged."""
+
+Residuals = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
+"""Residuals [C, N] of coordinates [C, P], those of trajectories that a mask [C, S] leaves out being 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Descent:
+    """Where B descents are; P coordinates, N samples.
+
+    Attributes:
+        x: Coordinates [B, P].
+        residual: Measured minus predicted [B, N].
+        jacobian: d(predicted)/dx at ``x``, shape [B, P, N]; an earlier one if none was asked for.
+    """
+
+    x: np.ndarray
+    residual: np.ndarray
+    jacobian: np.ndarray
+
+    def at(self, index: int, copies: int) -> "Descent":
+        """One of them, ``copies`` times."""
+        return Descent(*(np.repeat(a[index : index + 1], copies, 0) for a in vars(self).values()))
+
+
+@dataclass(frozen=True, eq=False)
+class LeastSquares:
+    """A squared error to be made small.
+
+    Attributes:
+        coordinates: The P coordinates.
+        residuals: Simulates.
+        ridge: Pull of the coordinates to their start [rad^2].
+    """
+
+    coordinates: Sequence[Coordinate]
+    residuals: Residuals
+    ridge: float
+
+    def jacobian(
+        self,
+        x: np.ndarray,
+        residual: np.ndarray,
+        widened: np.ndarray | None = None,
+        keep: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """d(predicted)/dx by one-sided differences.
+
+        Args:
+            x: Coordinates [B, P].
+            residual: Residuals there [B, N].
+            widened: Factors on the steps [B].
+            keep: Trajectories that count [B, S].
+
+        Returns:
+            Shape [B, P, N].
+        """
+        size = x.shape[1]
+        factor = np.ones(len(x)) if widened is None else widened
+        steps = np.stack([c.step(x[:, i], factor) for i, c in enumerate(self.coordinates)], axis=1)
+        moved = np.repeat(x[:, None], size, axis=1)
+        moved[:, np.arange(size), np.arange(size)] += steps
+        answers = self.residuals(moved.reshape(-1, size), _repeat(keep, size)).reshape(len(x), size, -1)
+        np.subtract(residual[:, None], answers, out=answers)
+        answers /= steps[:, :, None]
+        return answers
+
+    def descend(
+        self,
+        x: np.ndarray,
+        iterations: int,
+        *,
+        keep: np.ndarray | None = None,
+        known: Descent | None = None,
+        finish: bool = True,
+    ) -> Descent:
+        """Descend.
+
+        Args:
+            x: Starts [B, P].
+            iterations: Steps at most.
+            keep: Trajectories that count in each [B, S]; all by default.
+            known: Residuals and Jacobians at the starts.
+            finish: Whether the Jacobian at the end is wanted.
+        """
+        lower = np.array([c.lower for c in self.coordinates])
+        upper = np.array([c.upper for c in self.coordinates])
+        logarithmic = np.array([c.log for c in self.coordinates])
+        x, origin, tries = x.copy(), x.copy(), len(LAMBDAS)
+        residual = known.residual if known is not None else self.residuals(x, keep)
+        jacobian = np.zeros((*x.shape, residual.shape[1])) if known is None else known.jacobian
+        cost = np.einsum("bn,bn->b", residual, residual)
+        damping, failures = np.full(len(x), FIRST_DAMPING), np.zeros(len(x), int)
+        active = np.arange(len(x))
+        for number in range(iterations):
+            here, kept = x[active], None if keep is None else keep[active]
+            if known is None or number > 0:
+                widened = WIDEN ** failures[active]
+                jacobian[active] = self.jacobian(here, residual[active], widened, kept)
+            slopes = jacobian[active]
+            gram = slopes @ slopes.transpose(0, 2, 1) + self.ridge * np.eye(x.shape[1])
+            gradient = np.einsum("bpn,bn->bp", slopes, residual[active])
+            gradient -= self.ridge * (here - origin[active])
+            free = ~(((here <= lower) & (gradient < 0.0)) | ((here >= upper) & (gradient > 0.0)))
+            step = _steps(gram, gradient, free, damping[active, None] * LAMBDAS)
+            limit = np.where(logarithmic, LOG_TRUST, LINEAR_TRUST + np.abs(here))[:, None]
+            trials = np.clip(here[:, None] + np.clip(step, -limit, limit), lower, upper)
+            answers = self.residuals(trials.reshape(-1, x.shape[1]), _repeat(kept, tries))
+            costs = np.einsum("bn,bn->b", answers, answers).reshape(-1, tries)
+            costs += self.ridge * ((trials - origin[active, None]) ** 2).sum(2)
+            best = np.argmin(costs, axis=1)
+            each = np.arange(len(active))
+            gain = (cost[active] - costs[each, best]) / np.maximum(cost[active], 1e-300)
+            won, lost = active[gain > 0.0], active[gain <= 0.0]
+            x[won] = trials[each, best][gain > 0.0]
+            residual[won] = answers.reshape(len(active), tries, -1)[each, best][gain > 0.0]
+            cost[won] = costs[each, best][gain > 0.0]
+            damping[won] = np.maximum(damping[won] * LAMBDAS[best[gain > 0.0]] * 0.3, LEAST_DAMPING)
+            damping[lost] *= 3.0
+            failures[active] = np.where(gain > TOLERANCE, 0, failures[active] + 1)
+            active = active[failures[active] < FAILURES]
+            if not len(active):
+                break
+        if finish:
+            jacobian = self.jacobian(x, residual, keep=keep)
+        return Descent(x, residual, jacobian)
+
+
+def _repeat(keep: np.ndarray | None, times: int) -> np.ndarray | None:
+    return None if keep is None else np.repeat(keep, times, axis=0)
+
+
+def _steps(gram: np.ndarray, gradient: np.ndarray, free: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Damped steps of the free coordinates, 0 of the others.
+
+    Args:
+        gram: Normal matrices [B, P, P].
+        gradient: Right sides [B, P].
+        free: Which coordinates may move [B, P].
+        damping: Factors on the diagonal that are added [B, L].
+
+    Returns:
+        Shape [B, L, P].
+    """
+    size = gram.shape[1]
+    diagonal = np.einsum("bpp->bp", gram)[:, None] * damping[:, :, None]
+    system = gram[:, None] + diagonal[..., None] * np.eye(size)
+    both = free[:, None, :, None] & free[:, None, None, :]
+    system = np.where(both, system, np.eye(size))
+    right = np.where(free, gradient, 0.0)[:, None, :, None]
+    return np.linalg.solve(system, np.broadcast_to(right, (*system.shape[:3], 1)))[..., 0]
