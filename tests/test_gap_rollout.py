@@ -105,7 +105,7 @@ def test_trajectories_come_in_the_order_asked_for():
     np.testing.assert_array_equal(rollouts.predict(rows, [2, 0]), np.concatenate(parts, axis=1))
     keep = np.array([[True, False], [True, True]])
     some = rollouts.predict(rows, [2, 0], joint=0, keep=keep)
-    simulated = np.repeat(keep, 100, axis=1)
+    simulated = np.repeat(keep, [part.shape[1] for part in parts], axis=1)
     np.testing.assert_array_equal(some, np.where(simulated, np.concatenate(parts, axis=1)[..., 0], 0.0))
     assert rollouts.predict(rows[:0]).shape == (0, 300, 1)
     again = pickle.loads(pickle.dumps(rollouts))
