@@ -9,7 +9,7 @@ from test_gap_fit import recorded
 
 import vd.kernels.actuators as servo
 from vd.gap.coordinates import Coordinate
-from vd.gap.fit import JointFit
+from vd.gap.fit import JointFit, JointProblem
 from vd.gap.judge import Accepted, Explanation, Judge, intervals, share
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
@@ -159,21 +159,28 @@ def test_load_and_friction_are_found_together(tmp_path: Path) -> None:
     assert {effect.name for effect in report.effects} == {"coulomb_friction", "gravity_load"}
 
 
-def concluded(judge: Judge, **options: object) -> Explanation:
+def concluded(judge: Judge, left: float = FLOOR, **options: object) -> Explanation:
     """A conclusion about Coulomb friction that is beyond doubt but for ``options``."""
-    baseline, final = made_up((), 0.010), made_up(("coulomb_friction",), FLOOR)
-    rivals = {"coulomb_friction": [final, made_up(("backlash",), 0.004)]}
+    baseline, final = made_up((), 0.010), made_up(("coulomb_friction",), left)
+    simpler = made_up(("stribeck_friction",), left)  # a form of it is no rival
+    rivals = {"coulomb_friction": [final, simpler, made_up(("backlash",), 0.004)]}
     return judge.conclude(baseline, final, rivals, [], "", **options)  # type: ignore[arg-type]
 
 
 def test_two_searches_that_disagree_by_more_than_the_gain_give_no_name(judge: Judge) -> None:
     assert [a.named for a in concluded(judge).accepted] == [True]
-    # Its gain is what the next best leaves: 4 - 1 mrad.
-    near = concluded(judge, again=made_up(("coulomb_friction",), 0.0035))
+    left = 1.5 * FLOOR
+    # Its gain is what the next best leaves: 4 - 1.5 mrad.
+    near = concluded(judge, left, again=made_up(("coulomb_friction",), 0.0035))
     assert near.verdict == "effects" and near.accepted[0].named
-    far = concluded(judge, again=made_up(("coulomb_friction",), 0.0045))
+    far = concluded(judge, left, again=made_up(("coulomb_friction",), 0.0045))
     assert far.verdict == "unknown" and not far.accepted[0].named
-    assert "two searches" in far.reason and "3.50 mrad" in far.reason
+    assert "two searches" in far.reason and "3.00 mrad" in far.reason
+
+
+def test_a_worse_optimum_says_nothing_against_a_model_at_the_noise_floor(judge: Judge) -> None:
+    worse = concluded(judge, FLOOR, again=made_up(("coulomb_friction",), 0.0095))
+    assert worse.verdict == "effects" and worse.accepted[0].named
 
 
 def test_what_has_structure_is_not_explained(judge: Judge) -> None:
@@ -293,6 +300,21 @@ def test_nothing_hidden_is_no_gap_and_resumes(tmp_path: Path) -> None:
     assert other.seconds != report.seconds
 
 
+def test_a_short_search_that_ends_astray_does_not_hold_the_baseline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From an inertia too small to show no descent comes back."""
+
+    def astray(problem: JointProblem, base: np.ndarray, *_: object, **__: object) -> np.ndarray:
+        rows = base.copy()
+        rows[problem.joint, servo.INERTIA] = 1e-5
+        return rows
+
+    monkeypatch.setattr(JointProblem, "start_baseline", astray)
+    report = analysed(recorded({}), tmp_path, effects=("command_delay",))
+    assert report.verdict == "no_gap" and report.baseline.rmse_rad < 1.1 * report.noise_floor_rad
+
+
 def test_an_effect_that_is_not_considered_ends_unknown_or_tied(tmp_path: Path) -> None:
     report = analysed(recorded({servo.BACKLASH_WIDTH: 0.08}), tmp_path, effects=("thermal_drift",))
     assert report.verdict == "unknown" and not report.effects
@@ -340,3 +362,40 @@ def test_a_model_with_chance_in_it_is_judged_by_its_likelihood(judge: Judge) -> 
     after = made_up(("command_jitter",), 0.9 * spread)
     assert judge.better(before, after)[0]
     assert not judge.better(before, made_up(("command_jitter",), errors.mean() * 2.0))[0]
+    # A motion that is predicted badly without it, but fits, is no sign of chance.
+    fits_well = replace(before, sse=COUNT * (0.9 * spread) ** 2)
+    assert not judge.better(fits_well, after)[0]
+
+
+def searching(answers: list[float]) -> tuple[Selection, list[int]]:
+    """A selection whose other searches end at given errors, and the seeds that it asked for."""
+    seeds: list[int] = []
+
+    def run(calls: list[tuple[str, dict[str, object]]]) -> list[object]:
+        ((method, options),) = calls
+        assert method == "again"
+        seeds.append(options["seed"])  # type: ignore[arg-type]
+        return [made_up(("backlash",), answers[len(seeds) - 1])]
+
+    selection = Selection(
+        floor=FLOOR,
+        weights=resamples(10, np.random.default_rng(0)),
+        run=run,  # type: ignore[arg-type]
+        joint=0,
+        others=(),
+        candidates=SMALL,
+        scales=None,  # type: ignore[arg-type]
+    )
+    return selection, seeds
+
+
+def test_a_search_that_fails_is_repeated_before_it_counts() -> None:
+    present = made_up(("backlash",), 0.004)
+    selection, seeds = searching([0.030, 0.00401, 0.0])
+    again = selection.search_again(present)
+    assert again is not None and again.rmse == pytest.approx(0.00401) and len(set(seeds)) == 2
+    selection, seeds = searching([0.030, 0.020, 0.010])
+    again = selection.search_again(present)
+    assert again is not None and again.rmse == pytest.approx(0.010) and len(set(seeds)) == 3
+    selection, seeds = searching([])
+    assert selection.search_again(made_up(("backlash",), FLOOR)) is None, "nothing is better than the floor"

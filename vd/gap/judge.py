@@ -30,8 +30,9 @@ MIN_GAIN = 0.05
 """Share of the held-out RMSE that an effect must remove."""
 MIN_GAIN_FLOORS = 0.7
 """Gap that an effect must close, as sqrt(before^2 - after^2), in noise floors."""
-MIN_SHARE = 0.02
-"""The same in whole gaps: no integrator's model of a large effect is better than that."""
+MIN_SHARE = 0.01
+"""The same in whole gaps: no integrator's model of a large effect is better than that. The right models of
+an acceleration limit leave 0.002 of gaps of 300 noise floors."""
 NAMED = 0.9
 """Share of the resamples that must choose an effect for it to be named."""
 PENALTY = 0.01
@@ -51,6 +52,9 @@ STRUCTURE = 0.09
 something: the right ones leave 0.05 at most (the noise of the first sample, which starts a rollout)."""
 STRUCTURE_SURE = 0.02
 """The same for the low end of its interval over trajectories."""
+AT_FLOOR = 1.3
+"""Final error, in noise floors, which no other optimum of the same model can improve much: one that another
+search ends in above it is that search's failure."""
 REPEATABLE = 2.0
 """Final error, in noise floors, up to which residuals are held against noise alone. A real machine that is
 farther from it does not repeat its motions that well; how well is not known from one recording of each."""
@@ -166,6 +170,9 @@ class Judge:
             after: The larger.
             tail: Share of the resamples that may see no gain.
         """
+        if RANDOM in after.effects and RANDOM not in before.effects:
+            # Its errors are not held out, so neither may those be that it is compared with.
+            before = replace(before, held_out=before.sse)
         old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
         gain = 1.0 - after.held_out_rmse / before.held_out_rmse
         sampled = (
@@ -311,10 +318,14 @@ class Judge:
         rivals: Sequence[JointFit],
         again: JointFit | None,
     ) -> str:
-        """Why two searches for the final model contradict each other about an effect, or nothing."""
-        if again is None:
+        """Why two searches for the final model contradict each other about an effect, or nothing.
+
+        Its gain is what it leaves less than the next best that is no form of it.
+        """
+        if again is None or final.rmse < AT_FLOOR * self.floor:
             return ""
-        without = [fit.rmse for fit in rivals if fit is not final and fit.effects[-1:] != (name,)]
+        same = {name, *NESTED.get(name, ()), *(k for k, simpler in NESTED.items() if name in simpler)}
+        without = [fit.rmse for fit in rivals if fit is not final and not same & set(fit.effects[-1:])]
         gain = min([baseline.rmse, *without]) - final.rmse
         apart = abs(again.rmse - final.rmse)
         if apart <= max(gain, 0.0) or gain <= 0.0:

@@ -299,6 +299,9 @@ def _identify(team: Team, specs: Sequence[JointSpec], options: Options, progress
         start = {"base": rows, "scales": scales, "seed": options.seed, "generations": CMA_GENERATIONS}
         searched = team.run(spec, [("start_baseline", start)])[0]
         starts = [{}, *({"velocity_limit": f * scales.speed} for f in SPEED_STARTS)]
+        # A short search can end where the inertia is too small to show, from where no descent comes back.
+        nominal = {key: float(rows[spec.joint, BASELINE_PARAMETERS[key].column]) for key in spec.baseline}
+        starts += [nominal, {**nominal, "velocity_limit": SPEED_STARTS[0] * scales.speed}]
         call = {"base": searched, "effects": (), "starts": starts, "scales": scales}
         fit = team.run(spec, [("fit", {**call, "iterations": BASELINE_ITERATIONS})])[0][0]
         name = chain.joints[spec.joint]
