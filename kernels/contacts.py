@@ -1,6 +1,8 @@
-"""Contact forces read from the solver's constraint rows."""
+"""Contact forces read from the solver's constraint rows, and restitution written into its contacts."""
 
 import warp as wp
+
+from vd.kernels.columns import read_vec3
 
 wp.set_module_options({"enable_backward": False})
 
@@ -58,3 +60,68 @@ def pair_force_kernel(
         for edge in range(1, 2 * (contact_dim[contact] - 1)):
             normal += row_force[world, contact_row[contact, edge]]
     wp.atomic_add(force, world, normal)
+
+
+@wp.func
+def damping_ratio(restitution: float, lowest: float) -> float:
+    """Damping ratio z of a spring that throws back with ``restitution``; at least ``lowest``.
+
+    The coefficient is exp(-pi z / sqrt(1 - z^2)).
+    """
+    if restitution <= 0.0:
+        return 1.0
+    log = -wp.log(wp.min(restitution, 1.0))
+    return wp.clamp(log / wp.sqrt(wp.PI * wp.PI + log * log), lowest, 1.0)
+
+
+@wp.kernel
+def restitution_kernel(
+    # Model:
+    nominal: wp.array2d[wp.vec2],
+    geom_kind: wp.array2d[int],
+    kind_table: int,
+    kind_hand: int,
+    object_column: int,
+    threshold: float,
+    lowest: float,
+    # In:
+    joint_qd: wp.array2d[float],
+    hand_restitution: wp.array[float],
+    object_restitution: wp.array[float],
+    table_restitution: wp.array[float],
+    # Out:
+    solref_out: wp.array2d[wp.vec2],
+):
+    """Write each geom's contact reference so that a fast object bounces and a slow one does not.
+
+    Launch: [N, G].
+
+    A reference is (time constant, damping ratio). Where the object is faster than ``threshold``, the ratio is
+    divided by as much as the time constant is multiplied with: the stiffness 1 / (time constant * ratio)^2
+    stays. As for friction, hand and table carry the mean of their own and the object's restitution, because
+    of two geoms that touch the solver takes the one with the higher priority: table over hand over object.
+
+    Args:
+        nominal: References without restitution, shape [N, G].
+        geom_kind: Kind of each geom, shape [N, G].
+        kind_table: Kind of the table.
+        kind_hand: Kind of the hand's geoms.
+        object_column: Column of the object's linear velocity.
+        threshold: Speed of the object below which nothing bounces [m/s].
+        lowest: Least damping ratio relative to the nominal.
+        joint_qd: Velocities, shape [N, D + 6].
+        hand_restitution: Coefficient of restitution of the hand, shape [N].
+        object_restitution: The same of the object, shape [N].
+        table_restitution: The same of the table, shape [N].
+        solref_out: References, shape [N, G]; geoms that are neither hand nor table keep theirs.
+    """
+    world, geom = wp.tid()
+    kind = geom_kind[world, geom]
+    if kind != kind_table and kind != kind_hand:
+        return
+    reference = nominal[world, geom]
+    if wp.length(read_vec3(world, object_column, joint_qd)) > threshold:
+        own = wp.where(kind == kind_table, table_restitution[world], hand_restitution[world])
+        ratio = damping_ratio(0.5 * (own + object_restitution[world]), lowest)
+        reference = wp.vec2(reference[0] / ratio, reference[1] * ratio)
+    solref_out[world, geom] = reference

@@ -149,6 +149,42 @@ def draw_servo_kernel(
 
 
 @wp.kernel
+def draw_restitution_kernel(
+    # Model:
+    bounds: wp.vec2,
+    # In:
+    mask_in: wp.array[int],
+    # In/Out:
+    rng: wp.array[wp.uint32],
+    # Out:
+    hand_out: wp.array[float],
+    object_out: wp.array[float],
+    table_out: wp.array[float],
+):
+    """Draw the coefficients of restitution of the masked worlds (Table S3). Launch: [N].
+
+    Args:
+        bounds: Range of each.
+        mask_in: 1 where a world is drawn anew, shape [N].
+        rng: Random stream of each world, shape [N].
+        hand_out: Restitution of all hand shapes, shape [N].
+        object_out: Restitution of the object, shape [N].
+        table_out: Restitution of the table, shape [N].
+    """
+    world = wp.tid()
+    if mask_in[world] == 0:
+        return
+    state = rng[world]
+    state, of_hand = uniform(state, bounds)
+    state, of_object = uniform(state, bounds)
+    state, of_table = uniform(state, bounds)
+    hand_out[world] = of_hand
+    object_out[world] = of_object
+    table_out[world] = of_table
+    rng[world] = next_stream(state, world)
+
+
+@wp.kernel
 def draw_masses_kernel(
     # Model:
     params: wp.array[RandomisationParams],

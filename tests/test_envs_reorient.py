@@ -27,6 +27,7 @@ from vd.kernels.shapes import (
 )
 from vd.sim.cfg import SimCfg
 from vd.sim.replay import replay
+from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE
 from vd.sim.simulator import SimulationError
 
 WORLDS = 4
@@ -274,7 +275,39 @@ def test_randomisation_reaches_the_solver():
     assert env.sim.joint_q.numpy().shape == (16, 9 + 7)
 
 
+def test_restitution_is_drawn_and_saved_and_reaches_the_contacts(device):
+    bouncy = RandomisationCfg(restitution=(0.5, 0.9))
+    env = make(device, num_worlds=16, randomisation=bouncy)
+    drawn = env.sim.restitution
+    table = drawn.table.numpy()
+    assert len(np.unique(table)) == 16 and table.min() >= 0.5 and table.max() <= 0.9
+    velocity = env.sim.joint_qd.numpy().copy()
+    velocity[:, -4] = -1.0  # the object's, downward
+    env.sim.joint_qd.assign(velocity)
+    env.sim.restitution.apply(env.sim.joint_qd)
+    kind = env.sim._geom_kind.numpy()
+    ratio = env.sim.solver.mjw_model.geom_solref.numpy()[..., 1]
+    assert (ratio[kind == SHAPE_TABLE] < 0.25).all() and (ratio[kind == SHAPE_OBJECT] > 0.9).all()
+    run(env, 10)
+    state = env.state_dict()
+    expected = run(env, 5, seed=2)
+    other = make(device, num_worlds=16, randomisation=bouncy)
+    other.load_state_dict(state)
+    np.testing.assert_array_equal(other.sim.restitution.table.numpy(), drawn.table.numpy())
+    if device == "cpu":
+        assert np.array_equal(run(other, 5, seed=2), expected)
+    with pytest.raises(ValueError, match=r"randomisation\.restitution"):
+        make(device, num_worlds=16, randomisation=RandomisationCfg()).load_state_dict(state)
+
+
+def test_without_restitution_nothing_of_it_is_built():
+    assert make(randomisation=RandomisationCfg(enabled=True)).sim.restitution is None
+    assert make(randomisation=RandomisationCfg(enabled=False, restitution=(0.0, 1.0))).sim.restitution is None
+
+
 def test_bad_configurations_name_the_field():
+    with pytest.raises(ValueError, match=r"randomisation\.restitution is 0\.5 1\.2"):
+        make(randomisation=RandomisationCfg(restitution=(0.5, 1.2)))
     with pytest.raises(ValueError, match="fewer than the"):
         make(objects=("symmetric",), num_worlds=1)
     with pytest.raises(ValueError, match="fingertip = 'wet'"):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
-from vd.bench.physics import GRAVITY, SmallScene, pinch, rest, slide
+from vd.bench.physics import GRAVITY, SmallScene, bounce, pinch, rest, slide
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import add_object, build_hand, build_scene, new_builder
@@ -167,3 +167,51 @@ def test_importing_keeps_every_collider_and_mount():
     assert base[:3] == pytest.approx([0.0, 0.0, PAPER.scene.hand_height_m])
     down = wp.quat_rotate(wp.quat(*base[3:]), wp.vec3(0.0, 0.0, 1.0))
     assert down[2] == pytest.approx(-1.0)
+
+
+def test_a_ball_rebounds_by_its_coefficient_and_gains_no_energy():
+    results = [bounce(CFG, e, seconds=1.5) for e in (0.0, 0.3, 0.6)]
+    rebounds = [r.rebound for r in results]
+    assert rebounds == sorted(rebounds)
+    for result in results:
+        assert result.rebound == pytest.approx(result.restitution, abs=0.03)
+        # The moment of touching within a physics step makes single rebounds higher or lower.
+        assert result.rebound_most - result.rebound < 0.12
+        assert result.energy_most < 1.0
+
+
+def test_more_than_the_contacts_can_do_is_clamped():
+    high, one = bounce(CFG, 0.95, seconds=1.0), bounce(CFG, 1.0, seconds=1.0)
+    assert high.rebound == one.rebound == pytest.approx(0.88, abs=0.02)
+    assert one.energy_most < 1.0
+
+
+def test_a_ball_that_bounced_lies_still_and_no_deeper():
+    plain, bounced = bounce(CFG, 0.0, plain=True, seconds=2.0), bounce(CFG, 0.8)
+    assert bounced.rest_speed < 1e-3
+    assert bounced.rest_penetration == pytest.approx(plain.rest_penetration, rel=1e-3)
+
+
+def test_objects_come_to_rest_with_restitution():
+    objects = load_set("procedural-150-seed0")[::10]
+    plain, bouncing = rest(objects, CFG), rest(objects, CFG, restitution=1.0)
+    assert sum(r.rests for r in bouncing) >= sum(r.rests for r in plain) - 1
+    assert max(r.penetration for r in bouncing) < 1e-3
+
+
+def test_restitution_of_zero_is_the_plain_model_to_the_bit(cube):
+    """Thrown hard at the table: an object fast enough to bounce, and hand contacts besides."""
+    hand = load_hand("dclaw3")
+    ends = []
+    for restitution in (False, True):
+        scene = build_scene(hand=hand, objects=[cube], num_worlds=2, cfg=CFG, device="cpu")
+        sim = Simulator(scene, CFG, restitution=restitution)
+        velocity = sim.joint_qd.numpy()
+        velocity[:, 9:12] = [0.3, 0.0, -2.0]
+        sim.joint_qd.assign(velocity)
+        for _ in range(6):
+            sim.step()
+        ends.append((sim.joint_q.numpy().copy(), sim.joint_qd.numpy().copy()))
+        assert (sim.restitution is not None) == restitution
+    np.testing.assert_array_equal(ends[0][0], ends[1][0])
+    np.testing.assert_array_equal(ends[0][1], ends[1][1])

@@ -13,6 +13,7 @@ from vd.kernels.randomisation import (
     disturbance_force_kernel,
     draw_dynamics_kernel,
     draw_masses_kernel,
+    draw_restitution_kernel,
     draw_servo_kernel,
 )
 from vd.kernels.rng import next_stream
@@ -259,3 +260,28 @@ def test_disturbance_has_the_paper_s_rate_and_magnitude_and_any_direction(device
 def test_disturbance_never_and_always(device, probability, share):
     force = force_array(device, np.ones((1000, 3)), np.ones(1000), 12, probability=probability)
     assert np.mean(np.any(force != 0.0, axis=1)) == share
+
+
+def draw_restitution(device, mask, bounds=DR.restitution, seed=0):
+    """Launch; returns coefficients [3, N] of hand, object and table, and streams."""
+    out = [unwritten(len(mask), float, device) for _ in range(3)]
+    rng = streams(len(mask), seed, device)
+    inputs = [wp.vec2(*bounds), device_array(mask, int, device), rng]
+    wp.launch(draw_restitution_kernel, dim=len(mask), inputs=inputs, outputs=out, device=device)
+    return np.stack([array.numpy() for array in out]), rng.numpy()
+
+
+def test_restitution_is_that_of_table_s3_and_drawn_for_each_body(device):
+    drawn, _ = draw_restitution(device, np.ones(20_000, int), seed=2)
+    for values in drawn:
+        assert_uniform(values, (0.0, 1.0))
+    assert_uncorrelated(drawn.T, 0.05)
+
+
+def test_restitution_of_other_worlds_stays(device):
+    mask = np.arange(10) % 2
+    drawn, after = draw_restitution(device, mask, (0.2, 0.3))
+    assert np.isnan(drawn[:, mask == 0]).all()
+    assert ((drawn[:, mask == 1] >= 0.2) & (drawn[:, mask == 1] <= 0.3)).all()
+    before = streams(10, 0, device).numpy()
+    np.testing.assert_array_equal(after == before, mask == 0)

@@ -67,9 +67,13 @@ class SimCommand:
         return 0
 
 
+RESTITUTIONS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+"""Coefficients asked for when the map to rebounds is measured."""
+
+
 @dataclass(frozen=True)
 class PhysicsCommand:
-    """Contact quality: objects at rest, a pinched cube, sliding against Coulomb's law."""
+    """Contact quality: objects at rest, a pinched cube, sliding against Coulomb's law, a bouncing ball."""
 
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets to drop on the table."""
@@ -85,7 +89,7 @@ class PhysicsCommand:
         import warp as wp
 
         from vd.assets_usd.objects.model import load_set
-        from vd.bench.physics import pinch, rest, slide
+        from vd.bench.physics import bounce, pinch, rest, slide
         from vd.sim.cfg import SimCfg
 
         wp.config.log_level = wp.LOG_WARNING
@@ -102,6 +106,8 @@ class PhysicsCommand:
             "pinch": dataclasses.asdict(held),
             "slide_m": measured,
             "slide_coulomb_m": coulomb,
+            "slide_bouncing_m": slide(cfg, device=self.device, restitution=1.0)[0],
+            "bounce": [dataclasses.asdict(bounce(cfg, e, device=self.device)) for e in RESTITUTIONS],
         }
         print(json.dumps(report, indent=1))
         if self.json:

@@ -13,6 +13,7 @@ from vd.kernels.randomisation import (
     disturbance_force_kernel,
     draw_dynamics_kernel,
     draw_masses_kernel,
+    draw_restitution_kernel,
     draw_servo_kernel,
 )
 from vd.kernels.worlds import (
@@ -119,7 +120,7 @@ class Randomiser:
         self.draw(self._due)
 
     def draw(self, mask: wp.array) -> None:
-        """Draw gains, servos, frictions and constant errors for the worlds of ``mask``, shape [N]."""
+        """Draw gains, servos, frictions, restitution and constant errors for the worlds of ``mask`` [N]."""
         env = self._env
         wp.launch(
             draw_dynamics_kernel,
@@ -150,6 +151,15 @@ class Randomiser:
                 dim=env.num_worlds,
                 inputs=[self._servo_ranges, mask, self.kp, self.kd, env.rng],
                 outputs=[env.sim.servo.parameters],
+                device=env.device,
+            )
+        if env.sim.restitution is not None:
+            drawn = env.sim.restitution
+            wp.launch(
+                draw_restitution_kernel,
+                dim=env.num_worlds,
+                inputs=[wp.vec2(*env.cfg.randomisation.restitution), mask, env.rng],
+                outputs=[drawn.hand, drawn.object, drawn.table],
                 device=env.device,
             )
 

@@ -69,7 +69,9 @@ class ReorientEnv:
         self.servo_ranges = servo_ranges(self.hand, random)
         """Range (low, high) of each number of each joint's servo, shape [D, P, 2]; equal ends are fixed."""
         largest = self.servo_ranges[:, :, 1] if needs_servo(self.servo_ranges) else None
-        self.sim = Simulator(self.scene, cfg.sim, servo_rows=largest, servo_seed=cfg.seed)
+        self.sim = Simulator(
+            self.scene, cfg.sim, servo_rows=largest, servo_seed=cfg.seed, restitution=random.bounces
+        )
         servo = self.sim.servo
         self.measured_q = self.sim.joint_q if servo is None else servo.measured_q
         """Joint positions as the encoders report them at the end of the step [rad], shape [N, *]."""
@@ -472,6 +474,7 @@ class ReorientEnv:
             **({} if self.views is None else {"view": self.views.view}),
             **self.randomiser.stateful(),
             **({} if self.sim.servo is None else self.sim.servo.stateful()),
+            **({} if self.sim.restitution is None else self.sim.restitution.stateful()),
         }
 
     def state_dict(self) -> dict[str, Any]:
@@ -487,9 +490,9 @@ class ReorientEnv:
         """
         if state["arrays"].keys() != self._stateful().keys():
             raise ValueError(
-                "the saved environment has other servos or views; resume with hand_layer, observation.view "
-                "and randomisation.effects of the checkpoint, or from one without worlds "
-                "(vd-train export --resumable)"
+                "the saved environment has other servos, views or contacts; resume with hand_layer, "
+                "observation.view, randomisation.effects and randomisation.restitution of the checkpoint, "
+                "or from one without worlds (vd-train export --resumable)"
             )
         for name, array in self._stateful().items():
             saved = state["arrays"][name]

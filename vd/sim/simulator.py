@@ -12,6 +12,7 @@ from vd.kernels.contacts import pair_force_kernel
 from vd.kernels.guard import collect_overflow_kernel, guard_kernel
 from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
+from vd.sim.restitution import Restitution
 from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
 
 # Faster than any joint (8 rad/s) or dropped object (2 m/s) can be; an object that spins faster than
@@ -82,7 +83,13 @@ class Simulator:
     """
 
     def __init__(
-        self, scene: Scene, cfg: SimCfg, *, servo_rows: np.ndarray | None = None, servo_seed: int = 0
+        self,
+        scene: Scene,
+        cfg: SimCfg,
+        *,
+        servo_rows: np.ndarray | None = None,
+        servo_seed: int = 0,
+        restitution: bool = False,
     ):
         """Build the solver of a scene.
 
@@ -92,6 +99,7 @@ class Simulator:
             servo_rows: Parameters of every joint's servo, shape [D, P] or [N, D, P]
                 (:mod:`vd.kernels.actuators`); the solver's plain drives by default.
             servo_seed: Seed of the random delays and losses of commands.
+            restitution: Whether contacts can bounce; see :attr:`restitution`.
         """
         cfg.validate()
         self.scene, self.cfg = scene, cfg
@@ -123,6 +131,10 @@ class Simulator:
         """Joint speed limits [rad/s], shape [D]."""
         geom_shape = self.solver.mjc_geom_to_newton_shape.numpy()
         self._geom_kind = array(np.where(geom_shape >= 0, scene.shape_kind[geom_shape], 0).astype(np.int32))
+        self.restitution: Restitution | None = None
+        """Coefficients of restitution, zero until written; None: contacts stay as they are."""
+        if restitution:
+            self.restitution = Restitution(self.solver, self._geom_kind, len(scene.hand.velocity_limit))
         self.table_force = wp.zeros(n, dtype=float, device=self.device)
         """Normal force between object and table at the end of the control step [N], shape [N]."""
         self.overflow = wp.zeros(n, dtype=wp.int32, device=self.device)
@@ -171,6 +183,8 @@ class Simulator:
             if ours and self.servo is not None:
                 self.servo.receive()
                 self.servo.drive(*here[1:])
+            if ours and self.restitution is not None:
+                self.restitution.apply(here[2])
             self.solver.step(
                 here[0], there[0], self.control, None, self.cfg.physics_dt, observables=self._observables
             )
