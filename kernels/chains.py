@@ -52,13 +52,13 @@ DIVERGED = 100.0
 
 @wp.struct
 class Links:
-    """Bodies of a chain, in the base frame with all joints at zero; one row per joint.
+    """Bodies of a chain, in the base frame with all joints at zero; rows beyond its joints are zero.
 
-    axis: Unit joint axes [n].
-    offset: From the joint before (the base, for the first) to the joint [n] [m].
-    mass: Masses of the links after each joint [n] [kg].
-    com: From the joint to the centre of mass [n] [m].
-    inertia: About the centre of mass [n] [kg m^2].
+    axis: Unit joint axes [MAX_JOINTS].
+    offset: From the joint before (the base, for the first) to the joint [MAX_JOINTS] [m].
+    mass: Masses of the links after each joint [MAX_JOINTS] [kg].
+    com: From the joint to the centre of mass [MAX_JOINTS] [m].
+    inertia: About the centre of mass [MAX_JOINTS] [kg m^2].
     gravity: Acceleration of gravity [m/s^2].
     """
 
@@ -87,53 +87,56 @@ class Samples:
 
 
 @wp.func
-def chain_dynamics(q: wp.vec3, speed: wp.vec3, count: int, links: Links):
+def chain_dynamics(q: wp.vec3, speed: wp.vec3, links: Links):
     """Mass matrix and bias torques (Coriolis, centrifugal, gravity) of the bodies.
 
-    Recursive Newton-Euler outwards; each body is projected on the joints before it at once.
+    Outwards, each link in its own frame: the joints' axes and the velocities that they give to the link's
+    joint are turned along, so that no inertia has to be. Loops are unrolled and the arrays in registers.
 
     Returns:
-        ``(mass, bias)`` [3, 3] and [3]; zero beyond ``count``.
+        ``(mass, bias)`` [3, 3] and [3]; zero for links without mass.
     """
     mass = wp.mat33(0.0)
     bias = wp.vec3(0.0)
     axes = wp.mat33(0.0)
-    origins = wp.mat33(0.0)
-    turn = wp.quat_identity()
-    origin = wp.vec3(0.0)
+    levers = wp.mat33(0.0)
     omega = wp.vec3(0.0)
     alpha = wp.vec3(0.0)
     acceleration = -links.gravity
-    for i in range(count):
-        offset = wp.quat_rotate(turn, links.offset[i])
-        axis = wp.quat_rotate(turn, links.axis[i])
-        origin += offset
-        acceleration += wp.cross(alpha, offset) + wp.cross(omega, wp.cross(omega, offset))
-        alpha += speed[i] * wp.cross(omega, axis)
-        omega += speed[i] * axis
-        turn = turn * wp.quat_from_axis_angle(links.axis[i], q[i])
+    for i in range(MAX_JOINTS):
+        axis = links.axis[i]
+        turn = wp.transpose(wp.quat_to_matrix(wp.quat_from_axis_angle(axis, q[i])))
+        if i > 0:
+            offset = links.offset[i]
+            acceleration += wp.cross(alpha, offset) + wp.cross(omega, wp.cross(omega, offset))
+            alpha = turn * (alpha + speed[i] * wp.cross(omega, axis))
+            for j in range(MAX_JOINTS):
+                if j < i:
+                    levers[j] = turn * (levers[j] + wp.cross(axes[j], offset))
+                    axes[j] = turn * axes[j]
+        omega = turn * omega + speed[i] * axis
+        acceleration = turn * acceleration
         axes[i] = axis
-        origins[i] = origin
 
-        rotation = wp.quat_to_matrix(turn)
-        inertia = rotation * links.inertia[i] * wp.transpose(rotation)
-        arm = rotation * links.com[i]
-        force = links.mass[i] * (acceleration + wp.cross(alpha, arm) + wp.cross(omega, wp.cross(omega, arm)))
+        arm = links.com[i]
+        inertia = links.inertia[i]
+        weight = links.mass[i]
+        force = weight * (acceleration + wp.cross(alpha, arm) + wp.cross(omega, wp.cross(omega, arm)))
         moment = inertia * alpha + wp.cross(omega, inertia * omega)
-        for j in range(i + 1):
-            axis_j = wp.vec3(axes[j, 0], axes[j, 1], axes[j, 2])
-            origin_j = wp.vec3(origins[j, 0], origins[j, 1], origins[j, 2])
-            lever = wp.cross(axis_j, origin + arm - origin_j)
-            bias[j] += wp.dot(axis_j, moment) + wp.dot(lever, force)
-            turned = inertia * axis_j
-            lever *= links.mass[i]
-            for k in range(j + 1):
-                axis_k = wp.vec3(axes[k, 0], axes[k, 1], axes[k, 2])
-                origin_k = wp.vec3(origins[k, 0], origins[k, 1], origins[k, 2])
-                entry = wp.dot(turned, axis_k) + wp.dot(lever, wp.cross(axis_k, origin + arm - origin_k))
-                mass[j, k] += entry
-                if k < j:
-                    mass[k, j] += entry
+        moved = wp.mat33(0.0)
+        for j in range(MAX_JOINTS):
+            if j <= i:
+                lever = levers[j] + wp.cross(axes[j], arm)
+                moved[j] = lever
+                bias[j] += wp.dot(axes[j], moment) + wp.dot(lever, force)
+                turned = inertia * axes[j]
+                for k in range(MAX_JOINTS):
+                    if k <= j:
+                        mass[j, k] += wp.dot(turned, axes[k]) + weight * wp.dot(lever, moved[k])
+    for j in range(MAX_JOINTS):
+        for k in range(MAX_JOINTS):
+            if k < j:
+                mass[k, j] = mass[j, k]
     return mass, bias
 
 
@@ -321,7 +324,7 @@ def rollout_kernel(
         read_fraction[j] = fraction
     weight = wp.vec3(0.0)
     if bodies != 0:
-        _resting, weight = chain_dynamics(q, wp.vec3(0.0), count, links)
+        _resting, weight = chain_dynamics(q, wp.vec3(0.0), links)
     for j in range(count):
         row = base_row + j
         # What coupled joints add to the reference is a load in the units of the drive.
@@ -396,7 +399,7 @@ def rollout_kernel(
 
         mass = wp.mat33(0.0)
         if bodies == 1:
-            mass, bias = chain_dynamics(q, speed, count, links)
+            mass, bias = chain_dynamics(q, speed, links)
             torque -= bias
         for j in range(MAX_JOINTS):
             inertia = wp.max(diagonal[j] + mass[j, j], SMALLEST_INERTIA)

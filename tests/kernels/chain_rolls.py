@@ -5,7 +5,7 @@ import warp as wp
 from kernel_oracle import device_array, unwritten
 
 from vd.kernels import actuators as servo
-from vd.kernels.chains import Links, Samples, rollout_kernel
+from vd.kernels.chains import MAX_JOINTS, Links, Samples, rollout_kernel
 from vd.kernels.effects import neutral_row
 
 DT = 1 / 480
@@ -38,7 +38,9 @@ def links_struct(bodies, gravity, device):
         ("com", wp.vec3),
         ("inertia", wp.mat33),
     ):
-        setattr(links, name, device_array(bodies[name], dtype, device))
+        rows = np.zeros((MAX_JOINTS, *bodies[name].shape[1:]))
+        rows[: len(bodies[name])] = bodies[name]
+        setattr(links, name, device_array(rows, dtype, device))
     links.gravity = wp.vec3(*gravity)
     return links
 

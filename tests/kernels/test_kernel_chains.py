@@ -31,13 +31,12 @@ from vd.kernels.effects import EFFECTS
 def dynamics_kernel(
     q: wp.array[wp.vec3],
     speed: wp.array[wp.vec3],
-    count: int,
     links: Links,
     mass_out: wp.array[wp.mat33],
     bias_out: wp.array[wp.vec3],
 ):
     i = wp.tid()
-    mass, bias = chain_dynamics(q[i], speed[i], count, links)
+    mass, bias = chain_dynamics(q[i], speed[i], links)
     mass_out[i] = mass
     bias_out[i] = bias
 
@@ -80,7 +79,6 @@ def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
         inputs=[
             device_array(q, wp.vec3, device),
             device_array(speed, wp.vec3, device),
-            n,
             links_struct(bodies, GRAVITY, device),
         ],
         outputs=[mass, bias],

@@ -18,7 +18,7 @@ from vd.assets_usd.hand_data import HandModel
 from vd.gap.crowd import Crowd
 from vd.gap.recording import Recording
 from vd.kernels import actuators as servo
-from vd.kernels.chains import Links, Samples, rollout_kernel
+from vd.kernels.chains import MAX_JOINTS, Links, Samples, rollout_kernel
 from vd.kernels.effects import BASELINE, neutral_row
 
 STEP_S = 1.0 / 480.0
@@ -373,7 +373,10 @@ class Rollouts:
             ("com", wp.vec3),
             ("inertia", wp.mat33),
         ):
-            setattr(links, name, wp.array(getattr(chain, name), dtype=dtype, device=self.device))
+            values = getattr(chain, name)
+            rows = np.zeros((MAX_JOINTS, *values.shape[1:]))
+            rows[: len(values)] = values
+            setattr(links, name, wp.array(rows, dtype=dtype, device=self.device))
         links.gravity = wp.vec3(*chain.gravity)
         slot = wp.array(chain.slot, dtype=int, device=self.device)
         bounds = (chain.lower, chain.upper, chain.effort)
