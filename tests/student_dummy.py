@@ -23,8 +23,9 @@ BAR_POINTS = 24
 VOXEL_M = 0.01
 
 TINY = StudentCfg(
-    encoder=EncoderCfg(channels=(8, 16), blocks=1, pooled_stages=0, embedding=16),
+    encoder=EncoderCfg(channels=(8, 16), blocks=1, pooled_stages=0, embedding=16, inputs=("constant",)),
     voxel_m=VOXEL_M,
+    senses=("action",),
     action_hidden=4,
     memory=16,
     head_hidden=16,

@@ -16,7 +16,8 @@ from vd.student.network import Student
 
 ACTIONS = 12
 SMALL = StudentCfg(
-    encoder=EncoderCfg(channels=(4, 8), blocks=1, embedding=16),
+    encoder=EncoderCfg(channels=(4, 8), blocks=1, embedding=16, inputs=("constant",)),
+    senses=("action",),
     action_hidden=8,
     memory=12,
     head_hidden=16,
@@ -42,7 +43,7 @@ def clouds(count: int, points: int = 200, seed: int = 0) -> np.ndarray:
 
 
 def sites(points: np.ndarray, device: str):
-    return Voxeliser(device=device)(wp.array(points, dtype=wp.vec3, device=device))
+    return Voxeliser(device=device)(wp.array(points, dtype=wp.vec3, device=device), ends=(50, 150))
 
 
 def student(cfg: StudentCfg, device: str) -> Student:
@@ -109,12 +110,45 @@ def test_batch_and_order_of_points_do_not_matter(device):
     assert torch.equal(together, net.encode(sites(shuffled, device)))
 
 
-def test_moving_a_cloud_by_whole_cells_of_the_last_stage_changes_nothing(device):
-    """Nothing but the grid gives a place a meaning, so the goal is told from the scene by its place alone."""
+def test_with_the_papers_input_moving_a_cloud_by_whole_cells_changes_nothing(device):
+    """Nothing but the grid gives a place a meaning there: only neighbours tell the goal from the scene."""
     net, points = student(SMALL, device), clouds(1)
     cell = 0.005 * 8  # two stages and one pooling: eight voxels
     moved = net.encode(sites(points + np.float32([cell, -cell, 2 * cell]), device))
     torch.testing.assert_close(net.encode(sites(points, device)), moved, atol=1e-4, rtol=1e-4)
+
+
+def test_places_and_marks_are_read_where_asked_for(device):
+    """The centre of each voxel in units of 10 cm, and whether goal or hand have a point in it."""
+    cfg = dataclasses.replace(SMALL, encoder=EncoderCfg(channels=(4, 8), blocks=1, embedding=16))
+    net, points = student(cfg, device), clouds(2)
+    scene = sites(points, device)
+    found = net.encoder.features(scene).cpu().numpy()
+    assert found.shape == (len(scene), 6) and (found[:, 0] == cfg.encoder.feature).all()
+    coordinates = scene.coordinates.cpu().numpy()
+    np.testing.assert_allclose(found[:, 1:4], (coordinates[:, 1:] + 0.5) * 0.05, atol=1e-6)
+    expected = np.zeros((len(scene), 2))
+    voxel = np.floor(points / np.float32(0.005)).astype(int)
+    for column, part in enumerate((slice(0, 50), slice(50, 150))):
+        held = {(cloud, *cell) for cloud in range(2) for cell in voxel[cloud, part].tolist()}
+        expected[:, column] = [tuple(row) in held for row in coordinates.tolist()]
+    np.testing.assert_array_equal(found[:, 4:], expected)
+    moved = net.encode(sites(points + np.float32([0.04, -0.04, 0.08]), device))
+    assert float((moved - net.encode(scene)).detach().abs().max()) > 1e-3
+    unmarked = Voxeliser(device=device)(wp.array(points, dtype=wp.vec3, device=device))
+    with pytest.raises(ValueError, match="marks"):
+        net.encode(unmarked)
+
+
+def test_senses_are_what_the_configuration_names(device):
+    net = student(dataclasses.replace(SMALL, senses=("action", "position", "velocity")), device)
+    frame = {name: torch.full((3, ACTIONS), value) for name, value in (("action", 1.0), ("position", 2.0))}
+    frame["velocity"] = torch.full((3, ACTIONS), 15.0)
+    assert net.senses(frame).unique(dim=1).tolist() == [[1.0, 2.0, 3.0]] * 3
+    assert net.senses(frame).shape == (3, net.num_senses)
+    assert student(SMALL, device).senses(frame).tolist() == frame["action"].tolist()
+    with pytest.raises(ValueError, match="senses"):
+        dataclasses.replace(SMALL, senses=("velocity",)).validate()
 
 
 def sequence(net: Student, steps: int, worlds: int):

@@ -213,6 +213,7 @@ def test_another_network_or_no_teacher_is_explained(tmp_path, stage, capsys):
 def test_stages_on_the_command_line(tmp_path, capsys):
     """Stage 1 by imitation of an installed teacher, stage 2 from it, resumed; then its stopping rule."""
     small = ["--preset", "cpu-demo", "--num-worlds", "2", "--dagger.rollout-steps", "3", "--no-tensorboard"]
+    small += ["--dagger.validation-worlds", "1"]
     small += ["--task.at-rest", "False"]  # the search for poses at rest takes long
     assert main(["student", *small, "--run-dir", str(tmp_path / "stage1"), "--max-steps", "6"]) == 0
     second = ["student", *small, "--stage", "2", "--run-dir", str(tmp_path / "stage2")]

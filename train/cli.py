@@ -1,4 +1,4 @@
-"""Command line of training: ``vd-train teacher``, ``student``, ``calibrate``, ``export``, ``bundle`` ..."""
+"""Command line of training: ``vd-train`` and its commands."""
 
 import os
 import sys
@@ -29,6 +29,7 @@ USAGE = """usage: vd-train COMMAND [flags]
 commands:
   teacher   train the teacher with PPO           vd-train teacher --preset gpu --run-dir runs/first
   student   imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
+  profile   where a student's time goes          vd-train profile --stage 1 --teacher dclaw3-table
   calibrate choose when a student stops          vd-train calibrate student.pt --objects SET
   export    write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
             or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
@@ -107,6 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "teacher": _teacher,
         "student": _student,
         "calibrate": _calibrate,
+        "profile": _profile,
         "export": _export,
         "bundle": _bundle,
         "curves": _curves,
@@ -269,6 +271,12 @@ def _calibrate(arguments: list[str], started: float) -> int:
     from vd.train.student.cli import calibrate_command
 
     return calibrate_command(arguments, started)
+
+
+def _profile(arguments: list[str], started: float) -> int:
+    from vd.train.student.cli import profile_command
+
+    return profile_command(arguments, started)
 
 
 def _export(arguments: list[str], _started: float) -> int:

@@ -24,7 +24,8 @@ from vd.student.sites import Sites
 
 Frame = dict[str, torch.Tensor]
 """Tensors of N worlds: ``body_q`` [N, B, 7], ``goal_quat`` [N, 4], ``action`` [N, D] (smoothed, of the step
-before), ``distance`` [N] (true angle to the goal [rad]) and, with a camera, ``points`` [N, K, 3] (base frame
+before), ``position`` [rad] and ``velocity`` [rad/s] of the joints as their encoders report them [N, D],
+``distance`` [N] (true angle to the goal [rad]) and, with a camera, ``points`` [N, K, 3] (base frame
 [m])."""
 
 
@@ -41,23 +42,36 @@ def relative_rotation(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor
     return torch.cat([vector, aw * bw - (a * b).sum(dim=-1, keepdim=True)], dim=-1)
 
 
-def voxels(points: torch.Tensor, goal: slice, voxelise: Voxeliser, *, separate: bool, augment: bool) -> tuple:
+def voxels(
+    points: torch.Tensor,
+    clouds: SceneClouds,
+    voxelise: Voxeliser,
+    *,
+    network: StudentCfg,
+    augment: bool,
+) -> tuple[Sites, ...]:
     """Voxels of clouds as the student takes them: of all points, or of scene and goal apart.
 
     Args:
-        points: Points [m], shape [R, P, 3], the goal's first.
-        goal: Columns of the goal.
+        points: Points [m], shape [R, P, 3]: the goal's, the hand's, then others.
+        clouds: Which columns are the goal's and the hand's.
         voxelise: Makes the voxels.
-        separate: Whether the goal is a cloud of its own.
+        network: Whether the goal is a cloud of its own, and whether voxels are marked.
         augment: Add noise, as in training.
 
     Returns:
         Arguments of :meth:`vd.student.network.Student.encode`.
     """
-    if not separate:
-        return (voxelise(points, augment=augment),)
-    parts = (points[:, goal.stop :].contiguous(), points[:, goal].contiguous())
-    return tuple(voxelise(part, augment=augment) for part in parts)
+    goal, hand = clouds.goal.stop, clouds.hand.stop
+    marked = "marks" in network.encoder.inputs
+    if network.goal == "merged":
+        return (voxelise(points, augment=augment, ends=(goal, hand) if marked else ()),)
+    scene, own = points[:, goal:].contiguous(), points[:, :goal].contiguous()
+    # Marks are of goal and hand in both: the one has no goal, the other no hand.
+    return (
+        voxelise(scene, augment=augment, ends=(0, hand - goal) if marked else ()),
+        voxelise(own, augment=augment, ends=(goal, goal) if marked else ()),
+    )
 
 
 class StudentView:
@@ -96,7 +110,7 @@ class StudentView:
         env.acts_in_view = False  # the student sees the world as it is, whatever its teacher does
         self.device = wp.device_to_torch(env.device)
         scene = env.scene
-        self._separate = network.goal == "separate"
+        self._network = network
         self._clouds = SceneClouds(
             env.hand,
             env.objects,
@@ -138,7 +152,7 @@ class StudentView:
         self._goal = wp.to_torch(env.goal_quat)
         self._smoothed = wp.to_torch(env.smoothed)
         self._steps = wp.to_torch(env.step_count)
-        self._object = scene.object_body
+        self._object, self._joints = scene.object_body, env.num_actions
 
     def frame(self) -> Frame:
         """What there is to see before the next action: copies, so that later steps do not change them."""
@@ -149,6 +163,8 @@ class StudentView:
             "body_q": body_q,
             "goal_quat": self._goal.clone(),
             "action": self._smoothed.clone(),
+            "position": wp.to_torch(self.env.measured_q)[:, : self._joints].clone(),
+            "velocity": wp.to_torch(self.env.measured_qd)[:, : self._joints].clone(),
             "distance": rotation_distance(self._body_q[:, self._object, 3:], self._goal),
         }
         if self.camera is not None:
@@ -186,7 +202,7 @@ class StudentView:
         )
         if self.camera is not None:
             points[:, columns.start :] = frame["points"]
-        return voxels(points, self._clouds.goal, self._voxelise, separate=self._separate, augment=augment)
+        return voxels(points, self._clouds, self._voxelise, network=self._network, augment=augment)
 
     def state_dict(self) -> dict[str, Any]:
         """Random states and what the camera remembers, as NumPy arrays."""

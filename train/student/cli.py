@@ -100,6 +100,32 @@ def student_command(arguments: list[str], started: float) -> int:
     return 0
 
 
+def profile_command(arguments: list[str], _started: float) -> int:
+    """``vd-train profile``: flags as of ``vd-train student``; nothing is kept."""
+    from tempfile import TemporaryDirectory
+
+    with TemporaryDirectory() as folder:
+        cfg = parse_student(["--from-scratch", *arguments, "--run-dir", folder])
+
+        from vd.train.progress import waiting
+        from vd.train.student.dagger import Dagger
+        from vd.train.student.profile import profile_iteration
+
+        if cfg.stage == 0:
+            raise ValueError("--stage 0 has no iterations of imitation; give --stage 1 or 2")
+        with waiting("two iterations (the first start compiles the kernels: a minute or two)"):
+            learner = build_student(cfg).learner
+            assert isinstance(learner, Dagger)
+            times = profile_iteration(learner)
+            samples = learner.samples_per_iteration
+            learner.close()
+    whole = sum(times.values())
+    print(f"stage {cfg.stage}: an iteration of {samples} control steps takes {whole:.2f} s, of which")
+    for name, seconds in times.items():
+        print(f"  {name:34s} {seconds:8.3f} s  {seconds / whole:6.1%}")
+    return 0
+
+
 def calibrate_command(arguments: list[str], _started: float) -> int:
     """``vd-train calibrate``; the exit status."""
     cfg = tyro.cli(CalibrateCfg, args=arguments, prog="vd-train calibrate")

@@ -34,7 +34,12 @@ class DaggerCfg:
     epochs: int = PAPER.dagger.epochs
     """Passes over a rollout."""
     learning_rate: float = PAPER.dagger.learning_rate
-    """Of AdamW with amsgrad, constant."""
+    """Of AdamW, constant after the warm-up."""
+    warmup_steps: int = 0
+    """Optimiser steps over which the learning rate rises from 0, linearly; the released code has none."""
+    amsgrad: bool = True
+    """Never forget the largest gradients (released code). Those of the first steps are the largest of all,
+    and make all later steps small."""
     grad_norm: float = PAPER.dagger.grad_norm
     """Gradient norm is clipped to this."""
     imitation: Literal["likelihood", "squared"] = "likelihood"
@@ -45,9 +50,13 @@ class DaggerCfg:
     clip_labels: bool = False
     """Clip the teacher's mean to [-1, 1], where the environment clips actions; the released code does not."""
     teacher_share: float = PAPER.dagger.teacher_share
-    """Share of worlds and steps in which the teacher acts in the first iteration (beta of DAgger)."""
+    """Share of worlds in which the teacher acts, drawn for every rollout, in the first iteration (beta of
+    DAgger)."""
+    teacher_share_last: float = 0.0
+    """What that share comes to. With a rest of it the states near the goal stay among those learned from,
+    which a student that is not good yet does not reach."""
     teacher_share_iterations: int = 0
-    """Iterations over which that share falls to 0, linearly; 0: it stays."""
+    """Iterations over which it gets there, linearly; 0: it stays at the first."""
     keep_rollouts: int = 1
     """Rollouts to learn from, the latest and those before it; the released code keeps the latest alone.
     Passes stay as long: they take sequences at random from all that are kept."""
@@ -56,6 +65,8 @@ class DaggerCfg:
     is ever seen. Otherwise episodes go on, and each rollout starts with the memory of the one before."""
     same_scene: bool = False
     """Begin every rollout in the same states, with the same disturbances: can they be learned by heart?"""
+    validation_worlds: int = 0
+    """Worlds that nothing is learned from: their first episode is the fixed set of ``validation/*``."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """Of the encoder's products; memory, heads, losses and weights stay in fp32."""
 
@@ -156,13 +167,35 @@ def paper(stage: Stage) -> StudentTrainCfg:
     )
 
 
+SHORT_ROLLOUTS = DaggerCfg(
+    epochs=2,
+    learning_rate=1e-3,
+    warmup_steps=100,
+    amsgrad=False,
+    grad_norm=1.0,
+    imitation="squared",
+    clip_labels=True,
+    teacher_share=1.0,
+    teacher_share_last=0.2,
+    teacher_share_iterations=20,
+    keep_rollouts=8,
+    reset=False,
+)
+"""What learns soonest: a part of each episode at a time, learned with those before, the teacher at first."""
+
+
 def gpu(stage: Stage) -> StudentTrainCfg:
-    """One GPU: the lean network, whose distance head remembers, half precision, near goals in stage 0."""
+    """One GPU: the lean network, the student's own joints, rollouts kept, half precision.
+
+    The numbers of the released code do not learn in hours: docs/results/student.md.
+    """
     start = paper(stage)
     return replace(
         start,
         preset="gpu",
-        dagger=replace(start.dagger, clip_labels=True, precision="bf16"),
+        dagger=replace(
+            SHORT_ROLLOUTS, rollout_steps=40, minibatch_worlds=20, validation_worlds=20, precision="bf16"
+        ),
         pretrain=PretrainCfg(near_share=0.5, precision="bf16"),
         network=LEAN,
     )
@@ -177,13 +210,13 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
         run=RunCfg(
             run_dir=RUNS / f"cpu-stage{stage}", device="cpu", save_every=5, max_minutes=7.0, max_steps=16_000
         ),
-        dagger=DaggerCfg(
+        dagger=replace(
+            SHORT_ROLLOUTS,
             rollout_steps=20,
             minibatch_worlds=4,
             epochs=4,
-            learning_rate=1e-3,
             keep_rollouts=50,
-            clip_labels=True,
+            validation_worlds=2,
         ),
         pretrain=PretrainCfg(batch=64, steps=10, learning_rate=1e-3, near_share=0.5),
         task=StudentTaskCfg(num_worlds=16),
@@ -207,7 +240,9 @@ def cpu_overfit(stage: Stage) -> StudentTrainCfg:
             minibatch_worlds=1,
             epochs=8,
             keep_rollouts=1,
-            teacher_share=1.0,
+            teacher_share_last=1.0,
+            validation_worlds=0,
+            reset=True,
             same_scene=True,
         ),
         task=replace(start.task, num_worlds=1),
@@ -262,6 +297,8 @@ def validate(cfg: StudentTrainCfg) -> None:
     weights = {
         "--dagger.distance-weight": dagger.distance_weight,
         "--dagger.teacher-share-iterations": dagger.teacher_share_iterations,
+        "--dagger.warmup-steps": dagger.warmup_steps,
+        "--dagger.validation-worlds": dagger.validation_worlds,
         "--pretrain.category-weight": pretrain.category_weight,
         "--pretrain.distance-weight": pretrain.distance_weight,
         "--pretrain.joint-weight": pretrain.joint_weight,
@@ -269,7 +306,11 @@ def validate(cfg: StudentTrainCfg) -> None:
     for flag, value in weights.items():
         if value < 0:
             raise ValueError(f"{flag} is {value}; it must not be negative")
-    shares = {"--dagger.teacher-share": dagger.teacher_share, "--pretrain.near-share": pretrain.near_share}
+    shares = {
+        "--dagger.teacher-share": dagger.teacher_share,
+        "--dagger.teacher-share-last": dagger.teacher_share_last,
+        "--pretrain.near-share": pretrain.near_share,
+    }
     for flag, share in shares.items():
         if not 0.0 <= share <= 1.0:
             raise ValueError(f"{flag} is {share}; it has to be in [0, 1]")

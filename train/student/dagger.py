@@ -14,16 +14,18 @@ import torch
 from torch import nn
 
 from vd.policy import Policy
-from vd.student.network import Student
+from vd.student.network import Student, StudentOutput
 from vd.student.sites import Sites
 from vd.train.ending import TrainingDivergedError
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import DaggerCfg
-from vd.train.student.losses import distance_loss, imitation_loss
+from vd.train.student.losses import distance_loss, imitation_loss, unexplained
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 
 STATISTICS = ("loss/imitation", "loss/distance", "loss/grad_norm")
 """What every minibatch reports."""
+UNCLIPPED = ("points",)
+"""Frames' tensors that hold NaN on purpose: where there is no point."""
 LOWER_RATES = "lower --dagger.learning-rate or --dagger.grad-norm, or take --dagger.precision fp32"
 """Remedy for a network that diverges."""
 
@@ -32,7 +34,7 @@ class View(Protocol):
     """What the student sees of the environment (:class:`vd.vision.StudentView`)."""
 
     def frame(self) -> dict[str, torch.Tensor]:
-        """Tensors [N, ...] of the present state, among them ``action`` [N, D] and ``distance`` [N]."""
+        """Tensors [N, ...] of the present state, among them the student's senses and ``distance`` [N]."""
         ...
 
     def sites(
@@ -74,6 +76,9 @@ class Dagger:
     episodes. As in the released code only the latest rollout is learned from, unless more are to be kept. In
     rollouts batch norms use their running statistics, as they do where the student is deployed.
 
+    The last worlds may be held out: nothing is learned from them, and their sequences of the first episode
+    are the fixed set on which each iteration measures the error, whatever states the student comes to.
+
     Args:
         env: The worlds.
         view: What the student sees of them.
@@ -95,7 +100,7 @@ class Dagger:
     ) -> None:
         self.env, self.view, self.student, self.teacher, self.cfg = env, view, student, teacher, cfg
         self.device = torch.device(env.device)
-        self.optimizer = make_optimizer(student, cfg.learning_rate)
+        self.optimizer = make_optimizer(student, cfg.learning_rate, amsgrad=cfg.amsgrad)
         self.samples_per_iteration = cfg.rollout_steps * env.num_envs
         self.iteration = 0
         """Iterations completed; decides the teacher's share."""
@@ -105,6 +110,16 @@ class Dagger:
         self._means = StepMeans()
         self._scene: dict[str, Any] | None = None
         self._kept: deque[Rollout] = deque(maxlen=cfg.keep_rollouts)
+        self._held_out: list[Rollout] = []
+        self._steps_done = 0
+        self._figures: dict[str, torch.Tensor] = {}
+        self._episode_rollouts = math.ceil(env.max_episode_length / cfg.rollout_steps)
+        self._learned_worlds = env.num_envs - cfg.validation_worlds
+        if self._learned_worlds < 1:
+            raise ValueError(
+                f"--dagger.validation-worlds {cfg.validation_worlds} leaves none of {env.num_envs} worlds to "
+                "learn from; give fewer, or more --num-worlds"
+            )
 
     def iterate(self, stopping: Callable[[], bool]) -> dict[str, float | None] | None:
         """One rollout and update.
@@ -122,25 +137,36 @@ class Dagger:
         rollout = self.collect(stopping)
         if rollout is None:
             return None
-        means = self._means.read(self._world_size)
+        means = self._means.read(self._world_size) | self._read(self._figures)
         collected = time.perf_counter()
         self._kept.append(rollout)
-        losses = self.update(merged(self._kept))
+        if self.cfg.validation_worlds and len(self._held_out) < self._episode_rollouts:
+            held_out = torch.arange(self._learned_worlds, self.env.num_envs, device=self.device)
+            self._held_out.append(taken([rollout], held_out))
+        losses = self.update(list(self._kept))
+        learned = time.perf_counter()
+        figures = self.validate()
         self.iteration += 1
         return {
             "collect_s": round(collected - start, 4),
-            "learn_s": round(time.perf_counter() - collected, 4),
+            "learn_s": round(learned - collected, 4),
             **self._window.add(means),
             **means,
             **self.env.end_iteration(),
             **losses,
+            **figures,
         }
 
     def teacher_share(self) -> float:
-        """Share of worlds and steps in which the teacher acts in this iteration."""
-        if self.cfg.teacher_share_iterations == 0:
-            return self.cfg.teacher_share
-        return self.cfg.teacher_share * max(0.0, 1.0 - self.iteration / self.cfg.teacher_share_iterations)
+        """Share of worlds in which the teacher acts in this iteration."""
+        first, last, iterations = (
+            self.cfg.teacher_share,
+            self.cfg.teacher_share_last,
+            self.cfg.teacher_share_iterations,
+        )
+        if iterations == 0:
+            return first
+        return first + (last - first) * min(1.0, self.iteration / iterations)
 
     def collect(self, stopping: Callable[[], bool] = lambda: False) -> Rollout | None:
         """Let the student act, and the teacher label; ``None`` if ``stopping`` said so on the way."""
@@ -149,9 +175,12 @@ class Dagger:
         if cfg.reset:
             self._begin_episodes()
             self._hidden = self.student.initial_hidden(worlds)
-        first, share = self._hidden, self.teacher_share()
+        first = self._hidden
+        # Whole rollouts of a world: mixed from step to step it would be what neither of the two does.
+        taught = torch.rand((worlds, 1), device=self.device) < self.teacher_share()
         frames: dict[str, torch.Tensor] = {}
         labels: list[torch.Tensor] = []
+        means: list[torch.Tensor] = []
         done = torch.zeros((cfg.rollout_steps, worlds), dtype=torch.bool, device=self.device)
         with torch.no_grad():
             observation = self.env.get_observations()
@@ -162,35 +191,63 @@ class Dagger:
                 frame = self.view.frame()
                 for name, value in frame.items():
                     if step == 0:
-                        frames[name] = value.new_empty((cfg.rollout_steps, *value.shape))
+                        # A tenth of a millimetre is lost of camera points, and half of the memory won.
+                        dtype = torch.half if name in UNCLIPPED else value.dtype
+                        frames[name] = value.new_empty((cfg.rollout_steps, *value.shape), dtype=dtype)
                     frames[name][step] = value
                 labels.append(self._label(observation[OBSERVATION_GROUP]))
                 sites = self.view.sites(frame, augment=True)
-                output = self.student(self._encode(sites)[None], frame["action"][None], self._hidden)
+                senses = self.student.senses(frame)
+                output = self.student(self._encode(sites)[None], senses[None], self._hidden)
                 action, std = output.mean[0], output.log_std[0].exp()
-                log = imitation_log(output.distance[0, :, -1], frame["distance"], action, labels[-1])
+                means.append(action)
+                error = (output.distance[0, :, -1] - frame["distance"]).abs().mean()
                 if cfg.imitation == "likelihood":
                     action = action + std * torch.randn_like(action)
-                if share > 0.0:
-                    teacher = torch.rand((worlds, 1), device=self.device) < share
-                    action = torch.where(teacher, labels[-1], action)
+                action = torch.where(taught, labels[-1], action)
                 observation, _, ended, extras = self.env.step(action)
                 done[step] = ended.bool()
                 self._hidden = output.hidden.masked_fill(done[step, :, None], 0.0)
-                log |= extras["log"]
+                log = {"student/distance_error": error, **extras["log"]}
                 if cfg.reset and step == cfg.rollout_steps - 1:
                     # Goals that the end of the rollout cuts off would be in no count otherwise.
                     log["task/timed_out"] = log["task/timed_out"] + (~done[step]).float().mean()
                 self._means.add(log | {"policy/std": std.mean()})
         rollout = Rollout(frames, torch.stack(labels), done, first, torch.arange(worlds, device=self.device))
+        own = ~taught[:, 0] if not bool(taught.all()) else taught[:, 0]
+        self._figures = imitation_figures("student", torch.stack(means)[:, own], rollout.label[:, own])
         self._check_rollout(rollout)
         return rollout
 
-    def update(self, rollout: Rollout) -> dict[str, float]:
-        """All passes over a rollout; means of :data:`STATISTICS` over its minibatches."""
+    def validate(self) -> Mapping[str, float | None]:
+        """Error on the sequences that were held out, without noise; none before an episode of them is there.
+
+        The memory runs on through the whole episode, as the student's own does.
+        """
+        if not self.cfg.validation_worlds:
+            return {}
+        names = ("action_error", "zero_error", "unexplained", "distance_error")
+        if len(self._held_out) < self._episode_rollouts:
+            return {f"validation/{name}": None for name in names}
+        self.student.eval()
+        hidden = self.student.initial_hidden(self.cfg.validation_worlds)
+        means, errors = [], []
+        with torch.no_grad():
+            for part in self._held_out:
+                output = self._run(part, hidden, augment=False)
+                hidden = output.hidden.masked_fill(part.done[-1, :, None], 0.0)
+                means.append(output.mean)
+                errors.append((output.distance[..., -1] - part.frames["distance"]).abs())
+        label = torch.cat([part.label for part in self._held_out])
+        figures = imitation_figures("validation", torch.cat(means), label)
+        figures["validation/distance_error"] = torch.cat(errors).mean()
+        return self._read(figures)
+
+    def update(self, rollouts: Sequence[Rollout]) -> dict[str, float]:
+        """All passes over rollouts; means of :data:`STATISTICS` over its minibatches."""
         self.student.train()
-        batches = self.minibatches(len(rollout.worlds))
-        steps = torch.stack([self._minibatch_step(rollout, sequences) for sequences in batches])
+        batches = self.minibatches(len(rollouts))
+        steps = torch.stack([self._minibatch_step(taken(rollouts, sequences)) for sequences in batches])
         if self._world_size > 1:
             # Each process averaged its own batch statistics; from here on all use those of the first.
             for buffer in self.student.buffers():
@@ -203,34 +260,35 @@ class Dagger:
             )
         return losses
 
-    def minibatches(self, sequences: int) -> Iterator[torch.Tensor]:
+    def minibatches(self, rollouts: int) -> Iterator[torch.Tensor]:
         """Sequences of each optimiser step: as many a pass as there are worlds, none twice, in a new order.
 
-        Of the latest rollout alone that is every world once. The last minibatch of a pass may be smaller.
+        Sequence n of rollout k is number k N + n; those of worlds that are held out never come. Of the latest
+        rollout alone that is every other world once. The last minibatch of a pass may be smaller.
         """
+        learned, worlds = self._learned_worlds, self.env.num_envs
         for _ in range(self.cfg.epochs):
-            order = torch.randperm(sequences, device=self.device)[: self.env.num_envs]
-            yield from order.split(self.cfg.minibatch_worlds)
+            order = torch.randperm(rollouts * learned, device=self.device)[:learned]
+            yield from (order // learned * worlds + order % learned).split(self.cfg.minibatch_worlds)
 
-    def losses(self, rollout: Rollout, sequences: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Imitation and distance loss of some sequences, with new noise on their clouds."""
-        frames = {name: value[:, sequences] for name, value in rollout.frames.items()}
-        steps, count = frames["action"].shape[:2]
-        flat = {name: value.flatten(0, 1) for name, value in frames.items()}
-        sites = self.view.sites(flat, rollout.worlds[sequences].repeat(steps), augment=True)
-        embedding = self._encode(sites).view(steps, count, -1)
-        hidden, done = rollout.hidden[sequences], rollout.done[:, sequences]
-        output = self.student(embedding, frames["action"], hidden, done)
-        imitation = imitation_loss(output, rollout.label[:, sequences], self.cfg.imitation)
-        return imitation, distance_loss(output.distance, frames["distance"])
+    def losses(self, rollout: Rollout) -> tuple[torch.Tensor, torch.Tensor]:
+        """Imitation and distance loss of sequences, with new noise on their clouds."""
+        output = self._run(rollout, rollout.hidden, augment=True)
+        imitation = imitation_loss(output, rollout.label, self.cfg.imitation, bounded=self.cfg.clip_labels)
+        return imitation, distance_loss(output.distance, rollout.frames["distance"])
 
     def state_dict(self) -> dict[str, Any]:
         """What all processes share besides the network: optimiser, and the window of rates."""
-        return {"optimizer": self.optimizer.state_dict(), "window": self._window.state_dict()}
+        return {
+            "optimizer": self.optimizer.state_dict(),
+            "steps": self._steps_done,
+            "window": self._window.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
         """Restore what :meth:`state_dict` gave."""
         self.optimizer.load_state_dict(state["optimizer"])
+        self._steps_done = state["steps"]
         self._window.load_state_dict(state["window"])
         self.iteration = iteration
 
@@ -244,6 +302,7 @@ class Dagger:
             "hidden": self._hidden.cpu(),
             "scene": self._scene,
             "rollouts": [moved(rollout, "cpu") for rollout in kept],
+            "held_out": [moved(rollout, "cpu") for rollout in self._held_out],
         }
 
     def load_local_state(self, state: dict[str, Any]) -> None:
@@ -254,6 +313,7 @@ class Dagger:
         self._scene = state["scene"]
         self._kept.clear()
         self._kept.extend(Rollout(**moved(rollout, self.device)) for rollout in state["rollouts"])
+        self._held_out = [Rollout(**moved(rollout, self.device)) for rollout in state["held_out"]]
 
     def fits(self, ranks: list[dict[str, Any]]) -> str:
         """Why the worlds of a checkpoint cannot be restored; empty if they can."""
@@ -285,9 +345,20 @@ class Dagger:
         with autocast(self.device, self.cfg.precision):
             return self.student.encode(*sites).float()
 
-    def _minibatch_step(self, rollout: Rollout, sequences: torch.Tensor) -> torch.Tensor:
+    def _run(self, rollout: Rollout, hidden: torch.Tensor, *, augment: bool) -> StudentOutput:
+        """What the student says to sequences of frames, with memory before the first of them [N, G]."""
+        steps, count = rollout.done.shape
+        flat = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
+        sites = self.view.sites(flat, rollout.worlds.repeat(steps), augment=augment)
+        embedding = self._encode(sites).view(steps, count, -1)
+        return self.student(embedding, self.student.senses(rollout.frames), hidden, rollout.done)
+
+    def _minibatch_step(self, rollout: Rollout) -> torch.Tensor:
         """One optimiser step; :data:`STATISTICS` on the device."""
-        imitation, distance = self.losses(rollout, sequences)
+        imitation, distance = self.losses(rollout)
+        self._steps_done += 1
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.cfg.learning_rate * min(1.0, self._steps_done / max(1, self.cfg.warmup_steps))
         norm = descend(
             self.student,
             self.optimizer,
@@ -297,10 +368,19 @@ class Dagger:
         )
         return torch.stack((imitation.detach(), distance.detach(), norm))
 
+    def _read(self, figures: dict[str, torch.Tensor]) -> dict[str, float]:
+        """Scalars averaged over the processes; waits for the device."""
+        values = torch.stack(tuple(figures.values()))
+        if self._world_size > 1:
+            torch.distributed.all_reduce(values)
+            values /= self._world_size
+        return dict(zip(figures, values.tolist(), strict=True))
+
     def _check_rollout(self, rollout: Rollout) -> None:
         """Stop before an update on values that are not finite."""
         tensors = {"the teacher's actions": rollout.label, **rollout.frames}
-        tensors.pop("points", None)  # where there is no point it is NaN, on purpose
+        for name in UNCLIPPED:
+            tensors.pop(name, None)
         finite = torch.stack([torch.isfinite(tensor).all() for tensor in tensors.values()]).tolist()
         bad = [name for name, good in zip(tensors, finite, strict=True) if not good]
         if bad or not bool(torch.isfinite(self._hidden).all()):
@@ -309,16 +389,20 @@ class Dagger:
             raise TrainingDivergedError(f"{what} not finite in the rollout; {LOWER_RATES}")
 
 
-def merged(rollouts: Sequence[Rollout]) -> Rollout:
-    """The sequences of several rollouts of equal length as one."""
-    if len(rollouts) == 1:
-        return rollouts[0]
+def taken(rollouts: Sequence[Rollout], sequences: torch.Tensor) -> Rollout:
+    """Some sequences of rollouts of N worlds each, as one: number k N + n is sequence n of rollout k."""
+    worlds = len(rollouts[0].worlds)
+    parts = []
+    for index, rollout in enumerate(rollouts):
+        own = sequences[sequences // worlds == index] - index * worlds if len(rollouts) > 1 else sequences
+        if len(own):
+            parts.append((rollout, own))
     return Rollout(
-        {name: torch.cat([one.frames[name] for one in rollouts], dim=1) for name in rollouts[0].frames},
-        torch.cat([one.label for one in rollouts], dim=1),
-        torch.cat([one.done for one in rollouts], dim=1),
-        torch.cat([one.hidden for one in rollouts]),
-        torch.cat([one.worlds for one in rollouts]),
+        {name: torch.cat([r.frames[name][:, own] for r, own in parts], dim=1) for name in rollouts[0].frames},
+        torch.cat([r.label[:, own] for r, own in parts], dim=1),
+        torch.cat([r.done[:, own] for r, own in parts], dim=1),
+        torch.cat([r.hidden[own] for r, own in parts]),
+        torch.cat([r.worlds[own] for r, own in parts]),
     )
 
 
@@ -331,19 +415,27 @@ def moved(rollout: Rollout | dict[str, Any], device: str | torch.device) -> dict
     }
 
 
-def imitation_log(
-    predicted: torch.Tensor, true: torch.Tensor, action: torch.Tensor, label: torch.Tensor
-) -> dict[str, torch.Tensor]:
-    """Errors of a step of N worlds while the student acts: root mean square of actions, distances [rad]."""
+def imitation_figures(prefix: str, mean: torch.Tensor, label: torch.Tensor) -> dict[str, torch.Tensor]:
+    """How far the student's mean actions are from labels [T, N, D], beside what says nothing of the state.
+
+    Returns:
+        Scalars on the device: ``action_error``, the root mean square of the difference of what the
+        environment makes of both; ``zero_error``, the same of no action; ``unexplained``, the share of the
+        labels' variance that is left (1: no better than the best constant action).
+    """
+    mean, label = mean.clamp(-1.0, 1.0), label.clamp(-1.0, 1.0)
     return {
-        "student/action_error": (action - label).square().mean().sqrt(),
-        "student/distance_error": (predicted - true).abs().mean(),
+        f"{prefix}/action_error": (mean - label).square().mean().sqrt(),
+        f"{prefix}/zero_error": label.square().mean().sqrt(),
+        f"{prefix}/unexplained": unexplained(mean, label),
     }
 
 
-def make_optimizer(student: nn.Module, learning_rate: float) -> torch.optim.Optimizer:
-    """AdamW with amsgrad, as in the released code."""
-    return torch.optim.AdamW(student.parameters(), lr=learning_rate, amsgrad=True)
+def make_optimizer(
+    network: nn.Module, learning_rate: float, *, amsgrad: bool = True
+) -> torch.optim.Optimizer:
+    """AdamW, with amsgrad as in the released code."""
+    return torch.optim.AdamW(network.parameters(), lr=learning_rate, amsgrad=amsgrad)
 
 
 def autocast(device: torch.device, precision: str) -> torch.autocast:

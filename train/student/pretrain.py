@@ -65,7 +65,7 @@ class RandomScenes:
     ) -> None:
         links = len(hand.link_names)
         self._objects, self._batch, self._near_share = len(objects), batch, near_share
-        self._device, self._separate = torch.device(wp.device_to_torch(device)), network.goal == "separate"
+        self._device, self._network = torch.device(wp.device_to_torch(device)), network
         self._scales, self._augment = len(scales), noise is not None
         # A "world" for each object in each size.
         self._clouds = SceneClouds(
@@ -114,9 +114,9 @@ class RandomScenes:
         )
         sites = voxels(
             wp.to_torch(self._points),
-            self._clouds.goal,
+            self._clouds,
             self._voxelise,
-            separate=self._separate,
+            network=self._network,
             augment=self._augment,
         )
         targets = {

@@ -134,7 +134,7 @@ class ControlStep:
         size = self.clouds.item.start + self.camera.cloud.points.shape[1]
         self.points = wp.empty((1, size), dtype=wp.vec3, device="cpu")
         self.voxelise = Voxeliser(net.cfg.voxel_m)
-        self.previous = torch.zeros(1, net.num_actions)
+        self.senses = torch.zeros(1, net.num_senses)
         self.hidden = net.initial_hidden(1)
         self.sites: Sites | None = None
 
@@ -151,16 +151,18 @@ class ControlStep:
 
     def voxels(self) -> None:
         """Points to voxels."""
-        self.sites = self.voxelise(self.points)
+        self.sites = self.voxelise(self.points, ends=(self.clouds.goal.stop, self.clouds.hand.stop))
 
     def act(self) -> np.ndarray:
         """Voxels, previous action and memory to the next action [D]."""
         assert self.sites is not None
         # Fresh maps each time: those of this cloud would else be kept.
         sites = Sites(self.sites.keys, self.sites.clouds)
-        output = self.net.act(sites, self.previous, self.hidden)
-        self.previous, self.hidden = output.mean.clamp(-1.0, 1.0), output.hidden
-        return self.previous.numpy()[0]
+        sites.marks = self.sites.marks
+        output = self.net.act(sites, self.senses, self.hidden)
+        action, self.hidden = output.mean.clamp(-1.0, 1.0), output.hidden
+        self.senses[:, : self.net.num_actions] = action
+        return action.numpy()[0]
 
     def __call__(self) -> np.ndarray:
         """The whole step."""
@@ -314,7 +316,7 @@ def measure_training(
     place = torch.device(wp.device_to_torch(wp.get_device(device)))
     net = Student(PRESETS[network], load_hand(hand).num_joints).to(place)
     voxelise = Voxeliser(net.cfg.voxel_m, noise=NoiseCfg(), clouds=clouds, seed=seed, device=device)
-    previous = torch.zeros(steps, worlds, net.num_actions, device=place)
+    senses = torch.zeros(steps, worlds, net.num_senses, device=place)
     on_gpu = place.type == "cuda"
     marks: dict[str, list[float]] = {}
     sizes: list[int] = []
@@ -340,7 +342,8 @@ def measure_training(
     def prepare(start: float, *, augment: bool) -> tuple[Sites, float]:
         scenes.write()
         start = stop("points", start)
-        sites = voxelise(scenes.points, augment=augment)
+        ends = (scenes.clouds.goal.stop, scenes.clouds.hand.stop)
+        sites = voxelise(scenes.points, augment=augment, ends=ends)
         start = stop("voxels", start)
         build(sites)
         sizes.append(len(sites))
@@ -350,9 +353,7 @@ def measure_training(
         net.train()
         sites, start = prepare(time.perf_counter(), augment=True)
         with torch.autocast(place.type, dtype=torch.bfloat16, enabled=half):
-            output = net(
-                net.encode(sites).unflatten(0, (steps, worlds)), previous, net.initial_hidden(worlds)
-            )
+            output = net(net.encode(sites).unflatten(0, (steps, worlds)), senses, net.initial_hidden(worlds))
             loss = output.mean.square().mean() + output.log_std.mean() + output.distance.square().mean()
         start = stop("forward", start)
         loss.backward()
@@ -363,7 +364,7 @@ def measure_training(
         net.eval()
         with torch.inference_mode(), torch.autocast(place.type, dtype=torch.bfloat16, enabled=half):
             sites, _ = prepare(time.perf_counter(), augment=False)
-            net.act(sites, previous[0].repeat(steps, 1), net.initial_hidden(clouds))
+            net.act(sites, senses[0].repeat(steps, 1), net.initial_hidden(clouds))
 
     def seconds(function: Callable[[], None]) -> float:
         function()

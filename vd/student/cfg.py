@@ -6,6 +6,8 @@ from typing import Literal
 from vd.paper import PAPER
 
 DistancePlace = Literal["before", "after"]
+VoxelInput = Literal["constant", "position", "marks"]
+Sense = Literal["action", "position", "velocity"]
 
 STD_RANGE = (0.02, 1.0)
 """Standard deviation of the student's actions, as of the teachers trained here: always some exploration."""
@@ -53,13 +55,19 @@ class EncoderCfg:
     """Stages, from the first, that halve the grid once more by max pooling after their first convolution."""
     embedding: int = PAPER.student.embedding
     """Width of the embedding."""
+    inputs: tuple[VoxelInput, ...] = ("constant", "position", "marks")
+    """What the network reads of every voxel. constant: the same number of each, all that the paper has; then
+    only neighbours tell a voxel of the goal from one of the scene. position: where its centre is in the
+    hand's base frame. marks: whether it holds points of the goal, and of the hand's own model."""
     feature: float = PAPER.cloud.feature
-    """The one feature of every voxel."""
+    """The constant feature."""
 
     def validate(self) -> None:
         """Raise ``ValueError`` for sizes that make no network, naming the field."""
         if not self.channels or min(self.channels) < 1:
             raise ValueError(f"encoder.channels = {self.channels} must name the width of at least one stage")
+        if not self.inputs or len(set(self.inputs)) != len(self.inputs):
+            raise ValueError(f"encoder.inputs = {self.inputs} must name some inputs, none twice")
         if self.blocks < 0 or self.embedding < 1:
             raise ValueError("encoder.blocks must not be negative and encoder.embedding be positive")
         if not 0 <= self.pooled_stages <= len(self.channels):
@@ -76,8 +84,11 @@ class StudentCfg:
     """Side of a voxel [m]."""
     goal: Literal["merged", "separate"] = "merged"
     """Goal and scene as one cloud, or with an encoder each."""
-    action_hidden: int = PAPER.student.action_hidden
-    """Width of the layers for the previous action."""
+    senses: tuple[Sense, ...] = ("action", "position", "velocity")
+    """What it knows of itself besides clouds: the previous action (all that the paper has), positions and
+    velocities of the joints, as the encoders report them."""
+    action_hidden: int = 128
+    """Width of the layers for the senses."""
     memory: int = PAPER.student.memory
     """Width of the GRU."""
     head_hidden: int = PAPER.student.head_hidden
@@ -95,6 +106,8 @@ class StudentCfg:
     def validate(self) -> None:
         """Raise ``ValueError`` for what cannot be built, naming the field."""
         self.encoder.validate()
+        if "action" not in self.senses or len(set(self.senses)) != len(self.senses):
+            raise ValueError(f"student.senses = {self.senses} must hold action, and nothing twice")
         if not self.voxel_m > 0.0:
             raise ValueError(f"student.voxel_m = {self.voxel_m} must be positive")
         if len(set(self.distance)) != len(self.distance) or not self.distance:
@@ -110,7 +123,9 @@ LEAN = StudentCfg()
 
 PAPER_NETWORK = replace(
     LEAN,
-    encoder=EncoderCfg(channels=PAPER.student.channels),
+    encoder=EncoderCfg(channels=PAPER.student.channels, inputs=("constant",)),
+    senses=("action",),
+    action_hidden=PAPER.student.action_hidden,
     distance=("before",),
     std_range=None,
 )

@@ -12,6 +12,7 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.kernels.kinematics import Joints, forward_kinematics_kernel
 from vd.kernels.link_points import CloudModel, link_points_kernel
 from vd.kernels.rng import init_rng_kernel
+from vd.kernels.voxel_marks import mark_voxels
 from vd.kernels.voxels import CloudNoise, draw_noise, voxelise
 from vd.paper import PAPER
 from vd.student.cfg import NoiseCfg
@@ -165,6 +166,7 @@ class Voxeliser:
         self.voxel_m = voxel_m
         self.device = device
         self._noise: wp.array | None = None
+        self._ends: dict[tuple[int, ...], wp.array] = {}
         self.rng = wp.empty(clouds, dtype=wp.uint32, device=device)
         """Random stream of each cloud of a batch, shape [clouds]."""
         if noise is not None:
@@ -176,13 +178,17 @@ class Voxeliser:
             self._noise = wp.array([values], dtype=CloudNoise, device=device)
             wp.launch(init_rng_kernel, dim=clouds, inputs=[seed], outputs=[self.rng], device=device)
 
-    def __call__(self, points: wp.array | torch.Tensor, *, augment: bool = False) -> Sites:
+    def __call__(
+        self, points: wp.array | torch.Tensor, *, augment: bool = False, ends: tuple[int, ...] = ()
+    ) -> Sites:
         """Voxels of clouds.
 
         Args:
             points: Points [m], shape [B, P] of vectors, or [B, P, 3] as a tensor; those not finite count
                 for nothing.
             augment: Add noise, as in training.
+            ends: Columns at which groups of points end, one group after the other from the first column on.
+                Voxels are marked by the groups of which they hold points (``marks`` of the result).
 
         Raises:
             ValueError: Noise is asked for where none was prepared, or for more clouds than were.
@@ -197,4 +203,9 @@ class Voxeliser:
                     f"no noise for {clouds} clouds: make the voxeliser with noise and as many clouds"
                 )
             draw = draw_noise(self._noise, self.rng[:clouds])
-        return Sites(voxelise(points, self.voxel_m, draw), clouds)
+        sites = Sites(voxelise(points, self.voxel_m, draw), clouds)
+        if ends:
+            if ends not in self._ends:
+                self._ends[ends] = wp.array(ends, dtype=wp.int32, device=self.device)
+            sites.marks = wp.to_torch(mark_voxels(sites.keys, points, self.voxel_m, self._ends[ends], draw))
+        return sites

@@ -4,15 +4,23 @@ T steps, N worlds, B = T N or N clouds, D actions, E the embedding, G the memory
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
 from torch import nn
 
+from vd.paper import PAPER
 from vd.student.cfg import EncoderCfg, StudentCfg
 from vd.student.sites import Sites
 from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool
 
+POSITION_SCALE_M = 0.1
+"""Positions of voxels are given in units of this: about the size of the scene."""
+VELOCITY_SCALE = PAPER.observation.velocity_scale
+"""Factor on joint velocities, as in the teacher's observation."""
+INPUT_WIDTHS = {"constant": 1, "position": 3, "marks": 2}
+"""Features of a voxel by the name of the input."""
 BROAD = 2.0
 """Bias with which a bounded standard deviation starts in the upper part of its (logarithmic) range."""
 
@@ -73,10 +81,10 @@ class VoxelEncoder(nn.Module):
     ``encoder.bfloat16()`` halves the time on a processor that multiplies in that precision.
     """
 
-    def __init__(self, cfg: EncoderCfg):
+    def __init__(self, cfg: EncoderCfg, voxel_m: float = PAPER.cloud.voxel_m):
         super().__init__()
-        self.feature = cfg.feature
-        widths = (1, *cfg.channels)
+        self.inputs, self.feature, self.voxel_m = cfg.inputs, cfg.feature, voxel_m
+        widths = (sum(INPUT_WIDTHS[name] for name in cfg.inputs), *cfg.channels)
         self.stages = nn.ModuleList(
             EncoderStage(inner, outer, cfg.blocks, pooled=i < cfg.pooled_stages)
             for i, (inner, outer) in enumerate(zip(widths, cfg.channels, strict=False))
@@ -84,9 +92,28 @@ class VoxelEncoder(nn.Module):
         self.final = nn.Linear(2 * cfg.channels[-1], cfg.embedding)
         self.projector = nn.Linear(cfg.embedding, cfg.embedding)
 
+    def features(self, sites: Sites) -> torch.Tensor:
+        """What is read of each voxel [M, C].
+
+        Raises:
+            ValueError: Marks are read, but the voxeliser was not asked for them.
+        """
+        weight, parts = self.final.weight, []
+        for name in self.inputs:
+            if name == "constant":
+                parts.append(weight.new_full((len(sites), 1), self.feature))
+            elif name == "position":
+                scale = self.voxel_m / POSITION_SCALE_M
+                parts.append((scale * (sites.coordinates[:, 1:] + 0.5)).to(weight.dtype))
+            elif sites.marks is None:
+                raise ValueError("the network reads marks of voxels; give the voxeliser the groups of points")
+            else:
+                parts.append(sites.marks.to(weight.dtype))
+        return torch.cat(parts, dim=1)
+
     def pooled(self, sites: Sites) -> torch.Tensor:
         """Largest and mean features of the last stage [B, 2 C], of the clouds of ``sites`` (level 0)."""
-        features = self.final.weight.new_full((len(sites), 1), self.feature)
+        features = self.features(sites)
         for stage in self.stages:
             features, sites = stage(features, sites)
         return global_pool(features, sites).to(self.final.weight.dtype)
@@ -117,12 +144,13 @@ class Student(nn.Module):
         cfg.validate()
         self.cfg = cfg
         self.num_actions = num_actions
+        self.num_senses = len(cfg.senses) * num_actions
         width = cfg.encoder.embedding
-        self.encoder = VoxelEncoder(cfg.encoder)
-        self.goal_encoder = VoxelEncoder(cfg.encoder) if cfg.goal == "separate" else None
+        self.encoder = VoxelEncoder(cfg.encoder, cfg.voxel_m)
+        self.goal_encoder = VoxelEncoder(cfg.encoder, cfg.voxel_m) if cfg.goal == "separate" else None
         self.merge_goal = nn.Linear(2 * width, width) if cfg.goal == "separate" else None
         self.action_layers = nn.Sequential(
-            nn.Linear(num_actions, cfg.action_hidden),
+            nn.Linear(self.num_senses, cfg.action_hidden),
             nn.GELU(),
             nn.Linear(cfg.action_hidden, cfg.action_hidden),
         )
@@ -144,6 +172,18 @@ class Student(nn.Module):
                 for place in cfg.distance
             }
         )
+
+    def senses(self, frame: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """What the student knows of itself [.., S].
+
+        Args:
+            frame: ``action`` [.., D], the (smoothed) action before the step, and as far as the configuration
+                names them ``position`` [rad] and ``velocity`` [rad/s] of the joints [.., D].
+        """
+        parts = [
+            frame[name] * VELOCITY_SCALE if name == "velocity" else frame[name] for name in self.cfg.senses
+        ]
+        return torch.cat(parts, dim=-1)
 
     def initial_hidden(self, worlds: int) -> torch.Tensor:
         """The memory at the start of an episode: zeros [N, G]."""
@@ -175,7 +215,7 @@ class Student(nn.Module):
     def forward(
         self,
         embedding: torch.Tensor,
-        previous_action: torch.Tensor,
+        senses: torch.Tensor,
         hidden: torch.Tensor,
         done: torch.Tensor | None = None,
     ) -> StudentOutput:
@@ -183,11 +223,11 @@ class Student(nn.Module):
 
         Args:
             embedding: From :meth:`encode`, shape [T, N, E].
-            previous_action: The (smoothed) action before each step, shape [T, N, D].
+            senses: From :meth:`senses`, before each step, shape [T, N, S].
             hidden: Memory before the first step, shape [N, G].
             done: Where a world ended with step t, so that step t + 1 starts without memory, shape [T, N].
         """
-        inputs = torch.cat([embedding, self.action_layers(previous_action)], dim=-1)
+        inputs = torch.cat([embedding, self.action_layers(senses)], dim=-1)
         remembered, hidden = self._remember(self.merge_action(inputs), hidden, done)
         features = self.head(remembered)
         places = {"before": embedding, "after": remembered}
@@ -206,10 +246,10 @@ class Student(nn.Module):
         )
 
     def act(
-        self, scene: Sites, previous_action: torch.Tensor, hidden: torch.Tensor, goal: Sites | None = None
+        self, scene: Sites, senses: torch.Tensor, hidden: torch.Tensor, goal: Sites | None = None
     ) -> StudentOutput:
-        """One step of N clouds: ``previous_action`` [N, D] and ``hidden`` [N, G] give leading shape [N]."""
-        output = self(self.encode(scene, goal)[None], previous_action[None], hidden)
+        """One step of N clouds: ``senses`` [N, S] and ``hidden`` [N, G] give leading shape [N]."""
+        output = self(self.encode(scene, goal)[None], senses[None], hidden)
         return StudentOutput(output.mean[0], output.log_std[0], output.distance[0], output.hidden)
 
     def _remember(

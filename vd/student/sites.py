@@ -21,7 +21,10 @@ class Sites:
         keys: Sorted keys of the cells (:mod:`vd.kernels.voxels`), shape [M].
         clouds: B.
         level: l.
+        marks: What the cells hold, columns of 0 and 1, shape [M, C], where that was asked for.
     """
+
+    marks: torch.Tensor | None = None
 
     def __init__(self, keys: wp.array, clouds: int, level: int = 0, *, sizes: Sequence[int] = ()):
         """Take the cells.
