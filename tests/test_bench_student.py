@@ -16,6 +16,9 @@ from vd.student.clouds import Voxeliser
 from vd.student.network import VoxelEncoder
 from vd.student.sparse import SparseConv3d
 
+ENDS = (500, 500 + 12 * 500)
+"""Where the points of the goal and of the hand end."""
+
 
 @pytest.fixture(autouse=True)
 def threads():
@@ -56,18 +59,18 @@ def test_dense_twin_has_the_encoders_layers(device):
     cfg = dataclasses.replace(LEAN.encoder, channels=(4, 8), blocks=1)
     scenes = Scenes(load_set("cube"), "dclaw3", 1, device, 0)
     scenes.write()
-    sites = Voxeliser(device=device)(scenes.points)
+    sites = Voxeliser(device=device)(scenes.points, ends=ENDS)
     twin = DenseEncoder(cfg).to(sites.device).eval()
     assert voxels_per_cell(cfg) == 8
     assert twin(sites).shape == (1, 16)
     sparse = sum(p.numel() for stage in twin.stages for p in stage.parameters())
-    assert sparse == 27 * (4 + 4 * 8 + 2 * 16 + 2 * 64) + 2 * (4 + 8 + 2 * 4 + 2 * 8)
+    assert sparse == 27 * (6 * 4 + 4 * 8 + 2 * 16 + 2 * 64) + 2 * (4 + 8 + 2 * 4 + 2 * 8)
 
 
 def test_scattered_twin_gives_the_same_features(device):
     scenes = Scenes(load_set("cube"), "dclaw3", 2, device, 0)
     scenes.write()
-    sites = Voxeliser(device=device)(scenes.points)
+    sites = Voxeliser(device=device)(scenes.points, ends=ENDS)
     torch.manual_seed(0)
     cfg = dataclasses.replace(LEAN.encoder, channels=(4, 8), blocks=1)
     encoder = VoxelEncoder(cfg).to(sites.device).eval()

@@ -12,7 +12,7 @@ import warp as wp
 from vd.config import from_dict, to_dict
 from vd.student.cfg import LEAN, PAPER_NETWORK, PRESETS, EncoderCfg, StudentCfg
 from vd.student.clouds import Voxeliser
-from vd.student.network import Student
+from vd.student.network import Student, voxel_features
 
 ACTIONS = 12
 SMALL = StudentCfg(
@@ -123,7 +123,7 @@ def test_places_and_marks_are_read_where_asked_for(device):
     cfg = dataclasses.replace(SMALL, encoder=EncoderCfg(channels=(4, 8), blocks=1, embedding=16))
     net, points = student(cfg, device), clouds(2)
     scene = sites(points, device)
-    found = net.encoder.features(scene).cpu().numpy()
+    found = voxel_features(scene, cfg.encoder, cfg.voxel_m).cpu().numpy()
     assert found.shape == (len(scene), 6) and (found[:, 0] == cfg.encoder.feature).all()
     coordinates = scene.coordinates.cpu().numpy()
     np.testing.assert_allclose(found[:, 1:4], (coordinates[:, 1:] + 0.5) * 0.05, atol=1e-6)

@@ -42,7 +42,7 @@ def record(
         for step in range(env.max_episode_steps):
             frame = view.frame()
             sites = view.sites(frame, augment=False)
-            output = student.act(sites[0], frame["action"], hidden, *sites[1:])
+            output = student.act(sites[0], student.senses(frame), hidden, *sites[1:])
             hidden = output.hidden
             rows.append(
                 torch.stack(

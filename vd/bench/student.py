@@ -157,9 +157,7 @@ class ControlStep:
         """Voxels, previous action and memory to the next action [D]."""
         assert self.sites is not None
         # Fresh maps each time: those of this cloud would else be kept.
-        sites = Sites(self.sites.keys, self.sites.clouds)
-        sites.marks = self.sites.marks
-        output = self.net.act(sites, self.senses, self.hidden)
+        output = self.net.act(self.sites.fresh(), self.senses, self.hidden)
         action, self.hidden = output.mean.clamp(-1.0, 1.0), output.hidden
         self.senses[:, : self.net.num_actions] = action
         return action.numpy()[0]
@@ -212,8 +210,8 @@ def measure_latency(
             missing = f"spconv is not installed ({error})"
         # Fresh sites each time: their maps are part of the work.
         encoders: dict[str, Callable[[], Any]] = {
-            "ours": lambda: net.encoder.pooled(Sites(sites.keys, sites.clouds)),
-            "per offset": lambda: offsets.pooled(Sites(sites.keys, sites.clouds)),
+            "ours": lambda: net.encoder.pooled(sites.fresh()),
+            "per offset": lambda: offsets.pooled(sites.fresh()),
         }
         encoders |= {name: partial(twin, sites) for name, twin in twins.items()}
         beside = take_turns(encoders, max(WARM_UP, calls // 10))

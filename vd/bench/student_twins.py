@@ -10,8 +10,9 @@ from typing import Any
 import torch
 from torch import nn
 
+from vd.paper import PAPER
 from vd.student.cfg import EncoderCfg
-from vd.student.network import VoxelEncoder
+from vd.student.network import VoxelEncoder, input_width, voxel_features
 from vd.student.sites import Sites
 from vd.student.sparse import SparseConv3d
 
@@ -53,7 +54,7 @@ class DenseEncoder(nn.Module):
     def __init__(self, cfg: EncoderCfg):
         super().__init__()
         self.cfg = cfg
-        widths = (1, *cfg.channels)
+        widths = (input_width(cfg), *cfg.channels)
         self.stages = nn.ModuleList()
         for i, (inner, outer) in enumerate(zip(widths, cfg.channels, strict=False)):
             layers: list[nn.Module] = [
@@ -71,8 +72,9 @@ class DenseEncoder(nn.Module):
         corner = cells.amin(dim=0).div(side, rounding_mode="floor") * side
         x, y, z = (cells - corner).T
         size = [-(-(int(axis.max()) + 1) // side) * side for axis in (x, y, z)]
-        grid = torch.zeros(1, 1, *size, device=sites.device)
-        grid[0, 0, x, y, z] = self.cfg.feature
+        features = voxel_features(sites, self.cfg, PAPER.cloud.voxel_m)
+        grid = torch.zeros(1, features.shape[1], *size, device=sites.device)
+        grid[0, :, x, y, z] = features.T
         for stage in self.stages:
             grid = stage(grid)
         return torch.cat([grid.amax(dim=(2, 3, 4)), grid.mean(dim=(2, 3, 4))], dim=1)
@@ -107,7 +109,7 @@ class SpconvEncoder(nn.Module):
 
         self.cfg = cfg
         self.tensor = spconv.SparseConvTensor
-        widths = (1, *cfg.channels)
+        widths = (input_width(cfg), *cfg.channels)
         self.stages = nn.ModuleList()
         for i, (inner, outer) in enumerate(zip(widths, cfg.channels, strict=False)):
             stage = nn.ModuleDict(
@@ -141,7 +143,7 @@ class SpconvEncoder(nn.Module):
         cells = rows[:, 1:] - corner
         size = [-(-(int(n) + 1) // side) * side for n in cells.amax(dim=0)]
         indices = torch.cat([rows[:, :1], cells], dim=1)
-        values = torch.full((len(sites), 1), self.cfg.feature, device=sites.device)
+        values = voxel_features(sites, self.cfg, PAPER.cloud.voxel_m)
         grid = self.tensor(values, indices, size, 1)
         for stage in self.stages:
             grid = stage["conv"](grid)

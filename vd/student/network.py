@@ -39,6 +39,30 @@ class StudentOutput:
     """Memory after the last step [N, G]."""
 
 
+def input_width(cfg: EncoderCfg) -> int:
+    """Features of a voxel."""
+    return sum(INPUT_WIDTHS[name] for name in cfg.inputs)
+
+
+def voxel_features(sites: Sites, cfg: EncoderCfg, voxel_m: float) -> torch.Tensor:
+    """What an encoder reads of each voxel [M, C].
+
+    Raises:
+        ValueError: Marks are read, but the voxeliser was not asked for them.
+    """
+    parts = []
+    for name in cfg.inputs:
+        if name == "constant":
+            parts.append(torch.full((len(sites), 1), cfg.feature, device=sites.device))
+        elif name == "position":
+            parts.append(voxel_m / POSITION_SCALE_M * (sites.coordinates[:, 1:] + 0.5))
+        elif sites.marks is None:
+            raise ValueError("the network reads marks of voxels; give the voxeliser the ends of the groups")
+        else:
+            parts.append(sites.marks)
+    return torch.cat(parts, dim=1)
+
+
 class ResidualBlock(nn.Module):
     """BN, ReLU, convolution, twice, added to the input (He et al. 2016), on the cells of one level."""
 
@@ -83,8 +107,8 @@ class VoxelEncoder(nn.Module):
 
     def __init__(self, cfg: EncoderCfg, voxel_m: float = PAPER.cloud.voxel_m):
         super().__init__()
-        self.inputs, self.feature, self.voxel_m = cfg.inputs, cfg.feature, voxel_m
-        widths = (sum(INPUT_WIDTHS[name] for name in cfg.inputs), *cfg.channels)
+        self.cfg, self.voxel_m = cfg, voxel_m
+        widths = (input_width(cfg), *cfg.channels)
         self.stages = nn.ModuleList(
             EncoderStage(inner, outer, cfg.blocks, pooled=i < cfg.pooled_stages)
             for i, (inner, outer) in enumerate(zip(widths, cfg.channels, strict=False))
@@ -92,28 +116,9 @@ class VoxelEncoder(nn.Module):
         self.final = nn.Linear(2 * cfg.channels[-1], cfg.embedding)
         self.projector = nn.Linear(cfg.embedding, cfg.embedding)
 
-    def features(self, sites: Sites) -> torch.Tensor:
-        """What is read of each voxel [M, C].
-
-        Raises:
-            ValueError: Marks are read, but the voxeliser was not asked for them.
-        """
-        weight, parts = self.final.weight, []
-        for name in self.inputs:
-            if name == "constant":
-                parts.append(weight.new_full((len(sites), 1), self.feature))
-            elif name == "position":
-                scale = self.voxel_m / POSITION_SCALE_M
-                parts.append((scale * (sites.coordinates[:, 1:] + 0.5)).to(weight.dtype))
-            elif sites.marks is None:
-                raise ValueError("the network reads marks of voxels; give the voxeliser the groups of points")
-            else:
-                parts.append(sites.marks.to(weight.dtype))
-        return torch.cat(parts, dim=1)
-
     def pooled(self, sites: Sites) -> torch.Tensor:
         """Largest and mean features of the last stage [B, 2 C], of the clouds of ``sites`` (level 0)."""
-        features = self.features(sites)
+        features = voxel_features(sites, self.cfg, self.voxel_m).to(self.final.weight.dtype)
         for stage in self.stages:
             features, sites = stage(features, sites)
         return global_pool(features, sites).to(self.final.weight.dtype)

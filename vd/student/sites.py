@@ -40,6 +40,12 @@ class Sites:
         self.level = level
         self._sizes = sizes
 
+    def fresh(self) -> "Sites":
+        """The same cells without maps, as they come from the voxeliser."""
+        same = Sites(self.keys, self.clouds, self.level)
+        same.marks = self.marks
+        return same
+
     def __len__(self) -> int:
         return int(self.keys.shape[0])
 
