@@ -44,7 +44,7 @@ def relative_rotation(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor
 
 def voxels(
     points: torch.Tensor,
-    clouds: SceneClouds,
+    ends: tuple[int, int],
     voxelise: Voxeliser,
     *,
     network: StudentCfg,
@@ -54,7 +54,7 @@ def voxels(
 
     Args:
         points: Points [m], shape [R, P, 3]: the goal's, the hand's, then others.
-        clouds: Which columns are the goal's and the hand's.
+        ends: Columns at which the goal's points end, and the hand's after them.
         voxelise: Makes the voxels.
         network: Whether the goal is a cloud of its own, and whether voxels are marked.
         augment: Add noise, as in training.
@@ -62,7 +62,7 @@ def voxels(
     Returns:
         Arguments of :meth:`vd.student.network.Student.encode`.
     """
-    goal, hand = clouds.goal.stop, clouds.hand.stop
+    goal, hand = ends
     marked = "marks" in network.encoder.inputs
     if network.goal == "merged":
         return (voxelise(points, augment=augment, ends=(goal, hand) if marked else ()),)
@@ -202,7 +202,7 @@ class StudentView:
         )
         if self.camera is not None:
             points[:, columns.start :] = frame["points"]
-        return voxels(points, self._clouds, self._voxelise, network=self._network, augment=augment)
+        return voxels(points, self._clouds.ends, self._voxelise, network=self._network, augment=augment)
 
     def state_dict(self) -> dict[str, Any]:
         """Random states and what the camera remembers, as NumPy arrays."""

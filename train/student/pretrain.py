@@ -114,7 +114,7 @@ class RandomScenes:
         )
         sites = voxels(
             wp.to_torch(self._points),
-            self._clouds,
+            self._clouds.ends,
             self._voxelise,
             network=self._network,
             augment=self._augment,

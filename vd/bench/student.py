@@ -151,7 +151,7 @@ class ControlStep:
 
     def voxels(self) -> None:
         """Points to voxels."""
-        self.sites = self.voxelise(self.points, ends=(self.clouds.goal.stop, self.clouds.hand.stop))
+        self.sites = self.voxelise(self.points, ends=self.clouds.ends)
 
     def act(self) -> np.ndarray:
         """Voxels, previous action and memory to the next action [D]."""
@@ -340,8 +340,7 @@ def measure_training(
     def prepare(start: float, *, augment: bool) -> tuple[Sites, float]:
         scenes.write()
         start = stop("points", start)
-        ends = (scenes.clouds.goal.stop, scenes.clouds.hand.stop)
-        sites = voxelise(scenes.points, augment=augment, ends=ends)
+        sites = voxelise(scenes.points, augment=augment, ends=scenes.clouds.ends)
         start = stop("voxels", start)
         build(sites)
         sizes.append(len(sites))

@@ -95,7 +95,13 @@ class CloudPart:
     goal_position_m: tuple[float, float, float] = PAPER.cloud.goal_position_m
     """Where the goal's cloud, turned as wanted, is put in the base frame."""
     feature: float = PAPER.cloud.feature
-    """The one feature of a voxel."""
+    """The constant feature of a voxel."""
+    inputs: tuple[str, ...] = ("constant",)
+    """Features of a voxel, in order. position: its centre in the base frame, in units of 0.1 m; marks:
+    whether it holds points of the goal, and of the hand."""
+    senses: tuple[str, ...] = ("action",)
+    """What the network reads besides the cloud, in order: the smoothed action before [D], positions [rad] and
+    0.2 times velocities [rad/s] of the joints as measured [D]."""
 
 
 @dataclass(frozen=True)
@@ -219,6 +225,8 @@ def derive_interface(
             voxel_m=network.voxel_m,
             goal=network.goal,
             feature=network.encoder.feature,
+            inputs=network.encoder.inputs,
+            senses=network.senses,
         ),
         camera=None if depth is None else _camera(hand, depth, camera),
     )

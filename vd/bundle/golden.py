@@ -26,6 +26,9 @@ TOLERANCE = 5e-3
 """Largest difference of an output from the golden one. Actions are of size 1; processors, GPUs and other
 versions of torch differ by 1e-6 to 1e-3."""
 
+SENSES = {"action": "previous_action", "position": "joint_q", "velocity": "joint_qd"}
+"""Golden input behind each sense of a student."""
+
 Golden = dict[str, torch.Tensor]
 
 
@@ -46,7 +49,8 @@ def student_golden(student: "SavedStudent", hand: HandModel) -> Golden:
 
     Inputs: ``joint_q`` [T, D] [rad]; ``object_pose`` [T, 7] in the base frame; ``goal_quat`` [4] in the world
     frame; ``points`` [T, P, 3] [m], base frame, the cloud that these give with a cube, moved away from the
-    borders of voxels; ``previous_action`` [T, D]. Outputs: ``action`` [T, D] and ``distance`` [T, H] [rad].
+    borders of voxels; ``previous_action`` [T, D]; ``joint_qd`` [T, D] [rad/s]. Outputs: ``action`` [T, D]
+    and ``distance`` [T, H] [rad].
     """
     from vd.assets_usd.objects.model import load_set
     from vd.sim.scene import hand_mount
@@ -73,6 +77,7 @@ def student_golden(student: "SavedStudent", hand: HandModel) -> Golden:
         "goal_points": _inside_voxels(np.tile(wanted, (STEPS, 1, 1)), side),
         "scene_points": _inside_voxels(np.stack(scenes), side),
         "previous_action": rng.uniform(-1.0, 1.0, (STEPS, len(rest))),
+        "joint_qd": rng.normal(size=(STEPS, len(rest))),
     }
     golden = {name: torch.tensor(value, dtype=torch.float32) for name, value in values.items()}
     return {**golden, **student_outputs(student, golden)}
@@ -87,14 +92,16 @@ def student_outputs(student: "SavedStudent", golden: Mapping[str, torch.Tensor])
     device = str(network.mean.weight.device)
     voxelise = Voxeliser(cfg.voxel_m, device=device)
     clouds = torch.cat([golden["goal_points"], golden["scene_points"]], dim=1)
-    goal = slice(0, golden["goal_points"].shape[1])
+    # The cube has as many points as the goal, which is the same cube.
+    ends = (golden["goal_points"].shape[1], golden["scene_points"].shape[1])
     hidden = network.initial_hidden(1)
     actions, distances = [], []
     with torch.no_grad():
-        for points, previous in zip(clouds, golden["previous_action"], strict=True):
+        for step, points in enumerate(clouds):
+            frame = {name: golden[source][step : step + 1].to(device) for name, source in SENSES.items()}
             cloud = points[None].contiguous().to(device)
-            sites = voxels(cloud, goal, voxelise, separate=cfg.goal == "separate", augment=False)
-            output = network.act(sites[0], previous[None].to(device), hidden, *sites[1:])
+            sites = voxels(cloud, ends, voxelise, network=cfg, augment=False)
+            output = network.act(sites[0], network.senses(frame), hidden, *sites[1:])
             hidden = output.hidden
             actions.append(output.mean[0])
             distances.append(output.distance[0])

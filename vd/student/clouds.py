@@ -29,6 +29,7 @@ class SceneClouds:
         goal: Columns of the goal.
         hand: Columns of the hand.
         item: Columns of the object.
+        ends: Columns at which goal and hand end.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class SceneClouds:
         self.goal = slice(0, samples)
         self.hand = slice(samples, samples + count)
         self.item = slice(samples + count, count + 2 * samples)
+        self.ends = (self.goal.stop, self.hand.stop)
         self.device = device
 
         def array(values: Any, dtype: Any) -> wp.array:
