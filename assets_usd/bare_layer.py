@@ -11,7 +11,7 @@ import numpy as np
 from pxr import Tf, Usd
 
 from vd.assets_usd.hand_data import HandError
-from vd.assets_usd.hand_layer import DRIVE, LAYER_FORMAT, read_servo
+from vd.assets_usd.hand_layer import DRIVE, LAYER_FORMAT, NAMESPACE, read_servo
 
 
 def read_bare_layer(path: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
@@ -45,6 +45,7 @@ def read_bare_layer(path: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.n
     baseline = {
         name: np.array([_number(path, prim, attribute) / factor for prim in prims])
         for name, (attribute, factor) in DRIVE.items()
+        if not attribute.startswith(f"{NAMESPACE}:")
     }
     return read_servo(prims, baseline, path)
 

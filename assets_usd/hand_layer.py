@@ -41,6 +41,7 @@ DRIVE: dict[str, tuple[str, float]] = {
     "kd": ("drive:angular:physics:damping", math.radians(1.0)),
     "velocity_limit": ("newton:velocityLimit", math.degrees(1.0)),
     "inertia": ("newton:armature", 1.0),
+    "kd_off": ("vd:baseline:kd_off", 1.0),
 }
 """USD attribute of each parameter of the baseline, and the factor from SI and radians to its unit."""
 
@@ -162,7 +163,8 @@ def read_servo(
     rows = np.tile(np.array(neutral_row(), dtype=float), (len(joints), 1))
     intervals = np.full((len(joints), PARAMETER_COLUMNS, 2), np.nan)
     for parameter in BASELINE:
-        rows[:, parameter.column] = baseline[parameter.name]
+        if parameter.name in baseline:
+            rows[:, parameter.column] = baseline[parameter.name]
     for index, joint in enumerate(joints):
         where = f"{source}: {joint.GetPath()}"
         effects: dict[str, set[str]] = {}
@@ -176,7 +178,8 @@ def read_servo(
                 ranges.append((name, effect, parameter.name))
             else:
                 rows[index, parameter.column] = _checked(where, name, parameter, value)
-                effects.setdefault(effect, set()).add(parameter.name)
+                if effect != BASELINE_GROUP:
+                    effects.setdefault(effect, set()).add(parameter.name)
         for effect, authored in effects.items():
             missing = _missing(effect, authored)
             if missing:
@@ -208,7 +211,7 @@ def _parse(where: str, name: str) -> tuple[str, Parameter, bool]:
     interval = parts[3:] == [INTERVAL]
     if len(parts) > 3 and not interval:
         raise HandError(f"{where}: '{name}': after a parameter only ':{INTERVAL}' can stand; rename it")
-    if effect == BASELINE_GROUP and not interval:
+    if effect == BASELINE_GROUP and not interval and DRIVE[parts[2]][0] != name:
         raise HandError(
             f"{where}: '{name}': the value belongs into '{DRIVE[parts[2]][0]}'; only ':{INTERVAL}' goes here"
         )
@@ -260,7 +263,9 @@ def _write_baseline(path: Path, joint: Sdf.PrimSpec, values: Mapping[str, Estima
         parameter, (attribute, factor) = known[name], DRIVE[name]
         value, interval = _split(estimate)
         number = _checked(where, attribute, parameter, value)
-        spec = Sdf.AttributeSpec(joint, attribute, Sdf.ValueTypeNames.Float)
+        own = attribute.startswith(f"{NAMESPACE}:")
+        kind = Sdf.ValueTypeNames.Double if own else Sdf.ValueTypeNames.Float
+        spec = Sdf.AttributeSpec(joint, attribute, kind, Sdf.VariabilityVarying, declaresCustom=own)
         spec.default = number * factor
         spec.documentation = f"{name} = {number:g} {parameter.unit}"
         _write_interval(where, joint, BASELINE_GROUP, parameter, interval)

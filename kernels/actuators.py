@@ -53,7 +53,8 @@ ELASTIC_INERTIA = 32
 COUPLING_0 = 33
 COUPLING_1 = 34
 COUPLING_2 = 35
-PARAMETER_COLUMNS = 36
+OFF_DAMPING = 36
+PARAMETER_COLUMNS = 37
 
 # Columns of a state row.
 STATE_FILTERED = 0
@@ -365,7 +366,8 @@ def drive_joint(
         speed: Joint velocity [rad/s].
         power: Factor on the controller's position and integral gains: 0 with the torque off, or a gain
             that was set on purpose, which leaves the damping as it is. With the torque off the damping,
-            mostly back-EMF, goes too, since the terminals are open; friction stays.
+            mostly back-EMF, goes too, since the terminals are open; friction stays, and of the damping
+            what is the gears' (``OFF_DAMPING``).
         dt: Time step [s].
         effort: Largest torque of the drive [N m]; ``NO_EFFORT_LIMIT`` where somebody else keeps it.
         parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
@@ -396,8 +398,10 @@ def drive_joint(
     steady = power * parameters[row, INTEGRAL_GAIN] * integral
     kp = power * parameters[row, KP]
     damping = parameters[row, KD]
+    open_damping = wp.float32(0.0)
     if power <= 0.0:
         damping = 0.0
+        open_damping = parameters[row, OFF_DAMPING]
     wanted = kp * (reference - position) - damping * speed + steady
     motor = motor_torque(wanted, speed, time, effort, parameters, row)
     carried = wp.abs(motor[0])
@@ -422,7 +426,7 @@ def drive_joint(
     load = elastic_load(position, speed, dt, parameters, row, state)
     result.reference = reference
     result.stiffness = kp
-    result.damping = damping + load[1]
+    result.damping = damping + open_damping + load[1]
     result.torque = (
         steady
         - parameters[row, GRAVITY_TORQUE] * wp.sin(position + parameters[row, GRAVITY_PHASE])

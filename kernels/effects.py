@@ -54,8 +54,10 @@ BASELINE = (
     Parameter("kd", "N m s/rad", servo.KD, 1e-5, 1e2, 0.3),
     Parameter("velocity_limit", "rad/s", servo.VELOCITY_LIMIT, 0.05, 100.0, 7.0, neutral=1e6),
     Parameter("inertia", "kg m^2", servo.INERTIA, 1e-6, 10.0, 1e-3),
+    Parameter("kd_off", "N m s/rad", servo.OFF_DAMPING, 0.0, 1e2, 0.0),
 )
-"""The paper's identification; the inertia (the drive's armature) is fitted for bare servos only."""
+"""The paper's identification; the inertia (the drive's armature) is fitted for bare servos only, as is
+``kd_off``, the damping that is left with the torque off, where a recording has such motion."""
 
 EFFECTS: dict[str, Effect] = {
     effect.name: effect

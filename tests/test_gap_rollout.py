@@ -46,6 +46,11 @@ def test_bare_servos_are_one_chain_each():
     assert [chain.joints for chain in found] == [("Pitch",), ("Jaw",)]
     assert [list(chain.columns) for chain in found] == [[0], [1]]
     assert set(found[0].baseline_free) == {"kp", "kd", "velocity_limit", "inertia"}
+    command = wave(joints=2)
+    enabled = np.ones(command.shape, bool)
+    enabled[50:, 1] = False
+    released = chains(recording("servo", ("Pitch", "Jaw"), trajectory("a", command, enabled=enabled)))
+    assert ["kd_off" in chain.baseline_free for chain in released] == [False, True]
     assert found[0].start_row[0, servo.GRAVITY_TORQUE] == 0.0
 
 

@@ -324,6 +324,26 @@ def test_a_drive_gives_no_more_than_its_effort(device):
     np.testing.assert_array_equal(both, got)
 
 
+def test_a_joint_that_is_switched_off_swings_out_by_what_damping_is_left(device):
+    """Small swings of a pendulum: exp(-c t / 2 I) cos(w t), w^2 = g / I - (c / 2 I)^2."""
+    inertia, weight, damping = 5e-3, 0.4, 0.01
+    rows = rows_of(
+        {servo.INERTIA: inertia, servo.GRAVITY_TORQUE: weight, servo.OFF_DAMPING: damping},
+        {servo.INERTIA: inertia, servo.GRAVITY_TORQUE: weight},
+    )
+    time = np.arange(0.0, 2.0, 0.02)
+    off = np.zeros((1, len(time), 1))
+    got = roll(device, rows, time, off, np.array([[0.02]]), power=off)[:, 0, :, 0]
+    for swing, c in zip(got, (damping, 0.0), strict=True):
+        rate = c / (2.0 * inertia)
+        turn = np.sqrt(weight / inertia - rate**2)
+        expected = 0.02 * np.exp(-rate * time) * (np.cos(turn * time) + rate / turn * np.sin(turn * time))
+        np.testing.assert_allclose(swing, expected, atol=2e-4)
+    # With the torque on, the drive's damping is all there is.
+    on = roll(device, rows, time, off, np.array([[0.02]]))[:, 0, :, 0]
+    np.testing.assert_array_equal(on[0], on[1])
+
+
 # --- Friction ---
 
 

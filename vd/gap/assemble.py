@@ -210,7 +210,7 @@ def _fit(joints: Sequence[Analysed], predictions: Predictions, curve: np.ndarray
 def _baseline_values(joint: Analysed, which: str) -> dict[str, float]:
     fit = getattr(joint.explanation, which)
     rows, names = fit.rows, ["kp", "kd", "velocity_limit"]
-    names += [n for n in ("inertia",) if n in joint.spec.baseline]
+    names += [n for n in ("inertia", "kd_off") if n in joint.spec.baseline]
     # A pendulum's known load is not fitted, but without it the rest means nothing.
     if "gravity_load" not in fit.effects and rows[joint.spec.joint, GRAVITY.column] > 0.0:
         names.append(GRAVITY.name)

@@ -135,6 +135,8 @@ def _scale(parameter: Parameter, scales: Scales) -> float:
         return max(0.3 * scales.torque, 1e-4)
     if parameter.column in (servo.BACKLASH_WIDTH, servo.DEAD_ZONE_WIDTH, servo.ENCODER_BIAS):
         return max(scales.residual, FLATTEST)
+    if parameter.column == servo.OFF_DAMPING:
+        return 0.1 * max(scales.torque, 1e-4) / scales.speed
     if parameter.column == servo.SUPPLY_SAG:
         return 0.3 / max(scales.peak, 1e-6)
     if parameter.column == servo.INTEGRAL_GAIN:

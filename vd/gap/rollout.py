@@ -162,6 +162,8 @@ def _bare(recording: Recording, column: int, p_gain: float | None) -> Chain:
     for parameter in BASELINE:
         row[parameter.column] = parameter.typical
     free = [parameter.name for parameter in BASELINE]
+    if all(t.enabled[:, column].all() for t in recording.trajectories):
+        free.remove("kd_off")  # nothing shows it
     load = None
     if recording.model == "pendulum":
         free.append("tau_g_nm")
