@@ -15,13 +15,15 @@ import torch
 from torch.distributed import PrefixStore
 from torch.distributed.rendezvous import rendezvous
 
+from vd.train import watchdog
+
 START_TIMEOUT = timedelta(minutes=20)
 """Longest wait for the slowest process to build its worlds; with a cold kernel cache alone over 3 minutes."""
 COLLECTIVE_TIMEOUT = timedelta(minutes=2)
 """Longest wait in a collective: an iteration takes about a second and a checkpoint a few. NCCL's default of
 10 minutes is that much of every GPU lost when one process hangs."""
-REPORT_AFTER_S = 90.0
-"""An iteration that takes this long reports where it is, before the others' wait in a collective ends."""
+
+_watchdog: watchdog.Watchdog | None = None  # one for the process, as its group
 
 
 @dataclass(frozen=True)
@@ -72,17 +74,22 @@ def join_processes(device: str) -> Processes:
         world_size=world_size,
         timeout=COLLECTIVE_TIMEOUT,
     )
+    global _watchdog
+    _watchdog = watchdog.Watchdog(store.clone(), rank, world_size)
     return Processes(rank, local_rank, world_size)
 
 
 def watch_iteration() -> None:
-    """Print every thread's stack on stderr if :data:`REPORT_AFTER_S` pass before the next call of this.
+    """Print every thread's stack on stderr, and who is waited for, if this is not called again soon.
 
-    A process that hangs outside of a collective says nothing otherwise: only those that wait for it do.
+    After ``watchdog.REPORT_AFTER_S``. A process that hangs outside of a collective says nothing otherwise:
+    only those that wait for it do.
     """
+    if _watchdog is not None:
+        _watchdog.beat()
     # A stderr without a file, as in a notebook, cannot be written to by the watching thread.
     with contextlib.suppress(AttributeError, ValueError, io.UnsupportedOperation):
-        faulthandler.dump_traceback_later(REPORT_AFTER_S, file=sys.stderr)
+        faulthandler.dump_traceback_later(watchdog.REPORT_AFTER_S, file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -103,6 +110,8 @@ def ending_together(*agreed: type[BaseException]) -> Iterator[None]:
         _abandon(error)
     finally:
         faulthandler.cancel_dump_traceback_later()
+        if _watchdog is not None:
+            _watchdog.stop()
 
 
 def _abandon(error: BaseException) -> NoReturn:
