@@ -37,6 +37,7 @@ class SceneConstants:
     control_hz: float = source(12.0, "P", "position controllers at 12 Hz (Methods, action space)")
     episode_s: float = source(10.0, "C", "resetTime: 120 control steps")
     air_episode_s: float = source(15.0, "P", "in-air test: 180 control steps")
+    air_table_s: float = source(2.0, "P", "in-air test: the table is taken away after 24 control steps")
     table_size_m: tuple[float, float, float] = source((0.6, 0.6, 0.1), "C", "fixed box")
     table_top_m: float = source(0.0, "C", "table box centred at z = -0.05")
     hand_height_m: float = source(0.25, "C", "base frame at (0, 0, 0.25), rotated pi about +y")

@@ -87,6 +87,24 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | None"
     return load_student(path, device) if is_student(path) else load_policy(path, device)
 
 
+def sees_clouds(name: str) -> bool:
+    """Whether a policy is a student.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+    """
+    if name in BUILT_IN or name in SHIPPED_POLICIES:
+        return False
+    path = find_policy(name)
+    if is_bundle(path):
+        from vd.bundle.store import read_contract
+
+        return read_contract(path).kind == "student"
+    from vd.student.saved import is_student
+
+    return is_student(path)
+
+
 def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
     """:func:`open_policy` where only a teacher, which sees the simulator's state, will do.
 

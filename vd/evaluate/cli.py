@@ -1,4 +1,4 @@
-"""Command line of evaluation: ``vd-eval POLICY --objects SET --episodes M``."""
+"""Command line of evaluation: ``vd-eval POLICY ... --objects SET ... --episodes M``."""
 
 import json
 import math
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from vd.evaluate.agents import LAYER_HELP, SHIPPED_POLICIES, start_at_rest
+from vd.evaluate.agents import LAYER_HELP, SHIPPED_POLICIES, sees_clouds, start_at_rest
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ WORLDS_CPU, WORLDS_GPU = 64, 8192
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0
 POLICY_HELP = (
-    "A policy.pt, a checkpoint, a run's folder, or the name of an installed policy: "
-    f"{', '.join(SHIPPED_POLICIES)}."
+    "A policy.pt or student.pt, a checkpoint, the folder of a bundle or of a run, or the name of an "
+    f"installed policy: {', '.join(SHIPPED_POLICIES)}."
 )
 """What names a policy on a command line."""
 _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
@@ -30,19 +30,22 @@ _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
 
 @dataclass
 class EvalCfg:
-    """Evaluate a policy: every object from the same starts to the same goals, whatever the policy.
+    """Evaluate policies: every object from the same starts to the same goals, whatever the policy.
 
     Objects fall into the hand from orientations uniform on SO(3), or, with --at-rest, lie on the table.
 
-    Writes eval.json (every episode) and eval.html (one page with figures) and prints a table. Errors are
-    measured at the end of an episode, or at the first step at which all success criteria hold.
+    Writes eval.json (every episode) and eval.html (one page with figures) and prints a table. A single
+    teacher is stopped, and its error measured, at the first step at which all success criteria hold.
+    Students, several policies, groups of objects and --in-air are compared side by side: students are stopped
+    by the distance that they predict and, for comparison, by the true one.
     """
 
-    policy: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = None
+    policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = ()
     agent: str | None = None
-    """zero, random, or the same as POLICY."""
+    """zero or random, alone or beside policies."""
     objects: tuple[str, ...] = ("cube",)
-    """Object sets by name, folders or files (vd-assets makes them)."""
+    """Object sets by name, folders or files (vd-assets makes them). NAME=SET puts one into a group, which
+    gets figures of its own: training=FOLDER held-out=FOLDER symmetric=cube."""
     episodes: int = 20
     """Starts and goals of every object."""
     hand: str | None = None
@@ -59,14 +62,19 @@ class EvalCfg:
     """Start from a drop, whatever the training."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """An episode stops, still and oriented, at this error [rad]; 0.1 for the paper's precise variant."""
-    episode_s: float = PAPER.scene.episode_s
-    """Time limit of an episode [s]."""
+    episode_s: float | None = None
+    """Time limit of an episode [s]; 10 by default, 15 with --in-air."""
+    in_air: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
+    sees: Literal["auto", "complete", "rendered"] = "auto"
+    """What students see: complete clouds, a depth camera's, or what their stage was trained on."""
     randomise: bool = False
     """Randomise dynamics and add noise and disturbances as in training."""
     resample: Literal["auto", "object", "episode"] = "auto"
     """What the bootstrap intervals resample: objects (from 8 of them) or episodes within objects."""
     num_worlds: int | None = None
-    """Worlds simulated at once; by default as many as episodes, up to 64 on a CPU and 8192 on a GPU."""
+    """Worlds simulated at once; by default as many as episodes, up to 64 on a CPU and 8192 on a GPU (1024 in
+    a comparison)."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
     output: Path = Path("runs/eval")
@@ -75,18 +83,26 @@ class EvalCfg:
     """Print protocol and summaries as JSON instead of the table."""
 
     @property
-    def agent_name(self) -> str:
-        """Which agent is evaluated.
+    def agent_names(self) -> tuple[str, ...]:
+        """What is evaluated, each once.
 
         Raises:
-            ValueError: None or two are named.
+            ValueError: Nothing is named.
         """
-        if (self.policy is None) == (self.agent is None):
+        names = tuple(dict.fromkeys((*self.policies, *([] if self.agent is None else [self.agent]))))
+        if not names:
             raise ValueError(
-                "name one agent: a policy file, --agent zero, --agent random, or an installed policy "
+                "name a policy: a file, --agent zero, --agent random, or an installed policy "
                 f"({', '.join(SHIPPED_POLICIES)})"
             )
-        return str(self.policy or self.agent)
+        return names
+
+    @property
+    def limit_s(self) -> float:
+        """Time limit of an episode [s]."""
+        if self.episode_s is not None:
+            return self.episode_s
+        return PAPER.scene.air_episode_s if self.in_air else PAPER.scene.episode_s
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
@@ -100,6 +116,8 @@ class EvalCfg:
             raise ValueError(
                 f"--stop-tolerance is {self.stop_tolerance}; it must be above 0 and at most pi rad"
             )
+        if self.limit_s <= 0.0:
+            raise ValueError(f"--episode-s is {self.episode_s}; it must be positive")
         start_at_rest(self.at_rest, self.no_at_rest)
         if self.num_worlds is not None and self.num_worlds < 1:
             raise ValueError(
@@ -112,11 +130,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cfg = tyro.cli(EvalCfg, args=arguments, prog="vd-eval")
     try:
         cfg.validate()
-        cfg.agent_name  # noqa: B018  # before anything slow is imported
-        result = evaluate(cfg)
+        names = cfg.agent_names  # before anything slow is imported
+        if len(names) > 1 or cfg.in_air or "=" in "".join(cfg.objects) or sees_clouds(names[0]):
+            return _compare(cfg)
+        return _evaluate(cfg)
     except (ValueError, FileNotFoundError, RuntimeError) as error:
         print(f"vd-eval: {error}", file=sys.stderr)
         return 1
+
+
+def _evaluate(cfg: EvalCfg) -> int:
+    result = evaluate(cfg)
     from vd.config import to_dict
     from vd.evaluate.report import task_line, terminal_table
 
@@ -126,6 +150,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         print(terminal_table(result))
         print(f"\n{task_line(result)}\n{cfg.output / 'eval.json'}\n{cfg.output / 'eval.html'}")
+    return 0
+
+
+def _compare(cfg: EvalCfg) -> int:
+    from vd.evaluate.compare import compare
+
+    comparison = compare(cfg)
+    from vd.config import to_dict
+    from vd.evaluate.comparison_page import terminal_table
+
+    if cfg.json:
+        summary = to_dict(comparison)
+        for row in summary["rows"]:
+            del row["result"]["episodes"]
+        for entry in summary["predictions"]:
+            del entry["true_rad"], entry["predicted_rad"]
+        print(json.dumps(summary, indent=1))
+    else:
+        print(terminal_table(comparison))
+        print(f"\n{cfg.output / 'eval.json'}\n{cfg.output / 'eval.html'}")
     return 0
 
 
@@ -151,7 +195,8 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
     from vd.evaluate.rollout import collect, collect_drawn, draw_starts_and_goals
 
     device = resolve_device(cfg.device)
-    trained = open_teacher(cfg.agent_name, device)
+    (name,) = cfg.agent_names
+    trained = open_teacher(name, device)
     count = len(load_set(list(cfg.objects)))
     task = task_for(
         trained,
@@ -161,16 +206,16 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         seed=cfg.seed,
         stop_tolerance_rad=cfg.stop_tolerance,
         max_goal_angle_rad=cfg.max_goal_angle,
-        episode_s=cfg.episode_s,
+        episode_s=cfg.limit_s,
         randomised=cfg.randomise,
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
     )
-    check_bundle(cfg.agent_name, task)
+    check_bundle(name, task)
     print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
     env = ReorientEnv(task, device)
-    policy = trained or built_in(cfg.agent_name, env.num_actions, seed=cfg.seed, device=device)
+    policy = trained or built_in(name, env.num_actions, seed=cfg.seed, device=device)
     rounds = math.ceil(cfg.episodes / (env.num_worlds // count))
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
     with tqdm(total=rounds * env.max_episode_steps, unit="step", desc="vd-eval", mininterval=refresh) as bar:
@@ -193,7 +238,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
     env.check()
     env.close()
     protocol = Protocol(
-        policy=cfg.agent_name,
+        policy=name,
         objects=", ".join(cfg.objects),
         hand=task.hand,
         hand_layer=task.hand_layer,
@@ -201,7 +246,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         seed=cfg.seed,
         max_goal_angle_rad=cfg.max_goal_angle,
         stop_tolerance_rad=cfg.stop_tolerance,
-        episode_s=cfg.episode_s,
+        episode_s=cfg.limit_s,
         control_hz=task.sim.control_hz,
         randomised=cfg.randomise,
         at_rest=task.start.at_rest,
@@ -213,7 +258,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         [item.symmetry for item in env.objects],
         episodes,
         resample=cfg.resample,
-        software=_software(device),
+        software=software(device),
     )
     result.write(cfg.output / "eval.json")
     write_report(result, cfg.output / "eval.html")
@@ -237,13 +282,14 @@ def resolve_device(name: str) -> str:
     return name
 
 
-def worlds_for(num_objects: int, episodes: int, device: str) -> int:
+def worlds_for(num_objects: int, episodes: int, device: str, *, limit: int | None = None) -> int:
     """Worlds to simulate at once: the same number for every object, at most one for each episode."""
-    limit = WORLDS_CPU if device == "cpu" else WORLDS_GPU
+    limit = limit or (WORLDS_CPU if device == "cpu" else WORLDS_GPU)
     return num_objects * max(1, min(episodes, limit // num_objects))
 
 
-def _software(device: str) -> dict[str, str]:
+def software(device: str) -> dict[str, str]:
+    """The device and the versions of what runs."""
     from importlib.metadata import PackageNotFoundError, version
 
     import warp as wp

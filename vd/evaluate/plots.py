@@ -22,9 +22,9 @@ def ecdf_figure(result: EvalResult) -> Figure:
     if 1 < len(errors) <= MAX_OBJECTS_DRAWN:
         for index, one in enumerate(errors):
             label = "each object" if index == 0 else None
-            _ecdf(axes, one, color=BLUE, alpha=0.22, linewidth=0.8, label=label)
-    _ecdf(axes, errors.ravel(), color=BLUE, linewidth=2.2, label="all episodes")
-    _ecdf(axes, starts.ravel(), color=ORANGE, linewidth=1.4, linestyle="--", label="object left at its start")
+            ecdf(axes, one, color=BLUE, alpha=0.22, linewidth=0.8, label=label)
+    ecdf(axes, errors.ravel(), color=BLUE, linewidth=2.2, label="all episodes")
+    ecdf(axes, starts.ravel(), color=ORANGE, linewidth=1.4, linestyle="--", label="object left at its start")
     angle = np.linspace(0.0, np.pi, 200)
     axes.plot(
         angle,
@@ -122,7 +122,8 @@ def _axes(width: float, height: float) -> tuple:
     return figure, axes
 
 
-def _ecdf(axes, values: np.ndarray, **style) -> None:
+def ecdf(axes, values: np.ndarray, **style) -> None:
+    """Draw the empirical distribution of errors [rad], pi for lost objects."""
     # Errors of pi are drops: the curve must not rise at the right edge as if it had reached them.
     ordered = np.sort(values)
     height = np.arange(1, len(ordered) + 1) / len(ordered)

@@ -102,8 +102,8 @@ def protocol_rows(result: EvalResult) -> list[tuple[str, str]]:
         ("objects", f"{protocol.objects} ({len(result.object_names)})"),
         ("hand", protocol.hand_name),
         ("starts and goals", f"{protocol.episodes} each for every object, seed {protocol.seed}"),
-        ("starts", _starts(protocol)),
-        ("goals", _goals(protocol)),
+        ("starts", starts_text(protocol)),
+        ("goals", goals_text(protocol)),
         ("stop", f"error at most {protocol.stop_tolerance_rad:g} rad, fingers and object still"),
         ("time limit", f"{protocol.episode_s:g} s at {protocol.control_hz:g} Hz"),
         ("randomisation, noise, disturbances", "on" if protocol.randomised else "off"),
@@ -116,18 +116,20 @@ def task_line(result: EvalResult) -> str:
     protocol = result.protocol
     randomisation = "on" if protocol.randomised else "off"
     return (
-        f"starts {_starts(protocol)}; goals {_goals(protocol)}; stop within "
+        f"starts {starts_text(protocol)}; goals {goals_text(protocol)}; stop within "
         f"{protocol.stop_tolerance_rad:g} rad and still; randomisation {randomisation}"
     )
 
 
-def _starts(protocol: Protocol) -> str:
+def starts_text(protocol: Protocol) -> str:
+    """How episodes start, in words."""
     if protocol.at_rest:
         return "at rest on the table, as the environment draws them"
     return "dropped into the hand, uniform on SO(3)"
 
 
-def _goals(protocol: Protocol) -> str:
+def goals_text(protocol: Protocol) -> str:
+    """Where goals lie, in words."""
     angle = protocol.max_goal_angle_rad
     if protocol.goals_about_vertical:
         return f"turned about the vertical by at most {angle:g} rad"

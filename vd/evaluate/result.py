@@ -45,7 +45,8 @@ class Episode:
     steps: int
     """Control steps simulated."""
     stopped: bool
-    """All success criteria (orientation and stillness) held at the last step."""
+    """All success criteria (orientation and stillness) held at the last step, or the rule that was asked for
+    stopped it there."""
     fell: bool
     """The object left the hand."""
 
@@ -86,6 +87,8 @@ class Protocol:
     """Goals only turn the object about the vertical."""
     hand_layer: str | None = None
     """Layer over the hand with an identified servo model, if any."""
+    in_air: bool = False
+    """The table is taken away once the hand had time to grasp."""
 
     @property
     def hand_name(self) -> str:

@@ -99,7 +99,7 @@ def collect(
     objects, episodes = starts.shape[:2]
     world_object = np.asarray(env.world_object)
     recorded: dict[tuple[int, int], Episode] = {}
-    for world_episode in _rounds(world_object, objects, episodes):
+    for world_episode in episode_rounds(world_object, objects, episodes):
         # Worlds without an episode left repeat their object's first one, unread.
         index = world_object, np.maximum(world_episode, 0)
         env.reset(object_quat=starts[index].astype(np.float32), goal_quat=goals[index].astype(np.float32))
@@ -134,20 +134,20 @@ def collect_drawn(
     """
     objects = len(env.objects)
     recorded: dict[tuple[int, int], Episode] = {}
-    rounds = _rounds(np.asarray(env.world_object), objects, episodes)
+    rounds = episode_rounds(np.asarray(env.world_object), objects, episodes)
     states = []
     for _ in rounds:
         env.reset()
         states.append(env.state_dict())
     for world_episode, state in zip(rounds, states, strict=True):
         env.load_state_dict(state)
-        starts = _unit(env.object_pose()[:, 3:7])
-        goals = _unit(env.goal_quat.numpy())
+        starts = unit_quats(env.object_pose()[:, 3:7])
+        goals = unit_quats(env.goal_quat.numpy())
         _run_round(env, policy, starts, goals, world_episode, recorded, on_step)
     return tuple(recorded[k, m] for k in range(objects) for m in range(episodes))
 
 
-def _rounds(world_object: np.ndarray, objects: int, episodes: int) -> list[np.ndarray]:
+def episode_rounds(world_object: np.ndarray, objects: int, episodes: int) -> list[np.ndarray]:
     """For every round the episode number of each world, -1 for none: a list of [N] arrays."""
     missing = sorted(set(range(objects)) - set(world_object.tolist()))
     if missing:
@@ -197,7 +197,7 @@ def _run_round(
                     start_quat=_quat(start[w]),
                     goal_quat=_quat(goal[w]),
                     start_error_rad=float(symmetric_error(start[w], goal[w], symmetry)),
-                    error_rad=float(symmetric_error(_unit(pose[w, 3:7]), goal[w], symmetry)),
+                    error_rad=float(symmetric_error(unit_quats(pose[w, 3:7]), goal[w], symmetry)),
                     steps=step,
                     stopped=bool(success[w] and not fell[w]),
                     fell=bool(fell[w]),
@@ -211,7 +211,8 @@ def _run_round(
     )
 
 
-def _unit(quat: np.ndarray) -> np.ndarray:
+def unit_quats(quat: np.ndarray) -> np.ndarray:
+    """Quaternions [.., 4] of length 1, in double precision."""
     quat = quat.astype(float)
     return quat / np.linalg.norm(quat, axis=-1, keepdims=True)
 

@@ -10,6 +10,7 @@ from newton.solvers import SolverMuJoCo
 from vd.kernels.actions import limit_joint_velocity_kernel
 from vd.kernels.contacts import pair_force_kernel
 from vd.kernels.guard import collect_overflow_kernel, guard_kernel
+from vd.paper import PAPER
 from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
 from vd.sim.restitution import Restitution
@@ -18,6 +19,9 @@ from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
 # Faster than any joint (8 rad/s) or dropped object (2 m/s) can be; an object that spins faster than
 # this is a solver failure on its way to NaN.
 MAX_SPEED = 500.0
+
+# Height of a table that is not there [m]: an object that is lost on the way down is reset long before.
+AWAY_M = -10.0
 
 # Work space of convex pairs is shared by all worlds; few worlds have no average to rely on.
 FEWEST_CONVEX_PAIRS = 64
@@ -237,6 +241,18 @@ class Simulator:
             outputs=[self.table_force],
             device=self.device,
         )
+
+    def place_table(self, *, present: bool) -> None:
+        """Put the table where it belongs, or out of reach of everything, in all worlds.
+
+        The solver computes where fixed shapes are once, when it is built, so this is written into its data,
+        where a captured step finds it.
+        """
+        table = self._geom_kind.numpy() == SHAPE_TABLE
+        height = PAPER.scene.table_top_m if present else AWAY_M
+        places = self.solver.mjw_data.geom_xpos.numpy()
+        places[..., 2] = np.where(table, height, places[..., 2])
+        self.solver.mjw_data.geom_xpos.assign(places)
 
     def forward_kinematics(self) -> None:
         """Refresh ``body_q`` and ``body_qd`` of all worlds from the joint state (after a reset)."""

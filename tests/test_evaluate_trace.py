@@ -1,0 +1,226 @@
+"""Rules that stop episodes, applied to what happened; with a test double of the environment."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from fake_env import FakeEnv, FakeObject
+from scipy.spatial.transform import Rotation
+
+from vd.evaluate.compare import parse_groups
+from vd.evaluate.comparison import OUTCOMES, Comparison, judge
+from vd.evaluate.comparison_page import labels, terminal_table, write_comparison
+from vd.evaluate.result import Protocol
+from vd.evaluate.trace import NEVER_RAD, record
+from vd.student.stopping import StoppingRule
+
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+HALF_TURN = Rotation.from_rotvec([0.0, 0.0, np.pi]).as_quat()
+STEP_RAD = 0.1
+"""What an object turns in a step."""
+
+
+class Turner:
+    """Turns the object about z by STEP_RAD a step, for some steps; predicts the distance and an offset."""
+
+    def __init__(self, env, *, until=100, offset=None):
+        self.env, self.until, self.steps = env, until, 0
+        if offset is not None:
+            self.offset = offset
+            self.predicted = torch.zeros(env.num_worlds)
+
+    def act(self, observation):
+        """The same action in all worlds."""
+        start, goal = observation[:, :4].numpy(), observation[:, 4:8].numpy()
+        if hasattr(self, "predicted"):
+            true = (Rotation.from_quat(start).inv() * Rotation.from_quat(goal)).magnitude()
+            self.predicted[:] = torch.as_tensor(true + self.offset)
+        self.steps = int(self.env.step_count.numpy()[0])
+        action = torch.zeros((self.env.num_worlds, self.env.num_actions))
+        action[:, 2] = STEP_RAD * 12.0 * (self.steps < self.until)
+        wp.to_torch(self.env.smoothed)[:] = action
+        return action
+
+
+def fake_env(objects=(FakeObject("a"),), worlds=1, steps=12, **settings):
+    env = FakeEnv(objects, num_worlds=worlds, max_episode_steps=steps, tolerance=NEVER_RAD, **settings)
+    env.smoothed = wp.zeros((worlds, env.num_actions), dtype=float, device="cpu")
+    env.table = []
+    env.sim.place_table = lambda present: env.table.append((int(env.step_count.numpy()[0]), present))
+    return env
+
+
+def goal_ahead(angle, objects=1, episodes=1):
+    starts = np.tile(IDENTITY, (objects, episodes, 1))
+    goals = np.tile(Rotation.from_rotvec([0.0, 0.0, angle]).as_quat(), (objects, episodes, 1))
+    return {"starts": starts, "goals": goals}
+
+
+def traced(angle=0.85, *, objects=(FakeObject("a"),), episodes=1, policy=None, **settings):
+    env = fake_env(objects, worlds=len(objects) * episodes, **settings)
+    return record(env, Turner(env, **(policy or {})), episodes, **goal_ahead(angle, len(objects), episodes))
+
+
+def test_what_happened_is_written_down():
+    trace = traced()
+    assert trace.predicted is None and trace.steps[0, 0] == 12 and not trace.fell.any()
+    passed = np.abs(0.85 - STEP_RAD * np.arange(13))
+    np.testing.assert_allclose(trace.distance[0, 0], passed, atol=1e-5)
+    np.testing.assert_allclose(trace.error, trace.distance, atol=1e-9)
+    assert np.isnan(trace.action_norm[0, 0, 12]) and np.isfinite(trace.action_norm[0, 0, :12]).all()
+
+
+@pytest.mark.parametrize(
+    ("bound", "steps", "error"),
+    [(0.5, 4, 0.45), (0.3, 6, 0.25), (0.01, 12, 0.35)],
+    ids=["early", "later", "never"],
+)
+def test_the_first_step_within_the_bounds_ends_it(bound, steps, error):
+    (episode,) = traced().episodes(StoppingRule(bound, 2.0), by_prediction=False)
+    assert (episode.steps, episode.stopped) == (steps, bound > 0.1)
+    assert episode.error_rad == pytest.approx(error, abs=1e-5), "at the stop, or at the end"
+
+
+def test_a_loud_action_does_not_stop():
+    """The object rests from the third step on: the smoothed action has to be below the bound too."""
+    trace = traced(policy={"until": 3})
+    (episode,) = trace.episodes(StoppingRule(0.9, 0.5), by_prediction=False)
+    assert episode.steps == 4 and episode.stopped
+
+
+def test_a_prediction_stops_where_it_says_and_the_truth_is_scored():
+    trace = traced(policy={"offset": -0.3})
+    (by_prediction,) = trace.episodes(StoppingRule(0.2, 2.0), by_prediction=True)
+    (by_truth,) = trace.episodes(StoppingRule(0.2, 2.0), by_prediction=False)
+    assert by_prediction.steps == 4 and by_prediction.error_rad == pytest.approx(0.45, abs=1e-5)
+    assert by_truth.steps == 7 and by_truth.error_rad == pytest.approx(0.15, abs=1e-5)
+    with pytest.raises(ValueError, match="only a student predicts"):
+        traced().episodes(StoppingRule(), by_prediction=True)
+
+
+def test_nothing_stops_before_the_first_action_or_after_a_fall():
+    near = traced(0.05, policy={"until": 0})
+    (episode,) = near.episodes(StoppingRule(0.4, 2.0), by_prediction=False)
+    assert episode.steps == 1 and episode.stopped
+    fallen = traced(fall_at={0: 3})
+    assert fallen.fell[0, 0] and fallen.steps[0, 0] == 3
+    assert np.isnan(fallen.distance[0, 0, 4:]).all(), "the next episode is not this one's"
+    (lost,) = fallen.episodes(StoppingRule(0.3, 2.0), by_prediction=False)
+    assert lost.fell and lost.steps == 3 and lost.scored_error_rad == pytest.approx(np.pi)
+    (saved,) = fallen.episodes(StoppingRule(0.8, 2.0), by_prediction=False)
+    assert saved.stopped and not saved.fell and saved.steps == 1
+
+
+def test_errors_are_up_to_symmetry_and_stops_are_not():
+    square = FakeObject("b", Rotation.from_rotvec(np.outer(np.arange(4), [0.0, 0.0, np.pi / 2])).as_quat())
+    trace = traced(np.pi / 2 + 0.3, objects=(FakeObject("a"), square), episodes=2)
+    assert trace.error.shape == (2, 2, 13)
+    np.testing.assert_allclose(trace.error[1, 0, :4], [0.3, 0.2, 0.1, 0.0], atol=1e-5)
+    np.testing.assert_allclose(trace.distance[1, 0], trace.distance[0, 0], atol=1e-9)
+
+
+def test_the_table_goes_and_comes_back():
+    env = fake_env(worlds=1, steps=6)
+    record(env, Turner(env), 2, **goal_ahead(1.0, 1, 2), table_steps=2)
+    assert env.table == [(0, True), (2, False), (0, True), (2, False), (0, True)]
+
+
+def test_starts_that_the_environment_draws_are_the_same_for_any_policy():
+    traces = []
+    for until in (0, 100):
+        env = fake_env(worlds=2, steps=4)
+        traces.append(record(env, Turner(env, until=until), 6))
+    np.testing.assert_allclose(traces[0].start_quat, traces[1].start_quat)
+    np.testing.assert_allclose(traces[0].goal_quat, traces[1].goal_quat)
+    assert len(np.unique(traces[0].start_quat[0, :, 0])) == 6
+
+
+def protocol(name, episodes, **changes):
+    values = dict(
+        policy=name,
+        objects="set",
+        hand="dclaw3",
+        episodes=episodes,
+        seed=0,
+        max_goal_angle_rad=float(np.pi),
+        stop_tolerance_rad=0.4,
+        episode_s=1.0,
+        control_hz=12.0,
+        randomised=False,
+    )
+    return Protocol(**{**values, **changes})
+
+
+def compared(offset=-0.3, fall_at=None):
+    objects = (FakeObject("a"), FakeObject("b"))
+    trace = traced(objects=objects, episodes=4, policy={"offset": offset}, fall_at=fall_at)
+    return judge(
+        trace,
+        protocol("student.pt", 4),
+        list(objects),
+        kind="student of stage 1",
+        sees="complete clouds",
+        group="training",
+        rule=StoppingRule(0.2, 2.0),
+    )
+
+
+def test_every_episode_is_in_one_class():
+    rows, _ = compared(fall_at={1: 2, 5: 12})
+    assert [row.stopped_by for row in rows] == ["prediction", "true distance"]
+    by_prediction, by_truth = ({k: v.value for k, v in row.outcomes.items()} for row in rows)
+    assert tuple(by_prediction) == OUTCOMES
+    # It stops at 0.45 rad by its prediction, and at 0.35 by the truth; one fell before, one long after.
+    assert by_prediction == pytest.approx(dict(zip(OUTCOMES, (0.0, 7 / 8, 0.0, 1 / 8), strict=True)))
+    assert by_truth == pytest.approx(dict(zip(OUTCOMES, (7 / 8, 0.0, 0.0, 1 / 8), strict=True)))
+    never, _ = compared(offset=5.0)
+    assert never[0].outcomes["time-out"].value == 1.0
+
+
+def test_what_predictions_are_worth():
+    _, prediction = compared()
+    true = np.abs(0.85 - STEP_RAD * np.arange(12))
+    assert prediction.states == 8 * 12
+    assert prediction.mean_error_rad == pytest.approx(0.3, abs=1e-4)
+    near, far = prediction.bounds
+    assert (near.bound_rad, far.bound_rad) == (0.1, 0.4)
+    said = true - 0.3 <= 0.4
+    assert far.seen == 1.0 and far.right == pytest.approx((true[said] <= 0.4).mean())
+    assert far.by_prediction.value == 0.0, "it stops at 0.65 rad"
+    assert far.by_truth.value == 1.0 and near.by_truth.value == 1.0
+    _, sure = compared(offset=0.0)
+    assert [bound.right for bound in sure.bounds] == [1.0, 1.0]
+    assert [bound.by_prediction for bound in sure.bounds] == [bound.by_truth for bound in sure.bounds]
+
+
+def test_page_and_file(tmp_path):
+    rows, prediction = compared()
+    comparison = Comparison(tuple(rows), (prediction,), software={"torch": "2"})
+    comparison.write(tmp_path / "eval.json")
+    assert Comparison.read(tmp_path / "eval.json") == comparison
+    write_comparison(comparison, tmp_path / "eval.html")
+    html = (tmp_path / "eval.html").read_text()
+    for word in ("object falls", "stopped by", "near and seen so", "complete clouds", "training"):
+        assert word in html
+    assert html.count("<img") == 3 and "http" not in html.replace("http://www.w3.org", "")
+    assert "orientation error" in terminal_table(comparison)
+    (tmp_path / "x.json").write_text('{"format": 1}')
+    with pytest.raises(ValueError, match="run vd-eval again"):
+        Comparison.read(tmp_path / "x.json")
+
+
+def test_names_in_legends_are_as_short_as_they_can_be():
+    names = ("runs/a/stage1/student.pt", "runs/a/stage2/student.pt", "dclaw3-table")
+    assert list(labels(names).values()) == ["stage1", "stage2", "dclaw3-table"]
+    assert labels(("runs/a/policy.pt",)) == {"runs/a/policy.pt": "a"}
+
+
+def test_groups_of_objects():
+    assert parse_groups(["cube"]) == {"objects": ("cube",)}
+    assert parse_groups(["training=a", "held-out=b", "training=c"]) == {
+        "training": ("a", "c"),
+        "held-out": ("b",),
+    }
+    for wrong in ("=a", "a="):
+        with pytest.raises(ValueError, match="NAME=SET"):
+            parse_groups([wrong])

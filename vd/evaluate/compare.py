@@ -1,0 +1,196 @@
+"""Run several policies through the same episodes, and judge each by its prediction and the true distance."""
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from vd.evaluate.agents import BUILT_IN, built_in, check_bundle, open_policy, start_at_rest, task_for
+from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.envs.cfg import ReorientCfg
+    from vd.evaluate.cli import EvalCfg
+    from vd.evaluate.comparison import Comparison
+
+STUDENT_WORLDS_GPU = 1024
+"""Worlds simulated at once by default where a student looks at them: depth images and clouds take memory."""
+
+
+def parse_groups(objects: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Object sets by the name of their group: ``NAME=SET`` is of that group, others of ``objects``.
+
+    Raises:
+        ValueError: A group has no set.
+    """
+    groups: dict[str, tuple[str, ...]] = {}
+    for item in objects:
+        name, equals, sets = item.partition("=")
+        if not equals:
+            name, sets = "objects", item
+        if not name or not sets:
+            raise ValueError(f"--objects: '{item}' has to be NAME=SET, such as training=procedural-150-seed0")
+        groups[name] = (*groups.get(name, ()), sets)
+    return groups
+
+
+def compare(cfg: "EvalCfg") -> "Comparison":
+    """Run a comparison and write its JSON and page into ``cfg.output``.
+
+    Raises:
+        ValueError: A setting, object set or policy cannot be used.
+        FileNotFoundError: There is no such policy.
+        vd.sim.simulator.SimulationError: Contacts were lost, or a world left the finite numbers.
+    """
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would scroll the rest away
+    from vd.assets_usd.objects.model import load_set
+    from vd.envs.reorient import ReorientEnv
+    from vd.evaluate.cli import resolve_device, software, worlds_for
+    from vd.evaluate.comparison import Comparison, judge
+    from vd.evaluate.comparison_page import write_comparison
+    from vd.evaluate.result import Protocol
+
+    device = resolve_device(cfg.device)
+    groups = parse_groups(cfg.objects)
+    sizes = {name: len(load_set(list(sets))) for name, sets in groups.items()}
+    count = sum(sizes.values())
+    limit = None if device == "cpu" else STUDENT_WORLDS_GPU
+    worlds = cfg.num_worlds or worlds_for(count, cfg.episodes, device, limit=limit)
+    rows, predictions = [], []
+    env: Any = None
+    task, start = None, None
+    for name in cfg.agent_names:
+        policy = open_policy(name, device)
+        wanted = _task(cfg, policy, tuple(s for sets in groups.values() for s in sets), worlds)
+        check_bundle(name, wanted)
+        if task != wanted:
+            print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
+            if env is not None:
+                env.close()
+            env = ReorientEnv(wanted, device)
+            task, start = wanted, env.state_dict()
+        env.load_state_dict(start)
+        actor, kind, sees, rule = _actor(cfg, name, policy, env, device)
+        trace = _run(cfg, env, actor, name)
+        protocol = Protocol(
+            policy=name,
+            objects="",
+            hand=wanted.hand,
+            hand_layer=wanted.hand_layer,
+            episodes=cfg.episodes,
+            seed=cfg.seed,
+            max_goal_angle_rad=cfg.max_goal_angle,
+            stop_tolerance_rad=cfg.stop_tolerance,
+            episode_s=wanted.episode_s,
+            control_hz=wanted.sim.control_hz,
+            randomised=cfg.randomise,
+            at_rest=wanted.start.at_rest,
+            goals_about_vertical=wanted.start.at_rest and wanted.goal.about_vertical,
+            in_air=cfg.in_air,
+        )
+        first = 0
+        for group, sets in groups.items():
+            chosen = range(first, first + sizes[group])
+            first += sizes[group]
+            found, prediction = judge(
+                trace.of(chosen),
+                replace(protocol, objects=", ".join(sets)),
+                [env.objects[index] for index in chosen],
+                kind=kind,
+                sees=sees,
+                group=group,
+                rule=rule,
+                resample=cfg.resample,
+            )
+            rows += found
+            predictions += [] if prediction is None else [prediction]
+    env.close()
+    comparison = Comparison(tuple(rows), tuple(predictions), software=software(device))
+    comparison.write(cfg.output / "eval.json")
+    write_comparison(comparison, cfg.output / "eval.html")
+    return comparison
+
+
+def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int) -> "ReorientCfg":
+    """The task of one policy, in which no state ends an episode but a fall."""
+    from vd.evaluate.trace import NEVER_RAD
+
+    task = task_for(
+        policy,
+        hand=cfg.hand,
+        objects=sets,
+        num_worlds=worlds,
+        seed=cfg.seed,
+        stop_tolerance_rad=NEVER_RAD,
+        max_goal_angle_rad=cfg.max_goal_angle,
+        episode_s=cfg.limit_s,
+        randomised=cfg.randomise,
+        success_ends_episode=True,
+        at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
+        hand_layer=cfg.hand_layer,
+    )
+    if cfg.randomise:
+        return task
+    # Noise that is switched off anyway, and would keep a teacher and its student from sharing the worlds.
+    exact = replace(
+        task.randomisation,
+        observation_noise_mean=0.0,
+        observation_noise_std=0.0,
+        observation_offset_std=0.0,
+    )
+    return replace(task, randomisation=exact)
+
+
+def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str) -> tuple[Any, str, str, Any]:
+    """What acts, its kind, what it sees, and its rule to stop."""
+    from vd.policy import TrainedPolicy
+    from vd.student.stopping import StoppingRule
+
+    if name in BUILT_IN:
+        return built_in(name, env.num_actions, seed=cfg.seed, device=device), name, "nothing", StoppingRule()
+    if isinstance(policy, TrainedPolicy):
+        return policy, "teacher", "state", StoppingRule()
+    from vd.evaluate.student import StudentActor
+
+    assert policy is not None
+    rendered = None if cfg.sees == "auto" else cfg.sees == "rendered"
+    actor = StudentActor(env, policy, rendered=rendered, seed=cfg.seed)
+    sees = "rendered clouds" if actor.rendered else "complete clouds"
+    return actor, f"student of stage {policy.spec.stage}", sees, policy.spec.stopping
+
+
+def _run(cfg: "EvalCfg", env: Any, actor: Any, name: str) -> Any:
+    """All episodes of one policy, with a progress bar."""
+    import numpy as np
+    from tqdm import tqdm
+
+    from vd.evaluate.cli import LOG_EVERY_S
+    from vd.evaluate.rollout import draw_starts_and_goals
+    from vd.evaluate.trace import record
+
+    starts, goals = None, None
+    if not env.cfg.start.at_rest:
+        drawn = [
+            draw_starts_and_goals(item.name, cfg.episodes, seed=cfg.seed, max_goal_angle=cfg.max_goal_angle)
+            for item in env.objects
+        ]
+        starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
+    rounds = math.ceil(cfg.episodes / (env.num_worlds // len(env.objects)))
+    refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
+    title = Path(name).name or name
+    with tqdm(total=rounds * env.max_episode_steps, unit="step", desc=title, mininterval=refresh) as bar:
+        trace = record(
+            env,
+            actor,
+            cfg.episodes,
+            starts=starts,
+            goals=goals,
+            table_steps=round(PAPER.scene.air_table_s * env.cfg.sim.control_hz) if cfg.in_air else None,
+            on_step=bar.update,
+        )
+    env.check()
+    return trace

@@ -1,0 +1,292 @@
+"""A comparison as one HTML page, its figures, and lines for a terminal."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from vd.evaluate.comparison import OUTCOMES, Comparison, Prediction, Row
+from vd.evaluate.plots import BLUE, GREEN, GREY, ORANGE, ecdf
+from vd.evaluate.report import goals_text, number, percent, starts_text
+from vd.evaluate.result import TOLERANCES_RAD
+from vd.evaluate.statistics import Interval, chance_cdf
+from vd.page import Page
+from vd.paper import PAPER
+
+COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Of policies, in their order (Okabe and Ito)."""
+OUTCOME_COLOURS = dict(zip(OUTCOMES, (GREEN, "#E69F00", GREY, ORANGE), strict=True))
+PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.9
+"""Of one panel of a figure [inch]."""
+_RUN_FILES = ("policy.pt", "student.pt")
+"""Files that are called the same in every run, so that their folder tells more."""
+NEAR_RAD = 0.4
+"""Range of the second panel of the scatter, where predictions decide."""
+_HEADER = (
+    "policy",
+    "objects",
+    "stopped by",
+    "episodes",
+    *OUTCOMES,
+    *(f"<= {tolerance:g} rad" for tolerance in TOLERANCES_RAD if tolerance <= NEAR_RAD),
+    "median error [rad]",
+    "time to stop [s]",
+)
+_BOUND_HEADER = (
+    "student",
+    "objects",
+    "bound [rad]",
+    "near and seen so",
+    "said and right",
+    "stops within, by prediction",
+    "stops within, by true distance",
+    "mean error [rad]",
+)
+
+
+def labels(names: tuple[str, ...]) -> dict[str, str]:
+    """Short names of policies for legends: the ends of their paths that tell them apart."""
+
+    def telling(name: str) -> tuple[str, ...]:
+        parts = Path(name).parts
+        return parts[:-1] if len(parts) > 1 and parts[-1] in _RUN_FILES else parts
+
+    short = {}
+    for name in names:
+        parts = telling(name)
+        others = [telling(other) for other in names if other != name]
+        length = next(
+            (n for n in range(1, len(parts)) if all(parts[-n:] != other[-n:] for other in others)), len(parts)
+        )
+        short[name] = "/".join(parts[-length:])
+    return short
+
+
+def write_comparison(comparison: Comparison, path: Path) -> None:
+    """Write the page."""
+    page = Page("Comparison of policies", _lead(comparison))
+    short = labels(comparison.policies)
+    page.section("How episodes ended")
+    page.table(_HEADER, [_cells(row, short) for row in comparison.rows], words=(1, 2))
+    page.figure(
+        outcome_figure(comparison),
+        "Success: stopped within the tolerance. Orientation error: stopped outside of it. Time-out: never "
+        "stopped. Object falls: it left the hand before a stop.",
+    )
+    page.section("Errors")
+    page.figure(
+        ecdf_figure(comparison),
+        "Share of episodes that ended within each error. Solid: stopped by itself, a student by its "
+        "prediction, others by the true distance. Dashed: a student stopped by the true distance. A lost "
+        "object never counts, so curves end below one.",
+    )
+    if comparison.predictions:
+        page.section("Predicted distance")
+        page.figure(
+            scatter_figure(comparison),
+            "Predicted beside true distance to the goal, before symmetry, in a sample of all states of all "
+            "episodes; right, the near ones. Lines are 0.1 rad apart from equal.",
+        )
+        page.table(_BOUND_HEADER, _bound_cells(comparison.predictions, short), words=(1,))
+        page.text(
+            "Near and seen so: of the states truly within the bound, the share predicted within it. Said and "
+            "right: of those predicted within it, the share that is. The paper reports 29.4 % and 85.9 % for "
+            "the first at 0.1 and 0.4 rad, and stops within them of 25.9 % and 72.3 % by prediction, 67.4 % "
+            "and 80.9 % by true distance (in the air, twelve objects).",
+            small=True,
+        )
+    page.section("Every object")
+    for row in comparison.rows:
+        heading = f"{short[row.policy]}, {row.group}, stopped by {row.stopped_by}"
+        cells = [
+            (
+                summary.name,
+                str(summary.episodes),
+                *(percent(rate) for rate in summary.success.values()),
+                number(summary.median_error_rad),
+                percent(summary.stop_rate),
+                percent(summary.drop_rate),
+            )
+            for summary in row.result.per_object
+        ]
+        header = ("object", "episodes", *(f"<= {t:g} rad" for t in TOLERANCES_RAD), "median error [rad]")
+        page.table((*header, "stopped", "fell"), cells, folded=heading)
+    page.section("Protocol")
+    page.table(("setting", "value"), _protocol(comparison), words=(1,))
+    page.text(_METHOD, small=True)
+    page.write(path)
+
+
+def terminal_table(comparison: Comparison) -> str:
+    """The table of outcomes for a terminal."""
+    short = labels(comparison.policies)
+    # Of the shares only the first has its interval here: a line has to fit.
+    shares = range(_HEADER.index(OUTCOMES[1]), len(_HEADER) - 2)
+    rows = [_HEADER]
+    for row in comparison.rows:
+        cells = _cells(row, short)
+        rows.append(tuple(c.split(" (")[0] if i in shares else c for i, c in enumerate(cells)))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADER))]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if column < 3 else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    )
+
+
+def ecdf_figure(comparison: Comparison) -> Figure:
+    """Error distributions of all policies, a panel for each group."""
+    figure, panels = _panels(len(comparison.groups), PANEL_HEIGHT)
+    short, angle = labels(comparison.policies), np.linspace(0.0, np.pi, 200)
+    colour = dict(zip(comparison.policies, COLOURS * len(comparison.policies), strict=False))
+    for axes, group in zip(panels, comparison.groups, strict=True):
+        rows = [row for row in comparison.rows if row.group == group]
+        students = {row.policy for row in rows if row.stopped_by == "prediction"}
+        for row in rows:
+            other = row.policy in students and row.stopped_by == "true distance"
+            style = {"linestyle": "--", "linewidth": 1.2} if other else {"linewidth": 2.0}
+            label = None if other else f"{short[row.policy]} ({row.kind})"
+            ecdf(axes, row.result.errors().ravel(), color=colour[row.policy], label=label, **style)
+        axes.plot(angle, chance_cdf(angle), color=GREY, linestyle=":", label="uniform, no symmetry")
+        axes.axvline(rows[0].result.protocol.stop_tolerance_rad, color=GREY, linewidth=0.6)
+        axes.set(xlim=(0.0, np.pi), ylim=(0.0, 1.0), xlabel="error at the stop or end [rad]")
+        axes.set_title(f"{group} ({len(rows[0].result.object_names)} objects)", fontsize=10)
+        axes.legend(frameon=False, loc="lower right", fontsize=7)
+    panels[0].set_ylabel("share of episodes")
+    return figure
+
+
+def outcome_figure(comparison: Comparison) -> Figure:
+    """Shares of the outcome classes as stacked bars."""
+    short, rows = labels(comparison.policies), comparison.rows
+    figure = Figure(figsize=(9.0, 1.2 + 0.34 * len(rows)), layout="constrained")
+    axes = figure.add_subplot()
+    axes.spines[["top", "right"]].set_visible(False)
+    places = np.arange(len(rows))[::-1]
+    left = np.zeros(len(rows))
+    for name in OUTCOMES:
+        shares = np.array([row.outcomes[name].value for row in rows])
+        axes.barh(places, shares, left=left, color=OUTCOME_COLOURS[name], label=name, height=0.7)
+        left += shares
+    names = [f"{short[row.policy]}, {row.group}, by {row.stopped_by}" for row in rows]
+    axes.set_yticks(places, names, fontsize=8)
+    axes.set(xlim=(0.0, 1.0), xlabel="share of episodes")
+    axes.legend(frameon=False, fontsize=8, ncols=len(OUTCOMES), loc="lower center", bbox_to_anchor=(0.4, 1.0))
+    return figure
+
+
+def scatter_figure(comparison: Comparison) -> Figure:
+    """Predicted beside true distances, two panels for each student: all, and the near ones."""
+    short = labels(comparison.policies)
+    students = tuple(dict.fromkeys(entry.policy for entry in comparison.predictions))
+    figure = Figure(figsize=(2 * PANEL_WIDTH, PANEL_HEIGHT * len(students)), layout="constrained")
+    for line, policy in enumerate(students):
+        for column, limit in enumerate((np.pi, NEAR_RAD)):
+            axes = figure.add_subplot(len(students), 2, 2 * line + column + 1)
+            axes.spines[["top", "right"]].set_visible(False)
+            for index, entry in enumerate(e for e in comparison.predictions if e.policy == policy):
+                axes.plot(
+                    entry.true_rad,
+                    entry.predicted_rad,
+                    ".",
+                    markersize=2.0 if column == 0 else 4.0,
+                    alpha=0.35,
+                    color=COLOURS[index % len(COLOURS)],
+                    label=entry.group,
+                )
+            for offset in (-0.1, 0.1):
+                axes.plot([0.0, limit], [offset, limit + offset], color=GREY, linewidth=0.8)
+            axes.set(xlim=(0.0, limit), ylim=(0.0, limit), aspect="equal")
+            axes.set_xlabel("true distance [rad]")
+            axes.set_ylabel("predicted [rad]")
+            axes.set_title(short[policy], fontsize=9)
+            if column == 0:
+                axes.legend(frameon=False, fontsize=7, markerscale=4)
+    return figure
+
+
+def _panels(count: int, height: float) -> tuple[Figure, list]:
+    figure = Figure(figsize=(max(PANEL_WIDTH * count, 6.0), height), layout="constrained")
+    panels = [figure.add_subplot(1, count, index + 1) for index in range(count)]
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure, panels
+
+
+def _cells(row: Row, short: dict[str, str]) -> tuple[str, ...]:
+    overall = row.result.overall
+    shown = [rate for key, rate in overall.success.items() if float(key) <= NEAR_RAD]
+    return (
+        f"{short[row.policy]} ({row.kind})",
+        row.group,
+        row.stopped_by,
+        str(overall.episodes),
+        *(percent(row.outcomes[name]) for name in OUTCOMES),
+        *(percent(rate) for rate in shown),
+        number(overall.median_error_rad),
+        number(overall.time_to_success_s),
+    )
+
+
+def _bound_cells(predictions: tuple[Prediction, ...], short: dict[str, str]) -> list[tuple[str, ...]]:
+    def share(value: float | None) -> str:
+        return "none" if value is None else f"{100 * value:.1f} %"
+
+    def rate(interval: Interval) -> str:
+        return percent(interval)
+
+    return [
+        (
+            short[entry.policy],
+            entry.group,
+            f"{bound.bound_rad:g}",
+            share(bound.seen),
+            share(bound.right),
+            rate(bound.by_prediction),
+            rate(bound.by_truth),
+            f"{entry.mean_error_rad:.2f}",
+        )
+        for entry in predictions
+        for bound in entry.bounds
+    ]
+
+
+def _lead(comparison: Comparison) -> str:
+    protocol = comparison.rows[0].result.protocol
+    place = "in the air" if protocol.in_air else "on the table"
+    return (
+        f"{len(comparison.policies)} policies, {place}: starts {starts_text(protocol)}; goals "
+        f"{goals_text(protocol)}; {protocol.episodes} for each object"
+    )
+
+
+def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
+    protocol = comparison.rows[0].result.protocol
+    rows = [
+        ("hand", protocol.hand_name),
+        ("starts and goals", f"{protocol.episodes} each for every object, seed {protocol.seed}"),
+        ("starts", starts_text(protocol)),
+        ("goals", goals_text(protocol)),
+        ("time limit", f"{protocol.episode_s:g} s at {protocol.control_hz:g} Hz"),
+        ("table", f"taken away after {PAPER.scene.air_table_s:g} s" if protocol.in_air else "there"),
+        ("randomisation, noise, disturbances", "on" if protocol.randomised else "off"),
+    ]
+    by_group = {row.group: row.result.protocol.objects for row in comparison.rows}
+    rows += [(f"objects: {name}", sets) for name, sets in by_group.items()]
+    for row in comparison.rows:
+        if row.stopped_by == "prediction" or row.kind == "teacher":
+            rule = f"distance {row.rule.distance_rad:.3g} rad, action norm {row.rule.action_norm:.3g}"
+            rows.append((f"{row.policy}, {row.group}", f"sees {row.sees}, stops below {rule}"))
+    return rows + list(comparison.software.items())
+
+
+_METHOD = (
+    "Episodes run to the fall of the object or the time limit, whatever a policy does, and are then ended "
+    "by each rule at the first step at which it holds: what decides to stop does not change what happened "
+    "before. A rule is a bound on the distance, predicted by a student or true, and one on the norm of the "
+    "smoothed action; unlike the evaluation of a single teacher it does not ask for stillness. "
+    "Errors are measured at the stop, up to the object's symmetry; rules know no symmetry. Intervals are "
+    "95 %, as on the page of a single policy."
+)

@@ -1,0 +1,80 @@
+"""A student at work in an environment."""
+
+from typing import Any
+
+import torch
+import warp as wp
+
+from vd.config import from_dict
+from vd.sensors.cfg import DepthCameraCfg
+from vd.student.saved import SavedStudent
+from vd.vision import StudentView
+
+PRETRAINED, RENDERED = 0, 2
+"""Stages of the training: those of encoders that cannot act, and of depth cameras."""
+CLOUDS = 256
+"""Clouds through the network at once: their features take one or two gigabytes."""
+
+
+class StudentActor:
+    """The deterministic policy of a student: what it sees, its memory, and the mean of its actions.
+
+    Attributes:
+        num_actions: D.
+        rendered: Whether it sees by a depth camera.
+        predicted: Its distance to the goal before the latest action [rad], shape [N].
+    """
+
+    def __init__(self, env: Any, student: SavedStudent, *, rendered: bool | None = None, seed: int = 0):
+        """Open its eyes in every world.
+
+        Args:
+            env: The environment.
+            student: The student.
+            rendered: See by a depth camera, or complete clouds; as its stage was trained by default.
+            seed: Of the camera's errors.
+
+        Raises:
+            ValueError: It is one of stage 0, which cannot act, or of another hand.
+        """
+        spec = student.spec
+        if spec.stage == PRETRAINED:
+            raise ValueError("a student of stage 0 is an encoder, which cannot act; give one of stage 1 or 2")
+        if spec.num_actions != env.num_actions:
+            raise ValueError(
+                f"the student moves {spec.num_actions} joints, the hand {env.hand.name} has "
+                f"{env.num_actions}; use the hand it was trained for"
+            )
+        self.env, self.num_actions, self._student = env, spec.num_actions, student.network
+        self.rendered = spec.stage == RENDERED if rendered is None else rendered
+        self._view = StudentView(
+            env,
+            spec.network,
+            rendered=self.rendered,
+            depth=from_dict(DepthCameraCfg, student.depth, where="depth camera of the student"),
+            camera=spec.camera,
+            seed=seed,
+        )
+        self._hidden = self._student.initial_hidden(env.num_worlds)
+        self._steps = wp.to_torch(env.step_count)
+        self.predicted = self._hidden.new_zeros(env.num_worlds)
+
+    def act(self, _observation: torch.Tensor) -> torch.Tensor:
+        """Mean actions [N, D] for what is seen now; the teacher's observation is not looked at.
+
+        The memory of worlds that have just been reset starts empty.
+        """
+        frame = self._view.frame()
+        self._hidden.masked_fill_((self._steps == 0)[:, None], 0.0)
+        worlds = torch.arange(self.env.num_worlds, device=self._hidden.device)
+        means = []
+        with torch.no_grad():
+            for rows in worlds.split(CLOUDS):
+                sites = self._view.sites(
+                    {key: value[rows] for key, value in frame.items()}, rows, augment=False
+                )
+                output = self._student.act(sites[0], frame["action"][rows], self._hidden[rows], *sites[1:])
+                self._hidden[rows] = output.hidden
+                self.predicted[rows] = output.distance[:, -1]
+                means.append(output.mean)
+        return torch.cat(means)
