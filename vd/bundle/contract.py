@@ -72,12 +72,14 @@ class ActionPart:
 
 @dataclass(frozen=True)
 class ObservationPart:
-    """The vector a teacher sees; world frame."""
+    """The vector a teacher sees."""
 
     parts: dict[str, tuple[int, int]]
     """First column and the one after the last of each part."""
     velocity_scale: float = PAPER.observation.velocity_scale
     """Factor on joint velocities and the object's angular velocity."""
+    view: str = "world"
+    """Frame of observation and action: the world's, or goal: the turn of the hand that the goal asks for."""
 
 
 @dataclass(frozen=True)
@@ -241,7 +243,7 @@ def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
     if task.observation.shape != "none":
         end = slices["previous_action"].stop
         parts["shape"] = (end, end + shape_observation_size(hand.num_fingers))
-    return ObservationPart(parts)
+    return ObservationPart(parts, view=task.observation.view)
 
 
 def _camera(hand: HandModel, depth: DepthCameraCfg, pose: tuple[float, ...] | None) -> CameraPart:

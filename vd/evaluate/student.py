@@ -66,6 +66,7 @@ class StudentActor:
         """
         frame = self._view.frame()
         self._hidden.masked_fill_((self._steps == 0)[:, None], 0.0)
+        senses = self._student.senses(frame)
         worlds = torch.arange(self.env.num_worlds, device=self._hidden.device)
         means = []
         with torch.no_grad():
@@ -73,7 +74,7 @@ class StudentActor:
                 sites = self._view.sites(
                     {key: value[rows] for key, value in frame.items()}, rows, augment=False
                 )
-                output = self._student.act(sites[0], frame["action"][rows], self._hidden[rows], *sites[1:])
+                output = self._student.act(sites[0], senses[rows], self._hidden[rows], *sites[1:])
                 self._hidden[rows] = output.hidden
                 self.predicted[rows] = output.distance[:, -1]
                 means.append(output.mean)
