@@ -26,6 +26,9 @@ STATISTICS = ("loss/imitation", "loss/distance", "loss/grad_norm")
 """What every minibatch reports."""
 UNCLIPPED = ("points",)
 """Frames' tensors that hold NaN on purpose: where there is no point."""
+CHECKPOINT_ROLLOUT_BYTES = 2**28
+"""Kept rollouts that are larger together, those with camera points, are not written into checkpoints: a run
+that goes on from one begins with the rollouts to come."""
 LOWER_RATES = "lower --dagger.learning-rate or --dagger.grad-norm, or take --dagger.precision fp32"
 """Remedy for a network that diverges."""
 
@@ -296,6 +299,8 @@ class Dagger:
         """What belongs to this process: its worlds, random states, the student's memory, kept rollouts."""
         # The next iteration drops the oldest: one that stands alone, or the first of a full store.
         kept = list(self._kept)[-(self.cfg.keep_rollouts - 1) :] if self.cfg.keep_rollouts > 1 else []
+        if sum(rollout_bytes(rollout) for rollout in kept) > CHECKPOINT_ROLLOUT_BYTES:
+            kept = []
         return {
             "env": self.env.state_dict(),
             "view": self.view.state_dict(),
@@ -404,6 +409,12 @@ def taken(rollouts: Sequence[Rollout], sequences: torch.Tensor) -> Rollout:
         torch.cat([r.hidden[own] for r, own in parts]),
         torch.cat([r.worlds[own] for r, own in parts]),
     )
+
+
+def rollout_bytes(rollout: Rollout) -> int:
+    """Memory of a rollout's tensors."""
+    tensors = (*rollout.frames.values(), rollout.label, rollout.done, rollout.hidden)
+    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
 
 
 def moved(rollout: Rollout | dict[str, Any], device: str | torch.device) -> dict[str, Any]:
