@@ -46,7 +46,7 @@ def test_gradients_equal_those_of_an_unrolled_loop(kind):
     rollout.done = torch.tensor([[0, 1, 0], [0, 0, 0], [1, 1, 0], [0, 0, 0], [0, 0, 1]], dtype=torch.bool)
     rollout.hidden = torch.randn(3, TINY.memory)
     student = dagger.student.eval()  # one batch or five: the same statistics
-    imitation, distance = dagger.losses(rollout)
+    imitation, distance, _ = dagger.losses(rollout)
     (imitation + 0.5 * distance).backward()
     found = {name: p.grad.clone() for name, p in student.named_parameters() if p.grad is not None}
 
@@ -96,7 +96,7 @@ def test_no_gradient_crosses_the_end_of_an_episode():
         embedding = student.encode(*dagger.view.sites(frames, augment=True)).view(4, 2, -1)
         output = student(embedding, action, rollout.hidden, rollout.done)
         rollout.label[0] = output.mean[0]  # no error in the first step: its own loss has no gradient
-    imitation, _ = dagger.losses(rollout)
+    imitation, _, _ = dagger.losses(rollout)
     (gradient,) = torch.autograd.grad(imitation, action)
     assert float(gradient[0, 0].abs().max()) < 1e-9 < 1e-6 < float(gradient[0, 1].abs().max())
     assert float(gradient[1, 0].abs().max()) > 1e-6
@@ -132,7 +132,7 @@ def test_kept_rollouts_are_learned_from_too():
     together = taken(rollouts, torch.tensor([4, 0, 1, 5, 2, 3]))
     parts = [dagger.student.eval() and dagger.losses(one) for one in rollouts]
     whole = dagger.losses(together)
-    for loss, (first, second) in zip(whole, zip(*parts, strict=True), strict=True):
+    for loss, (first, second) in zip(whole[:2], zip(*(p[:2] for p in parts), strict=True), strict=True):
         torch.testing.assert_close(loss, 0.5 * (first + second))
     drawn = torch.cat([batch for _ in range(40) for batch in dagger.minibatches(2)])
     assert len(drawn) == 120 and set(drawn.tolist()) == set(range(6))
@@ -300,7 +300,7 @@ def test_half_precision_of_the_encoder_hardly_changes_the_losses():
     rollout = single.collect()
     for dagger in (single, half):
         dagger.student.eval()
-    for one, two in zip(single.losses(rollout), half.losses(rollout), strict=True):
+    for one, two in zip(single.losses(rollout)[:2], half.losses(rollout)[:2], strict=True):
         assert one.dtype == two.dtype == torch.float32
         assert two.item() == pytest.approx(one.item(), rel=0.05) and two.item() != one.item()
     half.update([half.collect()])

@@ -23,11 +23,8 @@ from vd.train.student.pretrain import (
     Pretrainer,
     PretrainHeads,
     RandomScenes,
-    angle_of,
-    multiply,
-    random_rotations,
-    two_columns,
 )
+from vd.train.student.rotations import angle_between, multiply, random_rotations, two_columns
 from vd.train.student.runner import StudentRunner
 from vd.vision import relative_rotation, rotation_distance
 
@@ -71,7 +68,9 @@ def test_rotations_agree_with_scipys():
     columns = two_columns(relative_rotation(a, b))
     matrix = between.as_matrix()
     np.testing.assert_allclose(columns, np.concatenate([matrix[:, :, 0], matrix[:, :, 1]], axis=1), atol=1e-5)
-    np.testing.assert_allclose(angle_of(columns), between.magnitude(), atol=2e-3)
+    np.testing.assert_allclose(angle_between(columns), between.magnitude(), atol=2e-3)
+    apart = angle_between(two_columns(a), two_columns(b))
+    np.testing.assert_allclose(apart, (first.inv() * second).magnitude(), atol=2e-3)
 
 
 def test_scenes_are_what_their_targets_say(assets):

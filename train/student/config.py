@@ -47,6 +47,10 @@ class DaggerCfg:
     squared error of the student's mean, which teaches no standard deviation: it then acts by its mean."""
     distance_weight: float = PAPER.dagger.distance_weight
     """Weight of the squared error of the predicted rotation distance [rad^2], the mean over the heads."""
+    pose_weight: float = 0.0
+    """Weight of the squared error of where the object is, and how it is turned from the goal, predicted from
+    the embedding by a head of the training alone. The teacher acts by these; labels alone teach the encoder
+    to see them much later. 0, as in the released code: no such head."""
     clip_labels: bool = False
     """Clip the teacher's mean to [-1, 1], where the environment clips actions; the released code does not."""
     teacher_share: float = PAPER.dagger.teacher_share
@@ -174,6 +178,7 @@ SHORT_ROLLOUTS = DaggerCfg(
     amsgrad=False,
     grad_norm=1.0,
     imitation="squared",
+    pose_weight=1.0,
     clip_labels=True,
     teacher_share=1.0,
     teacher_share_last=0.2,
@@ -296,6 +301,7 @@ def validate(cfg: StudentTrainCfg) -> None:
             raise ValueError(f"{flag} is {value}; it has to be positive")
     weights = {
         "--dagger.distance-weight": dagger.distance_weight,
+        "--dagger.pose-weight": dagger.pose_weight,
         "--dagger.teacher-share-iterations": dagger.teacher_share_iterations,
         "--dagger.warmup-steps": dagger.warmup_steps,
         "--dagger.validation-worlds": dagger.validation_worlds,

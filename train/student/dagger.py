@@ -20,10 +20,16 @@ from vd.train.ending import TrainingDivergedError
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import DaggerCfg
 from vd.train.student.losses import distance_loss, imitation_loss, unexplained
+from vd.train.student.rotations import angle_between, two_columns
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
+from vd.vision import relative_rotation
 
-STATISTICS = ("loss/imitation", "loss/distance", "loss/grad_norm")
+STATISTICS = ("loss/imitation", "loss/distance", "loss/pose", "loss/grad_norm")
 """What every minibatch reports."""
+POSE_SCALE_M = 0.05
+"""Positions of objects are predicted in units of this, about their spread."""
+POSE_VALUES = 9
+"""Position 3, two columns of the rotation from the goal 6."""
 UNCLIPPED = ("points",)
 """Frames' tensors that hold NaN on purpose: where there is no point."""
 CHECKPOINT_ROLLOUT_BYTES = 2**28
@@ -103,7 +109,14 @@ class Dagger:
     ) -> None:
         self.env, self.view, self.student, self.teacher, self.cfg = env, view, student, teacher, cfg
         self.device = torch.device(env.device)
-        self.optimizer = make_optimizer(student, cfg.learning_rate, amsgrad=cfg.amsgrad)
+        self.pose: nn.Module | None = None
+        """Predicts :func:`poses` from embeddings, in training only."""
+        if cfg.pose_weight > 0.0:
+            width, inside = student.cfg.encoder.embedding, student.cfg.distance_hidden
+            layers = (nn.Linear(width, inside), nn.GELU(), nn.Linear(inside, POSE_VALUES))
+            self.pose = nn.Sequential(*layers).to(self.device)
+        self._all = nn.ModuleList([student, *([] if self.pose is None else [self.pose])])
+        self.optimizer = make_optimizer(self._all, cfg.learning_rate, amsgrad=cfg.amsgrad)
         self.samples_per_iteration = cfg.rollout_steps * env.num_envs
         self.iteration = 0
         """Iterations completed; decides the teacher's share."""
@@ -115,6 +128,7 @@ class Dagger:
         self._kept: deque[Rollout] = deque(maxlen=cfg.keep_rollouts)
         self._held_out: list[Rollout] = []
         self._steps_done = 0
+        self._object = -1 if self.pose is None else env.env.scene.object_body
         self._figures: dict[str, torch.Tensor] = {}
         self._episode_rollouts = math.ceil(env.max_episode_length / cfg.rollout_steps)
         self._learned_worlds = env.num_envs - cfg.validation_worlds
@@ -229,21 +243,31 @@ class Dagger:
         """
         if not self.cfg.validation_worlds:
             return {}
-        names = ("action_error", "zero_error", "unexplained", "distance_error")
+        names = ["action_error", "zero_error", "unexplained", "distance_error"]
+        if self.pose is not None:
+            names.append("rotation_error")
         if len(self._held_out) < self._episode_rollouts:
             return {f"validation/{name}": None for name in names}
         self.student.eval()
         hidden = self.student.initial_hidden(self.cfg.validation_worlds)
-        means, errors = [], []
+        means, errors, turns = [], [], []
         with torch.no_grad():
             for part in self._held_out:
-                output = self._run(part, hidden, augment=False)
+                output, embedding = self._run(part, hidden, augment=False)
                 hidden = output.hidden.masked_fill(part.done[-1, :, None], 0.0)
                 means.append(output.mean)
+                if self.pose is not None:
+                    turns.append(
+                        angle_between(
+                            self.pose(embedding)[..., 3:], poses(part.frames, self._object)[..., 3:]
+                        )
+                    )
                 errors.append((output.distance[..., -1] - part.frames["distance"]).abs())
         label = torch.cat([part.label for part in self._held_out])
         figures = imitation_figures("validation", torch.cat(means), label)
         figures["validation/distance_error"] = torch.cat(errors).mean()
+        if turns:
+            figures["validation/rotation_error"] = torch.cat(turns).mean()
         return self._read(figures)
 
     def update(self, rollouts: Sequence[Rollout]) -> dict[str, float]:
@@ -257,7 +281,7 @@ class Dagger:
                 torch.distributed.broadcast(buffer, 0)
         losses = dict(zip(STATISTICS, steps.mean(dim=0).tolist(), strict=True))
         bad = [name for name, value in losses.items() if not math.isfinite(value)]
-        if bad or not all_finite(self.student):
+        if bad or not all_finite(self._all):
             raise TrainingDivergedError(
                 f"{', '.join(bad) or 'weights'} not finite after the update; {LOWER_RATES}"
             )
@@ -274,17 +298,25 @@ class Dagger:
             order = torch.randperm(rollouts * learned, device=self.device)[:learned]
             yield from (order // learned * worlds + order % learned).split(self.cfg.minibatch_worlds)
 
-    def losses(self, rollout: Rollout) -> tuple[torch.Tensor, torch.Tensor]:
-        """Imitation and distance loss of sequences, with new noise on their clouds."""
-        output = self._run(rollout, rollout.hidden, augment=True)
+    def losses(self, rollout: Rollout) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Imitation, distance and pose loss of sequences, with new noise on their clouds."""
+        output, embedding = self._run(rollout, rollout.hidden, augment=True)
         imitation = imitation_loss(output, rollout.label, self.cfg.imitation, bounded=self.cfg.clip_labels)
-        return imitation, distance_loss(output.distance, rollout.frames["distance"])
+        distance = distance_loss(output.distance, rollout.frames["distance"])
+        if self.pose is None:
+            return imitation, distance, torch.zeros_like(distance)
+        return (
+            imitation,
+            distance,
+            (self.pose(embedding) - poses(rollout.frames, self._object)).square().mean(),
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """What all processes share besides the network: optimiser, and the window of rates."""
         return {
             "optimizer": self.optimizer.state_dict(),
             "steps": self._steps_done,
+            "pose": None if self.pose is None else self.pose.state_dict(),
             "window": self._window.state_dict(),
         }
 
@@ -292,6 +324,8 @@ class Dagger:
         """Restore what :meth:`state_dict` gave."""
         self.optimizer.load_state_dict(state["optimizer"])
         self._steps_done = state["steps"]
+        if self.pose is not None:
+            self.pose.load_state_dict(state["pose"])
         self._window.load_state_dict(state["window"])
         self.iteration = iteration
 
@@ -350,28 +384,35 @@ class Dagger:
         with autocast(self.device, self.cfg.precision):
             return self.student.encode(*sites).float()
 
-    def _run(self, rollout: Rollout, hidden: torch.Tensor, *, augment: bool) -> StudentOutput:
-        """What the student says to sequences of frames, with memory before the first of them [N, G]."""
+    def _run(
+        self, rollout: Rollout, hidden: torch.Tensor, *, augment: bool
+    ) -> tuple[StudentOutput, torch.Tensor]:
+        """What the student says to sequences of frames, with memory before the first of them [N, G].
+
+        Returns:
+            That, and the embeddings of the clouds [T, N, E].
+        """
         steps, count = rollout.done.shape
         flat = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
         sites = self.view.sites(flat, rollout.worlds.repeat(steps), augment=augment)
         embedding = self._encode(sites).view(steps, count, -1)
-        return self.student(embedding, self.student.senses(rollout.frames), hidden, rollout.done)
+        output = self.student(embedding, self.student.senses(rollout.frames), hidden, rollout.done)
+        return output, embedding
 
     def _minibatch_step(self, rollout: Rollout) -> torch.Tensor:
         """One optimiser step; :data:`STATISTICS` on the device."""
-        imitation, distance = self.losses(rollout)
+        imitation, distance, pose = self.losses(rollout)
         self._steps_done += 1
         for group in self.optimizer.param_groups:
             group["lr"] = self.cfg.learning_rate * min(1.0, self._steps_done / max(1, self.cfg.warmup_steps))
         norm = descend(
-            self.student,
+            self._all,
             self.optimizer,
-            imitation + self.cfg.distance_weight * distance,
+            imitation + self.cfg.distance_weight * distance + self.cfg.pose_weight * pose,
             self.cfg.grad_norm,
             self._world_size,
         )
-        return torch.stack((imitation.detach(), distance.detach(), norm))
+        return torch.stack((imitation.detach(), distance.detach(), pose.detach(), norm))
 
     def _read(self, figures: dict[str, torch.Tensor]) -> dict[str, float]:
         """Scalars averaged over the processes; waits for the device."""
@@ -392,6 +433,18 @@ class Dagger:
             self.env.check()  # says more, if the simulation is the cause
             what = ", ".join(bad) or "the student's memory"
             raise TrainingDivergedError(f"{what} not finite in the rollout; {LOWER_RATES}")
+
+
+def poses(frames: Mapping[str, torch.Tensor], body: int) -> torch.Tensor:
+    """Where the object of frames is, in units of 5 cm, and how it is turned from the goal [.., 9].
+
+    Args:
+        frames: ``body_q`` [.., B, 7] and ``goal_quat`` [.., 4].
+        body: The object's column.
+    """
+    pose = frames["body_q"][..., body, :]
+    turn = two_columns(relative_rotation(pose[..., 3:], frames["goal_quat"]))
+    return torch.cat((pose[..., :3] / POSE_SCALE_M, turn), dim=-1)
 
 
 def taken(rollouts: Sequence[Rollout], sequences: torch.Tensor) -> Rollout:

@@ -23,6 +23,7 @@ from vd.student.sites import Sites
 from vd.train.ending import TrainingDivergedError
 from vd.train.student.config import PretrainCfg
 from vd.train.student.dagger import all_finite, autocast, descend, make_optimizer
+from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
 from vd.vision import relative_rotation, rotation_distance, voxels
 
 OBJECT_RANGE_M = ((-0.06, 0.06), (-0.06, 0.06), (0.02, 0.16))
@@ -264,7 +265,7 @@ class Pretrainer:
             loss = (distance - targets["distance"]).square().mean()
         elif "rotation" in predictions:
             loss = (predictions["rotation"] - targets["rotation"]).square().mean()
-            distance = angle_of(predictions["rotation"].detach())
+            distance = angle_between(predictions["rotation"].detach())
         if "distance" in predictions or "rotation" in predictions:
             total = total + cfg.distance_weight * loss
             error = (distance.detach() - targets["distance"]).abs().mean()
@@ -310,45 +311,3 @@ class Pretrainer:
         loss, figures = self.losses(sites, targets)
         norm = descend(self._all, self.optimizer, loss, self.cfg.grad_norm, self._world_size)
         return {**figures, "loss/total": loss.detach(), "loss/grad_norm": norm}
-
-
-def random_rotations(count: int, device: torch.device) -> torch.Tensor:
-    """Quaternions uniform on SO(3), xyzw [count, 4]."""
-    return nn.functional.normalize(torch.randn((count, 4), device=device), dim=-1)
-
-
-def rotations_about(axis: torch.Tensor, angle: torch.Tensor) -> torch.Tensor:
-    """Quaternions xyzw [R, 4] about axes [R, 3], which need no unit length, by angles [R] [rad]."""
-    half = 0.5 * angle[:, None]
-    return torch.cat([nn.functional.normalize(axis, dim=-1) * half.sin(), half.cos()], dim=1)
-
-
-def multiply(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Product of quaternions xyzw [R, 4]: first turns what second turned."""
-    return relative_rotation(first, torch.cat([-second[:, :3], second[:, 3:]], dim=1))
-
-
-def two_columns(quaternion: torch.Tensor) -> torch.Tensor:
-    """First two columns of the rotation matrices of quaternions xyzw [R, 4], one after the other: [R, 6]."""
-    x, y, z, w = quaternion.unbind(-1)
-    return torch.stack(
-        (
-            1.0 - 2.0 * (y * y + z * z),
-            2.0 * (x * y + z * w),
-            2.0 * (x * z - y * w),
-            2.0 * (x * y - z * w),
-            1.0 - 2.0 * (x * x + z * z),
-            2.0 * (y * z + x * w),
-        ),
-        dim=-1,
-    )
-
-
-def angle_of(columns: torch.Tensor) -> torch.Tensor:
-    """Angle [R] [rad] of the rotations nearest to two columns [R, 6], by Gram and Schmidt."""
-    first = nn.functional.normalize(columns[:, :3], dim=-1)
-    second = columns[:, 3:]
-    second = nn.functional.normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
-    third = torch.linalg.cross(first, second)
-    trace = first[:, 0] + second[:, 1] + third[:, 2]
-    return torch.acos((0.5 * (trace - 1.0)).clamp(-1.0, 1.0))
