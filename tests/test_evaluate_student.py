@@ -160,3 +160,12 @@ def test_a_single_student_in_the_air(tmp_path, capsys):
     by_prediction, by_truth = comparison.rows
     assert by_prediction.sees == "rendered clouds" and by_prediction.result.protocol.in_air
     assert by_truth.outcomes["object falls"].value + by_truth.outcomes["success"].value > 0.0
+
+
+@pytest.mark.slow
+def test_a_student_is_shown(tmp_path):
+    from vd.play.cli import PlayCfg, record_video
+
+    path = save_student(tmp_path / "student.pt", 2)
+    assert record_video(PlayCfg(policy=path, seconds=0.5, device="cpu"), tmp_path / "moments.png") == 6
+    assert (tmp_path / "moments.png").is_file()

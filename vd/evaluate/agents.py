@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from vd.bundle import is_bundle
 from vd.config import from_dict
-from vd.envs.cfg import CurriculumCfg, ReorientCfg, SuccessCfg
+from vd.envs.cfg import CurriculumCfg, ObservationCfg, ReorientCfg, SuccessCfg
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -134,6 +134,15 @@ def check_bundle(name: str, task: ReorientCfg) -> None:
     check_hand(read_contract(path), load_hand(task.hand, task.fingertip, task.hand_layer), path)
 
 
+def is_saved_student(policy: Any | None) -> "TypeGuard[SavedStudent]":
+    """Whether what :func:`open_policy` gave is a student."""
+    if policy is None:
+        return False
+    from vd.student.saved import SavedStudent
+
+    return isinstance(policy, SavedStudent)
+
+
 def start_at_rest(yes: bool, no: bool) -> bool | None:
     """What the flags ``--at-rest`` and ``--no-at-rest`` ask for; None: as trained.
 
@@ -191,6 +200,9 @@ def task_for(
             trained.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
+    if is_saved_student(policy):
+        # A student, which does not look at its teacher's observation.
+        base = replace(base, observation=ObservationCfg())
     return replace(
         base,
         hand=hand or base.hand,

@@ -117,9 +117,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
 
 def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int) -> "ReorientCfg":
     """The task of one policy, in which no state ends an episode but a fall."""
-    from vd.envs.cfg import ObservationCfg
     from vd.evaluate.trace import NEVER_RAD
-    from vd.policy import TrainedPolicy
 
     task = task_for(
         policy,
@@ -135,8 +133,6 @@ def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
     )
-    if policy is not None and not isinstance(policy, TrainedPolicy):
-        task = replace(task, observation=ObservationCfg())  # a student does not look at its teacher's
     if cfg.randomise:
         return task
     # Noise that is switched off anyway, and would keep a teacher and its student from sharing the worlds.

@@ -187,20 +187,20 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
 
 
 def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
-    """Environment with at least one world for each object, trained policy if one is named, device."""
+    """Environment with at least one world for each object, trained agent if one is named, device."""
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would scroll the rest away
     from vd.assets_usd.objects.model import load_set
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.agents import check_bundle, open_teacher, task_for
+    from vd.evaluate.agents import check_bundle, is_saved_student, open_policy, task_for
     from vd.evaluate.cli import resolve_device
 
     device = resolve_device(cfg.device)
     count = len(load_set(list(cfg.objects)))
     if device == "cpu" and count > FAST_WORLDS_CPU:
         print(f"vd-play: {count} objects are {count} worlds, slow on a CPU; name fewer with --objects")
-    trained = open_teacher(cfg.agent_name, device)
+    trained = open_policy(cfg.agent_name, device)
     task = task_for(
         trained,
         hand=cfg.hand,
@@ -216,7 +216,12 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         hand_layer=cfg.hand_layer,
     )
     check_bundle(cfg.agent_name, task)
-    return ReorientEnv(task, device), trained, device
+    env = ReorientEnv(task, device)
+    if is_saved_student(trained):
+        from vd.evaluate.student import StudentActor
+
+        return env, StudentActor(env, trained, seed=cfg.seed), device
+    return env, trained, device
 
 
 if __name__ == "__main__":
