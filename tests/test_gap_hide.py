@@ -8,9 +8,10 @@ import pytest
 
 from vd.gap.excitations import MENU, JointRange, excitation_set
 from vd.gap.hidden_finger import FingerBody
-from vd.gap.hidden_plant import OUTSIDE, STEP_S, Plant, Run, simulate
+from vd.gap.hidden_plant import FULL_DUTY_RAD, OUTSIDE, STEP_S, Plant, Run, simulate
 from vd.gap.hide import (
     ENCODER_COUNT,
+    FULL_P_GAIN,
     Hiding,
     effect_parameters,
     hide,
@@ -21,7 +22,10 @@ from vd.gap.hide import (
     truth_path,
 )
 from vd.gap.recording import read_recording
+from vd.gap.rollout import chains
 from vd.gap.sizes import effect_at, showing, sized_effect
+from vd.gap.team import JointSpec
+from vd.gap.telemetry import late_side, vetoes
 from vd.kernels.effects import EFFECTS
 
 KP, KD, INERTIA = 2.0, 0.1, 4.0e-3
@@ -361,6 +365,40 @@ def test_the_recording_tells_nothing_and_the_truth_lies_beside_it(tmp_path):
     counts = trajectory.position / ENCODER_COUNT
     np.testing.assert_allclose(counts, np.round(counts), atol=1e-2)
     assert 0.5e-3 < np.diff(trajectory.time).std() < 2.5e-3
+
+
+def test_the_duty_cycle_is_the_controllers_output():
+    """It follows the error that the controller sees, whatever a motor with limits makes of it."""
+    limits = {"torque_limit": {"tau_max_nm": 0.4}, "coulomb_friction": {"tau_c_nm": 0.05}}
+    bare = Hiding(model="servo", effects=limits, seed=2, excitations=("gain_ladder",))
+    plain, told = simulate_hidden([bare, replace(bare, pwm=True)])
+    assert all(t.pwm is None for t in plain.recording.trajectories)
+    gains = set()
+    for t in told.recording.trajectories:
+        assert np.abs(t.pwm).max() <= 1.0
+        gain = t.conditions["p_gain"] / FULL_P_GAIN
+        gains.add(gain)
+        expected = np.clip(gain * (t.command - t.position) / FULL_DUTY_RAD, -1.0, 1.0)
+        np.testing.assert_allclose(t.pwm, expected, atol=6e-3)
+    assert len(gains) > 1
+    # Everything else of the recording is the same.
+    for one, other in zip(plain.recording.trajectories, told.recording.trajectories, strict=True):
+        np.testing.assert_array_equal(one.position, other.position)
+
+
+@pytest.mark.parametrize("late", ["command_delay", "read_delay"])
+def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path):
+    hide("servo", {late: {"delay_s": 0.03}}, tmp_path / "r", seed=6, pwm=True)
+    recording = read_recording(tmp_path / "r")
+    (chain,) = chains(recording)
+    everything = tuple(range(len(recording.trajectories)))
+    spec = JointSpec(0, 0, everything, everything, 1e-3, ("kd",))
+    other = {"command_delay": "read_delay", "read_delay": "command_delay"}[late]
+    assert late_side(recording, chain, spec) == late
+    contradicted = set(vetoes(recording, chain, spec, chain.start_row))
+    assert {other, "command_filter", "dead_zone", "backlash"} <= contradicted and late not in contradicted
+    silent = replace(recording, trajectories=tuple(replace(t, pwm=None) for t in recording.trajectories))
+    assert late_side(silent, chain, spec) == ""
 
 
 def test_seeds_repeat_and_differ_alone_and_in_batches():

@@ -8,7 +8,7 @@ import pytest
 from test_gap_fit import recorded
 
 import vd.kernels.actuators as servo
-from vd.gap.coordinates import Coordinate
+from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.fit import JointFit, JointProblem
 from vd.gap.judge import Accepted, Explanation, Judge, intervals, share
 from vd.gap.recording import Recording
@@ -117,6 +117,14 @@ def test_sets_of_several_joints_meet_in_one_name() -> None:
     assert names(one) == ["?"]
     # Separate servos share gravity, not the play of one gear.
     assert names(one, explanation("backlash"), groups=[0, 1]) == ["?", "backlash"]
+    # What is worse by more than an effect must gain is not adopted, unless it was not fitted to the end.
+    poor = explanation("dead_zone", "backlash")
+    poor.rivals["dead_zone"][1] = made_up(("backlash",), 0.013)  # type: ignore[index]
+    assert names(poor, explanation("backlash")) == ["?", "backlash"]
+    ended = [lambda fit: made_up(fit.effects, 0.0102)] * 2
+    shared = share([poor, explanation("backlash")], [FLOOR] * 2, polish=ended)
+    assert [e.accepted[0].name for e in shared] == ["backlash"] * 2 and shared[0].accepted[0].named
+    assert shared[0].final.held_out_rmse == pytest.approx(0.0102)
     loaded = explanation("encoder_bias", "gravity_load")
     assert names(loaded, explanation("gravity_load"), groups=[0, 1]) == ["gravity_load", "gravity_load"]
 
@@ -387,6 +395,46 @@ def searching(answers: list[float]) -> tuple[Selection, list[int]]:
         scales=None,  # type: ignore[arg-type]
     )
     return selection, seeds
+
+
+@pytest.mark.parametrize("named", ["torque_speed_limit", "torque_limit"])
+def test_the_simpler_of_two_stands_for_the_other_only_if_it_is_earned(named: str) -> None:
+    """On one motion the simpler one does well, so that they tie; on the whole it may gain too little."""
+    before = made_up(("load_friction",), 0.010)
+    uneven = np.full(10, 0.0125)
+    uneven[:4] = 0.002
+    simple = np.tile([0.0076, 0.0082], 5) if named == "torque_limit" else uneven
+    fits = {"torque_speed_limit": 0.0079, "torque_limit": simple}
+    selection, _ = searching([])
+    selection.candidates, selection.floor = tuple(fits), 1e-2 * FLOOR
+    made = {name: made_up(("load_friction", name), value) for name, value in fits.items()}
+    selection.fit_candidates = lambda *_, **__: made  # type: ignore[method-assign]
+    selection.run = lambda calls: [0.0 for _ in calls]
+    longer, _, trials = selection.extend(before, 0)
+    assert longer.effects[1] == named and trials[0].round == 1
+
+
+def test_a_fit_that_is_worse_than_without_begins_anew_nearly_off() -> None:
+    present = made_up((), 0.010)
+    begun = []
+
+    def run(calls: list) -> list:
+        answers = []
+        for name, call in calls:
+            if name == "promise":
+                answers.append(np.linspace(0.9, 0.1, len(call["starts"])))
+                continue
+            starts = [s.get("coulomb_friction.tau_c_nm", 1.0) for s in call["starts"]]
+            begun.append(starts)
+            answers.append([made_up(call["effects"], 0.02 if starts[0] > 0.01 else 0.006)])
+        return answers
+
+    selection, _ = searching([])
+    selection.run, selection.candidates = run, ("coulomb_friction",)
+    selection.scales = Scales(1.0, 1.0, 2.0, 3.0, 10.0, 1e-3, 0.01, 6.0)
+    fits = selection.fit_candidates(present)
+    assert fits["coulomb_friction"].rmse == pytest.approx(0.006)
+    assert begun[-1] == [pytest.approx(0.1 * begun[0][0])]
 
 
 def test_a_search_that_fails_is_repeated_before_it_counts() -> None:

@@ -162,6 +162,8 @@ class Hide:
     """Sets of motions."""
     seed: int = 0
     """Seed of everything random."""
+    pwm: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Record the duty cycle as well, which tells a late command from a late reading."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print the truth as JSON."""
 
@@ -177,6 +179,7 @@ class Hide:
             seed=self.seed,
             effect_joints={name: joints for name, _, joints in parsed if joints},
             excitations=self.excitations,
+            pwm=self.pwm,
         )
         if self.json:
             print(json.dumps(hidden.truth, indent=1))

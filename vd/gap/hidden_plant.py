@@ -18,6 +18,8 @@ from vd.gap.hidden_finger import Finger, FingerBody, slip
 
 STEP_S = 4.0e-4
 """Time step [s]: five times finer than the fitted model's, second order where the motion is smooth."""
+FULL_DUTY_RAD = 1.2
+"""Error at full P gain that asks for all of the supply [rad], as of a soft X-series servo."""
 PARTS = 8
 """Parts of a step in which the reference is kept: a motor at its limit must not act before the command
 arrives, nor a profile stop late."""
@@ -101,14 +103,33 @@ def simulate(runs: Sequence[Run], *, dt: float = STEP_S) -> list[np.ndarray]:
     Raises:
         ValueError: An effect or parameter is unknown, or too stiff for the time step.
     """
+    return [position for position, _ in _record(runs, dt, duties=False)]
+
+
+def simulate_with_duty(runs: Sequence[Run], *, dt: float = STEP_S) -> list[tuple[np.ndarray, np.ndarray]]:
+    """As :func:`simulate`, and the duty cycles [T, J] in [-1, 1] that the controllers have at the stamps.
+
+    A position servo's duty cycle is its controller's output: the error that it sees, less what it ignores,
+    plus what it has integrated. The damping is the motor's own. A reading that is late is one of position.
+    """
+    return _record(runs, dt, duties=True)
+
+
+def _record(runs: Sequence[Run], dt: float, *, duties: bool) -> list[tuple[np.ndarray, np.ndarray]]:
     batch = _Batch(runs, dt)
-    path = batch.integrate(batch.references())
+    asked = np.empty((batch.steps, *batch.kp.shape)) if duties else None
+    path = batch.integrate(batch.references(), asked)
     grid = np.arange(path.shape[0]) * dt
     delay, bias = batch.of("read_delay", "delay_s"), batch.of("encoder_bias", "bias_rad")
     recorded = []
     for b, run in enumerate(runs):
         columns = [np.interp(run.time - delay[b, j], grid, path[:, b, j]) for j in range(batch.count)]
-        recorded.append(np.stack(columns, axis=1) + bias[b])
+        duty = np.zeros((0, batch.count))
+        if asked is not None:
+            # The step after the stamp: a command is written before the servo is read.
+            step = np.minimum(np.ceil(run.time / dt).astype(int), batch.steps - 1)
+            duty = np.clip(asked[step, b] / FULL_DUTY_RAD, -1.0, 1.0)
+        recorded.append((np.stack(columns, axis=1) + bias[b], duty))
     return recorded
 
 
@@ -207,8 +228,14 @@ class _Batch:
             on[:, b] = run.enabled[np.maximum(np.searchsorted(run.time, grid, side="right") - 1, 0)]
         return on
 
-    def integrate(self, reference: np.ndarray) -> np.ndarray:
-        """Positions [K + 1, B, J] from rest at the equilibrium of the first reference."""
+    def integrate(self, reference: np.ndarray, asked: np.ndarray | None = None) -> np.ndarray:
+        """Positions [K + 1, B, J] from rest at the equilibrium of the first reference.
+
+        Args:
+            reference: Result of :meth:`references`.
+            asked: Filled with what the controllers ask for in each step, as an error at full gain
+                [K, B, J] [rad], if given.
+        """
         dt, half = self.dt, 0.5 * self.dt
         switch = self._switch()
         first = np.ones_like(self.kp) if switch is None else switch[0]
@@ -245,6 +272,8 @@ class _Batch:
             if creeping:
                 wound = wound + dt * (error.mean(axis=0) if motor.bends else error) * (on > 0.0)
                 wanted = wanted + self.gain * on * integral_gain * wound
+            if asked is not None:
+                asked[k] = (wanted.mean(axis=0) if motor.bends else wanted) / self.kp
             torque, slope, carried = motor(wanted - damping * v, v, k * dt)
             load = loads(middle, v)
             new = self._speed(middle, v, torque + load, 0.5 * slope * damping, loads, carried, v, k * dt)

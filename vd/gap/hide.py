@@ -15,7 +15,7 @@ import numpy as np
 from vd.files import write_json
 from vd.gap.excitations import Excitation, JointRange, excitation_set
 from vd.gap.hidden_finger import FingerBody
-from vd.gap.hidden_plant import OUTSIDE, Plant, Run, simulate
+from vd.gap.hidden_plant import OUTSIDE, Plant, Run, simulate, simulate_with_duty
 from vd.gap.recording import BARE_MODELS, Recording, Trajectory, write_recording
 from vd.kernels.effects import EFFECTS
 
@@ -26,6 +26,8 @@ NOISE_RAD = 3.0e-4
 STAMP_JITTER_S = 1.0e-3
 """Standard deviation of the sampling instants about the regular ones [s]; the stamps tell them."""
 SHORTEST_PERIOD_S = 1.0e-3
+PWM_COUNTS = 885
+"""Counts of a full duty cycle, as of Dynamixel X servos."""
 BASE_SPREAD = 0.2
 """Base parameters lie within this share of the hand's, as the paper's randomisation has it."""
 PAUSE_S = 2.0
@@ -65,6 +67,7 @@ class Hiding:
         jitter_s: Jitter of the sampling instants [s].
         base_spread: Spread of stiffness, damping and speed limit about the hand's; 0: exactly the hand's.
         mass_spread: Spread of the finger's masses and inertias about the hand's.
+        pwm: Record the duty cycle as well.
     """
 
     model: str
@@ -77,6 +80,7 @@ class Hiding:
     jitter_s: float = STAMP_JITTER_S
     base_spread: float = BASE_SPREAD
     mass_spread: float = 0.0
+    pwm: bool = False
 
 
 @dataclass(frozen=True)
@@ -184,12 +188,20 @@ def simulate_hidden(hidings: Sequence[Hiding]) -> list[Hidden]:
     # Long trajectories with long ones: a batch runs as long as its longest.
     order = sorted(range(len(runs)), key=lambda i: runs[i].time[-1])
     positions: dict[int, np.ndarray] = {}
+    duties: dict[int, np.ndarray] = {}
     for start in range(0, len(order), CHUNK):
         part = order[start : start + CHUNK]
-        positions.update(zip(part, simulate([runs[i] for i in part]), strict=True))
+        chosen = [runs[i] for i in part]
+        if any(hiding.pwm for hiding in hidings):
+            for i, (position, duty) in zip(part, simulate_with_duty(chosen), strict=True):
+                positions[i], duties[i] = position, duty
+        else:
+            positions.update(zip(part, simulate(chosen), strict=True))
     results, first = [], 0
     for session in sessions:
-        results.append(session.finish([positions[first + i] for i in range(len(session.runs))]))
+        own = range(first, first + len(session.runs))
+        told = [duties[i] for i in own] if session.hiding.pwm else None
+        results.append(session.finish([positions[i] for i in own], told))
         first += len(session.runs)
     return results
 
@@ -221,7 +233,7 @@ class _Session:
             time[i] = max(time[i], time[i - 1] + SHORTEST_PERIOD_S)
         return np.round(time, 6)
 
-    def finish(self, positions: Sequence[np.ndarray]) -> Hidden:
+    def finish(self, positions: Sequence[np.ndarray], duties: Sequence[np.ndarray] | None = None) -> Hidden:
         """Add noise and rounding; the recording and the truth."""
         hiding = self.hiding
         trajectories = []
@@ -237,13 +249,15 @@ class _Session:
                     command=motion.command,
                     position=np.round(noisy / ENCODER_COUNT) * ENCODER_COUNT,
                     enabled=motion.enabled,
+                    pwm=None if duties is None else np.round(duties[i] * PWM_COUNTS) / PWM_COUNTS,
                 )
             )
+        servo = {"model": "test rig", "p_gain": self.plant.full_gain}
         recording = Recording(
             Path(),
             hiding.model,
             self.plant.joints,
-            {"model": "test rig", "p_gain": self.plant.full_gain},
+            servo if duties is None else {**servo, "pwm_full_scale": PWM_COUNTS},
             ENCODER_COUNT,
             tuple(trajectories),
         )

@@ -4,7 +4,7 @@ Everything is judged on trajectories that the fit has not seen, and resampled by
 the choice inside the resampling.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -68,6 +68,10 @@ DETERMINED = ("kp", "kd", "inertia")
 """Baseline parameters that every useful excitation determines."""
 WIDE = 10.0
 """Ratio of the ends of an interval from which a parameter counts as open."""
+
+
+Polish = Callable[[JointFit], JointFit]
+"""Fits a model to the end."""
 
 
 @dataclass(frozen=True)
@@ -418,7 +422,10 @@ def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
 
 
 def share(
-    explanations: Sequence[Explanation], floors: Sequence[float], groups: Sequence[int] | None = None
+    explanations: Sequence[Explanation],
+    floors: Sequence[float],
+    groups: Sequence[int] | None = None,
+    polish: Sequence[Polish] | None = None,
 ) -> list[Explanation]:
     """Name on a joint that member of a set which another joint names, or which all such sets share.
 
@@ -430,14 +437,20 @@ def share(
         explanations: Of the joints.
         floors: Their noise floors [rad].
         groups: Number of the finger of each joint; one for all if None.
+        polish: Of each joint: fits a member of a set to the end, which the search for the best one did not.
     """
     fingers = [0] * len(explanations) if groups is None else groups
     result = []
-    for explanation, floor, finger in zip(explanations, floors, fingers, strict=True):
+    finish = [_as_it_is] * len(explanations) if polish is None else polish
+    for explanation, floor, finger, end in zip(explanations, floors, fingers, finish, strict=True):
         alike = [e for e, other in zip(explanations, fingers, strict=True) if other == finger]
         named = _named(alike) | (_named(explanations) & OF_THE_MACHINE)
-        result.append(_adopt(explanation, named, floor))
+        result.append(_adopt(explanation, named, floor, end))
     return result
+
+
+def _as_it_is(fit: JointFit) -> JointFit:
+    return fit
 
 
 def _named(explanations: Sequence[Explanation]) -> set[str]:
@@ -451,8 +464,11 @@ def _named(explanations: Sequence[Explanation]) -> set[str]:
     return named
 
 
-def _adopt(explanation: Explanation, named: set[str], floor: float) -> Explanation:
-    """One joint's explanation with what the other joints name in the place of its sets."""
+def _adopt(explanation: Explanation, named: set[str], floor: float, polish: Polish) -> Explanation:
+    """One joint's explanation with what the other joints name in the place of its sets.
+
+    A set stays where that model is worse by as much as an effect must gain.
+    """
     final, accepted = explanation.final, list(explanation.accepted)
     for i, own in enumerate(accepted):
         others = [name for name in own.tied if name in named]
@@ -462,6 +478,9 @@ def _adopt(explanation: Explanation, named: set[str], floor: float) -> Explanati
             fits = explanation.rivals.get(own.name, ())
             fit = next((fit for fit in fits if fit.effects[-1] == others[0]), None)
             if fit is None or set(fit.effects) != {*final.effects, others[0]} - {own.name}:
+                continue
+            fit = polish(fit)
+            if fit.held_out_rmse * (1.0 - MIN_GAIN) > final.held_out_rmse:
                 continue
             final = fit
             own = replace(own, name=others[0])

@@ -13,6 +13,7 @@ import numpy as np
 from vd.gap.coordinates import Scales, sizes, torque_power
 from vd.gap.fit import JointFit
 from vd.gap.judge import AT_FLOOR, EXPLAINED, NESTED, NO_GAP, RANDOM, Explanation, Judge, Trial
+from vd.gap.result import parameter_of
 from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.effects import EFFECTS
 
@@ -32,6 +33,8 @@ ALIKE = 0.5
 """Share of the best promise that a candidate must have to be fitted once another explains everything."""
 BEHIND = 3.0
 """Finalists have at most this many times the error of the best after screening."""
+NEARLY_OFF = 0.1
+"""Share of a starting size from which a fit begins anew that ended worse than without the effect."""
 SCREEN_ITERATIONS = 6
 WIDE = 15.0
 """Error of a round's best, in noise floors, up to which every start of every candidate is tried: a linear
@@ -270,6 +273,15 @@ class Selection(Judge):
                 fits = self.look_wider(present, fits)
                 best = self.winner(list(fits.values()))
             accepted, why = self.better(present, best, SEARCH_TAIL)
+            if not accepted:
+                # The simpler of two stands for the one that contains it only if it earns its place as well.
+                name = best.effects[-1]
+                richer = [
+                    f for f in fits.values() if name in NESTED.get(f.effects[-1], ()) and not f.at_bound
+                ]
+                earned = [f for f in richer if self.better(present, f, SEARCH_TAIL)[0]]
+                if earned:
+                    best, accepted, why = earned[int(np.argmin(self.scores(earned)))], True, ""
             trials += self.judge(number, present, fits, best, accepted, why)
             trials += self.screened_out(number, present, fits)
             if not accepted:
@@ -376,6 +388,17 @@ class Selection(Judge):
             [self.call(present, fit.effects[-1], [fit.values], FULL_ITERATIONS) for fit in finalists]
         )
         fits = {fit.effects[-1]: fit for fit in (*(r[0] for r in refits), *screened[len(finalists) :])}
+        # Nothing added can do worse than nothing: such a fit began too large, and no descent led back.
+        astray = [name for name, fit in fits.items() if fit.rmse > present.rmse]
+        small = {name: _smaller(flat[order[name][0]][1]) for name in astray}
+        again = [name for name in astray if small[name] is not None]
+        calls = [
+            self.call(present, name, [{**present.values, **(small[name] or {})}], FULL_ITERATIONS)
+            for name in again
+        ]
+        for name, found in zip(again, self.run(calls), strict=True):
+            if found[0].rmse < fits[name].rmse:
+                fits[name] = found[0]
         return fits
 
     def add_random(self, present: JointFit) -> JointFit:
@@ -517,6 +540,18 @@ class Selection(Judge):
         values = {k: v for k, v in present.values.items() if k.rpartition(".")[0] in ("", *effects)}
         call = {"base": rows, "effects": tuple(effects), "starts": [values], "scales": self.scales}
         return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0][0]
+
+
+def _smaller(start: Mapping[str, float]) -> dict[str, float] | None:
+    """A start at which the effect is nearly off; None for one whose zero is not off."""
+    parameters = {key: parameter_of(key) for key in start if "." in key}
+    if any(p.lower > 0.0 and p.neutral == 0.0 for p in parameters.values()):
+        return None
+    return {
+        key: NEARLY_OFF * value if parameters[key].lower == 0.0 else value
+        for key, value in start.items()
+        if key in parameters
+    }
 
 
 def _two(starts: Sequence[dict[str, float]]) -> list[dict[str, float]]:

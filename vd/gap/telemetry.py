@@ -33,6 +33,10 @@ BEHIND_SENSOR = {
     "supply_sag": "only as a resistance behind the voltage sensor, which loses torque like a sagging supply"
 }
 """Effects whose cause telemetry contradicts, but not a loss of the same form where it has no sensor."""
+LAGS_S = np.arange(0.0, 0.3, 2.5e-3)
+"""Lags that are tried [s]: up to the longest delay searched, as fine as the duty cycle tells."""
+CLEARER = 4.0
+"""How many times more of the duty cycle the wrong delay must leave than the right one."""
 REFERENCE_SIDE = "backlash"
 """Play of the reference, as the servo model has it; play behind the motor does not show."""
 
@@ -53,10 +57,58 @@ def vetoes(recording: Recording, chain: Chain, spec: JointSpec, rows: np.ndarray
     reason = _steady_voltage(trajectories, column)
     if reason:
         result["supply_sag"] = reason
-    reason = _plain_duty(trajectories, column, chain.reference_p_gain, rows[spec.joint])
+    reason, late = _plain_duty(recording, chain, spec, trajectories, rows[spec.joint])
     if reason:
-        result.update(dict.fromkeys((*UPSTREAM, REFERENCE_SIDE), reason))
+        result.update(dict.fromkeys({*UPSTREAM, REFERENCE_SIDE} - {late}, reason))
     return result
+
+
+def late_side(recording: Recording, chain: Chain, spec: JointSpec) -> str:
+    """Which of command and reading is late, if the recorded duty cycle says so.
+
+    Positions alone cannot tell (:data:`vd.kernels.effects.EQUIVALENT`). The duty cycle follows the late
+    command less the position there is, or the command there is less the position that is reported later.
+
+    Returns:
+        ``command_delay``, ``read_delay``, or nothing where neither fits, both do, or no duty is recorded.
+    """
+    column = int(chain.columns[spec.joint])
+    trajectories = [recording.trajectories[i] for i in spec.trajectories]
+    left, side, lag = min(
+        (1.0 - _follows(trajectories, column, chain.reference_p_gain, **{side: lag}), side, lag)
+        for side in ("command_delay", "read_delay")
+        for lag in LAGS_S
+    )
+    other = "read_delay" if side == "command_delay" else "command_delay"
+    rest = 1.0 - max(_follows(trajectories, column, chain.reference_p_gain, **{other: lag}) for lag in LAGS_S)
+    # Registers read one after the other are less than a sample apart: that is nobody's delay.
+    sample = float(np.median(np.concatenate([np.diff(t.time) for t in trajectories])))
+    return side if lag >= sample and left < 1.0 - LINEAR and CLEARER * left < rest else ""
+
+
+def _follows(
+    trajectories: list[Trajectory],
+    column: int,
+    reference_gain: float | None,
+    command_delay: float = 0.0,
+    read_delay: float = 0.0,
+) -> float:
+    """Share of the duty cycle that follows the error if command or reading is that late [s]."""
+    errors, duties = [], []
+    for t in trajectories:
+        if t.pwm is None or not np.isfinite(t.pwm[:, column]).all():
+            continue
+        sent = np.maximum(np.searchsorted(t.time, t.time - command_delay, side="right") - 1, 0)
+        position = np.interp(t.time + read_delay, t.time, t.position[:, column])
+        gain = float(t.conditions.get("p_gain", reference_gain)) / reference_gain if reference_gain else 1.0
+        used = t.enabled[:, column] & (np.abs(t.pwm[:, column]) < SATURATED)
+        errors.append(gain * (t.command[sent, column] - position)[used])
+        duties.append(t.pwm[used, column])
+    if sum(map(len, errors)) < MIN_SAMPLES:
+        return 0.0
+    error, duty = np.concatenate(errors), np.concatenate(duties)
+    slope = float(error @ duty) / max(float(error @ error), 1e-300)
+    return 1.0 - float(np.sum((duty - slope * error) ** 2)) / max(float(duty @ duty), 1e-300)
 
 
 def _steady_voltage(trajectories: list[Trajectory], column: int) -> str:
@@ -81,26 +133,16 @@ def _steady_voltage(trajectories: list[Trajectory], column: int) -> str:
 
 
 def _plain_duty(
-    trajectories: list[Trajectory], column: int, reference_gain: float | None, row: np.ndarray
-) -> str:
-    """Why the duty cycle speaks against anything between command and controller, or nothing."""
-    errors, duties = [], []
-    for t in trajectories:
-        if t.pwm is None or not np.isfinite(t.pwm[:, column]).all():
-            continue
-        gain = float(t.conditions.get("p_gain", reference_gain)) / reference_gain if reference_gain else 1.0
-        used = t.enabled[:, column] & (np.abs(t.pwm[:, column]) < SATURATED)
-        errors.append(gain * (t.command - t.position)[:, column][used])
-        duties.append(t.pwm[:, column][used])
-    if not errors or sum(map(len, errors)) < MIN_SAMPLES:
-        return ""
-    error, duty = np.concatenate(errors), np.concatenate(duties)
-    power = float(error @ error)
-    if power <= 0.0 or row[servo.KP] <= 0.0:
-        return ""
-    slope = float(error @ duty) / power
-    left = float(np.sum((duty - slope * error) ** 2)) / max(float(np.sum(duty**2)), 1e-300)
-    if 1.0 - left < LINEAR:
-        return ""
-    share = 100.0 * (1.0 - left)
-    return f"the recorded duty cycle follows the plain error ({share:.1f} % of it): it acts downstream"
+    recording: Recording, chain: Chain, spec: JointSpec, trajectories: list[Trajectory], row: np.ndarray
+) -> tuple[str, str]:
+    """Why the duty cycle speaks against anything between command and controller, and but for which delay."""
+    if row[servo.KP] <= 0.0:
+        return "", ""
+    late = late_side(recording, chain, spec)
+    if late:
+        return f"the recorded duty cycle follows the error with a {late.replace('_', ' ')} alone", late
+    share = _follows(trajectories, int(chain.columns[spec.joint]), chain.reference_p_gain)
+    if share < LINEAR:
+        return "", ""
+    text = f"the recorded duty cycle follows the plain error ({100.0 * share:.1f} % of it)"
+    return f"{text}: it acts downstream", ""

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from vd.gap.judge import Explanation, alike, share, stood_for
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S, Chain, chains
-from vd.gap.select import Selection
+from vd.gap.select import FULL_ITERATIONS, Selection
 from vd.gap.statistics import noise_floor, resamples
 from vd.gap.team import Bench, JointSpec, Team
 from vd.gap.telemetry import vetoes
@@ -362,7 +363,8 @@ def _explain_all(
         chain = team.bench.chains[joint.spec.chain]
         rng = np.random.default_rng([options.seed, joint.spec.chain, joint.spec.joint])
         names = candidates(chain, options.effects)
-        same = alike(names)
+        told = vetoes(recording, chain, joint.spec, joint.fit.rows)
+        same = {name: others for name, others in alike(names).items() if not {name, *others} & set(told)}
         selection = Selection(
             run=lambda calls: team.run(joint.spec, calls),
             joint=joint.spec.joint,
@@ -378,7 +380,7 @@ def _explain_all(
             scales=joint.scales,
             weights=resamples(len(joint.spec.trajectories), rng),
             refits=REFITS,
-            vetoes={**stood_for(same), **vetoes(recording, chain, joint.spec, joint.fit.rows)},
+            vetoes={**stood_for(same), **told},
             report=lambda line: progress(f"explain: {joint.name}: {line}"),
         )
         result = selection.explain(joint.fit)
@@ -386,7 +388,14 @@ def _explain_all(
         return result
 
     floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))
-    return share(_parallel(one, joints), floors, fingers)
+
+    def finished(joint: Joint, fit: JointFit) -> JointFit:
+        call = {"base": fit.rows, "effects": fit.effects, "starts": [fit.values], "scales": joint.scales}
+        call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
+        whole = team.run(joint.spec, [("fit", call)])[0][0]
+        return team.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales})])[0]
+
+    return share(_parallel(one, joints), floors, fingers, [partial(finished, joint) for joint in joints])
 
 
 def replace_baseline(explanation: Explanation, baseline: JointFit) -> Explanation:
