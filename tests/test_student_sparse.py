@@ -171,6 +171,59 @@ def test_parts_give_the_same_as_the_whole(device, monkeypatch):
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
 
 
+def fused_cases(device, channels):
+    """Sites and features of each precision, where a device has the fused kernels."""
+    sites = random_sites(device, clouds=3, points=2000)
+    if sparse.fused_for(features_of(sites, 1)) is None:
+        pytest.skip(f"no fused kernels on {device}")
+    for precision in (torch.float32, torch.bfloat16):
+        yield sites, features_of(sites, channels).to(precision)
+
+
+@pytest.fixture
+def gathered(monkeypatch):
+    """Switches to gathers and products one after the other."""
+    return lambda: monkeypatch.setattr(sparse, "fused_for", lambda features: None)
+
+
+@pytest.mark.parametrize(("inner", "outer", "stride"), [(1, 32, 2), (32, 64, 2), (128, 256, 1), (24, 20, 1)])
+def test_fused_convolution_equals_a_double_precision_one(device, inner, outer, stride):
+    for sites, values in fused_cases(device, inner):
+        conv = SparseConv3d(inner, outer, stride=stride).to(sites.device)
+        pull = features_of(sites if stride == 1 else sites.coarser, outer, seed=1).to(values.dtype)
+
+        def gradients(dtype, sites=sites, values=values, conv=conv, pull=pull):
+            inputs = values.to(dtype).requires_grad_()
+            weight = conv.weight.detach().to(values.dtype).to(dtype).requires_grad_()
+            output = torch.func.functional_call(conv, {"weight": weight}, (inputs, sites))
+            return output, *torch.autograd.grad(output, (inputs, weight), pull.to(dtype))
+
+        bound = 1e-6 if values.dtype is torch.float32 else 5e-3
+        fused = gradients(values.dtype)
+        for one, exact in zip(fused, gradients(torch.float64), strict=True):
+            assert (one.double() - exact).norm() < bound * exact.norm()
+        for again, once in zip(gradients(values.dtype), fused, strict=True):
+            assert torch.equal(again, once)  # no sum depends on who comes first
+
+
+def test_fused_pooling_is_that_of_gathered_rows(device, gathered):
+    def gradients(sites, values):
+        inputs = values.clone().requires_grad_()
+        output = SparseMaxPool3d()(inputs, sites)
+        pull = features_of(sites.coarser, values.shape[1], seed=1).to(values.dtype)
+        return output, *torch.autograd.grad(output, inputs, pull)
+
+    # rounded: ties in every window
+    cases = [(sites, values.round()) for sites, values in fused_cases(device, 5)]
+    for _, values in cases:
+        values[7, 2] = torch.nan
+    fused = [gradients(*case) for case in cases]
+    gathered()
+    for case, results in zip(cases, fused, strict=True):
+        for one, other in zip(results, gradients(*case), strict=True):
+            torch.testing.assert_close(one, other, atol=0.0, rtol=0.0, equal_nan=True)
+
+
 def test_half_precision_stays_near_single(device):
     sites = random_sites(device)
     conv = SparseConv3d(8, 8, stride=2).to(sites.device)

@@ -5,9 +5,15 @@ the weights [K C_in, C_out]. At this network's few sites a cloud that is faster 
 every offset with scattered sums, although it multiplies zeros (docs/student.md). No sum is scattered
 in the backward pass either: the gradient of the input is a gather too, with the reverse map, so
 results do not depend on the order of atomic additions.
+
+On a GPU one kernel gathers and multiplies (:mod:`vd.student.fused`): a gathered matrix is 27 times the
+features, and moving it there and back takes longer than everything else.
 """
 
+import functools
 import math
+import warnings
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -20,6 +26,33 @@ from vd.student.sites import Sites
 GATHER_LIMIT = {"cpu": 2**20, "cuda": 2**27}
 """Entries of the gathered matrix at most, larger ones are made in parts: 4 MB on a CPU, where a part is
 multiplied before it leaves the cache (a quarter faster in training), 256 MB in half precision on a GPU."""
+FUSED_TYPES = (torch.float32, torch.bfloat16, torch.float16)
+"""Precisions of the kernels that gather and multiply at once."""
+
+
+@functools.cache
+def fused_kernels(device: torch.device) -> ModuleType | None:
+    """:mod:`vd.student.fused`, or None with a warning where Triton is missing or cannot compile for a GPU."""
+    try:
+        from vd.student import fused
+
+        fused.multiply(
+            torch.ones(1, 1, device=device),
+            torch.zeros(1, 1, dtype=torch.int32, device=device),
+            torch.ones(1, 1, 1, device=device),
+        )
+    except (ImportError, RuntimeError, OSError) as error:
+        warnings.warn(
+            f"the student's convolutions are many times slower without Triton: {error}", stacklevel=2
+        )
+        return None
+    return fused
+
+
+def fused_for(features: torch.Tensor) -> ModuleType | None:
+    """The fused kernels if they take such features: on a GPU, in single or half precision."""
+    takes = features.is_cuda and features.dtype in FUSED_TYPES
+    return fused_kernels(features.device) if takes else None
 
 
 def gather_rows(features: torch.Tensor, table: torch.Tensor, fill: float = 0.0) -> torch.Tensor:
@@ -39,6 +72,8 @@ def gather_multiply(features: torch.Tensor, table: torch.Tensor, weight: torch.T
 
     Shapes [F, C_in], [M, K] and [K, C_in, C_out] give [M, C_out].
     """
+    if fused := fused_for(features):
+        return fused.multiply(features, table, weight)
     flat = weight.reshape(-1, weight.shape[2])
     outputs = [
         gather_rows(features, table[rows]).flatten(1) @ flat for rows in parts(table, features.shape[1])
@@ -48,11 +83,27 @@ def gather_multiply(features: torch.Tensor, table: torch.Tensor, weight: torch.T
     return torch.cat(outputs) if outputs else features.new_zeros((0, weight.shape[2]))
 
 
+def weight_gradient(features: torch.Tensor, table: torch.Tensor, grad: torch.Tensor) -> torch.Tensor:
+    """Gradient of the weights of :func:`gather_multiply`, [K, C_in, C_out], in single precision at least.
+
+    Gathers ``features`` [F, C_in] by ``table`` [M, K] again: kept, they would take 27 times their memory.
+    """
+    if fused := fused_for(features):
+        return fused.weight_gradient(features, table, grad)
+    channels = features.shape[1]
+    precision = torch.promote_types(features.dtype, torch.float32)
+    total = grad.new_zeros((table.shape[1] * channels, grad.shape[1]), dtype=precision)
+    for rows in parts(table, channels):
+        total += gather_rows(features, table[rows]).flatten(1).t() @ grad[rows]
+    return total.view(table.shape[1], channels, grad.shape[1])
+
+
 class _Convolution(torch.autograd.Function):
     """``gather_multiply`` with its gradients, by gathers alone.
 
     ``back`` is the reverse map [F, K]: which outputs read each input, by the same weights. The map of
-    neighbours needs none: it is its own reverse with the weights in opposite order.
+    neighbours needs none: it is its own reverse with the weights in opposite order. Weights may be of
+    higher precision than ``features``, in which products are made; so is their gradient then.
     """
 
     @staticmethod
@@ -64,7 +115,7 @@ class _Convolution(torch.autograd.Function):
         back: torch.Tensor | None = None,
     ) -> torch.Tensor:
         ctx.save_for_backward(features, weight, table, back)
-        return gather_multiply(features, table, weight)
+        return gather_multiply(features, table, weight.to(features.dtype))
 
     @staticmethod
     @once_differentiable
@@ -72,17 +123,13 @@ class _Convolution(torch.autograd.Function):
         features, weight, table, back = ctx.saved_tensors
         to_features = to_weight = None
         if ctx.needs_input_grad[0]:
-            turned = weight.transpose(1, 2)
+            turned = weight.to(grad.dtype).transpose(1, 2)
             if back is None:
                 to_features = gather_multiply(grad, table, turned.flip(0))
             else:
                 to_features = gather_multiply(grad, back, turned)
         if ctx.needs_input_grad[1]:
-            # Gathered again, not kept: 27 times the memory of the features would be.
-            total = weight.new_zeros((weight.shape[0] * weight.shape[1], weight.shape[2]))
-            for rows in parts(table, features.shape[1]):
-                total = total.addmm(gather_rows(features, table[rows]).flatten(1).t(), grad[rows])
-            to_weight = total.view_as(weight)
+            to_weight = weight_gradient(features, table, grad).to(weight.dtype)
         return to_features, to_weight, None, None
 
 
@@ -91,15 +138,23 @@ class _WindowMaximum(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, features: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
-        values, winner = gather_rows(features, table, -math.inf).max(dim=1)
-        ctx.save_for_backward(table.gather(1, winner).long())
         ctx.rows = features.shape[0]
+        if fused := fused_for(features):
+            values, winner = fused.pool(features, table)
+            ctx.save_for_backward(winner, table)
+        else:
+            values, winner = gather_rows(features, table, -math.inf).max(dim=1)
+            ctx.save_for_backward(table.gather(1, winner).long())
         return values
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None]:
-        (winner,) = ctx.saved_tensors
+        winner, *table = ctx.saved_tensors
+        if table:
+            fused = fused_kernels(grad.device)
+            assert fused is not None
+            return fused.pool_gradient(grad, *table, winner, ctx.rows), None
         # Windows do not overlap: no entry is written twice.
         return grad.new_zeros((ctx.rows, grad.shape[1])).scatter_(0, winner, grad), None
 
@@ -125,14 +180,12 @@ class SparseConv3d(nn.Module):
 
     def forward(self, features: torch.Tensor, sites: Sites) -> torch.Tensor:
         """Convolve ``features`` [M, C_in]; rows of the result are of ``sites``, or of ``sites.coarser``."""
-        weight = self.weight
         if torch.is_autocast_enabled(features.device.type):
-            dtype = torch.get_autocast_dtype(features.device.type)
-            features, weight = features.to(dtype), weight.to(dtype)
+            features = features.to(torch.get_autocast_dtype(features.device.type))
         if self.stride == 2:
             back = sites.strided_back if features.requires_grad else None
-            return _Convolution.apply(features, weight, sites.strided, back)
-        return _Convolution.apply(features, weight, sites.neighbours)
+            return _Convolution.apply(features, self.weight, sites.strided, back)
+        return _Convolution.apply(features, self.weight, sites.neighbours)
 
     def extra_repr(self) -> str:
         """Sizes, for ``print``."""
