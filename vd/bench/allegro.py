@@ -5,9 +5,10 @@ an asset of 17.8 MB that Newton fetches; where it cannot, the example gets a per
 else one made of boxes, of the Allegro's size. SI units, quaternions xyzw.
 """
 
+import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -134,7 +135,8 @@ def make_example(worlds: int) -> Any:
 def _asset_is_here() -> bool:
     """Whether Newton has, or can fetch, the example's hand."""
     try:
-        newton.utils.download_asset("wonik_allegro")
+        with redirect_stdout(sys.stderr):  # it tells of its attempts; standard output is for the rows
+            newton.utils.download_asset("wonik_allegro")
     except Exception:  # no network, no git, a cache that cannot be written: all mean no
         return False
     return True
