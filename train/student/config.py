@@ -34,9 +34,11 @@ class DaggerCfg:
     epochs: int = PAPER.dagger.epochs
     """Passes over a rollout."""
     learning_rate: float = PAPER.dagger.learning_rate
-    """Of AdamW, constant after the warm-up."""
+    """Of AdamW, after the warm-up and until the decay."""
     warmup_steps: int = 0
     """Optimiser steps over which the learning rate rises from 0, linearly; the released code has none."""
+    decay_after_steps: int = 0
+    """Optimiser steps after which the learning rate falls as 1 / sqrt(steps); 0: never (released code)."""
     amsgrad: bool = True
     """Never forget the largest gradients (released code). Those of the first steps are the largest of all,
     and make all later steps small."""
@@ -84,7 +86,9 @@ class PretrainCfg:
     steps: int = 50
     """Optimiser steps of an iteration."""
     learning_rate: float = PAPER.dagger.learning_rate
-    """Of AdamW with amsgrad, constant."""
+    """Of AdamW, constant."""
+    amsgrad: bool = True
+    """Never forget the largest gradients, as in imitation."""
     grad_norm: float = PAPER.dagger.grad_norm
     """Gradient norm is clipped to this."""
     distance: Literal["scalar", "6d"] = "scalar"
@@ -171,6 +175,8 @@ def paper(stage: Stage) -> StudentTrainCfg:
     )
 
 
+GPU_WORLDS = 2048
+"""Worlds of a GPU: five times those of the released code are simulated in hardly more time."""
 SHORT_ROLLOUTS = DaggerCfg(
     epochs=2,
     learning_rate=1e-3,
@@ -199,9 +205,18 @@ def gpu(stage: Stage) -> StudentTrainCfg:
         start,
         preset="gpu",
         dagger=replace(
-            SHORT_ROLLOUTS, rollout_steps=40, minibatch_worlds=20, validation_worlds=20, precision="bf16"
+            SHORT_ROLLOUTS,
+            rollout_steps=20,
+            minibatch_worlds=80,
+            decay_after_steps=2000,
+            keep_rollouts=10,
+            validation_worlds=40,
+            precision="bf16",
         ),
-        pretrain=PretrainCfg(near_share=0.5, precision="bf16"),
+        task=replace(start.task, num_worlds=GPU_WORLDS),
+        pretrain=PretrainCfg(
+            batch=1024, learning_rate=1e-3, amsgrad=False, distance="6d", near_share=0.5, precision="bf16"
+        ),
         network=LEAN,
     )
 
@@ -223,7 +238,9 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
             keep_rollouts=50,
             validation_worlds=2,
         ),
-        pretrain=PretrainCfg(batch=64, steps=10, learning_rate=1e-3, near_share=0.5),
+        pretrain=PretrainCfg(
+            batch=64, steps=10, learning_rate=1e-3, amsgrad=False, distance="6d", near_share=0.5
+        ),
         task=StudentTaskCfg(num_worlds=16),
         network=SMALL_NETWORK,
         depth=DepthCameraCfg(points=2000),
@@ -304,6 +321,7 @@ def validate(cfg: StudentTrainCfg) -> None:
         "--dagger.pose-weight": dagger.pose_weight,
         "--dagger.teacher-share-iterations": dagger.teacher_share_iterations,
         "--dagger.warmup-steps": dagger.warmup_steps,
+        "--dagger.decay-after-steps": dagger.decay_after_steps,
         "--dagger.validation-worlds": dagger.validation_worlds,
         "--pretrain.category-weight": pretrain.category_weight,
         "--pretrain.distance-weight": pretrain.distance_weight,

@@ -185,6 +185,13 @@ class Dagger:
             return first
         return first + (last - first) * min(1.0, self.iteration / iterations)
 
+    def learning_rate(self) -> float:
+        """Of the present optimiser step."""
+        factor = min(1.0, self._steps_done / max(1, self.cfg.warmup_steps))
+        if self.cfg.decay_after_steps:
+            factor *= min(1.0, math.sqrt(self.cfg.decay_after_steps / max(1, self._steps_done)))
+        return factor * self.cfg.learning_rate
+
     def collect(self, stopping: Callable[[], bool] = lambda: False) -> Rollout | None:
         """Let the student act, and the teacher label; ``None`` if ``stopping`` said so on the way."""
         cfg, worlds = self.cfg, self.env.num_envs
@@ -404,7 +411,7 @@ class Dagger:
         imitation, distance, pose = self.losses(rollout)
         self._steps_done += 1
         for group in self.optimizer.param_groups:
-            group["lr"] = self.cfg.learning_rate * min(1.0, self._steps_done / max(1, self.cfg.warmup_steps))
+            group["lr"] = self.learning_rate()
         norm = descend(
             self._all,
             self.optimizer,

@@ -211,7 +211,7 @@ class Pretrainer:
         self.scenes, self.student, self.cfg = scenes, student, cfg
         self.heads = PretrainHeads(student, cfg, objects).to(student.mean.weight.device)
         self._all = nn.ModuleList([student, self.heads])
-        self.optimizer = make_optimizer(self._all, cfg.learning_rate)
+        self.optimizer = make_optimizer(self._all, cfg.learning_rate, amsgrad=cfg.amsgrad)
         self.samples_per_iteration = cfg.batch * cfg.steps
         self._world_size = world_size
 
