@@ -184,7 +184,7 @@ SHORT_ROLLOUTS = DaggerCfg(
     amsgrad=False,
     grad_norm=1.0,
     imitation="squared",
-    pose_weight=1.0,
+    pose_weight=2.0,
     clip_labels=True,
     teacher_share=1.0,
     teacher_share_last=0.2,
@@ -201,11 +201,14 @@ def gpu(stage: Stage) -> StudentTrainCfg:
     The numbers of the released code do not learn in hours: docs/results/student.md.
     """
     start = paper(stage)
+    dagger = SHORT_ROLLOUTS
+    if stage == RENDERED:  # it begins from a student that acts already
+        dagger = replace(dagger, learning_rate=5e-4, teacher_share=dagger.teacher_share_last)
     return replace(
         start,
         preset="gpu",
         dagger=replace(
-            SHORT_ROLLOUTS,
+            dagger,
             rollout_steps=20,
             minibatch_worlds=80,
             decay_after_steps=2000,
