@@ -158,6 +158,54 @@ def voxel_key_kernel(
 
 
 @wp.kernel
+def point_group_kernel(
+    # In:
+    end_in: wp.array[int],
+    points: int,
+    # Out:
+    group_out: wp.array[int],
+):
+    """Group of each point by its column. Launch: [B, P].
+
+    Args:
+        end_in: Columns at which the groups end, one after the other, shape [C].
+        points: P.
+        group_out: Groups, C for points after the last, shape [>= B P].
+    """
+    cloud, point = wp.tid()
+    group = wp.int32(0)
+    while group < end_in.shape[0] and point >= end_in[group]:
+        group += 1
+    group_out[cloud * points + point] = group
+
+
+@wp.kernel
+def voxel_mark_kernel(
+    # In:
+    key_in: wp.array[wp.int64],
+    limit: wp.int64,
+    run_in: wp.array[int],
+    group_in: wp.array[int],
+    # Out:
+    mark_out: wp.array2d[float],
+):
+    """Mark the voxel of each point with the point's group. Launch: [K].
+
+    Points of a voxel write the same value, so their order does not matter.
+
+    Args:
+        key_in: Sorted keys of points, shape [>= K].
+        limit: Keys from here on are ignored.
+        run_in: Place of each key among the voxels, counted from 1, shape [K].
+        group_in: Group of each point, in the order of the keys, shape [>= K].
+        mark_out: 1 where a voxel holds a point of the group, shape [M, C]; the others stay.
+    """
+    i = wp.tid()
+    if key_in[i] < limit and group_in[i] < mark_out.shape[1]:
+        mark_out[run_in[i] - 1, group_in[i]] = 1.0
+
+
+@wp.kernel
 def run_start_kernel(
     # In:
     key_in: wp.array[wp.int64],
@@ -349,6 +397,36 @@ def voxelise(points: wp.array, voxel_size: float, noise: NoiseDraw | None = None
     Raises:
         ValueError: The voxel size is not positive, or there are too many points or clouds.
     """
+    return _voxelise(points, voxel_size, noise, None)[0]
+
+
+def voxelise_marked(
+    points: wp.array, voxel_size: float, ends: wp.array, noise: NoiseDraw | None = None
+) -> tuple[wp.array, wp.array]:
+    """:func:`voxelise`, telling of what the points in each voxel are samples.
+
+    Args:
+        points: See :func:`voxelise`.
+        voxel_size: See :func:`voxelise`.
+        ends: Columns of ``points`` at which groups end, one after the other, ascending, int32, shape [C];
+            points after the last are of none.
+        noise: See :func:`voxelise`.
+
+    Returns:
+        Keys, shape [M], and marks: 1 where a voxel holds a point of the group, else 0, float, shape [M, C].
+
+    Raises:
+        ValueError: See :func:`voxelise`.
+    """
+    keys, marks = _voxelise(points, voxel_size, noise, ends)
+    assert marks is not None
+    return keys, marks
+
+
+def _voxelise(
+    points: wp.array, voxel_size: float, noise: NoiseDraw | None, ends: wp.array | None
+) -> tuple[wp.array, wp.array | None]:
+    """Keys, and marks if there are ``ends``."""
     clouds, per_cloud = points.shape
     count, device = clouds * per_cloud, points.device
     if not voxel_size > 0.0:
@@ -369,9 +447,29 @@ def voxelise(points: wp.array, voxel_size: float, noise: NoiseDraw | None = None
         outputs=[keys],
         device=device,
     )
-    order = wp.empty(2 * count, dtype=int, device=device)
-    wp.utils.radix_sort_pairs(keys, order, count, end_bit=CLOUD_SHIFT + clouds.bit_length())
-    return unique_keys(keys, count, limit=clouds << CLOUD_SHIFT)[0]
+    groups = wp.empty(2 * count, dtype=int, device=device)  # sorted along; of no meaning without ends
+    if ends is not None:
+        wp.launch(
+            point_group_kernel,
+            dim=(clouds, per_cloud),
+            inputs=[ends, per_cloud],
+            outputs=[groups],
+            device=device,
+        )
+    wp.utils.radix_sort_pairs(keys, groups, count, end_bit=CLOUD_SHIFT + clouds.bit_length())
+    limit = clouds << CLOUD_SHIFT
+    voxels, run = unique_keys(keys, count, limit=limit)
+    if ends is None:
+        return voxels, None
+    marks = wp.zeros((voxels.shape[0], ends.shape[0]), dtype=float, device=device)
+    wp.launch(
+        voxel_mark_kernel,
+        dim=count,
+        inputs=[keys, wp.int64(limit), run, groups],
+        outputs=[marks],
+        device=device,
+    )
+    return voxels, marks
 
 
 def cloud_offsets(keys: wp.array, clouds: int, level: int = 0) -> wp.array:

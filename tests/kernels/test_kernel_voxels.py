@@ -16,6 +16,7 @@ from vd.kernels.voxels import (
     spread_bits,
     voxel_key_kernel,
     voxelise,
+    voxelise_marked,
 )
 
 SIZE = 0.005
@@ -82,6 +83,22 @@ def test_voxels_are_the_set_of_floors(device, points):
     offsets = cloud_offsets(keys, len(points)).numpy()
     np.testing.assert_array_equal(offsets, [np.sum(rows[:, 0] < b) for b in range(len(points) + 1)])
     assert (np.diff(keys.numpy()) > 0).all()
+
+
+@EXAMPLES
+@given(points=clouds(), data=st.data())
+def test_marks_name_the_groups_whose_points_a_voxel_holds(device, points, data):
+    ends = sorted(data.draw(st.lists(st.integers(0, points.shape[1]), min_size=1, max_size=3)))
+    keys, marks = voxelise_marked(
+        device_array(points, wp.vec3, device), 1.0, device_array(np.array(ends, np.int32), int, device)
+    )
+    rows = [tuple(row) for row in coordinates(keys).numpy()]
+    np.testing.assert_array_equal(keys.numpy(), voxels(points, device)[1].numpy())
+    expected = np.zeros((len(rows), len(ends)))
+    for group, (start, end) in enumerate(zip([0, *ends], ends, strict=False)):
+        for voxel in expected_voxels(points[:, start:end], 1.0):
+            expected[rows.index(voxel), group] = 1.0
+    np.testing.assert_array_equal(marks.numpy(), expected)
 
 
 def test_floor_goes_down_below_zero_too(device):

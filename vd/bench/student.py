@@ -151,7 +151,8 @@ class ControlStep:
 
     def voxels(self) -> None:
         """Points to voxels."""
-        self.sites = self.voxelise(self.points, ends=self.clouds.ends)
+        marked = "marks" in self.net.cfg.encoder.inputs
+        self.sites = self.voxelise(self.points, ends=self.clouds.ends if marked else ())
 
     def act(self) -> np.ndarray:
         """Voxels, previous action and memory to the next action [D]."""
@@ -316,6 +317,7 @@ def measure_training(
     voxelise = Voxeliser(net.cfg.voxel_m, noise=NoiseCfg(), clouds=clouds, seed=seed, device=device)
     senses = torch.zeros(steps, worlds, net.num_senses, device=place)
     on_gpu = place.type == "cuda"
+    ends = scenes.clouds.ends if "marks" in net.cfg.encoder.inputs else ()
     marks: dict[str, list[float]] = {}
     sizes: list[int] = []
 
@@ -340,7 +342,7 @@ def measure_training(
     def prepare(start: float, *, augment: bool) -> tuple[Sites, float]:
         scenes.write()
         start = stop("points", start)
-        sites = voxelise(scenes.points, augment=augment, ends=scenes.clouds.ends)
+        sites = voxelise(scenes.points, augment=augment, ends=ends)
         start = stop("voxels", start)
         build(sites)
         sizes.append(len(sites))

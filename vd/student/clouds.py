@@ -12,8 +12,7 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.kernels.kinematics import Joints, forward_kinematics_kernel
 from vd.kernels.link_points import CloudModel, link_points_kernel
 from vd.kernels.rng import init_rng_kernel
-from vd.kernels.voxel_marks import mark_voxels
-from vd.kernels.voxels import CloudNoise, draw_noise, voxelise
+from vd.kernels.voxels import CloudNoise, draw_noise, voxelise, voxelise_marked
 from vd.paper import PAPER
 from vd.student.cfg import NoiseCfg
 from vd.student.sites import Sites
@@ -205,9 +204,11 @@ class Voxeliser:
                     f"no noise for {clouds} clouds: make the voxeliser with noise and as many clouds"
                 )
             draw = draw_noise(self._noise, self.rng[:clouds])
-        sites = Sites(voxelise(points, self.voxel_m, draw), clouds)
-        if ends:
-            if ends not in self._ends:
-                self._ends[ends] = wp.array(ends, dtype=wp.int32, device=self.device)
-            sites.marks = wp.to_torch(mark_voxels(sites.keys, points, self.voxel_m, self._ends[ends], draw))
+        if not ends:
+            return Sites(voxelise(points, self.voxel_m, draw), clouds)
+        if ends not in self._ends:
+            self._ends[ends] = wp.array(ends, dtype=wp.int32, device=self.device)
+        keys, marks = voxelise_marked(points, self.voxel_m, self._ends[ends], draw)
+        sites = Sites(keys, clouds)
+        sites.marks = wp.to_torch(marks)
         return sites
