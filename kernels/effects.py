@@ -208,6 +208,12 @@ A servo that does not change with time, and is commanded rather than steered by 
 its whole motion in time either way. By convention the shift is one of the command.
 """
 
+TOGETHER: dict[str, tuple[str, ...]] = {
+    "asymmetric_friction": ("coulomb_friction", "dead_zone", "encoder_bias", "gravity_load"),
+}
+"""Effects that are the same as two others together, of those listed: friction that differs between the
+directions is friction that does not, and a constant torque or offset."""
+
 
 def neutral_row() -> list[float]:
     """A parameter row with every effect off and no drive, ``PARAMETER_COLUMNS`` values."""

@@ -10,7 +10,7 @@ from test_gap_fit import recorded
 import vd.kernels.actuators as servo
 from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.fit import JointFit, JointProblem
-from vd.gap.judge import Accepted, Explanation, Judge, intervals, share
+from vd.gap.judge import Accepted, Explanation, Judge, cancelled, intervals, share
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
 from vd.gap.select import Selection
@@ -87,6 +87,62 @@ def test_the_simpler_of_nested_effects_wins_a_tie(judge: Judge) -> None:
     better = made_up(("stribeck_friction",), 1.0e-3)
     worse = made_up(("coulomb_friction",), 1.6e-3)
     assert judge.winner([better, worse]) is better
+
+
+def test_at_the_floor_the_samples_choose_not_the_luck_of_a_motion(judge: Judge) -> None:
+    right = made_up(("coulomb_friction",), 1.06 * FLOOR, fitted=1.00 * FLOOR)
+    lucky = made_up(("dead_zone",), 1.01 * FLOOR, fitted=1.02 * FLOOR)
+    assert judge.winner([lucky, right]) is right
+    far = made_up(("dead_zone",), 5.0 * FLOOR, fitted=6.0 * FLOOR)
+    farther = made_up(("coulomb_friction",), 5.5 * FLOOR, fitted=5.0 * FLOOR)
+    assert judge.winner([far, farther]) is far, "away from it unseen motions do"
+
+
+def test_a_small_excess_tells_apart_only_if_most_motions_show_it(judge: Judge) -> None:
+    winner = made_up(("coulomb_friction",), FLOOR)
+    everywhere = np.full(10, np.sqrt(1.01) * FLOOR)
+    assert not judge.tied(winner, made_up(("dead_zone",), everywhere))[0]
+    assert judge.tied(winner, made_up(("dead_zone",), everywhere), loose=True)[0]
+    somewhere = np.full(10, np.sqrt(0.996) * FLOOR)
+    somewhere[:2] = np.sqrt(1.07) * FLOOR  # the same in all, but most motions say the opposite
+    assert judge.tied(winner, made_up(("dead_zone",), somewhere))[0]
+    assert judge.tied(winner, made_up(("dead_zone",), np.sqrt(1.002) * FLOOR))[0], "what models leave"
+
+
+def test_a_fuller_form_that_is_a_little_better_makes_a_set(judge: Judge) -> None:
+    limit = made_up(("torque_limit",), FLOOR)
+    for excess, tied in ((0.993, ("torque_speed_limit",)), (0.999, ()), (1.01, ())):
+        line = made_up(("torque_speed_limit",), np.sqrt(excess) * FLOOR)
+        assert judge.accept(limit, "torque_limit", [limit, line], {}, limit).tied == tied
+    friction = made_up(("coulomb_friction",), FLOOR)
+    fuller = made_up(("stribeck_friction",), np.sqrt(0.993) * FLOOR)
+    assert judge.accept(friction, "coulomb_friction", [friction, fuller], {}, friction).tied == ()
+
+
+def test_a_load_and_an_offset_that_cancel_at_rest_are_a_spring() -> None:
+    def fit(torque: float, phase: float, bias: float) -> JointFit:
+        plain = made_up(("gravity_load", "encoder_bias"), FLOOR)
+        keys = ("gravity_load.tau_g_nm", "gravity_load.phase_rad", "encoder_bias.bias_rad")
+        some = tuple(Coordinate(key, 0, False, 1.0, -9.0, 9.0) for key in keys)
+        rows = plain.rows.copy()
+        rows[0, servo.KP] = 3.0
+        x = np.array([0.0, 0.0, torque, phase, bias])
+        return replace(plain, coordinates=(*plain.coordinates[:2], *some), x=x, rows=rows)
+
+    assert "spring" in cancelled(fit(0.015, -1.15, -0.00457), 0, 0.0)
+    assert cancelled(fit(0.015, -1.15, 0.00457), 0, 0.0) == "", "together they hold it off"
+    assert cancelled(fit(0.015, -1.15, -0.0065), 0, 0.0) == ""
+    assert cancelled(fit(0.015, -1.15, -0.00457), 0, 0.8) == "", "and elsewhere it rests elsewhere"
+    assert cancelled(made_up(("gravity_load",), FLOOR), 0, 0.0) == ""
+
+
+def test_friction_with_a_direction_stands_for_dry_friction_and_an_offset(tmp_path: Path) -> None:
+    hidden = {servo.FRICTION_PLUS: 0.09, servo.FRICTION_MINUS: 0.04}
+    effects = ("coulomb_friction", "asymmetric_friction", "encoder_bias", "gravity_load")
+    report = analysed(recorded(hidden), tmp_path, effects=effects)
+    assert [effect.name for effect in report.effects] == ["asymmetric_friction"]
+    assert report.ambiguous == (("asymmetric_friction", "coulomb_friction", "encoder_bias"),)
+    assert report.open_sets == () and "stands for" in verdict_sentence(report)
 
 
 def test_a_bound_is_no_estimate(judge: Judge) -> None:

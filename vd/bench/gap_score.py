@@ -12,7 +12,7 @@ from vd.gap.hidden_plant import CABLE, COGGING, WARMING
 from vd.gap.hide import Hiding
 from vd.gap.recording import BARE_MODELS
 from vd.gap.sizes import sized_effect
-from vd.kernels.effects import EFFECTS, EQUIVALENT
+from vd.kernels.effects import EFFECTS, EQUIVALENT, TOGETHER
 
 KINDS = ("single", "none", "pair", "outside")
 MASS_SPREAD = 0.2
@@ -29,6 +29,11 @@ with the position, as only gravity does in the table; friction that falls as the
 one form or another; torque ripple is like nothing in it."""
 STANDS_FOR: Mapping[str, str] = {other: name for name, others in EQUIVALENT.items() for other in others}
 """Effects of which positions alone cannot show that they are not another, which is named for both."""
+SUMS: Mapping[frozenset[str], str] = {
+    frozenset({"coulomb_friction", "stribeck_friction"}): "stribeck_friction",
+    frozenset({"coulomb_friction", "asymmetric_friction"}): "asymmetric_friction",
+}
+"""Pairs that are exactly one of the two, with other numbers: no recording shows the second."""
 MASS_EFFECTS = ("gravity_load", "payload_inertia")
 """What a hand with other masses than its model has: naming them is right."""
 
@@ -85,6 +90,17 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
     right = set(case.effects) | (set(MASS_EFFECTS) if case.change == "mass" else set())
     # The name that stands for a hidden effect is right if the report says that it does.
     right |= {STANDS_FOR[n] for n in case.effects if n in STANDS_FOR and any(n in group for group in sets)}
+    # So is one that is the same as the hidden ones together, if the report says that.
+    stood_for = {
+        n
+        for group in sets
+        if group[0] in named and len(case.effects) > 1 and {*case.effects} <= {*group[1:]}
+        if {*group[1:]} <= {*TOGETHER.get(group[0], ())}
+        for n in group
+    }
+    right |= stood_for
+    both = SUMS.get(frozenset(case.effects))
+    summed = {*case.effects} if both in named else set()
     tolerated = right | {n for name in case.effects for n in NEIGHBOURS.get(name, ())}
     held_out = report["held_out"]
     return {
@@ -93,7 +109,9 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
         "named": named,
         "sets": sets,
         "by_convention": [
-            n for n in case.effects if n not in named and STANDS_FOR.get(n) in {*named} & right
+            n
+            for n in case.effects
+            if n not in named and (STANDS_FOR.get(n) in {*named} & right or n in stood_for | summed)
         ],
         "missed": [n for n in case.effects if n not in named and not any(n in group for group in sets)],
         "false": [n for n in named if n not in tolerated],

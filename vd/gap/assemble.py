@@ -31,7 +31,7 @@ from vd.gap.result import (
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import interval, resamples, rmse
 from vd.gap.team import Bench, JointSpec
-from vd.kernels.effects import EFFECTS, EQUIVALENT
+from vd.kernels.effects import EFFECTS, EQUIVALENT, TOGETHER
 
 CLOSE = 0.1
 """Values of one effect on two joints within this share of each other are one value."""
@@ -349,7 +349,9 @@ def _sets(joints: Sequence[Analysed]) -> tuple[tuple[str, ...], ...]:
 
 
 def _next(joints: Sequence[Analysed]) -> str:
-    sets = [group for group in _sets(joints) if set(group[1:]) - set(EQUIVALENT.get(group[0], ()))]
+    named = {a.name for j in joints for a in j.explanation.accepted if a.named}
+    closed = {n: {*EQUIVALENT.get(n, ()), *(TOGETHER.get(n, ()) if n in named else ())} for n in EFFECTS}
+    sets = [group for group in _sets(joints) if set(group[1:]) - closed[group[0]]]
     if sets:
         listed = " and ".join(name.replace("_", " ") for name in sets[0][:2])
         return (

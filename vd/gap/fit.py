@@ -394,6 +394,8 @@ class JointProblem:
         for number in range(OTHER_STARTS):
             middle = fit.values if number < OTHER_STARTS - 1 else self._nominal()
             start = {key: middle[key] * np.exp(rng.normal(0.0, OTHER_SPREAD)) for key in self.baseline}
+            # A limit above all speeds has no slope to descend.
+            start["velocity_limit"] = min(start["velocity_limit"], scales.speed)
             for effect in fit.effects:
                 options = sizes(effect, others, scales)
                 start.update(options[int(rng.integers(len(options)))])

@@ -17,7 +17,7 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import atomic_path, write_json
-from vd.kernels.effects import BASELINE, EFFECTS, EQUIVALENT, Parameter
+from vd.kernels.effects import BASELINE, EFFECTS, EQUIVALENT, TOGETHER, Parameter
 
 FORMAT = "vd-gap-report/1"
 _OPTIONAL = ("hand", "hand_layer", "closing")
@@ -297,9 +297,16 @@ class Report:
     def open_sets(self) -> tuple[tuple[str, ...], ...]:
         """The sets in ``ambiguous`` that another recording can split.
 
-        The others hold a named effect and those for which it stands (:data:`EQUIVALENT`).
+        The others hold a named effect and those for which it stands: one other (:data:`EQUIVALENT`), or
+        several together (:data:`TOGETHER`).
         """
-        return tuple(g for g in self.ambiguous if set(g[1:]) - set(EQUIVALENT.get(g[0], ())))
+        named = {effect.name for effect in self.effects}
+
+        def closed(group: tuple[str, ...]) -> bool:
+            both = set(TOGETHER.get(group[0], ())) if group[0] in named else set()
+            return set(group[1:]) <= {*EQUIVALENT.get(group[0], ()), *both}
+
+        return tuple(group for group in self.ambiguous if not closed(group))
 
     def with_closing(self, closing: Closing) -> "Report":
         """The same report with what the closing simulation showed."""

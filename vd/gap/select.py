@@ -12,7 +12,7 @@ import numpy as np
 
 from vd.gap.coordinates import Scales, sizes, torque_power
 from vd.gap.fit import JointFit
-from vd.gap.judge import AT_FLOOR, EXPLAINED, NESTED, NO_GAP, RANDOM, Explanation, Judge, Trial
+from vd.gap.judge import AT_FLOOR, EXPLAINED, NESTED, NO_GAP, RANDOM, Explanation, Judge, Trial, cancelled
 from vd.gap.result import parameter_of
 from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.effects import EFFECTS
@@ -39,6 +39,8 @@ SCREEN_ITERATIONS = 6
 WIDE = 15.0
 """Error of a round's best, in noise floors, up to which every start of every candidate is tried: a linear
 promise is no guide to where an effect that rings or brakes can be found."""
+LOOKS = 2
+"""Rounds in which they are: each costs as much as several others."""
 SEARCHES = 3
 """Searches for the final model from elsewhere, until one comes back to it."""
 FULL_ITERATIONS = 12
@@ -77,6 +79,8 @@ class Selection(Judge):
         restarts: Searches from another first effect, where the first search leaves a gap.
         vetoes: Effects that telemetry contradicts, with the reason.
         report: Called with a line of progress.
+        rest: Where the joint rests before it moves [rad].
+        looks: Rounds in which every start may be tried (:meth:`look_wider`).
     """
 
     run: Run
@@ -89,6 +93,8 @@ class Selection(Judge):
     seed: int = 0
     vetoes: Mapping[str, str] = field(default_factory=dict)
     report: Callable[[str], None] = lambda line: None
+    rest: float = 0.0
+    looks: int = LOOKS
     nominal: Mapping[str, float] = field(default_factory=dict)
     """Nominal values of the baseline's parameters, by key."""
     promised: dict[str, float] = field(default_factory=dict)
@@ -190,7 +196,14 @@ class Selection(Judge):
         return result
 
     def explained(self, explanation: Explanation) -> Explanation:
-        """The explanation with what a member of a set means that telemetry contradicts by its name."""
+        """The explanation with what its names do not say.
+
+        What a member of a set means that telemetry contradicts by its name; and no names where two
+        effects are but one that is not in the table.
+        """
+        alike = cancelled(explanation.final, self.joint, self.rest)
+        if alike and explanation.verdict in ("effects", "ambiguous"):
+            return replace(explanation, verdict="unknown", reason=alike)
         tied = {name for one in explanation.accepted for name in one.tied}
         notes = [
             f"{name} {BEHIND_SENSOR[name]}" for name in sorted(tied & set(BEHIND_SENSOR) & set(self.vetoes))
@@ -269,7 +282,8 @@ class Selection(Judge):
             if not fits:
                 break
             best = self.winner(list(fits.values()))
-            if EXPLAINED * self.floor < best.rmse < WIDE * self.floor:
+            if self.looks > 0 and EXPLAINED * self.floor < best.rmse < WIDE * self.floor:
+                self.looks -= 1
                 fits = self.look_wider(present, fits)
                 best = self.winner(list(fits.values()))
             accepted, why = self.better(present, best, SEARCH_TAIL)
@@ -289,6 +303,8 @@ class Selection(Judge):
             if FRICTION_AND_LOAD in fits and len(present.effects) + 2 <= MAX_EFFECTS:
                 apart = self.take_apart(present, fits[FRICTION_AND_LOAD])
                 pair = self.winner(apart) if apart else best
+                if apart and best.effects[-1] == FRICTION_AND_LOAD:
+                    self.apart[FRICTION_AND_LOAD] = pair
                 better = int(np.argmin(self.scores([best, pair]))) == 1
                 if better and not self.tied(pair, best)[0]:  # in a tie one effect is simpler than two
                     before, after = present.held_out_rmse, pair.held_out_rmse
@@ -422,7 +438,9 @@ class Selection(Judge):
             present_base = present
         tries = [self.add_random(present_base)]
         if present_base.effects:
-            tries.append(self.add_random(baseline))
+            alone = self.add_random(baseline)
+            if not self.better(alone, tries[0])[0]:
+                tries = [alone]
         best = self.winner(tries)
         accepted, why = self.better(present, best)
         gain, ci = self.gain(present, best)

@@ -26,7 +26,7 @@ from vd.gap.crowd import Crowd
 from vd.gap.design import design, pieces
 from vd.gap.find import findings
 from vd.gap.fit import JointFit, candidates, others_in
-from vd.gap.judge import Explanation, alike, share, stood_for
+from vd.gap.judge import RANDOM, Explanation, alike, polished, share, stood_for
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S, Chain, chains
@@ -382,6 +382,7 @@ def _explain_all(
             refits=REFITS,
             vetoes={**stood_for(same), **told},
             report=lambda line: progress(f"explain: {joint.name}: {line}"),
+            rest=_rest(recording, int(chain.columns[joint.spec.joint]), joint.spec.trajectories),
         )
         result = selection.explain(joint.fit)
         progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
@@ -395,7 +396,35 @@ def _explain_all(
         whole = team.run(joint.spec, [("fit", call)])[0][0]
         return team.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales})])[0]
 
-    return share(_parallel(one, joints), floors, fingers, [partial(finished, joint) for joint in joints])
+    ends = [partial(finished, joint) for joint in joints]
+    return _consistent(team, joints, share(_parallel(one, joints), floors, fingers, ends))
+
+
+def _rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:
+    """Where a joint begins most of its motions [rad]."""
+    return float(np.median([recording.trajectories[i].position[0, column] for i in trajectories]))
+
+
+def _consistent(
+    team: Team, joints: Sequence[Joint], explanations: Sequence[Explanation]
+) -> list[Explanation]:
+    """Final models with the other joints of their chain as these are in the end, not without effects.
+
+    Joints that drive or load each other are else fitted to motions that the others do not make.
+    """
+
+    def again(index: int) -> Explanation:
+        joint, own = joints[index], explanations[index]
+        rows, changed = own.final.rows.copy(), False
+        for other, found in zip(joints, explanations, strict=True):
+            if other is not joint and other.spec.chain == joint.spec.chain and found.final.effects:
+                rows[other.spec.joint], changed = found.final.rows[other.spec.joint], True
+        if not changed or not own.final.effects or RANDOM in own.final.effects:
+            return own
+        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales}
+        return polished(own, team.run(joint.spec, [("refine", call)])[0], joint.spec.floor)
+
+    return _parallel(again, range(len(joints)))
 
 
 def replace_baseline(explanation: Explanation, baseline: JointFit) -> Explanation:
