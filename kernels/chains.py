@@ -199,18 +199,21 @@ def friction_impulses(wanted: wp.vec3, inverse: wp.mat33, bound: wp.vec3, before
         ``(speed, impulse)``; joints whose impulse is within its bound stand still exactly.
     """
     impulse = wp.vec3(0.0)
-    for i in range(count):
-        impulse[i] = wp.clamp(before[i], -bound[i], bound[i])
+    for i in range(MAX_JOINTS):
+        if i < count:
+            impulse[i] = wp.clamp(before[i], -bound[i], bound[i])
     speed = wanted + inverse * impulse
     for _sweep in range(FRICTION_SWEEPS):
-        for i in range(count):
-            new = wp.clamp(impulse[i] - speed[i] / inverse[i, i], -bound[i], bound[i])
-            change = new - impulse[i]
-            impulse[i] = new
-            for j in range(count):
-                speed[j] += inverse[j, i] * change
-    for i in range(count):
-        if wp.abs(impulse[i]) < bound[i]:
+        for i in range(MAX_JOINTS):
+            if i < count:
+                new = wp.clamp(impulse[i] - speed[i] / inverse[i, i], -bound[i], bound[i])
+                change = new - impulse[i]
+                impulse[i] = new
+                for j in range(MAX_JOINTS):
+                    if j < count:
+                        speed[j] += inverse[j, i] * change
+    for i in range(MAX_JOINTS):
+        if i < count and wp.abs(impulse[i]) < bound[i]:
             speed[i] = 0.0
     return speed, impulse
 
@@ -305,34 +308,36 @@ def rollout_kernel(
     read_step = wp.vec3i(0)
     read_fraction = wp.vec3(0.0)
     dry = wp.int32(0)  # typed: it changes in a loop
-    for j in range(count):
-        row = base_row + j
-        q[j] = start[run, j] - parameters[row, ENCODER_BIAS]
-        q_start[j] = q[j]
-        held[j] = samples.command[begin, j]
-        held_power[j] = samples.power[begin, j]
-        start_servo(held[j], q[j], row, state)
-        state[row, STATE_TIME] = dt * float(samples.step[begin])
-        step, fraction, kept = arrival(samples, begin, stream[run], parameters, row, dt)
-        due_step[j] = step
-        due_fraction[j] = fraction
-        due_kept[j] = kept
-        step, fraction = split_steps(
-            samples.step[begin], samples.fraction[begin], -parameters[row, READ_DELAY] / dt
-        )
-        read_step[j] = step
-        read_fraction[j] = fraction
+    for j in range(MAX_JOINTS):
+        if j < count:
+            row = base_row + j
+            q[j] = start[run, j] - parameters[row, ENCODER_BIAS]
+            q_start[j] = q[j]
+            held[j] = samples.command[begin, j]
+            held_power[j] = samples.power[begin, j]
+            start_servo(held[j], q[j], row, state)
+            state[row, STATE_TIME] = dt * float(samples.step[begin])
+            step, fraction, kept = arrival(samples, begin, stream[run], parameters, row, dt)
+            due_step[j] = step
+            due_fraction[j] = fraction
+            due_kept[j] = kept
+            step, fraction = split_steps(
+                samples.step[begin], samples.fraction[begin], -parameters[row, READ_DELAY] / dt
+            )
+            read_step[j] = step
+            read_fraction[j] = fraction
     weight = wp.vec3(0.0)
     if bodies != 0:
         _resting, weight = chain_dynamics(q, wp.vec3(0.0), links)
-    for j in range(count):
-        row = base_row + j
-        # What coupled joints add to the reference is a load in the units of the drive.
-        load = -weight[j]
-        for i in range(count):
-            if i != j:
-                load += held_power[j] * parameters[row, KP] * parameters[row, COUPLING_0 + slot[i]] * q[i]
-        rest_play(held[j], q[j], load, held_power[j], parameters, row, state)
+    for j in range(MAX_JOINTS):
+        if j < count:
+            row = base_row + j
+            # What coupled joints add to the reference is a load in the units of the drive.
+            load = -weight[j]
+            for i in range(MAX_JOINTS):
+                if i < count and i != j:
+                    load += held_power[j] * parameters[row, KP] * parameters[row, COUPLING_0 + slot[i]] * q[i]
+            rest_play(held[j], q[j], load, held_power[j], parameters, row, state)
 
     for k in range(samples.step[begin], samples.step[end - 1] + 1):
         # From rest at the first position to the velocity half a step later.
@@ -346,56 +351,60 @@ def rollout_kernel(
         stiffness = wp.vec3(0.0)
         motor = wp.vec3(0.0)
         loaded = wp.vec3(0.0)
-        for j in range(count):
-            row = base_row + j
-            # Commands that arrive within the step divide it; the reference is the mean over it.
-            reference = wp.float32(0.0)
-            power = held_power[j]
-            done = wp.float32(0.0)
-            while due_step[j] <= k:
-                if due_kept[j] == 1:
-                    part = wp.float32(0.0)
-                    if due_step[j] == k:
-                        part = due_fraction[j] - done
-                    if part > 0.0:
-                        reference += part * shape_command(held[j], part * dt, parameters, row, state)
-                        done += part
-                    power += (1.0 - done) * (samples.power[write[j], j] - held_power[j])
-                    held[j] = samples.command[write[j], j]
-                    held_power[j] = samples.power[write[j], j]
-                write[j] = write[j] + 1
-                if write[j] < end:
-                    step, fraction, kept = arrival(samples, write[j], stream[run], parameters, row, dt)
-                    # In order: no command overtakes the one before.
-                    if step < due_step[j] or (step == due_step[j] and fraction < due_fraction[j]):
-                        step = due_step[j]
-                        fraction = due_fraction[j]
-                    due_step[j] = step
-                    due_fraction[j] = fraction
-                    due_kept[j] = kept
-                else:
-                    due_step[j] = 2147483647
-            coupled = wp.float32(0.0)
-            if count > 1:
-                for i in range(count):
-                    coupled += parameters[row, COUPLING_0 + slot[i]] * q[i]
-            before = wp.float32(0.0)
-            if done > 0.0:
-                before = reference / done + coupled
-            part = 1.0 - done
-            reference += part * shape_command(held[j], part * dt, parameters, row, state) + coupled
-            drive = drive_joint(
-                reference, before, done, q[j], speed[j], power, dt, effort[j], parameters, row, state
-            )
-            torque[j] = drive.stiffness * (drive.reference - q[j]) - drive.damping * speed[j] + drive.torque
-            damping[j] = drive.damping
-            stiffness[j] = drive.stiffness
-            bound[j] = kick * drive.friction
-            motor[j] = parameters[row, LOAD_FRICTION] * drive.motor
-            loaded[j] = parameters[row, LOAD_FRICTION] * drive.motor_damping
-            if drive.friction > 0.0:
-                dry = 1
-            diagonal[j] = parameters[row, INERTIA] + parameters[row, PAYLOAD_INERTIA]
+        for j in range(MAX_JOINTS):
+            if j < count:
+                row = base_row + j
+                # Commands that arrive within the step divide it; the reference is the mean over it.
+                reference = wp.float32(0.0)
+                power = held_power[j]
+                done = wp.float32(0.0)
+                while due_step[j] <= k:
+                    if due_kept[j] == 1:
+                        part = wp.float32(0.0)
+                        if due_step[j] == k:
+                            part = due_fraction[j] - done
+                        if part > 0.0:
+                            reference += part * shape_command(held[j], part * dt, parameters, row, state)
+                            done += part
+                        power += (1.0 - done) * (samples.power[write[j], j] - held_power[j])
+                        held[j] = samples.command[write[j], j]
+                        held_power[j] = samples.power[write[j], j]
+                    write[j] = write[j] + 1
+                    if write[j] < end:
+                        step, fraction, kept = arrival(samples, write[j], stream[run], parameters, row, dt)
+                        # In order: no command overtakes the one before.
+                        if step < due_step[j] or (step == due_step[j] and fraction < due_fraction[j]):
+                            step = due_step[j]
+                            fraction = due_fraction[j]
+                        due_step[j] = step
+                        due_fraction[j] = fraction
+                        due_kept[j] = kept
+                    else:
+                        due_step[j] = 2147483647
+                coupled = wp.float32(0.0)
+                if count > 1:
+                    for i in range(MAX_JOINTS):
+                        if i < count:
+                            coupled += parameters[row, COUPLING_0 + slot[i]] * q[i]
+                before = wp.float32(0.0)
+                if done > 0.0:
+                    before = reference / done + coupled
+                part = 1.0 - done
+                reference += part * shape_command(held[j], part * dt, parameters, row, state) + coupled
+                drive = drive_joint(
+                    reference, before, done, q[j], speed[j], power, dt, effort[j], parameters, row, state
+                )
+                torque[j] = (
+                    drive.stiffness * (drive.reference - q[j]) - drive.damping * speed[j] + drive.torque
+                )
+                damping[j] = drive.damping
+                stiffness[j] = drive.stiffness
+                bound[j] = kick * drive.friction
+                motor[j] = parameters[row, LOAD_FRICTION] * drive.motor
+                loaded[j] = parameters[row, LOAD_FRICTION] * drive.motor_damping
+                if drive.friction > 0.0:
+                    dry = 1
+                diagonal[j] = parameters[row, INERTIA] + parameters[row, PAYLOAD_INERTIA]
 
         mass = wp.mat33(0.0)
         if bodies == 1:
@@ -424,34 +433,37 @@ def rollout_kernel(
                 if loaded[0] != 0.0 or loaded[1] != 0.0 or loaded[2] != 0.0:
                     bound = load_bounds(bound, kick, motor, loaded, new_speed - speed)
                     new_speed, impulse = friction_impulses(free_speed, inverse, bound, impulse, count)
-        for j in range(count):
-            row = base_row + j
-            limit = parameters[row, VELOCITY_LIMIT]
-            v = wp.clamp(new_speed[j], -limit, limit)
-            last = q[j]
-            after = last + dt * v
-            if after < lower[j] or after > upper[j]:
-                # A start beyond a stop, as an encoder's bias makes it, is no reason to jump.
-                after = wp.clamp(after, wp.min(lower[j], last), wp.max(upper[j], last))
-                v = 0.0
-            if not (wp.abs(after - q_start[j]) < DIVERGED):
-                after = q_start[j] + DIVERGED
-                v = 0.0
-            q[j] = after
-            speed[j] = v
-            while read_step[j] <= k and read[j] < end:
-                share = 0.0
-                if read_step[j] == k:
-                    share = read_fraction[j]
-                position = last + share * (after - last) + parameters[row, ENCODER_BIAS]
-                if only < 0:
-                    predicted[to_output + read[j], j] = position
-                elif only == j:
-                    predicted[to_output + read[j], 0] = position
-                read[j] = read[j] + 1
-                if read[j] < end:
-                    step, fraction = split_steps(
-                        samples.step[read[j]], samples.fraction[read[j]], -parameters[row, READ_DELAY] / dt
-                    )
-                    read_step[j] = step
-                    read_fraction[j] = fraction
+        for j in range(MAX_JOINTS):
+            if j < count:
+                row = base_row + j
+                limit = parameters[row, VELOCITY_LIMIT]
+                v = wp.clamp(new_speed[j], -limit, limit)
+                last = q[j]
+                after = last + dt * v
+                if after < lower[j] or after > upper[j]:
+                    # A start beyond a stop, as an encoder's bias makes it, is no reason to jump.
+                    after = wp.clamp(after, wp.min(lower[j], last), wp.max(upper[j], last))
+                    v = 0.0
+                if not (wp.abs(after - q_start[j]) < DIVERGED):
+                    after = q_start[j] + DIVERGED
+                    v = 0.0
+                q[j] = after
+                speed[j] = v
+                while read_step[j] <= k and read[j] < end:
+                    share = 0.0
+                    if read_step[j] == k:
+                        share = read_fraction[j]
+                    position = last + share * (after - last) + parameters[row, ENCODER_BIAS]
+                    if only < 0:
+                        predicted[to_output + read[j], j] = position
+                    elif only == j:
+                        predicted[to_output + read[j], 0] = position
+                    read[j] = read[j] + 1
+                    if read[j] < end:
+                        step, fraction = split_steps(
+                            samples.step[read[j]],
+                            samples.fraction[read[j]],
+                            -parameters[row, READ_DELAY] / dt,
+                        )
+                        read_step[j] = step
+                        read_fraction[j] = fraction

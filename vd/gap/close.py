@@ -195,12 +195,8 @@ def _newton(
     for joint, values in report.baseline.parameters.items():
         for name, value in values.items():
             rows[before.joint_names.index(joint), _COLUMN[name]] = value
-    return _with(
-        curves,
-        recording,
-        simulate_hand(recording, before, rows, device=device),
-        simulate_hand(recording, after, np.array(after.servo, dtype=float), device=device),
-    )
+    both = np.stack([rows, np.array(after.servo, dtype=float)])
+    return _with(curves, recording, *simulate_hand(recording, after, both, device=device))
 
 
 def _bare(layer: Path, recording: Recording, curves: Predictions, device: str) -> Predictions:

@@ -8,14 +8,22 @@ import numpy as np
 from vd.gap.coordinates import Coordinate
 
 LAMBDAS = np.array([0.1, 1.0, 10.0])
-"""Factors on the damping that are tried in each step."""
+"""Factors on the damping that are tried in each step; the others only where the first gains less than ..."""
+ENOUGH = 0.5
+"""... this share of what the linear model promises."""
 FIRST_DAMPING = 1e-3
 LEAST_DAMPING = 1e-7
 WIDEN = -3.0
 """Factor on the finite-difference steps after a step that fails, with the other sign: dry friction makes
 the squared error rugged at the scale of the smallest steps."""
 FAILURES = 4
-"""Failed steps in a row that end a fit."""
+"""Failed steps in a row that end a fit; one of which nothing was expected counts twice."""
+RACE_EVERY = 2
+"""Iterations after which descents that are only there to find the best start are compared."""
+RACE_LAG = 1.3
+"""Error beyond which, in that of the best, at most half of the descents go on."""
+SAME_COST, SAME_PLACE = 1e-3, 0.02
+"""Relative difference of cost and largest difference of coordinates of descents that have met."""
 LOG_TRUST = 1.5
 """Largest change of a logarithmic coordinate in one step."""
 LINEAR_TRUST = 5.0
@@ -34,7 +42,7 @@ class Descent:
     Attributes:
         x: Coordinates [B, P].
         residual: Measured minus predicted [B, N].
-        jacobian: d(predicted)/dx at ``x``, shape [B, P, N]; an earlier one if none was asked for.
+        jacobian: d(predicted)/dx at or near ``x``, shape [B, P, N].
     """
 
     x: np.ndarray
@@ -95,7 +103,7 @@ class LeastSquares:
         *,
         keep: np.ndarray | None = None,
         known: Descent | None = None,
-        finish: bool = True,
+        race: bool = False,
     ) -> Descent:
         """Descend.
 
@@ -104,12 +112,15 @@ class LeastSquares:
             iterations: Steps at most.
             keep: Trajectories that count in each [B, S]; all by default.
             known: Residuals and Jacobians at the starts.
-            finish: Whether the Jacobian at the end is wanted.
+            race: Only the best is wanted: the others end once they meet it or fall behind.
+
+        Returns:
+            The ends; their Jacobians are those of the last steps.
         """
         lower = np.array([c.lower for c in self.coordinates])
         upper = np.array([c.upper for c in self.coordinates])
         logarithmic = np.array([c.log for c in self.coordinates])
-        x, origin, tries = x.copy(), x.copy(), len(LAMBDAS)
+        x, origin = x.copy(), x.copy()
         residual = known.residual if known is not None else self.residuals(x, keep)
         jacobian = np.zeros((*x.shape, residual.shape[1])) if known is None else known.jacobian
         cost = np.einsum("bn,bn->b", residual, residual)
@@ -128,25 +139,67 @@ class LeastSquares:
             step = _steps(gram, gradient, free, damping[active, None] * LAMBDAS)
             limit = np.where(logarithmic, LOG_TRUST, LINEAR_TRUST + np.abs(here))[:, None]
             trials = np.clip(here[:, None] + np.clip(step, -limit, limit), lower, upper)
-            answers = self.residuals(trials.reshape(-1, x.shape[1]), _repeat(kept, tries))
-            costs = np.einsum("bn,bn->b", answers, answers).reshape(-1, tries)
-            costs += self.ridge * ((trials - origin[active, None]) ** 2).sum(2)
-            best = np.argmin(costs, axis=1)
-            each = np.arange(len(active))
-            gain = (cost[active] - costs[each, best]) / np.maximum(cost[active], 1e-300)
-            won, lost = active[gain > 0.0], active[gain <= 0.0]
-            x[won] = trials[each, best][gain > 0.0]
-            residual[won] = answers.reshape(len(active), tries, -1)[each, best][gain > 0.0]
-            cost[won] = costs[each, best][gain > 0.0]
-            damping[won] = np.maximum(damping[won] * LAMBDAS[best[gain > 0.0]] * 0.3, LEAST_DAMPING)
+            moved = trials - here[:, None]
+            promised = 2.0 * (moved @ gradient[:, :, None])[..., 0]
+            promised -= np.einsum("blp,bpq,blq->bl", moved, gram, moved)
+            costs, best = np.full(trials.shape[:2], np.inf), np.empty((len(active), residual.shape[1]))
+            self._try(trials, origin[active], kept, np.arange(len(active)), slice(0, 1), costs, best)
+            short = np.flatnonzero(cost[active] - costs[:, 0] < ENOUGH * promised[:, 0])
+            if len(short):
+                self._try(trials, origin[active], kept, short, slice(1, None), costs, best)
+            chosen, each = np.argmin(costs, axis=1), np.arange(len(active))
+            gain = (cost[active] - costs[each, chosen]) / np.maximum(cost[active], 1e-300)
+            better = gain > 0.0
+            won, lost = active[better], active[~better]
+            x[won], residual[won] = trials[each, chosen][better], best[better]
+            cost[won] = costs[each, chosen][better]
+            damping[won] = np.maximum(damping[won] * LAMBDAS[chosen[better]] * 0.3, LEAST_DAMPING)
             damping[lost] *= 3.0
-            failures[active] = np.where(gain > TOLERANCE, 0, failures[active] + 1)
+            flat = promised[:, 0] < TOLERANCE * cost[active]
+            failures[active] = np.where(gain > TOLERANCE, 0, failures[active] + np.where(flat, 2, 1))
             active = active[failures[active] < FAILURES]
+            if race and number % RACE_EVERY == RACE_EVERY - 1:
+                active = _leaders(active, x, cost)
             if not len(active):
                 break
-        if finish:
-            jacobian = self.jacobian(x, residual, keep=keep)
         return Descent(x, residual, jacobian)
+
+    def _try(
+        self,
+        trials: np.ndarray,
+        origin: np.ndarray,
+        keep: np.ndarray | None,
+        which: np.ndarray,
+        tries: slice,
+        costs: np.ndarray,
+        best: np.ndarray,
+    ) -> None:
+        """Simulate some trials of some descents: their costs [B, L], and the residuals of the best so far."""
+        given = trials[which, tries]
+        size = given.shape[1]
+        kept = _repeat(None if keep is None else keep[which], size)
+        answers = self.residuals(given.reshape(-1, trials.shape[2]), kept)
+        squares = np.einsum("cn,cn->c", answers, answers).reshape(-1, size)
+        squares += self.ridge * ((given - origin[which, None]) ** 2).sum(2)
+        before = costs[which].min(axis=1)
+        costs[which, tries] = squares
+        winner = np.argmin(squares, axis=1)
+        better = squares[np.arange(len(which)), winner] < before
+        best[which[better]] = answers.reshape(len(which), size, -1)[np.arange(len(which)), winner][better]
+
+
+def _leaders(active: np.ndarray, x: np.ndarray, cost: np.ndarray) -> np.ndarray:
+    """The descents that still race: none that has met a better one, nor one of the slower half far behind."""
+    order = active[np.argsort(cost[active])]
+    kept: list[int] = []
+    best = float(cost.min())
+    for b in order:
+        near = (cost[b] - cost < SAME_COST * cost[b]) & (np.abs(x - x[b]).max(axis=1) < SAME_PLACE)
+        met = bool((near & ((cost < cost[b]) | ((cost == cost[b]) & (np.arange(len(cost)) < b)))).any())
+        behind = cost[b] > RACE_LAG**2 * best and len(kept) >= (len(order) + 1) // 2
+        if not met and not behind:
+            kept.append(int(b))
+    return np.sort(np.array(kept, int))
 
 
 def _repeat(keep: np.ndarray | None, times: int) -> np.ndarray | None:

@@ -225,7 +225,7 @@ class JointProblem:
         iterations: int = 12,
         trajectories: Trajectories = None,
         refits: int = 0,
-    ) -> list[JointFit]:
+    ) -> JointFit:
         """Fit a model from several starts at once, by Levenberg-Marquardt.
 
         Args:
@@ -238,7 +238,7 @@ class JointProblem:
             refits: Steps of Levenberg-Marquardt of each refit without a fold; 0: one Gauss-Newton step.
 
         Returns:
-            One fit per start, best first.
+            The best.
         """
         coordinates = [coordinate(key, scales) for key in self.fitted(effects)]
         x0 = np.array(
@@ -248,17 +248,18 @@ class JointProblem:
             ]
         )
         chosen = self.trajectories if trajectories is None else np.asarray(trajectories)
-        found = self.squares(base, coordinates, chosen).descend(x0, iterations)
-        fits = [
-            self._result(base, effects, coordinates, *each, chosen)
-            for each in zip(found.x, found.residual, found.jacobian, strict=True)
-        ]
-        order = sorted(range(len(fits)), key=lambda i: float(fits[i].sse.sum()))
-        fits = [fits[i] for i in order]
-        if trajectories is None:
-            squares, absolutes = self.cross_validate(fits[0], found.at(order[0], 1), refits)
-            fits[0] = replace(fits[0], held_out=squares, held_out_abs=absolutes)
-        return fits
+        model = self.squares(base, coordinates, chosen)
+        found = model.descend(x0, iterations, race=True)
+        squares = np.einsum("bn,bn->b", found.residual, found.residual)
+        found = found.at(int(np.argmin(squares)), 1)
+        found = replace(found, jacobian=model.jacobian(found.x, found.residual))
+        fit = self._result(
+            base, effects, coordinates, found.x[0], found.residual[0], found.jacobian[0], chosen
+        )
+        if trajectories is not None:
+            return fit
+        held_out, absolute = self.cross_validate(fit, found, refits)
+        return replace(fit, held_out=held_out, held_out_abs=absolute)
 
     def fitted(self, effects: Sequence[str]) -> list[str]:
         """Keys of what a model with these effects fits on this joint."""
@@ -313,7 +314,7 @@ class JointProblem:
             start = replace(
                 start, residual=start.residual * inside, jacobian=start.jacobian * inside[:, None]
             )
-            x = model.descend(start.x, iterations, keep=~out, known=start, finish=False).x
+            x = model.descend(start.x, iterations, keep=~out, known=start).x
         else:
             x = np.stack([self._without(fit, fold) for fold in out])
         residual = self.residuals(self.rows(fit.rows, fit.coordinates, x), keep=out)
@@ -353,7 +354,7 @@ class JointProblem:
                     scales,
                     iterations=FINER_ITERATIONS,
                     trajectories=self.trajectories,
-                )[0]
+                )
                 x, error = result.x, np.abs(result.x - x)
             residual = self.residuals(result.rows[None])[0]
         finally:
@@ -412,7 +413,7 @@ class JointProblem:
             scales,
             iterations=OTHER_ITERATIONS,
             trajectories=self.trajectories,
-        )[0]
+        )
 
     def _nominal(self) -> dict[str, float]:
         row = self.rollouts.chain.start_row[self.joint]

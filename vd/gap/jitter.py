@@ -111,13 +111,24 @@ class JitterFit:
         losses = 0.5 * (np.log(variance) + error**2 / variance)
         return np.array([part.sum() for part in np.split(losses, self.ends)])
 
-    def fit(self) -> JointFit:
-        """The jitter with the largest likelihood, as a fit like any other."""
+    def fit(self, worst: float) -> JointFit:
+        """The jitter with the largest likelihood, as a fit like any other.
+
+        Args:
+            worst: Squared error of a model without chance [rad^2]. Where no start of the search comes as near
+                there is no jitter to be found: the starts are dense beside what a jitter does.
+        """
 
         def total(x: np.ndarray) -> float:
             return float(self.losses(*self._values(x)).sum())
 
-        start = min(np.log(np.array(START_SIGMA_DROP)), key=total)
+        starts = np.log(np.array(START_SIGMA_DROP))
+        totals = [total(x) for x in starts]
+        start = starts[int(np.argmin(totals))]
+        sigma, drop = self._values(start)
+        here = self.losses(sigma, drop)
+        if self._equivalent(here).sum() > worst:
+            return self._as_fit(sigma, drop, here)
         for _ in range(ROUNDS):
             simplex = start + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0]])
             options = {"maxfev": EVALUATIONS, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
@@ -126,6 +137,11 @@ class JitterFit:
             self.losses(sigma, drop)
             self._move(self.shift)
         return self._result(sigma, drop)
+
+    def _equivalent(self, losses: np.ndarray) -> np.ndarray:
+        """Squared errors that a normal distribution of constant width has at the same likelihood [S]."""
+        count = self.problem.count
+        return count * np.exp(np.minimum(2.0 * losses / count - 1.0, LARGEST))
 
     def _extents(self, sigma: float, drop: float, here: np.ndarray) -> dict[str, tuple[float, float]]:
         """Intervals of both parameters: the values of the pairs that the trajectories do not reject.
@@ -174,7 +190,6 @@ class JitterFit:
 
     def _result(self, sigma: float, drop: float) -> JointFit:
         """Equivalent errors, and the likelihood's curvature in the place of the Gauss-Newton matrices."""
-        keep = self.keep
         x = np.array([c.inverse(v) for c, v in zip(self.coordinates, (sigma, drop), strict=True)])
         steps = np.maximum(STEP * x, [c.inverse(LEAST_DROP) for c in self.coordinates])
         here = self.losses(sigma, drop)
@@ -185,18 +200,26 @@ class JitterFit:
                 moved[i] = max(moved[i] + sign * steps[i], 0.0)
                 pair = [float(c.value(v)) for c, v in zip(self.coordinates, moved, strict=True)]
                 sides[i, k] = self.losses(pair[0], pair[1])
-        size, count = len(keep) + 2, self.problem.count
+        curved, slope = np.empty((2, self.size)), np.empty((2, self.size))
+        for i in range(2):
+            curvature = (sides[i, 0] + sides[i, 1] - 2.0 * here) / steps[i] ** 2
+            # No trajectory alone may bend the wrong way by the error of the draws; the sum is what counts.
+            curved[i] = max(float(curvature.sum()), 1e-6) / self.size
+            slope[i] = -(sides[i, 0] - sides[i, 1]) / (2.0 * steps[i])
+        fit = self._as_fit(sigma, drop, here)
+        floor = self.problem.floor**2
+        for i in range(2):
+            fit.gram[:, i - 2, i - 2], fit.gradient[:, i - 2] = curved[i] * floor, slope[i] * floor
+        return replace(fit, extents=self._extents(sigma, drop, here))
+
+    def _as_fit(self, sigma: float, drop: float, here: np.ndarray) -> JointFit:
+        """A pair of values, and the losses there, as a fit whose matrices leave them out."""
+        keep = self.keep
+        x = [c.inverse(v) for c, v in zip(self.coordinates, (sigma, drop), strict=True)]
+        size, equivalent = len(keep) + 2, self._equivalent(here)
         gram, gradient = np.zeros((self.size, size, size)), np.zeros((self.size, size))
         gram[:, : size - 2, : size - 2] = self.base.gram[:, keep][:, :, keep]
         gradient[:, : size - 2] = self.base.gradient[:, keep]
-        for i in range(2):
-            curvature = (sides[i, 0] + sides[i, 1] - 2.0 * here) / steps[i] ** 2
-            at = size - 2 + i
-            # No trajectory alone may bend the wrong way by the error of the draws; the sum is what counts.
-            share = max(float(curvature.sum()), 1e-6) / self.size
-            gram[:, at, at] = share * self.problem.floor**2
-            gradient[:, at] = -(sides[i, 0] - sides[i, 1]) / (2.0 * steps[i]) * self.problem.floor**2
-        equivalent = count * np.exp(np.minimum(2.0 * here / count - 1.0, LARGEST))
         coordinates: list[Coordinate] = [*(self.base.coordinates[i] for i in keep), *self.coordinates]
         effects = tuple(e for e in self.base.effects if e != "command_delay")
         return JointFit(
@@ -206,10 +229,9 @@ class JitterFit:
             rows=self.row(sigma, drop),
             sse=equivalent,
             held_out=equivalent,
-            count=count,
+            count=self.problem.count,
             gram=gram,
             gradient=gradient,
-            extents=self._extents(sigma, drop, here),
         )
 
 
@@ -222,5 +244,6 @@ def fit_jitter(
     iterations: int,
 ) -> JointFit:
     """Fit ``effects`` and jitter: first with a constant delay for its mean, then its spread."""
-    fit = problem.fit(base, (*effects, "command_delay"), starts, scales, iterations=iterations)[0]
-    return JitterFit(problem, fit, scales).fit()
+    fit = problem.fit(base, (*effects, "command_delay"), starts, scales, iterations=iterations)
+    left = problem.residuals(base[None])[0]
+    return JitterFit(problem, fit, scales).fit(float(left @ left))

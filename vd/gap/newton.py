@@ -298,23 +298,27 @@ def simulate_hand(
     Args:
         recording: A recording of a hand.
         hand: The hand.
-        rows: Servo parameters, shape [D, P].
+        rows: Servo parameters, shape [D, P], or of M models that are simulated side by side [M, D, P].
         dt: Physics step [s].
         device: Warp device.
         indices: Trajectories to simulate, each a world of one batch; all by default.
 
     Returns:
         Predicted recorded positions [rad] in the recording's columns, the samples of the trajectories one
-        after the other, shape [S, J].
+        after the other, shape [S, J] or [M, S, J].
     """
     chosen = list(range(len(recording.trajectories)) if indices is None else indices)
-    tracks = np.repeat(np.array(chosen)[:, None], hand.num_fingers, axis=1)
+    rows = np.asarray(rows, dtype=float)
+    models = rows[None] if rows.ndim == 2 else rows
+    tracks = np.repeat(np.array(chosen * len(models))[:, None], hand.num_fingers, axis=1)
     replay = HandReplay(recording, hand, tracks, dt=dt, device=device, keep_positions=True)
-    replay.run(rows)
+    replay.run(np.repeat(models, len(chosen), axis=0))
     columns = [hand.joint_names.index(name) for name in recording.joints]
     positions = replay.positions.numpy()[..., columns].astype(float)
+    positions = positions.reshape(len(models), len(chosen), -1, len(columns))
     lengths = [len(recording.trajectories[i].time) for i in chosen]
-    return np.concatenate([positions[k, :length] for k, length in enumerate(lengths)])
+    answers = np.concatenate([positions[:, k, :length] for k, length in enumerate(lengths)], axis=1)
+    return answers[0] if rows.ndim == 2 else answers
 
 
 @dataclasses.dataclass(frozen=True)

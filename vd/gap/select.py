@@ -35,7 +35,10 @@ BEHIND = 3.0
 """Finalists have at most this many times the error of the best after screening."""
 NEARLY_OFF = 0.1
 """Share of a starting size from which a fit begins anew that ended worse than without the effect."""
+HOPELESS = 1.5
+"""The same factor half way: those beyond it are not fitted to the end."""
 SCREEN_ITERATIONS = 6
+HALF_ITERATIONS = 4
 WIDE = 15.0
 """Error of a round's best, in noise floors, up to which every start of every candidate is tried: a linear
 promise is no guide to where an effect that rings or brakes can be found."""
@@ -178,7 +181,7 @@ class Selection(Judge):
             for name in names
         ]
         least = min(fit.rmse for fit in fits.values())
-        found = sorted((fits_[0] for fits_ in self.run(calls)), key=lambda fit: fit.rmse)
+        found = sorted(self.run(calls), key=lambda fit: fit.rmse)
         better = [
             fit
             for fit in found[:FINALISTS]
@@ -189,7 +192,7 @@ class Selection(Judge):
             [self.call(present, fit.effects[-1], [fit.values], FULL_ITERATIONS) for fit in better]
         )
         result = dict(fits)
-        for refit in (refit[0] for refit in refits):
+        for refit in refits:
             known = result.get(refit.effects[-1])
             if known is None or refit.held_out_rmse < known.held_out_rmse:
                 result[refit.effects[-1]] = refit
@@ -350,7 +353,7 @@ class Selection(Judge):
             given = [{**base, **dry[friction], **start} for start in (starts[name], *others)]
             call = self.call(present, friction, given, FULL_ITERATIONS)
             calls.append(("fit", {**call[1], "effects": (*present.effects, friction, name)}))
-        return [fits[0] for fits in self.run(calls)]
+        return self.run(calls)
 
     def fit_candidates(
         self, present: JointFit, skip: Sequence[str] = (), vetoed: Sequence[str] = ()
@@ -389,7 +392,7 @@ class Selection(Judge):
                 )
                 for name in chosen
             ]
-            return [fits[0] for fits in self.run(calls)]
+            return self.run(calls)
 
         screened = screen(ranked[:FIRST])
         rest = ranked[FIRST:]
@@ -400,10 +403,15 @@ class Selection(Judge):
         screened += screen(rest)
         screened.sort(key=lambda fit: fit.rmse)
         finalists = [fit for fit in screened[:FINALISTS] if fit.rmse < BEHIND * screened[0].rmse]
-        refits = self.run(
-            [self.call(present, fit.effects[-1], [fit.values], FULL_ITERATIONS) for fit in finalists]
-        )
-        fits = {fit.effects[-1]: fit for fit in (*(r[0] for r in refits), *screened[len(finalists) :])}
+
+        def go_on(chosen: Sequence[JointFit], iterations: int) -> list[JointFit]:
+            return self.run([self.call(present, f.effects[-1], [f.values], iterations) for f in chosen])
+
+        if len(finalists) > 1:
+            finalists = sorted(go_on(finalists, HALF_ITERATIONS), key=lambda fit: fit.rmse)
+        near = [fit for fit in finalists if fit.rmse < HOPELESS * finalists[0].rmse]
+        last = [*go_on(near, FULL_ITERATIONS), *finalists[len(near) :]]
+        fits = {fit.effects[-1]: fit for fit in (*last, *screened[len(finalists) :])}
         # Nothing added can do worse than nothing: such a fit began too large, and no descent led back.
         astray = [name for name, fit in fits.items() if fit.rmse > present.rmse]
         small = {name: _smaller(flat[order[name][0]][1]) for name in astray}
@@ -413,8 +421,8 @@ class Selection(Judge):
             for name in again
         ]
         for name, found in zip(again, self.run(calls), strict=True):
-            if found[0].rmse < fits[name].rmse:
-                fits[name] = found[0]
+            if found.rmse < fits[name].rmse:
+                fits[name] = found
         return fits
 
     def add_random(self, present: JointFit) -> JointFit:
@@ -557,7 +565,7 @@ class Selection(Judge):
                 rows[self.joint, parameter.column] = parameter.neutral
         values = {k: v for k, v in present.values.items() if k.rpartition(".")[0] in ("", *effects)}
         call = {"base": rows, "effects": tuple(effects), "starts": [values], "scales": self.scales}
-        return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0][0]
+        return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0]
 
 
 def _smaller(start: Mapping[str, float]) -> dict[str, float] | None:

@@ -304,7 +304,7 @@ def _identify(team: Team, specs: Sequence[JointSpec], options: Options, progress
         nominal = {key: float(rows[spec.joint, BASELINE_PARAMETERS[key].column]) for key in spec.baseline}
         starts += [nominal, {**nominal, "velocity_limit": SPEED_STARTS[0] * scales.speed}]
         call = {"base": searched, "effects": (), "starts": starts, "scales": scales}
-        fit = team.run(spec, [("fit", {**call, "iterations": BASELINE_ITERATIONS})])[0][0]
+        fit = team.run(spec, [("fit", {**call, "iterations": BASELINE_ITERATIONS})])[0]
         name = chain.joints[spec.joint]
         progress(f"find: {name}: baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}")
         return Joint(name, spec, _scales(team, spec, fit), fit)
@@ -324,7 +324,7 @@ def _together(team: Team, joints: Sequence[Joint]) -> list[Joint]:
             if other.spec.chain == joint.spec.chain:
                 rows[other.spec.joint] = other.fit.rows[other.spec.joint]
         call = {"base": rows, "effects": joint.fit.effects, "starts": [{}], "scales": joint.scales}
-        fit = team.run(joint.spec, [("fit", {**call, "iterations": POLISH_ITERATIONS})])[0][0]
+        fit = team.run(joint.spec, [("fit", {**call, "iterations": POLISH_ITERATIONS})])[0]
         return replace(joint, fit=fit, scales=_scales(team, joint.spec, fit))
 
     return _parallel(again, joints)
@@ -345,7 +345,7 @@ def _resume(team: Team, specs: Sequence[JointSpec], known: dict[str, Any]) -> li
             0
         ]
         call = {"base": rows, "effects": (), "starts": [{}], "scales": scales, "iterations": 1}
-        return Joint(name, spec, scales, team.run(spec, [("fit", {**call, "refits": REFITS})])[0][0])
+        return Joint(name, spec, scales, team.run(spec, [("fit", {**call, "refits": REFITS})])[0])
 
     return _parallel(one, specs)
 
@@ -393,7 +393,7 @@ def _explain_all(
     def finished(joint: Joint, fit: JointFit) -> JointFit:
         call = {"base": fit.rows, "effects": fit.effects, "starts": [fit.values], "scales": joint.scales}
         call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
-        whole = team.run(joint.spec, [("fit", call)])[0][0]
+        whole = team.run(joint.spec, [("fit", call)])[0]
         return team.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales})])[0]
 
     ends = [partial(finished, joint) for joint in joints]
