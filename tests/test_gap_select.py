@@ -482,7 +482,7 @@ def test_a_fit_that_is_worse_than_without_begins_anew_nearly_off() -> None:
                 continue
             starts = [s.get("coulomb_friction.tau_c_nm", 1.0) for s in call["starts"]]
             begun.append(starts)
-            answers.append([made_up(call["effects"], 0.02 if starts[0] > 0.01 else 0.006)])
+            answers.append(made_up(call["effects"], 0.02 if starts[0] > 0.01 else 0.006))
         return answers
 
     selection, _ = searching([])

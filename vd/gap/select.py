@@ -33,10 +33,10 @@ ALIKE = 0.5
 """Share of the best promise that a candidate must have to be fitted once another explains everything."""
 BEHIND = 3.0
 """Finalists have at most this many times the error of the best after screening."""
-NEARLY_OFF = 0.1
-"""Share of a starting size from which a fit begins anew that ended worse than without the effect."""
 HOPELESS = 1.5
 """The same factor half way: those beyond it are not fitted to the end."""
+NEARLY_OFF = 0.1
+"""Share of a starting size from which a fit begins anew that ended worse than without the effect."""
 SCREEN_ITERATIONS = 6
 HALF_ITERATIONS = 4
 WIDE = 15.0
