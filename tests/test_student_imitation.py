@@ -3,12 +3,15 @@
 import math
 import os
 import signal
+import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from student_dummy import TINY, DummyTeacher, make_dagger, make_student_runner, weights
+from train_dummy import DummyEnv
 
 from vd.student.cfg import NoiseCfg
 from vd.student.network import Student
@@ -17,8 +20,9 @@ from vd.train.checkpoint import list_checkpoints
 from vd.train.cli import main
 from vd.train.ending import Interrupted, TrainingDivergedError
 from vd.train.metrics import read_progress
-from vd.train.student.dagger import taken
-from vd.train.student.losses import distance_loss, imitation_loss
+from vd.train.student.dagger import poses, taken
+from vd.train.student.losses import distance_loss, imitation_loss, unexplained
+from vd.train.student.profile import profile_iteration
 
 
 def test_the_losses_fall_on_one_rollout():
@@ -114,6 +118,11 @@ def test_losses_are_what_they_say():
     torch.testing.assert_close(imitation_loss(output, rollout.label, "likelihood"), expected)
     squared = (output.mean - rollout.label).square().sum(-1).mean()
     torch.testing.assert_close(imitation_loss(output, rollout.label, "squared"), squared)
+    # what the environment clips alike is no error, but for labels short of the bound
+    beyond = replace(output, mean=torch.tensor([[[1.5, -1.5]]]))
+    for label, left in (([1.0, -1.0], 0.0), ([0.5, -1.0], 1.0), ([-1.0, 1.0], 12.5), ([1.0, -2.0], 0.25)):
+        loss = imitation_loss(beyond, torch.tensor([[label]]), "squared", bounded=True)
+        assert float(loss) == pytest.approx(left)
     assert float(distance_loss(torch.tensor([[[1.0, 3.0]]]), torch.tensor([[1.0]]))) == 2.0
 
 
@@ -183,6 +192,113 @@ def test_the_teacher_acts_in_its_share_which_falls_to_none():
     assert not torch.equal(*(lambda r: (r.frames["action"][1:], r.label[:-1]))(dagger.collect()))
 
 
+def test_the_teachers_share_can_stay_and_is_drawn_by_world():
+    dagger = make_dagger(
+        worlds=40, teacher_share=0.9, teacher_share_last=0.4, teacher_share_iterations=2, rollout_steps=3
+    )
+    assert [dagger.teacher_share() for dagger.iteration in range(4)] == pytest.approx([0.9, 0.65, 0.4, 0.4])
+    dagger.iteration = 5
+    rollout = dagger.collect()
+    own = (rollout.frames["action"][1:] == rollout.label[:-1]).all(dim=-1)
+    # a world is the teacher's for the whole rollout, or the student's
+    assert torch.equal(own.all(dim=0), own.any(dim=0)) and 4 <= int(own[0].sum()) <= 28
+
+
+def test_nothing_is_learned_from_worlds_that_are_held_out():
+    dagger = make_dagger(worlds=5, minibatch_worlds=2, epochs=2, validation_worlds=2, keep_rollouts=2)
+    drawn = torch.cat(list(dagger.minibatches(2)))
+    assert len(drawn) == 6 and set((drawn % 5).tolist()) <= {0, 1, 2} and int(drawn.max()) < 10
+    with pytest.raises(ValueError, match="validation-worlds"):
+        make_dagger(worlds=2, validation_worlds=2)
+
+
+def test_the_fixed_set_is_the_first_episode_of_the_worlds_held_out():
+    """Its error is that of the student acting through the episode, memory and all, without noise."""
+    dagger = make_dagger(worlds=5, validation_worlds=2, reset=False, imitation="squared", teacher_share=1.0)
+    rollouts = math.ceil(dagger.env.max_episode_length / 6)
+    rows = [dagger.iterate(lambda: False) for _ in range(rollouts + 2)]
+    assert [row["validation/unexplained"] is None for row in rows] == [True] * (rollouts - 1) + [False] * 3
+    parts = [{name: value.clone() for name, value in part.frames.items()} for part in dagger._held_out]
+    dagger.iterate(lambda: False)
+    assert len(dagger._held_out) == rollouts
+    for before, part in zip(parts, dagger._held_out, strict=True):
+        assert all(torch.equal(before[name], part.frames[name]) for name in before)
+    student, hidden, means, labels = dagger.student.eval(), torch.zeros(2, TINY.memory), [], []
+    with torch.no_grad():
+        for part in dagger._held_out:
+            for step in range(6):
+                frame = {name: value[step] for name, value in part.frames.items()}
+                output = student.act(*dagger.view.sites(frame, augment=False), frame["action"], hidden)
+                hidden = output.hidden.masked_fill(part.done[step][:, None], 0.0)
+                means.append(output.mean.clamp(-1.0, 1.0))
+                labels.append(part.label[step].clamp(-1.0, 1.0))
+    error, label = torch.stack(means) - torch.stack(labels), torch.stack(labels)
+    figures = dagger.validate()
+    assert figures["validation/action_error"] == pytest.approx(float(error.square().mean().sqrt()), rel=1e-4)
+    assert figures["validation/zero_error"] == pytest.approx(float(label.square().mean().sqrt()), rel=1e-5)
+
+
+def test_a_constant_leaves_all_of_the_variance_unexplained():
+    true = torch.randn(50, 8, 3)
+    assert float(unexplained(true.mean(dim=(0, 1)).expand_as(true), true)) == pytest.approx(1.0)
+    assert float(unexplained(true, true)) == 0.0
+    assert float(unexplained(torch.zeros_like(true), true)) > 1.0
+
+
+def test_the_learning_rate_rises_and_falls():
+    dagger = make_dagger(learning_rate=1.0, warmup_steps=10, decay_after_steps=100)
+    rates = []
+    for dagger._steps_done in (1, 5, 10, 100, 400):
+        rates.append(dagger.learning_rate())
+    assert rates == pytest.approx([0.1, 0.5, 1.0, 1.0, 0.5])
+    dagger._steps_done = 4
+    dagger.update([dagger.collect()])
+    assert dagger.optimizer.param_groups[0]["lr"] == pytest.approx(0.8)  # four steps of 2 worlds each later
+
+
+def test_poses_are_read_from_frames_and_learned(monkeypatch):
+    """A head of the training alone: the student has no more weights than without."""
+    bodies = torch.zeros(4, 3, 2, 7)
+    bodies[..., 1, :] = torch.tensor([0.05, -0.1, 0.0, 0.0, 0.0, math.sin(0.5), math.cos(0.5)])
+    goal = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(4, 3, 4)
+    found = poses({"body_q": bodies, "goal_quat": goal}, 1)
+    assert found.shape == (4, 3, 9)
+    np.testing.assert_allclose(
+        found[0, 0],
+        [1.0, -2.0, 0.0, math.cos(1.0), math.sin(1.0), 0, -math.sin(1.0), math.cos(1.0), 0],
+        atol=1e-6,
+    )
+
+    def target(frames, body):
+        return frames["target"].repeat(1, 1, 5)[..., :9]
+
+    monkeypatch.setattr("vd.train.student.dagger.poses", target)
+    monkeypatch.setattr(DummyEnv, "scene", SimpleNamespace(object_body=1), raising=False)
+    dagger = make_dagger(pose_weight=1.0, epochs=1, rollout_steps=4)
+    assert weights(dagger.student).size == weights(make_dagger().student).size
+    rollout = dagger.collect()
+    first = dagger.update([rollout])
+    for _ in range(40):
+        last = dagger.update([rollout])
+    assert last["loss/pose"] < 0.3 * first["loss/pose"]
+    again = make_dagger(pose_weight=1.0, seed=3)
+    again.load_state_dict(dagger.state_dict(), 41)
+    for one, two in zip(again.pose.parameters(), dagger.pose.parameters(), strict=True):
+        assert torch.equal(one, two)
+
+
+def test_parts_of_an_iteration_add_up():
+    dagger = make_dagger()
+    start = time.perf_counter()
+    dagger.iterate(lambda: False)
+    times = profile_iteration(dagger, warm_up=1)
+    passed = time.perf_counter() - start
+    assert list(times.values()) == sorted(times.values(), reverse=True)
+    assert {"acting: simulation", "learning: backward", "learning: optimiser", "acting"} <= times.keys()
+    assert 0.0 < sum(times.values()) < passed and min(times.values()) >= 0.0
+    assert type(dagger.collect).__name__ == "method" and "step" not in vars(dagger.env)
+
+
 def test_squared_errors_let_the_student_act_by_its_mean():
     one, two = (make_dagger(imitation="squared") for _ in range(2))
     torch.manual_seed(1)
@@ -204,6 +320,7 @@ def test_labels_are_clipped_where_asked_for():
 def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
     for reset in (True, False):
         options = {"noise": NoiseCfg(), "reset": reset, "keep_rollouts": 1 if reset else 2}
+        options |= {"validation_worlds": 0 if reset else 2, "warmup_steps": 6}
         whole = make_student_runner(tmp_path / f"whole{reset}", make_dagger(**options))
         whole.learn(4)
         make_student_runner(tmp_path / f"parts{reset}", make_dagger(**options)).learn(2)
