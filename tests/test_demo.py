@@ -1,5 +1,6 @@
 """The demo from end to end, tiny, and what its page says about what it cannot know beforehand."""
 
+import json
 import re
 import time
 from dataclasses import replace
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from test_demo_student import student_rows
 from test_gap_report import sample_curves, sample_report
 
 from vd.assets_usd.objects import importer
@@ -17,6 +19,8 @@ from vd.gap.report import write_report
 from vd.train import cli, demo, demo_agents, demo_page
 from vd.train.demo_gap import ANALYSIS
 from vd.train.demo_stages import Budget, Stages, TimeUp, time_limit
+from vd.train.demo_student import student_files
+from vd.train.metrics import PROGRESS_FILE
 from vd.train.presets import PRESETS
 
 EPISODE_S = 0.5
@@ -55,6 +59,16 @@ def made_up_gap(folder: Path, _seed: int, _device: str) -> None:
     write_report(sample_report(curves), curves, folder / ANALYSIS)
 
 
+def made_up_students(folder: Path, _seed: int, *, minutes: float) -> None:
+    """Runs of students that never were; tests/test_demo_student.py trains some."""
+    assert minutes > 0.0
+    for path, rows in zip(student_files(folder), (student_rows(0.1), student_rows(0.4)), strict=True):
+        path.parent.mkdir(parents=True)
+        path.touch()
+        lines = [json.dumps(row) for row in rows]
+        (path.parent / PROGRESS_FILE).write_text("\n".join(lines) + "\n")
+
+
 @pytest.fixture
 def small(monkeypatch, tmp_path) -> demo.DemoCfg:
     """Settings under which every stage is short, with assets of its own."""
@@ -69,6 +83,7 @@ def small(monkeypatch, tmp_path) -> demo.DemoCfg:
     monkeypatch.setattr(demo_agents, "VIDEO_SECONDS", 0.5)
     monkeypatch.setattr(demo_agents, "VIDEO_CELLS", 1)
     monkeypatch.setattr(demo, "find_hidden_gap", made_up_gap)
+    monkeypatch.setattr(demo, "train_students", made_up_students)
     return demo.DemoCfg(
         out=tmp_path / "demo", minutes=20.0, objects=("cube",), preset="cpu-demo", num_worlds=4, max_steps=128
     )
@@ -89,8 +104,9 @@ def test_demo_ends_with_a_page_and_repeats_nothing(small, cone, capsys):
     page = demo.run_demo(small)
     text = page.read_text()
     assert text.count("<video") == 2
-    assert text.count("<img") >= 4  # comparison, learning, curves, contact sheet
+    assert text.count("<img") >= 5  # comparison, learning, curves, contact sheet, student
     assert "lacks command delay" in text
+    assert "begins to imitate" in text and "0.45 on held-out episodes" in text
     (link,) = re.findall(r'<a href="([^"]+)"', text)
     assert (page.parent / link).is_file()
     assert "task on purpose" in text  # what makes it easier is said
@@ -111,7 +127,7 @@ def test_demo_ends_with_a_page_and_repeats_nothing(small, cone, capsys):
     assert demo.run_demo(small) == page
     assert page.is_file()
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    # Import, objects, gap, training, comparison, video, both again with meshes, evaluation.
+    # Import, objects, gap, training, comparison, video, both again with meshes, student, evaluation.
     assert capsys.readouterr().out.count("done before") == total - 2
 
 
@@ -135,7 +151,7 @@ def test_a_used_up_budget_still_ends_with_a_page_that_says_what_is_missing(small
         assert f"by hand: {command}" in output
         assert command in text.partition("Left out")[2]
     assert "cone.stl" in text
-    assert "[9/9, " in output  # nothing is announced for meshes that are not there
+    assert "[10/10, " in output  # nothing is announced for meshes that are not there
 
 
 def test_a_machine_too_slow_for_the_comparison_ends_with_the_remedy(tmp_path):

@@ -2,8 +2,8 @@
 
 Authors the hand and a few objects, imports meshes if a folder is given, finds an effect that is hidden in a
 servo, trains a teacher with the preset that fits the machine, evaluates it beside a random and a zero agent,
-records a video and writes one HTML page. Most stages are calls of the public commands; what is finished is
-not repeated by the next call.
+records a video, lets a student of point clouds begin to imitate an installed teacher, and writes a page.
+Most stages are calls of the public commands; what is finished is not repeated by the next call.
 
 It ends in time whatever the machine: the import has a share of the time, training ends where the stages
 after it need the rest, the comparison is sized by the speed measured in training, and every stage after it is
@@ -25,12 +25,13 @@ import tyro
 
 from vd.config import to_dict
 from vd.files import write_json
-from vd.train.demo_agents import AGENTS, GoalCount, compare_agents, progress_bar, record_training_task
+from vd.train.demo_agents import AGENTS, GoalCount, compare_agents, record_training_task
 from vd.train.demo_gap import find_hidden_gap, gap_commands, gap_report
-from vd.train.demo_stages import Budget, Stages, TimeUp, time_limit
+from vd.train.demo_import import IMPORT_SEARCH, IMPORT_SHARE, import_for
+from vd.train.demo_stages import Budget, Stages
+from vd.train.demo_student import student_commands, student_files, train_students
 
 if TYPE_CHECKING:
-    from vd.assets_usd.objects.importer import ImportResult
     from vd.evaluate.result import EvalResult
 
 OBJECTS = ("cube",)
@@ -39,19 +40,16 @@ OBJECTS = ("cube",)
 SHOWN = ("procedural-3-seed0",)
 """Built-in sets that are authored beside them, and only appear in the evaluation."""
 
-STAGES, MESH_STAGES = 8, 2
+STAGES, MESH_STAGES = 9, 2
 """Stages of every demo, and those that imported meshes add after their import."""
 
-# Share of the time for importing meshes: enough for several, and training still gets past random actions.
-IMPORT_SHARE = 0.15
-# Search effort of the convex decomposition, a quarter of the default: a stapler took 8 s in place of 29 s of
-# CPU time and an alarm clock 99 s in place of 142 s; the volume errors of their parts did not grow.
-IMPORT_SEARCH = 5
-# Time kept back from training for what follows it on two cores: comparison, video, evaluation, page;
+# Time kept back from training for what follows it on two cores: comparison, video, student, evaluation, page;
 # and for comparison and video with the imported meshes.
-RESERVE_MIN, RESERVE_MESHES_MIN = 4.5, 1.5
+RESERVE_MIN, RESERVE_MESHES_MIN = 5.5, 1.75
 # Time kept back for the page alone.
 PAGE_MIN = 0.3
+# Time kept back from the student for the evaluation after it.
+PAPER_MIN = 0.8
 # Training is worth starting with at least this much time left.
 LEAST_TRAINING_MIN = 1.0
 # Wanted duration of an agent's episodes in the comparison; their number follows from the speed of training.
@@ -74,7 +72,7 @@ class DemoCfg:
 
     out: Path = Path("demo")
     """Folder of everything the demo writes; the page is index.html."""
-    minutes: float = 14.0
+    minutes: float = 14.6
     """Time for everything [min]; training gets what the other stages leave, from about 6 on."""
     seed: int = 0
     """Seed of assets, training and evaluation."""
@@ -102,47 +100,6 @@ class DemoCfg:
                 raise ValueError(f"{flag} is {value}; it has to be positive")
         if not self.objects:
             raise ValueError("--objects is empty; name a set, such as cube")
-
-
-@dataclass
-class DemoResults:
-    """What the page shows.
-
-    Attributes:
-        cfg: Settings of the demo.
-        preset: Preset that was trained.
-        machine: What it ran on.
-        hand: Name of the hand.
-        run_dir: Folder of the training.
-        sheet: Contact sheet of the objects.
-        agents: Result of each agent in the task of the training: first goals, and all goals of an episode.
-        imported: The same on the imported meshes; empty if there are none or there was no time.
-        gap: Whether a hidden gap was looked for; its report is in ``folder``.
-        folder: Files of this demo.
-        paper: Result of the trained policy under the paper's criteria and goals.
-        video: Recording of the trained policy.
-        imported_video: The same with imported meshes.
-        seconds: Duration of each stage.
-        left_out: What there was no time for, and the command that does it by hand.
-        commands: The whole demo by hand, in order.
-    """
-
-    cfg: DemoCfg
-    preset: str
-    machine: str
-    hand: str
-    run_dir: Path
-    sheet: Path | None
-    agents: "dict[str, tuple[EvalResult, GoalCount]]"
-    imported: "dict[str, tuple[EvalResult, GoalCount]]"
-    gap: bool
-    folder: Path
-    paper: "EvalResult | None"
-    video: Path | None
-    imported_video: Path | None
-    seconds: dict[str, float]
-    left_out: list[tuple[str, str]]
-    commands: list[str]
 
 
 @dataclass
@@ -211,7 +168,7 @@ class _Demo:
         rest = self.folder / "not-imported.json"
         with self.stages.run("import", title, products=[rest]) as needed:
             if needed:
-                done = _import_for(meshes, out, share_s)
+                done = import_for(meshes, out, share_s)
                 missing = [path.name for path in meshes if str(path) not in done]
                 if not missing and not self.imported:
                     raise DemoError(
@@ -332,6 +289,22 @@ class _Demo:
         )
         return video if there else None
 
+    def imitate(self) -> bool:
+        """Let a student learn one scene by heart and begin to imitate on many; returns whether it did."""
+        commands = [f"vd-train {' '.join(a)}" for a in student_commands(self.folder, self.cfg.seed)]
+        self.commands += commands
+        keep = PAGE_MIN + PAPER_MIN
+        return self.stages.run_if_time(
+            "student",
+            "let a student of point clouds learn a scene by heart, then imitate on many",
+            lambda: train_students(
+                self.folder, self.cfg.seed, minutes=self.stages.budget.left_s(keep_min=keep) / 60.0
+            ),
+            products=student_files(self.folder),
+            keep_min=PAGE_MIN,
+            command=" && ".join(commands),
+        )
+
     def judge_as_paper(self) -> "EvalResult | None":
         """Judge the trained policy by the paper's criteria, with goals from all of SO(3)."""
         from vd.assets_usd.objects.model import load_set
@@ -432,11 +405,12 @@ def run_demo(cfg: DemoCfg, *, started: float | None = None) -> Path:
     if demo.imported:
         imported = demo.compare_imported()
         imported_video = demo.record(demo.imported, "imported-video", "record it with imported meshes")
+    student = demo.imitate()
     paper = demo.judge_as_paper()
 
     page = cfg.out / "index.html"
     with stages.run("page", "write the page"):
-        from vd.train.demo_page import write_page
+        from vd.train.demo_page import DemoResults, write_page
 
         results = DemoResults(
             cfg=cfg,
@@ -448,6 +422,7 @@ def run_demo(cfg: DemoCfg, *, started: float | None = None) -> Path:
             agents=agents,
             imported=imported,
             gap=gap,
+            student=student,
             folder=folder,
             paper=paper,
             video=video,
@@ -469,33 +444,6 @@ def _label(cfg: DemoCfg, preset: str) -> str:
         files = sorted(p for p in [cfg.meshes, *cfg.meshes.rglob("*")] if p.is_file())
         parts += [f"{path} {path.stat().st_size} {path.stat().st_mtime_ns}" for path in files]
     return f"{name}-{hashlib.sha256(chr(10).join(parts).encode()).hexdigest()[:6]}"
-
-
-def _import_for(meshes: list[Path], out: Path, seconds: float) -> "dict[str, ImportResult]":
-    """Import meshes in their order for a time; returns the results of those that were reached, by source."""
-    from vd.assets_usd.cache import assets_dir
-    from vd.assets_usd.objects.decompose import DecomposeSettings
-    from vd.assets_usd.objects.importer import ImportSettings, import_meshes
-
-    results: dict[str, ImportResult] = {}
-    with progress_bar("  importing", len(meshes), "mesh") as bar:
-
-        def keep(result: "ImportResult", _done: int, _total: int) -> None:
-            results[result.source] = result
-            bar.update()
-            if result.status == "refused":
-                bar.write(f"  refused {result.source}: {result.reason}", file=sys.stderr)
-
-        # Equal to those of vd-assets import, which then goes on from here.
-        settings = ImportSettings(
-            DecomposeSettings(mcts_iterations=IMPORT_SEARCH), cache=str(assets_dir() / "decompositions")
-        )
-        try:
-            with time_limit(seconds):
-                import_meshes(meshes, out, settings, progress=keep)
-        except TimeUp:
-            pass
-    return results
 
 
 def _comparison_files(folder: Path) -> list[Path]:

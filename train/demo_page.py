@@ -1,6 +1,7 @@
 """The page of the demo: what was trained, what came out, what each number means, and what to do next."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +13,13 @@ from vd.evaluate.result import EvalResult
 from vd.page import Page
 from vd.paper import PAPER
 from vd.train.demo_gap import add_gap
+from vd.train.demo_student import add_student
 from vd.train.metrics import PROGRESS_FILE, read_progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from vd.train.demo import DemoResults
+    from vd.train.demo import DemoCfg
     from vd.train.demo_agents import GoalCount
 
 COLORS = {"trained": "#0072B2", "random": "#D55E00", "zero": "#8a8f98"}
@@ -38,11 +40,55 @@ STAGE_NAMES = {
     "video": "record",
     "imported": "compare on imported meshes",
     "imported-video": "record with imported meshes",
+    "student": "let a student imitate",
     "paper": "evaluate by the paper's criteria",
 }
 
 
-def write_page(results: "DemoResults", path: Path) -> None:
+@dataclass
+class DemoResults:
+    """What the page shows.
+
+    Attributes:
+        cfg: Settings of the demo.
+        preset: Preset that was trained.
+        machine: What it ran on.
+        hand: Name of the hand.
+        run_dir: Folder of the training.
+        sheet: Contact sheet of the objects.
+        agents: Result of each agent in the task of the training: first goals, and all goals of an episode.
+        imported: The same on the imported meshes; empty if there are none or there was no time.
+        gap: Whether a hidden gap was looked for; its report is in ``folder``.
+        student: Whether students were trained; their runs are in ``folder``.
+        folder: Files of this demo.
+        paper: Result of the trained policy under the paper's criteria and goals.
+        video: Recording of the trained policy.
+        imported_video: The same with imported meshes.
+        seconds: Duration of each stage.
+        left_out: What there was no time for, and the command that does it by hand.
+        commands: The whole demo by hand, in order.
+    """
+
+    cfg: "DemoCfg"
+    preset: str
+    machine: str
+    hand: str
+    run_dir: Path
+    sheet: Path | None
+    agents: "dict[str, tuple[EvalResult, GoalCount]]"
+    imported: "dict[str, tuple[EvalResult, GoalCount]]"
+    gap: bool
+    student: bool
+    folder: Path
+    paper: "EvalResult | None"
+    video: Path | None
+    imported_video: Path | None
+    seconds: dict[str, float]
+    left_out: list[tuple[str, str]]
+    commands: list[str]
+
+
+def write_page(results: DemoResults, path: Path) -> None:
     """Write the demo's page."""
     task = trained_task(open_teacher(str(results.run_dir), "cpu"))
     rows = read_progress(results.run_dir / PROGRESS_FILE)
@@ -70,6 +116,8 @@ def write_page(results: "DemoResults", path: Path) -> None:
         )
     if results.paper is not None:
         _paper_criteria(page, results, results.paper)
+    if results.student:
+        add_student(page, results.folder)
     if results.gap:
         add_gap(page, results.folder, path.parent)
     if results.left_out:
@@ -157,7 +205,7 @@ def _text(value: Any) -> str:
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
-def _outcome(page: Page, results: "DemoResults", task: ReorientCfg) -> None:
+def _outcome(page: Page, results: DemoResults, task: ReorientCfg) -> None:
     agents = {name: result for name, (result, _) in results.agents.items()}
     tiles = []
     for name, result in agents.items():
@@ -206,7 +254,7 @@ def _agents_table(page: Page, agents: "Mapping[str, tuple[EvalResult, GoalCount]
     )
 
 
-def _imported(page: Page, results: "DemoResults") -> None:
+def _imported(page: Page, results: DemoResults) -> None:
     """What the policy does with meshes that it has never seen."""
     trained = results.imported["trained"][0]
     page.section("Imported meshes, on which it was not trained")
@@ -221,7 +269,7 @@ def _imported(page: Page, results: "DemoResults") -> None:
         page.video(results.imported_video, "The trained policy with some of the imported meshes.")
 
 
-def _trained_on(results: "DemoResults") -> str:
+def _trained_on(results: DemoResults) -> str:
     return results.agents["trained"][0].protocol.objects
 
 
@@ -278,7 +326,7 @@ def comparison_figure(agents: "Mapping[str, EvalResult]") -> "Figure":
     return figure
 
 
-def _learning(page: Page, results: "DemoResults", task: ReorientCfg, rows: list[dict[str, Any]]) -> None:
+def _learning(page: Page, results: DemoResults, task: ReorientCfg, rows: list[dict[str, Any]]) -> None:
     from vd.train.curves import plot_curves
 
     page.section("Learning")
@@ -324,7 +372,7 @@ def learning_figure(rows: list[dict[str, Any]], per_episode: Mapping[str, float]
     return figure
 
 
-def _paper_criteria(page: Page, results: "DemoResults", paper: EvalResult) -> None:
+def _paper_criteria(page: Page, results: DemoResults, paper: EvalResult) -> None:
     overall = paper.overall
     page.section("The same policy, judged as in the paper")
     page.text(
