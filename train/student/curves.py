@@ -13,6 +13,13 @@ PANELS = (
         "error of the student's mean action,\nroot mean square, in rollouts",
         1.0,
     ),
+    ("student/unexplained", "share of the labels' variance\nthat is left, in rollouts", 1.0),
+    ("validation/unexplained", "share of the labels' variance\nthat is left, on the fixed set", 1.0),
+    (
+        "validation/rotation_error",
+        "mean error of the predicted rotation\nfrom the goal, on the fixed set [rad]",
+        1.0,
+    ),
     ("student/distance_error", "mean error of the predicted distance [rad]", 1.0),
     ("success_per_goal", "goals reached while it explores [%]", 100.0),
     ("student/category", "objects told right [%]", 100.0),
