@@ -266,7 +266,7 @@ def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tm
     scores = [score.floors for score in result.ranking]
     assert scores == sorted(scores, reverse=True) and scores[0] > 3.0
     assert "second_payload" not in {score.name for score in result.ranking}, "a bare servo's load is unknown"
-    assert "coulomb friction from backlash" in result.sentence
+    assert "coulomb friction and backlash" in result.sentence
     written = json.loads(write_plan(result, tmp_path).read_text())
     assert written["excitation"] == result.ranking[0].name
     for entry in written["trajectories"]:
@@ -301,7 +301,9 @@ def test_plan_says_when_nothing_would_help(recording):
         for row, name in zip(report.evidence, twins, strict=True)
     )
     result = plan(dataclasses.replace(report, evidence=rows), read_recording(recording), None)
-    assert "No motion of the menu would tell coulomb friction from stribeck friction" in result.sentence
+    assert (
+        "No motion of the menu would decide between coulomb friction and stribeck friction" in result.sentence
+    )
 
 
 def test_other_fingers_take_the_model_of_the_recorded_one():

@@ -306,7 +306,36 @@ def test_every_verdict_has_its_sentence_and_its_page(curves, tmp_path, verdict):
     assert sentence in words.verdict_sentence(report)
     assert words.next_step(report)
     write_report(report, None, tmp_path)
-    assert (report.next_experiment or words.next_step(report)) in (tmp_path / "report.html").read_text()
+    page = html.unescape((tmp_path / "report.html").read_text())
+    steps = words.sentences(report.next_experiment or words.next_step(report))
+    assert all(step in page for step in steps) and steps[0].endswith(".")
+
+
+def test_many_open_sets_are_a_list_by_joint(curves, tmp_path):
+    friction, limits = ("coulomb_friction", "dead_zone"), ("torque_limit", "supply_sag", "torque_saturation")
+    other = ("elastic_transmission", "command_filter")
+    report = sample_report(
+        curves,
+        verdict="ambiguous",
+        closing=None,
+        effects=(),
+        ambiguous=(friction, limits, other),
+        next_experiment="Record long holds on f0_j1 (20 s). The commands are in x/; go on.",
+    )
+    sets = {JOINTS[0]: (friction,), JOINTS[1]: (friction[::-1], limits), JOINTS[2]: (other,)}
+    joints = tuple(dataclasses.replace(j, open_sets=sets.get(j.joint, ())) for j in report.joints)
+    report = Report.from_dict(dataclasses.replace(report, joints=joints).validate().to_dict())
+    assert words.open_questions(report) == [
+        "f0_j1 and f0_j2: coulomb friction or dead zone",
+        "f0_j2: torque limit, supply sag or torque saturation",
+        "f0_j3: elastic transmission or command filter",
+    ]
+    assert "3 sets of causes" in words.verdict_sentence(report)
+    assert len(words.verdict_sentence(report)) < 330
+    write_report(report, None, tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    for line in (*words.open_questions(report), "The commands are in x/; go on."):
+        assert f"<li>{line}</li>" in page
 
 
 def test_a_report_with_hardly_anything_has_a_page(report, tmp_path):

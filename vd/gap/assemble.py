@@ -269,6 +269,7 @@ def _gap(joint: Analysed, errors: Errors, rng: np.random.Generator) -> JointGap:
         identified_ci95=interval(rmse(errors.identified, errors.count, weights)),
         verdict=joint.explanation.verdict,
         reason=joint.explanation.reason,
+        open_sets=_open_sets(joint),
     )
 
 
@@ -346,6 +347,14 @@ def _sets(joints: Sequence[Analysed]) -> tuple[tuple[str, ...], ...]:
             if (open_ or accepted.equivalent) and not any(set(members) == set(s) for s in result):
                 result.append(members)
     return tuple(result)
+
+
+def _open_sets(joint: Analysed) -> tuple[tuple[str, ...], ...]:
+    """The sets of one joint that another recording can split."""
+    if joint.explanation.verdict not in ("effects", "ambiguous"):
+        return ()
+    accepted = joint.explanation.accepted
+    return tuple((one.name, *one.tied) for one in accepted if one.tied and not one.named)
 
 
 def _next(joints: Sequence[Analysed]) -> str:

@@ -232,7 +232,7 @@ def _print_step(step: _Step, name: str, file: str) -> int:
 
 def _print_report(analysis: "Analysis", as_json: bool) -> int:
     from vd.gap.result import Report as Contents
-    from vd.gap.words import finding_text, next_step, verdict_sentence
+    from vd.gap.words import finding_text, next_step, open_questions, verdict_sentence
 
     path = analysis.out / "report.json"
     if as_json:
@@ -242,7 +242,10 @@ def _print_report(analysis: "Analysis", as_json: bool) -> int:
     print(verdict_sentence(report))
     for finding in report.findings:
         print(f"  {finding_text(finding)}")
-    print(f"{next_step(report)}\n\n{analysis.out / 'report.html'}\n{path}")
+    print(next_step(report))
+    for line in open_questions(report):
+        print(f"  open: {line}")
+    print(f"\n{analysis.out / 'report.html'}\n{path}")
     return OK
 
 

@@ -395,21 +395,20 @@ def _left_over(difference: np.ndarray, slopes: np.ndarray, floor: float, old: in
 
 
 def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
-    apart = " or ".join(" from ".join(map(plain, group)) for group in report.open_sets)
+    sets = [list(dict.fromkeys(map(plain, group))) for group in report.open_sets]
+    one = listing(sets[0]) if len(sets) == 1 else ""  # several are listed by themselves
     if best.floors < VISIBLE:
-        goal = f"tell {apart}" if apart else "show more than these do"
+        goal = f"decide between {one}" if one else "decide" if sets else "show more than these do"
         return (
             f"No motion of the menu would {goal}: the models in question differ by at most {best.floors:.1f} "
             "times the noise floor, so either serves in simulation. To decide, record another quantity, "
-            "such as "
-            f"current or an external sensor. The best of the menu is in {PLAN_FOLDER}/."
+            f"such as current or an external sensor. The best of the menu is in {PLAN_FOLDER}/."
         )
-    goal = f"to tell {apart}" if apart else "to see what these motions do not show"
+    goal = f" to decide between {one}" if one else "" if sets else " to see what these motions do not show"
     return (
-        f"Record {CONCLUSIONS[best.name]} on {listing(joints)} ({best.seconds:.0f} s) {goal}: there the "
-        "models "
-        f"in question differ by {best.floors:.1f} times the noise floor. The commands are in {PLAN_FOLDER}/; "
-        "add what was measured to the recording and run vd-gap again."
+        f"Record {CONCLUSIONS[best.name]} on {listing(joints)} ({best.seconds:.0f} s){goal}: there the "
+        f"models in question differ by {best.floors:.1f} times the noise floor. The commands are in "
+        f"{PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
     )
 
 

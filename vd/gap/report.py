@@ -17,9 +17,11 @@ from vd.gap.words import (
     mrad,
     mrad_range,
     next_step,
+    open_questions,
     percent,
     percent_range,
     plain,
+    sentences,
     unit_text,
     verdict_sentence,
 )
@@ -112,7 +114,15 @@ def _headline(page: Page, report: Report) -> None:
 
 def _next(page: Page, report: Report) -> None:
     page.section("What to do next")
-    page.text(next_step(report))
+    steps = sentences(next_step(report))
+    if len(steps) > 1:
+        page.points(steps)
+    else:
+        page.text(steps[0])
+    open_ = open_questions(report)
+    if open_:
+        page.text("Still open, with what this recording cannot tell apart:")
+        page.points(open_)
 
 
 def _found(page: Page, report: Report) -> None:

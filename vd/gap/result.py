@@ -131,6 +131,8 @@ class JointGap:
     verdict: Verdict
     reason: str
     """One sentence: why this verdict."""
+    open_sets: tuple[tuple[str, ...], ...] = ()
+    """Effects that the recording does not tell apart on this joint, a set each."""
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,15 @@
 """What ``vd-gap`` found in plain sentences, for the terminal and the page."""
 
 import math
+import re
 from collections.abc import Sequence
 
 from vd.gap.result import Candidate, Estimate, Finding, Interval, NamedEffect, Report
 
 MAX_NAMED_JOINTS = 4
 """More joints than this are counted rather than listed."""
+MAX_SETS = 2
+"""More sets than this are counted in a sentence and listed after it."""
 MAX_PLACES = 6
 """Decimals of an estimate at most."""
 MILLI = 1e3
@@ -96,11 +99,14 @@ def verdict_sentence(report: Report) -> str:
     """The verdict in one or two sentences that need no context."""
     floor, before = mrad(report.noise_floor_rad), mrad(report.held_out.baseline_rmse_rad)
     sets = [f"{{{', '.join(plain(name) for name in group)}}}" for group in report.open_sets]
+    many = f"{len(sets)} sets of causes" if len(sets) > MAX_SETS else ""
     if report.verdict == "effects":
         missing = listing([effect_sentence(effect) for effect in report.effects])
         text = f"The simulation lacks {missing}. {_shrinks(report)}"
         text += _equivalents(report)
-        if sets:
+        if many:
+            text += f" More is missing, for which this recording leaves {many}, listed under what to do next."
+        elif sets:
             text += f" Something else remains that this recording cannot tell apart: {listing(sets)}."
         return text
     if report.verdict == "no_gap":
@@ -108,6 +114,12 @@ def verdict_sentence(report: Report) -> str:
         return (
             f"No gap: the {model} explains this recording. What remains, {before} on held-out "
             f"motions, is no more than noise ({floor}) or than any candidate explains."
+        )
+    if report.verdict == "ambiguous" and many:
+        return (
+            f"There is a gap ({before} on held-out motions against a noise floor of {floor}), and this "
+            f"recording leaves {many} for it, listed under what to do next. With one of each in the model "
+            f"the error falls to {mrad(report.held_out.identified_rmse_rad)}."
         )
     if report.verdict == "ambiguous":
         return (
@@ -171,6 +183,25 @@ def next_step(report: Report) -> str:
     if report.verdict == "no_gap":
         return "Nothing to do. Use the identified baseline; record other motions only if the task needs them."
     return "Record the same joints with other motions; vd-gap plan proposes which."
+
+
+def open_questions(report: Report) -> list[str]:
+    """What is left open, joints with the same set together: ``f0_j1: backlash or dead zone``."""
+    joints: dict[frozenset[str], list[str]] = {}
+    names: dict[frozenset[str], tuple[str, ...]] = {}
+    for joint in report.joints:
+        for group in joint.open_sets:
+            joints.setdefault(frozenset(group), []).append(joint.joint)
+            names.setdefault(frozenset(group), group)
+    return [
+        f"{joints_text(held)}: {listing([plain(name) for name in names[group]], 'or')}"
+        for group, held in joints.items()
+    ]
+
+
+def sentences(text: str) -> list[str]:
+    """A text by its sentences."""
+    return re.split(r"(?<=\.)\s+(?=[A-Z])", text)
 
 
 def decision_text(row: Candidate) -> str:
