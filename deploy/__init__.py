@@ -1,1 +1,1 @@
-"""Running a policy on hardware; reuses the kernels on CPU (arrives with the student)."""
+"""Running a policy on hardware. So far the motors: their bus, and a twin of it to try everything on."""

@@ -1,0 +1,163 @@
+"""Control tables of the XM430 and XH430 motors (ROBOTIS e-manual), as typed data, and their units.
+
+Angles in radians with zero in the middle of the range, velocities in rad/s, currents in A.
+"""
+
+import math
+from dataclasses import dataclass
+from enum import IntFlag
+
+COUNTS_PER_TURN = 4096
+CENTRE = 2048
+"""Count of the middle of the range, the zero of all angles here."""
+RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
+RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
+SIZE = 148
+"""Bytes that are simulated: all but the indirect addresses behind."""
+EEPROM_END = 64
+"""Items below are kept without power, and cannot be written while torque is on."""
+POSITION_MODE = 3
+
+
+@dataclass(frozen=True)
+class Item:
+    """One entry of the control table."""
+
+    address: int
+    size: int
+    """Bytes, little-endian."""
+    writable: bool = True
+    initial: int = 0
+    low: int | None = None
+    """Least value that can be written; None asks nothing."""
+    high: int | None = None
+
+    @property
+    def signed(self) -> bool:
+        """Whether negative numbers are two's complement."""
+        return self.low is None or self.low < 0
+
+    def to_bytes(self, value: int) -> bytes:
+        """Little-endian bytes of a value."""
+        return (value & ((1 << (8 * self.size)) - 1)).to_bytes(self.size, "little")
+
+    def from_bytes(self, data: bytes) -> int:
+        """The value of ``size`` bytes."""
+        return int.from_bytes(data, "little", signed=self.signed)
+
+
+@dataclass(frozen=True)
+class Model:
+    """What tells one motor of the series from another."""
+
+    name: str
+    number: int
+    current_unit_a: float
+    current_limit: int
+    """Largest and initial limit, counts of ``current_unit_a``."""
+    velocity_limit: int
+    """Initial limit, counts of 0.229 rev/min."""
+    volts: tuple[int, int]
+    """Least and largest voltage limit [0.1 V]."""
+    supply_v: float
+    torque_nm_per_a: float
+    """Stall torque over stall current."""
+
+
+MODELS = {
+    model.name: model
+    for model in (
+        Model("XM430-W210", 1030, 2.69e-3, 1193, 330, (95, 160), 12.0, 3.0 / 2.3),
+        Model("XM430-W350", 1020, 2.69e-3, 1193, 200, (95, 160), 12.0, 4.1 / 2.3),
+        Model("XH430-W350", 1000, 2.69e-3, 648, 280, (95, 160), 12.0, 3.4 / 1.3),
+        Model("XH430-V210", 1050, 1.34e-3, 689, 380, (110, 300), 24.0, 2.6 / 0.7),
+    )
+}
+"""The motors, by name."""
+
+
+class HardwareError(IntFlag):
+    """Bits of the hardware error status and of the shutdown mask."""
+
+    VOLTAGE = 1 << 0
+    OVERHEATING = 1 << 2
+    ENCODER = 1 << 3
+    SHOCK = 1 << 4
+    OVERLOAD = 1 << 5
+
+
+def describe_hardware_error(bits: int) -> str:
+    """The bits of a hardware error status in words."""
+    names = [str(bit.name).lower() for bit in HardwareError if bits & bit]
+    return ", ".join(names) or "none"
+
+
+def table(model: Model) -> dict[str, Item]:
+    """The control table of a motor, by item."""
+    low_v, high_v = model.volts
+    gain = {"low": 0, "high": 16383}
+    items = {
+        "model_number": Item(0, 2, False, model.number, 0),
+        "model_information": Item(2, 4, False, 0, 0),
+        "firmware_version": Item(6, 1, False, 45, 0),
+        "id": Item(7, 1, True, 1, 0, 252),
+        "baud_rate": Item(8, 1, True, 1, 0, 7),
+        "return_delay_time": Item(9, 1, True, 250, 0, 254),
+        "drive_mode": Item(10, 1, True, 0, 0, 5),
+        "operating_mode": Item(11, 1, True, POSITION_MODE, 0, 16),
+        "secondary_id": Item(12, 1, True, 255, 0, 255),
+        "protocol_type": Item(13, 1, True, 2, 1, 2),
+        "homing_offset": Item(20, 4, True, 0, -1_044_479, 1_044_479),
+        "moving_threshold": Item(24, 4, True, 10, 0, 1023),
+        "temperature_limit": Item(31, 1, True, 80, 0, 100),
+        "max_voltage_limit": Item(32, 2, True, high_v, low_v, high_v),
+        "min_voltage_limit": Item(34, 2, True, low_v, low_v, high_v),
+        "pwm_limit": Item(36, 2, True, 885, 0, 885),
+        "current_limit": Item(38, 2, True, model.current_limit, 0, model.current_limit),
+        "velocity_limit": Item(44, 4, True, model.velocity_limit, 0, 1023),
+        "max_position_limit": Item(48, 4, True, 4095, 0, 4095),
+        "min_position_limit": Item(52, 4, True, 0, 0, 4095),
+        "shutdown": Item(63, 1, True, 0b110100, 0, 255),
+        "torque_enable": Item(64, 1, True, 0, 0, 1),
+        "led": Item(65, 1, True, 0, 0, 1),
+        "status_return_level": Item(68, 1, True, 2, 0, 2),
+        "registered_instruction": Item(69, 1, False, 0, 0),
+        "hardware_error_status": Item(70, 1, False, 0, 0),
+        "velocity_i_gain": Item(76, 2, True, 1920, **gain),
+        "velocity_p_gain": Item(78, 2, True, 100, **gain),
+        "position_d_gain": Item(80, 2, True, 0, **gain),
+        "position_i_gain": Item(82, 2, True, 0, **gain),
+        "position_p_gain": Item(84, 2, True, 800, **gain),
+        "feedforward_2nd_gain": Item(88, 2, True, 0, **gain),
+        "feedforward_1st_gain": Item(90, 2, True, 0, **gain),
+        "bus_watchdog": Item(98, 1, True, 0, -1, 127),
+        "goal_pwm": Item(100, 2),
+        "goal_current": Item(102, 2),
+        "goal_velocity": Item(104, 4),
+        "profile_acceleration": Item(108, 4, True, 0, 0, 32767),
+        "profile_velocity": Item(112, 4, True, 0, 0, 32767),
+        "goal_position": Item(116, 4),
+        "realtime_tick": Item(120, 2, False, 0, 0),
+        "moving": Item(122, 1, False, 0, 0),
+        "moving_status": Item(123, 1, False, 0, 0),
+        "present_pwm": Item(124, 2, False),
+        "present_current": Item(126, 2, False),
+        "present_velocity": Item(128, 4, False),
+        "present_position": Item(132, 4, False),
+        "velocity_trajectory": Item(136, 4, False),
+        "position_trajectory": Item(140, 4, False),
+        "present_input_voltage": Item(144, 2, False, round(10 * model.supply_v), 0),
+        "present_temperature": Item(146, 1, False, 30, 0),
+        "backup_ready": Item(147, 1, False, 0, 0),
+    }
+    return items
+
+
+def to_counts(angle_rad: float) -> int:
+    """The nearest count of an angle."""
+    return CENTRE + round(angle_rad / RAD_PER_COUNT)
+
+
+def to_angle(counts: int) -> float:
+    """The angle of a count [rad]."""
+    return (counts - CENTRE) * RAD_PER_COUNT

@@ -1,0 +1,192 @@
+"""One motor of the twin: its control table, what can be written when, and how it protects itself."""
+
+from dataclasses import dataclass, field
+
+from vd.deploy.control_table import (
+    EEPROM_END,
+    RAD_S_PER_COUNT,
+    SIZE,
+    HardwareError,
+    Model,
+    table,
+    to_angle,
+    to_counts,
+)
+from vd.deploy.packets import ALERT, Failure
+from vd.deploy.plant import Drive
+
+WATCHDOG_UNIT_S = 0.02
+OVERLOAD_SHARE, OVERLOAD_S = 0.9, 1.0
+"""A motor that gives this share of its largest torque for this long has an overload; the real rule is not
+published."""
+AMBIENT_C, HEATING_C_PER_S, COOLING_S = 30.0, 0.5, 120.0
+"""Case temperature: rise at full torque, and time constant of cooling."""
+GOALS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
+TICK_MODULUS = 32768
+
+
+@dataclass
+class Motor:
+    """A motor on the bus."""
+
+    model: Model
+    id: int
+    memory: bytearray = field(init=False)
+    heat_c_per_s: float = 0.0
+    """Injected heating, whatever the torque [deg C/s]."""
+
+    def __post_init__(self) -> None:
+        """Power on with factory settings."""
+        self.items = table(self.model)
+        self._at = {item.address: (name, item) for name, item in self.items.items()}
+        self.memory = bytearray(SIZE)
+        own = self.id
+        for name, item in self.items.items():
+            self.put(name, item.initial)
+        self.put("id", own)
+        self.temperature = AMBIENT_C
+        self._power_on()
+
+    def _power_on(self) -> None:
+        for name, item in self.items.items():
+            if item.address >= EEPROM_END and item.writable:
+                self.put(name, item.initial)
+        self.put("hardware_error_status", 0)
+        self._clock = self._tick = self._strained = self._silence = 0.0
+        self.registered: tuple[int, bytes] | None = None
+
+    def reboot(self) -> None:
+        """Start anew: torque off, errors cleared, RAM at its initial values; what is kept in EEPROM stays."""
+        self._power_on()
+
+    def get(self, name: str) -> int:
+        """Value of an item."""
+        item = self.items[name]
+        return item.from_bytes(self.memory[item.address : item.address + item.size])
+
+    def put(self, name: str, value: int) -> None:
+        """Set an item, as the motor itself does, without any rule."""
+        item = self.items[name]
+        self.memory[item.address : item.address + item.size] = item.to_bytes(value)
+        if name == "id":
+            self.id = value
+
+    @property
+    def alert(self) -> int:
+        """The alert bit of status packets."""
+        return ALERT if self.get("hardware_error_status") else 0
+
+    @property
+    def shut_down(self) -> bool:
+        """Whether an error has taken the torque away; only a reboot gives it back."""
+        return bool(self.get("hardware_error_status") & self.get("shutdown"))
+
+    def read(self, address: int, length: int) -> tuple[Failure, bytes]:
+        """Bytes of the control table."""
+        if length < 1 or address + length > SIZE:
+            return Failure.LENGTH, b""
+        return Failure.NONE, bytes(self.memory[address : address + length])
+
+    def write(self, address: int, data: bytes) -> Failure:
+        """Write whole items; all or, with an error, none."""
+        changes: list[tuple[str, int]] = []
+        if not data:
+            return Failure.LENGTH
+        while data:
+            if address not in self._at:
+                return Failure.ACCESS
+            name, item = self._at[address]
+            if len(data) < item.size:
+                return Failure.LENGTH
+            value = item.from_bytes(data[: item.size])
+            failure = self._refusal(name, value)
+            if failure:
+                return failure
+            changes.append((name, value))
+            address, data = address + item.size, data[item.size :]
+        for name, value in changes:
+            self._accept(name, value)
+        return Failure.NONE
+
+    def _refusal(self, name: str, value: int) -> Failure:
+        item = self.items[name]
+        torque = self.get("torque_enable")
+        if not item.writable or (item.address < EEPROM_END and torque):
+            return Failure.ACCESS
+        if (item.low is not None and value < item.low) or (item.high is not None and value > item.high):
+            return Failure.RANGE
+        if name == "torque_enable" and value and self.shut_down:
+            return Failure.ACCESS
+        if name in GOALS and self.get("bus_watchdog") == -1:
+            return Failure.ACCESS
+        if name == "goal_position":
+            low, high = self.get("min_position_limit"), self.get("max_position_limit")
+            return Failure.NONE if low <= value <= high else Failure.LIMIT
+        limits = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
+        if name in limits and abs(value) > self.get(limits[name]):
+            return Failure.LIMIT
+        return Failure.NONE
+
+    def _accept(self, name: str, value: int) -> None:
+        if name == "torque_enable" and value and not self.get("torque_enable"):
+            self.put("goal_position", self.get("present_position"))  # a motor does not jump when switched on
+        self.put(name, value)
+
+    def heard(self) -> None:
+        """An instruction came for this motor."""
+        self._silence = 0.0
+
+    @property
+    def drive(self) -> Drive:
+        """What the motor does with its axis at present."""
+        on = bool(self.get("torque_enable"))
+        limit = min(self.get("current_limit"), self.model.current_limit) * self.model.current_unit_a
+        return Drive(
+            goal_rad=to_angle(self.get("goal_position")) if on else None,
+            p_gain=float(self.get("position_p_gain")),
+            velocity_limit=self.get("velocity_limit") * RAD_S_PER_COUNT,
+            torque_limit=limit * self.model.torque_nm_per_a,
+        )
+
+    def sense(self, seconds: float, position: float, velocity: float, torque: float) -> None:
+        """Take in the state of the axis after ``seconds`` more, and protect the motor.
+
+        Args:
+            seconds: Time since the last call.
+            position: Angle [rad]; the encoder has no more than one turn.
+            velocity: Speed [rad/s].
+            torque: Torque of the motor [N m].
+        """
+        self._clock += seconds
+        self.put("realtime_tick", int(self._clock * 1000.0) % TICK_MODULUS)
+        counts = to_counts(position)
+        speed = round(velocity / RAD_S_PER_COUNT)
+        self.put("present_position", counts)
+        self.put("present_velocity", speed)
+        self.put("present_current", round(torque / self.model.torque_nm_per_a / self.model.current_unit_a))
+        self.put("moving", int(abs(speed) > self.get("moving_threshold")))
+        self._protect(seconds, torque)
+        self._watch(seconds)
+
+    def _protect(self, seconds: float, torque: float) -> None:
+        full = self.model.current_limit * self.model.current_unit_a * self.model.torque_nm_per_a
+        load = abs(torque) / full
+        warming = HEATING_C_PER_S * load**2 - (self.temperature - AMBIENT_C) / COOLING_S + self.heat_c_per_s
+        self.temperature += seconds * warming
+        self.put("present_temperature", min(255, round(self.temperature)))
+        self._strained = self._strained + seconds if load >= OVERLOAD_SHARE else 0.0
+        bits = self.get("hardware_error_status")
+        if self.temperature > self.get("temperature_limit"):
+            bits |= HardwareError.OVERHEATING
+        if self._strained >= OVERLOAD_S:
+            bits |= HardwareError.OVERLOAD
+        self.put("hardware_error_status", bits)
+        if self.shut_down:
+            self.put("torque_enable", 0)
+
+    def _watch(self, seconds: float) -> None:
+        self._silence += seconds
+        limit = self.get("bus_watchdog")
+        if limit > 0 and self._silence > limit * WATCHDOG_UNIT_S:
+            self.put("bus_watchdog", -1)
+            self.put("goal_position", self.get("present_position"))

@@ -1,0 +1,81 @@
+"""What the twin's motors move: anything that follows drives and tells where it is.
+
+SI units, radians; one axis per motor.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+P_GAIN_UNIT = 200.0
+"""The paper's position gain, at which the simple plant has :data:`LAG_S`."""
+LAG_S = 0.1
+"""Time constant of a D'Claw joint at that gain [s]: its identified damping over stiffness."""
+SHORTEST_LAG_S = 0.01
+STIFFNESS_NM = 3.0
+"""Torque per radian of error at that gain [N m/rad], about what was identified for the D'Claw."""
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What one motor does with its axis."""
+
+    goal_rad: float | None
+    """Where it drives to; None with its torque off."""
+    p_gain: float
+    """Position gain in the motor's units."""
+    velocity_limit: float
+    """Largest speed [rad/s]."""
+    torque_limit: float
+    """Largest torque [N m]."""
+
+
+class Plant(Protocol):
+    """A mechanism behind the motors."""
+
+    def advance(self, seconds: float, drives: Sequence[Drive]) -> None:
+        """Go on by ``seconds`` with one drive for each axis."""
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions [rad], velocities [rad/s] and motor torques [N m] of the axes, each of shape [D]."""
+
+
+@dataclass
+class FirstOrderPlant:
+    """Axes without mass that approach their goals exponentially, within the limits of speed."""
+
+    axes: int
+    """D."""
+    position: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    blocked: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    """Axes that something holds, shape [D]."""
+
+    def __post_init__(self) -> None:
+        """Start at zero, free."""
+        if not self.position.size:
+            self.position = np.zeros(self.axes)
+        if not self.blocked.size:
+            self.blocked = np.zeros(self.axes, dtype=bool)
+        self._velocity, self._torque = np.zeros(self.axes), np.zeros(self.axes)
+
+    def advance(self, seconds: float, drives: Sequence[Drive]) -> None:
+        """Go on by ``seconds``."""
+        for axis, drive in enumerate(drives):
+            if drive.goal_rad is None or drive.p_gain <= 0.0:
+                self._velocity[axis] = self._torque[axis] = 0.0
+                continue
+            error = drive.goal_rad - self.position[axis]
+            pull = STIFFNESS_NM * drive.p_gain / P_GAIN_UNIT * error
+            self._torque[axis] = np.clip(pull, -drive.torque_limit, drive.torque_limit)
+            lag = max(SHORTEST_LAG_S, LAG_S * P_GAIN_UNIT / drive.p_gain)
+            step = 0.0 if self.blocked[axis] else error * -np.expm1(-seconds / lag)
+            furthest = drive.velocity_limit * seconds
+            step = float(np.clip(step, -furthest, furthest))
+            self._velocity[axis] = step / seconds if seconds > 0.0 else 0.0
+            self.position[axis] += step
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Positions, velocities and torques, each of shape [D]."""
+        return self.position.copy(), self._velocity.copy(), self._torque.copy()

@@ -1,0 +1,394 @@
+"""dynamixel-sdk, unchanged, against the twin over its pseudo-terminal."""
+
+import itertools
+import random
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+sdk = pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
+
+from vd.deploy.bus import BusError, MotorBus, MotorSettings  # noqa: E402
+from vd.deploy.control_table import MODELS, HardwareError, table, to_angle, to_counts  # noqa: E402
+from vd.deploy.motor import Motor  # noqa: E402
+from vd.deploy.packets import ALERT, Failure  # noqa: E402
+from vd.deploy.plant import FirstOrderPlant  # noqa: E402
+from vd.deploy.twin import Faults, Twin  # noqa: E402
+
+IDS = (10, 11, 12)
+MODEL = "XH430-V210"
+LIMITS = MotorSettings(current_limit_a=0.5, velocity_limit_rad_s=5.0, lower_rad=-1.0, upper_rad=1.2)
+
+
+@pytest.fixture
+def twin():
+    with Twin([Motor(MODELS[MODEL], id) for id in IDS]) as served:
+        yield served
+
+
+@pytest.fixture
+def bus(twin):
+    # The SDK waits 34 ms for an answer; on a busy machine the twin may not run for longer.
+    with MotorBus(twin.path, IDS, MODEL, retries=4) as opened:
+        yield opened
+
+
+def ready(bus: MotorBus) -> None:
+    bus.configure(dict.fromkeys(bus.ids, LIMITS))
+    assert bus.torque(True) == {}
+
+
+def settle(bus: MotorBus, seconds: float = 1.0):
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        state = bus.read_state()
+        time.sleep(0.02)
+    return state
+
+
+def test_items_do_not_overlap_and_hold_their_initial_values():
+    for model in MODELS.values():
+        items = sorted(table(model).values(), key=lambda item: item.address)
+        for item, following in itertools.pairwise(items):
+            assert item.address + item.size <= following.address
+        motor = Motor(model, 7)
+        assert motor.get("model_number") == model.number and motor.get("id") == 7
+        assert motor.get("goal_pwm") == 0 and motor.get("position_p_gain") == 800
+
+
+@pytest.mark.parametrize("angle", [-3.0, -0.0007, 0.0, 1.0, 3.1])
+def test_angles_survive_their_counts(angle):
+    assert to_angle(to_counts(angle)) == pytest.approx(angle, abs=0.5 * 2 * np.pi / 4096)
+
+
+def test_the_sdk_finds_the_motors(bus, twin):
+    assert bus.missing() == {}
+    assert bus.ping(10) == 1050 and bus.ping(99) is None
+    found, result = sdk.PacketHandler(2.0).broadcastPing(bus._port)
+    assert result == sdk.COMM_SUCCESS and sorted(found) == list(IDS)
+
+
+def test_settings_are_written_and_read_back(bus, twin):
+    bus.configure(dict.fromkeys(IDS, LIMITS))
+    motor = twin.motors[1]
+    assert (motor.get("position_p_gain"), motor.get("position_d_gain")) == (200, 10)
+    assert motor.get("current_limit") == int(0.5 / 1.34e-3)
+    assert motor.get("min_position_limit") == to_counts(-1.0)
+    assert bus.read(11, "velocity_limit") == motor.get("velocity_limit") > 0
+
+
+def test_a_setting_that_a_motor_does_not_keep_is_named(bus, twin):
+    accept = twin.motors[2]._accept
+    twin.motors[2]._accept = lambda name, value: accept(name, 77 if name == "position_p_gain" else value)
+    with pytest.raises(BusError, match="motor 12: position_p_gain is 77, not 200"):
+        bus.configure(dict.fromkeys(IDS, LIMITS))
+
+
+def test_goals_are_reached_and_clipped_to_the_limits(bus, twin):
+    ready(bus)
+    bus.write_goals(np.array([0.5, -0.4, 3.0]))
+    state = settle(bus)
+    np.testing.assert_allclose(state.position, [0.5, -0.4, 1.2], atol=0.005)
+    assert not state.alert.any()
+    with pytest.raises(ValueError, match="finite angles"):
+        bus.write_goals(np.array([0.0, np.nan, 0.0]))
+
+
+def test_speed_keeps_its_limit(bus, twin):
+    slow = MotorSettings(current_limit_a=0.5, velocity_limit_rad_s=0.5, lower_rad=-1.0, upper_rad=1.2)
+    bus.configure(dict.fromkeys(IDS, slow))
+    bus.torque(True)
+    bus.write_goals(np.full(3, 1.0))
+    first = bus.read_state()
+    second = settle(bus, 0.5)
+    rate = (second.position - first.position) / (second.time_s - first.time_s)
+    np.testing.assert_allclose(rate, 0.5, rtol=0.1)
+    np.testing.assert_allclose(second.velocity, 0.5, rtol=0.1)
+
+
+def test_sync_read_answers_in_the_order_asked(twin):
+    with MotorBus(twin.path, IDS[::-1], MODEL, retries=4) as backwards:
+        twin.plant.position[:] = [0.1, 0.2, 0.3]
+        time.sleep(0.05)
+        np.testing.assert_allclose(backwards.read_state().position, [0.3, 0.2, 0.1], atol=0.001)
+
+
+def test_bulk_read_through_the_sdk(bus, twin):
+    twin.plant.position[:] = [0.1, 0.2, 0.3]
+    time.sleep(0.05)
+    group = sdk.GroupBulkRead(bus._port, sdk.PacketHandler(2.0))
+    group.addParam(10, 132, 4)
+    group.addParam(12, 146, 1)
+    assert group.txRxPacket() == sdk.COMM_SUCCESS
+    assert to_angle(group.getData(10, 132, 4)) == pytest.approx(0.1, abs=0.001)
+    assert group.getData(12, 146, 1) == 30
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "torque", "failure"),
+    [
+        ("position_p_gain", 20000, 0, Failure.RANGE),
+        ("goal_position", 4000, 0, Failure.LIMIT),
+        ("model_number", 1, 0, Failure.ACCESS),
+        ("current_limit", 100, 1, Failure.ACCESS),
+        ("goal_position", 2100, 1, Failure.NONE),
+    ],
+)
+def test_motors_refuse_what_the_manual_says(name, value, torque, failure):
+    motor = Motor(MODELS[MODEL], 1)
+    motor.put("max_position_limit", 3000)
+    motor.put("torque_enable", torque)
+    item = motor.items[name]
+    before = bytes(motor.memory)
+    assert motor.write(item.address, item.to_bytes(value)) == failure
+    assert (bytes(motor.memory) == before) == (failure != Failure.NONE)
+    assert motor.write(item.address, b"") == Failure.LENGTH
+
+
+def test_a_refusal_reaches_the_caller(bus):
+    with pytest.raises(BusError, match="motor 10: write 20000 to position_p_gain: refused: range"):
+        bus.write(10, "position_p_gain", 20000)
+
+
+def test_a_blocked_motor_shuts_down_and_says_why_until_rebooted(bus, twin):
+    full = MotorSettings(current_limit_a=0.923, velocity_limit_rad_s=5.0, lower_rad=-1.5, upper_rad=1.5)
+    bus.configure(dict.fromkeys(IDS, full))
+    bus.torque(True)
+    twin.plant.blocked[1] = True
+    bus.write_goals(np.array([0.2, 1.4, 0.2]))
+    end = time.monotonic() + 4.0
+    while not bus.read_state().alert[1] and time.monotonic() < end:
+        time.sleep(0.02)
+    state = bus.read_state()
+    assert state.alert.tolist() == [False, True, False]
+    assert bus.hardware_errors() == {11: "overload"}
+    assert bus.read(11, "torque_enable") == 0 and state.current[1] == 0.0
+    assert "access" in bus.torque(True, [11])[11]
+    bus.reboot(11)
+    assert bus.hardware_errors() == {}
+
+
+def test_an_overheating_motor_switches_off(bus, twin):
+    ready(bus)
+    twin.motors[0].heat_c_per_s = 200.0
+    time.sleep(0.6)
+    assert bus.read_state().alert[0] and bus.hardware_errors() == {10: "overheating"}
+    assert bus.read(10, "torque_enable") == 0
+
+
+def test_a_restarted_motor_is_not_heard_before_it_is_configured(bus, twin):
+    ready(bus)
+    time.sleep(0.3)
+    bus.read_state()
+    twin.motors[2].reboot()
+    for _ in range(2):
+        with pytest.raises(BusError, match="motor 12: its clock differs"):
+            bus.read_state()
+    bus.configure(dict.fromkeys(IDS, LIMITS))
+    bus.read_state()
+
+
+def test_a_loose_cable_and_a_wrong_id_are_named(bus, twin):
+    twin.faults.cut_off = {11}
+    assert "does not answer" in bus.missing()[11]
+    begin = time.monotonic()
+    with pytest.raises(BusError, match="motor 11"):
+        bus.read_state()
+    assert time.monotonic() - begin < 1.0  # five readings, each about 40 ms on an idle machine
+    twin.faults.cut_off = set()
+    twin.motors[0].put("id", 13)
+    assert list(bus.missing()) == [10]
+    with pytest.raises(BusError, match="motor 10"):
+        bus.read_state()
+
+
+def test_a_motor_of_another_model_is_named():
+    with Twin([Motor(MODELS["XM430-W210"], 10)]) as twin, MotorBus(twin.path, [10], MODEL, retries=4) as bus:
+        assert bus.missing() == {10: "is XM430-W210, not XH430-V210"}
+
+
+def test_the_bus_watchdog_stops_a_motor_that_hears_nothing():
+    now = [0.0]
+    motor = Motor(MODELS[MODEL], 1)
+    twin = Twin([motor], clock=lambda: now[0])
+    motor.put("torque_enable", 1)
+    motor.put("goal_position", to_counts(1.0))
+    motor.put("bus_watchdog", 5)
+    for _ in range(30):
+        now[0] += 0.005
+        twin._advance()
+    assert motor.get("bus_watchdog") == -1
+    held = motor.get("present_position")
+    assert motor.get("goal_position") == held < to_counts(0.9)
+    assert motor.write(motor.items["goal_position"].address, bytes(4)) == Failure.ACCESS
+    twin.close()
+
+
+def test_a_lost_port_is_an_error_of_the_bus(bus, twin):
+    bus.close()
+    with pytest.raises(BusError, match="is lost"):
+        bus.read_state()
+    with pytest.raises(BusError, match="cannot open"):
+        MotorBus("/dev/no-such-port", IDS, MODEL)
+
+
+def test_many_threads_share_one_bus(bus, twin):
+    ready(bus)
+    failed = []
+
+    def work(id: int) -> None:
+        try:
+            for _ in range(15):
+                assert bus.read(id, "id") == id
+                bus.read_state()
+        except Exception as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=work, args=(id,)) for id in IDS]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == []
+
+
+def test_late_lost_and_corrupted_states_are_not_taken_for_fresh_ones(bus, twin):
+    """Axes move all the time; each accepted state is compared with where they were when it was read."""
+    ready(bus)
+    twin.faults = Faults(lose=0.02, corrupt=0.05, truncate=0.03, late=0.05, late_s=0.06, seed=1)
+    accepted = 0
+    begin = time.monotonic()
+    for step in range(150):
+        bus.write_goals(0.8 * np.sin(2.0 * (time.monotonic() - begin)) * np.ones(3))
+        try:
+            state = bus.read_state()
+        except BusError:
+            continue
+        accepted += 1
+        # The twin moves on meanwhile: 2 rad/s for less than 50 ms.
+        np.testing.assert_allclose(state.position, twin.plant.position, atol=0.12)
+        time.sleep(0.01 * (step % 2))
+    assert accepted > 60
+    assert bus.rejected > 10
+
+
+class Noise:
+    """A far end that answers every reading with broken, cut, doubled, foreign or made-up packets."""
+
+    def __init__(self, twin: Twin, seed: int):
+        self.twin, self.random, self.sent = twin, random.Random(seed), 0
+        twin._put = self.put
+
+    def put(self, data: bytes) -> None:
+        """Send something else than ``data``."""
+        rng, self.sent = self.random, self.sent + 1
+        kind = rng.randrange(7)
+        broken = bytearray(data)
+        if kind == 0:
+            del broken[rng.randrange(len(broken)) :]
+        elif kind == 1:
+            for _ in range(rng.randrange(1, 4)):
+                broken[rng.randrange(len(broken))] ^= rng.randrange(1, 256)
+        elif kind == 2:
+            broken[5:7] = rng.randrange(65536).to_bytes(2, "little")
+        elif kind == 3:
+            broken = bytearray(rng.randbytes(rng.randrange(60)))
+        elif kind == 4:
+            broken = bytearray(b"\xff\xff\xfd\x00" * rng.randrange(1, 8)) + broken[: rng.randrange(12)]
+        elif kind == 5:
+            del broken[rng.randrange(4, len(broken))]
+        else:
+            at = rng.randrange(len(broken))
+            broken[at:at] = rng.randbytes(rng.randrange(1, 6))
+        if bytes(broken) != data:
+            Twin._put(self.twin, bytes(broken))
+
+
+@pytest.mark.slow
+def test_ten_thousand_broken_packets_make_no_hang_no_crash_and_no_position():
+    """Every accepted state would be wrong: none of the packets that arrive is a whole answer of the motor."""
+    motor = Motor(MODELS[MODEL], 1)
+    with Twin([motor]) as twin, MotorBus(twin.path, [1], MODEL, retries=0) as bus:
+        motor.put("return_delay_time", 0)
+        bus._port.setPacketTimeout = lambda length: bus._port.setPacketTimeoutMillis(3.0)
+        true = bus.read_state()
+        noise = Noise(twin, seed=0)
+        slowest = 0.0
+        while noise.sent < 10_000:
+            begin = time.monotonic()
+            try:
+                state = bus.read_state()
+            except BusError:
+                pass
+            else:
+                # Bytes put before or behind a whole packet leave it whole, which is no fault.
+                np.testing.assert_array_equal(state.position, true.position)
+            slowest = max(slowest, time.monotonic() - begin)
+        assert slowest < 2.0
+        del twin._put
+        bus.read_state()
+
+
+def test_the_twin_survives_broken_instructions(bus, twin):
+    """What a program sends may be broken as well: nothing moves, and the next sound packet is answered."""
+    ready(bus)
+    goals = [motor.get("goal_position") for motor in twin.motors]
+    rng = random.Random(3)
+    item = table(MODELS[MODEL])["goal_position"]
+    from vd.deploy.packets import BROADCAST, Instruction, Packet, encode
+
+    rows = b"".join(bytes([id]) + item.to_bytes(2500) for id in IDS)
+    start = item.address.to_bytes(2, "little") + (4).to_bytes(2, "little")
+    sound = encode(Packet(BROADCAST, Instruction.SYNC_WRITE, start + rows))
+    for _ in range(500):
+        broken = bytearray(sound)
+        if rng.random() < 0.5:
+            del broken[rng.randrange(1, len(broken)) :]
+        else:
+            broken[rng.randrange(len(broken))] ^= rng.randrange(1, 256)
+        bus._port.writePort(bytes(broken))
+    time.sleep(0.1)
+    assert [motor.get("goal_position") for motor in twin.motors] == goals
+    assert bus.missing() == {}
+
+
+def test_the_twin_is_a_process_of_its_own():
+    command = [sys.executable, "-m", "vd.deploy.twin", "--ids", "1", "2", "--model", "XM430-W210"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        path = process.stdout.readline().strip()
+        with MotorBus(path, [1, 2], "XM430-W210", retries=4) as bus:
+            assert bus.missing() == {}
+            bus.configure(dict.fromkeys(bus.ids, LIMITS))
+            bus.torque(True)
+            bus.write_goals(np.array([0.3, -0.3]))
+            np.testing.assert_allclose(settle(bus).position, [0.3, -0.3], atol=0.005)
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def test_status_errors_carry_the_alert_bit(bus, twin):
+    twin.motors[0].put("hardware_error_status", HardwareError.VOLTAGE)
+    data, result, error = sdk.PacketHandler(2.0).read1ByteTxRx(bus._port, 10, 70)
+    assert result == sdk.COMM_SUCCESS and data == HardwareError.VOLTAGE and error == ALERT
+
+
+def test_the_plant_can_be_another_one():
+    class Still(FirstOrderPlant):
+        def advance(self, seconds, drives):
+            self.goals = [drive.goal_rad for drive in drives]
+
+    plant = Still(1)
+    with Twin([Motor(MODELS[MODEL], 1)], plant) as twin, MotorBus(twin.path, [1], MODEL, retries=4) as bus:
+        bus.configure({1: LIMITS})
+        bus.torque(True)
+        bus.write_goals(np.array([0.7]))
+        time.sleep(0.1)
+        assert plant.goals[0] == pytest.approx(0.7, abs=0.001)
+        assert bus.read_state().position[0] == pytest.approx(0.0)
