@@ -192,14 +192,15 @@ class Judge:
             after: The larger.
             tail: Share of the resamples that may see no gain.
         """
-        if RANDOM in after.effects and RANDOM not in before.effects:
-            # Its errors are not held out, so neither may those be that it is compared with.
-            before = replace(before, held_out=before.sse)
         old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
         gain = 1.0 - after.held_out_rmse / before.held_out_rmse
-        sampled = (
-            _likelihood_gain(before, after, self.weights) if RANDOM in after.effects else 1.0 - new / old
-        )
+        sampled = 1.0 - new / old
+        if RANDOM in after.effects:
+            # Its errors are not held out: what it is compared with must not gain by being so either.
+            fitted = replace(before, held_out=before.sse)
+            if 1.0 - after.rmse / before.rmse < PENALTY * len(EFFECTS[RANDOM].parameters):
+                return False, "what happens by chance fits no better than what does not"
+            sampled = _likelihood_gain(fitted, after, self.weights)
         low = float(np.quantile(sampled, tail))
         closed = np.sqrt(max(before.held_out_rmse**2 - after.held_out_rmse**2, 0.0))
         if gain < MIN_GAIN:
