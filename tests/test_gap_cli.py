@@ -11,6 +11,7 @@ import pytest
 from vd.assets_usd.bare_layer import read_bare_layer
 from vd.assets_usd.hand_data import HandError
 from vd.gap import cli, steps
+from vd.gap.chain import chains
 from vd.gap.close import _counterparts, simulate_again, write_identified
 from vd.gap.hide import hide
 from vd.gap.plan import plan, write_plan
@@ -27,7 +28,7 @@ from vd.gap.result import (
     Source,
     TrajectoryError,
 )
-from vd.gap.rollout import Rollouts, chains
+from vd.gap.rollout import Rollouts
 from vd.kernels import actuators
 
 JOINT = "joint"

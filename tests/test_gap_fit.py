@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 import vd.kernels.actuators as servo
+from vd.gap.chain import chains
 from vd.gap.coordinates import coordinate
 from vd.gap.design import design
 from vd.gap.find import findings, phases
 from vd.gap.fit import JointProblem, candidates
 from vd.gap.judge import intervals
 from vd.gap.recording import Recording, Trajectory
-from vd.gap.rollout import Rollouts, chains
+from vd.gap.rollout import Rollouts
 from vd.gap.statistics import covariance, noise_floor, resamples, rmse
 from vd.gap.workflow import baseline_of
 

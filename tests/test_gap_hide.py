@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vd.gap.chain import chains
 from vd.gap.excitations import MENU, JointRange, excitation_set
 from vd.gap.hidden_finger import FingerBody
 from vd.gap.hidden_plant import FULL_DUTY_RAD, OUTSIDE, STEP_S, Plant, Run, simulate
@@ -22,7 +23,6 @@ from vd.gap.hide import (
     truth_path,
 )
 from vd.gap.recording import read_recording
-from vd.gap.rollout import chains
 from vd.gap.sizes import effect_at, showing, sized_effect
 from vd.gap.team import JointSpec
 from vd.gap.telemetry import late_side, vetoes

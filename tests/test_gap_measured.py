@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vd.gap.chain import chains
 from vd.gap.design import MAX_MOTION_S, design, pieces
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Report
-from vd.gap.rollout import chains
 from vd.gap.statistics import held
 from vd.gap.workflow import explain
 

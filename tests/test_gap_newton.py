@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from vd.assets_usd.hands import load_hand
+from vd.gap.chain import chains
 from vd.gap.excitations import JointRange, steps_and_sines
 from vd.gap.newton import HandReplay, identify, pack_tracks, simulate_hand
 from vd.gap.recording import Recording, Trajectory
-from vd.gap.rollout import Rollouts, chains
+from vd.gap.rollout import Rollouts
 from vd.kernels import actuators as servo
 
 HAND = load_hand("dclaw3")

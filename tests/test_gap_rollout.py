@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
+from vd.gap.chain import GRAVITY_M_S2, chains
 from vd.gap.recording import Recording, Trajectory, read_recording
-from vd.gap.rollout import GRAVITY_M_S2, Rollouts, chains
+from vd.gap.rollout import Rollouts
 from vd.kernels import actuators as servo
 from vd.sim.scene import hand_mount
 

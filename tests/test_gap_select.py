@@ -9,7 +9,8 @@ from test_gap_fit import recorded
 
 import vd.kernels.actuators as servo
 from vd.gap.coordinates import Coordinate, Scales
-from vd.gap.fit import JointFit, JointProblem
+from vd.gap.fit import JointProblem
+from vd.gap.joint_fit import JointFit
 from vd.gap.judge import Accepted, Explanation, Judge, cancelled, intervals, share
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
@@ -396,7 +397,7 @@ def test_unknown_effects_are_refused(tmp_path: Path) -> None:
 
 def test_telemetry_contradicts_a_cause() -> None:
     """A duty cycle in proportion to the error leaves no room for a delay; a steady voltage none for sag."""
-    from vd.gap.rollout import chains
+    from vd.gap.chain import chains
     from vd.gap.team import JointSpec
 
     recording = recorded({servo.COULOMB_TORQUE: 0.05})

@@ -7,9 +7,10 @@ import pytest
 from test_gap_fit import TRUE, recorded
 
 import vd.kernels.actuators as servo
+from vd.gap.chain import chains
 from vd.gap.crowd import Crowd
 from vd.gap.design import design
-from vd.gap.rollout import STEP_S, Rollouts, chains
+from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.statistics import noise_floor
 from vd.gap.team import Bench, Call, JointSpec, Team
 from vd.gap.workflow import baseline_of

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from vd.gap.chain import Chain
 from vd.gap.recording import Recording, Trajectory
-from vd.gap.rollout import Chain
 from vd.gap.statistics import held
 
 MAX_FOLDS = 6

@@ -14,7 +14,8 @@ import numpy as np
 from scipy.optimize import minimize
 
 from vd.gap.coordinates import Coordinate, Scales, coordinate
-from vd.gap.fit import JointFit, JointProblem
+from vd.gap.fit import JointProblem
+from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
 
 DRAWS = 16

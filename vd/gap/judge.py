@@ -10,7 +10,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 import vd.kernels.actuators as servo
-from vd.gap.fit import RIDGE, JointFit
+from vd.gap.fit import RIDGE
+from vd.gap.joint_fit import JointFit
 from vd.gap.result import Verdict
 from vd.gap.statistics import covariance, half_width, interval, rmse
 from vd.kernels.effects import EFFECTS, EQUIVALENT

@@ -21,8 +21,9 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_model import HandModel
+from vd.gap.chain import DOWN_IN_BASE, GRAVITY_M_S2
 from vd.gap.recording import Recording, Trajectory
-from vd.gap.rollout import DOWN_IN_BASE, GRAVITY_M_S2, STREAM_BITS
+from vd.gap.rollout import STREAM_BITS
 from vd.kernels.actuators import BACKLASH_WIDTH, ENCODER_BIAS, KD, KP, VELOCITY_LIMIT
 from vd.kernels.chains import Samples
 from vd.kernels.effects import BASELINE

@@ -19,10 +19,11 @@ import numpy as np
 
 import vd.kernels.actuators as servo
 from vd.files import write_json, write_text
+from vd.gap.chain import Chain, chains
 from vd.gap.excitations import MENU, Excitation, JointRange
 from vd.gap.recording import BARE_MODELS, Recording, Trajectory
 from vd.gap.result import Report, parameter_columns, parameter_of
-from vd.gap.rollout import STEP_S, Chain, Rollouts, chains
+from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.words import listing, plain
 from vd.kernels.effects import BASELINE, EFFECTS
 

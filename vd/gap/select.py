@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vd.gap.coordinates import Scales, sizes, torque_power
-from vd.gap.fit import JointFit
+from vd.gap.joint_fit import JointFit
 from vd.gap.judge import AT_FLOOR, EXPLAINED, NESTED, NO_GAP, RANDOM, Explanation, Judge, Trial, cancelled
 from vd.gap.result import parameter_of
 from vd.gap.telemetry import BEHIND_SENSOR

@@ -11,11 +11,12 @@ from typing import Any
 
 import warp as wp
 
+from vd.gap.chain import Chain
 from vd.gap.crowd import Crowd
 from vd.gap.fit import JointProblem
 from vd.gap.jitter import fit_jitter
 from vd.gap.recording import Recording
-from vd.gap.rollout import Chain, Rollouts
+from vd.gap.rollout import Rollouts
 
 Call = tuple[str, dict[str, Any]]
 SHORT_S = 0.1

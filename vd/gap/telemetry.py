@@ -8,8 +8,8 @@ its controller's output: where it follows the plain error at the recorded gain, 
 import numpy as np
 
 import vd.kernels.actuators as servo
+from vd.gap.chain import Chain
 from vd.gap.recording import Recording, Trajectory
-from vd.gap.rollout import Chain
 from vd.gap.team import JointSpec
 
 LINEAR = 0.995

@@ -1,0 +1,74 @@
+"""The result of a fit: a model of one joint, its errors, and the matrices that intervals are made of."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from vd.gap.coordinates import Coordinate
+from vd.gap.statistics import rmse
+
+ONE_SIDED, DRY = "asymmetric_friction", ("coulomb_friction", "stribeck_friction")
+"""The friction that can have a direction without any, and those that fill it up."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointFit:
+    """A fitted model of one joint; S trajectories, P parameters.
+
+    Attributes:
+        effects: Names of the effects in the model.
+        coordinates: What was fitted.
+        x: Fitted coordinates [P].
+        rows: Parameter rows of the chain's joints, shape [n, PARAMETER_COLUMNS].
+        sse: Sum of squared errors of each trajectory [S] [rad^2].
+        held_out: The same, each trajectory predicted by a fit without its group [S].
+        count: Samples of each trajectory [S].
+        gram: J^T J of each trajectory, [S, P, P].
+        gradient: J^T r of each trajectory, [S, P].
+        held_out_abs: Sum of absolute errors of held-out trajectories [S] [rad]; None where not taken.
+        step_error: What the time step of the rollouts leaves open in ``x`` [P]; None where not estimated.
+        structure: Sum of products of successive residuals in motion, and their number, of each trajectory
+            [2, S] [rad^2]: zero on average if only noise is left; None where not estimated.
+        extents: 95 % intervals by key, of parameters for which the matrices do not give them.
+    """
+
+    effects: tuple[str, ...]
+    coordinates: tuple[Coordinate, ...]
+    x: np.ndarray
+    rows: np.ndarray
+    sse: np.ndarray
+    held_out: np.ndarray
+    count: np.ndarray
+    gram: np.ndarray
+    gradient: np.ndarray
+    held_out_abs: np.ndarray | None = None
+    step_error: np.ndarray | None = None
+    structure: np.ndarray | None = None
+    extents: Mapping[str, tuple[float, float]] | None = None
+
+    @property
+    def values(self) -> dict[str, float]:
+        """Parameter values by key."""
+        return {c.key: float(c.value(x)) for c, x in zip(self.coordinates, self.x, strict=True)}
+
+    @property
+    def rmse(self) -> float:
+        """RMSE on what was fitted [rad]."""
+        return float(rmse(self.sse, self.count))
+
+    @property
+    def held_out_rmse(self) -> float:
+        """RMSE on held-out trajectories [rad]."""
+        return float(rmse(self.held_out, self.count))
+
+    @property
+    def at_bound(self) -> tuple[str, ...]:
+        """Keys of effect parameters that ended at a bound."""
+        pairs = zip(self.coordinates, self.x, strict=True)
+        bound = [c.key for c, x in pairs if "." in c.key and c.bound(float(x))]
+        if ONE_SIDED in self.effects and not set(DRY) & set(self.effects):
+            # No dry friction spares one direction: what does is a load, and a greater one would push.
+            sides = [key for key, value in self.values.items() if key.startswith(ONE_SIDED)]
+            bound += [key for key in sides if self.values[key] <= 0.0]
+        return tuple(bound)
