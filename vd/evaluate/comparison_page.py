@@ -147,7 +147,7 @@ def ecdf_figure(comparison: Comparison) -> Figure:
         for row in rows:
             other = row.policy in students and row.stopped_by == "true distance"
             style = {"linestyle": "--", "linewidth": 1.2} if other else {"linewidth": 2.0}
-            label = None if other else f"{short[row.policy]} ({row.kind})"
+            label = None if other else _named(row, short)
             ecdf(axes, row.result.errors().ravel(), color=colour[row.policy], label=label, **style)
         axes.plot(angle, chance_cdf(angle), color=GREY, linestyle=":", label="uniform, no symmetry")
         axes.axvline(rows[0].result.protocol.stop_tolerance_rad, color=GREY, linewidth=0.6)
@@ -215,11 +215,16 @@ def _panels(count: int, height: float) -> tuple[Figure, list]:
     return figure, panels
 
 
+def _named(row: Row, short: dict[str, str]) -> str:
+    """A policy with its kind; zero and random are their own."""
+    return row.kind if row.kind == row.policy else f"{short[row.policy]} ({row.kind})"
+
+
 def _cells(row: Row, short: dict[str, str]) -> tuple[str, ...]:
     overall = row.result.overall
     shown = [rate for key, rate in overall.success.items() if float(key) <= NEAR_RAD]
     return (
-        f"{short[row.policy]} ({row.kind})",
+        _named(row, short),
         row.group,
         row.stopped_by,
         str(overall.episodes),
