@@ -152,7 +152,8 @@ def ecdf_figure(comparison: Comparison) -> Figure:
         axes.plot(angle, chance_cdf(angle), color=GREY, linestyle=":", label="uniform, no symmetry")
         axes.axvline(rows[0].result.protocol.stop_tolerance_rad, color=GREY, linewidth=0.6)
         axes.set(xlim=(0.0, np.pi), ylim=(0.0, 1.0), xlabel="error at the stop or end [rad]")
-        axes.set_title(f"{group} ({len(rows[0].result.object_names)} objects)", fontsize=10)
+        count = len(rows[0].result.object_names)
+        axes.set_title(f"{group} ({count} object{'s' if count > 1 else ''})", fontsize=10)
         axes.legend(frameon=False, loc="lower right", fontsize=7)
     panels[0].set_ylabel("share of episodes")
     return figure
