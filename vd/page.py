@@ -31,7 +31,7 @@ main{max-width:62rem;margin:0 auto;padding:2rem 1.25rem 4rem}
 h1{font-size:1.9rem;line-height:1.2;margin:0 0 .25rem}h2{font-size:1.3rem;margin:2.5rem 0 .75rem}
 .lead,figcaption,.small{color:var(--soft)}p{margin:.6rem 0;max-width:46rem}
 ul{margin:.6rem 0;padding-left:1.3rem;max-width:46rem}li{margin:.25rem 0}
-.scroll{overflow-x:auto}details{margin:1rem 0}summary{cursor:pointer;font-weight:600}
+.scroll{overflow-x:auto;margin:1rem 0}details{margin:1rem 0}summary{cursor:pointer;font-weight:600}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;font-size:.92rem}
 th,td{padding:.4rem .7rem;border-bottom:1px solid var(--line);text-align:right;white-space:nowrap}
 th:first-child,td:first-child,.words{text-align:left}td.words{white-space:normal;min-width:12rem}

@@ -25,6 +25,8 @@ MAX_POINTS = 4000
 MAX_BARS = 16
 """Candidates drawn of one round."""
 BAR = 0.36
+PANELS = 2
+"""Rounds of the search beside each other: their labels leave no room for a third."""
 
 
 def overlay_figure(report: Report, curves: Predictions, joint: str, index: int) -> Figure:
@@ -179,10 +181,14 @@ def evidence_figure(report: Report, joints: tuple[str, ...]) -> Figure:
     rows = [row for row in report.evidence if row.joints == joints]
     rounds = sorted({row.round for row in rows})
     shown = {number: _best([row for row in rows if row.round == number]) for number in rounds}
-    figure = Figure(
-        figsize=(WIDTH, 1.3 + 0.24 * max(len(group) for group in shown.values())), layout="constrained"
-    )
-    panels = np.atleast_1d(figure.subplots(1, len(rounds), squeeze=False)[0])
+    across = min(len(rounds), PANELS)
+    down = -(-len(rounds) // across)
+    height = 0.24 * max(len(group) for group in shown.values()) + 0.5
+    figure = Figure(figsize=(WIDTH, 0.8 + down * height), layout="constrained")
+    every = figure.subplots(down, across, squeeze=False).ravel()
+    panels = every[: len(rounds)]
+    for unused in every[len(rounds) :]:
+        unused.set_axis_off()
     colors = {"named": GREEN, "tied": BLUE, "rejected": GREY}
     for axes, (number, group) in zip(panels, shown.items(), strict=True):
         _clean(axes)
@@ -195,7 +201,7 @@ def evidence_figure(report: Report, joints: tuple[str, ...]) -> Figure:
         axes.set_yticks(range(len(group)), names, fontsize=8)
         axes.axvline(0.0, color=INK, linewidth=0.8)
         axes.set_xlim(left=_lower_limit(group), right=104.0)
-        axes.set_title("first effect" if number == 1 else f"effect {number}", fontsize=9)
+        axes.set_title("first round" if number == 1 else f"round {number}", fontsize=9)
         axes.tick_params(axis="x", labelsize=8)
     figure.supxlabel(
         "share of the error on held-out motions that it removes, given the effects before [%]", fontsize=9

@@ -315,7 +315,7 @@ class Judge:
             return replace(explanation, reason=f"{names} come nearest, but {lack}: the cause is another")
         named = [a.name for a in accepted if a.named]
         if named:
-            return replace(explanation, verdict="effects", reason=f"{' and '.join(named)} explain it")
+            return replace(explanation, verdict="effects", reason=_explain(named))
         if all(a.at_bound for a in accepted):
             return replace(explanation, reason=f"{accepted[0].name} fits only with a parameter at its bound")
         sets = [" or ".join((a.name, *a.tied)) for a in accepted if a.tied and not a.at_bound]
@@ -416,6 +416,10 @@ class Judge:
             tied=tuple(tied),
             at_bound=any(key.startswith(f"{name}.") for key in final.at_bound),
         )
+
+
+def _explain(names: Sequence[str]) -> str:
+    return f"{' and '.join(names)} {'explains' if len(names) == 1 else 'explain'} it"
 
 
 def _likelihood_gain(before: JointFit, after: JointFit, weights: np.ndarray) -> np.ndarray:
@@ -534,7 +538,7 @@ def _adopt(explanation: Explanation, named: set[str], floor: float, polish: Poli
     verdict, reason = explanation.verdict, explanation.reason
     names = [a.name for a in accepted if a.named]
     if verdict == "ambiguous" and names:
-        verdict, reason = "effects", f"{' and '.join(names)} explain it, as on the other joints"
+        verdict, reason = "effects", f"{_explain(names)}, as on the other joints"
     return replace(explanation, final=final, accepted=tuple(accepted), verdict=verdict, reason=reason)
 
 

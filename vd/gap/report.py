@@ -140,7 +140,7 @@ def _found(page: Page, report: Report) -> None:
     if report.joints:
         page.table(
             ["joint", "verdict", "why"],
-            [(one.joint, _VERDICT_WORDS[one.verdict].lower(), one.reason) for one in report.joints],
+            [(one.joint, _VERDICT_WORDS[one.verdict].lower(), plain(one.reason)) for one in report.joints],
             words=(1, 2),
         )
 
@@ -302,13 +302,15 @@ def _parameters(page: Page, report: Report) -> None:
     names = list(dict.fromkeys(n for fit in report.identified.parameters.values() for n in fit))
     if names:
         before, after = report.baseline.parameters, report.identified.parameters
-        page.table(
-            ["joint", *(f"{name} [{unit_text(UNITS.get(name, '1'))}]" for name in names)],
-            [
-                (joint, *(_before_after(before.get(joint, {}).get(n), values.get(n)) for n in names))
-                for joint, values in after.items()
-            ],
-        )
+        units = [f"{name} [{unit_text(UNITS.get(name, '1'))}]" for name in names]
+        cells = [
+            [_before_after(before.get(joint, {}).get(n), values.get(n)) for n in names]
+            for joint, values in after.items()
+        ]
+        if len(names) > len(after):  # the longer side goes down the page
+            page.table(["parameter", *after], list(zip(units, *cells, strict=True)))
+        else:
+            page.table(["joint", *units], [(j, *row) for j, row in zip(after, cells, strict=True)])
         page.text(
             "The plain servo model, before → after the effects joined the fit. Without the missing effect "
             "these "
