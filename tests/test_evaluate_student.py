@@ -127,13 +127,13 @@ def test_without_a_table_objects_fall_and_it_comes_back(env):
 @pytest.mark.slow
 def test_students_and_teacher_side_by_side(tmp_path, capsys):
     students = [save_student(tmp_path / f"stage{n}" / "student.pt", n) for n in (1, 2)]
-    flags = ["--objects", "training=cube", "symmetric=cuboid", "--episodes", "2", "--device", "cpu"]
+    flags = ["--objects", "training=cuboid", "both=cube", "both=cuboid", "--episodes", "2", "--device", "cpu"]
     flags += ["--episode-s", "0.5", "--output", str(tmp_path / "out")]
     assert main([*students, "dclaw3-table", "--agent", "zero", *flags, "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     comparison = Comparison.read(tmp_path / "out" / "eval.json")
     assert [row["policy"] for row in printed["rows"]] == [row.policy for row in comparison.rows]
-    assert comparison.groups == ("training", "symmetric") and len(comparison.policies) == 4
+    assert comparison.groups == ("training", "both") and len(comparison.policies) == 4
     assert {(row.kind, row.sees) for row in comparison.rows} == {
         ("student of stage 1", "complete clouds"),
         ("student of stage 2", "rendered clouds"),
@@ -141,8 +141,11 @@ def test_students_and_teacher_side_by_side(tmp_path, capsys):
         ("zero", "nothing"),
     }
     assert len(comparison.rows) == 2 * (2 + 2 + 1 + 1) and len(comparison.predictions) == 4
+    alone, both = (next(row for row in comparison.rows if row.group == g) for g in comparison.groups)
+    assert alone.result.object_names == ("cuboid",) and both.result.object_names == ("cube", "cuboid")
+    assert [e.error_rad for e in alone.result.episodes] == [e.error_rad for e in both.result.episodes[2:]]
     starts = {
-        (row.group, episode.object_index, episode.start_quat, episode.goal_quat)
+        (row.result.object_names[episode.object_index], episode.start_quat, episode.goal_quat)
         for row in comparison.rows
         for episode in row.result.episodes
     }

@@ -45,7 +45,7 @@ class EvalCfg:
     """zero or random, alone or beside policies."""
     objects: tuple[str, ...] = ("cube",)
     """Object sets by name, folders or files (vd-assets makes them). NAME=SET puts one into a group, which
-    gets figures of its own: training=FOLDER held-out=FOLDER symmetric=cube."""
+    gets figures of its own: training=FOLDER held-out=FOLDER symmetric=symmetric."""
     episodes: int = 20
     """Starts and goals of every object."""
     hand: str | None = None

@@ -56,8 +56,9 @@ def compare(cfg: "EvalCfg") -> "Comparison":
 
     device = resolve_device(cfg.device)
     groups = parse_groups(cfg.objects)
-    sizes = {name: len(load_set(list(sets))) for name, sets in groups.items()}
-    count = sum(sizes.values())
+    everything = tuple(dict.fromkeys(s for sets in groups.values() for s in sets))
+    members = {name: [item.name for item in load_set(list(sets))] for name, sets in groups.items()}
+    count = len(load_set(list(everything)))
     limit = None if device == "cpu" else STUDENT_WORLDS_GPU
     worlds = cfg.num_worlds or worlds_for(count, cfg.episodes, device, limit=limit)
     rows, predictions = [], []
@@ -65,7 +66,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
     task, start = None, None
     for name in cfg.agent_names:
         policy = open_policy(name, device)
-        wanted = _task(cfg, policy, tuple(s for sets in groups.values() for s in sets), worlds)
+        wanted = _task(cfg, policy, everything, worlds)
         check_bundle(name, wanted)
         if task != wanted:
             print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
@@ -92,14 +93,13 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             goals_about_vertical=wanted.start.at_rest and wanted.goal.about_vertical,
             in_air=cfg.in_air,
         )
-        first = 0
+        index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
-            chosen = range(first, first + sizes[group])
-            first += sizes[group]
+            chosen = [index[member] for member in members[group]]
             found, prediction = judge(
                 trace.of(chosen),
                 replace(protocol, objects=", ".join(sets)),
-                [env.objects[index] for index in chosen],
+                [env.objects[number] for number in chosen],
                 kind=kind,
                 sees=sees,
                 group=group,

@@ -271,7 +271,7 @@ def _lead(comparison: Comparison) -> str:
 def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
     protocol = comparison.rows[0].result.protocol
     rows = [
-        ("hand", protocol.hand_name),
+        ("hand", ", ".join(dict.fromkeys(row.result.protocol.hand_name for row in comparison.rows))),
         ("starts and goals", f"{protocol.episodes} each for every object, seed {protocol.seed}"),
         ("starts", starts_text(protocol)),
         ("goals", goals_text(protocol)),
