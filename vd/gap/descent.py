@@ -62,11 +62,13 @@ class LeastSquares:
         coordinates: The P coordinates.
         residuals: Simulates.
         ridge: Pull of the coordinates to their start [rad^2].
+        slopes: Simulates for Jacobians, if they may come from a coarser simulation.
     """
 
     coordinates: Sequence[Coordinate]
     residuals: Residuals
     ridge: float
+    slopes: Residuals | None = None
 
     def jacobian(
         self,
@@ -91,7 +93,10 @@ class LeastSquares:
         steps = np.stack([c.step(x[:, i], factor) for i, c in enumerate(self.coordinates)], axis=1)
         moved = np.repeat(x[:, None], size, axis=1)
         moved[:, np.arange(size), np.arange(size)] += steps
-        answers = self.residuals(moved.reshape(-1, size), _repeat(keep, size)).reshape(len(x), size, -1)
+        simulate = self.residuals if self.slopes is None else self.slopes
+        if self.slopes is not None:
+            residual = self.slopes(x, keep)
+        answers = simulate(moved.reshape(-1, size), _repeat(keep, size)).reshape(len(x), size, -1)
         np.subtract(residual[:, None], answers, out=answers)
         answers /= steps[:, :, None]
         return answers

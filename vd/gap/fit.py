@@ -65,6 +65,7 @@ class JointProblem:
         baseline: Sequence[str],
     ):
         self.rollouts = rollouts
+        self.coarse: Rollouts | None = None  # simulates for slopes, where it may be another
         self.joint = joint
         self.trajectories = np.asarray(trajectories)
         self.folds = np.asarray(folds)
@@ -77,7 +78,12 @@ class JointProblem:
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
 
     def residuals(
-        self, rows: np.ndarray, trajectories: Trajectories = None, keep: np.ndarray | None = None
+        self,
+        rows: np.ndarray,
+        trajectories: Trajectories = None,
+        keep: np.ndarray | None = None,
+        *,
+        rollouts: Rollouts | None = None,
     ) -> np.ndarray:
         """Measured minus predicted position of the joint for C chains [C, n, PARAMETER_COLUMNS]: [C, N].
 
@@ -85,7 +91,8 @@ class JointProblem:
         """
         chosen = [int(t) for t in (self.trajectories if trajectories is None else trajectories)]
         measured = np.concatenate([self._measured[t] for t in chosen])
-        predicted = self.rollouts.predict(rows, chosen, joint=self.joint, keep=keep)
+        simulation = self.rollouts if rollouts is None else rollouts
+        predicted = simulation.predict(rows, chosen, joint=self.joint, keep=keep)
         self.simulated += len(rows) * len(chosen) if keep is None else int(keep.sum())
         residual = measured - predicted
         if keep is not None:
@@ -100,7 +107,12 @@ class JointProblem:
         def residuals(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
             return self.residuals(self.rows(base, coordinates, x), trajectories, keep)
 
-        return LeastSquares(coordinates, residuals, RIDGE * self.floor**2)
+        def coarse(x: np.ndarray, keep: np.ndarray | None) -> np.ndarray:
+            rows = self.rows(base, coordinates, x)
+            return self.residuals(rows, trajectories, keep, rollouts=self.coarse)
+
+        slopes = None if self.coarse is None else coarse
+        return LeastSquares(coordinates, residuals, RIDGE * self.floor**2, slopes)
 
     def rows(self, base: np.ndarray, coordinates: Sequence[Coordinate], x: np.ndarray) -> np.ndarray:
         """Chains [C, n, PARAMETER_COLUMNS] with this joint's parameters at coordinates [C, P]."""
@@ -276,11 +288,13 @@ class JointProblem:
         """The same model fitted on with finer time steps, for values that do not depend on the step.
 
         What the last halving changes is kept as the error that is left, and the structure of the
-        residuals is measured. Held-out errors are those of ``fit``, to be compared with other models'.
+        residuals is measured. Slopes are those of the problem's own time step: they need not be finer.
+        Held-out errors are those of ``fit``, to be compared with other models'.
         """
         rollouts, x, error = self.rollouts, fit.x, np.zeros(len(fit.x))
         result = fit
         try:
+            self.coarse = rollouts
             for divisor in FINER:
                 self.rollouts = rollouts.at(rollouts.dt / divisor)
                 result = self.fit(
@@ -294,7 +308,7 @@ class JointProblem:
                 x, error = result.x, np.abs(result.x - x)
             residual = self.residuals(result.rows[None])[0]
         finally:
-            self.rollouts = rollouts
+            self.rollouts, self.coarse = rollouts, None
         structure = self._structure(residual)
         return replace(
             result,
