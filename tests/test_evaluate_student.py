@@ -22,6 +22,7 @@ from vd.student.network import Student
 from vd.student.saved import SavedStudent, StudentSpec, student_export
 from vd.student.stopping import StoppingRule
 from vd.train.checkpoint import save_checkpoint
+from vd.train.cli import main as train
 
 TASK = ReorientCfg(
     hand="dclaw3",
@@ -154,8 +155,9 @@ def test_students_and_teacher_side_by_side(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_single_student_in_the_air(tmp_path, capsys):
-    path = save_student(tmp_path / "student.pt", 1)
+def test_a_bundled_student_in_the_air(tmp_path, capsys):
+    path = str(tmp_path / "bundle")
+    assert train(["bundle", save_student(tmp_path / "student.pt", 1), path]) == 0
     flags = ["--in-air", "--episodes", "2", "--device", "cpu", "--episode-s", "2.5"]
     assert main([path, *flags, "--sees", "rendered", "--output", str(tmp_path / "out")]) == 0
     assert "object falls" in capsys.readouterr().out
