@@ -7,7 +7,6 @@ one call of :class:`vd.gap.rollout.Rollouts`.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-import cma
 import numpy as np
 
 import vd.kernels.actuators as servo
@@ -421,6 +420,8 @@ class JointProblem:
 
     def start_baseline(self, base: np.ndarray, scales: Scales, *, seed: int, generations: int) -> np.ndarray:
         """The paper's search: CMA-ES on the squared error of a few trajectories. Returns rows."""
+        import cma  # half a second, which most worker processes do not need
+
         coordinates = [coordinate(key, scales) for key in self.baseline]
         x0 = np.array([c.inverse(float(base[self.joint, c.column])) for c in coordinates])
         spread = np.linspace(0, len(self.trajectories) - 1, CMA_TRAJECTORIES).round().astype(int)
