@@ -319,14 +319,16 @@ class MotorBus:
             return self._accept(now, answers)
 
     def _answer(self, id: int) -> tuple[bytes, int]:
-        """State and error byte of the next answer, which has to be this motor's."""
-        frame, result = self._packets.rxPacket(self._port, False)
-        if result != self._sdk.COMM_SUCCESS:
-            raise BusError(f"motor {id}: no state: {self._packets.getTxRxResult(result)}")
-        body = _status_body(bytes(frame))
-        if body is None or body[0] != id:
-            came = "nothing sound" if body is None else f"motor {body[0]}"
-            raise BusError(f"motor {id}: {came} answered instead")
+        """State and error byte of this motor's next answer."""
+        while True:
+            frame, result = self._packets.rxPacket(self._port, False)
+            if result != self._sdk.COMM_SUCCESS:
+                raise BusError(f"motor {id}: no state: {self._packets.getTxRxResult(result)}")
+            body = _status_body(bytes(frame))
+            if body is None:
+                raise BusError(f"motor {id}: what answered is no status packet")
+            if body[0] == id:
+                break  # others' come late from an exchange before; the time limit is one for all
         _, error, data = body
         if error & ~ALERT:
             raise BusError(f"motor {id}: {_failure(error)}")

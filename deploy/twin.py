@@ -15,6 +15,7 @@ import time
 import tty
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from vd.deploy.control_table import MODELS
 from vd.deploy.motor import Motor
@@ -299,7 +300,11 @@ class TwinCommand:
     """Serve a bus of simulated motors on a pseudo-terminal until interrupted."""
 
     ids: tuple[int, ...] = (10, 11, 12, 20, 21, 22, 30, 31, 32)
-    """IDs of the motors."""
+    """IDs of the motors, on axes without mass; without --hand."""
+    hand: str | None = None
+    """Hand that the motors move, simulated in Newton: dclaw3, dclaw4 or a hand's USD."""
+    calibration: Path | None = None
+    """Calibration file of that hand's motors; IDs 10, 11, 12, 20, ... by default."""
     model: str = "XH430-V210"
     """Their model."""
     lose: float = 0.0
@@ -325,7 +330,16 @@ class TwinCommand:
         faults = Faults(
             self.lose, self.corrupt, self.truncate, self.late, cut_off=set(self.cut_off), seed=self.seed
         )
-        twin = Twin([Motor(MODELS[self.model], id) for id in self.ids], faults=faults)
+        ids, plant = self.ids, None
+        if self.hand is not None:
+            from vd.assets_usd.hands import load_hand
+            from vd.deploy.joints import read_joints, uncalibrated
+            from vd.deploy.newton_hand import NewtonHand
+
+            hand = load_hand(self.hand)
+            joints = uncalibrated(hand) if self.calibration is None else read_joints(self.calibration, hand)
+            ids, plant = joints.ids, NewtonHand(hand, joints)
+        twin = Twin([Motor(MODELS[self.model], id) for id in ids], plant, faults)
         print(twin.path, flush=True)
         try:
             twin.serve()

@@ -1,0 +1,121 @@
+"""The simulated hand behind the motors, and which motor turns which joint."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from vd.assets_usd.hands import load_hand
+from vd.deploy.control_table import MODELS
+from vd.deploy.joints import CalibrationError, Joints, read_joints, uncalibrated
+from vd.deploy.motor import Motor
+from vd.deploy.newton_hand import NewtonHand
+from vd.deploy.plant import Drive
+from vd.deploy.twin import Twin
+from vd.paper import PAPER
+
+MODEL = "XM430-W210"
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand("dclaw3")
+
+
+@pytest.fixture
+def turned(hand) -> Joints:
+    """Motors mounted every which way."""
+    rng = np.random.default_rng(0)
+    plain = uncalibrated(hand)
+    return Joints(plain.names, plain.ids, rng.choice([-1.0, 1.0], 9), rng.uniform(-0.5, 0.5, 9))
+
+
+def drives(joints: Joints, goal: np.ndarray | None) -> list[Drive]:
+    angles = [None] * len(joints.ids) if goal is None else list(joints.to_motor(goal))
+    return [Drive(angle, 200.0, 6.0, 2.6) for angle in angles]
+
+
+def test_the_hand_goes_where_its_motors_drive_and_falls_without_them(hand, turned):
+    plant = NewtonHand(hand, turned)
+    reset = np.tile(PAPER.scene.reset_joint_rad, 3)
+    np.testing.assert_allclose(turned.to_joint(plant.read()[0]), reset, atol=1e-6)
+    goal = reset + np.tile([0.1, 0.2, 0.3], 3)
+    for _ in range(60):
+        plant.advance(0.02, drives(turned, goal))
+    position, velocity, torque = plant.read()
+    # Gravity bends the joints by torque over stiffness, and the motors' torque says so.
+    np.testing.assert_allclose(turned.to_joint(position), goal, atol=0.05)
+    np.testing.assert_allclose(turned.sign * torque / hand.kp, goal - turned.to_joint(position), atol=0.01)
+    assert np.abs(velocity).max() < 0.05
+    for _ in range(60):
+        plant.advance(0.02, drives(turned, None))
+    assert np.abs(turned.to_joint(plant.read()[0]) - goal).max() > 0.3
+    assert np.abs(plant.read()[2]).max() == 0.0
+
+
+def test_limits_are_the_hands_in_the_motors_frame(hand, turned):
+    settings = turned.settings(hand, MODEL)
+    for axis, id in enumerate(turned.ids):
+        ends = turned.to_motor(np.stack([hand.lower, hand.upper]))[:, axis]
+        assert settings[id].lower_rad == min(ends) and settings[id].upper_rad == max(ends)
+        torque = settings[id].current_limit_a * MODELS[MODEL].torque_nm_per_a
+        assert torque == pytest.approx(hand.effort[axis], rel=1e-6)
+    far = Joints(turned.names, turned.ids, turned.sign, turned.offset + 3.0)
+    with pytest.raises(CalibrationError, match=r"f0_j1, motor 10: its range"):
+        far.settings(hand, MODEL)
+
+
+def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_path):
+    path = tmp_path / "motors.json"
+    turned.save(path, hand.name)
+    again = read_joints(path, hand)
+    assert again.ids == turned.ids
+    np.testing.assert_array_equal(again.offset, turned.offset)
+    record = json.loads(path.read_text())
+    record["motors"][1]["sign"] = 2
+    path.write_text(json.dumps(record))
+    with pytest.raises(CalibrationError, match=r"motors\.sign"):
+        read_joints(path, hand)
+    record["motors"][1] |= {"sign": 1, "id": 10}
+    path.write_text(json.dumps(record))
+    with pytest.raises(CalibrationError, match=r"motors\.id"):
+        read_joints(path, hand)
+    with pytest.raises(CalibrationError, match="f3_j1"):
+        read_joints(path, load_hand("dclaw4"))
+
+
+def test_the_simulated_hand_moves_through_the_bus(hand, turned):
+    pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
+    from vd.deploy.bus import MotorBus
+
+    motors = [Motor(MODELS[MODEL], id) for id in turned.ids]
+    with (
+        Twin(motors, NewtonHand(hand, turned)) as twin,
+        MotorBus(twin.path, turned.ids, MODEL, retries=4) as bus,
+    ):
+        bus.configure(turned.settings(hand, MODEL))
+        assert bus.torque(True) == {}
+        goal = np.tile([0.1, 0.6, -0.9], 3)
+        bus.write_goals(turned.to_motor(goal))
+        end = time.monotonic() + 1.5
+        while time.monotonic() < end:
+            state = bus.read_state()
+            time.sleep(0.05)
+        np.testing.assert_allclose(turned.to_joint(state.position), goal, atol=0.06)
+        assert not state.alert.any()
+
+
+def test_the_recorded_steps_are_the_solvers(hand):
+    """Fingers that press on each other: contacts come and go, and the solver's iterations differ."""
+    joints = uncalibrated(hand)
+    recorded, stepped = NewtonHand(hand, joints), NewtonHand(hand, joints)
+    goal = np.tile([0.3, hand.lower[1], hand.lower[2]], 3)
+    contacts = []
+    for _ in range(40):
+        recorded.advance(2.0 * recorded.cfg.physics_dt + 1e-9, drives(joints, goal))
+        stepped.advance(0.0, drives(joints, goal))
+        stepped._two_steps()
+        contacts.append(int(stepped._solver.mjw_data.nacon.numpy()[0]))
+        np.testing.assert_array_equal(recorded.read()[0], stepped.read()[0])
+    assert contacts[0] == 0 < max(contacts)
