@@ -21,7 +21,12 @@ from vd.gap.workflow import explain
 whole = pytest.mark.skipif(not os.environ.get("VD_ACCEPTANCE"), reason="minutes long; set VD_ACCEPTANCE=1")
 FRICTION = ("coulomb_friction", "dead_zone", "backlash")
 LOAD = ("coulomb_friction", "gravity_load", "encoder_bias", "asymmetric_friction")
-LOSSES = ("coulomb_friction", "load_friction", "torque_saturation", "supply_sag", "command_delay", "backlash")
+LOSSES = (
+    *("coulomb_friction", "load_friction", "torque_limit", "torque_saturation", "supply_sag"),
+    *("command_delay", "backlash"),
+)
+MAE_RAD = 0.036
+"""Goal for the pendulum at a gain that was left out [rad]."""
 
 
 def measured(shared_dir: Path, name: str) -> Recording:
@@ -71,8 +76,12 @@ def test_the_pendulum_is_predicted_at_gains_left_out(pendulum):
     gains = pendulum.held_out.left_out
     assert [group.condition for group in gains] == ["p_gain"] * 3
     # Coulomb and viscous friction alone leave 63.9 mrad, a load-dependent Stribeck model 51.7.
-    assert pendulum.held_out.identified_mae_rad < 0.040
-    assert all(group.identified_mae_rad < 0.5 * group.baseline_mae_rad for group in gains)
+    assert pendulum.held_out.identified_mae_rad < MAE_RAD
+    assert all(group.identified_mae_rad < 0.6 * group.baseline_mae_rad for group in gains)
+    # It swings freely once the torque is off, and what damping is left then is not dry friction's.
+    joint = pendulum.joints[0].joint
+    parameters = pendulum.identified.parameters[joint]
+    assert 0.005 < parameters["kd_off"] < 0.5 * parameters["kd"]
 
 
 @pytest.fixture(scope="module")
@@ -94,11 +103,11 @@ def test_long_recordings_are_analysed_in_pieces_from_rest(arm):
 
 
 @pytest.mark.slow
-def test_friction_and_dead_zone_tie_on_the_vertical_axis(arm, tmp_path):
+def test_friction_dead_zone_and_backlash_tie_on_the_vertical_axis(arm, tmp_path):
     effects = (*FRICTION, "gravity_load")
     report = explain(only(arm, "Rotation"), None, tmp_path, effects=effects, workers=1)
     assert report.verdict == "ambiguous" and not report.effects
-    assert {"coulomb_friction", "dead_zone"} <= set(report.ambiguous[0]) <= set(FRICTION)
+    assert set(report.ambiguous[0]) == set(FRICTION)
     assert report.held_out.reduction > 0.4
 
 
@@ -116,7 +125,8 @@ def test_whole_arm(arm, tmp_path):
     assert sum(share >= 0.4 for share in smaller) >= 5, smaller
     assert "gravity_load" in names(report, "Pitch") & names(report, "Elbow")
     assert "gravity_load" not in names(report, "Rotation")
-    assert any({"coulomb_friction", "dead_zone"} <= set(members) for members in report.ambiguous)
+    rotation = next(joint for joint in report.joints if joint.joint == "Rotation")
+    assert set(FRICTION) in [set(members) for members in rotation.open_sets]
 
 
 @whole
@@ -124,4 +134,6 @@ def test_whole_pendulum(shared_dir, tmp_path):
     report = explain(measured(shared_dir, "xl330_pendulum"), None, tmp_path)
     assert "load_friction" in names(report, "pendulum")
     assert "torque_saturation" not in names(report, "pendulum")
-    assert report.held_out.identified_mae_rad < 0.040
+    assert report.held_out.identified_mae_rad < MAE_RAD
+    assert any("torque_saturation" in members for members in report.ambiguous)
+    assert not {"command_delay", "backlash", "supply_sag"} & names(report, "pendulum")

@@ -120,11 +120,14 @@ class Selection(Judge):
         present, rivals, rows = self.search(baseline, baseline)
         trials += rows
         first = {t.name: t.fit for t in rows if t.round == 1 and not t.placebo and np.isfinite(t.gain)}
+        tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
         for name in sorted(first, key=lambda n: first[n].rmse):
-            near = NO_GAP * self.floor < present.held_out_rmse < NEAR * self.floor
-            if present.effects and not near:
-                break  # explained, or far beyond what another path would change
-            if name in present.effects or self.restarts == 0 or first[name].at_bound:
+            if present.effects and present.held_out_rmse <= NO_GAP * self.floor:
+                break
+            # Far from the floor another path would change little, unless its beginning was as good.
+            far = present.effects and present.held_out_rmse >= NEAR * self.floor
+            skipped = name not in tied if far else name in present.effects
+            if skipped or self.restarts == 0 or first[name].at_bound:
                 continue
             self.restarts -= 1
             other, fits, rows = self.search(baseline, first[name])
