@@ -26,6 +26,9 @@ START_SIGMA_DROP = tuple((sigma, drop) for sigma in (0.0015, 0.005, 0.015) for d
 """Where the search starts: [s] and the share of commands dropped."""
 ROUNDS = 2
 """Searches, with the rest of the model linearised anew before the second."""
+NOT_NEAR = 1.5
+"""Error of the best start, in that of a model without chance, from which a search has nothing to find. One of
+1.2 has come down to 0.9."""
 LARGEST = 2.0
 """Logarithm of the largest equivalent error squared [rad^2]: as good as none."""
 DAMPING = 1e-4
@@ -116,8 +119,8 @@ class JitterFit:
         """The jitter with the largest likelihood, as a fit like any other.
 
         Args:
-            worst: Squared error of a model without chance [rad^2]. Where no start of the search comes as near
-                there is no jitter to be found: the starts are dense beside what a jitter does.
+            worst: Squared error of a model without chance [rad^2]. Where no start of the search comes near
+                that (``NOT_NEAR``) there is no jitter to be found.
         """
 
         def total(x: np.ndarray) -> float:
@@ -128,7 +131,7 @@ class JitterFit:
         start = starts[int(np.argmin(totals))]
         sigma, drop = self._values(start)
         here = self.losses(sigma, drop)
-        if self._equivalent(here).sum() > worst:
+        if self._equivalent(here).sum() > NOT_NEAR**2 * worst:
             return self._as_fit(sigma, drop, here)
         for _ in range(ROUNDS):
             simplex = start + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0]])

@@ -199,11 +199,12 @@ class Judge:
         if RANDOM in after.effects:
             # Its errors are not held out: what it is compared with must not gain by being so either.
             fitted = replace(before, held_out=before.sse)
-            if 1.0 - after.rmse / before.rmse < PENALTY * len(EFFECTS[RANDOM].parameters):
-                return False, "what happens by chance fits no better than what does not"
             sampled = _likelihood_gain(fitted, after, self.weights)
+            # The share by which the widths shrink, as the likelihood has it: on the geometric mean.
+            whole = float(_likelihood_gain(fitted, after, np.ones((1, len(after.count))))[0])
+            gain = 1.0 - np.exp(-whole / after.count.sum())
         low = float(np.quantile(sampled, tail))
-        closed = np.sqrt(max(before.held_out_rmse**2 - after.held_out_rmse**2, 0.0))
+        closed = before.held_out_rmse * np.sqrt(max(1.0 - (1.0 - gain) ** 2, 0.0))
         if gain < MIN_GAIN:
             return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
         if low <= 0.0:

@@ -430,10 +430,11 @@ class Selection(Judge):
 
     def add_random(self, present: JointFit) -> JointFit:
         """A model with random delays as well."""
+        start = {**present.values, "command_delay.delay_s": JITTER_START_S}
         call = {
             "base": present.rows,
             "effects": present.effects,
-            "starts": [{**present.values, "command_delay.delay_s": JITTER_START_S}],
+            "starts": [start, {**start, **self.nominal}],
             "scales": self.scales,
             "iterations": FULL_ITERATIONS,
         }
