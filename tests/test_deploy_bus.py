@@ -33,7 +33,7 @@ def twin():
 @pytest.fixture
 def bus(twin):
     # The SDK waits 34 ms for an answer; on a busy machine the twin may not run for longer.
-    with MotorBus(twin.path, IDS, MODEL, retries=4) as opened:
+    with MotorBus(twin.path, IDS, MODEL, retries=20) as opened:
         yield opened
 
 
@@ -111,7 +111,7 @@ def test_speed_keeps_its_limit(bus, twin):
 
 
 def test_sync_read_answers_in_the_order_asked(twin):
-    with MotorBus(twin.path, IDS[::-1], MODEL, retries=4) as backwards:
+    with MotorBus(twin.path, IDS[::-1], MODEL, retries=20) as backwards:
         twin.plant.position[:] = [0.1, 0.2, 0.3]
         time.sleep(0.05)
         np.testing.assert_allclose(backwards.read_state().position, [0.3, 0.2, 0.1], atol=0.001)
@@ -198,7 +198,7 @@ def test_a_loose_cable_and_a_wrong_id_are_named(bus, twin):
     begin = time.monotonic()
     with pytest.raises(BusError, match="motor 11"):
         bus.read_state()
-    assert time.monotonic() - begin < 1.0  # five readings, each about 40 ms on an idle machine
+    assert time.monotonic() - begin < 4.0  # 21 readings, each about 40 ms on an idle machine
     twin.faults.cut_off = set()
     twin.motors[0].put("id", 13)
     assert list(bus.missing()) == [10]
@@ -207,7 +207,7 @@ def test_a_loose_cable_and_a_wrong_id_are_named(bus, twin):
 
 
 def test_a_motor_of_another_model_is_named():
-    with Twin([Motor(MODELS["XM430-W210"], 10)]) as twin, MotorBus(twin.path, [10], MODEL, retries=4) as bus:
+    with Twin([Motor(MODELS["XM430-W210"], 10)]) as twin, MotorBus(twin.path, [10], MODEL, retries=20) as bus:
         assert bus.missing() == {10: "is XM430-W210, not XH430-V210"}
 
 
@@ -314,8 +314,10 @@ def test_ten_thousand_broken_packets_make_no_hang_no_crash_and_no_position():
     motor = Motor(MODELS[MODEL], 1)
     with Twin([motor]) as twin, MotorBus(twin.path, [1], MODEL, retries=0) as bus:
         motor.put("return_delay_time", 0)
-        bus._port.setPacketTimeout = lambda length: bus._port.setPacketTimeoutMillis(3.0)
+        bus.retries = 20
         true = bus.read_state()
+        bus.retries = 0
+        bus._port.setPacketTimeout = lambda length: bus._port.setPacketTimeoutMillis(3.0)
         noise = Noise(twin, seed=0)
         slowest = 0.0
         while noise.sent < 10_000:
@@ -329,7 +331,8 @@ def test_ten_thousand_broken_packets_make_no_hang_no_crash_and_no_position():
                 np.testing.assert_array_equal(state.position, true.position)
             slowest = max(slowest, time.monotonic() - begin)
         assert slowest < 2.0
-        del twin._put
+        del twin._put, bus._port.setPacketTimeout
+        bus.retries = 20
         bus.read_state()
 
 
@@ -362,7 +365,7 @@ def test_the_twin_is_a_process_of_its_own():
     try:
         assert process.stdout is not None
         path = process.stdout.readline().strip()
-        with MotorBus(path, [1, 2], "XM430-W210", retries=4) as bus:
+        with MotorBus(path, [1, 2], "XM430-W210", retries=20) as bus:
             assert bus.missing() == {}
             bus.configure(dict.fromkeys(bus.ids, LIMITS))
             bus.torque(True)
@@ -385,7 +388,7 @@ def test_the_plant_can_be_another_one():
             self.goals = [drive.goal_rad for drive in drives]
 
     plant = Still(1)
-    with Twin([Motor(MODELS[MODEL], 1)], plant) as twin, MotorBus(twin.path, [1], MODEL, retries=4) as bus:
+    with Twin([Motor(MODELS[MODEL], 1)], plant) as twin, MotorBus(twin.path, [1], MODEL, retries=20) as bus:
         bus.configure({1: LIMITS})
         bus.torque(True)
         bus.write_goals(np.array([0.7]))

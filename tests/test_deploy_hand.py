@@ -92,7 +92,7 @@ def test_the_simulated_hand_moves_through_the_bus(hand, turned):
     motors = [Motor(MODELS[MODEL], id) for id in turned.ids]
     with (
         Twin(motors, NewtonHand(hand, turned)) as twin,
-        MotorBus(twin.path, turned.ids, MODEL, retries=4) as bus,
+        MotorBus(twin.path, turned.ids, MODEL, retries=20) as bus,
     ):
         bus.configure(turned.settings(hand, MODEL))
         assert bus.torque(True) == {}
