@@ -11,7 +11,7 @@ import vd.kernels.actuators as servo
 from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import Accepted, Explanation, Judge, cancelled, intervals, share
+from vd.gap.judge import Accepted, Explanation, Judge, Trial, cancelled, intervals, share
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
 from vd.gap.select import Selection
@@ -492,6 +492,33 @@ def test_a_fit_that_is_worse_than_without_begins_anew_nearly_off() -> None:
     fits = selection.fit_candidates(present)
     assert fits["coulomb_friction"].rmse == pytest.approx(0.006)
     assert begun[-1] == [pytest.approx(0.1 * begun[0][0])]
+
+
+def test_far_from_the_floor_the_search_begins_anew_where_first_effects_tied() -> None:
+    baseline, first = made_up((), 0.10), made_up(("torque_saturation",), 0.08)
+    beginnings = []
+
+    def search(_: JointFit, start: JointFit) -> tuple:
+        beginnings.append(start.effects)
+        if start is not baseline:
+            return made_up((*start.effects, "torque_limit"), 0.04), {}, []
+        names = {"torque_saturation": "named", "load_friction": "tied", "thermal_drift": "rejected"}
+        fits = {name: first if name == first.effects[0] else made_up((name,), 0.08) for name in names}
+        rows = [Trial(1, name, fits[name], 0.2, (0.1, 0.3), names[name]) for name in names]
+        return made_up(("torque_saturation", "coulomb_friction"), 0.05), {}, rows
+
+    class FoundError(Exception):
+        pass
+
+    def better(_: JointFit, present: JointFit) -> tuple[bool, str]:
+        raise FoundError(present)
+
+    selection, _ = searching([])
+    selection.search, selection.better = search, better  # type: ignore[method-assign, assignment]
+    with pytest.raises(FoundError) as found:
+        selection.explain(baseline)
+    assert beginnings == [(), ("load_friction",)]
+    assert found.value.args[0].effects == ("load_friction", "torque_limit")
 
 
 def test_a_search_that_fails_is_repeated_before_it_counts() -> None:
