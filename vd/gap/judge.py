@@ -200,9 +200,11 @@ class Judge:
             # Its errors are not held out: what it is compared with must not gain by being so either.
             fitted = replace(before, held_out=before.sse)
             sampled = _likelihood_gain(fitted, after, self.weights)
-            # The share by which the widths shrink, as the likelihood has it: on the geometric mean.
-            whole = float(_likelihood_gain(fitted, after, np.ones((1, len(after.count))))[0])
-            gain = 1.0 - np.exp(-whole / after.count.sum())
+            # The share by which the widths shrink, as the likelihood has it: on the geometric mean. The other
+            # model has a width of its own for every motion here, lest chance be credited with what any excuse
+            # for some of them would gain.
+            own = 0.5 * after.count * np.log(np.maximum(before.sse, 1e-30) / np.maximum(after.sse, 1e-30))
+            gain = 1.0 - float(np.exp(-own.sum() / after.count.sum()))
         low = float(np.quantile(sampled, tail))
         closed = before.held_out_rmse * np.sqrt(max(1.0 - (1.0 - gain) ** 2, 0.0))
         if gain < MIN_GAIN:
