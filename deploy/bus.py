@@ -19,6 +19,7 @@ from vd.deploy.control_table import (
     MODELS,
     POSITION_MODE,
     RAD_S_PER_COUNT,
+    TICK_MODULUS,
     Item,
     Model,
     describe_hardware_error,
@@ -26,7 +27,6 @@ from vd.deploy.control_table import (
     to_angle,
     to_counts,
 )
-from vd.deploy.motor import TICK_MODULUS
 from vd.deploy.packets import ALERT, MAX_ID, Failure
 
 BAUD_RATE = 1_000_000

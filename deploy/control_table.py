@@ -17,6 +17,8 @@ SIZE = 148
 EEPROM_END = 64
 """Items below are kept without power, and cannot be written while torque is on."""
 POSITION_MODE = 3
+TICK_MODULUS = 32768
+"""Milliseconds after which a motor's clock begins anew."""
 
 
 @dataclass(frozen=True)

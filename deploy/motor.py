@@ -6,6 +6,7 @@ from vd.deploy.control_table import (
     EEPROM_END,
     RAD_S_PER_COUNT,
     SIZE,
+    TICK_MODULUS,
     HardwareError,
     Model,
     table,
@@ -22,7 +23,6 @@ published."""
 AMBIENT_C, HEATING_C_PER_S, COOLING_S = 30.0, 0.5, 120.0
 """Case temperature: rise at full torque, and time constant of cooling."""
 GOALS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
-TICK_MODULUS = 32768
 
 
 @dataclass
