@@ -35,6 +35,9 @@ def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
     spec = JointSpec(0, 0, trajectories, folds, noise_floor(recording, 0), baseline_of(chain))
     with Team(Bench(recording, [chain], STEP_S, "cpu"), workers=1) as team:
         alone, simulated = answers(team, spec), team.simulated
+        again = answers(team, spec)
+        assert team.simulated == simulated, "a call that was made before is not made again"
+        assert all(one is other for one, other in zip(alone, again, strict=True))
     crowd = Crowd()
     with Team(Bench(recording, [chain], STEP_S, "cpu", crowd), workers=1) as team:
         together = answers(team, spec)

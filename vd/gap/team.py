@@ -1,7 +1,9 @@
 """Who fits: worker processes that each hold the recording, or on a GPU threads that simulate together."""
 
 import copy
+import hashlib
 import multiprocessing
+import pickle
 import threading
 import time
 from collections.abc import Sequence
@@ -114,6 +116,11 @@ class Bench:
         return Answer(result, problem.simulated, time.perf_counter() - begin)
 
 
+def _key(spec: JointSpec, call: Call) -> bytes:
+    """What a result depends on: searches that meet ask for the same fits."""
+    return hashlib.sha256(pickle.dumps((spec.chain, spec.joint, call))).digest()
+
+
 _bench: Bench | None = None
 """Of a worker process."""
 
@@ -141,6 +148,7 @@ class Team:
         self.bench, self.workers = bench, workers
         self.simulated = 0
         self.spent: dict[str, tuple[int, float]] = {}
+        self._known: dict[bytes, Any] = {}
         self._lock = threading.Lock()
         self._pool: Executor | None = None
 
@@ -167,24 +175,34 @@ class Team:
         return f"{self.simulated} motions simulated; summed over workers: {', '.join(times)}"
 
     def run(self, spec: JointSpec, calls: Sequence[Call]) -> list[Any]:
-        """Results of the calls, in order. May be used from several threads."""
-        if self._pool is None:
-            with self._lock:
-                answers = [self.bench.call(spec, call) for call in calls]
-        else:
-            if self.bench.crowd is not None:
-                with self._lock:
-                    self.bench.problem(spec)  # made once, before threads ask for it
-                self.bench.crowd.join(len(calls))
-            work = _work if self.bench.crowd is None else self._together
-            waiting: list[Future] = [self._pool.submit(work, spec, call) for call in calls]
-            answers = [future.result() for future in waiting]
+        """Results of the calls, in order; of a call that was made before, the same. For several threads."""
+        keys = [_key(spec, call) for call in calls]
         with self._lock:
-            for (name, _), answer in zip(calls, answers, strict=True):
+            known = {key: self._known[key] for key in keys if key in self._known}
+        new = {key: call for key, call in zip(keys, calls, strict=True) if key not in known}
+        answers = dict(zip(new, self._answers(spec, list(new.values())), strict=True))
+        with self._lock:
+            for key, answer in answers.items():
+                name = new[key][0]
                 rollouts, seconds = self.spent.get(name, (0, 0.0))
                 self.spent[name] = rollouts + answer.simulated, seconds + answer.seconds
                 self.simulated += answer.simulated
-        return [answer.result for answer in answers]
+                self._known[key] = known[key] = answer.result
+        return [known[key] for key in keys]
+
+    def _answers(self, spec: JointSpec, calls: Sequence[Call]) -> list[Answer]:
+        """Run calls."""
+        if self._pool is None:
+            with self._lock:
+                return [self.bench.call(spec, call) for call in calls]
+        crowd = self.bench.crowd
+        if crowd is not None:
+            with self._lock:
+                self.bench.problem(spec)  # made once, before threads ask for it
+            crowd.join(len(calls))
+        work = _work if crowd is None else self._together
+        waiting: list[Future] = [self._pool.submit(work, spec, call) for call in calls]
+        return [future.result() for future in waiting]
 
     def _together(self, spec: JointSpec, call: Call) -> Answer:
         """Run a call in one of the threads that simulate together."""
