@@ -107,7 +107,11 @@ def test_a_small_excess_tells_apart_only_if_most_motions_show_it(judge: Judge) -
     somewhere = np.full(10, np.sqrt(0.996) * FLOOR)
     somewhere[:2] = np.sqrt(1.07) * FLOOR  # the same in all, but most motions say the opposite
     assert judge.tied(winner, made_up(("dead_zone",), somewhere))[0]
-    assert judge.tied(winner, made_up(("dead_zone",), np.sqrt(1.002) * FLOOR))[0], "what models leave"
+    slightly = made_up(("dead_zone",), np.sqrt(1.002) * FLOOR)
+    assert judge.tied(winner, slightly)[0], "what models leave"
+    richer = replace(slightly, x=np.zeros(len(slightly.x) + 2))
+    assert not judge.tied(winner, richer)[0], "more parameters that do worse"
+    assert judge.tied(winner, replace(richer, sse=0.999 * winner.sse))[0]
 
 
 def test_a_fuller_form_that_is_a_little_better_makes_a_set(judge: Judge) -> None:
@@ -144,6 +148,33 @@ def test_friction_with_a_direction_stands_for_dry_friction_and_an_offset(tmp_pat
     assert [effect.name for effect in report.effects] == ["asymmetric_friction"]
     assert report.ambiguous == (("asymmetric_friction", "coulomb_friction", "encoder_bias"),)
     assert report.open_sets == () and "stands for" in verdict_sentence(report)
+
+
+@pytest.mark.parametrize(("excess", "merged"), [(1.0, True), (1.1, False)])
+def test_dry_friction_and_an_offset_are_put_together_where_one_cause_does_as_well(
+    excess: float, merged: bool
+) -> None:
+    one = made_up(("torque_limit", "asymmetric_friction"), FLOOR * np.sqrt(excess))
+    two = made_up(("torque_limit", "coulomb_friction", "encoder_bias"), FLOOR)
+    scales = Scales(3.0, 0.5, 2.0, 6.0, 70.0, 1e-3, 1e-3, 12.0)
+
+    def run(calls: list[tuple[str, dict[str, object]]]) -> list[object]:
+        wanted = [tuple(options["effects"]) for _, options in calls]  # type: ignore[arg-type]
+        return [one if effects == one.effects else made_up(effects, 0.01) for effects in wanted]
+
+    selection = Selection(
+        floor=FLOOR,
+        weights=resamples(10, np.random.default_rng(0)),
+        run=run,  # type: ignore[arg-type]
+        joint=0,
+        others=(),
+        candidates=("asymmetric_friction", *two.effects),
+        scales=scales,
+    )
+    found = selection.put_together(two)
+    assert (found is one) == merged and (found is two) != merged
+    assert selection.apart == ({"asymmetric_friction": two} if merged else {})
+    assert selection.put_together(one) is one, "nothing to put together"
 
 
 def test_a_bound_is_no_estimate(judge: Judge) -> None:

@@ -32,9 +32,9 @@ MIN_GAIN = 0.05
 """Share of the held-out RMSE that an effect must remove."""
 MIN_GAIN_FLOORS = 0.7
 """Gap that an effect must close, as sqrt(before^2 - after^2), in noise floors."""
-MIN_SHARE = 0.01
-"""The same in whole gaps: no integrator's model of a large effect is better than that. The right models of
-an acceleration limit leave 0.002 of gaps of 300 noise floors."""
+MIN_SHARE = 0.02
+"""The same in whole gaps: no fit of a large effect is better than that. With half of it, an acceleration
+limit of 300 noise floors, whose optimum is sharp, comes with a second effect that is not there."""
 NAMED = 0.9
 """Share of the resamples that must choose an effect for it to be named."""
 PENALTY = 0.01
@@ -234,6 +234,9 @@ class Judge:
         low, high = interval(error - best)
         if winner.rmse < EXPLAINED * self.floor:
             excess = (other.rmse**2 - winner.rmse**2) / self.floor**2
+            if excess > 0.0:  # what needs more parameters to do worse is no equal
+                more = max(len(other.x) - len(winner.x), 0)
+                excess += 2.0 * PENALTY * more * (winner.rmse / self.floor) ** 2
             if loose or excess < SMALL_EXCESS_FLOORS**2 or excess >= EXCESS_FLOORS**2:
                 return excess < (EXCESS_FLOORS if loose else SMALL_EXCESS_FLOORS) ** 2, (low, high)
             return float(np.quantile(self.weights @ (other.sse - winner.sse), TIE_TAIL)) <= 0.0, (low, high)

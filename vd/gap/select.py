@@ -148,6 +148,10 @@ class Selection(Judge):
             trials += rows
             if chance is not present:
                 present, rivals = chance, {}
+        together = self.put_together(present)
+        if together is not present:
+            present = together
+            rivals = {name: self.rivals(present, name) for name in present.effects}
         evidence = self.settle(trials, present)
         if not present.effects or RANDOM in present.effects:
             return self.conclude(baseline, present, rivals, evidence, loose)
@@ -357,6 +361,30 @@ class Selection(Judge):
             call = self.call(present, friction, given, FULL_ITERATIONS)
             calls.append(("fit", {**call[1], "effects": (*present.effects, friction, name)}))
         return self.run(calls)
+
+    def put_together(self, present: JointFit) -> JointFit:
+        """The model with asymmetric friction in the place of dry friction and an offset, if that is as good.
+
+        One cause is simpler than two that are the same as it.
+        """
+        usable = {*self.candidates} - {*present.effects, *self.vetoes}
+        parts = [
+            {friction, offset}
+            for friction in ("coulomb_friction", "dead_zone")
+            for offset in ("encoder_bias", "gravity_load")
+            if {friction, offset} <= {*present.effects}
+        ]
+        if not parts or FRICTION_AND_LOAD not in usable or RANDOM in present.effects:
+            return present
+        kept = [name for name in present.effects if name not in parts[0]]
+        without = self.refit(present, kept)
+        starts = self.starts(without, sizes(FRICTION_AND_LOAD, self.others, self.scales))
+        fit = self.run([self.call(without, FRICTION_AND_LOAD, starts, FULL_ITERATIONS)])[0]
+        if fit.at_bound or not self.tied(present, fit)[0]:
+            return present
+        self.report(f"~ {' and '.join(sorted(parts[0]))} are {FRICTION_AND_LOAD}")
+        self.apart[FRICTION_AND_LOAD] = present
+        return fit
 
     def fit_candidates(
         self, present: JointFit, skip: Sequence[str] = (), vetoed: Sequence[str] = ()
