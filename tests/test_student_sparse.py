@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import vd.student
 from vd.kernels.voxels import voxelise
 from vd.student import sparse
 from vd.student.sites import Sites
@@ -170,6 +172,13 @@ def test_parts_give_the_same_as_the_whole(device, monkeypatch):
     assert len(parts(sites.neighbours, 4)) > 2
     for one, other in zip(whole, gradients(), strict=True):
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-5)
+
+
+def test_warns_and_gathers_where_the_fused_kernels_cannot_be_had(monkeypatch):
+    monkeypatch.setitem(sys.modules, "vd.student.fused", None)
+    monkeypatch.delattr(vd.student, "fused", raising=False)
+    with pytest.warns(UserWarning, match="Triton"):
+        assert sparse.fused_kernels.__wrapped__(torch.device("cpu")) is None
 
 
 def fused_cases(device, channels):

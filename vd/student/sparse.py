@@ -13,6 +13,7 @@ features, and moving it there and back takes longer than everything else.
 import functools
 import math
 import warnings
+from subprocess import SubprocessError
 from types import ModuleType
 from typing import Any
 
@@ -41,7 +42,7 @@ def fused_kernels(device: torch.device) -> ModuleType | None:
             torch.zeros(1, 1, dtype=torch.int32, device=device),
             torch.ones(1, 1, 1, device=device),
         )
-    except (ImportError, RuntimeError, OSError) as error:
+    except (ImportError, RuntimeError, OSError, SubprocessError) as error:  # no Triton, compiler or headers
         warnings.warn(
             f"the student's convolutions are many times slower without Triton: {error}", stacklevel=2
         )
