@@ -244,13 +244,18 @@ from pathlib import Path
 import torch
 torch.set_num_threads(1)
 sys.path.insert(0, {tests!r})
+from types import SimpleNamespace
 from student_dummy import make_dagger, make_student_runner, weights
+from train_dummy import DummyEnv
+import vd.train.student.dagger as dagger_module
 from vd.train.distributed import join_processes
+DummyEnv.scene = SimpleNamespace(object_body=1)
+dagger_module.poses = lambda frames, body: frames["target"].repeat(1, 1, 5)[..., :9]
 rank, folder = int(os.environ["RANK"]), Path({folder!r})
-dagger = make_dagger(seed=rank, world_size=2)  # other worlds, and other weights until they are shared
+dagger = make_dagger(seed=rank, world_size=2, pose_weight=1.0)  # other worlds; other weights at first
 runner = make_student_runner(folder, dagger, processes=join_processes("cpu"))
 runner.learn(2)
-result = [weights(dagger.student).tolist(), float(dagger.collect().label.sum())]
+result = [weights(dagger.network).tolist(), float(dagger.collect().label.sum())]
 (folder / f"rank{{rank}}.json").write_text(json.dumps(result))
 runner.shutdown()
 """

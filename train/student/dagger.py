@@ -115,8 +115,9 @@ class Dagger:
             width, inside = student.cfg.encoder.embedding, student.cfg.distance_hidden
             layers = (nn.Linear(width, inside), nn.GELU(), nn.Linear(inside, POSE_VALUES))
             self.pose = nn.Sequential(*layers).to(self.device)
-        self._all = nn.ModuleList([student, *([] if self.pose is None else [self.pose])])
-        self.optimizer = make_optimizer(self._all, cfg.learning_rate, amsgrad=cfg.amsgrad)
+        self.network = nn.ModuleList([student, *([] if self.pose is None else [self.pose])])
+        """All that is trained."""
+        self.optimizer = make_optimizer(self.network, cfg.learning_rate, amsgrad=cfg.amsgrad)
         self.samples_per_iteration = cfg.rollout_steps * env.num_envs
         self.iteration = 0
         """Iterations completed; decides the teacher's share."""
@@ -288,7 +289,7 @@ class Dagger:
                 torch.distributed.broadcast(buffer, 0)
         losses = dict(zip(STATISTICS, steps.mean(dim=0).tolist(), strict=True))
         bad = [name for name, value in losses.items() if not math.isfinite(value)]
-        if bad or not all_finite(self._all):
+        if bad or not all_finite(self.network):
             raise TrainingDivergedError(
                 f"{', '.join(bad) or 'weights'} not finite after the update; {LOWER_RATES}"
             )
@@ -413,7 +414,7 @@ class Dagger:
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate()
         norm = descend(
-            self._all,
+            self.network,
             self.optimizer,
             imitation + self.cfg.distance_weight * distance + self.cfg.pose_weight * pose,
             self.cfg.grad_norm,

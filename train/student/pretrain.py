@@ -210,8 +210,8 @@ class Pretrainer:
     ) -> None:
         self.scenes, self.student, self.cfg = scenes, student, cfg
         self.heads = PretrainHeads(student, cfg, objects).to(student.mean.weight.device)
-        self._all = nn.ModuleList([student, self.heads])
-        self.optimizer = make_optimizer(self._all, cfg.learning_rate, amsgrad=cfg.amsgrad)
+        self.network = nn.ModuleList([student, self.heads])
+        self.optimizer = make_optimizer(self.network, cfg.learning_rate, amsgrad=cfg.amsgrad)
         self.samples_per_iteration = cfg.batch * cfg.steps
         self._world_size = world_size
 
@@ -241,7 +241,7 @@ class Pretrainer:
                 torch.distributed.broadcast(buffer, 0)
         figures: dict[str, float | None] = dict(zip(rows[0], means.tolist(), strict=True))
         bad = [name for name, value in figures.items() if value is None or not math.isfinite(value)]
-        if bad or not all_finite(self._all):
+        if bad or not all_finite(self.network):
             raise TrainingDivergedError(f"{', '.join(bad) or 'weights'} not finite; {LOWER_RATES}")
         return figures
 
@@ -309,5 +309,5 @@ class Pretrainer:
     def _step(self) -> dict[str, torch.Tensor]:
         sites, targets = self.scenes.draw()
         loss, figures = self.losses(sites, targets)
-        norm = descend(self._all, self.optimizer, loss, self.cfg.grad_norm, self._world_size)
+        norm = descend(self.network, self.optimizer, loss, self.cfg.grad_norm, self._world_size)
         return {**figures, "loss/total": loss.detach(), "loss/grad_norm": norm}

@@ -33,6 +33,8 @@ class Learner(Protocol):
     """What improves a student: imitation (:class:`vd.train.student.dagger.Dagger`) or pre-training."""
 
     student: Student
+    network: torch.nn.Module
+    """All that it trains: the student, and heads of the training alone."""
     samples_per_iteration: int
 
     def iterate(self, stopping: Callable[[], bool]) -> dict[str, float | None] | None:
@@ -139,7 +141,7 @@ class StudentRunner:
         first = self.iteration
         total = self.total_iterations if iterations is None else first + iterations
         if self.is_distributed:
-            for value in self.learner.student.state_dict().values():
+            for value in self.learner.network.state_dict().values():
                 torch.distributed.broadcast(value, 0)
         log = (
             ProgressFile(self.run.run_dir, tensorboard=self.run.tensorboard, done=first)
