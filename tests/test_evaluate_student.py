@@ -78,6 +78,14 @@ def test_worlds_are_seen_in_parts_without_a_difference(env, monkeypatch):
             env.step(wp.from_torch(action.contiguous()))
         found.append(torch.cat([action, actor.predicted[:, None]], dim=1))
     torch.testing.assert_close(*found, atol=1e-4, rtol=0.0)
+    env.load_state_dict(state)
+    actor = StudentActor(env, make_student(goal="separate"))
+    actor.active = torch.tensor([True, False, True])
+    some = actor.act(wp.to_torch(env.observation))
+    env.load_state_dict(state)
+    whole = StudentActor(env, make_student(goal="separate")).act(wp.to_torch(env.observation))
+    torch.testing.assert_close(some[[0, 2]], whole[[0, 2]], atol=1e-4, rtol=0.0)
+    assert not some[1].any()
     assert (actor.predicted > 0.0).any() or (actor.predicted < 0.0).any()
 
 

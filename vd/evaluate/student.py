@@ -23,6 +23,7 @@ class StudentActor:
         num_actions: D.
         rendered: Whether it sees by a depth camera.
         predicted: Its distance to the goal before the latest action [rad], shape [N].
+        active: Where it acts, shape [N], bool; elsewhere its actions are 0 and cost nothing.
     """
 
     def __init__(self, env: Any, student: SavedStudent, *, rendered: bool | None = None, seed: int = 0):
@@ -58,6 +59,7 @@ class StudentActor:
         self._hidden = self._student.initial_hidden(env.num_worlds)
         self._steps = wp.to_torch(env.step_count)
         self.predicted = self._hidden.new_zeros(env.num_worlds)
+        self.active = torch.ones(env.num_worlds, dtype=torch.bool, device=self._hidden.device)
 
     def act(self, _observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] for what is seen now; the teacher's observation is not looked at.
@@ -67,15 +69,13 @@ class StudentActor:
         frame = self._view.frame()
         self._hidden.masked_fill_((self._steps == 0)[:, None], 0.0)
         senses = self._student.senses(frame)
-        worlds = torch.arange(self.env.num_worlds, device=self._hidden.device)
-        means = []
+        mean = frame["action"].new_zeros(frame["action"].shape)
         with torch.no_grad():
-            for rows in worlds.split(CLOUDS):
-                sites = self._view.sites(
-                    {key: value[rows] for key, value in frame.items()}, rows, augment=False
-                )
+            for rows in self.active.nonzero().flatten().split(CLOUDS):
+                seen = {key: value[rows] for key, value in frame.items()}
+                sites = self._view.sites(seen, rows, augment=False)
                 output = self._student.act(sites[0], senses[rows], self._hidden[rows], *sites[1:])
                 self._hidden[rows] = output.hidden
                 self.predicted[rows] = output.distance[:, -1]
-                means.append(output.mean)
-        return torch.cat(means)
+                mean[rows] = output.mean
+        return mean

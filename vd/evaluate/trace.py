@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 import warp as wp
 
 from vd.evaluate.result import Episode
@@ -104,7 +105,7 @@ def record(
 
     Args:
         env: An environment that no state ends (``success.rotation_rad`` of NEVER_RAD), as it was built.
-        policy: What acts; one with ``predicted`` is a student.
+        policy: What acts; one with ``predicted`` is a student, and is told where it need not act any more.
         episodes: M.
         starts: Initial orientations [K, M, 4]; None: the environment draws them, all before the first step.
         goals: Goal orientations [K, M, 4], with ``starts``.
@@ -170,6 +171,8 @@ def _record_round(
             env.sim.place_table(present=False)
         living = place[0][alive], place[1][alive]
         trace.action_norm[(*living, step)] = smoothed.norm(dim=-1).cpu().numpy()[worlds][alive]
+        if trace.predicted is not None:
+            policy.active = _mask(worlds[alive], env.num_worlds, smoothed.device)
         action = policy.act(wp.to_torch(env.observation))
         if trace.predicted is not None:
             trace.predicted[(*living, step)] = policy.predicted.cpu().numpy()[worlds][alive]
@@ -183,6 +186,13 @@ def _record_round(
         on_step()
         if not alive.any():
             return
+
+
+def _mask(worlds: np.ndarray, count: int, device: torch.device) -> torch.Tensor:
+    """True at some worlds [N]."""
+    mask = torch.zeros(count, dtype=torch.bool, device=device)
+    mask[torch.from_numpy(worlds).to(device)] = True
+    return mask
 
 
 def _write_errors(
