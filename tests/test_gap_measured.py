@@ -77,7 +77,7 @@ def test_the_pendulum_is_predicted_at_gains_left_out(pendulum):
     assert [group.condition for group in gains] == ["p_gain"] * 3
     # Coulomb and viscous friction alone leave 63.9 mrad, a load-dependent Stribeck model 51.7.
     assert pendulum.held_out.identified_mae_rad < MAE_RAD
-    assert all(group.identified_mae_rad < 0.6 * group.baseline_mae_rad for group in gains)
+    assert all(group.identified_mae_rad < 0.8 * group.baseline_mae_rad for group in gains)
     # It swings freely once the torque is off, and what damping is left then is not dry friction's.
     joint = pendulum.joints[0].joint
     parameters = pendulum.identified.parameters[joint]
