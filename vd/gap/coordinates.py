@@ -1,7 +1,7 @@
 """Coordinates in which the servo model is fitted, and sizes at which the search for an effect starts."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,8 @@ GRAVITY = EFFECTS["gravity_load"].parameters[0]
 BASELINE_PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAVITY)}
 """Everything that a baseline can fit, by name."""
 
+NEARLY_OFF = 0.1
+"""Share of a starting size from which a fit begins anew that ended worse than without the effect."""
 LOG_STEP = 0.01
 """Finite-difference step of a logarithmic coordinate: above the noise of single precision."""
 LINEAR_STEP = 0.05
@@ -223,3 +225,27 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
     if effect in SMOOTHING:
         starts += [{**start, "inertia": LIGHT * scales.inertia} for start in starts]
     return starts
+
+
+def smaller(start: Mapping[str, float]) -> dict[str, float] | None:
+    """A start at which the effect is nearly off; None for one whose zero is not off."""
+    parameters = {key: _parameter(key) for key in start if "." in key}
+    if any(p.lower > 0.0 and p.neutral == 0.0 for p in parameters.values()):
+        return None
+    return {
+        key: NEARLY_OFF * value if parameters[key].lower == 0.0 else value
+        for key, value in start.items()
+        if key in parameters
+    }
+
+
+def best_two(starts: Sequence[dict[str, float]]) -> list[dict[str, float]]:
+    """The best of starts in order of promise, and the best that changes other parameters, if any does."""
+    other = next((start for start in starts[1:] if start.keys() != starts[0].keys()), None)
+    return [starts[0], *([other] if other is not None else starts[1:2])]
+
+
+def _parameter(key: str) -> Parameter:
+    """The parameter of an effect by its key."""
+    effect, _, name = key.rpartition(".")
+    return next(p for p in EFFECTS[effect].parameters if p.name == name)

@@ -10,10 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.coordinates import Scales, sizes, torque_power
+from vd.gap.coordinates import Scales, best_two, sizes, smaller, torque_power
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import AT_FLOOR, EXPLAINED, NESTED, NO_GAP, RANDOM, Explanation, Judge, Trial, cancelled
-from vd.gap.result import parameter_of
 from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.effects import EFFECTS
 
@@ -35,8 +34,6 @@ BEHIND = 3.0
 """Finalists have at most this many times the error of the best after screening."""
 HOPELESS = 1.5
 """The same factor half way: those beyond it are not fitted to the end."""
-NEARLY_OFF = 0.1
-"""Share of a starting size from which a fit begins anew that ended worse than without the effect."""
 SCREEN_ITERATIONS = 6
 HALF_ITERATIONS = 4
 WIDE = 15.0
@@ -418,7 +415,7 @@ class Selection(Judge):
                 self.call(
                     present,
                     name,
-                    self.starts(present, _two([flat[i][1] for i in order[name]])),
+                    self.starts(present, best_two([flat[i][1] for i in order[name]])),
                     SCREEN_ITERATIONS,
                 )
                 for name in chosen
@@ -445,7 +442,7 @@ class Selection(Judge):
         fits = {fit.effects[-1]: fit for fit in (*last, *screened[len(finalists) :])}
         # Nothing added can do worse than nothing: such a fit began too large, and no descent led back.
         astray = [name for name, fit in fits.items() if fit.rmse > present.rmse]
-        small = {name: _smaller(flat[order[name][0]][1]) for name in astray}
+        small = {name: smaller(flat[order[name][0]][1]) for name in astray}
         again = [name for name in astray if small[name] is not None]
         calls = [
             self.call(present, name, [{**present.values, **(small[name] or {})}], FULL_ITERATIONS)
@@ -598,21 +595,3 @@ class Selection(Judge):
         values = {k: v for k, v in present.values.items() if k.rpartition(".")[0] in ("", *effects)}
         call = {"base": rows, "effects": tuple(effects), "starts": [values], "scales": self.scales}
         return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0]
-
-
-def _smaller(start: Mapping[str, float]) -> dict[str, float] | None:
-    """A start at which the effect is nearly off; None for one whose zero is not off."""
-    parameters = {key: parameter_of(key) for key in start if "." in key}
-    if any(p.lower > 0.0 and p.neutral == 0.0 for p in parameters.values()):
-        return None
-    return {
-        key: NEARLY_OFF * value if parameters[key].lower == 0.0 else value
-        for key, value in start.items()
-        if key in parameters
-    }
-
-
-def _two(starts: Sequence[dict[str, float]]) -> list[dict[str, float]]:
-    """The best of starts in order of promise, and the best that changes other parameters, if any does."""
-    other = next((start for start in starts[1:] if start.keys() != starts[0].keys()), None)
-    return [starts[0], *([other] if other is not None else starts[1:2])]
