@@ -155,3 +155,20 @@ def count_goals_kernel(
         wp.atomic_add(counts, 1, 1.0)
     if fell[world] != 0:
         wp.atomic_add(counts, 2, 1.0)
+
+
+@wp.kernel
+def copy_columns_kernel(
+    # In:
+    values_in: wp.array2d[float],
+    # Out:
+    values_out: wp.array2d[float],
+):
+    """Copy the first columns of a wider array; copies of slices cannot be in a graph. Launch: [N, D].
+
+    Args:
+        values_in: Values, shape [N, >= D].
+        values_out: Its first columns, shape [N, D].
+    """
+    world, column = wp.tid()
+    values_out[world, column] = values_in[world, column]

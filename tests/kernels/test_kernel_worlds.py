@@ -5,11 +5,12 @@ import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, SENTINEL, device_array
+from kernel_oracle import EXAMPLES, SENTINEL, device_array, unwritten
 
 from vd.kernels.contacts import pair_force_kernel
 from vd.kernels.guard import collect_overflow_kernel, guard_kernel
 from vd.kernels.worlds import (
+    copy_columns_kernel,
     count_goals_kernel,
     record_step_kernel,
     redraw_mask_kernel,
@@ -237,3 +238,16 @@ def test_gains_force_pose_masks_and_counts_go_where_they_belong(device):
         device=device,
     )
     np.testing.assert_array_equal(counts.numpy(), [5.0, 4.0, 4.0])
+
+
+def test_the_first_columns_are_copied(device):
+    wide = np.random.default_rng(0).normal(size=(3, 7)).astype(np.float32)
+    narrow = unwritten((3, 4), float, device)
+    wp.launch(
+        copy_columns_kernel,
+        dim=(3, 4),
+        inputs=[device_array(wide, float, device)],
+        outputs=[narrow],
+        device=device,
+    )
+    np.testing.assert_array_equal(narrow.numpy(), wide[:, :4])

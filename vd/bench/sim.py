@@ -61,9 +61,7 @@ def seconds_per_call(function: Any, calls: int, device: str) -> float:
 
 
 def captured(function: Any, device: str) -> Any:
-    """``function`` as one CUDA graph launch; itself on the CPU."""
-    if device == "cpu":
-        return function
+    """``function`` as the launch of one graph."""
     with wp.ScopedCapture(device=device) as capture:
         function()
     return lambda: wp.capture_launch(capture.graph)

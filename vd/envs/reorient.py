@@ -1,7 +1,7 @@
 """The in-hand reorientation environment: one call is one 12 Hz control step of N worlds.
 
 World frame: z up, table top at z = 0. SI units, radians, quaternions xyzw. Everything but the
-physics is Warp kernels; a step copies nothing to the host, and on CUDA it is one captured graph.
+physics is Warp kernels; a step copies nothing to the host, and it is one captured graph, on CPU and CUDA.
 """
 
 from pathlib import Path
@@ -27,7 +27,7 @@ from vd.kernels.resets import episode_kernel, reset_kernel
 from vd.kernels.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.shapes import shape_observation_size
-from vd.kernels.worlds import count_goals_kernel, record_step_kernel, world_mask_kernel
+from vd.kernels.worlds import copy_columns_kernel, count_goals_kernel, record_step_kernel, world_mask_kernel
 from vd.paper import PAPER
 from vd.sim.replay import save_dump
 from vd.sim.scene import build_scene
@@ -200,9 +200,7 @@ class ReorientEnv:
         """
         if action.ptr != self.action.ptr:
             wp.copy(self.action, action)
-        if self.device == "cpu":
-            self.launch_step()
-        elif not self._kernels_loaded:
+        if not self._kernels_loaded:
             self.launch_step()  # before the capture, also in a run that resumes at a later step
             self._kernels_loaded = True
         else:
@@ -242,7 +240,7 @@ class ReorientEnv:
         )
 
     def launch_step(self) -> None:
-        """Launch every kernel of a control step; :meth:`step` replays them as one graph on CUDA."""
+        """Launch every kernel of a control step; :meth:`step` replays them as one graph."""
         n, d, p = self.num_worlds, self.num_actions, self.parameters
         sim = self.sim
         self._apply_action()
@@ -349,7 +347,10 @@ class ReorientEnv:
         n, d, sim = self.num_worlds, self.num_actions, self.sim
         if sim.servo is not None:
             # Only the servo knows what it had in the last physics step: a late command, a limited torque.
-            wp.copy(self.effort, sim.solver.mjw_data.qfrc_actuator[:, :d])
+            torque = sim.solver.mjw_data.qfrc_actuator
+            wp.launch(
+                copy_columns_kernel, dim=(n, d), inputs=[torque], outputs=[self.effort], device=self.device
+            )
             return
         wp.launch(
             joint_effort_kernel,
