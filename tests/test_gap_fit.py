@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import pytest
 import vd.kernels.actuators as servo
 from vd.gap.chain import chains
 from vd.gap.coordinates import coordinate
+from vd.gap.descent import Descent, LeastSquares
 from vd.gap.design import design
 from vd.gap.find import findings, phases
 from vd.gap.fit import JointProblem, candidates
@@ -195,6 +197,27 @@ def test_held_out_errors_see_no_fold_that_they_predict() -> None:
     fit = problem.fit(base, ("encoder_bias",), [bias], scales)
     assert fit.held_out[0] > fit.sse[0]
     assert fit.held_out.sum() > fit.sse.sum()
+
+
+def test_a_refit_that_finds_no_way_down_is_not_taken_for_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    recording = recorded({})
+    odd = recording.trajectories[0]
+    parts = (replace(odd, position=odd.position + 0.05), *recording.trajectories[1:])
+    problem = problem_of(replace(recording, trajectories=parts))
+    base = problem.rollouts.chain.start_row.copy()
+    scales = problem.scales(base[0], 0.01)
+    bias = {"encoder_bias.bias_rad": 0.01}
+    one_step = problem.fit(base, ("encoder_bias",), [bias], scales)
+    descend = LeastSquares.descend
+
+    def stays(self: LeastSquares, x: np.ndarray, iterations: int, **given: Any) -> Descent:
+        known = given.get("known")
+        return descend(self, x, iterations, **given) if known is None else replace(known, x=x.copy())
+
+    monkeypatch.setattr(LeastSquares, "descend", stays)
+    stuck = problem.fit(base, ("encoder_bias",), [bias], scales, refits=3)
+    assert stuck.held_out == pytest.approx(one_step.held_out)
+    assert stuck.held_out[0] > stuck.sse[0]
 
 
 def test_noise_floor_is_the_larger_of_quantum_and_noise() -> None:

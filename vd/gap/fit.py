@@ -262,6 +262,9 @@ class JointProblem:
                 start, residual=start.residual * inside, jacobian=start.jacobian * inside[:, None]
             )
             x = model.descend(start.x, iterations, keep=~out, known=start).x
+            # A refit that found no way down is still the fit that has seen the fold.
+            for stuck in np.flatnonzero((x == start.x).all(axis=1)):
+                x[stuck] = self._without(fit, out[stuck])
         else:
             x = np.stack([self._without(fit, fold) for fold in out])
         residual = self.residuals(self.rows(fit.rows, fit.coordinates, x), keep=out)
