@@ -62,7 +62,7 @@ class Motor:
     def get(self, name: str) -> int:
         """Value of an item."""
         item = self.items[name]
-        return item.from_bytes(self.memory[item.address : item.address + item.size])
+        return item.from_bytes(bytes(self.memory[item.address : item.address + item.size]))
 
     def put(self, name: str, value: int) -> None:
         """Set an item, as the motor itself does, without any rule."""

@@ -133,7 +133,7 @@ class Twin:
         motor.heard()
         single = SINGLE.get(packet.instruction)
         if single is None:
-            failure, data = Failure.INSTRUCTION, b""
+            failure, data = int(Failure.INSTRUCTION), b""
         else:
             failure, data = single(motor, packet.parameters)
         level = motor.get("status_return_level")
