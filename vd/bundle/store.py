@@ -5,7 +5,6 @@ import json
 import shutil
 import tempfile
 from dataclasses import dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +34,7 @@ from vd.envs.cfg import ReorientCfg
 from vd.files import write_json
 from vd.policy import PolicySpec, TrainedPolicy
 from vd.sensors.cfg import DepthCameraCfg
+from vd.versions import installed_versions
 
 if TYPE_CHECKING:
     from vd.student.saved import SavedStudent
@@ -71,7 +71,7 @@ def write_teacher(folder: Path, policy: TrainedPolicy, hand: HandModel) -> Contr
         network=to_dict(policy.spec),
         stopping=None,
         provenance=_provenance(policy.task, "", None, policy.iteration, policy.env_steps),
-        software=_software(),
+        software=installed_versions(_PACKAGES),
     )
     _write(folder, contract, policy.weights, teacher_golden(policy))
     return contract
@@ -105,7 +105,7 @@ def write_student(folder: Path, student: "SavedStudent", hand: HandModel) -> Con
             _provenance(student.task, spec.teacher, spec.stage, student.iteration, student.env_steps),
             depth=student.depth if rendered else {},
         ),
-        software=_software(),
+        software=installed_versions(_PACKAGES),
     )
     _write(folder, contract, student.network.state_dict(), student_golden(student, hand))
     return contract
@@ -223,16 +223,6 @@ def _provenance(
         env_steps=env_steps,
         task={**task, "objects": list(objects)},
     )
-
-
-def _software() -> dict[str, str]:
-    found = {}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 def _write(folder: Path, contract: Contract, weights: dict[str, Any], golden: Golden) -> None:

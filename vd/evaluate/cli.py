@@ -290,17 +290,11 @@ def worlds_for(num_objects: int, episodes: int, device: str, *, limit: int | Non
 
 def software(device: str) -> dict[str, str]:
     """The device and the versions of what runs."""
-    from importlib.metadata import PackageNotFoundError, version
-
     import warp as wp
 
-    found = {"device": wp.get_device(device).name}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    from vd.versions import installed_versions
+
+    return {"device": wp.get_device(device).name} | installed_versions(_PACKAGES)
 
 
 if __name__ == "__main__":

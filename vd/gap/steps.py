@@ -20,6 +20,7 @@ from vd.config import from_dict, to_dict
 from vd.files import write_json
 from vd.gap.recording import BARE_MODELS, Recording, read_recording
 from vd.gap.result import Closing, Predictions, Report
+from vd.versions import installed_versions
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
@@ -283,21 +284,9 @@ def _report(analysis: Analysis) -> None:
         hand=analysis.hand_name,
         hand_layer=None if analysis.settings.hand_layer is None else str(analysis.settings.hand_layer),
         command=analysis.command(),
-        software=_software(),
+        software=installed_versions(_PACKAGES),
     )
     write_report(report, Predictions.read(analysis.out / CLOSING_CURVES), analysis.out)
-
-
-def _software() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version
-
-    found = {}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 _RUN: dict[str, Callable[[Analysis], None]] = {
