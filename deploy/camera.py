@@ -1,0 +1,99 @@
+"""Depth images for the control loop, whatever they come from: a RealSense, a recording, a simulated camera.
+
+Times are seconds of :func:`time.monotonic`, the clock of the loop. Depth is along the optical axis (x right,
+y down, z forward) [m]; 0 means no value, as RealSense cameras report it.
+"""
+
+import time
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from vd.assets_usd.hand_data import CameraModel
+
+MAX_AGE_S = 0.25
+"""Age from which an image is stale [s]: three control periods. The latency of a D415 is below 0.1 s."""
+
+
+class CameraError(RuntimeError):
+    """A camera that cannot be used as asked; names the remedy."""
+
+
+class StaleCamera(CameraError):  # noqa: N818 - it names the state, as the reports of the loop do
+    """No image that is new enough to act upon."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without a place."""
+
+    width: int
+    """Columns of the image."""
+    height: int
+    """Rows of the image."""
+    fx: float
+    """Horizontal focal length [px]."""
+    fy: float
+    """Vertical focal length [px]."""
+    cx: float
+    """Principal point, from the left edge of the image [px]; the first pixel's centre is at 0.5."""
+    cy: float
+    """Principal point, from the top edge of the image [px]."""
+
+    @staticmethod
+    def of(camera: CameraModel) -> "Intrinsics":
+        """Those of a camera that has a place."""
+        return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+    def seen_from(self, camera: CameraModel) -> CameraModel:
+        """The camera with these intrinsics, at the place and with the range of another."""
+        return replace(
+            camera, width=self.width, height=self.height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy
+        )
+
+
+@dataclass(frozen=True)
+class DepthFrame:
+    """One depth image."""
+
+    depth_m: np.ndarray
+    """Depth along the optical axis [m], 0 for none, float32 [H, W]."""
+    time_s: float
+    """When it was exposed [s], on the clock of :func:`time.monotonic`."""
+
+
+class DepthSource(Protocol):
+    """Where depth images come from."""
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of the images that :meth:`read` returns."""
+
+    def read(self, timeout_s: float) -> DepthFrame:
+        """The newest image, waiting for one that was not returned before.
+
+        Args:
+            timeout_s: How long to wait [s].
+
+        Raises:
+            StaleCamera: No new image came in time, or it is too old.
+        """
+
+    def close(self) -> None:
+        """Stop the camera; no :meth:`read` after this."""
+
+
+def check_fresh(frame: DepthFrame, max_age_s: float = MAX_AGE_S) -> DepthFrame:
+    """The frame, if it is new enough.
+
+    Raises:
+        StaleCamera: It is older than ``max_age_s``.
+    """
+    age = time.monotonic() - frame.time_s
+    if age > max_age_s:
+        raise StaleCamera(
+            f"the newest depth image is {age:.2f} s old, more than {max_age_s:.2f} s; "
+            "check the camera's cable (USB 3), and that no filter or other program takes the processor"
+        )
+    return frame
