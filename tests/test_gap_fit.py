@@ -12,9 +12,9 @@ from vd.gap.chain import chains
 from vd.gap.coordinates import coordinate
 from vd.gap.descent import Descent, LeastSquares
 from vd.gap.design import design
+from vd.gap.explanation import intervals
 from vd.gap.find import findings, phases
 from vd.gap.fit import JointProblem, candidates
-from vd.gap.judge import intervals
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import covariance, noise_floor, resamples, rmse

@@ -8,15 +8,17 @@ import pytest
 from test_gap_fit import recorded
 
 import vd.kernels.actuators as servo
+from vd.gap.consensus import share
 from vd.gap.coordinates import Coordinate, Scales
+from vd.gap.explanation import Accepted, Explanation, Trial, intervals
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import Accepted, Explanation, Judge, Trial, cancelled, intervals, share
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import vetoes
+from vd.gap.verdict import Verdicts, cancelled
 from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain, find
 from vd.kernels.effects import EFFECTS
@@ -44,11 +46,11 @@ def made_up(effects: tuple[str, ...], errors: np.ndarray | float, fitted: float 
 
 
 @pytest.fixture
-def judge() -> Judge:
-    return Judge(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
+def judge() -> Verdicts:
+    return Verdicts(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
 
 
-def test_gain_must_hold_over_trajectories(judge: Judge) -> None:
+def test_gain_must_hold_over_trajectories(judge: Verdicts) -> None:
     before = made_up((), 0.010)
     assert judge.better(before, made_up(("backlash",), 0.005))[0]
     assert not judge.better(before, made_up(("backlash",), 0.0097))[0]
@@ -58,12 +60,12 @@ def test_gain_must_hold_over_trajectories(judge: Judge) -> None:
     assert not judge.better(before, made_up(("backlash",), uneven))[0]
 
 
-def test_what_is_under_the_noise_floor_is_no_gain(judge: Judge) -> None:
+def test_what_is_under_the_noise_floor_is_no_gain(judge: Verdicts) -> None:
     accepted, why = judge.better(made_up((), 1.15e-3), made_up(("backlash",), 1.05e-3))
     assert not accepted and "noise floor" in why
 
 
-def test_a_tie_is_a_set(judge: Judge) -> None:
+def test_a_tie_is_a_set(judge: Verdicts) -> None:
     rng = np.random.default_rng(1)
     winner = made_up(("coulomb_friction",), 0.004)
     noise = rng.normal(0.0, 1e-3, 10)
@@ -71,7 +73,7 @@ def test_a_tie_is_a_set(judge: Judge) -> None:
     assert not judge.tied(winner, made_up(("backlash",), 0.006))[0]
 
 
-def test_at_the_floor_samples_decide(judge: Judge) -> None:
+def test_at_the_floor_samples_decide(judge: Verdicts) -> None:
     """An explained recording tells candidates apart even if one motion alone shows the difference."""
     errors = np.full(10, FLOOR)
     winner = made_up(("coulomb_friction",), errors)
@@ -81,7 +83,7 @@ def test_at_the_floor_samples_decide(judge: Judge) -> None:
     assert judge.tied(winner, made_up(("dead_zone",), FLOOR))[0]
 
 
-def test_the_simpler_of_nested_effects_wins_a_tie(judge: Judge) -> None:
+def test_the_simpler_of_nested_effects_wins_a_tie(judge: Verdicts) -> None:
     simple = made_up(("coulomb_friction",), 1.000e-3)
     complex_ = made_up(("stribeck_friction",), 0.970e-3, fitted=0.999e-3)
     assert judge.winner([complex_, simple]) is simple
@@ -90,7 +92,7 @@ def test_the_simpler_of_nested_effects_wins_a_tie(judge: Judge) -> None:
     assert judge.winner([better, worse]) is better
 
 
-def test_at_the_floor_the_samples_choose_not_the_luck_of_a_motion(judge: Judge) -> None:
+def test_at_the_floor_the_samples_choose_not_the_luck_of_a_motion(judge: Verdicts) -> None:
     right = made_up(("coulomb_friction",), 1.06 * FLOOR, fitted=1.00 * FLOOR)
     lucky = made_up(("dead_zone",), 1.01 * FLOOR, fitted=1.02 * FLOOR)
     assert judge.winner([lucky, right]) is right
@@ -99,7 +101,7 @@ def test_at_the_floor_the_samples_choose_not_the_luck_of_a_motion(judge: Judge) 
     assert judge.winner([far, farther]) is far, "away from it unseen motions do"
 
 
-def test_a_small_excess_tells_apart_only_if_most_motions_show_it(judge: Judge) -> None:
+def test_a_small_excess_tells_apart_only_if_most_motions_show_it(judge: Verdicts) -> None:
     winner = made_up(("coulomb_friction",), FLOOR)
     everywhere = np.full(10, np.sqrt(1.01) * FLOOR)
     assert not judge.tied(winner, made_up(("dead_zone",), everywhere))[0]
@@ -114,7 +116,7 @@ def test_a_small_excess_tells_apart_only_if_most_motions_show_it(judge: Judge) -
     assert judge.tied(winner, replace(richer, sse=0.999 * winner.sse))[0]
 
 
-def test_a_fuller_form_that_is_a_little_better_makes_a_set(judge: Judge) -> None:
+def test_a_fuller_form_that_is_a_little_better_makes_a_set(judge: Verdicts) -> None:
     limit = made_up(("torque_limit",), FLOOR)
     for excess, tied in ((0.993, ("torque_speed_limit",)), (0.999, ()), (1.01, ())):
         line = made_up(("torque_speed_limit",), np.sqrt(excess) * FLOOR)
@@ -177,7 +179,7 @@ def test_dry_friction_and_an_offset_are_put_together_where_one_cause_does_as_wel
     assert selection.put_together(one) is one, "nothing to put together"
 
 
-def test_a_bound_is_no_estimate(judge: Judge) -> None:
+def test_a_bound_is_no_estimate(judge: Verdicts) -> None:
     stuck = made_up(("backlash",), 0.004)
     end = Coordinate("backlash.width_rad", servo.BACKLASH_WIDTH, False, 1.0, 0.0, 9.0)
     stuck = replace(stuck, coordinates=(*stuck.coordinates[:-1], end), x=np.array([0.0, 0.0, 0.0, 9.0]))
@@ -219,7 +221,7 @@ def test_sets_of_several_joints_meet_in_one_name() -> None:
 
 @pytest.mark.parametrize(("floor", "tied"), [(FLOOR, ("supply_sag",)), (10.0 * FLOOR, ())])
 def test_forms_of_one_loss_are_a_set_only_far_from_the_floor(floor: float, tied: tuple[str, ...]) -> None:
-    judge = Judge(floor=floor, weights=resamples(10, np.random.default_rng(0)))
+    judge = Verdicts(floor=floor, weights=resamples(10, np.random.default_rng(0)))
     judge.without["torque_saturation"] = 0.040
     soft, sag, delay, limit = (
         made_up((name,), error)
@@ -255,7 +257,7 @@ def test_load_and_friction_are_found_together(tmp_path: Path) -> None:
     assert {effect.name for effect in report.effects} == {"coulomb_friction", "gravity_load"}
 
 
-def concluded(judge: Judge, left: float = FLOOR, **options: object) -> Explanation:
+def concluded(judge: Verdicts, left: float = FLOOR, **options: object) -> Explanation:
     """A conclusion about Coulomb friction that is beyond doubt but for ``options``."""
     baseline, final = made_up((), 0.010), made_up(("coulomb_friction",), left)
     simpler = made_up(("stribeck_friction",), left)  # a form of it is no rival
@@ -263,7 +265,7 @@ def concluded(judge: Judge, left: float = FLOOR, **options: object) -> Explanati
     return judge.conclude(baseline, final, rivals, [], "", **options)  # type: ignore[arg-type]
 
 
-def test_two_searches_that_disagree_by_more_than_the_gain_give_no_name(judge: Judge) -> None:
+def test_two_searches_that_disagree_by_more_than_the_gain_give_no_name(judge: Verdicts) -> None:
     assert [a.named for a in concluded(judge).accepted] == [True]
     left = 1.5 * FLOOR
     # Its gain is what the next best leaves: 4 - 1.5 mrad.
@@ -274,12 +276,12 @@ def test_two_searches_that_disagree_by_more_than_the_gain_give_no_name(judge: Ju
     assert "two searches" in far.reason and "3.00 mrad" in far.reason
 
 
-def test_a_worse_optimum_says_nothing_against_a_model_at_the_noise_floor(judge: Judge) -> None:
+def test_a_worse_optimum_says_nothing_against_a_model_at_the_noise_floor(judge: Verdicts) -> None:
     worse = concluded(judge, FLOOR, again=made_up(("coulomb_friction",), 0.0095))
     assert worse.verdict == "effects" and worse.accepted[0].named
 
 
-def test_what_has_structure_is_not_explained(judge: Judge) -> None:
+def test_what_has_structure_is_not_explained(judge: Verdicts) -> None:
     final = made_up(("coulomb_friction",), FLOOR)
     pairs = np.full(10, 400.0)
 
@@ -297,7 +299,7 @@ def test_what_has_structure_is_not_explained(judge: Judge) -> None:
     assert with_structure(8.0, rms=5.0 * FLOOR).verdict == "effects"
 
 
-def test_what_the_time_step_leaves_open_widens_the_interval(judge: Judge) -> None:
+def test_what_the_time_step_leaves_open_widens_the_interval(judge: Verdicts) -> None:
     fit = made_up((), FLOOR)
     plain = intervals(fit, FLOOR)["p0"]
     wide = intervals(replace(fit, step_error=np.full(3, 0.5)), FLOOR)["p0"]
@@ -448,7 +450,7 @@ def test_telemetry_contradicts_a_cause() -> None:
     assert "supply_sag" not in vetoes(replace(recording, trajectories=falling), chain, spec, chain.start_row)
 
 
-def test_a_model_with_chance_in_it_is_judged_by_its_likelihood(judge: Judge) -> None:
+def test_a_model_with_chance_in_it_is_judged_by_its_likelihood(judge: Verdicts) -> None:
     """A few motions hold most of the squared error; what matters is how surely all are known."""
     errors = np.full(10, 1e-3)
     errors[:2] = 6e-3

@@ -10,7 +10,7 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.gap.coordinates import BASELINE_PARAMETERS, GRAVITY, Scales
 from vd.gap.design import varied
-from vd.gap.judge import Accepted, Explanation
+from vd.gap.explanation import Accepted, Explanation
 from vd.gap.recording import Recording
 from vd.gap.result import (
     Alternative,

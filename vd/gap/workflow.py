@@ -21,18 +21,21 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
+from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
 from vd.gap.chain import Chain, chains
+from vd.gap.consensus import share
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.crowd import Crowd
 from vd.gap.design import design, pieces
+from vd.gap.explanation import Explanation, polished
 from vd.gap.find import findings
 from vd.gap.fit import candidates, others_in
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import RANDOM, Explanation, alike, polished, share, stood_for
+from vd.gap.judge import RANDOM
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S
-from vd.gap.select import FULL_ITERATIONS, Selection
+from vd.gap.select import Selection
 from vd.gap.statistics import noise_floor, resamples
 from vd.gap.team import Bench, JointSpec, Team
 from vd.gap.telemetry import vetoes

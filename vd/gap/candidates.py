@@ -1,0 +1,252 @@
+"""Fits of the models that a search compares: with one more effect, with one less, from elsewhere."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from vd.gap.coordinates import Scales, best_two, sizes, smaller, torque_power
+from vd.gap.joint_fit import JointFit
+from vd.gap.judge import AT_FLOOR, EXPLAINED, RANDOM
+from vd.kernels.effects import EFFECTS, EQUIVALENT
+
+SHORT_LIST = 10
+"""Candidates of a round that are fitted, after the linear screening of all."""
+FINALISTS = 6
+"""Candidates of a round that are fitted to the end."""
+FIRST = 4
+"""Candidates that are fitted before the rest of the short list."""
+ALIKE = 0.5
+"""Share of the best promise that a candidate must have to be fitted once another explains everything."""
+BEHIND = 3.0
+"""Finalists have at most this many times the error of the best after screening."""
+HOPELESS = 1.5
+"""The same factor half way: those beyond it are not fitted to the end."""
+SCREEN_ITERATIONS = 6
+HALF_ITERATIONS = 4
+FULL_ITERATIONS = 12
+SEARCHES = 3
+"""Searches for the final model from elsewhere, until one comes back to it."""
+JITTER_START_S = 0.005
+ASTRAY = 2.0
+"""Factor from the nominal model beyond which a fit starts from that as well."""
+SEED_STEP = 1000
+BETTER = 0.98
+"""Share of the error from which another search for the same model has found a better one."""
+
+Call = tuple[str, dict[str, Any]]
+Run = Callable[[list[Call]], list[Any]]
+"""Runs methods of the joint's :class:`vd.gap.fit.JointProblem` by name, in parallel."""
+
+
+@dataclass(kw_only=True)
+class CandidateFits:
+    """Fits models of one joint.
+
+    Attributes:
+        floor: Noise floor [rad].
+        run: Runs fits.
+        joint: Index of the joint in its chain.
+        others: Slots of the other joints of the chain.
+        candidates: Effects to consider.
+        scales: Sizes of the joint's motion.
+        refits: Steps of each refit without a fold (:meth:`vd.gap.fit.JointProblem.fit`).
+        seed: Of the second search for the final model.
+        vetoes: Effects that telemetry contradicts, with the reason.
+        nominal: Nominal values of the baseline's parameters, by key.
+        promised: Share of the squared error that each candidate of the last round could remove at best.
+    """
+
+    floor: float
+    run: Run
+    joint: int
+    others: Sequence[int]
+    candidates: Sequence[str]
+    scales: Scales
+    refits: int = 0
+    seed: int = 0
+    vetoes: Mapping[str, str] = field(default_factory=dict)
+    nominal: Mapping[str, float] = field(default_factory=dict)
+    promised: dict[str, float] = field(default_factory=dict)
+
+    def fit_candidates(
+        self, present: JointFit, skip: Sequence[str] = (), vetoed: Sequence[str] = ()
+    ) -> dict[str, JointFit]:
+        """Fits with each promising further effect, the finalists to convergence, by name.
+
+        Args:
+            present: Model to which they are added.
+            skip: Effects to leave out.
+            vetoed: Effects to try in spite of a veto.
+        """
+        out = {*present.effects, *(set(self.vetoes) - set(vetoed)), *skip, RANDOM}
+        names = [name for name in self.candidates if name not in out]
+        starts = {name: sizes(name, self.others, self.scales) for name in names}
+        flat = [(name, start) for name in names for start in starts[name]]
+        if not flat:
+            return {}
+        promise = self.run(
+            [("promise", {"fit": present, "starts": [s for _, s in flat], "scales": self.scales})]
+        )[0]
+        self.promised = {
+            name: max(float(promise[i]) for i, (own, _) in enumerate(flat) if own == name) for name in names
+        }
+        order: dict[str, list[int]] = {name: [] for name in names}
+        for i in np.argsort(-promise):
+            order[flat[i][0]].append(int(i))
+        ranked = sorted(names, key=lambda name: -promise[order[name][0]])[:SHORT_LIST]
+
+        def screen(chosen: Sequence[str]) -> list[JointFit]:
+            calls = [
+                self.call(
+                    present,
+                    name,
+                    self.starts(present, best_two([flat[i][1] for i in order[name]])),
+                    SCREEN_ITERATIONS,
+                )
+                for name in chosen
+            ]
+            return self.run(calls)
+
+        screened = screen(ranked[:FIRST])
+        rest = ranked[FIRST:]
+        if min(fit.rmse for fit in screened) < EXPLAINED * self.floor:
+            # What explains everything has only those to fear that promised nearly as much.
+            enough = ALIKE * promise[order[ranked[0]][0]]
+            rest = [name for name in rest if promise[order[name][0]] > enough]
+        screened += screen(rest)
+        screened.sort(key=lambda fit: fit.rmse)
+        finalists = [fit for fit in screened[:FINALISTS] if fit.rmse < BEHIND * screened[0].rmse]
+
+        def go_on(chosen: Sequence[JointFit], iterations: int) -> list[JointFit]:
+            return self.run([self.call(present, f.effects[-1], [f.values], iterations) for f in chosen])
+
+        if len(finalists) > 1:
+            finalists = sorted(go_on(finalists, HALF_ITERATIONS), key=lambda fit: fit.rmse)
+        near = [fit for fit in finalists if fit.rmse < HOPELESS * finalists[0].rmse]
+        last = [*go_on(near, FULL_ITERATIONS), *finalists[len(near) :]]
+        fits = {fit.effects[-1]: fit for fit in (*last, *screened[len(finalists) :])}
+        # Nothing added can do worse than nothing: such a fit began too large, and no descent led back.
+        astray = [name for name, fit in fits.items() if fit.rmse > present.rmse]
+        small = {name: smaller(flat[order[name][0]][1]) for name in astray}
+        again = [name for name in astray if small[name] is not None]
+        calls = [
+            self.call(present, name, [{**present.values, **(small[name] or {})}], FULL_ITERATIONS)
+            for name in again
+        ]
+        for name, found in zip(again, self.run(calls), strict=True):
+            if found.rmse < fits[name].rmse:
+                fits[name] = found
+        return fits
+
+    def look_wider(self, present: JointFit, fits: Mapping[str, JointFit]) -> dict[str, JointFit]:
+        """The fits of a round, and those of all candidates from every start where these are better."""
+        out = {*present.effects, *self.vetoes, RANDOM}
+        names = [name for name in self.candidates if name not in out]
+        calls = [
+            self.call(
+                present, name, self.starts(present, sizes(name, self.others, self.scales)), SCREEN_ITERATIONS
+            )
+            for name in names
+        ]
+        least = min(fit.rmse for fit in fits.values())
+        found = sorted(self.run(calls), key=lambda fit: fit.rmse)
+        better = [
+            fit
+            for fit in found[:FINALISTS]
+            if fit.rmse < BETTER * (fits[fit.effects[-1]].rmse if fit.effects[-1] in fits else np.inf)
+            and fit.rmse < BEHIND * least
+        ]
+        refits = self.run(
+            [self.call(present, fit.effects[-1], [fit.values], FULL_ITERATIONS) for fit in better]
+        )
+        result = dict(fits)
+        for refit in refits:
+            known = result.get(refit.effects[-1])
+            if known is None or refit.held_out_rmse < known.held_out_rmse:
+                result[refit.effects[-1]] = refit
+        return result
+
+    def add_random(self, present: JointFit) -> JointFit:
+        """A model with random delays as well."""
+        start = {**present.values, "command_delay.delay_s": JITTER_START_S}
+        call = {
+            "base": present.rows,
+            "effects": present.effects,
+            "starts": [start, {**start, **self.nominal}],
+            "scales": self.scales,
+            "iterations": FULL_ITERATIONS,
+        }
+        return self.run([("fit_jitter", call)])[0]
+
+    def search_again(self, present: JointFit) -> JointFit | None:
+        """The final model as searches from elsewhere find it; None at the noise floor: none is better."""
+        if present.rmse < AT_FLOOR * self.floor:
+            return None
+        best: JointFit | None = None
+        for number in range(SEARCHES):
+            call = {"fit": present, "scales": self.scales, "seed": self.seed + number * SEED_STEP}
+            found = self.run([("again", call)])[0]
+            best = found if best is None or found.rmse < best.rmse else best
+            if best.rmse < present.rmse / BETTER:
+                break
+        return best
+
+    def starts(self, present: JointFit, added: Sequence[dict[str, float]]) -> list[dict[str, float]]:
+        """Where a fit with a further effect starts: at the present model, and from the nominal one.
+
+        Without the effect, the baseline may have gone far to imitate it (an unmodelled delay is best met
+        by a servo twenty times as stiff), and from there no descent comes back.
+        """
+        result = [{**present.values, **start} for start in added]
+        away = {key: present.values[key] / value for key, value in self.nominal.items() if value > 0.0}
+        if any(not 1.0 / ASTRAY < ratio < ASTRAY for ratio in away.values()):
+            torque = 1.0 / away.get("kp", 1.0)
+            start = {key: value * torque ** torque_power(key) for key, value in result[0].items()}
+            result.append({**start, **self.nominal})
+        return result
+
+    def call(
+        self, present: JointFit, name: str, starts: Sequence[Mapping[str, float]], iterations: int
+    ) -> Call:
+        """The call that fits ``present`` with one more effect."""
+        return (
+            "fit",
+            {
+                "base": present.rows,
+                "effects": (*present.effects, name),
+                "starts": list(starts),
+                "scales": self.scales,
+                "iterations": iterations,
+                "refits": self.refits if iterations == FULL_ITERATIONS else 0,
+            },
+        )
+
+    def refit(self, present: JointFit, effects: Sequence[str]) -> JointFit:
+        """The fit with only some of a model's effects."""
+        rows = present.rows.copy()
+        for name in set(present.effects) - set(effects):
+            for parameter in EFFECTS[name].parameters:
+                rows[self.joint, parameter.column] = parameter.neutral
+        values = {k: v for k, v in present.values.items() if k.rpartition(".")[0] in ("", *effects)}
+        call = {"base": rows, "effects": tuple(effects), "starts": [values], "scales": self.scales}
+        return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0]
+
+
+def alike(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The candidates that stand for others of the candidates, and for which."""
+    return {
+        name: inside
+        for name, others in EQUIVALENT.items()
+        if name in names and (inside := tuple(other for other in others if other in names))
+    }
+
+
+def stood_for(equivalent: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Candidates that another stands for, with the reason why they are not tried."""
+    return {
+        other: f"leaves the same positions as {name}, which stands for both"
+        for name, others in equivalent.items()
+        for other in others
+    }

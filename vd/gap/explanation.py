@@ -1,0 +1,98 @@
+"""What the search for what a joint lacks has found: the evidence, effects with intervals, the verdict."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from vd.gap.fit import RIDGE
+from vd.gap.joint_fit import JointFit
+from vd.gap.result import Verdict
+from vd.gap.statistics import covariance, half_width
+from vd.kernels.effects import EFFECTS
+
+NAMED = 0.9
+"""Share of the resamples that must choose an effect for it to be named."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate in one round of the selection."""
+
+    round: int
+    name: str
+    fit: JointFit
+    gain: float
+    gain_ci: tuple[float, float]
+    decision: str = "rejected"
+    reason: str = ""
+    placebo: bool = False
+
+
+@dataclass(frozen=True)
+class Accepted:
+    """An effect of the final model."""
+
+    name: str
+    confidence: float
+    estimates: dict[str, tuple[float, float, float]]
+    """Parameter -> (value, low, high)."""
+    alternatives: tuple[tuple[str, float, tuple[float, float]], ...]
+    """(name, held-out RMSE, interval of the difference to this effect's), best first."""
+    tied: tuple[str, ...]
+    """Alternatives that this recording does not tell from it."""
+    at_bound: bool
+    equivalent: tuple[str, ...] = ()
+    """Effects that leave the same positions whatever the motion; the name stands for them too."""
+    doubt: str = ""
+    """Why it is no name in spite of all."""
+
+    @property
+    def named(self) -> bool:
+        """Whether it is the answer rather than one of a set."""
+        return not self.tied and not self.at_bound and not self.doubt and self.confidence >= NAMED
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What one joint lacks."""
+
+    baseline: JointFit
+    final: JointFit
+    verdict: Verdict
+    reason: str
+    accepted: tuple[Accepted, ...] = ()
+    trials: tuple[Trial, ...] = ()
+    rivals: Mapping[str, Sequence[JointFit]] = field(default_factory=dict)
+    """Fits with others in the place of each effect."""
+
+
+def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
+    """95 % intervals by key: the spread over trajectories, and the error of the time step."""
+    matrix = covariance(fit.gram, fit.gradient, np.full(len(fit.x), RIDGE * floor**2), floor)
+    width = half_width(np.diag(matrix), len(fit.gram))
+    if fit.step_error is not None:
+        width = np.hypot(width, fit.step_error)
+    result = {}
+    for c, x, w in zip(fit.coordinates, fit.x, width, strict=True):
+        low, high = max(x - w, c.lower), min(x + w, c.upper)
+        result[c.key] = float(c.value(low)), float(c.value(high))
+    return {**result, **(fit.extents or {})}
+
+
+def estimates(
+    final: JointFit, name: str, spread: Mapping[str, tuple[float, float]]
+) -> dict[str, tuple[float, float, float]]:
+    """Parameters of an effect with their intervals."""
+    return {
+        p.name: (final.values[f"{name}.{p.name}"], *spread[f"{name}.{p.name}"])
+        for p in EFFECTS[name].parameters
+        if f"{name}.{p.name}" in final.values
+    }
+
+
+def polished(explanation: Explanation, fit: JointFit, floor: float) -> Explanation:
+    """The explanation with its final model fitted anew."""
+    spread = intervals(fit, floor)
+    accepted = tuple(replace(a, estimates=estimates(fit, a.name, spread)) for a in explanation.accepted)
+    return replace(explanation, final=fit, accepted=accepted)

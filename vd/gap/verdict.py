@@ -1,0 +1,248 @@
+"""The last word on the model that a search ends with: confidence, sets of equals, and the verdict."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+import vd.kernels.actuators as servo
+from vd.gap.explanation import NAMED, Accepted, Explanation, Trial, estimates, intervals
+from vd.gap.joint_fit import JointFit
+from vd.gap.judge import (
+    AT_FLOOR,
+    EXPLAINED,
+    FORMS,
+    MIN_SHARE,
+    NESTED,
+    RANDOM,
+    RECOVERED,
+    REPEATABLE,
+    SMALL_EXCESS_FLOORS,
+    Judge,
+)
+
+UNEXPLAINED = 1.5
+"""A baseline beyond this factor of the noise floor has a gap, whether or not an effect explains it."""
+STRUCTURE = 0.09
+"""Mean product of successive residuals in motion, in squared noise floors, from which a model lacks
+something: the right ones leave 0.05 at most (the noise of the first sample, which starts a rollout)."""
+STRUCTURE_SURE = 0.02
+"""The same for the low end of its interval over trajectories."""
+CANCELLING = ("gravity_load", "encoder_bias")
+"""Effects that hold a joint off its command at rest. Where they cancel there, they are no two causes but one
+that pulls with the travel from there, a spring, which the table has not."""
+CANCELLED = 0.1
+"""Share of either that is left where they cancel; by chance they do so in a few of a hundred machines."""
+DETERMINED = ("kp", "kd", "inertia")
+"""Baseline parameters that every useful excitation determines."""
+WIDE = 10.0
+"""Ratio of the ends of an interval from which a parameter counts as open."""
+
+
+@dataclass(kw_only=True)
+class Verdicts(Judge):
+    """Judges the final model of one joint.
+
+    Attributes:
+        equivalent: Effects that one stands for, since the recording cannot tell them apart.
+        apart: Fits with several effects in the place of one that they are together, by its name.
+    """
+
+    equivalent: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    apart: dict[str, JointFit] = field(default_factory=dict)
+
+    def undetermined(self, fit: JointFit) -> str:
+        """Which parameter of the baseline the motions leave open, in words; empty if none."""
+        for key, (low, high) in intervals(fit, self.floor).items():
+            if key in DETERMINED and high > WIDE * low:
+                return f"{key} can lie anywhere between {low:.2g} and {high:.2g}: the motions do not show it"
+        return ""
+
+    def settle(self, trials: Sequence[Trial], final: JointFit) -> list[Trial]:
+        """The evidence with the steps that did not last marked as such."""
+        text = "helped at first, not needed or not earned in the end"
+        return [
+            replace(t, decision="rejected", reason=text)
+            if t.decision == "named" and t.name not in final.effects
+            else t
+            for t in trials
+        ]
+
+    def conclude(
+        self,
+        baseline: JointFit,
+        final: JointFit,
+        rivals: Mapping[str, list[JointFit]],
+        trials: Sequence[Trial],
+        loose: str,
+        refined: JointFit | None = None,
+        again: JointFit | None = None,
+    ) -> Explanation:
+        """Confidence, sets and verdict of the final model.
+
+        Args:
+            baseline: The model without effects.
+            final: The model chosen.
+            rivals: Fits with others in the place of each effect.
+            trials: The evidence.
+            loose: What of the baseline the motions leave open.
+            refined: The final model at finer time steps, whose values are reported.
+            again: The final model as another search finds it.
+        """
+        told = final if refined is None else refined
+        spread = intervals(told, self.floor)
+        accepted = []
+        for name in final.effects:
+            fits = rivals.get(name, [final])
+            one = self.accept(final, name, fits, spread, told)
+            if not one.tied:
+                one = replace(one, doubt=self.disagreement(baseline, final, name, fits, again))
+            accepted.append(one)
+        explanation = Explanation(baseline, told, "unknown", "", tuple(accepted), tuple(trials), rivals)
+        if not accepted:
+            tried = [t for t in trials if not t.placebo and np.isfinite(t.gain)]
+            why = tried[0].reason if tried else "there is no candidate"
+            if baseline.held_out_rmse > UNEXPLAINED * self.floor:
+                return replace(explanation, reason=f"a gap that no candidate explains: the best {why}")
+            if loose:
+                return replace(explanation, verdict="under_excited", reason=loose)
+            return replace(explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}")
+        gap = baseline.held_out_rmse**2 - self.floor**2
+        share = (baseline.held_out_rmse**2 - final.held_out_rmse**2) / max(gap, 1e-30)
+        # What chance does to each sample stays, however well its size is known.
+        if share < RECOVERED and RANDOM not in final.effects:
+            text = f"the best candidate recovers {100.0 * share:.0f} % of the squared gap, less than half"
+            return replace(explanation, reason=text)
+        lack = self.lack_of_fit(told)
+        if lack:
+            names = " and ".join(a.name for a in accepted)
+            return replace(explanation, reason=f"{names} come nearest, but {lack}: the cause is another")
+        named = [a.name for a in accepted if a.named]
+        if named:
+            return replace(explanation, verdict="effects", reason=explains(named))
+        if all(a.at_bound for a in accepted):
+            return replace(explanation, reason=f"{accepted[0].name} fits only with a parameter at its bound")
+        sets = [" or ".join((a.name, *a.tied)) for a in accepted if a.tied and not a.at_bound]
+        if not sets:
+            doubts = [a.doubt for a in accepted if a.doubt]
+            return replace(explanation, reason=(doubts or ["nothing is chosen often enough"])[0])
+        return replace(explanation, verdict="ambiguous", reason=f"{'; '.join(sets)}: not told apart")
+
+    def lack_of_fit(self, fit: JointFit) -> str:
+        """Why residuals near the noise floor are more than noise, in words; empty if they are not.
+
+        A wrong model that is flexible enough comes near the floor, and what it leaves is a function of
+        the motion: successive residuals agree, where noise has no memory.
+        """
+        if fit.structure is None or fit.rmse > REPEATABLE * self.floor:
+            return ""
+        products, count = fit.structure / np.array([[self.floor**2], [1.0]])
+        if count.sum() <= 0.0:
+            return ""
+        mean = float(products.sum() / count.sum())
+        drawn = (self.weights @ products) / np.maximum(self.weights @ count, 1.0)
+        sure = float(np.quantile(drawn, 0.025))
+        small = mean < (MIN_SHARE * self.whole / self.floor) ** 2
+        if mean < STRUCTURE or sure < STRUCTURE_SURE or small:
+            return ""
+        return f"what is left has structure ({np.sqrt(mean):.2f} noise floors that are not noise)"
+
+    def disagreement(
+        self,
+        baseline: JointFit,
+        final: JointFit,
+        name: str,
+        rivals: Sequence[JointFit],
+        again: JointFit | None,
+    ) -> str:
+        """Why two searches for the final model contradict each other about an effect, or nothing.
+
+        Its gain is what it leaves less than the next best that is no form of it.
+        """
+        if again is None or final.rmse < AT_FLOOR * self.floor:
+            return ""
+        same = {name, *NESTED.get(name, ()), *(k for k, simpler in NESTED.items() if name in simpler)}
+        without = [fit.rmse for fit in rivals if fit is not final and not same & set(fit.effects[-1:])]
+        gain = min([baseline.rmse, *without]) - final.rmse
+        apart = abs(again.rmse - final.rmse)
+        if apart <= max(gain, 0.0) or gain <= 0.0:
+            return ""
+        return (
+            f"two searches for {name} end {1e3 * apart:.2f} mrad apart, more than the {1e3 * gain:.2f} mrad "
+            "that it gains"
+        )
+
+    def accept(
+        self,
+        final: JointFit,
+        name: str,
+        rivals: Sequence[JointFit],
+        spread: Mapping[str, tuple[float, float]],
+        told: JointFit,
+    ) -> Accepted:
+        """Confidence and set of one effect of the final model, with the values ``told``."""
+        own = next((fit for fit in rivals if fit.effects and fit.effects[-1] == name), None)
+        mine = final if own is None or any(fit is final for fit in rivals) else own
+        others = [fit for fit in rivals if fit is not mine and fit.effects[-1] != name]
+        white = mine.rmse < EXPLAINED * self.floor
+        choice = np.argmin(self.scores([mine, *others], self.weights, fitted=white), axis=0)
+        simple = {i + 1 for i, fit in enumerate(others) if name in NESTED.get(fit.effects[-1], ())}
+        share = float(np.mean([c == 0 or c in simple for c in choice]))
+        alternatives, tied = [], []
+        for fit in sorted(others, key=lambda other: other.held_out_rmse):
+            other = fit.effects[-1]
+            same, ci = self.tied(mine, fit)
+            alternatives.append((other, fit.held_out_rmse, ci))
+            if same or self.same_loss(name, mine, fit):
+                tied.append(other)
+        # In a tie the simpler one is meant: none beside an effect that it contains.
+        # A fuller form of a loss stays in the set if it is better, by too little to be the name.
+        fuller = {
+            fit.effects[-1]
+            for fit in others
+            if {name, fit.effects[-1]} <= FORMS
+            and mine.rmse**2 - fit.rmse**2 > (SMALL_EXCESS_FLOORS * self.floor) ** 2
+        }
+        tied = [o for o in tied if o in fuller or not {name, *tied} & set(NESTED.get(o, ()))]
+        if share < NAMED and not tied:
+            rival = int(np.argmax(np.bincount(choice, minlength=len(others) + 1)[1:]))
+            tied.append(others[rival].effects[-1])
+        split, means = self.apart.get(name), tuple(self.equivalent.get(name, ()))
+        if split is not None and {*split.effects} > {*final.effects} - {name}:
+            same, _ = self.tied(mine, split, loose=True)
+            means += tuple(other for other in split.effects if same and other not in final.effects)
+        return Accepted(
+            name=name,
+            confidence=share,
+            estimates=estimates(told, name, spread),
+            equivalent=means,
+            alternatives=tuple(alternatives),
+            tied=tuple(tied),
+            at_bound=any(key.startswith(f"{name}.") for key in final.at_bound),
+        )
+
+
+def explains(names: Sequence[str]) -> str:
+    """The reason of a verdict that names effects."""
+    return f"{' and '.join(names)} {'explains' if len(names) == 1 else 'explain'} it"
+
+
+def cancelled(fit: JointFit, joint: int, rest: float) -> str:
+    """What two effects of a model are instead if they cancel at rest, in words; empty if they do not.
+
+    Args:
+        fit: The model.
+        joint: Index of its joint in the chain.
+        rest: Where the joint rests before it moves [rad].
+    """
+    if not {*CANCELLING} <= {*fit.effects}:
+        return ""
+    values, kp = fit.values, float(fit.rows[joint, servo.KP])
+    load = values["gravity_load.tau_g_nm"] * np.sin(rest + values["gravity_load.phase_rad"])
+    offset = kp * values["encoder_bias.bias_rad"]
+    if abs(offset - load) > CANCELLED * min(abs(load), abs(offset)):
+        return ""
+    return (
+        "gravity_load and encoder_bias cancel where the joint rests: a spring about that place would look "
+        "the same, and is not among the candidates"
+    )
