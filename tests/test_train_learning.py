@@ -157,6 +157,30 @@ def test_gradient_is_clipped_by_the_joint_norm(tmp_path):
     assert norms == pytest.approx([1e-3] * len(norms), rel=1e-2)
 
 
+def test_means_beyond_the_bound_come_back_only_with_their_loss(tmp_path):
+    beyond = {}
+    for coefficient in (0.0, 0.1):
+        ppo = dataclasses.replace(SMALL_PPO, bound_coefficient=coefficient, actor_learning_rate=1e-2)
+        runner = make_runner(tmp_path / str(coefficient), ppo=ppo)
+        # Flat advantages leave the surrogate without a gradient in the mean: the loss alone moves it.
+        with torch.no_grad():
+            runner.alg.actor.mlp[-2].bias[: runner.env.num_actions] = 3.0
+        with torch.inference_mode():
+            observation = runner.env.get_observations()
+            for _ in range(8):
+                action = runner.alg.act(observation)
+                observation, reward, done, extras = runner.env.step(action)
+                runner.alg.process_env_step(observation, reward, done, extras)
+            runner.alg.compute_returns(observation)
+        storage = runner.alg.storage
+        storage.advantages = torch.zeros_like(storage.advantages)
+        first = runner.alg.update()["beyond_bound"]
+        mean = runner.alg.actor(runner.env.get_observations())
+        beyond[coefficient] = (first, float(mean.detach().mean()))
+    assert beyond[0.0][0] == 1.0 and beyond[0.0][1] == pytest.approx(3.0, abs=0.5)
+    assert beyond[0.1][1] < 2.8 < beyond[0.0][1]
+
+
 def test_every_sample_is_used_once_an_epoch(tmp_path):
     ppo = dataclasses.replace(SMALL_PPO, epochs=2, minibatch_size=32)
     runner = make_runner(tmp_path, ppo=ppo)
@@ -218,6 +242,7 @@ def test_minibatches_are_never_larger_than_asked():
     [
         (PpoCfg(epochs=0), PolicyCfg(), "--ppo.epochs"),
         (PpoCfg(gamma=1.5), PolicyCfg(), "--ppo.gamma"),
+        (PpoCfg(bound_coefficient=-0.1), PolicyCfg(), "--ppo.bound-coefficient"),
         (PpoCfg(actor_learning_rate=float("nan")), PolicyCfg(), "--ppo.actor-learning-rate"),
         (PpoCfg(), PolicyCfg(initial_std=2.0, std_range=(0.1, 1.0)), "--policy.std-range"),
         (PpoCfg(), PolicyCfg(hidden=(64, 0)), "--policy.hidden"),

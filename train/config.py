@@ -39,6 +39,8 @@ class PpoCfg:
     """Weight of the value loss; acts through the joint gradient norm only."""
     entropy_coefficient: float = 0.0
     """Weight of the entropy bonus."""
+    bound_coefficient: float = 0.0
+    """Weight of the squared excess of mean actions beyond [-1, 1], where the environment clips them."""
     grad_norm: float = PAPER.teacher.grad_norm_code
     """Joint gradient norm of actor and critic is clipped to this."""
     optimizer: Literal["adam", "adamw"] = "adam"
@@ -116,6 +118,8 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
     for flag, value in positive.items():
         if not value > 0:
             raise ValueError(f"{flag} is {value}; it has to be positive")
+    if ppo.bound_coefficient < 0.0:
+        raise ValueError(f"--ppo.bound-coefficient is {ppo.bound_coefficient}; it has to be zero or positive")
     for flag, share in {"--ppo.gamma": ppo.gamma, "--ppo.gae-lambda": ppo.gae_lambda}.items():
         if not 0.0 <= share <= 1.0:
             raise ValueError(f"{flag} is {share}; it has to be in [0, 1]")
@@ -161,6 +165,7 @@ def rsl_rl_config(ppo: PpoCfg, policy: PolicyCfg, num_envs: int) -> dict[str, An
             "lam": ppo.gae_lambda,
             "value_loss_coef": ppo.value_coefficient,
             "entropy_coef": ppo.entropy_coefficient,
+            "bound_coef": ppo.bound_coefficient,
             "max_grad_norm": ppo.grad_norm,
             "optimizer": ppo.optimizer,
             "use_clipped_value_loss": False,

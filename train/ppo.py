@@ -17,7 +17,9 @@ KL_STEP = 1.5
 KL_BAND = 2.0
 """The rate is left alone while the KL divergence is within this factor of the wanted one."""
 
-STATISTICS = ("surrogate", "value", "entropy", "kl", "clip_fraction", "grad_norm")
+ACTION_BOUND = 1.0
+"""The environment clips actions to this; a mean beyond it changes nothing but how far it is to come back."""
+STATISTICS = ("surrogate", "value", "entropy", "kl", "clip_fraction", "grad_norm", "beyond_bound")
 """What every minibatch reports."""
 ACTOR_GROUP, CRITIC_GROUP = 0, 1
 """Optimiser groups. rsl-rl reads the learning rate it reports from group 0, so the actor is first."""
@@ -48,6 +50,7 @@ class TeacherPPO(PPO):
         critic: Value function.
         storage: Rollout of T steps in N worlds.
         critic_learning_rate: The critic's rate; ``learning_rate`` is the actor's.
+        bound_coef: Weight of the squared excess of mean actions beyond :data:`ACTION_BOUND`.
         **kwargs: rsl-rl's PPO arguments.
     """
 
@@ -61,11 +64,13 @@ class TeacherPPO(PPO):
         storage: RolloutStorage,
         *,
         critic_learning_rate: float,
+        bound_coef: float = 0.0,
         **kwargs: Any,
     ) -> None:
         super().__init__(actor, critic, storage, **kwargs)
         if self.actor.is_recurrent or self.critic.is_recurrent or self.rnd or self.symmetry:
             raise ValueError("TeacherPPO trains feed-forward networks, without RND and symmetry")
+        self.bound_coef = bound_coef
         self.optimizer = type(self.optimizer)(
             [
                 {"params": list(self.actor.parameters()), "lr": self.learning_rate},
@@ -83,8 +88,8 @@ class TeacherPPO(PPO):
 
         Returns:
             Means over the minibatches: ``surrogate``, ``value``, ``entropy``, ``kl`` (old to new policy),
-            ``clip_fraction``, ``grad_norm`` (before clipping), and ``explained_variance`` of the returns by
-            the values of the rollout.
+            ``clip_fraction``, ``grad_norm`` (before clipping), ``beyond_bound`` (share of mean
+            actions), and ``explained_variance`` of the returns by the values of the rollout.
         """
         steps = torch.stack([self._minibatch_step(batch) for batch in self._minibatches()])
         if self.schedule == "adaptive":
@@ -121,7 +126,7 @@ class TeacherPPO(PPO):
         """One optimiser step.
 
         Returns:
-            :data:`STATISTICS`, shape [6], on the device.
+            :data:`STATISTICS`, shape [7], on the device.
         """
         self.actor(batch["observations"], stochastic_output=True)
         log_ratio = self.actor.get_output_log_prob(batch["actions"]) - batch["log_prob"]
@@ -132,7 +137,10 @@ class TeacherPPO(PPO):
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = -torch.minimum(batch["advantages"] * ratio, batch["advantages"] * clipped).mean()
         value = (batch["returns"] - self.critic(batch["observations"]).squeeze(-1)).square().mean()
+        excess = (self.actor.output_mean.abs() - ACTION_BOUND).clamp_min(0.0)
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
+        if self.bound_coef:
+            loss = loss + self.bound_coef * excess.square().sum(dim=-1).mean()
 
         self.optimizer.zero_grad()
         loss.backward()
@@ -143,7 +151,8 @@ class TeacherPPO(PPO):
         self.optimizer.step()
         with torch.no_grad():
             clip_fraction = ((ratio - 1.0).abs() > self.clip_param).float().mean()
-            return torch.stack((surrogate, value, entropy, kl, clip_fraction, grad_norm)).detach()
+            beyond = (excess > 0.0).float().mean()
+            return torch.stack((surrogate, value, entropy, kl, clip_fraction, grad_norm, beyond)).detach()
 
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
         """Move the actor's learning rate so that the KL divergence of an update nears ``desired_kl``."""
