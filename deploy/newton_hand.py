@@ -1,9 +1,10 @@
-"""The hand in Newton as the plant behind the twin's motors, on the CPU, over a table.
+"""The hand in Newton as the plant behind the twin's motors, on the CPU, over a table, with an object or without.
 
 One world, stepped at the simulator's physics rate in as many steps as the time that passed holds.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import newton
@@ -11,16 +12,19 @@ import numpy as np
 import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
+from vd.assets_usd.objects.model import ObjectModel
 from vd.deploy.joints import Joints
 from vd.deploy.plant import P_GAIN_UNIT, Drive
 from vd.kernels.actions import limit_joint_velocity_kernel
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
-from vd.sim.scene import add_table, build_hand, new_builder
-from vd.sim.simulator import make_solver
+from vd.sim.scene import SHAPE_TABLE, Scene, add_table, build_hand, build_scene, new_builder
+from vd.sim.simulator import AWAY_M, make_solver
 
 LONGEST_S = 0.1
 """Time that is simulated at once at most: after a longer pause the hand is where it was."""
+ROOM = 4
+"""Times as many contacts as a world of many has on average, for there is no other world to take them from."""
 
 
 class NewtonHand:
@@ -33,26 +37,79 @@ class NewtonHand:
         hand: The hand.
         joints: Which motor turns which joint, and how.
         cfg: Physics.
+        item: An object to handle; none by default.
+
+    Attributes:
+        scene: What is where in the world; None without an object.
     """
 
-    def __init__(self, hand: HandModel, joints: Joints, cfg: SimCfg | None = None):
-        """Build the world, with the hand in the task's reset pose."""
-        self.hand, self.joints, self.cfg = hand, joints, cfg or SimCfg()
-        world = build_hand(hand, self.cfg, visuals=False)
-        add_table(world, self.cfg, visible=False)
-        builder = new_builder()
-        builder.add_world(world)
-        self._model = builder.finalize(device="cpu")
-        self._solver = make_solver(self._model, self.cfg)
+    def __init__(
+        self, hand: HandModel, joints: Joints, cfg: SimCfg | None = None, item: ObjectModel | None = None
+    ):
+        """Build the world, with the hand in the task's reset pose and the object above the table."""
+        self.hand, self.joints = hand, joints
+        cfg = cfg or SimCfg()
+        self.cfg = cfg = replace(cfg, nconmax=ROOM * cfg.nconmax, njmax=ROOM * cfg.njmax)
+        self.scene: Scene | None = None
+        if item is None:
+            world = build_hand(hand, cfg, visuals=False)
+            add_table(world, cfg, visible=False)
+            builder = new_builder()
+            builder.add_world(world)
+            self._model = builder.finalize(device="cpu")
+        else:
+            self.scene = build_scene(hand=hand, objects=[item], num_worlds=1, cfg=cfg, device="cpu")
+            self._model = self.scene.model
+        self._solver = make_solver(self._model, cfg)
         self._state, self._next = self._model.state(), self._model.state()
         self._control = self._model.control()
-        start = np.tile(PAPER.scene.reset_joint_rad, hand.num_fingers).astype(np.float32)
-        self._state.joint_q.assign(start)
-        self._target = start
-        self._limits = wp.zeros(len(start), dtype=float, device="cpu")
+        self._axes = hand.num_joints
+        self._target = np.tile(PAPER.scene.reset_joint_rad, hand.num_fingers).astype(np.float32)
+        self._limits = wp.zeros(self._axes, dtype=float, device="cpu")
         self._rest = 0.0
         self._gains: tuple[tuple[float, float], ...] = ()
+        self._write(self._state.joint_q, self._target)
+        if item is not None:
+            self.place_object((0.0, 0.0, 0.0, 1.0))
         self._graph = self._capture()
+
+    @property
+    def joint_q(self) -> np.ndarray:
+        """Hand joints [rad] and, with an object, its position [m] and quaternion xyzw, [D] or [D + 7]."""
+        return self._state.joint_q.numpy().copy()
+
+    @property
+    def joint_qd(self) -> np.ndarray:
+        """Their velocities: joints [rad/s], object linear [m/s] and angular [rad/s], [D] or [D + 6]."""
+        return self._state.joint_qd.numpy().copy()
+
+    @property
+    def body_q(self) -> wp.array:
+        """Poses of all bodies in the world frame, shape [1, B]."""
+        return self._state.body_q.reshape((1, -1))
+
+    def place_object(self, quat: Sequence[float]) -> None:
+        """Put the object where an episode starts, at rest, turned as wanted (xyzw); it falls from there."""
+        self._write(self._state.joint_q, [*PAPER.scene.object_start_m, *quat], self._axes)
+        self._write(self._state.joint_qd, np.zeros(6), self._axes)
+        # The solver warm-starts from the last accelerations, which mean nothing after a jump.
+        self._solver.reset(self._state, flags=newton.StateFlags(0))
+
+    def place_table(self, *, present: bool) -> None:
+        """Put the table where it belongs, or out of reach, as :meth:`vd.sim.simulator.Simulator.place_table`."""
+        assert self.scene is not None
+        shapes = self._solver.mjc_geom_to_newton_shape.numpy()
+        table = (shapes >= 0) & (self.scene.shape_kind[shapes] == SHAPE_TABLE)
+        places = self._solver.mjw_data.geom_xpos.numpy()
+        places[..., 2] = np.where(table, PAPER.scene.table_top_m if present else AWAY_M, places[..., 2])
+        self._solver.mjw_data.geom_xpos.assign(places)
+
+    @staticmethod
+    def _write(array: wp.array, values: Sequence[float] | np.ndarray, first: int = 0) -> None:
+        """Write ``values`` into an array from ``first`` on."""
+        whole = array.numpy()
+        whole[first : first + len(values)] = values
+        array.assign(whole)
 
     def _capture(self) -> Any:
         """Two physics steps as one recorded launch, which takes a tenth of the time.
@@ -86,7 +143,7 @@ class NewtonHand:
         self._set_gains(drives)
         goals = np.array([np.nan if drive.goal_rad is None else drive.goal_rad for drive in drives])
         self._target = np.where(np.isnan(goals), self._target, self.joints.to_joint(goals)).astype(np.float32)
-        self._control.joint_target_q.assign(self._target)
+        self._write(self._control.joint_target_q, self._target)
         self._limits.assign(np.minimum([drive.velocity_limit for drive in drives], self.hand.velocity_limit))
         self._rest = min(self._rest + seconds, LONGEST_S)
         while self._rest >= 2.0 * self.cfg.physics_dt:
@@ -95,9 +152,15 @@ class NewtonHand:
 
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions [rad], velocities [rad/s] and torques [N m] of the motors, each of shape [D]."""
-        q, qd = self._state.joint_q.numpy().astype(float), self._state.joint_qd.numpy().astype(float)
-        stiffness = self._model.joint_target_ke.numpy()
-        damping = self._model.joint_target_kd.numpy()
+        q, qd, stiffness, damping = (
+            array.numpy()[: self._axes].astype(float)
+            for array in (
+                self._state.joint_q,
+                self._state.joint_qd,
+                self._model.joint_target_ke,
+                self._model.joint_target_kd,
+            )
+        )
         torque = np.clip(stiffness * (self._target - q) - damping * qd, -self.hand.effort, self.hand.effort)
         sign = self.joints.sign
         return self.joints.to_motor(q), sign * qd, sign * torque
@@ -110,6 +173,6 @@ class NewtonHand:
         self._gains = gains
         on = np.array([switched for _, switched in gains])
         scale = np.array([p_gain for p_gain, _ in gains]) / P_GAIN_UNIT
-        self._model.joint_target_ke.assign((self.hand.kp * scale * on).astype(np.float32))
-        self._model.joint_target_kd.assign((self.hand.kd * on).astype(np.float32))
+        self._write(self._model.joint_target_ke, self.hand.kp * scale * on)
+        self._write(self._model.joint_target_kd, self.hand.kd * on)
         self._solver.notify_model_changed(newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES)

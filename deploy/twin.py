@@ -14,13 +14,21 @@ import threading
 import time
 import tty
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from vd.deploy.control_table import MODELS
 from vd.deploy.motor import Motor
 from vd.deploy.packets import BROADCAST, MAX_ID, Failure, Instruction, Packet, PacketReader, encode, status
 from vd.deploy.plant import FirstOrderPlant, Plant
+
+if TYPE_CHECKING:
+    from vd.assets_usd.objects.model import ObjectModel
+    from vd.deploy.newton_hand import NewtonHand
+    from vd.deploy.twin_side import TwinSide
 
 RETURN_DELAY_UNIT_S = 2e-6
 SILENCE_S = 0.01
@@ -55,6 +63,7 @@ class Twin:
         plant: What they move; axes without mass by default.
         faults: What goes wrong; may be changed while it runs.
         clock: Time [s].
+        side: What it tells beside the motors, if anything.
     """
 
     def __init__(
@@ -63,12 +72,13 @@ class Twin:
         plant: Plant | None = None,
         faults: Faults | None = None,
         clock: Callable[[], float] = time.monotonic,
+        side: "TwinSide | None" = None,
     ):
         """Open the pseudo-terminal; serves once started."""
         self.motors = list(motors)
         self.plant = plant or FirstOrderPlant(len(self.motors))
         self.faults = faults or Faults()
-        self._clock, self._then = clock, clock()
+        self._clock, self._then, self._side = clock, clock(), side
         self._random = random.Random(self.faults.seed)
         self._reader = PacketReader()
         self._held: list[tuple[float, bytes]] = []
@@ -97,14 +107,20 @@ class Twin:
             self._thread.join()
         for end in (self._near, self._far):
             os.close(end)
+        if self._side is not None:
+            self._side.close()
 
     def serve(self) -> None:
         """Answer until closed."""
         while not self._end.is_set():
             due = min((at for at, _ in self._held), default=float("inf")) - self._clock()
-            ready, _, _ = select.select([self._near], [], [], max(0.0, min(IDLE_S, due)))
+            beside = self._side.sockets if self._side is not None else []
+            ready, _, _ = select.select([self._near, *beside], [], [], max(0.0, min(IDLE_S, due)))
             self._advance()
-            if ready:
+            for one in beside:
+                if one in ready and self._side is not None:
+                    self._side.serve(one)
+            if self._near in ready:
                 self._heard_at = self._clock()
                 for packet in self._reader.feed(self._receive()):
                     self.handle(packet)
@@ -305,6 +321,14 @@ class TwinCommand:
     """Hand that the motors move, simulated in Newton: dclaw3, dclaw4 or a hand's USD."""
     calibration: Path | None = None
     """Calibration file of that hand's motors; IDs 10, 11, 12, 20, ... by default."""
+    object: str | None = None
+    """Object on the table, with --hand: name of a built-in set, or a file."""
+    side: Path | None = None
+    """Unix socket to make, with --object: true state, depth images, placing the object."""
+    camera: tuple[float, float, float, float, float, float, float] | None = None
+    """Pose of the depth camera in the hand's base frame, position [m] and quaternion xyzw; the hand's own."""
+    realistic: bool = False
+    """Give the depth images the errors of a real camera."""
     model: str = "XH430-V210"
     """Their model."""
     lose: float = 0.0
@@ -330,7 +354,7 @@ class TwinCommand:
         faults = Faults(
             self.lose, self.corrupt, self.truncate, self.late, cut_off=set(self.cut_off), seed=self.seed
         )
-        ids, plant = self.ids, None
+        ids, plant, side = self.ids, None, None
         if self.hand is not None:
             from vd.assets_usd.hands import load_hand
             from vd.deploy.joints import read_joints, uncalibrated
@@ -338,8 +362,9 @@ class TwinCommand:
 
             hand = load_hand(self.hand)
             joints = uncalibrated(hand) if self.calibration is None else read_joints(self.calibration, hand)
-            ids, plant = joints.ids, NewtonHand(hand, joints)
-        twin = Twin([Motor(MODELS[self.model], id) for id in ids], plant, faults)
+            ids, plant = joints.ids, NewtonHand(hand, joints, item=self._item())
+            side = self._beside(plant)
+        twin = Twin([Motor(MODELS[self.model], id) for id in ids], plant, faults, side=side)
         print(twin.path, flush=True)
         try:
             twin.serve()
@@ -348,6 +373,33 @@ class TwinCommand:
         finally:
             twin.close()
         return 0
+
+    def _item(self) -> "ObjectModel | None":
+        """The object that is named."""
+        if self.object is None:
+            return None
+        from vd.assets_usd.objects.model import load_set
+
+        found = load_set(self.object)
+        if len(found) > 1:
+            raise ValueError(f"--object {self.object} holds {len(found)} objects; name the file of one")
+        return found[0]
+
+    def _beside(self, plant: "NewtonHand") -> "TwinSide | None":
+        """The socket, if one is asked for."""
+        if self.side is None:
+            return None
+        if plant.scene is None:
+            raise ValueError("--side needs --object")
+        from vd.deploy.twin_side import TwinSide
+        from vd.sensors.cfg import DepthSensorCfg
+
+        camera = plant.hand.camera
+        if self.camera is not None:
+            place = np.array(self.camera)
+            camera = replace(camera, position=place[:3], quaternion=place[3:])
+        sensor = DepthSensorCfg.realistic() if self.realistic else None
+        return TwinSide(self.side, plant, camera, sensor=sensor, seed=self.seed)
 
 
 def main() -> None:

@@ -1,0 +1,182 @@
+"""A twin in a process of its own, and what it tells beside its motors."""
+
+import contextlib
+import json
+import select
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd.assets_usd.hand_data import CameraModel
+from vd.deploy.camera import DepthFrame, Intrinsics, StaleCamera
+from vd.deploy.twin_side import Arrays, receive
+
+START_S = 300.0
+"""Longest start: on a machine that has not compiled the simulator's kernels, that takes minutes."""
+ANSWER_S = 5.0
+"""Longest wait for an answer that the loop does not depend on."""
+
+
+class TwinError(RuntimeError):
+    """The twin did not start, or is gone."""
+
+
+@dataclass(frozen=True)
+class TwinState:
+    """The true state of the simulated hand; D joints."""
+
+    time_s: float
+    """When, by the monotonic clock [s]."""
+    cpu_s: float
+    """Processor time of the twin since its start [s]."""
+    joint_q: np.ndarray
+    """Joints [rad] [D]."""
+    joint_qd: np.ndarray
+    """Their velocities [rad/s] [D]."""
+    object_pose: np.ndarray
+    """Position [m] and quaternion xyzw of the object in the world frame [7]."""
+    object_velocity: np.ndarray
+    """Its linear [m/s] and angular [rad/s] velocity [6]."""
+
+
+class TwinProcess:
+    """A twin of a hand, its object and its camera, as another process.
+
+    Args:
+        hand: Name of the hand or its USD.
+        item: Object: name of a built-in set, or a file.
+        camera: Its depth camera, with the pose in the hand's base frame.
+        realistic: Whether the camera has the errors of a real one.
+        arguments: More arguments of ``python -m vd.deploy.twin``.
+
+    Attributes:
+        path: Device of its bus.
+
+    Raises:
+        TwinError: It did not start; says why.
+    """
+
+    def __init__(
+        self,
+        hand: str,
+        item: str,
+        camera: CameraModel,
+        *,
+        realistic: bool = False,
+        arguments: Sequence[str] = (),
+    ):
+        self.camera = camera
+        self._folder = tempfile.TemporaryDirectory(prefix="vd-twin-")
+        side = Path(self._folder.name) / "side"
+        pose = [f"{value:.9g}" for value in (*camera.position, *camera.quaternion)]
+        command = [sys.executable, "-m", "vd.deploy.twin", "--hand", hand, "--object", item]
+        command += ["--side", str(side), "--camera", *pose, *(["--realistic"] if realistic else []), *arguments]
+        self._process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+        )
+        self.path = self._first_line()
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._socket.connect(str(side))
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> "TwinProcess":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _first_line(self) -> str:
+        """The device that it prints when it serves."""
+        assert self._process.stdout is not None and self._process.stderr is not None
+        ready, _, _ = select.select([self._process.stdout], [], [], START_S)
+        line = self._process.stdout.readline().strip() if ready else ""
+        if not line.startswith("/"):
+            self._process.kill()
+            words = self._process.stderr.read().strip().splitlines()
+            self._folder.cleanup()
+            raise TwinError(f"the twin did not start: {words[-1] if words else line or 'no answer'}")
+        return line
+
+    def ask(self, ask: str, timeout_s: float = ANSWER_S, **values: Any) -> Arrays:
+        """One request on the side.
+
+        Raises:
+            TwinError: No answer.
+        """
+        with self._lock:
+            try:
+                self._socket.settimeout(timeout_s)
+                self._socket.sendall(json.dumps({"ask": ask, **values}).encode())
+                return receive(self._socket)
+            except OSError as error:
+                raise TwinError(f"the twin does not answer: {error}") from error
+
+    def state(self) -> TwinState:
+        """The true state.
+
+        Raises:
+            TwinError: No answer.
+        """
+        answer = self.ask("state")
+        q, qd = answer["joint_q"], answer["joint_qd"]
+        return TwinState(
+            float(answer["time_s"]), float(answer["cpu_s"]), q[:-7], qd[:-6], q[-7:], qd[-6:]
+        )
+
+    def place_object(self, quat: Sequence[float]) -> None:
+        """Put the object where an episode starts, turned as wanted (xyzw); it falls from there."""
+        self.ask("object", quat=[float(value) for value in quat])
+
+    def place_table(self, *, present: bool) -> None:
+        """Put the table back, or take it away."""
+        self.ask("table", present=present)
+
+    def close(self) -> None:
+        """End it."""
+        self._socket.close()
+        self._process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(timeout=ANSWER_S)
+        self._process.kill()
+        self._process.communicate()
+        self._folder.cleanup()
+
+
+class TwinCamera:
+    """The depth camera of a twin: an image whenever one is wanted.
+
+    Args:
+        twin: The twin.
+    """
+
+    def __init__(self, twin: TwinProcess):
+        self._twin = twin
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of its images."""
+        return Intrinsics.of(self._twin.camera)
+
+    def read(self, timeout_s: float) -> DepthFrame:
+        """An image of the present.
+
+        Raises:
+            StaleCamera: None came in time.
+        """
+        try:
+            answer = self._twin.ask("depth", timeout_s)
+        except TwinError as error:
+            raise StaleCamera(str(error)) from error
+        return DepthFrame(answer["depth"], float(answer["time_s"]))
+
+    def close(self) -> None:
+        """Nothing to stop: the twin goes on."""
