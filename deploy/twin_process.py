@@ -1,6 +1,5 @@
 """A twin in a process of its own, and what it tells beside its motors."""
 
-import contextlib
 import json
 import select
 import socket
@@ -80,8 +79,9 @@ class TwinProcess:
         pose = [f"{value:.9g}" for value in (*camera.position, *camera.quaternion)]
         command = [sys.executable, "-m", "vd.deploy.twin", "--hand", hand, "--object", item]
         command += ["--side", str(side), "--camera", *pose, *(["--realistic"] if realistic else []), *arguments]
+        self._words = (Path(self._folder.name) / "words").open("w+")
         self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+            command, stdout=subprocess.PIPE, stderr=self._words, text=True, start_new_session=True
         )
         self.path = self._first_line()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -95,16 +95,19 @@ class TwinProcess:
         self.close()
 
     def _first_line(self) -> str:
-        """The device that it prints when it serves."""
-        assert self._process.stdout is not None and self._process.stderr is not None
-        ready, _, _ = select.select([self._process.stdout], [], [], START_S)
-        line = self._process.stdout.readline().strip() if ready else ""
-        if not line.startswith("/"):
-            self._process.kill()
-            words = self._process.stderr.read().strip().splitlines()
-            self._folder.cleanup()
-            raise TwinError(f"the twin did not start: {words[-1] if words else line or 'no answer'}")
-        return line
+        """The device that it prints when it serves; libraries may have said something before."""
+        assert self._process.stdout is not None
+        end = time.monotonic() + START_S
+        while select.select([self._process.stdout], [], [], max(0.0, end - time.monotonic()))[0]:
+            line = self._process.stdout.readline()
+            if line.startswith("/"):
+                return line.strip()
+            if not line:
+                break
+        self._words.seek(0)
+        words = self._words.read().strip().splitlines()
+        self._end()
+        raise TwinError(f"the twin did not start: {words[-1] if words else 'no answer'}")
 
     def ask(self, ask: str, timeout_s: float = ANSWER_S, **values: Any) -> Arrays:
         """One request on the side.
@@ -143,11 +146,18 @@ class TwinProcess:
     def close(self) -> None:
         """End it."""
         self._socket.close()
+        self._end()
+
+    def _end(self) -> None:
         self._process.terminate()
-        with contextlib.suppress(subprocess.TimeoutExpired):
+        try:
             self._process.wait(timeout=ANSWER_S)
-        self._process.kill()
-        self._process.communicate()
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        self._words.close()
         self._folder.cleanup()
 
 
