@@ -1,4 +1,4 @@
-"""The hand in Newton as the plant behind the twin's motors, on the CPU, over a table, with an object or without.
+"""The hand in Newton as the plant behind the twin's motors, on the CPU, over a table, with or without an object.
 
 One world, stepped at the simulator's physics rate in as many steps as the time that passed holds.
 """
@@ -96,7 +96,7 @@ class NewtonHand:
         self._solver.reset(self._state, flags=newton.StateFlags(0))
 
     def place_table(self, *, present: bool) -> None:
-        """Put the table where it belongs, or out of reach, as :meth:`vd.sim.simulator.Simulator.place_table`."""
+        """Put the table where it belongs, or out of reach of everything."""
         assert self.scene is not None
         shapes = self._solver.mjc_geom_to_newton_shape.numpy()
         table = (shapes >= 0) & (self.scene.shape_kind[shapes] == SHAPE_TABLE)

@@ -78,7 +78,14 @@ class TwinProcess:
         side = Path(self._folder.name) / "side"
         pose = [f"{value:.9g}" for value in (*camera.position, *camera.quaternion)]
         command = [sys.executable, "-m", "vd.deploy.twin", "--hand", hand, "--object", item]
-        command += ["--side", str(side), "--camera", *pose, *(["--realistic"] if realistic else []), *arguments]
+        command += [
+            "--side",
+            str(side),
+            "--camera",
+            *pose,
+            *(["--realistic"] if realistic else []),
+            *arguments,
+        ]
         self._words = (Path(self._folder.name) / "words").open("w+")
         self._process = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=self._words, text=True, start_new_session=True
@@ -131,9 +138,7 @@ class TwinProcess:
         """
         answer = self.ask("state")
         q, qd = answer["joint_q"], answer["joint_qd"]
-        return TwinState(
-            float(answer["time_s"]), float(answer["cpu_s"]), q[:-7], qd[:-6], q[-7:], qd[-6:]
-        )
+        return TwinState(float(answer["time_s"]), float(answer["cpu_s"]), q[:-7], qd[:-6], q[-7:], qd[-6:])
 
     def place_object(self, quat: Sequence[float]) -> None:
         """Put the object where an episode starts, turned as wanted (xyzw); it falls from there."""

@@ -1,0 +1,128 @@
+"""Writing the log of a run on a hand: rows and events are appended whole: a crash loses at most one."""
+
+import json
+import os
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd.assets_usd.hand_data import HandModel
+from vd.assets_usd.hand_spec import HANDS
+from vd.deploy.control_table import RAD_PER_COUNT
+from vd.files import write_json
+from vd.gap.recording import FORMAT as RECORDING_FORMAT
+from vd.hand_log import (
+    EVENTS_FILE,
+    JOINT_CHANNELS,
+    LOG_FORMAT,
+    RECORDING_FILE,
+    RUN_FILE,
+    STEP_COLUMNS,
+    STEPS_FILE,
+    TRUTH_COLUMNS,
+)
+
+DIGITS = 6
+
+
+class LogWriter:
+    """A log being written.
+
+    Args:
+        folder: To make; it must not hold a log.
+        hand: The hand.
+        run: What runs: policy, object, goals (quaternions xyzw), and whatever is worth to know.
+        servo: What is known of the motors: model, gains.
+        truth: Whether the object's pose is known: a twin's.
+
+    Raises:
+        FileExistsError: There is a log already.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        hand: HandModel,
+        run: Mapping[str, Any],
+        *,
+        servo: Mapping[str, Any],
+        truth: bool = False,
+    ):
+        if (folder / RUN_FILE).exists():
+            raise FileExistsError(f"{folder} holds a log; choose another folder")
+        folder.mkdir(parents=True, exist_ok=True)
+        self.folder, self._joints = folder, hand.joint_names
+        self.started_s = time.monotonic()
+        self._run = {
+            "format": LOG_FORMAT,
+            "hand": hand.name,
+            "joints": list(hand.joint_names),
+            "unix_s": time.time(),
+            **run,
+        }
+        recording = {
+            "format": RECORDING_FORMAT,
+            "model": hand.name if hand.name in HANDS else "servo",
+            "joints": list(hand.joint_names),
+            "servo": dict(servo),
+            "encoder_resolution_rad": RAD_PER_COUNT,
+            "trajectories": [{"file": STEPS_FILE, "excitation": "policy", "joints": list(hand.joint_names)}],
+        }
+        self._columns = [
+            "t",
+            *(f"{channel}.{joint}" for channel in JOINT_CHANNELS for joint in hand.joint_names),
+            *STEP_COLUMNS,
+            *(TRUTH_COLUMNS if truth else ()),
+        ]
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
+        self._steps = os.open(folder / STEPS_FILE, flags, 0o644)
+        self._events = os.open(folder / EVENTS_FILE, flags, 0o644)
+        self._append(self._steps, ",".join(self._columns))
+        write_json(folder / RECORDING_FILE, recording)
+        write_json(folder / RUN_FILE, self._run)
+
+    def since(self, time_s: float) -> float:
+        """Seconds from the start of the log to a time of the monotonic clock."""
+        return time_s - self.started_s
+
+    def step(
+        self,
+        time_s: float,
+        joints: Mapping[str, np.ndarray],
+        values: Sequence[float],
+        truth: Sequence[float] = (),
+    ) -> None:
+        """Append a control step.
+
+        Args:
+            time_s: When the state was read, by the monotonic clock [s].
+            joints: Each of JOINT_CHANNELS [D].
+            values: In the order of STEP_COLUMNS.
+            truth: In the order of TRUTH_COLUMNS, if they are logged.
+        """
+        row = [
+            self.since(time_s),
+            *(v for channel in JOINT_CHANNELS for v in joints[channel]),
+            *values,
+            *truth,
+        ]
+        self._append(self._steps, ",".join(f"{value:.{DIGITS}f}" for value in row))
+
+    def event(self, event: str, **values: Any) -> None:
+        """Append an event of this moment."""
+        line = {"t": round(self.since(time.monotonic()), DIGITS), "event": event, **values}
+        self._append(self._events, json.dumps(line))
+
+    def finish(self, reason: str, **summary: Any) -> None:
+        """Say how it ended, and close the files."""
+        self.event("end", reason=reason)
+        os.close(self._steps)
+        os.close(self._events)
+        write_json(self.folder / RUN_FILE, {**self._run, "end": {"reason": reason, **summary}})
+
+    @staticmethod
+    def _append(file: int, line: str) -> None:
+        os.write(file, line.encode() + b"\n")  # one call: whole, or not at all

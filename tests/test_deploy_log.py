@@ -1,0 +1,78 @@
+"""The log of a run: appended whole, read also where it was cut short, and a recording for vd-gap."""
+
+import json
+
+import numpy as np
+import pytest
+
+from vd.assets_usd.hands import load_hand
+from vd.deploy.log import LogWriter
+from vd.gap.recording import read_recording
+from vd.hand_log import JOINT_CHANNELS, STEP_COLUMNS, STEPS_FILE, TRUTH_COLUMNS, LogError, is_log, read_log
+
+STEPS = 30
+GOALS = [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A log with two goals, the first of which was reached."""
+    hand = load_hand("dclaw3")
+    log = LogWriter(tmp_path / "log", hand, {"goals": GOALS}, servo={"p_gain": 200}, truth=True)
+    for step in range(STEPS):
+        wave = 0.3 * np.sin(0.5 * step + np.arange(9))
+        joints = {channel: wave + 0.01 * i for i, channel in enumerate(JOINT_CHANNELS)}
+        values = [float(step >= 10), 1.0, 0.5, 0.001, 0.002, 0.02, 0.02, 0.0]
+        assert len(values) == len(STEP_COLUMNS)
+        log.step(log.started_s + step / 12, joints, values, [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step])
+        if step == 9:
+            log.event("stop", goal=0, outcome="stopped", distance=0.2)
+    log.event("stop", goal=1, outcome="time limit", distance=0.7)
+    log.finish("all goals done", steps=STEPS)
+    return tmp_path / "log"
+
+
+def test_what_is_written_is_read(folder):
+    log = read_log(folder)
+    assert is_log(folder) and not is_log(folder.parent)
+    assert log.run["end"] == {"reason": "all goals done", "steps": STEPS}
+    np.testing.assert_allclose(log.columns["t"], np.arange(STEPS) / 12, atol=1e-6)
+    expected = 0.3 * np.sin(0.5 * np.arange(STEPS)[:, None] + np.arange(9))
+    np.testing.assert_allclose(log.channel("position"), expected + 0.01, atol=1e-6)
+    assert log.object_pose.shape == (STEPS, 7) and log.object_pose[3, 2] == 0.03
+    first, second = log.stops
+    assert (first.outcome, second.outcome) == ("stopped", "time limit")
+    assert second.goal_quat == tuple(GOALS[1])
+    assert second.unix_s == pytest.approx(log.run["unix_s"] + second.time_s)
+    assert len(TRUTH_COLUMNS) == 8
+
+
+def test_the_log_is_a_recording(folder):
+    recording = read_recording(folder)
+    trajectory = recording.trajectories[0]
+    np.testing.assert_allclose(trajectory.position, read_log(folder).channel("position"), atol=1e-9)
+    assert recording.model == "dclaw3" and trajectory.current is not None
+
+
+def test_a_log_cut_short_is_read_to_its_last_whole_row(folder):
+    """Killed while it ran: no end, a torn row, a torn event."""
+    run = json.loads((folder / "run.json").read_text())
+    del run["end"]
+    (folder / "run.json").write_text(json.dumps(run))
+    whole = (folder / STEPS_FILE).read_bytes()
+    (folder / STEPS_FILE).write_bytes(whole[: len(whole) - 150])
+    events = (folder / "events.jsonl").read_text()
+    (folder / "events.jsonl").write_text(events[:-20])
+    log = read_log(folder)
+    assert len(log.columns["t"]) == STEPS - 1 and len(log.stops) == 2
+
+
+def test_what_is_no_log_is_refused(folder, tmp_path):
+    with pytest.raises(LogError, match=r"there is no run\.json"):
+        read_log(tmp_path)
+    run = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps({**run, "format": "vd-hand-log/0"}))
+    with pytest.raises(LogError, match="this version reads"):
+        read_log(folder)
+    with pytest.raises(FileExistsError):
+        LogWriter(folder, load_hand("dclaw3"), {}, servo={})

@@ -1,0 +1,162 @@
+"""The log of a policy on a hand: written by vd-deploy as it goes, replayed by vd-play, read by vd-gap.
+
+A folder. ``steps.csv`` has a row for every control step, appended whole, so that a log cut short by a crash
+is a log. ``recording.json`` beside it makes the folder a recording (:mod:`vd.gap.recording`). ``run.json`` says
+what ran, and at the end how it ended; ``events.jsonl`` has goals, stops and faults. SI units, radians, world
+frame, quaternions xyzw; times are seconds since the start.
+"""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+LOG_FORMAT = "vd-hand-log/1"
+RUN_FILE, STEPS_FILE, EVENTS_FILE, RECORDING_FILE = "run.json", "steps.csv", "events.jsonl", "recording.json"
+JOINT_CHANNELS = ("command", "position", "velocity", "current", "temperature", "action", "smoothed")
+"""Columns ``channel.joint``: goal sent [rad], measured [rad], [rad/s], [A], [deg C]; the policy's action, and
+its moving average as it was before that action."""
+STEP_COLUMNS = (
+    "goal",
+    "acting",
+    "distance",
+    "late_s",
+    "sensed_s",
+    "sent_s",
+    "cpu_s",
+    "missed",
+)
+"""Number of the goal; whether the policy acts, or the hand holds still after a stop; distance to the goal that
+the stopping rule sees [rad]; how late the step began, and from its beginning, the state's reading and the
+sending of goals [s]; processor time of the process for this step [s]; deadlines missed so far."""
+TRUTH_COLUMNS = (*(f"object.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")), "error")
+"""Pose of the object and its angle to the goal, up to symmetry: a twin's only."""
+
+
+class LogError(ValueError):
+    """A log that cannot be used; names file and remedy."""
+
+
+@dataclass(frozen=True)
+class Stop:
+    """Where the pursuit of one goal ended."""
+
+    goal: int
+    """Number of the goal."""
+    goal_quat: tuple[float, ...]
+    """Wanted orientation of the object [4]."""
+    time_s: float
+    """When [s], since the start of the log."""
+    unix_s: float
+    """When, in seconds since 1970."""
+    outcome: str
+    """``stopped`` by the policy, ``time limit``, ``lost`` or ``aborted``."""
+    distance: float | None
+    """Distance that the policy predicted [rad]; None before its first step."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandLog:
+    """A log that was read; T steps, D joints.
+
+    Attributes:
+        path: Folder.
+        run: What ``run.json`` says.
+        columns: Columns of the steps by name, [T] each.
+        events: Events in order.
+    """
+
+    path: Path
+    run: dict[str, Any]
+    columns: dict[str, np.ndarray]
+    events: list[dict[str, Any]]
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints [D]."""
+        return tuple(self.run["joints"])
+
+    @property
+    def goals(self) -> np.ndarray:
+        """Wanted orientations [G, 4]."""
+        return np.array(self.run["goals"], dtype=float).reshape(-1, 4)
+
+    @property
+    def stops(self) -> list[Stop]:
+        """Where the pursuit of each goal ended."""
+        return [
+            Stop(
+                goal=event["goal"],
+                goal_quat=tuple(self.run["goals"][event["goal"]]),
+                time_s=event["t"],
+                unix_s=self.run["unix_s"] + event["t"],
+                outcome=event["outcome"],
+                distance=event["distance"],
+            )
+            for event in self.events
+            if event["event"] == "stop"
+        ]
+
+    def channel(self, name: str) -> np.ndarray:
+        """One of JOINT_CHANNELS [T, D]; NaN where it was not logged."""
+        blank = np.full(len(self.columns["t"]), np.nan)
+        return np.stack([self.columns.get(f"{name}.{joint}", blank) for joint in self.joints], axis=1)
+
+    @property
+    def object_pose(self) -> np.ndarray | None:
+        """Pose of the object [T, 7]; None where it is not known."""
+        if TRUTH_COLUMNS[0] not in self.columns:
+            return None
+        return np.stack([self.columns[name] for name in TRUTH_COLUMNS[:7]], axis=1)
+
+
+def is_log(path: str | Path) -> bool:
+    """Whether a folder is a log."""
+    return (Path(path) / RUN_FILE).is_file()
+
+
+def read_log(path: str | Path) -> HandLog:
+    """Read a log, also one that was cut short.
+
+    Raises:
+        LogError: It is none, or damaged.
+    """
+    path = Path(path)
+    try:
+        run = json.loads((path / RUN_FILE).read_text())
+    except FileNotFoundError:
+        raise LogError(
+            f"{path} is no log: there is no {RUN_FILE}; give a folder that vd-deploy wrote"
+        ) from None
+    except json.JSONDecodeError as error:
+        raise LogError(f"{path / RUN_FILE} is damaged ({error})") from error
+    found = run.get("format") if isinstance(run, dict) else None
+    if found != LOG_FORMAT:
+        raise LogError(f"{path / RUN_FILE}: format is {found!r}; this version reads {LOG_FORMAT!r}")
+    return HandLog(path, run, _columns(path / STEPS_FILE), _events(path / EVENTS_FILE))
+
+
+def _columns(file: Path) -> dict[str, np.ndarray]:
+    if not file.is_file():
+        raise LogError(f"{file} is missing; copy the whole folder again")
+    with file.open(newline="") as stream:
+        header, *rows = csv.reader(stream)
+    if rows and len(rows[-1]) < len(header):  # the last row of a log that was cut short
+        rows.pop()
+    if not rows:
+        raise LogError(f"{file} has no steps")
+    try:
+        values = np.array([[float(cell) for cell in row] for row in rows])
+    except ValueError as error:
+        raise LogError(f"{file} is damaged ({error})") from error
+    return dict(zip(header, values.T, strict=True))
+
+
+def _events(file: Path) -> list[dict[str, Any]]:
+    if not file.is_file():
+        return []
+    lines = file.read_text().splitlines(keepends=True)
+    return [json.loads(line) for line in lines if line.endswith("\n")]
