@@ -1,4 +1,4 @@
-"""The hand in Newton as the plant behind the twin's motors, on the CPU, over a table, with or without an object.
+"""The hand in Newton as the plant behind the twin's motors, on the CPU, over a table with an object or none.
 
 One world, stepped at the simulator's physics rate in as many steps as the time that passed holds.
 """

@@ -1,9 +1,9 @@
 """The log of a policy on a hand: written by vd-deploy as it goes, replayed by vd-play, read by vd-gap.
 
 A folder. ``steps.csv`` has a row for every control step, appended whole, so that a log cut short by a crash
-is a log. ``recording.json`` beside it makes the folder a recording (:mod:`vd.gap.recording`). ``run.json`` says
-what ran, and at the end how it ended; ``events.jsonl`` has goals, stops and faults. SI units, radians, world
-frame, quaternions xyzw; times are seconds since the start.
+is a log. ``recording.json`` beside it makes the folder a recording (:mod:`vd.gap.recording`). ``run.json``
+says what ran, and at the end how it ended; ``events.jsonl`` has goals, stops and faults. SI units, radians,
+world frame, quaternions xyzw; times are seconds since the start.
 """
 
 import csv
@@ -29,9 +29,9 @@ STEP_COLUMNS = (
     "cpu_s",
     "missed",
 )
-"""Number of the goal; whether the policy acts, or the hand holds still after a stop; distance to the goal that
-the stopping rule sees [rad]; how late the step began, and from its beginning, the state's reading and the
-sending of goals [s]; processor time of the process for this step [s]; deadlines missed so far."""
+"""Number of the goal; whether the policy acts, or the hand holds still after a stop; distance to the goal
+that the stopping rule sees [rad]; how late the step began, and from its beginning, the state's reading and
+the sending of goals [s]; processor time of the process for this step [s]; deadlines missed so far."""
 TRUTH_COLUMNS = (*(f"object.{axis}" for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")), "error")
 """Pose of the object and its angle to the goal, up to symmetry: a twin's only."""
 
