@@ -246,6 +246,7 @@ def test_friction_of_one_direction_alone_is_a_load() -> None:
         )
 
     assert fit(0.0, 0.2).at_bound == ("asymmetric_friction.tau_plus_nm",)
+    assert fit(1e-4, 0.2).at_bound == ("asymmetric_friction.tau_plus_nm",), "a descent stops short of zero"
     assert fit(0.05, 0.2).at_bound == ()
     assert fit(0.0, 0.2, "coulomb_friction").at_bound == ()
 

@@ -401,6 +401,7 @@ def _evidence(joint: Analysed) -> list[Candidate]:
                 if key.startswith(f"{trial.name}.")
             },
             placebo=trial.placebo,
+            given=tuple(name for name in trial.fit.effects if name != trial.name),
         )
         for trial in joint.explanation.trials
     ]

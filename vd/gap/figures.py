@@ -7,9 +7,10 @@ import math
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from vd.gap.result import Candidate, Predictions, Report
-from vd.gap.words import MILLI, plain
+from vd.gap.words import MILLI, listing, plain
 
 # Colours of Okabe and Ito, which colour-blind readers can tell apart.
 INK, BLUE, ORANGE, GREEN, GREY = "#1c2330", "#0072B2", "#D55E00", "#009E73", "#8a8f98"
@@ -27,6 +28,9 @@ MAX_BARS = 16
 BAR = 0.36
 PANELS = 2
 """Rounds of the search beside each other: their labels leave no room for a third."""
+BAR_IN, TITLE_IN = 0.24, 0.5
+"""Height of a candidate's row and of a round's title with its axis [in]."""
+DECISIONS = {"named": GREEN, "tied": BLUE, "rejected": GREY}
 
 
 def overlay_figure(report: Report, curves: Predictions, joint: str, index: int) -> Figure:
@@ -180,36 +184,51 @@ def evidence_figure(report: Report, joints: tuple[str, ...]) -> Figure:
     """Gain of every candidate on some joints, round by round, with intervals."""
     rows = [row for row in report.evidence if row.joints == joints]
     rounds = sorted({row.round for row in rows})
-    shown = {number: _best([row for row in rows if row.round == number]) for number in rounds}
-    across = min(len(rounds), PANELS)
-    down = -(-len(rounds) // across)
-    height = 0.24 * max(len(group) for group in shown.values()) + 0.5
-    figure = Figure(figsize=(WIDTH, 0.8 + down * height), layout="constrained")
-    every = figure.subplots(down, across, squeeze=False).ravel()
-    panels = every[: len(rounds)]
-    for unused in every[len(rounds) :]:
-        unused.set_axis_off()
-    colors = {"named": GREEN, "tied": BLUE, "rejected": GREY}
-    for axes, (number, group) in zip(panels, shown.items(), strict=True):
-        _clean(axes)
-        for place, row in enumerate(reversed(group)):
-            color = colors[row.decision]
-            low, high = (100.0 * x for x in row.gain_ci95)
-            axes.plot([low, high], [place, place], color=color, linewidth=2.0, alpha=0.6)
-            axes.plot([100.0 * row.gain], [place], "o" if not row.placebo else "x", color=color, markersize=5)
-        names = [f"{plain(row.name)}{' (placebo)' if row.placebo else ''}" for row in reversed(group)]
-        axes.set_yticks(range(len(group)), names, fontsize=8)
-        axes.axvline(0.0, color=INK, linewidth=0.8)
-        axes.set_xlim(left=_lower_limit(group), right=104.0)
-        axes.set_title("first round" if number == 1 else f"round {number}", fontsize=9)
-        axes.tick_params(axis="x", labelsize=8)
+    shown = [_best([row for row in rows if row.round == number]) for number in rounds]
+    pairs = [shown[i : i + PANELS] for i in range(0, len(shown), PANELS)]
+    heights = [BAR_IN * max(map(len, pair)) + TITLE_IN for pair in pairs]
+    figure = Figure(figsize=(WIDTH, 0.8 + sum(heights)), layout="constrained")
+    grid = figure.add_gridspec(len(pairs), len(pairs[0]), height_ratios=heights)
+    for line, pair in enumerate(pairs):
+        for place, group in enumerate(pair):
+            _gains(_clean(figure.add_subplot(grid[line, place])), group)
     figure.supxlabel(
         "share of the error on held-out motions that it removes, given the effects before [%]", fontsize=9
     )
-    for label, color in (("accepted", GREEN), ("cannot be told apart", BLUE), ("rejected", GREY)):
-        panels[0].plot([], [], "o", color=color, label=label)
-    figure.legend(loc="outside upper center", ncols=3, frameon=False, fontsize=9)
+    marks = [Line2D([], [], marker="o", linestyle="", color=color) for color in DECISIONS.values()]
+    labels = ["accepted", "cannot be told apart", "rejected"]
+    figure.legend(marks, labels, loc="outside upper center", ncols=3, frameon=False, fontsize=9)
     return figure
+
+
+def _gains(axes, group: list[Candidate]) -> None:
+    """One round: a row for each candidate, with an arrow at the edge for one that is beyond it."""
+    left = _lower_limit(group)
+    for place, row in enumerate(reversed(group)):
+        color, gain = DECISIONS[row.decision], 100.0 * row.gain
+        low, high = (100.0 * x for x in row.gain_ci95)
+        axes.plot([low, high], [place, place], color=color, linewidth=2.0, alpha=0.6)
+        if gain >= left:
+            axes.plot([gain], [place], "x" if row.placebo else "o", color=color, markersize=5)
+        else:
+            known = math.isfinite(gain)
+            note = f"{gain:.0f} %" if known else "not fitted"
+            axes.plot([left] if known else [], [place] if known else [], "<", color=color, markersize=5)
+            axes.text(left, place, f"   {note}", color=color, fontsize=7, va="center")
+    names = [f"{plain(row.name)}{' (placebo)' if row.placebo else ''}" for row in reversed(group)]
+    axes.set_yticks(range(len(group)), names, fontsize=8)
+    axes.axvline(0.0, color=INK, linewidth=0.8)
+    axes.set_xlim(left=left, right=104.0)
+    axes.set_ylim(-0.6, len(group) - 0.4)
+    axes.set_title(_round_title(group[0]), fontsize=9)
+    axes.tick_params(axis="x", labelsize=8)
+
+
+def _round_title(row: Candidate) -> str:
+    """Which round it is, and what was in the model before it."""
+    if not row.given:
+        return f"round {row.round}: added to the plain servo"
+    return f"round {row.round}: added to {listing([plain(name) for name in row.given])}"
 
 
 def chosen_overlays(report: Report, curves: Predictions) -> list[tuple[str, int]]:

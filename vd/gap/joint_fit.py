@@ -10,6 +10,8 @@ from vd.gap.statistics import rmse
 
 ONE_SIDED, DRY = "asymmetric_friction", ("coulomb_friction", "stribeck_friction")
 """The friction that can have a direction without any, and those that fill it up."""
+SPARED = 0.05
+"""Share of the friction in one direction below which the other has none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +71,6 @@ class JointFit:
         bound = [c.key for c, x in pairs if "." in c.key and c.bound(float(x))]
         if ONE_SIDED in self.effects and not set(DRY) & set(self.effects):
             # No dry friction spares one direction: what does is a load, and a greater one would push.
-            sides = [key for key, value in self.values.items() if key.startswith(ONE_SIDED)]
-            bound += [key for key in sides if self.values[key] <= 0.0]
+            sides = {key: value for key, value in self.values.items() if key.startswith(ONE_SIDED)}
+            bound += [key for key, value in sides.items() if value <= SPARED * max(sides.values())]
         return tuple(bound)

@@ -155,6 +155,8 @@ class Candidate:
     """Fitted values by ``effect.parameter``, a parameter of this effect, or a baseline's name."""
     placebo: bool = False
     """A negative control (an effect driven by shuffled time), which must be rejected."""
+    given: tuple[str, ...] = ()
+    """Effects that were in the model before it was added."""
 
 
 @dataclass(frozen=True)
