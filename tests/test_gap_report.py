@@ -353,6 +353,28 @@ def test_a_report_with_hardly_anything_has_a_page(report, tmp_path):
     assert "Nowhere by more than noise" in (tmp_path / "report.html").read_text()
 
 
+def test_every_candidate_leaves_a_mark_however_bad_it_is(report):
+    unknown = math.nan
+    alone = Candidate((JOINTS[0],), 1, "backlash", 2e-3, 0.5, (0.4, 0.6), "named", "best")
+    rest = [
+        dataclasses.replace(alone, round=6, name=name, gain=gain, gain_ci95=(gain, gain), given=("backlash",))
+        for name, gain in (("command_jitter", -195.0), ("supply_sag", -2.0), ("thermal_drift", -0.1))
+    ]
+    vetoed = dataclasses.replace(alone, round=7, name="command_delay", gain=unknown, gain_ci95=(unknown,) * 2)
+    changed = dataclasses.replace(report, evidence=(alone, *rest, vetoed))
+    panels = figures.evidence_figure(changed, (JOINTS[0],)).axes
+    assert [axes.get_title() for axes in panels] == [
+        "round 1: each alone",
+        "round 6: added to backlash",
+        "round 7: each alone",
+    ]
+    left, right = panels[1].get_xlim()
+    marks = [line for line in panels[1].lines if line.get_marker() in ("o", "<")]
+    assert len(marks) == 3 and all(left <= line.get_xdata()[0] <= right for line in marks)
+    assert [text.get_text().strip() for text in panels[1].texts] == ["far worse", "200 % worse"]
+    assert [text.get_text().strip() for text in panels[2].texts] == ["not fitted"]
+
+
 def test_overlays_show_joints_with_a_gap_in_different_motions(report, curves):
     chosen = figures.chosen_overlays(report, curves)
     assert {joint for joint, _ in chosen} == {"f0_j2"}

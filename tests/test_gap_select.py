@@ -555,6 +555,23 @@ def test_far_from_the_floor_the_search_begins_anew_where_first_effects_tied() ->
     assert found.value.args[0].effects == ("load_friction", "torque_limit")
 
 
+def test_a_search_that_comes_back_to_where_it_began_ends() -> None:
+    baseline, rounds = made_up((), 0.10), []
+
+    def extend(present: JointFit, done: int) -> tuple:
+        rounds.append(done + 1)
+        added = made_up((*present.effects, "gravity_load" if present.effects else "coulomb_friction"), 0.05)
+        return added, {}, [Trial(done + 1, added.effects[-1], added, 0.5, (0.4, 0.6), "named")]
+
+    def revise(present: JointFit) -> tuple:
+        return made_up(("coulomb_friction",), 0.06), {}
+
+    selection, _ = searching([])
+    selection.extend, selection.revise = extend, revise  # type: ignore[method-assign, assignment]
+    found, _, _ = selection.search(baseline, baseline)
+    assert found.effects == ("coulomb_friction",) and rounds == [1, 2]
+
+
 def test_a_search_that_fails_is_repeated_before_it_counts() -> None:
     present = made_up(("backlash",), 0.004)
     selection, seeds = searching([0.030, 0.00401, 0.0])

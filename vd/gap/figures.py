@@ -30,6 +30,8 @@ PANELS = 2
 """Rounds of the search beside each other: their labels leave no room for a third."""
 BAR_IN, TITLE_IN = 0.24, 0.5
 """Height of a candidate's row and of a round's title with its axis [in]."""
+FAR_WORSE = 1000.0
+"""Loss [%] beyond which its size says nothing more."""
 DECISIONS = {"named": GREEN, "tied": BLUE, "rejected": GREY}
 
 
@@ -206,15 +208,17 @@ def _gains(axes, group: list[Candidate]) -> None:
     left = _lower_limit(group)
     for place, row in enumerate(reversed(group)):
         color, gain = DECISIONS[row.decision], 100.0 * row.gain
-        low, high = (100.0 * x for x in row.gain_ci95)
-        axes.plot([low, high], [place, place], color=color, linewidth=2.0, alpha=0.6)
         if gain >= left:
+            axes.plot(
+                [100.0 * x for x in row.gain_ci95], [place, place], color=color, linewidth=2.0, alpha=0.6
+            )
             axes.plot([gain], [place], "x" if row.placebo else "o", color=color, markersize=5)
-        else:
-            known = math.isfinite(gain)
-            note = f"{gain:.0f} %" if known else "not fitted"
-            axes.plot([left] if known else [], [place] if known else [], "<", color=color, markersize=5)
+        elif math.isfinite(gain):
+            axes.plot([left], [place], "<", color=color, markersize=5)
+            note = f"{-gain:.0f} % worse" if gain > -FAR_WORSE else "far worse"
             axes.text(left, place, f"   {note}", color=color, fontsize=7, va="center")
+        else:
+            axes.text(left, place, "  not fitted", color=color, fontsize=7, va="center")
     names = [f"{plain(row.name)}{' (placebo)' if row.placebo else ''}" for row in reversed(group)]
     axes.set_yticks(range(len(group)), names, fontsize=8)
     axes.axvline(0.0, color=INK, linewidth=0.8)
@@ -226,9 +230,9 @@ def _gains(axes, group: list[Candidate]) -> None:
 
 def _round_title(row: Candidate) -> str:
     """Which round it is, and what was in the model before it."""
-    if not row.given:
-        return f"round {row.round}: added to the plain servo"
-    return f"round {row.round}: added to {listing([plain(name) for name in row.given])}"
+    if row.given:
+        return f"round {row.round}: added to {listing([plain(name) for name in row.given])}"
+    return f"round {row.round}: each alone"
 
 
 def chosen_overlays(report: Report, curves: Predictions) -> list[tuple[str, int]]:

@@ -11,7 +11,6 @@ from vd.gap.words import (
     amount,
     decision_text,
     estimate,
-    finding_text,
     joints_text,
     listing,
     mrad,
@@ -24,6 +23,7 @@ from vd.gap.words import (
     sentences,
     unit_text,
     verdict_sentence,
+    where_text,
 )
 from vd.kernels.effects import EFFECTS
 from vd.page import Page
@@ -132,9 +132,11 @@ def _found(page: Page, report: Report) -> None:
             "Before any effect is added, the plain servo model (stiffness, damping, speed limit) is fitted. "
             "What it cannot follow:"
         )
+        rows = []
         for joint in dict.fromkeys(finding.joint for finding in report.findings):
-            found = [finding for finding in report.findings if finding.joint == joint]
-            page.points([finding_text(finding) for finding in found[:MAX_FINDINGS]])
+            found = [where_text(finding) for finding in report.findings if finding.joint == joint]
+            rows += [(joint if i == 0 else "", where) for i, where in enumerate(found[:MAX_FINDINGS])]
+        page.table(["joint", "where"], rows, words=(1,))
     else:
         page.text("Nowhere by more than noise, once the plain servo model is fitted.")
     if report.joints:
@@ -268,17 +270,22 @@ def _evidence_row(row: Candidate) -> tuple[str, ...]:
 def _parameters(page: Page, report: Report) -> None:
     page.section("The identified model")
     rows = [
-        (joints_text(effect.joints), plain(effect.name), name, estimate(one), percent(effect.confidence))
+        (
+            joints_text(effect.joints),
+            plain(effect.name),
+            f"{name} = {estimate(one)}",
+            percent(effect.confidence),
+        )
         for effect in report.effects
         for name, one in effect.parameters.items()
     ]
     rows += [
-        (joints_text(effect.joints), f"{plain(effect.name)} (not named)", name, estimate(one), "")
+        (joints_text(effect.joints), f"{plain(effect.name)} (not named)", f"{name} = {estimate(one)}", "")
         for effect in report.provisional
         for name, one in effect.parameters.items()
     ]
     if rows:
-        page.table(["joint", "effect", "parameter", "value", "confidence"], rows, words=(1, 2))
+        page.table(["joint", "effect", "parameter", "confidence"], rows, words=(1, 2))
         if report.provisional:
             page.text(
                 "Not named: an effect that stands for its ambiguous set, so that the model can be simulated.",

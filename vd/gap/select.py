@@ -137,6 +137,7 @@ class Selection(CandidateFits, Verdicts):
         present, trials, tried = start, [], len(start.effects)
         rivals = {start.effects[-1]: [start]} if start.effects else {}
         while tried < MAX_ROUNDS:
+            begun = set(present.effects)
             longer, added, rows = self.extend(present, tried)
             trials += rows
             tried = max((row.round for row in rows), default=MAX_ROUNDS)
@@ -147,9 +148,9 @@ class Selection(CandidateFits, Verdicts):
                 break
             if len(present.effects) > 1:
                 revised, rivals = self.revise(present)
-                same = set(revised.effects) == set(present.effects)
+                settled = set(revised.effects) in (set(present.effects), begun)  # or back where it began
                 present = revised
-                if same:
+                if settled:
                     break
             if not grown or present.held_out_rmse < NO_GAP * self.floor:
                 break

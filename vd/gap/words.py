@@ -84,9 +84,12 @@ def estimate(one: Estimate) -> str:
 
 def finding_text(finding: Finding) -> str:
     """Joint, and where it fails."""
-    if finding.where.startswith(finding.joint):
-        return finding.where
-    return f"{finding.joint}: {finding.where}"
+    return f"{finding.joint}: {where_text(finding)}"
+
+
+def where_text(finding: Finding) -> str:
+    """Where a joint fails, without its name."""
+    return finding.where.removeprefix(f"{finding.joint}: ")
 
 
 def effect_sentence(effect: NamedEffect) -> str:
