@@ -6,7 +6,7 @@ y down, z forward) [m]; 0 means no value, as RealSense cameras report it.
 
 import time
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -63,6 +63,19 @@ class DepthFrame:
     """When it was exposed [s], on the clock of :func:`time.monotonic`."""
 
 
+@dataclass(frozen=True)
+class GrayFrame:
+    """One picture, for finding markers."""
+
+    image: np.ndarray
+    """Brightness, uint8 [H, W]."""
+    time_s: float
+    """When it was exposed [s], on the clock of :func:`time.monotonic`."""
+
+
+Frame = TypeVar("Frame", DepthFrame, GrayFrame)
+
+
 class DepthSource(Protocol):
     """Where depth images come from."""
 
@@ -84,7 +97,7 @@ class DepthSource(Protocol):
         """Stop the camera; no :meth:`read` after this."""
 
 
-def check_fresh(frame: DepthFrame, max_age_s: float = MAX_AGE_S) -> DepthFrame:
+def check_fresh(frame: Frame, max_age_s: float = MAX_AGE_S) -> Frame:
     """The frame, if it is new enough.
 
     Raises:
@@ -93,7 +106,7 @@ def check_fresh(frame: DepthFrame, max_age_s: float = MAX_AGE_S) -> DepthFrame:
     age = time.monotonic() - frame.time_s
     if age > max_age_s:
         raise StaleCamera(
-            f"the newest depth image is {age:.2f} s old, more than {max_age_s:.2f} s; "
+            f"the newest image is {age:.2f} s old, more than {max_age_s:.2f} s; "
             "check the camera's cable (USB 3), and that no filter or other program takes the processor"
         )
     return frame
