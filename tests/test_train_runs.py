@@ -1,5 +1,6 @@
 """How runs end and go on: checkpoints, resuming, signals, limits, divergence, several processes."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from train_dummy import DummyEnv, make_runner
+from train_dummy import SMALL_PPO, DummyEnv, make_runner
 
 from vd.policy import RandomPolicy, ZeroPolicy, load_policy
 from vd.train.checkpoint import (
@@ -396,6 +397,21 @@ def test_a_new_run_can_begin_from_anothers_checkpoint(tmp_path):
     assert [row["iteration"] for row in _rows(tmp_path / "second")] == [4]
     with pytest.raises(ValueError, match="is a policy; --init needs a checkpoint"):
         second.begin_from(str(tmp_path / "first" / "policy.pt"))
+
+
+def test_a_new_run_has_its_own_learning_rates_and_a_resumed_one_those_it_had(tmp_path):
+    adaptive = dataclasses.replace(SMALL_PPO, schedule="adaptive", desired_kl=1e-4)
+    first = make_runner(tmp_path / "first", ppo=adaptive, save_every=1)
+    first.learn(2)
+    checkpoint = str(find_checkpoint(tmp_path / "first", "latest"))
+    assert first.alg.learning_rate < adaptive.actor_learning_rate, "the rate has to have moved"
+    wanted = dataclasses.replace(SMALL_PPO, actor_learning_rate=7e-4, critic_learning_rate=8e-4)
+    second = make_runner(tmp_path / "second", ppo=wanted)
+    second.begin_from(checkpoint)
+    rates = [group["lr"] for group in second.alg.optimizer.param_groups]
+    assert rates == [7e-4, 8e-4] and second.alg.learning_rate == 7e-4
+    second.load(checkpoint)
+    assert second.alg.learning_rate == first.alg.learning_rate
 
 
 def test_a_run_goes_on_with_another_number_of_worlds_to_the_same_steps(tmp_path):

@@ -83,6 +83,12 @@ class TeacherPPO(PPO):
         """The critic's learning rate."""
         return self.optimizer.param_groups[CRITIC_GROUP]["lr"]
 
+    def set_learning_rates(self, actor: float, critic: float) -> None:
+        """Go on with these rates; a checkpoint brings those it was saved with."""
+        self.learning_rate = actor
+        self.optimizer.param_groups[ACTOR_GROUP]["lr"] = actor
+        self.optimizer.param_groups[CRITIC_GROUP]["lr"] = critic
+
     def update(self) -> dict[str, float]:
         """Run all epochs over the rollout.
 

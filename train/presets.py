@@ -27,8 +27,8 @@ class TeacherCfg:
     """Go on from a checkpoint of --run-dir: latest (a bare --resume), best, a file, or auto: the latest, and
     a new run where there is none."""
     init: Path | None = None
-    """Begin a new run with the networks, optimiser and curriculum of another run's checkpoint. It may have
-    observed less: what is new (--env.observation.shape) starts without effect."""
+    """Begin a new run with the networks, optimiser and curriculum of another run's checkpoint, at this run's
+    learning rates. It may have observed less: what is new (--env.observation.shape) starts without effect."""
     smoke: bool = False
     """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)

@@ -78,7 +78,7 @@ class TeacherRunner(OnPolicyRunner):
         deadline: float | None = None,
     ) -> None:
         validate(ppo, policy, run)
-        self.run, self.policy_cfg, self.task = run, policy, task
+        self.ppo, self.run, self.policy_cfg, self.task = ppo, run, policy, task
         # rsl-rl prints its models and observation groups while it builds them.
         with contextlib.redirect_stdout(io.StringIO()):
             super().__init__(env, rsl_rl_config(ppo, policy, env.num_envs), log_dir=None, device=device)
@@ -256,7 +256,7 @@ class TeacherRunner(OnPolicyRunner):
     def begin_from(self, path: str) -> None:
         """Begin with networks, optimiser, curriculum and counters of another run's checkpoint.
 
-        Worlds and random states are this run's own, and so is the choice of the best checkpoint.
+        Worlds, random states, learning rates and the choice of the best checkpoint are this run's own.
 
         Args:
             path: The checkpoint.
@@ -268,6 +268,7 @@ class TeacherRunner(OnPolicyRunner):
         if "optimizer_state_dict" not in state:
             raise ValueError(f"{path} is a policy; --init needs a checkpoint, which has an optimiser too")
         self._restore(without_worlds(state), path, None, True)
+        self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.new_episodes = "it is of another run"
         self._best = None
         self._window = GoalWindow(self._window_length)
