@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 
 from vd.deploy.control_table import (
+    FULL_PWM,
     MODELS,
     POSITION_MODE,
     RAD_S_PER_COUNT,
     TICK_MODULUS,
+    WATCHDOG_UNIT_S,
     Item,
     Model,
     describe_hardware_error,
@@ -32,8 +34,8 @@ from vd.deploy.packets import ALERT, MAX_ID, Failure
 BAUD_RATE = 1_000_000
 P_GAIN, D_GAIN = 200, 10
 """Position gains of the paper's motors, in their units."""
-STATE_ADDRESS, STATE_BYTES = 120, 16
-"""From the realtime tick to the position: one read for the whole state."""
+STATE_ADDRESS, STATE_BYTES = 120, 27
+"""From the realtime tick to the temperature: one read for the whole state."""
 CLOCK_TOLERANCE_S = 0.04
 """A state whose clock went on by so much more or less than ours is an old one, or from after a restart; the
 packet's own time on the line and in the driver is within it."""
@@ -59,6 +61,12 @@ class BusState:
     """Speeds [rad/s], shape [D]."""
     current: np.ndarray
     """Currents [A], shape [D]."""
+    pwm: np.ndarray
+    """Duty cycles in [-1, 1], shape [D]."""
+    voltage: np.ndarray
+    """Voltages of the supply [V], shape [D]."""
+    temperature: np.ndarray
+    """Temperatures of the motors [deg C], shape [D]."""
     alert: np.ndarray
     """Whether a motor reports a hardware error, shape [D]."""
 
@@ -160,9 +168,10 @@ class MotorBus:
             try:
                 yield
             except (OSError, termios.error, TypeError) as error:  # a closed port raises TypeError
-                self._port.is_using = False
                 name = self._port.getPortName()
                 raise BusError(f"{name} is lost: {error}; is its adapter still there?") from error
+            finally:
+                self._port.is_using = False  # else no packet could follow an exchange that was interrupted
 
     def _ask(self, ask: Callable[..., tuple[Any, int, int]], *arguments: Any) -> tuple[Any, int, int]:
         """One exchange with one motor, again if no sound answer came: answer, result and error byte."""
@@ -177,6 +186,12 @@ class MotorBus:
         """Model number of a motor, or None if it does not answer."""
         number, result, _ = self._ask(self._packets.ping, id)
         return int(number) if result == self._sdk.COMM_SUCCESS else None
+
+    def ping_all(self) -> dict[int, tuple[int, int]]:
+        """Model number and firmware version of every motor that answers a ping to all, by ID."""
+        with self._line():
+            found, _ = self._packets.broadcastPing(self._port)
+        return {int(id): (int(number), int(firmware)) for id, (number, firmware) in found.items()}
 
     def missing(self) -> dict[int, str]:
         """What is wrong with the motors that do not answer, or are of another model, by ID."""
@@ -254,6 +269,27 @@ class MotorBus:
                 failed[id] = str(error)
         return failed
 
+    def release(self) -> None:
+        """Switch the torque of all motors off with one packet, which none of them answers.
+
+        Raises:
+            BusError: The packet could not be sent.
+        """
+        self._write_all("torque_enable", [0] * len(self.ids))
+
+    def watch(self, seconds: float) -> None:
+        """Have the motors stop where they are once the line was silent for so long; 0 switches that off.
+
+        A motor that has stopped so refuses goals until this is called again.
+
+        Raises:
+            BusError: No sound answer, or a motor refused.
+        """
+        for id in self.ids:
+            self.write(id, "bus_watchdog", 0)
+            if seconds > 0.0:
+                self.write(id, "bus_watchdog", max(1, round(seconds / WATCHDOG_UNIT_S)))
+
     def reboot(self, id: int) -> None:
         """Restart a motor: clears its hardware error. Torque is off afterwards; configure it before use."""
         with self._line():
@@ -279,16 +315,23 @@ class MotorBus:
         goals = np.asarray(goals, dtype=float)
         if goals.shape != (len(self.ids),) or not np.isfinite(goals).all():
             raise ValueError(f"goals have to be {len(self.ids)} finite angles, not {goals}")
-        item = self._items["goal_position"]
-        rows: list[int] = []
+        counts = []
         for id, goal in zip(self.ids, goals, strict=True):
             if id in self._settings:
                 goal = np.clip(goal, self._settings[id].lower_rad, self._settings[id].upper_rad)
-            rows += [id, *item.to_bytes(to_counts(float(goal)))]
+            counts.append(to_counts(float(goal)))
+        self._write_all("goal_position", counts)
+
+    def _write_all(self, name: str, values: Sequence[int]) -> None:
+        """Write one item of every motor in one packet."""
+        item = self._items[name]
+        rows = [
+            byte for id, value in zip(self.ids, values, strict=True) for byte in (id, *item.to_bytes(value))
+        ]
         with self._line():
             result = self._packets.syncWriteTxOnly(self._port, item.address, item.size, rows, len(rows))
         if result != self._sdk.COMM_SUCCESS:
-            raise BusError(f"goals were not sent: {self._packets.getTxRxResult(result)}")
+            raise BusError(f"{name} was not sent: {self._packets.getTxRxResult(result)}")
 
     def read_state(self) -> BusState:
         """Read all motors at once.
@@ -348,6 +391,9 @@ class MotorBus:
             position=np.array([to_angle(int(count)) for count in column("present_position")]),
             velocity=column("present_velocity") * RAD_S_PER_COUNT,
             current=column("present_current") * self.model.current_unit_a,
+            pwm=column("present_pwm") / FULL_PWM,
+            voltage=0.1 * column("present_input_voltage"),
+            temperature=column("present_temperature").astype(float),
             alert=np.array([bool(error & ALERT) for _, error in answers]),
         )
         if self._last is not None:

@@ -17,6 +17,10 @@ SIZE = 148
 EEPROM_END = 64
 """Items below are kept without power, and cannot be written while torque is on."""
 POSITION_MODE = 3
+FULL_PWM = 885.0
+"""Counts of the whole supply voltage."""
+WATCHDOG_UNIT_S = 0.02
+"""Unit of the bus watchdog."""
 TICK_MODULUS = 32768
 """Milliseconds after which a motor's clock begins anew."""
 
@@ -114,7 +118,7 @@ def table(model: Model) -> dict[str, Item]:
         "temperature_limit": Item(31, 1, True, 80, 0, 100),
         "max_voltage_limit": Item(32, 2, True, high_v, low_v, high_v),
         "min_voltage_limit": Item(34, 2, True, low_v, low_v, high_v),
-        "pwm_limit": Item(36, 2, True, 885, 0, 885),
+        "pwm_limit": Item(36, 2, True, int(FULL_PWM), 0, int(FULL_PWM)),
         "current_limit": Item(38, 2, True, model.current_limit, 0, model.current_limit),
         "velocity_limit": Item(44, 4, True, model.velocity_limit, 0, 1023),
         "max_position_limit": Item(48, 4, True, 4095, 0, 4095),

@@ -7,6 +7,7 @@ from vd.deploy.control_table import (
     RAD_S_PER_COUNT,
     SIZE,
     TICK_MODULUS,
+    WATCHDOG_UNIT_S,
     HardwareError,
     Model,
     table,
@@ -16,7 +17,6 @@ from vd.deploy.control_table import (
 from vd.deploy.packets import ALERT, Failure
 from vd.deploy.plant import Drive
 
-WATCHDOG_UNIT_S = 0.02
 OVERLOAD_SHARE, OVERLOAD_S = 0.9, 1.0
 """A motor that gives this share of its largest torque for this long has an overload; the real rule is not
 published."""

@@ -102,7 +102,7 @@ class Twin:
 
     def close(self) -> None:
         """Stop serving and close the pseudo-terminal."""
-        self._end.set()
+        self.end()
         if self._thread is not None:
             self._thread.join()
         for end in (self._near, self._far):
@@ -110,8 +110,12 @@ class Twin:
         if self._side is not None:
             self._side.close()
 
+    def end(self) -> None:
+        """Have :meth:`serve` return."""
+        self._end.set()
+
     def serve(self) -> None:
-        """Answer until closed."""
+        """Answer until it has to end."""
         while not self._end.is_set():
             due = min((at for at, _ in self._held), default=float("inf")) - self._clock()
             beside = self._side.sockets if self._side is not None else []
@@ -311,6 +315,11 @@ ORDER: dict[int, Callable[[bytes], bytes]] = {
 """Where the instructions that several motors answer name them."""
 
 
+def _end_with_input(twin: Twin) -> None:
+    sys.stdin.read()
+    twin.end()
+
+
 @dataclass(frozen=True)
 class TwinCommand:
     """Serve a bus of simulated motors on a pseudo-terminal until interrupted."""
@@ -343,6 +352,8 @@ class TwinCommand:
     """IDs of motors with a loose cable."""
     seed: int = 0
     """Of the faults."""
+    attached: bool = False
+    """End when standard input does: with the program that started it, however that ended."""
 
     def run(self) -> int:
         """Serve."""
@@ -356,16 +367,21 @@ class TwinCommand:
         )
         ids, plant, side = self.ids, None, None
         if self.hand is not None:
+            import warp as wp
+
             from vd.assets_usd.hands import load_hand
             from vd.deploy.joints import read_joints, uncalibrated
             from vd.deploy.newton_hand import NewtonHand
 
+            wp.config.log_level = wp.LOG_WARNING  # what is printed is the path
             hand = load_hand(self.hand)
             joints = uncalibrated(hand) if self.calibration is None else read_joints(self.calibration, hand)
             ids, plant = joints.ids, NewtonHand(hand, joints, item=self._item())
             side = self._beside(plant)
         twin = Twin([Motor(MODELS[self.model], id) for id in ids], plant, faults, side=side)
         print(twin.path, flush=True)
+        if self.attached:
+            threading.Thread(target=_end_with_input, args=(twin,), daemon=True).start()
         try:
             twin.serve()
         except KeyboardInterrupt:

@@ -1,13 +1,9 @@
 """A twin in a process of its own, and what it tells beside its motors."""
 
 import json
-import select
 import socket
-import subprocess
-import sys
 import tempfile
 import threading
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,16 +13,11 @@ import numpy as np
 
 from vd.assets_usd.hand_data import CameraModel
 from vd.deploy.camera import DepthFrame, Intrinsics, StaleCamera
+from vd.deploy.child import TwinChild, TwinError
 from vd.deploy.twin_side import Arrays, receive
 
-START_S = 300.0
-"""Longest start: on a machine that has not compiled the simulator's kernels, that takes minutes."""
 ANSWER_S = 5.0
 """Longest wait for an answer that the loop does not depend on."""
-
-
-class TwinError(RuntimeError):
-    """The twin did not start, or is gone."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +38,7 @@ class TwinState:
     """Its linear [m/s] and angular [rad/s] velocity [6]."""
 
 
-class TwinProcess:
+class TwinProcess(TwinChild):
     """A twin of a hand, its object and its camera, as another process.
 
     Args:
@@ -77,20 +68,8 @@ class TwinProcess:
         self._folder = tempfile.TemporaryDirectory(prefix="vd-twin-")
         side = Path(self._folder.name) / "side"
         pose = [f"{value:.9g}" for value in (*camera.position, *camera.quaternion)]
-        command = [sys.executable, "-m", "vd.deploy.twin", "--hand", hand, "--object", item]
-        command += [
-            "--side",
-            str(side),
-            "--camera",
-            *pose,
-            *(["--realistic"] if realistic else []),
-            *arguments,
-        ]
-        self._words = (Path(self._folder.name) / "words").open("w+")
-        self._process = subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=self._words, text=True, start_new_session=True
-        )
-        self.path = self._first_line()
+        options = ["--hand", hand, "--object", item, "--side", str(side), "--camera", *pose]
+        super().__init__([*options, *(["--realistic"] if realistic else []), *arguments])
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._socket.connect(str(side))
         self._lock = threading.Lock()
@@ -100,21 +79,6 @@ class TwinProcess:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _first_line(self) -> str:
-        """The device that it prints when it serves; libraries may have said something before."""
-        assert self._process.stdout is not None
-        end = time.monotonic() + START_S
-        while select.select([self._process.stdout], [], [], max(0.0, end - time.monotonic()))[0]:
-            line = self._process.stdout.readline()
-            if line.startswith("/"):
-                return line.strip()
-            if not line:
-                break
-        self._words.seek(0)
-        words = self._words.read().strip().splitlines()
-        self._end()
-        raise TwinError(f"the twin did not start: {words[-1] if words else 'no answer'}")
 
     def ask(self, ask: str, timeout_s: float = ANSWER_S, **values: Any) -> Arrays:
         """One request on the side.
@@ -151,18 +115,7 @@ class TwinProcess:
     def close(self) -> None:
         """End it."""
         self._socket.close()
-        self._end()
-
-    def _end(self) -> None:
-        self._process.terminate()
-        try:
-            self._process.wait(timeout=ANSWER_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        assert self._process.stdout is not None
-        self._process.stdout.close()
-        self._words.close()
+        super().close()
         self._folder.cleanup()
 
 

@@ -1,0 +1,82 @@
+"""``vd-deploy``: a policy on a real hand, or on its twin, and what has to come before and after."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple
+
+OK, FAILED, INTERRUPTED = 0, 1, 130
+"""Exit statuses: done, or not, with the reason; Ctrl-C."""
+
+
+class Entry(NamedTuple):
+    """Where a command is: a dataclass of its options, and the function that takes it and returns a status."""
+
+    module: str
+    options: str
+    function: str
+    summary: str
+
+
+RUN = Entry("vd.deploy.run", "RunCfg", "run", "drive the hand with a policy")
+COMMANDS = {
+    "scan": Entry(
+        "vd.deploy.scan", "ScanCfg", "scan", "which motors are on the line, and what is wrong with them"
+    ),
+    "check": Entry(
+        "vd.deploy.check", "CheckCfg", "check", "preflight: everything that must be right before it moves"
+    ),
+    "home": Entry("vd.deploy.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"),
+}
+"""The commands by name."""
+
+USAGE = """usage: vd-deploy [flags]            {run}
+       vd-deploy COMMAND [flags]
+
+commands:
+{commands}
+
+Every command takes --hand dclaw3|dclaw4 and either --port DEVICE or --twin, a simulated hand on a
+pseudo-terminal. Nothing moves before the preflight has passed and you have said yes (--yes says so at once).
+vd-deploy COMMAND --help lists the flags of a command, vd-deploy --hand dclaw3 --help those of a run."""
+
+
+def usage() -> str:
+    """The overview of the commands."""
+    lines = [f"  {name:<10} {entry.summary}" for name, entry in COMMANDS.items()]
+    return USAGE.format(run=RUN.summary, commands="\n".join(lines))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``vd-deploy``; returns the exit status."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if not arguments or arguments in (["-h"], ["--help"]):
+        print(usage())
+        return OK
+    name, entry = "", RUN
+    if not arguments[0].startswith("-"):
+        name = arguments.pop(0)
+        if name not in COMMANDS:
+            print(f"vd-deploy: no command {name!r}; choose of {', '.join(COMMANDS)}", file=sys.stderr)
+            return FAILED
+        entry = COMMANDS[name]
+    import tyro
+
+    module = importlib.import_module(entry.module)
+    options = tyro.cli(
+        getattr(module, entry.options),
+        args=arguments,
+        prog=f"vd-deploy {name}".strip(),
+        description=module.__doc__,
+    )
+    try:
+        return int(getattr(module, entry.function)(options))
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except (ValueError, OSError, RuntimeError) as error:  # BusError and StoppedError among them
+        print(f"vd-deploy: {error}", file=sys.stderr)
+        return FAILED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,116 @@
+"""From options to a hand: its model, its motors' calibration, and the bus, to real motors or to a twin."""
+
+import contextlib
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from vd.deploy.child import TwinChild
+
+if TYPE_CHECKING:
+    from vd.assets_usd.hand_model import HandModel
+    from vd.deploy.bus import MotorBus
+    from vd.deploy.joints import Joints
+
+MOTOR = "XH430-V210"
+"""The motors whose stall torque is the hand's effort limit."""
+BAUD_RATE = 1_000_000
+TWIN_RETRIES = 3
+"""The twin is a process among others, which may not run for longer than the SDK waits for an answer."""
+
+
+@dataclass(frozen=True)
+class HandOptions:
+    """Which hand, and where its motors are."""
+
+    hand: str = "dclaw3"
+    """dclaw3, dclaw4 or a hand's USD."""
+    hand_layer: Path | None = None
+    """Identified servo model over the hand (identified.usda); a twin moves as it says."""
+    port: str | None = None
+    """Serial port of the motors, such as /dev/ttyUSB0."""
+    twin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Simulate the motors and the hand in place of --port."""
+    twin_args: str = ""
+    """More options of the twin, such as "--lose 0.01 --cut-off 11"; python -m vd.deploy.twin --help."""
+    calibration: Path | None = None
+    """Calibration file of the joints' motors; IDs 10, 11, 12, 20, ... with zero in the middle by default."""
+    motor: str = MOTOR
+    """Model of the motors."""
+    baud_rate: int = BAUD_RATE
+    """Of the port."""
+
+
+@dataclass(frozen=True)
+class Connection:
+    """A hand and the bus to its motors."""
+
+    hand: "HandModel"
+    """The hand, with its layer."""
+    joints: "Joints"
+    """Which motor turns which joint."""
+    bus: "MotorBus"
+    """Its motors, in the joints' order."""
+
+
+def read_hand_and_joints(options: HandOptions) -> tuple["HandModel", "Joints"]:
+    """The hand of the options and its motors.
+
+    Raises:
+        ValueError: Hand, layer or calibration cannot be used.
+    """
+    from vd.assets_usd.hands import load_hand
+    from vd.deploy.joints import read_joints, uncalibrated
+
+    hand = load_hand(options.hand, layer=options.hand_layer)
+    if options.calibration is None:
+        return hand, uncalibrated(hand)
+    return hand, read_joints(options.calibration, hand)
+
+
+@contextlib.contextmanager
+def open_port(options: HandOptions) -> Iterator[str]:
+    """The serial port of the options; a twin behind it is started, and ended with the block.
+
+    Raises:
+        ValueError: Neither or both of a port and a twin are asked for.
+        TwinError: The twin did not start.
+    """
+    if options.twin == (options.port is not None):
+        raise ValueError("give --port, such as /dev/ttyUSB0, or --twin for a simulated hand")
+    if options.port is not None:
+        yield options.port
+        return
+    print("starting the twin ...", file=sys.stderr, flush=True)
+    arguments = ["--hand", options.hand, "--model", options.motor]
+    if options.hand_layer is not None:
+        arguments += ["--hand-layer", str(options.hand_layer)]
+    if options.calibration is not None:
+        arguments += ["--calibration", str(options.calibration)]
+    twin = TwinChild([*arguments, *options.twin_args.split()])
+    try:
+        yield twin.path
+    finally:
+        twin.close()
+
+
+@contextlib.contextmanager
+def connect(options: HandOptions) -> Iterator[Connection]:
+    """Open the bus to the hand of the options.
+
+    Raises:
+        ValueError: Options that cannot be.
+        TwinError: The twin did not start.
+        BusError: The port cannot be opened.
+    """
+    from vd.deploy.bus import MotorBus
+
+    hand, joints = read_hand_and_joints(options)
+    retries = {"retries": TWIN_RETRIES} if options.twin else {}
+    with open_port(options) as port:
+        with MotorBus(port, joints.ids, options.motor, baud_rate=options.baud_rate, **retries) as bus:
+            yield Connection(hand, joints, bus)

@@ -1,0 +1,117 @@
+"""Find the motors on a line: who answers, at which rate, and how each differs from what the hand needs."""
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from vd.deploy.connect import HandOptions, open_port, read_hand_and_joints
+
+if TYPE_CHECKING:
+    from vd.deploy.joints import Joints
+
+BAUD_RATES = (57_600, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 115_200)
+"""Rates of the motors, the ones that are met most first: the factory's, then ours."""
+OUT_OF_THE_BOX = 1
+"""ID of a motor that nobody has numbered."""
+
+
+@dataclass(frozen=True)
+class ScanCfg(HandOptions):
+    """Find the motors on a line; nothing is written to them."""
+
+    baud_rates: tuple[int, ...] = BAUD_RATES
+    """Rates to try."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print JSON."""
+
+
+@dataclass(frozen=True)
+class FoundMotor:
+    """One motor that answered."""
+
+    id: int
+    baud_rate: int
+    model: str
+    """Name, or its number where it is none of ours."""
+    firmware: int
+
+
+def find(port: str, baud_rates: Sequence[int], say: Callable[[str], None]) -> list[FoundMotor]:
+    """All motors that answer a broadcast ping, at each rate.
+
+    Raises:
+        BusError: The port cannot be opened.
+    """
+    from vd.deploy.bus import BusError, MotorBus
+    from vd.deploy.control_table import MODELS
+
+    names = {model.number: name for name, model in MODELS.items()}
+    found, refused = [], []
+    for rate in baud_rates:
+        try:
+            with MotorBus(port, [OUT_OF_THE_BOX], next(iter(MODELS)), baud_rate=rate) as bus:
+                answers = bus.ping_all()
+        except BusError as error:
+            refused.append(error)  # not every adapter has every rate
+            if len(refused) == len(baud_rates):
+                raise
+            continue
+        say(f"{port} at {rate}: {len(answers)} motors")
+        found += [
+            FoundMotor(id, rate, names.get(number, f"model {number}"), firmware)
+            for id, (number, firmware) in sorted(answers.items())
+        ]
+    return found
+
+
+def differences(found: Sequence[FoundMotor], joints: "Joints", model: str, baud_rate: int) -> list[str]:
+    """What differs from what the hand needs, a sentence for each, with the remedy."""
+    wrong = []
+    by_id: dict[int, list[FoundMotor]] = {}
+    for motor in found:
+        by_id.setdefault(motor.id, []).append(motor)
+    spare = sorted(set(by_id) - set(joints.ids))
+    for name, id in zip(joints.names, joints.ids, strict=True):
+        if id not in by_id:
+            guess = f"; is it {', '.join(f'ID {s}' for s in spare)}?" if spare else ""
+            wrong.append(f"{name}: no motor {id} answers: check its cable, power and ID{guess}")
+            continue
+        for motor in by_id[id]:
+            if motor.baud_rate != baud_rate:
+                wrong.append(
+                    f"{name}: motor {id} is at {motor.baud_rate} baud, not {baud_rate}: change its baud rate"
+                )
+            if motor.model != model:
+                wrong.append(f"{name}: motor {id} is {motor.model}, not {model}: give --motor, or replace it")
+    wrong += [
+        f"motor {id} is none of the hand's: give it the ID of its joint, or --calibration" for id in spare
+    ]
+    firmware = {motor.firmware for motor in found}
+    if len(firmware) > 1:
+        wrong.append(f"motors have firmware {', '.join(map(str, sorted(firmware)))}: update them to the same")
+    return wrong
+
+
+def scan(cfg: ScanCfg) -> int:
+    """Find the motors and print them; 1 if they are not those of the hand."""
+    _, joints = read_hand_and_joints(cfg)
+    # A pseudo-terminal has no rate: a twin answers at each.
+    rates = [cfg.baud_rate] if cfg.twin else cfg.baud_rates
+    with open_port(cfg) as port:
+        found = find(port, rates, lambda text: print(text, file=sys.stderr, flush=True))
+    wrong = differences(found, joints, cfg.motor, cfg.baud_rate)
+    if cfg.json:
+        print(json.dumps({"motors": [asdict(motor) for motor in found], "differences": wrong}, indent=1))
+    else:
+        names = dict(zip(joints.ids, joints.names, strict=True))
+        for motor in found:
+            joint = names.get(motor.id, "-")
+            print(
+                f"{motor.id:>4} {joint:<6} {motor.model:<10} firmware {motor.firmware} {motor.baud_rate} baud"
+            )
+        print("\n".join(wrong) or f"all {len(joints.ids)} motors of {cfg.hand} are there")
+    return 1 if wrong else 0
