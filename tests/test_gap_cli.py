@@ -14,7 +14,7 @@ from vd.gap import cli, steps
 from vd.gap.chain import chains
 from vd.gap.close import _counterparts, simulate_again, write_identified
 from vd.gap.hide import hide
-from vd.gap.plan import plan, write_plan
+from vd.gap.plan import _fitted, plan, write_plan
 from vd.gap.recording import read_recording
 from vd.gap.result import (
     Candidate,
@@ -98,7 +98,9 @@ def servo_report(folder, *, verdict="effects", ambiguous=()):
         next_experiment="",
         seconds=1.0,
         recording=Source(str(folder), "servo", (JOINT,), len(curves.files), len(curves.time), 40.0),
-        joints=(JointGap(JOINT, FLOOR, before, (0.0, 1.0), after, (0.0, 1.0), verdict, "made up"),),
+        joints=(
+            JointGap(JOINT, FLOOR, before, (0.0, 1.0), after, (0.0, 1.0), verdict, "made up", ambiguous),
+        ),
         evidence=tuple(
             Candidate((JOINT,), 1, name, after, 0.8, (0.7, 0.9), decision, "made up", values)
             for name, values in names.items()
@@ -263,7 +265,7 @@ def test_layers_that_are_none_are_named(recording, tmp_path):
 def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tmp_path):
     report, _ = servo_report(recording, verdict="ambiguous", ambiguous=(("coulomb_friction", "backlash"),))
     result = plan(report, read_recording(recording), None)
-    assert result.competing == {JOINT: ("coulomb_friction", "backlash")}
+    assert result.competing == {JOINT: (("coulomb_friction", "backlash"),)}
     scores = [score.floors for score in result.ranking]
     assert scores == sorted(scores, reverse=True) and scores[0] > 3.0
     assert "second_payload" not in {score.name for score in result.ranking}, "a bare servo's load is unknown"
@@ -279,11 +281,35 @@ def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tm
         assert time[-1] == pytest.approx(entry["duration_s"], abs=1e-5)
 
 
+def test_plan_counts_the_pairs_of_every_set_that_a_motion_tells_apart(recording):
+    sets = (("coulomb_friction", "backlash"), ("torque_limit", "torque_saturation"))
+    report, _ = servo_report(recording, verdict="ambiguous", ambiguous=sets)
+    weak = Candidate((JOINT,), 2, "torque_limit", 0.01, 0.2, (0.1, 0.3), "tied", "", {"tau_max_nm": 50.0})
+    report = dataclasses.replace(report, evidence=(*report.evidence, weak))  # a limit that is never met
+    result = plan(report, read_recording(recording), None)
+    assert result.competing == {JOINT: sets}
+    assert all(score.pairs == 2 for score in result.ranking)
+    told = [score.told for score in result.ranking]
+    assert told == sorted(told, reverse=True) and told[0] > 0
+    assert f"tells {told[0]} of 2 pairs" in result.sentence
+
+
+def test_plan_takes_an_effect_as_it_was_fitted_beside_the_others(recording):
+    report, _ = servo_report(recording)
+    early = report.evidence[1]
+    late = dataclasses.replace(early, round=7, parameters={"width_rad": 0.02}, given=("command_delay",))
+    report = dataclasses.replace(report, evidence=(*report.evidence, late))
+    assert _fitted(report, JOINT, "backlash", set()) == {"width_rad": 0.08}
+    assert _fitted(report, JOINT, "backlash", {"command_delay"}) == {"width_rad": 0.02}
+    assert _fitted(report, JOINT, "backlash", {"supply_sag"}) == {"width_rad": 0.02}
+    assert _fitted(report, JOINT, "supply_sag", set()) == {}
+
+
 def test_plan_for_motions_that_show_too_little(recording):
     report, _ = servo_report(recording, verdict="under_excited")
     slow = read_recording(recording).subset([3])
     result = plan(report, slow, None)
-    assert result.moved == (JOINT,)
+    assert tuple(result.competing) == (JOINT,)
     assert "what these motions do not show" in result.sentence
     assert slow.trajectories[0].excitation not in {motion.name for motion in result.motions}
 

@@ -3,7 +3,7 @@
 Every set of motions of the menu is simulated under every model in question, together with what has been
 recorded. Two models differ by what refitting to both cannot absorb: the part of their difference along small
 changes of their parameters is taken out, as far as those parameters are uncertain, and so is the size of what
-they already disagree about. The set whose least different pair stands out most from the noise is proposed.
+they already disagree about. The set of motions that tells most pairs of models apart is proposed.
 """
 
 import csv
@@ -24,7 +24,7 @@ from vd.gap.excitations import MENU, Excitation, JointRange
 from vd.gap.recording import BARE_MODELS, Recording, Trajectory
 from vd.gap.result import Report, parameter_columns, parameter_of
 from vd.gap.rollout import STEP_S, Rollouts
-from vd.gap.words import listing, plain
+from vd.gap.words import joints_text, listing, plain
 from vd.kernels.effects import BASELINE, EFFECTS
 
 if TYPE_CHECKING:
@@ -68,10 +68,12 @@ class Score:
 
     name: str
     """Key of :data:`vd.gap.excitations.MENU`."""
-    disagreement_rad: float
-    """RMS difference of the two models that differ least, refitting taken into account."""
+    told: int
+    """Pairs of models in question that differ by more than :data:`VISIBLE` noise floors."""
+    pairs: int
+    """Pairs in question."""
     floors: float
-    """The same in noise floors."""
+    """RMS difference of two models in noise floors of the joint, refitting taken into account: the median."""
     seconds: float
     """Length of all its motions."""
 
@@ -83,10 +85,8 @@ class Plan:
     model: str
     joints: tuple[str, ...]
     """All joints of the recording; commands name every one of them."""
-    moved: tuple[str, ...]
-    """Joints in question."""
-    competing: dict[str, tuple[str, ...]]
-    """Models in question, by joint."""
+    competing: dict[str, tuple[tuple[str, ...], ...]]
+    """Sets of models in question, by joint."""
     ranking: tuple[Score, ...]
     """Best first."""
     motions: tuple[Excitation, ...]
@@ -114,50 +114,48 @@ def plan(
     Raises:
         ValueError: The recording has no joint with a model to compare.
     """
-    targets, floor = _targets(report), report.noise_floor_rad
+    targets, floors = _targets(report), {one.joint: one.noise_floor_rad for one in report.joints}
     reach = _reach(recording, hand)
-    totals: dict[str, list[float]] = {}
-    seconds: dict[str, float] = {}
-    kept: dict[str, list[Excitation]] = {}
-    competing: dict[str, tuple[str, ...]] = {}
+    pairs: dict[str, list[float]] = {}
+    motions: dict[str, list[Excitation]] = {}
+    competing: dict[str, list[tuple[str, ...]]] = {}
     for chain in chains(recording, hand):
         base = _base(chain, report, start or {})
         for joint in (name for name in chain.joints if name in targets):
-            models = _models(report, chain, joint, base, targets[joint])
-            competing[joint] = tuple(models)
-            for name in MENU:
-                motions = _motions(name, reach, recording, joint)
-                if not motions:
-                    continue
-                step = FINE_STEP_S if targets[joint] else STEP_S
-                pairs = _disagreements(chain, recording, motions, joint, models, floor, step, device)
-                # Rivals have to be separated for sure; where anything is possible, it is the sum that counts.
-                value = float(np.min(pairs) if targets[joint] else np.sqrt(np.mean(np.square(pairs))))
-                totals.setdefault(name, []).append(value)
-                seconds[name] = seconds.get(name, 0.0) + sum(motion.duration for motion in motions)
-                kept.setdefault(name, []).extend(motions)
-    if not totals:
+            menu = {name: found for name in MENU if (found := _motions(name, reach, recording, joint))}
+            for name, found in menu.items():
+                motions.setdefault(name, []).extend(found)
+            for group in targets[joint] or ((),):
+                models = _models(report, chain, joint, base, group)
+                competing.setdefault(joint, []).append(tuple(models))
+                step, floor = FINE_STEP_S if group else STEP_S, floors.get(joint, report.noise_floor_rad)
+                differences = _disagreements(chain, recording, menu, joint, models, floor, step, device)
+                for name, values in differences.items():
+                    pairs.setdefault(name, []).extend(value / floor for value in values)
+    if not pairs:
         raise ValueError(
             f"{recording.path}: no joint has a fitted model to plan from, or every motion of the menu has "
-            "been "
-            "recorded; run vd-gap explain first"
+            "been recorded; run vd-gap explain first"
         )
-    ranking = sorted(
-        (
-            Score(name, float(np.median(values)), float(np.median(values)) / floor, seconds[name])
-            for name, values in totals.items()
-        ),
-        key=lambda score: -score.floors,
-    )
-    best = ranking[0]
+    total = max(map(len, pairs.values()))
+    scores = [
+        Score(
+            name,
+            sum(value > VISIBLE for value in values),
+            total,
+            float(np.median(values)),
+            sum(motion.duration for motion in motions[name]),
+        )
+        for name, values in pairs.items()
+    ]
+    ranking = sorted(scores, key=lambda score: (-score.told, -score.floors))
     return Plan(
         model=recording.model,
         joints=recording.joints,
-        moved=tuple(competing),
-        competing=competing,
+        competing={joint: tuple(groups) for joint, groups in competing.items()},
         ranking=tuple(ranking),
-        motions=tuple(kept[best.name]),
-        sentence=_sentence(best, report, tuple(competing)),
+        motions=tuple(motions[ranking[0].name]),
+        sentence=_sentence(ranking[0], report, tuple(competing)),
     )
 
 
@@ -192,7 +190,7 @@ def write_plan(result: Plan, folder: Path) -> Path:
             "joints": list(result.joints),
             "sentence": result.sentence,
             "excitation": result.ranking[0].name,
-            "competing": {joint: list(names) for joint, names in result.competing.items()},
+            "competing": {joint: [list(names) for names in sets] for joint, sets in result.competing.items()},
             "ranking": [vars(score) for score in result.ranking],
             "trajectories": entries,
         },
@@ -200,19 +198,15 @@ def write_plan(result: Plan, folder: Path) -> Path:
     return path
 
 
-def _targets(report: Report) -> dict[str, tuple[str, ...]]:
-    """Joints in question with the effects that compete on each; none means that all do."""
-    targets: dict[str, tuple[str, ...]] = {}
-    for group in report.open_sets:
-        rows = [row for row in report.evidence if row.name in group and row.decision != "rejected"]
-        for joint in dict.fromkeys(joint for row in rows for joint in row.joints):
-            targets[joint] = group
+def _targets(report: Report) -> dict[str, tuple[tuple[str, ...], ...]]:
+    """Joints in question with the sets of effects that compete on each; none means that all do."""
+    targets = {one.joint: one.open_sets for one in report.joints if one.open_sets}
     if not targets:
         shaky = [
             one.joint for one in report.joints if one.verdict in ("under_excited", "ambiguous", "unknown")
         ]
         targets = {joint: () for joint in shaky or report.recording.joints}
-    return {joint: group for joint, group in targets.items() if joint in report.identified.parameters}
+    return {joint: groups for joint, groups in targets.items() if joint in report.identified.parameters}
 
 
 def _base(chain: Chain, report: Report, start: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -235,15 +229,11 @@ def _models(
     for name in group:  # one of them stands in the identified model for all
         for parameter in EFFECTS[name].parameters:
             base[index, parameter.column] = parameter.neutral
+    held = {e.name for e in (*report.effects, *report.provisional) if joint in e.joints}
     for name in group:
-        found = [
-            row
-            for row in report.evidence
-            if row.name == name and joint in row.joints and row.parameters and not row.placebo
-        ]
         values = {p.column: p.typical for p in EFFECTS[name].parameters}
-        for row in found[-1:]:  # the last round is the one in which it is in question
-            values |= {parameter_of(key, name).column: value for key, value in row.parameters.items()}
+        for key, value in _fitted(report, joint, name, held - set(group)).items():
+            values[parameter_of(key, name).column] = value
         models[name] = base.copy()
         for column, value in values.items():
             models[name][index, column] = value
@@ -258,6 +248,17 @@ def _models(
         for parameter in effect.parameters:
             models[effect.name][index, parameter.column] = parameter.typical
     return models
+
+
+def _fitted(report: Report, joint: str, name: str, given: set[str]) -> dict[str, float]:
+    """Parameters of an effect on a joint as they were fitted beside the effects given, or else last."""
+    found = [
+        row
+        for row in report.evidence
+        if row.name == name and joint in row.joints and row.parameters and not row.placebo
+    ]
+    beside = [row for row in found if set(row.given) == given]
+    return (beside or found)[-1].parameters if found else {}
 
 
 def _reach(recording: Recording, hand: "HandModel | None") -> JointRange:
@@ -307,21 +308,22 @@ def _common(recording: Recording) -> dict[str, float | str]:
 def _disagreements(
     chain: Chain,
     recording: Recording,
-    motions: Sequence[Excitation],
+    menu: Mapping[str, Sequence[Excitation]],
     joint: str,
     models: Mapping[str, np.ndarray],
     floor: float,
     dt: float,
     device: str,
-) -> list[float]:
-    """RMS difference [rad] of every two rivals, or of each to the plain servo, after refitting."""
+) -> dict[str, list[float]]:
+    """What every two rivals, or each and the plain servo, say differently about each set of motions [rad]."""
     known = _known(recording, joint)
+    motions = [(name, motion) for name, found in menu.items() for motion in found]
     imagined = replace(
         recording,
         trajectories=known
         + tuple(
             Trajectory(
-                file=f"{index}_{motion.name}",
+                file=f"{index}_{name}",
                 excitation=motion.name,
                 joints=motion.joints,
                 conditions=motion.conditions,
@@ -330,11 +332,12 @@ def _disagreements(
                 position=motion.command,
                 enabled=motion.enabled,
             )
-            for index, motion in enumerate(motions)
+            for index, (name, motion) in enumerate(motions)
         ),
     )
     rollouts = Rollouts(chain, imagined, dt=dt, device=device)
-    old = sum(len(trajectory.time) for trajectory in known)
+    old = np.arange(len(rollouts.sample_trajectory)) < sum(len(trajectory.time) for trajectory in known)
+    owner = np.array([""] * len(known) + [name for name, _ in motions])[rollouts.sample_trajectory]
     index = chain.joints.index(joint)
     rows, free = [], []
     for model in models.values():
@@ -354,10 +357,13 @@ def _disagreements(
     count = len(models)
     plain_first = PLAIN in models  # then every effect is one of many, and is compared with none
     pairs = [(0, b) for b in range(1, count)] if plain_first else itertools.combinations(range(count), 2)
-    return [
-        _left_over(curves[a] - curves[b], np.concatenate([slopes[a], slopes[b]]), floor, old)
-        for a, b in pairs
-    ]
+    result: dict[str, list[float]] = {name: [] for name in menu}
+    for a, b in pairs:
+        difference, both = curves[a] - curves[b], np.concatenate([slopes[a], slopes[b]])
+        for name, values in result.items():
+            seen = old | (owner == name)
+            values.append(_left_over(difference[seen], both[:, seen], floor, int(old.sum())))
+    return result
 
 
 def _free(chain: Chain, rows: np.ndarray, joint: int) -> list[int]:
@@ -398,18 +404,20 @@ def _left_over(difference: np.ndarray, slopes: np.ndarray, floor: float, old: in
 def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
     sets = [list(dict.fromkeys(map(plain, group))) for group in report.open_sets]
     one = listing(sets[0]) if len(sets) == 1 else ""  # several are listed by themselves
-    if best.floors < VISIBLE:
+    if best.told == 0:
         goal = f"decide between {one}" if one else "decide" if sets else "show more than these do"
         return (
-            f"No motion of the menu would {goal}: the models in question differ by at most {best.floors:.1f} "
-            "times the noise floor, so either serves in simulation. To decide, record another quantity, "
-            f"such as current or an external sensor. The best of the menu is in {PLAN_FOLDER}/."
+            f"No motion of the menu would {goal}: on all of them the models in question differ by less than "
+            f"{VISIBLE:g} times the noise floor, so either serves in simulation. To decide, record another "
+            f"quantity, such as current or an external sensor. The best of the menu is in {PLAN_FOLDER}/."
         )
     goal = f" to decide between {one}" if one else "" if sets else " to see what these motions do not show"
+    shows = f"there the models in question differ by {best.floors:.1f} times the noise floor"
+    if best.pairs > 1:
+        shows = f"that tells {best.told} of {best.pairs} pairs of possible models apart"
     return (
-        f"Record {CONCLUSIONS[best.name]} on {listing(joints)} ({best.seconds:.0f} s){goal}: there the "
-        f"models in question differ by {best.floors:.1f} times the noise floor. The commands are in "
-        f"{PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
+        f"Record {CONCLUSIONS[best.name]} on {joints_text(joints)} ({best.seconds:.0f} s){goal}: {shows}. "
+        f"The commands are in {PLAN_FOLDER}/; add what was measured to the recording and run vd-gap again."
     )
 
 
