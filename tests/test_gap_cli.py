@@ -12,7 +12,7 @@ from vd.assets_usd.bare_layer import read_bare_layer
 from vd.assets_usd.hand_data import HandError
 from vd.gap import cli, steps
 from vd.gap.chain import chains
-from vd.gap.close import _counterparts, simulate_again, write_identified
+from vd.gap.close import counterparts, simulate_again, write_identified
 from vd.gap.hide import hide
 from vd.gap.plan import _fitted, plan, write_plan
 from vd.gap.recording import read_recording
@@ -335,5 +335,5 @@ def test_plan_says_when_nothing_would_help(recording):
 
 def test_other_fingers_take_the_model_of_the_recorded_one():
     joints = tuple(f"f{f}_j{j}" for f in range(3) for j in (1, 2, 3))
-    found = _counterparts(joints, ("f1_j1", "f1_j3"))
+    found = counterparts(joints, ("f1_j1", "f1_j3"))
     assert found == {"f0_j1": "f1_j1", "f2_j1": "f1_j1", "f0_j3": "f1_j3", "f2_j3": "f1_j3"}

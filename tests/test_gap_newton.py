@@ -1,5 +1,6 @@
 """Newton replays a recording as the rollouts predict it, and the paper's search finds what made one."""
 
+import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -8,10 +9,12 @@ import numpy as np
 import pytest
 
 from vd.assets_usd.hands import load_hand
+from vd.gap import cli
 from vd.gap.chain import chains
 from vd.gap.excitations import JointRange, steps_and_sines
-from vd.gap.newton import HandReplay, identify, pack_tracks, simulate_hand
-from vd.gap.recording import Recording, Trajectory
+from vd.gap.identify import identify, pack_tracks, write_drives
+from vd.gap.newton import HandReplay, simulate_hand
+from vd.gap.recording import Recording, Trajectory, write_recording
 from vd.gap.rollout import Rollouts
 from vd.kernels import actuators as servo
 
@@ -132,7 +135,7 @@ def test_unknown_joints_are_named():
         simulate_hand(recording, HAND, rows())
 
 
-def test_the_search_finds_the_gains_that_made_a_recording():
+def test_the_search_finds_the_gains_that_made_a_recording(tmp_path):
     """Two fingers, one joint each, searched together; the true gains are 40 % off the start."""
     joints, dt = ("f0_j1", "f1_j2"), 1.0 / 120.0
     recording = motions("step_large", joints, 1.2)
@@ -165,3 +168,31 @@ def test_the_search_finds_the_gains_that_made_a_recording():
     assert np.allclose(found.kp / found.kd, (truth[:, servo.KP] / truth[:, servo.KD])[chosen], rtol=0.1)
     assert [generation for generation, _ in heard] == list(range(1, 11))
     assert found.rollouts == 10 * 10 * 2 and found.rollouts_per_second > 0.0
+    layer = tmp_path / "drives.usda"
+    write_drives(found, layer, HAND, made, every_finger=True)
+    layered = load_hand("dclaw3", layer=layer)
+    for joint, other in (("f0_j1", "f2_j1"), ("f1_j2", "f2_j2")):
+        for name in (joint, other):  # fingers that were not recorded have the drive of their counterpart
+            row = layered.servo[HAND.joint_names.index(name)]
+            assert row[servo.KP] == pytest.approx(found.kp[found.joints.index(joint)], rel=1e-5)
+    assert layered.servo[2, servo.KP] == HAND.servo[2, servo.KP]
+
+
+def test_a_bare_servo_is_no_hand_to_identify(tmp_path, capsys):
+    assert cli.main(["hide", "servo", "--out", str(tmp_path / "rec")]) == 0
+    assert cli.main(["identify", str(tmp_path / "rec"), "--out", str(tmp_path / "drives.usda")]) == 1
+    assert "a bare servo is no hand" in capsys.readouterr().err
+
+
+def test_identify_prints_the_drives_and_writes_the_layer(tmp_path, capsys):
+    recording = motions("step_large", ("f0_j1",), 1.2)
+    moved = tuple(replace(t, position=t.command) for t in recording.trajectories)
+    write_recording(replace(recording, trajectories=moved), tmp_path / "rec")
+    layer = tmp_path / "drives.usda"
+    flags = ["--generations", "1", "--population", "4", "--rate", "120", "--out", str(layer)]
+    assert cli.main(["identify", str(tmp_path / "rec"), *flags, "--json"]) == 0
+    captured = capsys.readouterr()
+    assert "generation 1/1: f0 " in captured.err
+    found = json.loads(captured.out)
+    assert found["joints"] == ["f0_j1"] and len(found["kp"]) == 1
+    assert load_hand("dclaw3", layer=layer).servo[0, servo.KP] == pytest.approx(found["kp"][0], rel=1e-5)

@@ -188,6 +188,78 @@ class Hide:
         return OK
 
 
+@dataclass(frozen=True)
+class Identify:
+    """The paper's identification alone: the drives of a hand, searched for in Newton, without any effect.
+
+    CMA-ES over stiffness, damping and velocity limit, a search for each finger and every motion of every
+    candidate simulated at once. vd-gap run needs none of it: it finds the same drives, and what they lack.
+    """
+
+    recording: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
+    """Folder with recording.json and its CSV files."""
+    out: Path = Path("drives.usda")
+    """Layer to write, for --hand-layer."""
+    hand: str | None = None
+    """Hand's name or USD file; by default the recording's model."""
+    every_finger: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Give fingers that were not recorded the drives of the first, as the paper does."""
+    generations: int = 100
+    """Generations of the search."""
+    population: int = 64
+    """Candidates of a generation; times the motions of a finger: the worlds."""
+    rate: float = 480.0
+    """Physics steps a second; training has 120, a quarter of the work."""
+    seed: int = 0
+    """Seed of the search."""
+    device: str = "cpu"
+    """cpu, cuda, or auto."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print what was found as JSON."""
+
+    def run(self) -> int:
+        """Search, and write the layer."""
+        import dataclasses
+
+        import warp as wp
+
+        from vd.gap.identify import identify, write_drives
+        from vd.gap.steps import Analysis, Settings
+
+        wp.config.log_level = wp.LOG_WARNING
+        analysis = Analysis(Settings(self.recording, self.hand), self.out.parent)
+        recording, hand = analysis.recording, analysis.hand
+        if hand is None:
+            raise ValueError(f"{self.recording}: a bare {recording.model} is no hand; use vd-gap run")
+
+        def show(generation: int, best: dict[str, float]) -> None:
+            errors = ", ".join(f"{finger} {1e3 * error:.2f} mrad" for finger, error in best.items())
+            print(f"generation {generation}/{self.generations}: {errors}", file=sys.stderr, flush=True)
+
+        found = identify(
+            recording,
+            hand,
+            generations=self.generations,
+            population=self.population,
+            dt=1.0 / self.rate,
+            device=_device(self.device),
+            seed=self.seed,
+            progress=show,
+        )
+        write_drives(found, self.out, hand, recording, every_finger=self.every_finger)
+        if self.json:
+            values = {name: getattr(found, name).tolist() for name in ("kp", "kd", "velocity_limit")}
+            print(json.dumps({**dataclasses.asdict(found), **values}, indent=1))
+            return OK
+        for i, joint in enumerate(found.joints):
+            print(
+                f"{joint}: {found.kp[i]:.3g} N m/rad, {found.kd[i]:.3g} N m s/rad, at most "
+                f"{found.velocity_limit[i]:.3g} rad/s"
+            )
+        print(f"{found.rollouts} motions simulated, {found.rollouts_per_second:.0f} a second\n{self.out}")
+        return OK
+
+
 Command = (
     Annotated[Run, tyro.conf.subcommand("run")]
     | Annotated[Find, tyro.conf.subcommand("find")]
@@ -195,13 +267,14 @@ Command = (
     | Annotated[Close, tyro.conf.subcommand("close")]
     | Annotated[Report, tyro.conf.subcommand("report")]
     | Annotated[Plan, tyro.conf.subcommand("plan")]
+    | Annotated[Identify, tyro.conf.subcommand("identify")]
     | Annotated[Hide, tyro.conf.subcommand("hide")]
 )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
-    command: Run | Find | Explain | Close | Report | Plan | Hide = tyro.cli(
+    command: Run | Find | Explain | Close | Report | Plan | Identify | Hide = tyro.cli(
         Command,
         args=arguments,
         prog="vd-gap",

@@ -52,7 +52,7 @@ def write_identified(
     held = (*report.effects, *report.provisional)
     source = {joint: joint for joint in fitted}
     if every_finger and hand is not None:
-        source |= _counterparts(hand.joint_names, tuple(fitted))
+        source |= counterparts(hand.joint_names, tuple(fitted))
     write_layer(
         path,
         hand if hand is not None else recording.model,
@@ -77,7 +77,7 @@ def _finger(joint: str) -> str:
     return joint.partition("_")[0]
 
 
-def _counterparts(joints: tuple[str, ...], known: tuple[str, ...]) -> dict[str, str]:
+def counterparts(joints: tuple[str, ...], known: tuple[str, ...]) -> dict[str, str]:
     """The identified joint at the same place of another finger, for joints that have none of their own."""
     place = {joint.partition("_")[2]: joint for joint in reversed(known)}
     return {
