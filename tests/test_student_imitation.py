@@ -20,9 +20,9 @@ from vd.train.checkpoint import list_checkpoints
 from vd.train.cli import main
 from vd.train.ending import Interrupted, TrainingDivergedError
 from vd.train.metrics import read_progress
-from vd.train.student.dagger import poses, taken
-from vd.train.student.losses import distance_loss, imitation_loss, unexplained
+from vd.train.student.losses import distance_loss, imitation_loss, poses, unexplained
 from vd.train.student.profile import profile_iteration
+from vd.train.student.rollout import taken
 
 
 def test_the_losses_fall_on_one_rollout():

@@ -1,12 +1,15 @@
 """The stopping rule: what it stops, and how its bounds are chosen."""
 
+import dataclasses
 import itertools
 
 import numpy as np
 import pytest
 import torch
 
+from vd.evaluate.trace import Trace
 from vd.student.stopping import StoppingRule, calibrate
+from vd.train.student.calibrate import calibrate_trace
 
 TOLERANCE = 0.4
 
@@ -74,3 +77,30 @@ def test_nothing_to_calibrate_on_is_an_error():
         calibrate(predicted, norm, true, np.zeros_like(alive))
     with pytest.raises(ValueError, match="no rule stops any of 60 episodes"):
         calibrate(predicted, norm, true + 2.0, alive)
+
+
+def test_a_recorded_trace_gives_the_same_rule():
+    """2 objects, 30 episodes each; NaN after their ends, as a trace has it."""
+    predicted, norm, true, alive = episodes(6)
+    alive[0] = False  # before the first action there is nothing to stop
+    steps = 1 + alive.sum(axis=0)
+
+    def traced(values):
+        whole = np.concatenate([values, np.full((1, values.shape[1]), 9.0)]).T.reshape(2, 30, -1)
+        ends = np.arange(whole.shape[-1]) < steps.reshape(2, 30, 1)
+        return np.where(ends, whole, np.nan)
+
+    quats = np.zeros((2, 30, 4))
+    trace = Trace(
+        quats,
+        quats,
+        error=traced(true),
+        distance=traced(true),
+        action_norm=traced(norm),
+        predicted=traced(predicted),
+        steps=steps.reshape(2, 30),
+        fell=np.zeros((2, 30), dtype=bool),
+    )
+    assert calibrate_trace(trace) == calibrate(predicted, norm, true, alive)
+    with pytest.raises(ValueError, match="only a student"):
+        calibrate_trace(dataclasses.replace(trace, predicted=None))

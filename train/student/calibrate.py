@@ -1,65 +1,40 @@
-"""Episodes of a student that nothing stops, and from them the rule by which it stops."""
+"""The rule by which a student stops, from episodes that nothing stops."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 import warp as wp
 
+from vd.assets_usd.objects.model import load_set
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
+from vd.evaluate.student import StudentActor
+from vd.evaluate.trace import NEVER_RAD, Trace, record
 from vd.paper import PAPER
-from vd.sensors.cfg import DepthCameraCfg
-from vd.student.network import Student
 from vd.student.saved import load_student, read_student, saved_spec
 from vd.student.stopping import Calibration, calibrate
 from vd.train.checkpoint import save_checkpoint
-from vd.train.student.config import PRETRAINING, RENDERED
-from vd.vision import StudentView
-
-NEVER_RAD = 1e-9
-"""Orientation tolerance that no state meets: episodes then go on, whatever the student does."""
 
 
-def record(
-    env: ReorientEnv, view: StudentView, student: Student
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Run one episode in every world with the student's mean action.
+def calibrate_trace(trace: Trace, *, tolerance_rad: float = PAPER.success.rotation_rad) -> Calibration:
+    """The stopping rule that suits a student's recorded episodes.
 
-    Returns:
-        Predicted distances [rad], norms of the smoothed action, true distances [rad] and whether the
-        episode still runs, shape [T, N] each; the step before the first action does not count as running.
+    Args:
+        trace: Episodes of a student, T steps.
+        tolerance_rad: Largest true distance that counts as right [rad].
+
+    Raises:
+        ValueError: The trace is no student's, or no rule stops any episode within the tolerance.
     """
-    env.reset()
-    device = student.mean.weight.device
-    hidden = student.initial_hidden(env.num_worlds)
-    alive = torch.ones(env.num_worlds, dtype=torch.bool, device=device)
-    fell = wp.to_torch(env.fell)
-    rows: list[torch.Tensor] = []
-    with torch.no_grad():
-        for step in range(env.max_episode_steps):
-            frame = view.frame()
-            sites = view.sites(frame, augment=False)
-            output = student.act(sites[0], student.senses(frame), hidden, *sites[1:])
-            hidden = output.hidden
-            rows.append(
-                torch.stack(
-                    (
-                        output.distance[:, -1],
-                        frame["action"].norm(dim=-1),
-                        frame["distance"],
-                        (alive & (step > 0)).float(),
-                    )
-                )
-            )
-            wp.to_torch(env.action).copy_(output.mean)
-            env.step(env.action)
-            alive = alive & (fell == 0)
-    env.check()
-    predicted, norm, true, running = torch.stack(rows, dim=1).cpu().numpy()
-    return predicted, norm, true, running > 0.0
+    if trace.predicted is None:
+        raise ValueError("only a student predicts distances; there is no rule to choose for another policy")
+    after = np.arange(trace.distance.shape[-1])
+    running = (after > 0) & (after < trace.steps[..., None])
+    values = trace.predicted, trace.action_norm, trace.distance, running
+    return calibrate(*(value.reshape(-1, len(after)).T for value in values), tolerance_rad=tolerance_rad)
 
 
 def calibrate_student(
@@ -77,7 +52,7 @@ def calibrate_student(
     Args:
         path: ``student.pt``.
         objects: Object sets to calibrate on; the training's by default.
-        episodes: Number of episodes, one a world.
+        episodes: Number of episodes, one a world, rounded up to as many of each object.
         tolerance_rad: Largest true distance that counts as right [rad].
         randomise: Domain randomisation.
         seed: Of starts, goals and sensor errors.
@@ -88,31 +63,25 @@ def calibrate_student(
     """
     wp.config.log_level = wp.LOG_WARNING
     saved = load_student(path, device)
-    spec = saved.spec
-    if spec.stage == PRETRAINING:
-        raise ValueError(f"{path} is of stage 0, which does not act; calibrate a student of stage 1 or 2")
     trained = from_dict(ReorientCfg, saved.task, where="task of the student")
+    sets = objects or trained.objects
+    count = len(load_set(list(sets)))
+    each = math.ceil(episodes / count)
     task = replace(
         trained,
-        objects=objects or trained.objects,
-        num_worlds=episodes,
+        objects=sets,
+        num_worlds=each * count,
         seed=seed,
         success=replace(trained.success, rotation_rad=NEVER_RAD),
         randomisation=replace(trained.randomisation, enabled=randomise),
     )
     env = ReorientEnv(task, device)
-    view = StudentView(
-        env,
-        spec.network,
-        rendered=spec.stage == RENDERED,
-        depth=from_dict(DepthCameraCfg, saved.depth, where="depth camera of the student"),
-        camera=spec.camera,
-        seed=seed,
-    )
-    result = calibrate(*record(env, view, saved.network), tolerance_rad=tolerance_rad)
+    trace = record(env, StudentActor(env, saved, seed=seed), each)
+    env.check()
     env.close()
+    result = calibrate_trace(trace, tolerance_rad=tolerance_rad)
     state = read_student(path)
-    what = f"{', '.join(task.objects)}: {episodes} episodes, tolerance {tolerance_rad:g} rad, seed {seed}"
+    what = f"{', '.join(sets)}: {result.episodes} episodes, tolerance {tolerance_rad:g} rad, seed {seed}"
     spec = replace(saved_spec(state, path), stopping=result.rule, calibrated_on=what)
     save_checkpoint(path, {**state, "spec": to_dict(spec)})
     return result

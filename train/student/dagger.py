@@ -7,7 +7,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
 import torch
@@ -19,19 +18,14 @@ from vd.student.sites import Sites
 from vd.train.ending import TrainingDivergedError
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import DaggerCfg
-from vd.train.student.losses import distance_loss, imitation_loss, unexplained
-from vd.train.student.rotations import angle_between, two_columns
+from vd.train.student.losses import POSE_VALUES, distance_loss, imitation_figures, imitation_loss, poses
+from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer
+from vd.train.student.rollout import UNCLIPPED, Rollout, moved, rollout_bytes, taken
+from vd.train.student.rotations import angle_between
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
-from vd.vision import relative_rotation
 
 STATISTICS = ("loss/imitation", "loss/distance", "loss/pose", "loss/grad_norm")
 """What every minibatch reports."""
-POSE_SCALE_M = 0.05
-"""Positions of objects are predicted in units of this, about their spread."""
-POSE_VALUES = 9
-"""Position 3, two columns of the rotation from the goal 6."""
-UNCLIPPED = ("points",)
-"""Frames' tensors that hold NaN on purpose: where there is no point."""
 CHECKPOINT_ROLLOUT_BYTES = 2**28
 """Kept rollouts that are larger together, those with camera points, are not written into checkpoints: a run
 that goes on from one begins with the rollouts to come."""
@@ -59,22 +53,6 @@ class View(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore them."""
         ...
-
-
-@dataclass
-class Rollout:
-    """What an update needs of N sequences of T steps."""
-
-    frames: dict[str, torch.Tensor]
-    """Frames before each step, tensors [T, N, ...]."""
-    label: torch.Tensor
-    """The teacher's mean action of each state [T, N, D]."""
-    done: torch.Tensor
-    """Where the goal or the episode ended with the step [T, N], bool."""
-    hidden: torch.Tensor
-    """The student's memory before the first step [N, G]."""
-    worlds: torch.Tensor
-    """World of each sequence [N]."""
 
 
 class Dagger:
@@ -441,110 +419,3 @@ class Dagger:
             self.env.check()  # says more, if the simulation is the cause
             what = ", ".join(bad) or "the student's memory"
             raise TrainingDivergedError(f"{what} not finite in the rollout; {LOWER_RATES}")
-
-
-def poses(frames: Mapping[str, torch.Tensor], body: int) -> torch.Tensor:
-    """Where the object of frames is, in units of 5 cm, and how it is turned from the goal [.., 9].
-
-    Args:
-        frames: ``body_q`` [.., B, 7] and ``goal_quat`` [.., 4].
-        body: The object's column.
-    """
-    pose = frames["body_q"][..., body, :]
-    turn = two_columns(relative_rotation(pose[..., 3:], frames["goal_quat"]))
-    return torch.cat((pose[..., :3] / POSE_SCALE_M, turn), dim=-1)
-
-
-def taken(rollouts: Sequence[Rollout], sequences: torch.Tensor) -> Rollout:
-    """Some sequences of rollouts of N worlds each, as one: number k N + n is sequence n of rollout k."""
-    worlds = len(rollouts[0].worlds)
-    parts = []
-    for index, rollout in enumerate(rollouts):
-        own = sequences[sequences // worlds == index] - index * worlds if len(rollouts) > 1 else sequences
-        if len(own):
-            parts.append((rollout, own))
-    return Rollout(
-        {name: torch.cat([r.frames[name][:, own] for r, own in parts], dim=1) for name in rollouts[0].frames},
-        torch.cat([r.label[:, own] for r, own in parts], dim=1),
-        torch.cat([r.done[:, own] for r, own in parts], dim=1),
-        torch.cat([r.hidden[own] for r, own in parts]),
-        torch.cat([r.worlds[own] for r, own in parts]),
-    )
-
-
-def rollout_bytes(rollout: Rollout) -> int:
-    """Memory of a rollout's tensors."""
-    tensors = (*rollout.frames.values(), rollout.label, rollout.done, rollout.hidden)
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
-
-
-def moved(rollout: Rollout | dict[str, Any], device: str | torch.device) -> dict[str, Any]:
-    """A rollout, or the dictionary of one, as a dictionary of tensors on ``device``."""
-    values = rollout if isinstance(rollout, dict) else asdict(rollout)
-    return {
-        name: moved(value, device) if isinstance(value, dict) else value.to(device)
-        for name, value in values.items()
-    }
-
-
-def imitation_figures(prefix: str, mean: torch.Tensor, label: torch.Tensor) -> dict[str, torch.Tensor]:
-    """How far the student's mean actions are from labels [T, N, D], beside what says nothing of the state.
-
-    Returns:
-        Scalars on the device: ``action_error``, the root mean square of the difference of what the
-        environment makes of both; ``zero_error``, the same of no action; ``unexplained``, the share of the
-        labels' variance that is left (1: no better than the best constant action).
-    """
-    mean, label = mean.clamp(-1.0, 1.0), label.clamp(-1.0, 1.0)
-    return {
-        f"{prefix}/action_error": (mean - label).square().mean().sqrt(),
-        f"{prefix}/zero_error": label.square().mean().sqrt(),
-        f"{prefix}/unexplained": unexplained(mean, label),
-    }
-
-
-def make_optimizer(
-    network: nn.Module, learning_rate: float, *, amsgrad: bool = True
-) -> torch.optim.Optimizer:
-    """AdamW, with amsgrad as in the released code."""
-    return torch.optim.AdamW(network.parameters(), lr=learning_rate, amsgrad=amsgrad)
-
-
-def autocast(device: torch.device, precision: str) -> torch.autocast:
-    """Products in half precision where ``precision`` is ``bf16``."""
-    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")
-
-
-def descend(
-    network: nn.Module,
-    optimizer: torch.optim.Optimizer,
-    loss: torch.Tensor,
-    grad_norm: float,
-    world_size: int = 1,
-) -> torch.Tensor:
-    """One optimiser step on the gradient of ``loss``, averaged over processes and clipped.
-
-    Returns:
-        Norm of the gradient before clipping, a scalar on the device.
-    """
-    optimizer.zero_grad()
-    loss.backward()
-    parameters = list(network.parameters())
-    if world_size > 1:
-        # Every process has to take part with every weight, also one whose loss does not reach it.
-        gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-        flat = torch.cat([gradient.flatten() for gradient in gradients])
-        torch.distributed.all_reduce(flat)
-        flat /= world_size
-        parts = flat.split([p.numel() for p in parameters])
-        for parameter, part in zip(parameters, parts, strict=True):
-            if parameter.grad is not None:
-                parameter.grad.copy_(part.view_as(parameter))
-    norm = nn.utils.clip_grad_norm_(parameters, grad_norm)
-    optimizer.step()
-    return norm.detach()
-
-
-def all_finite(network: nn.Module) -> bool:
-    """Whether all weights are; one wait for the device."""
-    return math.isfinite(float(torch.stack([p.detach().sum() for p in network.parameters()]).sum()))

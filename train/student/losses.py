@@ -1,10 +1,18 @@
-"""Losses of the student. T steps, N worlds, D actions, H distance heads."""
+"""Losses of the student, and figures of its errors. T steps, N worlds, D actions, H distance heads."""
 
 import math
+from collections.abc import Mapping
 
 import torch
 
 from vd.student.network import StudentOutput
+from vd.train.student.rotations import two_columns
+from vd.vision import relative_rotation
+
+POSE_SCALE_M = 0.05
+"""Positions of objects are predicted in units of this, about their spread."""
+POSE_VALUES = 9
+"""Position 3, two columns of the rotation from the goal 6."""
 
 
 def imitation_loss(
@@ -40,3 +48,31 @@ def unexplained(predicted: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
     """Share of the variance of ``true`` [T, N, D] over steps and worlds that is left: 1 for a constant."""
     rest = (true - true.mean(dim=(0, 1))).square().mean()
     return (predicted - true).square().mean() / rest.clamp(min=torch.finfo(rest.dtype).tiny)
+
+
+def imitation_figures(prefix: str, mean: torch.Tensor, label: torch.Tensor) -> dict[str, torch.Tensor]:
+    """How far the student's mean actions are from labels [T, N, D], beside what says nothing of the state.
+
+    Returns:
+        Scalars on the device: ``action_error``, the root mean square of the difference of what the
+        environment makes of both; ``zero_error``, the same of no action; ``unexplained``, the share of the
+        labels' variance that is left (1: no better than the best constant action).
+    """
+    mean, label = mean.clamp(-1.0, 1.0), label.clamp(-1.0, 1.0)
+    return {
+        f"{prefix}/action_error": (mean - label).square().mean().sqrt(),
+        f"{prefix}/zero_error": label.square().mean().sqrt(),
+        f"{prefix}/unexplained": unexplained(mean, label),
+    }
+
+
+def poses(frames: Mapping[str, torch.Tensor], body: int) -> torch.Tensor:
+    """Where the object of frames is, in units of 5 cm, and how it is turned from the goal [.., 9].
+
+    Args:
+        frames: ``body_q`` [.., B, 7] and ``goal_quat`` [.., 4].
+        body: The object's column.
+    """
+    pose = frames["body_q"][..., body, :]
+    turn = two_columns(relative_rotation(pose[..., 3:], frames["goal_quat"]))
+    return torch.cat((pose[..., :3] / POSE_SCALE_M, turn), dim=-1)

@@ -22,7 +22,7 @@ from vd.student.network import Student
 from vd.student.sites import Sites
 from vd.train.ending import TrainingDivergedError
 from vd.train.student.config import PretrainCfg
-from vd.train.student.dagger import all_finite, autocast, descend, make_optimizer
+from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer
 from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
 from vd.vision import relative_rotation, rotation_distance, voxels
 

@@ -75,8 +75,28 @@ class EncoderCfg:
 
 
 @dataclass(frozen=True)
+class TurnCfg:
+    """Pooling that turns with a cloud, of object and goal (:mod:`vd.student.turn`)."""
+
+    vectors: int = 0
+    """Vectors of a cloud, and tensors; 0, as in the paper: the rotation from the goal has to be read from
+    the embedding of the whole cloud."""
+    rounds: int = 3
+    """How often points are weighted, each time by how they lie to the vectors before."""
+    hidden: int = 32
+    """Width of the layers that weigh a point."""
+    pairs: int = 8
+    """Mixtures of them that are multiplied, the object's with the goal's."""
+
+    def validate(self) -> None:
+        """Raise ``ValueError`` for sizes that make no network, naming the field."""
+        if self.vectors < 0 or min(self.rounds, self.hidden, self.pairs) < 1:
+            raise ValueError("turn: vectors must not be negative and every other size be positive")
+
+
+@dataclass(frozen=True)
 class StudentCfg:
-    """The student's network; the default is leaner than the paper's (preset ``lean``)."""
+    """The student's network; presets are below."""
 
     encoder: EncoderCfg = field(default_factory=EncoderCfg)
     """From voxels to an embedding."""
@@ -84,6 +104,8 @@ class StudentCfg:
     """Side of a voxel [m]."""
     goal: Literal["merged", "separate"] = "merged"
     """Goal and scene as one cloud, or with an encoder each."""
+    turn: TurnCfg = field(default_factory=TurnCfg)
+    """How the object is turned from the goal, read from the two directly."""
     senses: tuple[Sense, ...] = ("action", "position", "velocity")
     """What it knows of itself besides clouds: the previous action (all that the paper has), positions and
     velocities of the joints, as the encoders report them."""
@@ -106,6 +128,9 @@ class StudentCfg:
     def validate(self) -> None:
         """Raise ``ValueError`` for what cannot be built, naming the field."""
         self.encoder.validate()
+        self.turn.validate()
+        if self.turn.vectors and "marks" not in self.encoder.inputs:
+            raise ValueError("student.turn needs voxels that are marked: add marks to encoder.inputs")
         if "action" not in self.senses or len(set(self.senses)) != len(self.senses):
             raise ValueError(f"student.senses = {self.senses} must hold action, and nothing twice")
         if not self.voxel_m > 0.0:
@@ -118,8 +143,9 @@ class StudentCfg:
             raise ValueError(f"student.std_range = {self.std_range} must be (low, high), both positive")
 
 
-LEAN = StudentCfg()
-"""A last stage of half the width, distance heads before and after the GRU, bounded standard deviation."""
+LEAN = StudentCfg(turn=TurnCfg(vectors=32))
+"""A last stage of half the width, distance heads before and after the GRU, bounded standard deviation, and
+the rotation from the goal pooled apart."""
 
 PAPER_NETWORK = replace(
     LEAN,
@@ -128,11 +154,13 @@ PAPER_NETWORK = replace(
     action_hidden=PAPER.student.action_hidden,
     distance=("before",),
     std_range=None,
+    turn=TurnCfg(),
 )
 """The network of the paper, sizes as in its released code."""
 
 SMALL = replace(
     LEAN,
+    turn=TurnCfg(vectors=16, rounds=2),
     encoder=EncoderCfg(channels=(16, 32, 32, 32), blocks=1, embedding=64),
     memory=64,
     head_hidden=64,

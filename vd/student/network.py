@@ -14,6 +14,7 @@ from vd.paper import PAPER
 from vd.student.cfg import EncoderCfg, StudentCfg
 from vd.student.sites import Sites
 from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool
+from vd.student.turn import TurnEncoder
 
 POSITION_SCALE_M = 0.1
 """Positions of voxels are given in units of this: about the size of the scene."""
@@ -154,6 +155,8 @@ class Student(nn.Module):
         self.encoder = VoxelEncoder(cfg.encoder, cfg.voxel_m)
         self.goal_encoder = VoxelEncoder(cfg.encoder, cfg.voxel_m) if cfg.goal == "separate" else None
         self.merge_goal = nn.Linear(2 * width, width) if cfg.goal == "separate" else None
+        self.turn = TurnEncoder(cfg.turn, cfg.voxel_m, width) if cfg.turn.vectors else None
+        self.merge_turn = nn.Linear(2 * width, width) if cfg.turn.vectors else None
         self.action_layers = nn.Sequential(
             nn.Linear(self.num_senses, cfg.action_hidden),
             nn.GELU(),
@@ -212,10 +215,13 @@ class Student(nn.Module):
         # The encoders may be of lower precision than the rest.
         precision = self.mean.weight.dtype
         embedding = self.encoder(scene).to(precision)
-        if self.goal_encoder is None or self.merge_goal is None or goal is None:
-            return embedding
-        both = torch.cat([embedding, self.goal_encoder(goal).to(precision)], dim=-1)
-        return torch.relu(self.merge_goal(both))
+        if self.goal_encoder is not None and self.merge_goal is not None and goal is not None:
+            both = torch.cat([embedding, self.goal_encoder(goal).to(precision)], dim=-1)
+            embedding = torch.relu(self.merge_goal(both))
+        if self.turn is not None and self.merge_turn is not None:
+            both = torch.cat([embedding, self.turn(scene, goal).to(precision)], dim=-1)
+            embedding = torch.relu(self.merge_turn(both))
+        return embedding
 
     def forward(
         self,

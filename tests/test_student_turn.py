@@ -1,0 +1,159 @@
+"""Pooling that turns with a cloud: equivariance, what it may depend on, and that it learns a rotation."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from vd.student.cfg import EncoderCfg, StudentCfg, TurnCfg
+from vd.student.clouds import Voxeliser
+from vd.student.network import Student
+from vd.student.turn import ShapeVectors, TurnEncoder, item_and_goal, padded
+from vd.train.student.rotations import angle_between, random_rotations, two_columns
+from vd.vision import relative_rotation
+
+SIZES = TurnCfg(vectors=4, rounds=2, hidden=8, pairs=3)
+GOAL_POINTS, HAND_POINTS, ITEM_POINTS = 60, 40, 60
+ENDS = (GOAL_POINTS, GOAL_POINTS + HAND_POINTS)
+GOAL_PLACE, HAND_PLACE = (0.0, 0.0, -0.3), (0.3, 0.0, 0.0)
+
+
+def shape(points: int = ITEM_POINTS, seed: int = 0) -> np.ndarray:
+    """An irregular cloud [P, 3], some centimetres wide."""
+    return np.random.default_rng(seed).normal(size=(points, 3)) * (0.03, 0.02, 0.01)
+
+
+def scene(item: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """Goal, hand and object, apart from each other [1, P, 3]."""
+    hand = shape(HAND_POINTS, seed=9) + HAND_PLACE
+    return np.concatenate([goal + GOAL_PLACE, hand, item])[None].astype(np.float32)
+
+
+def voxels(points: np.ndarray, device: str):
+    return Voxeliser(device=device)(wp.array(points, dtype=wp.vec3, device=device), ends=ENDS)
+
+
+def turn_encoder(device: str) -> TurnEncoder:
+    torch.manual_seed(0)
+    return TurnEncoder(SIZES, 0.005, 16).to(wp.device_to_torch(device)).eval()
+
+
+def test_vectors_and_tensors_turn_with_the_cloud():
+    torch.manual_seed(0)
+    pool = ShapeVectors(SIZES).double()
+    points = torch.from_numpy(shape() / 0.05)[None]
+    present = torch.ones_like(points[..., :1])
+    matrix = torch.from_numpy(Rotation.random(random_state=1).as_matrix())
+    vectors, tensors = pool(points, present)
+    turned_vectors, turned_tensors = pool(points @ matrix.T + 3.0, present)
+    torch.testing.assert_close(turned_vectors, vectors @ matrix.T)
+    torch.testing.assert_close(turned_tensors, matrix @ tensors @ matrix.T)
+    assert vectors.norm(dim=-1).min() > 0.05  # they do say something
+
+
+def test_absent_points_count_for_nothing():
+    torch.manual_seed(0)
+    pool = ShapeVectors(SIZES)
+    points = torch.from_numpy(shape() / 0.05).float()[None]
+    present = torch.ones_like(points[..., :1])
+    more = torch.cat([points, torch.full((1, 7, 3), 5.0)], dim=1)
+    fewer = torch.cat([present, torch.zeros(1, 7, 1)], dim=1)
+    for one, other in zip(pool(points, present), pool(more, fewer), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_padded_rows_hold_the_voxels_of_their_cloud(device):
+    clouds = np.concatenate([scene(shape(seed=i), shape(seed=i)) for i in range(3)])
+    sites = voxels(clouds, device)
+    item, goal = item_and_goal(sites)
+    assert not (item & goal).any()
+    points, present = padded(sites, goal)
+    for i in range(3):
+        own = np.unique(np.floor(clouds[i, :GOAL_POINTS] / 0.005), axis=0) + 0.5
+        found = points[i][present[i, :, 0] > 0].cpu().numpy()
+        assert np.array_equal(own, np.unique(found, axis=0))
+    points, present = padded(sites, torch.zeros_like(goal))
+    assert points.shape == (3, 1, 3) and not present.any()
+
+
+def test_embedding_sees_shapes_but_not_places_nor_the_hand(device):
+    net = turn_encoder(device)
+    turned = shape() @ Rotation.random(random_state=2).as_matrix().T
+    points = scene(turned, shape())
+    first = net(voxels(points, device))
+    moved = points.copy()
+    moved[:, ENDS[1] :] += np.float32(0.04)  # 8 voxels, away from goal and hand
+    moved[:, ENDS[0] : ENDS[1]] *= np.float32(1.1)
+    torch.testing.assert_close(net(voxels(moved, device)), first, rtol=1e-4, atol=1e-5)
+    other = net(voxels(scene(shape(), shape()), device))
+    assert (other - first).abs().max() > 1e-3
+
+
+def test_goal_apart_gives_the_same(device):
+    net = turn_encoder(device)
+    points = scene(shape(seed=1), shape())
+    voxelise = Voxeliser(device=device)
+    whole = net(voxels(points, device))
+    parts = [wp.array(part, dtype=wp.vec3, device=device) for part in np.split(points, [GOAL_POINTS], axis=1)]
+    goal = voxelise(parts[0], ends=(GOAL_POINTS, GOAL_POINTS))
+    rest = voxelise(parts[1], ends=(0, HAND_POINTS))
+    torch.testing.assert_close(net(rest, goal), whole)
+
+
+def test_a_cloud_without_an_object_is_finite(device):
+    points = scene(np.full((ITEM_POINTS, 3), np.nan), shape())
+    assert torch.isfinite(turn_encoder(device)(voxels(points, device))).all()
+
+
+def test_needs_marks(device):
+    cfg = StudentCfg(turn=SIZES, encoder=EncoderCfg(inputs=("constant",)))
+    with pytest.raises(ValueError, match="add marks"):
+        Student(cfg, 9)
+    with pytest.raises(ValueError, match="vectors"):
+        Student(dataclasses.replace(cfg, turn=TurnCfg(vectors=-1)), 9)
+    bare = Voxeliser(device=device)(wp.array(scene(shape(), shape()), dtype=wp.vec3, device=device))
+    with pytest.raises(ValueError, match="marks"):
+        turn_encoder(device)(bare)
+
+
+def test_gradients_agree_with_finite_differences():
+    torch.manual_seed(0)
+    pool = ShapeVectors(TurnCfg(vectors=2, rounds=2, hidden=3)).double()
+    points = torch.from_numpy(shape(6) / 0.05)[None]
+    present = torch.ones_like(points[..., :1])
+    parameters = tuple(pool.parameters())
+
+    def outputs(*values):
+        names = [name for name, _ in pool.named_parameters()]
+        return torch.func.functional_call(pool, dict(zip(names, values, strict=True)), (points, present))
+
+    assert torch.autograd.gradcheck(outputs, parameters)
+
+
+def test_relative_rotation_is_learned_where_neither_cloud_alone_says_anything():
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    pool, head = ShapeVectors(TurnCfg(vectors=8, rounds=2, hidden=16)), torch.nn.Linear(9, 6)
+    weights = torch.nn.Parameter(torch.ones(8))
+    optimizer = torch.optim.Adam([*pool.parameters(), *head.parameters(), weights], lr=5e-3)
+    cloud = torch.from_numpy(shape(48) / 0.05).float()
+    cloud[:, 0] += cloud[:, 1].square() + cloud[:, 2].abs()  # no symmetry
+    present, errors = torch.ones(32, 48, 1), []
+    for _ in range(300):
+        turn, goal = (random_rotations(32, torch.device("cpu")) for _ in range(2))
+        clouds = [
+            cloud @ torch.from_numpy(Rotation.from_quat(q.numpy()).as_matrix()).float().mT
+            for q in (turn, goal)
+        ]
+        (one, _), (other, _) = (pool(points, present) for points in clouds)
+        predicted = head(torch.einsum("k,bki,bkj->bij", weights, one, other).flatten(1))
+        true = two_columns(relative_rotation(turn, goal))
+        loss = (predicted - true).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        errors.append(float(angle_between(predicted.detach(), true).mean()))
+    assert np.mean(errors[-20:]) < 0.3  # of any guess the mean is 2.2

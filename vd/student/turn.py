@@ -1,0 +1,140 @@
+"""How the object is turned from the goal, by pooling that turns with a cloud.
+
+A vector is a weighted sum of a cloud's points about their centre. Its weights depend on what stays as it is
+when the cloud is turned, so vectors turn with the cloud, whatever the weights are (cf. tensor field networks,
+Thomas 2018; vector neurons, Deng 2021). Products of the vectors of two clouds of one shape then hold the
+rotation from one to the other, for shapes seen in training and for others.
+
+Global pooling of a convolution has to learn this from nothing: a rotation from the goal is a product of two
+unknown ones, of which neither cloud alone says anything, so there is no gradient to begin with
+(docs/results/student.md). G clouds, P points, K vectors.
+"""
+
+import torch
+from torch import nn
+
+from vd.student.cfg import TurnCfg
+from vd.student.sites import Sites
+
+RADIUS_M = 0.05
+"""Points are given in units of this, about the radius of an object."""
+SMALL = 1e-2
+"""Vectors are scaled to length 1, those that are not much longer than this less: noise stays small."""
+GOAL, HAND = 0, 1
+"""Columns of the marks of voxels."""
+
+
+def item_and_goal(sites: Sites, goal: Sites | None = None) -> tuple[torch.Tensor, torch.Tensor]:
+    """Marks of the voxels of the object and of the goal [M], as float; with ``goal`` of two sets of voxels.
+
+    A voxel is the object's that holds no point of the goal, nor of the hand's own model.
+    """
+    if sites.marks is None or (goal is not None and goal.marks is None):
+        raise ValueError("the network reads marks of voxels; give the voxeliser the ends of the groups")
+    item = (sites.marks[:, GOAL] == 0) & (sites.marks[:, HAND] == 0)
+    return item, (sites if goal is None or goal.marks is None else goal).marks[:, GOAL] > 0
+
+
+def padded(sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Coordinates of some voxels, a row for each cloud.
+
+    Args:
+        sites: Voxels of B clouds.
+        chosen: Which, bool [M].
+
+    Returns:
+        Coordinates of their centres [voxels], zeros where a cloud has fewer, shape [B, P, 3], and 1 where
+        there is one, shape [B, P, 1].
+    """
+    rows = sites.coordinates[chosen]
+    cloud = rows[:, 0].long()
+    counts = torch.bincount(cloud, minlength=sites.clouds)
+    place = torch.arange(len(cloud), device=cloud.device) - (counts.cumsum(0) - counts)[cloud]
+    points = torch.zeros((sites.clouds, max(1, int(counts.max())), 3), device=cloud.device)
+    present = torch.zeros_like(points[..., :1])
+    points[cloud, place] = rows[:, 1:] + 0.5
+    present[cloud, place] = 1.0
+    return points, present
+
+
+def unit(values: torch.Tensor) -> torch.Tensor:
+    """Values [.., C] scaled to length 1 at most."""
+    return values * torch.rsqrt(values.square().sum(dim=-1, keepdim=True) + SMALL * SMALL)
+
+
+class ShapeVectors(nn.Module):
+    """K vectors, and K symmetric tensors without trace, that turn with a cloud.
+
+    Each round weighs points by their distance from the centre and by how they lie to the vectors and tensors
+    of the round before. Tensors see what looks the same from both sides, where vectors vanish.
+    """
+
+    def __init__(self, cfg: TurnCfg):
+        super().__init__()
+        widths = [2] + [2 + 3 * cfg.vectors] * (cfg.rounds - 1)
+        self.weigh = nn.ModuleList(
+            nn.Sequential(
+                nn.Linear(width, cfg.hidden),
+                nn.GELU(),
+                nn.Linear(cfg.hidden, cfg.hidden),
+                nn.GELU(),
+                nn.Linear(cfg.hidden, cfg.vectors),
+            )
+            for width in widths
+        )
+
+    def forward(self, points: torch.Tensor, present: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Vectors [G, K, 3] and tensors [G, K, 3, 3] of points [G, P, 3], present or not [G, P, 1]."""
+        share = present / present.sum(dim=1, keepdim=True).clamp(min=1.0)
+        centred = (points - (points * share).sum(dim=1, keepdim=True)) * present
+        square = centred.square().sum(dim=-1, keepdim=True)
+        identity = torch.eye(3, device=points.device, dtype=points.dtype).flatten()
+        spread = (centred[..., :, None] * centred[..., None, :]).flatten(-2) - square / 3.0 * identity
+        both = torch.cat([centred, spread], dim=-1)
+        far = torch.cat([square.sqrt(), square], dim=-1)
+        seen, vectors, tensors = far, points, points
+        for weigh in self.weigh:
+            pooled = (weigh(seen) * share).transpose(1, 2) @ both
+            vectors, tensors = unit(pooled[..., :3]), unit(pooled[..., 3:])
+            along = centred @ vectors.transpose(1, 2)
+            seen = torch.cat([far, along, along.square(), spread @ tensors.transpose(1, 2)], dim=-1)
+        return vectors, tensors.unflatten(-1, (3, 3))
+
+
+class TurnEncoder(nn.Module):
+    """An embedding of how the object of each cloud is turned from the goal.
+
+    Both shapes are pooled by the same weights. What follows sees only products of a vector (tensor) of the
+    one with one of the other.
+    """
+
+    def __init__(self, cfg: TurnCfg, voxel_m: float, embedding: int):
+        super().__init__()
+        self.scale = voxel_m / RADIUS_M
+        self.shape = ShapeVectors(cfg)
+        self.mix = nn.ModuleList(nn.Linear(cfg.vectors, cfg.pairs, bias=False) for _ in range(4))
+        products = 2 * 9 * cfg.pairs
+        self.hidden = nn.Sequential(nn.Linear(products, embedding), nn.GELU())
+        self.out = nn.Linear(products + embedding, embedding)
+
+    def forward(self, sites: Sites, goal: Sites | None = None) -> torch.Tensor:
+        """Embeddings [B, E] of the clouds of ``sites``, the goal's voxels among them or in ``goal``."""
+        item, wanted = item_and_goal(sites, goal)
+        with torch.autocast(sites.device.type, enabled=False):
+            vectors, tensors = self.shape(*self._scaled(sites, item))
+            aims, aim_tensors = self.shape(*self._scaled(sites if goal is None else goal, wanted))
+            turned = self._mixed(0, vectors)[..., :, None] * self._mixed(1, aims)[..., None, :]
+            spread = self._mixed(2, tensors.flatten(2)).unflatten(-1, (3, 3)) @ self._mixed(
+                3, aim_tensors.flatten(2)
+            ).unflatten(-1, (3, 3))
+            products = torch.cat([turned.flatten(1), spread.flatten(1)], dim=1)
+            return self.out(torch.cat([products, self.hidden(products)], dim=1))
+
+    def _scaled(self, sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        points, present = padded(sites, chosen)
+        dtype = self.out.weight.dtype
+        return self.scale * points.to(dtype), present.to(dtype)
+
+    def _mixed(self, index: int, values: torch.Tensor) -> torch.Tensor:
+        """Sums over the K vectors [B, K, C] with learned weights: [B, pairs, C]."""
+        return self.mix[index](values.transpose(1, 2)).transpose(1, 2)
