@@ -14,7 +14,7 @@ from vd.paper import PAPER
 from vd.student.cfg import EncoderCfg, StudentCfg
 from vd.student.sites import Sites
 from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool
-from vd.student.turn import TurnEncoder
+from vd.student.turn import TurnEncoder, marks
 
 POSITION_SCALE_M = 0.1
 """Positions of voxels are given in units of this: about the size of the scene."""
@@ -57,10 +57,8 @@ def voxel_features(sites: Sites, cfg: EncoderCfg, voxel_m: float) -> torch.Tenso
             parts.append(torch.full((len(sites), 1), cfg.feature, device=sites.device))
         elif name == "position":
             parts.append(voxel_m / POSITION_SCALE_M * (sites.coordinates[:, 1:] + 0.5))
-        elif sites.marks is None:
-            raise ValueError("the network reads marks of voxels; give the voxeliser the ends of the groups")
         else:
-            parts.append(sites.marks)
+            parts.append(marks(sites))
     return torch.cat(parts, dim=1)
 
 

@@ -20,19 +20,24 @@ RADIUS_M = 0.05
 """Points are given in units of this, about the radius of an object."""
 SMALL = 1e-2
 """Vectors are scaled to length 1, those that are not much longer than this less: noise stays small."""
-GOAL, HAND = 0, 1
-"""Columns of the marks of voxels."""
+GOAL = 0
+"""Column of the marks of voxels."""
+
+
+def marks(sites: Sites) -> torch.Tensor:
+    """Marks of voxels [M, 2]: whether they hold points of the goal, and of the hand's own model."""
+    if sites.marks is None:
+        raise ValueError("the network reads marks of voxels; give the voxeliser the ends of the groups")
+    return sites.marks
 
 
 def item_and_goal(sites: Sites, goal: Sites | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Marks of the voxels of the object and of the goal [M], as float; with ``goal`` of two sets of voxels.
+    """Which voxels are the object's, and which the goal's (of ``goal``, where that is given), bool [M].
 
     A voxel is the object's that holds no point of the goal, nor of the hand's own model.
     """
-    if sites.marks is None or (goal is not None and goal.marks is None):
-        raise ValueError("the network reads marks of voxels; give the voxeliser the ends of the groups")
-    item = (sites.marks[:, GOAL] == 0) & (sites.marks[:, HAND] == 0)
-    return item, (sites if goal is None or goal.marks is None else goal).marks[:, GOAL] > 0
+    wanted = marks(sites if goal is None else goal)[:, GOAL] > 0
+    return (marks(sites) == 0).all(dim=1), wanted
 
 
 def padded(sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
