@@ -2,7 +2,7 @@
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -73,8 +73,12 @@ def read_hand_and_joints(options: HandOptions) -> tuple["HandModel", "Joints"]:
 
 
 @contextlib.contextmanager
-def open_port(options: HandOptions) -> Iterator[str]:
+def open_port(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[str]:
     """The serial port of the options; a twin behind it is started, and ended with the block.
+
+    Args:
+        options: The options.
+        twin_options: More of the twin's, if there is one.
 
     Raises:
         ValueError: Neither or both of a port and a twin are asked for.
@@ -91,7 +95,7 @@ def open_port(options: HandOptions) -> Iterator[str]:
         arguments += ["--hand-layer", str(options.hand_layer)]
     if options.calibration is not None:
         arguments += ["--calibration", str(options.calibration)]
-    twin = TwinChild([*arguments, *options.twin_args.split()])
+    twin = TwinChild([*arguments, *twin_options, *options.twin_args.split()])
     try:
         yield twin.path
     finally:
@@ -99,8 +103,12 @@ def open_port(options: HandOptions) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def connect(options: HandOptions) -> Iterator[Connection]:
+def connect(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[Connection]:
     """Open the bus to the hand of the options.
+
+    Args:
+        options: The options.
+        twin_options: More of the twin's, if there is one.
 
     Raises:
         ValueError: Options that cannot be.
@@ -111,6 +119,6 @@ def connect(options: HandOptions) -> Iterator[Connection]:
 
     hand, joints = read_hand_and_joints(options)
     retries = {"retries": TWIN_RETRIES} if options.twin else {}
-    with open_port(options) as port:
+    with open_port(options, twin_options) as port:
         with MotorBus(port, joints.ids, options.motor, baud_rate=options.baud_rate, **retries) as bus:
             yield Connection(hand, joints, bus)

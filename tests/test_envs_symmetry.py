@@ -45,7 +45,7 @@ def look(env: ReorientEnv) -> None:
     """Observe anew, in the views for where the objects are now."""
     every = wp.ones(WORLDS, dtype=wp.int32, device=env.device)
     env.views.choose(every, every)
-    env._observe()
+    env.observe()
 
 
 def act(env: ReorientEnv, action: np.ndarray) -> None:

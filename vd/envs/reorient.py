@@ -190,7 +190,7 @@ class ReorientEnv:
         self.randomiser.draw(self._reset)
         self._reset_worlds(use_start=object_quat is not None, use_goal=goal_quat is not None)
         self.randomiser.push()
-        self._observe()
+        self.observe()
 
     def step(self, action: Any) -> None:
         """Simulate one control step; worlds that end are reset, and the observation is fresh.
@@ -296,7 +296,7 @@ class ReorientEnv:
         )
         self.randomiser.redraw(self._reset)
         self._reset_worlds()
-        self._observe()
+        self.observe()
 
     def _reset_worlds(self, *, use_start: bool = False, use_goal: bool = False) -> None:
         """Reset the worlds of ``_reset``, give a goal to those of ``_new_goal`` too."""
@@ -376,7 +376,8 @@ class ReorientEnv:
             device=self.device,
         )
 
-    def _observe(self) -> None:
+    def observe(self) -> None:
+        """Refresh the observation from the present state; :meth:`step` and :meth:`reset` have done so."""
         sim = self.sim
         wp.launch(
             teacher_observation_kernel,

@@ -1,8 +1,7 @@
-"""A twin in a process of its own, and what it tells beside its motors."""
+"""The near end of a twin's side: its true state, its depth camera, and a hand to place the object."""
 
 import json
 import socket
-import tempfile
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +12,7 @@ import numpy as np
 
 from vd.assets_usd.hand_data import CameraModel
 from vd.deploy.camera import DepthFrame, Intrinsics, StaleCamera
-from vd.deploy.child import TwinChild, TwinError
+from vd.deploy.child import TwinError
 from vd.deploy.twin_side import Arrays, receive
 
 ANSWER_S = 5.0
@@ -38,43 +37,25 @@ class TwinState:
     """Its linear [m/s] and angular [rad/s] velocity [6]."""
 
 
-class TwinProcess(TwinChild):
-    """A twin of a hand, its object and its camera, as another process.
+class TwinLink:
+    """A connection to the side of a twin.
 
     Args:
-        hand: Name of the hand or its USD.
-        item: Object: name of a built-in set, or a file.
-        camera: Its depth camera, with the pose in the hand's base frame.
-        realistic: Whether the camera has the errors of a real one.
-        arguments: More arguments of ``python -m vd.deploy.twin``.
-
-    Attributes:
-        path: Device of its bus.
+        path: Its socket.
 
     Raises:
-        TwinError: It did not start; says why.
+        TwinError: Nobody serves there.
     """
 
-    def __init__(
-        self,
-        hand: str,
-        item: str,
-        camera: CameraModel,
-        *,
-        realistic: bool = False,
-        arguments: Sequence[str] = (),
-    ):
-        self.camera = camera
-        self._folder = tempfile.TemporaryDirectory(prefix="vd-twin-")
-        side = Path(self._folder.name) / "side"
-        pose = [f"{value:.9g}" for value in (*camera.position, *camera.quaternion)]
-        options = ["--hand", hand, "--object", item, "--side", str(side), "--camera", *pose]
-        super().__init__([*options, *(["--realistic"] if realistic else []), *arguments])
+    def __init__(self, path: Path):
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._socket.connect(str(side))
         self._lock = threading.Lock()
+        try:
+            self._socket.connect(str(path))
+        except OSError as error:
+            raise TwinError(f"no twin at {path}: {error}") from error
 
-    def __enter__(self) -> "TwinProcess":
+    def __enter__(self) -> "TwinLink":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -113,10 +94,8 @@ class TwinProcess(TwinChild):
         self.ask("table", present=present)
 
     def close(self) -> None:
-        """End it."""
+        """End the connection; the twin goes on."""
         self._socket.close()
-        super().close()
-        self._folder.cleanup()
 
 
 class TwinCamera:
@@ -124,15 +103,16 @@ class TwinCamera:
 
     Args:
         twin: The twin.
+        camera: The camera it was told to have.
     """
 
-    def __init__(self, twin: TwinProcess):
-        self._twin = twin
+    def __init__(self, twin: TwinLink, camera: CameraModel):
+        self._twin, self._camera = twin, camera
 
     @property
     def intrinsics(self) -> Intrinsics:
         """Of its images."""
-        return Intrinsics.of(self._twin.camera)
+        return Intrinsics.of(self._camera)
 
     def read(self, timeout_s: float) -> DepthFrame:
         """An image of the present.

@@ -1,0 +1,137 @@
+"""Policies as the loop flies them: from what is sensed to an action and the distance to the goal."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+
+from vd.assets_usd.hand_data import CameraModel, HandModel
+from vd.assets_usd.objects.model import ObjectModel
+from vd.config import from_dict
+from vd.deploy.mirror import Mirror, TeacherSight
+from vd.deploy.observation import Sensed, StudentSight, frame
+from vd.evaluate.statistics import rotation_angle
+from vd.evaluate.student import PRETRAINED, RENDERED
+from vd.sensors.cfg import DepthCameraCfg
+from vd.student.saved import SavedStudent
+from vd.student.stopping import StoppingRule
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a policy says of a moment."""
+
+    action: np.ndarray
+    """Mean action [D]."""
+    distance: float
+    """Distance to the goal by which it is stopped [rad]: a student's prediction, or the truth."""
+
+
+class Pilot(Protocol):
+    """A policy in the loop."""
+
+    rule: StoppingRule
+    """When it has arrived."""
+
+    def begin(self) -> None:
+        """A new goal: memory starts empty, as in training."""
+
+    def decide(self, sensed: Sensed) -> Decision:
+        """What to do now."""
+
+
+class StudentPilot:
+    """A student: sees clouds, remembers, and predicts its distance.
+
+    Args:
+        student: The student.
+        hand: The hand.
+        item: The object.
+        seed: Of the choice of camera points.
+
+    Attributes:
+        camera: Where its camera has to be; None: it sees complete clouds, which only a twin has.
+    """
+
+    def __init__(self, student: SavedStudent, hand: HandModel, item: ObjectModel, *, seed: int = 0):
+        spec = student.spec
+        if spec.stage == PRETRAINED:
+            raise ValueError("a student of stage 0 is an encoder, which cannot act; give one of stage 1 or 2")
+        self.rule, self._network = spec.stopping, student.network
+        self.camera = student_camera(student, hand)
+        self.sight = StudentSight(
+            hand,
+            item,
+            spec.network,
+            camera=self.camera,
+            depth=from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
+            if self.camera is not None
+            else None,
+            seed=seed,
+        )
+        self._hidden = self._network.initial_hidden(1)
+
+    def begin(self) -> None:
+        """A new goal: the memory starts empty, as in training."""
+        self._hidden = self._network.initial_hidden(1)
+
+    def decide(self, sensed: Sensed) -> Decision:
+        """Mean action and predicted distance."""
+        with torch.inference_mode():
+            sites = self.sight.sites(self.sight.points(sensed))
+            senses = self._network.senses(frame(sensed))
+            output = self._network.act(sites[0], senses, self._hidden, *sites[1:])
+        self._hidden = output.hidden
+        return Decision(output.mean[0].numpy().copy(), float(output.distance[0, -1]))
+
+
+class TeacherPilot:
+    """A teacher on a twin: it reads the twin's true state, which no real hand tells.
+
+    Args:
+        policy: The teacher.
+        mirror: A world of its training.
+    """
+
+    def __init__(self, policy: Any, mirror: Mirror):
+        self.rule = StoppingRule()
+        self._sight = TeacherSight(policy, mirror)
+
+    def begin(self) -> None:
+        """A teacher remembers nothing."""
+
+    def decide(self, sensed: Sensed) -> Decision:
+        """Mean action and true distance."""
+        assert sensed.object_pose is not None
+        distance = rotation_angle(sensed.object_pose[None, 3:].astype(float), sensed.goal_quat[None])[0]
+        return Decision(self._sight.act(sensed), float(distance))
+
+
+class StillPilot:
+    """Does nothing; to try everything but a policy.
+
+    Args:
+        num_actions: D.
+    """
+
+    def __init__(self, num_actions: int):
+        self.rule, self._action = StoppingRule(), np.zeros(num_actions)
+
+    def begin(self) -> None:
+        """Nothing to forget."""
+
+    def decide(self, sensed: Sensed) -> Decision:
+        """No action; the distance is not known."""
+        return Decision(self._action, float("nan"))
+
+
+def student_camera(student: SavedStudent, hand: HandModel) -> CameraModel | None:
+    """The camera that a student was trained with: the hand's, or where its training put it."""
+    spec = student.spec
+    if spec.stage != RENDERED:
+        return None
+    if spec.camera is None:
+        return hand.camera
+    place = np.array(spec.camera)
+    return replace(hand.camera, position=place[:3], quaternion=place[3:] / np.linalg.norm(place[3:]))

@@ -1,0 +1,139 @@
+"""For the same state a policy on a hand sees what it saw in training: whole episodes, both hands."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from vd.deploy.action import ActionFilter
+from vd.deploy.mirror import Mirror
+from vd.deploy.observation import Sensed, StudentSight, frame
+from vd.envs.cfg import RandomisationCfg, ReorientCfg
+from vd.envs.reorient import ReorientEnv
+from vd.evaluate.agents import open_teacher, task_for
+from vd.sensors.cfg import DepthCameraCfg
+from vd.student.cfg import PRESETS
+from vd.student.network import Student
+from vd.vision import StudentView
+
+POINT_M = 2e-6
+"""Points of the two clouds lie this close: rounding of poses that were computed in another order."""
+SENSE = 1e-6
+
+
+def state_of(env: ReorientEnv) -> Sensed:
+    """What a hand and its twin would report of a world."""
+    d = env.num_actions
+    q, qd = env.sim.joint_q.numpy()[0], env.sim.joint_qd.numpy()[0]
+    return Sensed(
+        joint_q=env.measured_q.numpy()[0, :d].copy(),
+        joint_qd=env.measured_qd.numpy()[0, :d].copy(),
+        smoothed=env.smoothed.numpy()[0].copy(),
+        goal_quat=env.goal_quat.numpy()[0].copy(),
+        object_pose=q[d:].copy(),
+        object_velocity=qd[d:].copy(),
+    )
+
+
+def keys(sites) -> set[tuple[int, ...]]:
+    return {tuple(row) for row in sites.coordinates.tolist()}
+
+
+def near_border(points: np.ndarray, side: float) -> int:
+    """Points that lie so close to a border between voxels that rounding decides."""
+    cells = points[np.isfinite(points).all(axis=1)] / side
+    return int((np.abs(cells - np.round(cells)) < 2.0 * POINT_M / side).any(axis=1).sum())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rendered", [False, True], ids=["complete", "camera"])
+@pytest.mark.parametrize("hand", ["dclaw3", "dclaw4"])
+def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered):
+    """Whole episodes of random actions; the deploy side is given joints, goal and image, nothing else."""
+    task = ReorientCfg(hand=hand, num_worlds=1, seed=3, randomisation=RandomisationCfg(enabled=False))
+    env = ReorientEnv(task, "cpu")
+    network = PRESETS["small"]
+    depth = DepthCameraCfg()
+    view = StudentView(env, network, rendered=rendered, depth=depth)
+    camera = env.hand.camera if rendered else None
+    sight = StudentSight(env.hand, env.objects[0], network, camera=camera, depth=depth)
+    actions = ActionFilter(env.hand, task)
+    torch.manual_seed(0)
+    student = Student(network, env.num_actions).eval()
+    hidden = there = student.initial_hidden(1)
+    rng = np.random.default_rng(0)
+    apart, borders, steps = 0, 0, 0
+    for _ in range(env.max_episode_steps):
+        seen = view.frame()
+        sensed = state_of(env)
+        if rendered:
+            sensed = replace(sensed, depth=view.camera.depth.numpy()[0].copy())
+        points = sight.points(sensed)
+        expected = _points(view, seen)
+        known = torch.isfinite(expected).all(dim=-1)
+        assert torch.equal(known, torch.isfinite(points).all(dim=-1))
+        assert (points[known] - expected[known]).abs().max() < POINT_M
+        ours, theirs = sight.sites(points), view.sites(seen, augment=False)
+        apart += len(keys(ours[0]) ^ keys(theirs[0]))
+        borders += near_border(expected[0].numpy(), network.voxel_m)
+        senses, wanted = student.senses(frame(sensed)), student.senses(seen)
+        assert (senses - wanted).abs().max() < SENSE
+        with torch.inference_mode():
+            one = student.act(ours[0], senses, hidden, *ours[1:])
+            other = student.act(theirs[0], wanted, there, *theirs[1:])
+        hidden, there = one.hidden, other.hidden
+        if keys(ours[0]) == keys(theirs[0]):
+            np.testing.assert_allclose(one.mean, other.mean, atol=2e-2)
+        action = rng.uniform(-1.0, 1.0, env.num_actions).astype(np.float32)
+        actions._smoothed.assign(sensed.smoothed[None])
+        target = actions.goal(action, sensed.joint_q)
+        env.step(wp.array(action[None], dtype=float, device="cpu"))
+        np.testing.assert_allclose(target, env.sim.target.numpy()[0, : env.num_actions], atol=1e-6)
+        steps += 1
+    assert steps == env.max_episode_steps
+    assert apart <= 2 * borders, f"{apart} voxels differ, {borders} points lie on borders"
+
+
+def _points(view: StudentView, seen: dict[str, torch.Tensor]) -> torch.Tensor:
+    """The simulator's cloud of a frame [1, P, 3]."""
+    taken = []
+    voxelise = view._voxelise
+    view._voxelise = lambda points, **_: taken.append(points)
+    try:
+        view.sites(seen, augment=False)
+    finally:
+        view._voxelise = voxelise
+    return taken[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hand", ["dclaw3", "dclaw4"])
+def test_a_teacher_sees_in_the_mirror_what_it_saw(hand):
+    """An episode of the installed policy, each state taken into another world."""
+    policy = open_teacher(f"{hand}-table", "cpu")
+    task = task_for(
+        policy,
+        hand=None,
+        objects=("cube",),
+        num_worlds=1,
+        seed=1,
+        stop_tolerance_rad=0.4,
+        max_goal_angle_rad=None,
+        episode_s=10.0,
+        randomised=False,
+        success_ends_episode=False,
+    )
+    env, mirror = ReorientEnv(task, "cpu"), Mirror(replace(task, seed=2))
+    worst = 0.0
+    for _ in range(env.max_episode_steps):
+        mirror.take(state_of(env))
+        worst = max(worst, float(np.abs(mirror.env.observation.numpy() - env.observation.numpy()).max()))
+        env.step(wp.from_torch(policy.act(wp.to_torch(env.observation)).contiguous()))
+    assert worst < 1e-4
+
+
+def test_a_mirror_wants_one_plain_world_and_the_truth():
+    with pytest.raises(ValueError, match="one world"):
+        Mirror(ReorientCfg(num_worlds=2))
