@@ -1,5 +1,6 @@
 """A twin as a process of its own, which ends with the one that started it."""
 
+import os
 import select
 import subprocess
 import sys
@@ -11,6 +12,20 @@ START_S = 300.0
 """Longest start: on a machine that has not compiled the simulator's kernels, that takes minutes."""
 END_S = 5.0
 """Time that a twin has to end."""
+
+
+def real_time() -> None:
+    """Run before all ordinary programs, as loop and twin need it on a busy machine; both mostly sleep.
+
+    Raises:
+        OSError: The system does not have it, or does not permit it.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))
+    except (AttributeError, PermissionError) as error:
+        raise OSError(
+            f"no real-time priority ({error}); on Linux allow it with `ulimit -r 1`, or leave --realtime out"
+        ) from error
 
 
 class TwinError(RuntimeError):

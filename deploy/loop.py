@@ -172,15 +172,14 @@ class ControlLoop:
             StaleCamera: There is no new image.
         """
         outcomes = []
-        with _undisturbed():
-            for number, goal in enumerate(goals):
-                outcome, distance = self._pursue(number, np.asarray(goal, dtype=float))
-                outcomes.append(outcome)
-                self._log.event("stop", goal=number, outcome=outcome, distance=distance)
-                if outcome == "lost":
-                    break
-                for _ in range(round(self._cfg.hold_s / self._clock.period_s)):
-                    self._step(number, goal, acting=False)
+        for number, goal in enumerate(goals):
+            outcome, distance = self._pursue(number, np.asarray(goal, dtype=float))
+            outcomes.append(outcome)
+            self._log.event("stop", goal=number, outcome=outcome, distance=distance)
+            if outcome == "lost":
+                break
+            for _ in range(round(self._cfg.hold_s / self._clock.period_s)):
+                self._step(number, goal, acting=False)
         return outcomes
 
     def _pursue(self, number: int, goal: np.ndarray) -> tuple[str, float | None]:
@@ -203,7 +202,7 @@ class ControlLoop:
         due = self._clock.due_s
         assert due is not None
         depth = None
-        if self._camera is not None and acting:
+        if self._camera is not None:
             image = self._camera.read(CAMERA_SHARE * self._clock.period_s)
             self._safe.image_at(image.time_s)
             depth = image.depth_m
@@ -306,8 +305,8 @@ def summary(times: Sequence[StepTimes]) -> dict[str, dict[str, float]]:
 
 
 @contextmanager
-def _undisturbed() -> Iterator[None]:
-    """Without the garbage collector, which pauses; what is there now is never looked at again."""
+def undisturbed() -> Iterator[None]:
+    """Without the garbage collector, which pauses for a second where there is much; a run makes little."""
     gc.collect()
     gc.freeze()
     gc.disable()

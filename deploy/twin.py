@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from vd.deploy.child import real_time
 from vd.deploy.control_table import MODELS
 from vd.deploy.motor import Motor
 from vd.deploy.packets import BROADCAST, MAX_ID, Failure, Instruction, Packet, PacketReader, encode, status
@@ -352,6 +353,8 @@ class TwinCommand:
     """IDs of motors with a loose cable."""
     seed: int = 0
     """Of the faults."""
+    realtime: bool = False
+    """Run before all ordinary programs, where that is permitted."""
     attached: bool = False
     """End when standard input does: with the program that started it, however that ended."""
 
@@ -378,6 +381,8 @@ class TwinCommand:
             joints = uncalibrated(hand) if self.calibration is None else read_joints(self.calibration, hand)
             ids, plant = joints.ids, NewtonHand(hand, joints, item=self._item())
             side = self._beside(plant)
+        if self.realtime:
+            real_time()
         twin = Twin([Motor(MODELS[self.model], id) for id in ids], plant, faults, side=side)
         print(twin.path, flush=True)
         if self.attached:

@@ -1,0 +1,177 @@
+"""A policy made ready to fly: loaded, checked against the hand, given its eyes, and warmed up."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from vd.assets_usd.hand_data import CameraModel
+from vd.assets_usd.hand_model import HandModel
+from vd.assets_usd.objects.model import ObjectModel, load_set
+from vd.deploy.camera import DepthSource
+from vd.deploy.mirror import Mirror
+from vd.deploy.motion import reset_pose
+from vd.deploy.observation import Sensed
+from vd.deploy.pilot import Pilot, StillPilot, StudentPilot, TeacherPilot
+from vd.deploy.realsense import RealSense, RealSenseCfg, find_device
+from vd.deploy.twin_link import TwinCamera, TwinLink
+from vd.envs.cfg import ReorientCfg
+from vd.evaluate.agents import check_bundle, is_saved_student, open_policy, task_for, trained_task
+from vd.evaluate.rollout import draw_goals
+from vd.paper import PAPER
+
+STILL = "still"
+"""Name of the policy that does nothing."""
+WARM_UP = 3
+"""Decisions before the hand is switched on: kernels are loaded, allocators have grown."""
+FIRST_IMAGE_S = 5.0
+"""Longest wait for a camera's first image."""
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A policy made ready."""
+
+    name: str
+    """As it was asked for."""
+    kind: str
+    """teacher, student or still."""
+    pilot: Pilot
+    """It."""
+    task: ReorientCfg
+    """Environment of its training."""
+    camera: CameraModel | None = None
+    """Where its depth camera has to be; None: it has none."""
+    needs_truth: bool = False
+    """Whether it needs the object's true pose, which only a twin knows."""
+
+
+def one_object(name: str) -> ObjectModel:
+    """The object that is named.
+
+    Raises:
+        ValueError: Several are.
+    """
+    found = load_set(name)
+    if len(found) > 1:
+        raise ValueError(f"--object {name} holds {len(found)} objects; name the file of one")
+    return found[0]
+
+
+def make_flight(
+    name: str, hand_name: str, item_name: str, hand: HandModel, item: ObjectModel, *, seed: int = 0
+) -> Flight:
+    """Load a policy, and make it ready.
+
+    Args:
+        name: Bundle, file of a policy, installed policy, or ``still``.
+        hand_name: Name of the hand or its USD.
+        item_name: Name of the object's set or its USD.
+        hand: The hand.
+        item: The object.
+        seed: Of the choice of camera points.
+
+    Raises:
+        ValueError: It is for another hand, or cannot act.
+    """
+    if name == STILL:
+        return Flight(name, STILL, StillPilot(hand.num_joints), ReorientCfg(hand=hand_name))
+    policy: Any = open_policy(name, "cpu")
+    if policy is None:
+        raise ValueError(f"{name} cannot be flown; give a bundle, a policy's file, or {STILL}")
+    student = is_saved_student(policy)
+    moves = policy.spec.num_actions if student else policy.num_actions
+    if moves != hand.num_joints:
+        raise ValueError(f"{name} moves {moves} joints, the hand {hand.name} has {hand.num_joints}")
+    check_bundle(name, replace(trained_task(policy), hand=hand_name))
+    if student:
+        pilot = StudentPilot(policy, hand, item, seed=seed)
+        camera = pilot.camera
+        return Flight(name, "student", pilot, trained_task(policy), camera, needs_truth=camera is None)
+    task = mirror_task(policy, hand_name, item_name)
+    return Flight(name, "teacher", TeacherPilot(policy, Mirror(task)), task, needs_truth=True)
+
+
+def mirror_task(policy: Any, hand_name: str, item_name: str) -> ReorientCfg:
+    """The environment of a policy's training as a mirror takes it: one world, not randomised."""
+    return task_for(
+        policy,
+        hand=hand_name,
+        objects=(item_name,),
+        num_worlds=1,
+        seed=0,
+        stop_tolerance_rad=PAPER.success.rotation_rad,
+        max_goal_angle_rad=None,
+        episode_s=PAPER.scene.episode_s,
+        randomised=False,
+        success_ends_episode=False,
+        at_rest=False,
+    )
+
+
+def make_goals(texts: Sequence[str], drawn: int, max_angle: float, *, seed: int) -> list[np.ndarray]:
+    """Goals as they were typed, or drawn ones, each within an angle of the one before.
+
+    Args:
+        texts: Quaternions x,y,z,w.
+        drawn: How many to draw where there are none.
+        max_angle: Largest angle between two drawn goals [rad]; the first from no rotation.
+        seed: Of the draw.
+
+    Returns:
+        Quaternions xyzw.
+
+    Raises:
+        ValueError: A text that is no quaternion.
+    """
+    goals = []
+    for text in texts:
+        try:
+            goal = np.array([float(part) for part in text.split(",")])
+        except ValueError:
+            goal = np.zeros(0)
+        if goal.shape != (4,) or not np.linalg.norm(goal) > 0.0:
+            raise ValueError(f"--goal {text}: give a quaternion x,y,z,w, such as 0,0,0.7071,0.7071")
+        goals.append(goal / np.linalg.norm(goal))
+    if goals:
+        return goals
+    rng = np.random.default_rng(seed)
+    last = np.array([0.0, 0.0, 0.0, 1.0])
+    for _ in range(drawn):
+        last = draw_goals(last[None], rng, max_angle)[0]
+        goals.append(last)
+    return goals
+
+
+def open_camera(flight: Flight, link: TwinLink | None, cfg: RealSenseCfg) -> DepthSource | None:
+    """The depth camera of a policy, a twin's or a real one; None if it needs none.
+
+    Raises:
+        CameraError: There is none, or its images are not those of the training.
+    """
+    if flight.camera is None:
+        return None
+    if link is not None:
+        return TwinCamera(link, flight.camera)
+    return RealSense(find_device(cfg.serial), cfg)
+
+
+def warm_up(
+    pilot: Pilot, hand: HandModel, goal: np.ndarray, camera: DepthSource | None, link: TwinLink | None
+) -> None:
+    """Let the policy decide a few times on what is seen now, and forget it."""
+    pose = reset_pose(hand.num_fingers)
+    known = None if link is None else link.state()
+    sensed = Sensed(
+        joint_q=pose,
+        joint_qd=np.zeros_like(pose),
+        smoothed=np.zeros_like(pose),
+        goal_quat=goal,
+        depth=None if camera is None else camera.read(FIRST_IMAGE_S).depth_m,
+        object_pose=None if known is None else known.object_pose,
+        object_velocity=None if known is None else known.object_velocity,
+    )
+    for _ in range(WARM_UP):
+        pilot.decide(sensed)
+    pilot.begin()

@@ -1,0 +1,257 @@
+"""Drive a hand with a policy: pursue goals one after the other, in one process at 12 Hz, and log every step.
+
+On a real hand the policy is a student, a bundle of vd-train, which sees joints and a depth camera. On a twin
+it can be a teacher too; that one reads the simulated object's true pose, which no real hand tells.
+"""
+
+import contextlib
+import select
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+
+from vd.deploy.bus import D_GAIN, P_GAIN
+from vd.deploy.child import real_time
+from vd.deploy.connect import Connection, HandOptions, connect
+from vd.deploy.motion import MOVE_S, move, reset_pose
+from vd.deploy.realsense import RealSenseCfg
+from vd.deploy.safety import SafeHand, SafetyCfg
+from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.assets_usd.objects.model import ObjectModel
+    from vd.deploy.flight import Flight
+    from vd.deploy.twin_link import TwinLink
+
+HOME_RAD_S = 0.5
+"""Speed of the way to the start [rad/s]."""
+SETTLE_S = 1.5
+"""Time that an object of a twin has to come to rest between the fingers [s]."""
+STATUS_S = 5.0
+"""Seconds between status lines where there is no terminal to rewrite one on."""
+
+
+@dataclass(frozen=True)
+class RunCfg(HandOptions):
+    """Drive a hand with a policy."""
+
+    policy: Annotated[str | None, tyro.conf.Positional] = None
+    """Bundle or file of a student, or with --twin also a teacher: a file or an installed policy; with --twin
+    the installed teacher of the hand by default. "still" does nothing."""
+    object: str = "cube"
+    """The object: name of a built-in set, or its USD."""
+    goal: tuple[str, ...] = ()
+    """Orientations of the object to reach, one after the other: quaternions x,y,z,w in the world frame."""
+    random_goals: int = 1
+    """How many goals to draw where --goal names none."""
+    max_goal_angle: float = np.pi
+    """Drawn goals lie within this angle [rad] of the one before."""
+    goal_s: float = PAPER.scene.episode_s
+    """Time for each goal [s]; then the next one is pursued."""
+    hold_s: float = 1.0
+    """How long the hand holds still between goals [s]."""
+    air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Take the twin's table away after 2 s, as the paper's test in the air does."""
+    realistic: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Give the twin's depth images the errors of a real camera."""
+    camera: RealSenseCfg = field(default_factory=RealSenseCfg)
+    """The depth camera."""
+    safety: SafetyCfg = field(default_factory=SafetyCfg)
+    """Limits."""
+    log: Path | None = None
+    """Folder of the log; runs/deploy/ and the time by default."""
+    seed: int = 0
+    """Of drawn goals and of the choice of points."""
+    realtime: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Run before all ordinary programs, the twin too; needs the right to (root, or ulimit -r)."""
+    threads: int = 1
+    """Threads of the network; more than one only helps on cores that nothing else uses."""
+    yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Do not ask before it moves; a twin is not asked for."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the flag and the remedy."""
+        if self.random_goals < 1 or self.threads < 1:
+            raise ValueError("--random-goals and --threads have to be at least 1")
+        if not self.goal_s > 0.0 or self.hold_s < 0.0:
+            raise ValueError("--goal-s has to be positive, and --hold-s must not be negative")
+        if (self.air or self.realistic) and not self.twin:
+            raise ValueError("--air and --realistic are for --twin")
+        if self.policy is None and not self.twin:
+            raise ValueError("name the policy: the folder of a bundle that vd-train bundle wrote")
+
+
+def run(cfg: RunCfg) -> int:
+    """Fly the policy; 0 if all goals were pursued, 1 if the object was lost."""
+    cfg.validate()
+    import torch
+    import warp as wp
+
+    from vd.deploy.connect import read_hand_and_joints
+    from vd.deploy.flight import make_flight, one_object
+    from vd.deploy.twin_link import TwinLink
+
+    wp.config.log_level = wp.LOG_WARNING  # a line for each kernel would scroll the preflight away
+    torch.set_num_threads(cfg.threads)
+    hand, _ = read_hand_and_joints(cfg)
+    item = one_object(cfg.object)
+    flight = make_flight(cfg.policy or f"{hand.name}-table", cfg.hand, cfg.object, hand, item, seed=cfg.seed)
+    if flight.needs_truth and not cfg.twin:
+        raise ValueError(
+            f"{cfg.policy} needs the object's true pose, which no real hand tells; give a student of stage 2"
+        )
+    with contextlib.ExitStack() as stack:
+        twin_options: list[str] = []
+        side = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vd-twin-"))) / "side"
+        if cfg.twin:
+            camera = flight.camera or hand.camera
+            pose = [f"{value:.9g}" for value in (*camera.position, *camera.quaternion)]
+            twin_options = ["--object", cfg.object, "--side", str(side), "--camera", *pose]
+            twin_options += ["--realistic"] if cfg.realistic else []
+            twin_options += ["--realtime"] if cfg.realtime else []
+        connection = stack.enter_context(connect(cfg, twin_options))
+        link = stack.enter_context(TwinLink(side)) if cfg.twin else None
+        return _fly(cfg, flight, connection, item, link)
+
+
+def _fly(
+    cfg: RunCfg, flight: "Flight", connection: Connection, item: "ObjectModel", link: "TwinLink | None"
+) -> int:
+    """Preflight, way to the start, the loop, and its log."""
+    from vd.deploy.action import ActionFilter
+    from vd.deploy.check import ready
+    from vd.deploy.flight import make_goals, open_camera, warm_up
+    from vd.deploy.log import LogWriter
+    from vd.deploy.loop import Clock, ControlLoop, LoopCfg, summary, undisturbed
+
+    hand = connection.hand
+    goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
+    pose = reset_pose(hand.num_fingers)
+    with contextlib.ExitStack() as stack:
+        camera = open_camera(flight, link, cfg.camera)
+        if camera is not None:
+            stack.callback(camera.close)
+        ready(
+            connection, f"The hand will pursue {len(goals)} goals.", yes=cfg.yes or cfg.twin, quiet=cfg.twin
+        )
+        warm_up(flight.pilot, hand, goals[0], camera, link)
+        folder = cfg.log or Path("runs/deploy") / datetime.now().strftime("%Y%m%d-%H%M%S")
+        log = LogWriter(
+            folder,
+            hand,
+            {
+                "policy": flight.name,
+                "kind": flight.kind,
+                "twin": cfg.twin,
+                "object": {"name": item.name, "set": cfg.object},
+                "goals": [[float(value) for value in goal] for goal in goals],
+                "control_hz": flight.task.sim.control_hz,
+                "stopping": vars(flight.pilot.rule),
+                "action": vars(flight.task.action),
+            },
+            servo={"model": cfg.motor, "p_gain": P_GAIN, "d_gain": D_GAIN},
+            truth=link is not None,
+        )
+        clock = Clock(flight.task.sim.control_hz)
+        if cfg.realtime:
+            real_time()
+        reason, outcomes = "aborted", list[str]()
+        status = StatusLine()
+        loop: ControlLoop | None = None
+        try:
+            with undisturbed(), SafeHand(connection.bus, connection.joints, hand, cfg.safety) as safe:
+                safe.arm()
+                move(safe, pose, HOME_RAD_S)
+                place(safe, pose, link, yes=cfg.yes)
+                loop = ControlLoop(
+                    safe,
+                    flight.pilot,
+                    ActionFilter(hand, flight.task),
+                    clock,
+                    log,
+                    LoopCfg(cfg.goal_s, cfg.hold_s),
+                    camera=camera,
+                    truth=link,
+                    symmetry=item.symmetry,
+                    status=status.show,
+                )
+                if cfg.air and link is not None:
+                    away = partial(link.place_table, present=False)
+                    threading.Timer(PAPER.scene.air_table_s, away).start()
+                outcomes = loop.run(goals)
+                reason = "lost" if "lost" in outcomes else "all goals pursued"
+        except BaseException as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise
+        finally:
+            status.end()
+            times = {} if loop is None else summary(loop.times)
+            steps = 0 if loop is None else len(loop.times)
+            log.finish(reason, outcomes=outcomes, steps=steps, missed=clock.missed, times=times)
+            print(report(folder, outcomes, steps, clock.missed, times))
+    return int(reason == "lost")
+
+
+def place(safe: SafeHand, pose: np.ndarray, link: "TwinLink | None", *, yes: bool) -> None:
+    """Hold the pose until the object is between the fingers: a person's or the twin's doing.
+
+    Raises:
+        StoppedError: The hand was stopped meanwhile.
+    """
+    asked = link is None and not yes and sys.stdin.isatty()
+    if link is not None:
+        link.place_object((0.0, 0.0, 0.0, 1.0))
+    elif asked:
+        print("Put the object between the fingers, then press Enter. ", end="", file=sys.stderr, flush=True)
+    end = time.monotonic() + SETTLE_S
+    while time.monotonic() < end or (asked and not select.select([sys.stdin], [], [], 0.0)[0]):
+        safe.read()
+        safe.command(pose)
+        safe.beat()
+        time.sleep(MOVE_S)
+    if asked:
+        sys.stdin.readline()
+
+
+class StatusLine:
+    """One line that is rewritten on a terminal, and now and then a new one elsewhere."""
+
+    def __init__(self) -> None:
+        self._live, self._next = sys.stderr.isatty(), 0.0
+
+    def show(self, line: str) -> None:
+        """Show a line."""
+        if self._live:
+            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
+        elif time.monotonic() >= self._next:
+            self._next = time.monotonic() + STATUS_S
+            print(line, file=sys.stderr, flush=True)
+
+    def end(self) -> None:
+        """Leave the line."""
+        if self._live:
+            print(file=sys.stderr)
+
+
+def report(folder: Path, outcomes: list[str], steps: int, missed: int, times: dict[str, Any]) -> str:
+    """What came of it, in a few lines."""
+    lines = [f"{outcome}: goal {number + 1}" for number, outcome in enumerate(outcomes)]
+    lines.append(f"{steps} control steps, {missed} deadlines missed")
+    for name, title in (
+        ("late_ms", "began late by"),
+        ("sent_ms", "goals sent after"),
+        ("cpu_ms", "processor time"),
+    ):
+        if name in times:
+            t = times[name]
+            lines.append(f"{title:<17} {t['median']:.1f} ms, 99 % {t['p99']:.1f}, most {t['max']:.1f}")
+    return "\n".join([*lines, f"log: {folder}"])

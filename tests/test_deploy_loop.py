@@ -1,0 +1,206 @@
+"""The control loop: its clock, how goals end, what is logged, and the whole of it on a twin."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from vd.assets_usd.hands import load_hand
+from vd.deploy import cli
+from vd.deploy.action import ActionFilter
+from vd.deploy.log import LogWriter
+from vd.deploy.loop import Clock, ControlLoop, LoopCfg
+from vd.deploy.pilot import Decision
+from vd.deploy.safety import JointState
+from vd.deploy.twin_link import TwinState
+from vd.envs.cfg import ReorientCfg
+from vd.hand_log import read_log
+from vd.paper import PAPER
+from vd.student.stopping import StoppingRule
+
+HZ = PAPER.scene.control_hz
+GOAL = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+@dataclass
+class Time:
+    """A clock that only moves when told, or slept on."""
+
+    now: float = 100.0
+
+    def __call__(self) -> float:
+        """The time [s]."""
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        """Let time pass."""
+        self.now += seconds
+
+
+@dataclass
+class Hand:
+    """Joints that are at once where they are told to be; each exchange takes ``work`` seconds."""
+
+    time: Time
+    work: list[float] = field(default_factory=list)
+    position: np.ndarray = field(default_factory=lambda: np.tile([0.0, 0.8, -1.1], 3))
+    missed: list[bool] = field(default_factory=list)
+
+    def read(self) -> JointState:
+        """As :class:`SafeHand`."""
+        zero = np.zeros(9)
+        return JointState(self.time.now, self.position.copy(), zero, zero, zero, zero + 12.0, zero + 30.0)
+
+    def command(self, target: np.ndarray) -> np.ndarray:
+        """As :class:`SafeHand`."""
+        self.time.now += self.work.pop(0) if self.work else 0.01
+        self.position = np.asarray(target)
+        return self.position
+
+    def beat(self, *, missed: bool) -> None:
+        """As :class:`SafeHand`."""
+        self.missed.append(missed)
+
+
+@dataclass
+class Countdown:
+    """A policy whose predicted distance falls by 0.1 rad a step from ``start``."""
+
+    start: float = 1.0
+    rule: StoppingRule = field(default_factory=lambda: StoppingRule(0.35, 2.0))
+    seen: list = field(default_factory=list)
+    begun: int = 0
+
+    def begin(self) -> None:
+        """From the start again."""
+        self.distance, self.begun = self.start, self.begun + 1
+
+    def decide(self, sensed) -> Decision:
+        """A tenth nearer."""
+        self.seen.append(sensed)
+        self.distance -= 0.1
+        return Decision(np.full(9, 0.1), self.distance)
+
+
+@pytest.fixture
+def parts(tmp_path, monkeypatch):
+    time = Time()
+    monkeypatch.setattr("vd.deploy.loop.time.monotonic", time)
+    hand = load_hand("dclaw3")
+    log = LogWriter(tmp_path / "log", hand, {"goals": [list(GOAL)] * 2}, servo={}, truth=True)
+    actions = ActionFilter(hand, ReorientCfg())
+    return Hand(time), Countdown(), actions, Clock(HZ, time, time.sleep), log
+
+
+@dataclass
+class Truth:
+    """An object that lies still, somewhere."""
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.03)
+
+    def state(self) -> TwinState:
+        """Where it lies."""
+        pose = np.array([*self.position, *GOAL])
+        return TwinState(0.0, 0.0, np.zeros(9), np.zeros(9), pose, np.zeros(6))
+
+
+def test_the_grid_stays_where_it_was_whatever_is_late():
+    time = Time()
+    clock = Clock(10.0, time, time.sleep)
+    assert clock.wait() == 0.0 and clock.due_s == 100.0
+    time.now += 0.03
+    assert not clock.end()
+    assert clock.wait() == pytest.approx(0.0) and clock.due_s == pytest.approx(100.1)
+    time.now += 0.25  # two deadlines pass
+    assert clock.end() and clock.missed == 2
+    assert clock.wait() == pytest.approx(0.05) and clock.due_s == pytest.approx(100.3)
+    time.now += 0.01
+    assert not clock.end() and clock.missed == 2
+    assert clock.wait() == pytest.approx(0.0) and clock.due_s == pytest.approx(100.4)
+
+
+def test_it_acts_until_the_policy_has_arrived_then_holds_and_goes_on(parts):
+    hand, pilot, actions, clock, log = parts
+    loop = ControlLoop(hand, pilot, actions, clock, log, LoopCfg(goal_s=10.0, hold_s=0.5), truth=Truth())
+    assert loop.run([GOAL, GOAL]) == ["stopped", "stopped"]
+    log.finish("done")
+    read = read_log(log.folder)
+    assert pilot.begun == 2
+    # From 1.0 in steps of 0.1 below 0.35: the seventh decision stops, so six actions are taken.
+    acting, number = read.columns["acting"], read.columns["goal"]
+    assert acting[number == 0].sum() == 7 and (acting == 0).sum() == 2 * 6
+    moved = np.abs(np.diff(read.channel("command")[:, 0])) > 1e-6
+    assert moved[:5].all() and not moved[6:12].any()
+    # The action filter: alpha a + (1 - alpha) before, zero again for the second goal.
+    smoothed = read.channel("smoothed")[:, 0]
+    alpha = PAPER.action.ema_alpha
+    assert smoothed[1] == pytest.approx(alpha * 0.1, abs=1e-6)
+    assert smoothed[2] == pytest.approx(alpha * 0.1 + (1 - alpha) * alpha * 0.1, abs=1e-6)
+    second = np.flatnonzero(number == 1)[0]
+    assert smoothed[second] == 0.0
+    assert [stop.outcome for stop in read.stops] == ["stopped", "stopped"]
+    assert read.stops[0].distance == pytest.approx(0.3)
+    assert np.diff(read.columns["t"]) == pytest.approx(np.full(len(acting) - 1, 1.0 / HZ), abs=1e-5)
+    np.testing.assert_allclose(read.columns["error"], 0.0, atol=1e-6)
+
+
+def test_a_goal_that_is_not_reached_ends_by_its_time_and_a_lost_object_the_run(parts):
+    hand, pilot, actions, clock, log = parts
+    pilot.start = 9.0
+    loop = ControlLoop(hand, pilot, actions, clock, log, LoopCfg(goal_s=1.0, hold_s=0.0), truth=Truth())
+    assert loop.run([GOAL]) == ["time limit"]
+    assert len(pilot.seen) == 12
+    away = Truth((0.3, 0.0, 0.03))
+    lost = ControlLoop(hand, pilot, actions, clock, log, LoopCfg(goal_s=1.0, hold_s=0.0), truth=away)
+    assert lost.run([GOAL, GOAL]) == ["lost"]
+
+
+def test_missed_deadlines_are_counted_and_told(parts):
+    hand, pilot, actions, clock, log = parts
+    hand.work = [0.01, 0.01, 0.1, 0.01]
+    pilot.start = 9.0
+    loop = ControlLoop(hand, pilot, actions, clock, log, LoopCfg(goal_s=0.5, hold_s=0.0))
+    loop.run([GOAL])
+    assert hand.missed == [False, False, True, False, False, False] and clock.missed == 1
+    assert loop.times[2].sent_s == pytest.approx(0.1) and loop.times[3].late_s == pytest.approx(0.1 - 1 / HZ)
+
+
+def test_there_is_nothing_to_stop_before_the_first_action(parts):
+    hand, pilot, actions, clock, log = parts
+    pilot.start = 0.1
+    loop = ControlLoop(hand, pilot, actions, clock, log, LoopCfg(hold_s=0.0))
+    assert loop.run([GOAL]) == ["stopped"]
+    assert len(pilot.seen) == 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hand", ["dclaw3", "dclaw4"])
+def test_a_teacher_flies_a_twin(hand, tmp_path, capsys):
+    """Everything but a real hand: the process of the twin, its bus, limits, policy, log."""
+    pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
+    folder = tmp_path / "log"
+    flags = ["--hand", hand, "--twin", "--goal-s", "2", "--hold-s", "0.2", "--log", str(folder)]
+    # Tests run beside others: late steps are for the log here, not for the safety.
+    patient = ["--safety.misses", "1000", "--safety.lost-s", "30", "--safety.watchdog-s", "2.5"]
+    goals = ["--goal", "0,0,0,1", "0,0,0.3,0.954"]
+    assert cli.main([*flags, *patient, *goals]) == 0, capsys.readouterr().err
+    log = read_log(folder)
+    assert log.run["kind"] == "teacher" and log.run["end"]["reason"] == "all goals pursued"
+    assert [stop.goal for stop in log.stops] == [0, 1]
+    steps = len(log.columns["t"])
+    assert log.run["end"]["steps"] == steps >= 10
+    # Goals are sent from where the joints are, and the joints follow.
+    step = PAPER.action.scale_rad_s / HZ
+    assert np.abs(log.channel("command") - log.channel("position")).max() < step + 0.3
+    assert np.isfinite(log.object_pose).all() and log.object_pose[:, 2].max() < 0.2
+
+
+def test_what_cannot_be_flown_is_refused(tmp_path, capsys):
+    assert cli.main(["--hand", "dclaw3", "--port", "/dev/none", "dclaw3-table"]) == 1
+    assert "true pose, which no real hand tells" in capsys.readouterr().err
+    assert cli.main(["--hand", "dclaw4", "--twin", "dclaw3-table"]) == 1
+    assert "moves 9 joints, the hand dclaw4 has 12" in capsys.readouterr().err
+    assert cli.main(["--hand", "dclaw3", "--port", "/dev/none"]) == 1
+    assert "name the policy" in capsys.readouterr().err
+    assert cli.main(["--hand", "dclaw3", "--twin", "still", "--goal", "1,2,3"]) == 1
+    assert "give a quaternion" in capsys.readouterr().err
