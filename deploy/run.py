@@ -109,7 +109,7 @@ def run(cfg: RunCfg) -> int:
         raise ValueError(
             f"{cfg.policy} needs the object's true pose, which no real hand tells; give a student of stage 2"
         )
-    with contextlib.ExitStack() as stack:
+    with real_time(cfg.realtime), contextlib.ExitStack() as stack:
         twin_options: list[str] = []
         side = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vd-twin-"))) / "side"
         if cfg.twin:
@@ -162,8 +162,6 @@ def _fly(
             truth=link is not None,
         )
         clock = Clock(flight.task.sim.control_hz)
-        if cfg.realtime:
-            real_time()
         reason, outcomes = "aborted", list[str]()
         status = StatusLine()
         loop: ControlLoop | None = None

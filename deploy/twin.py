@@ -381,14 +381,13 @@ class TwinCommand:
             joints = uncalibrated(hand) if self.calibration is None else read_joints(self.calibration, hand)
             ids, plant = joints.ids, NewtonHand(hand, joints, item=self._item())
             side = self._beside(plant)
-        if self.realtime:
-            real_time()
         twin = Twin([Motor(MODELS[self.model], id) for id in ids], plant, faults, side=side)
         print(twin.path, flush=True)
         if self.attached:
             threading.Thread(target=_end_with_input, args=(twin,), daemon=True).start()
         try:
-            twin.serve()
+            with real_time(self.realtime):
+                twin.serve()
         except KeyboardInterrupt:
             pass
         finally:
