@@ -119,12 +119,12 @@ class Twin:
         """Answer until it has to end."""
         while not self._end.is_set():
             due = min((at for at, _ in self._held), default=float("inf")) - self._clock()
-            beside = self._side.sockets if self._side is not None else []
+            beside = {} if self._side is None else {one.fileno(): one for one in self._side.sockets}
             ready, _, _ = select.select([self._near, *beside], [], [], max(0.0, min(IDLE_S, due)))
             self._advance()
-            for one in beside:
-                if one in ready and self._side is not None:
-                    self._side.serve(one)
+            for one in ready:
+                if one in beside and self._side is not None:
+                    self._side.serve(beside[one])
             if self._near in ready:
                 self._heard_at = self._clock()
                 for packet in self._reader.feed(self._receive()):

@@ -108,7 +108,7 @@ class TwinSide:
 def send(to: socket.socket, arrays: Arrays) -> None:
     """Send arrays by name."""
     buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+    np.savez(buffer, allow_pickle=False, **arrays)
     data = buffer.getvalue()
     to.sendall(len(data).to_bytes(LENGTH_BYTES, "little") + data)
 
