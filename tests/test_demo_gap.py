@@ -2,6 +2,8 @@
 
 import pytest
 
+from vd.gap import cli
+from vd.gap.result import Report
 from vd.page import Page
 from vd.train import demo_gap
 
@@ -17,6 +19,20 @@ def test_hidden_backlash_is_found_named_and_closed(tmp_path):
     assert effect.parameters[demo_gap.PARAMETER].value == pytest.approx(demo_gap.SIZE_RAD, rel=0.1)
     assert report.held_out.reduction > 0.8
     assert report.closing.identified_rmse_rad < 2.0 * report.noise_floor_rad
+
+    layer = demo_gap.gap_report(folder).parent / "identified.usda"
+    again = [
+        "run",
+        str(folder / demo_gap.RECORDING),
+        "--hand-layer",
+        str(layer),
+        "--out",
+        str(tmp_path / "again"),
+    ]
+    assert cli.main(again) == 0
+    after = Report.read(tmp_path / "again" / "report.json")
+    assert after.verdict == "no_gap" and after.hand_layer == str(layer)
+    assert after.baseline.rmse_rad < 1.1 * after.noise_floor_rad, "the layer alone explains the recording"
 
     page = Page("demo")
     demo_gap.add_gap(page, folder, tmp_path / "demo")
