@@ -16,6 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 KERNEL = 27
 """Weights of a 3x3x3 kernel."""
+_KERNEL = wp.constant(KERNEL)
 CENTRE = wp.constant(KERNEL // 2)
 """Offset (0, 0, 0)."""
 WINDOW = 8
@@ -130,6 +131,37 @@ def neighbour_kernel(
             if found >= 0:
                 table_out[row, k] = found
                 table_out[found, KERNEL - 1 - k] = row
+
+
+@wp.kernel
+def beside_kernel(
+    # In:
+    key_in: wp.array[wp.int64],
+    slot_key_in: wp.array[wp.int64],
+    slot_row_in: wp.array[int],
+    # Out:
+    beside_out: wp.array[int],
+):
+    """Tell of each voxel whether any of the 3x3x3 about it is in a hash table: 1 or 0. Launch: [M].
+
+    Args:
+        key_in: Keys of voxels, shape [M].
+        slot_key_in: Hash table of other voxels.
+        slot_row_in: Rows of its slots.
+        beside_out: Shape [M].
+    """
+    row = wp.tid()
+    key = key_in[row]
+    cell = key_coordinates(key & _MORTON_MASK)
+    found = wp.int32(0)
+    k = wp.int32(0)
+    while k < _KERNEL and found == 0:
+        x, y, z = cell[0] + k // 9 - 1, cell[1] + (k // 3) % 3 - 1, cell[2] + k % 3 - 1
+        other = cell_key(key >> _KEY_SHIFT, x, y, z, 0)
+        if other != _NONE and find_row(other, slot_key_in, slot_row_in) >= 0:
+            found = wp.int32(1)
+        k += 1
+    beside_out[row] = found
 
 
 @wp.kernel
@@ -281,6 +313,24 @@ def neighbour_table(keys: wp.array, level: int) -> wp.array:
     slots = hash_table(keys)
     wp.launch(neighbour_kernel, dim=count, inputs=[keys, level, *slots], outputs=[table], device=keys.device)
     return table
+
+
+def beside(keys: wp.array, others: wp.array) -> wp.array:
+    """1 where a voxel is one of ``others`` or touches one, by a corner at least, else 0, shape [M], int32.
+
+    Args:
+        keys: Keys of voxels [M].
+        others: Keys of other voxels, each once.
+    """
+    touches = wp.empty(keys.shape[0], dtype=int, device=keys.device)
+    wp.launch(
+        beside_kernel,
+        dim=keys.shape[0],
+        inputs=[keys, *hash_table(others)],
+        outputs=[touches],
+        device=keys.device,
+    )
+    return touches
 
 
 def strided_table(fine: wp.array, coarse: wp.array, level: int, *, reverse: bool = False) -> wp.array:

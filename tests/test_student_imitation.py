@@ -21,6 +21,7 @@ from vd.train.cli import main
 from vd.train.ending import Interrupted, TrainingDivergedError
 from vd.train.metrics import read_progress
 from vd.train.student.losses import distance_loss, imitation_loss, poses, unexplained
+from vd.train.student.optimise import scheduled
 from vd.train.student.profile import profile_iteration
 from vd.train.student.rollout import taken
 
@@ -246,11 +247,10 @@ def test_a_constant_leaves_all_of_the_variance_unexplained():
 
 
 def test_the_learning_rate_rises_and_falls():
-    dagger = make_dagger(learning_rate=1.0, warmup_steps=10, decay_after_steps=100)
-    rates = []
-    for dagger._steps_done in (1, 5, 10, 100, 400):
-        rates.append(dagger.learning_rate())
+    rates = [scheduled(1.0, step, warmup=10, decay_after=100) for step in (1, 5, 10, 100, 400)]
     assert rates == pytest.approx([0.1, 0.5, 1.0, 1.0, 0.5])
+    assert scheduled(0.3, 10**6) == 0.3
+    dagger = make_dagger(learning_rate=1.0, warmup_steps=10, decay_after_steps=100)
     dagger._steps_done = 4
     dagger.update([dagger.collect()])
     assert dagger.optimizer.param_groups[0]["lr"] == pytest.approx(0.8)  # four steps of 2 worlds each later

@@ -79,6 +79,19 @@ def test_padded_rows_hold_the_voxels_of_their_cloud(device):
     assert points.shape == (3, 1, 3) and not present.any()
 
 
+def test_the_object_has_no_voxel_that_touches_the_hand(device):
+    points = scene(shape(), shape())
+    seen = points[0, ENDS[0] : ENDS[1]] + np.float32(0.005)  # the camera's points of the hand, beside its own
+    sites = voxels(np.concatenate([points, seen[None]], axis=1), device)
+    item, _ = item_and_goal(sites)
+    own = np.floor(points[0] / 0.005)
+    found = sites.coordinates[item][:, 1:].cpu().numpy()
+    assert set(map(tuple, found)) == set(map(tuple, own[ENDS[1] :].astype(int)))
+    assert len(sites) > len(np.unique(own, axis=0))  # some of what the camera sees is not marked
+    none = torch.zeros_like(item)
+    assert not sites.touching(none, item).any() and not sites.touching(item, none).any()
+
+
 def test_embedding_sees_shapes_but_not_places_nor_the_hand(device):
     net = turn_encoder(device)
     turned = shape() @ Rotation.random(random_state=2).as_matrix().T

@@ -8,6 +8,7 @@ from hypothesis.extra import numpy as hnp
 from kernel_oracle import EXAMPLES, device_array
 
 from vd.kernels.coordinate_maps import (
+    beside,
     coarsen,
     hash_table,
     level_counts,
@@ -127,6 +128,20 @@ def test_windows_hold_the_sites_of_each_cell(device, cells, level):
     assert sorted(table[table < len(rows)]) == list(range(len(rows)))
 
 
+@EXAMPLES
+@given(cells=grids(), parity=st.integers(2, 3))
+def test_voxels_beside_others_are_those_with_one_of_them_about(device, cells, parity):
+    keys, rows = sites(cells, device, 0)
+    some, others = (
+        [row for row in range(len(rows)) if (rows[row, 1:].sum() % parity == 0) is which]
+        for which in (True, False)
+    )
+    there = {tuple(rows[row]) for row in others}
+    parts = (wp.array(keys.numpy()[part], dtype=wp.int64, device=device) for part in (some, others))
+    expected = [any(moved(rows[row], offset) in there for offset in OFFSETS) for row in some]
+    assert beside(*parts).numpy().astype(bool).tolist() == expected
+
+
 def test_hash_table_holds_every_key_once(device):
     cells = np.random.default_rng(0).integers(-60, 60, (4, 5000, 3))
     keys, rows = sites(cells, device, 0)
@@ -147,3 +162,6 @@ def test_no_sites_give_empty_maps(device):
         strided_table(keys, coarse, 0).shape == strided_table(keys, coarse, 0, reverse=True).shape == (0, 27)
     )
     assert window_table(keys, place, 0).shape == (0, 8)
+    assert beside(keys, keys).shape == (0,)
+    some = sites(np.zeros((1, 1, 3), dtype=int), device, 0)[0]
+    assert beside(some, keys).numpy().tolist() == [0] and beside(some, some).numpy().tolist() == [1]

@@ -86,7 +86,9 @@ class PretrainCfg:
     steps: int = 50
     """Optimiser steps of an iteration."""
     learning_rate: float = PAPER.dagger.learning_rate
-    """Of AdamW, constant."""
+    """Of AdamW, until the decay."""
+    decay_after_steps: int = 0
+    """Optimiser steps after which the learning rate falls as 1 / sqrt(steps); 0: never."""
     amsgrad: bool = True
     """Never forget the largest gradients, as in imitation."""
     grad_norm: float = PAPER.dagger.grad_norm
@@ -218,7 +220,13 @@ def gpu(stage: Stage) -> StudentTrainCfg:
         ),
         task=replace(start.task, num_worlds=GPU_WORLDS),
         pretrain=PretrainCfg(
-            batch=1024, learning_rate=1e-3, amsgrad=False, distance="6d", near_share=0.5, precision="bf16"
+            batch=1024,
+            learning_rate=1e-3,
+            decay_after_steps=1000,
+            amsgrad=False,
+            distance="6d",
+            near_share=0.5,
+            precision="bf16",
         ),
         network=LEAN,
     )
@@ -326,6 +334,7 @@ def validate(cfg: StudentTrainCfg) -> None:
         "--dagger.warmup-steps": dagger.warmup_steps,
         "--dagger.decay-after-steps": dagger.decay_after_steps,
         "--dagger.validation-worlds": dagger.validation_worlds,
+        "--pretrain.decay-after-steps": pretrain.decay_after_steps,
         "--pretrain.category-weight": pretrain.category_weight,
         "--pretrain.distance-weight": pretrain.distance_weight,
         "--pretrain.joint-weight": pretrain.joint_weight,

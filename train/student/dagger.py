@@ -19,7 +19,7 @@ from vd.train.ending import TrainingDivergedError
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import DaggerCfg
 from vd.train.student.losses import POSE_VALUES, distance_loss, imitation_figures, imitation_loss, poses
-from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer
+from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer, scheduled
 from vd.train.student.rollout import UNCLIPPED, Rollout, moved, rollout_bytes, taken
 from vd.train.student.rotations import angle_between
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
@@ -163,13 +163,6 @@ class Dagger:
         if iterations == 0:
             return first
         return first + (last - first) * min(1.0, self.iteration / iterations)
-
-    def learning_rate(self) -> float:
-        """Of the present optimiser step."""
-        factor = min(1.0, self._steps_done / max(1, self.cfg.warmup_steps))
-        if self.cfg.decay_after_steps:
-            factor *= min(1.0, math.sqrt(self.cfg.decay_after_steps / max(1, self._steps_done)))
-        return factor * self.cfg.learning_rate
 
     def collect(self, stopping: Callable[[], bool] = lambda: False) -> Rollout | None:
         """Let the student act, and the teacher label; ``None`` if ``stopping`` said so on the way."""
@@ -390,7 +383,12 @@ class Dagger:
         imitation, distance, pose = self.losses(rollout)
         self._steps_done += 1
         for group in self.optimizer.param_groups:
-            group["lr"] = self.learning_rate()
+            group["lr"] = scheduled(
+                self.cfg.learning_rate,
+                self._steps_done,
+                warmup=self.cfg.warmup_steps,
+                decay_after=self.cfg.decay_after_steps,
+            )
         norm = descend(
             self.network,
             self.optimizer,

@@ -13,6 +13,21 @@ def make_optimizer(
     return torch.optim.AdamW(network.parameters(), lr=learning_rate, amsgrad=amsgrad)
 
 
+def scheduled(rate: float, step: int, *, warmup: int = 0, decay_after: int = 0) -> float:
+    """Learning rate of an optimiser step, counted from 1.
+
+    Args:
+        rate: After the warm-up and until the decay.
+        step: Number of the step.
+        warmup: Steps over which it rises from 0, linearly.
+        decay_after: Step after which it falls as 1 / sqrt(steps); 0: never.
+    """
+    factor = min(1.0, step / max(1, warmup))
+    if decay_after:
+        factor *= min(1.0, math.sqrt(decay_after / max(1, step)))
+    return factor * rate
+
+
 def autocast(device: torch.device, precision: str) -> torch.autocast:
     """Products in half precision where ``precision`` is ``bf16``."""
     return torch.autocast(device.type, dtype=torch.bfloat16, enabled=precision == "bf16")

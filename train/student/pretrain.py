@@ -22,7 +22,7 @@ from vd.student.network import Student
 from vd.student.sites import Sites
 from vd.train.ending import TrainingDivergedError
 from vd.train.student.config import PretrainCfg
-from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer
+from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer, scheduled
 from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
 from vd.vision import relative_rotation, rotation_distance, voxels
 
@@ -214,6 +214,7 @@ class Pretrainer:
         self.optimizer = make_optimizer(self.network, cfg.learning_rate, amsgrad=cfg.amsgrad)
         self.samples_per_iteration = cfg.batch * cfg.steps
         self._world_size = world_size
+        self._steps_done = 0
 
     def iterate(self, stopping: Callable[[], bool]) -> dict[str, float | None] | None:
         """Some optimiser steps, a new batch each.
@@ -265,7 +266,9 @@ class Pretrainer:
             loss = (distance - targets["distance"]).square().mean()
         elif "rotation" in predictions:
             loss = (predictions["rotation"] - targets["rotation"]).square().mean()
-            distance = angle_between(predictions["rotation"].detach())
+            rotation = predictions["rotation"].detach()
+            distance = angle_between(rotation)
+            figures["student/rotation_error"] = angle_between(rotation, targets["rotation"]).mean()
         if "distance" in predictions or "rotation" in predictions:
             total = total + cfg.distance_weight * loss
             error = (distance.detach() - targets["distance"]).abs().mean()
@@ -279,12 +282,17 @@ class Pretrainer:
 
     def state_dict(self) -> dict[str, Any]:
         """Heads and optimiser."""
-        return {"optimizer": self.optimizer.state_dict(), "heads": self.heads.state_dict()}
+        return {
+            "optimizer": self.optimizer.state_dict(),
+            "steps": self._steps_done,
+            "heads": self.heads.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
         """Restore what :meth:`state_dict` gave."""
         self.heads.load_state_dict(state["heads"])
         self.optimizer.load_state_dict(state["optimizer"])
+        self._steps_done = state["steps"]
 
     def local_state(self) -> dict[str, Any]:
         """Random state of the augmentation."""
@@ -309,5 +317,10 @@ class Pretrainer:
     def _step(self) -> dict[str, torch.Tensor]:
         sites, targets = self.scenes.draw()
         loss, figures = self.losses(sites, targets)
+        self._steps_done += 1
+        for group in self.optimizer.param_groups:
+            group["lr"] = scheduled(
+                self.cfg.learning_rate, self._steps_done, decay_after=self.cfg.decay_after_steps
+            )
         norm = descend(self.network, self.optimizer, loss, self.cfg.grad_norm, self._world_size)
         return {**figures, "loss/total": loss.detach(), "loss/grad_norm": norm}

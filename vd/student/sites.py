@@ -6,7 +6,14 @@ from functools import cached_property
 import torch
 import warp as wp
 
-from vd.kernels.coordinate_maps import coarsen, level_counts, neighbour_table, strided_table, window_table
+from vd.kernels.coordinate_maps import (
+    beside,
+    coarsen,
+    level_counts,
+    neighbour_table,
+    strided_table,
+    window_table,
+)
 from vd.kernels.voxels import cloud_offsets, coordinates
 
 
@@ -63,6 +70,22 @@ class Sites:
     def coordinates(self) -> torch.Tensor:
         """Rows (cloud, x, y, z): each cell covers voxels from 2^l (x, y, z) on, shape [M, 4], int32."""
         return wp.to_torch(coordinates(self.keys, self.level))
+
+    def touching(self, chosen: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
+        """Those of the chosen cells that touch, by a corner at least, or are one of the others; level 0.
+
+        Args:
+            chosen: Which cells are asked about, bool [M].
+            others: Which they may touch, bool [M].
+
+        Returns:
+            Bool [M].
+        """
+        keys = wp.to_torch(self.keys)
+        some, rest = (wp.from_torch(keys[which]) for which in (chosen, others))
+        touches = torch.zeros_like(chosen)
+        touches[chosen] = wp.to_torch(beside(some, rest)).bool()
+        return touches
 
     @cached_property
     def _coarser(self) -> tuple["Sites", wp.array]:

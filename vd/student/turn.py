@@ -20,8 +20,8 @@ RADIUS_M = 0.05
 """Points are given in units of this, about the radius of an object."""
 SMALL = 1e-2
 """Vectors are scaled to length 1, those that are not much longer than this less: noise stays small."""
-GOAL = 0
-"""Column of the marks of voxels."""
+GOAL, HAND = 0, 1
+"""Columns of the marks of voxels."""
 
 
 def marks(sites: Sites) -> torch.Tensor:
@@ -34,10 +34,13 @@ def marks(sites: Sites) -> torch.Tensor:
 def item_and_goal(sites: Sites, goal: Sites | None = None) -> tuple[torch.Tensor, torch.Tensor]:
     """Which voxels are the object's, and which the goal's (of ``goal``, where that is given), bool [M].
 
-    A voxel is the object's that holds no point of the goal, nor of the hand's own model.
+    A voxel is the object's that holds no point of the goal, and neither holds nor touches one of the hand's
+    own model: a camera sees the hand too, between that model's samples. Half of the voxels without a mark
+    would be the hand's (docs/student.md).
     """
     wanted = marks(sites if goal is None else goal)[:, GOAL] > 0
-    return (marks(sites) == 0).all(dim=1), wanted
+    free = (marks(sites) == 0).all(dim=1)
+    return free & ~sites.touching(free, marks(sites)[:, HAND] > 0), wanted
 
 
 def padded(sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
