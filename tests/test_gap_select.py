@@ -217,6 +217,13 @@ def test_sets_of_several_joints_meet_in_one_name() -> None:
     assert shared[0].final.held_out_rmse == pytest.approx(0.0102)
     loaded = explanation("encoder_bias", "gravity_load")
     assert names(loaded, explanation("gravity_load"), groups=[0, 1]) == ["gravity_load", "gravity_load"]
+    # What another joint adds to a name is said, too.
+    dry = explanation("coulomb_friction").accepted
+    both = replace(
+        loaded, verdict="effects", accepted=(*dry, *loaded.accepted), reason="friction explains it"
+    )
+    adopted = share([both, explanation("gravity_load")], [FLOOR] * 2, [0, 1])[0]
+    assert adopted.reason == "coulomb_friction and gravity_load explain it, as on the other joints"
 
 
 @pytest.mark.parametrize(("floor", "tied"), [(FLOOR, ("supply_sag",)), (10.0 * FLOOR, ())])

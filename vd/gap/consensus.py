@@ -84,6 +84,6 @@ def _adopt(explanation: Explanation, named: set[str], floor: float, polish: Poli
         accepted = [replace(a, estimates=estimates(final, a.name, spread)) for a in accepted]
     verdict, reason = explanation.verdict, explanation.reason
     names = [a.name for a in accepted if a.named]
-    if verdict == "ambiguous" and names:
+    if names and len(names) > sum(a.named for a in explanation.accepted):
         verdict, reason = "effects", f"{explains(names)}, as on the other joints"
     return replace(explanation, final=final, accepted=tuple(accepted), verdict=verdict, reason=reason)
