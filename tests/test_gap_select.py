@@ -263,6 +263,9 @@ def test_load_and_friction_are_found_together(tmp_path: Path) -> None:
     effects = ("coulomb_friction", "asymmetric_friction", "gravity_load", "encoder_bias")
     report = analysed(recorded(hidden), tmp_path, effects=effects)
     assert {effect.name for effect in report.effects} == {"coulomb_friction", "gravity_load"}
+    # Neither was the best alone: the evidence says with what each was accepted.
+    accepted = {row.name: row.given for row in report.evidence if row.decision == "named"}
+    assert accepted == {"coulomb_friction": ("gravity_load",), "gravity_load": ("coulomb_friction",)}
 
 
 def concluded(judge: Verdicts, left: float = FLOOR, **options: object) -> Explanation:

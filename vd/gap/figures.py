@@ -4,6 +4,7 @@ Angles are shown in mrad where they are errors and in rad where they are positio
 """
 
 import math
+import textwrap
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -28,8 +29,8 @@ MAX_BARS = 16
 BAR = 0.36
 PANELS = 2
 """Rounds of the search beside each other: their labels leave no room for a third."""
-BAR_IN, TITLE_IN = 0.24, 0.5
-"""Height of a candidate's row and of a round's title with its axis [in]."""
+BAR_IN, TITLE_IN, TITLE_LETTERS = 0.24, 0.65, 44
+"""Height of a candidate's row and of a round's title with its axis [in]; letters of a line of the title."""
 FAR_WORSE = 1000.0
 """Loss [%] beyond which its size says nothing more."""
 DECISIONS = {"named": GREEN, "tied": BLUE, "rejected": GREY}
@@ -224,15 +225,15 @@ def _gains(axes, group: list[Candidate]) -> None:
     axes.axvline(0.0, color=INK, linewidth=0.8)
     axes.set_xlim(left=left, right=104.0)
     axes.set_ylim(-0.6, len(group) - 0.4)
-    axes.set_title(_round_title(group[0]), fontsize=9)
+    axes.set_title(_round_title(group), fontsize=9)
     axes.tick_params(axis="x", labelsize=8)
 
 
-def _round_title(row: Candidate) -> str:
+def _round_title(group: list[Candidate]) -> str:
     """Which round it is, and what was in the model before it."""
-    if row.given:
-        return f"round {row.round}: added to {listing([plain(name) for name in row.given])}"
-    return f"round {row.round}: each alone"
+    row = min(group, key=lambda row: len(row.given))  # two that were taken together are given each other
+    beside = f"added to {listing([plain(name) for name in row.given])}" if row.given else "each alone"
+    return textwrap.fill(f"round {row.round}: {beside}", TITLE_LETTERS)
 
 
 def chosen_overlays(report: Report, curves: Predictions) -> list[tuple[str, int]]:

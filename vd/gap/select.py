@@ -231,6 +231,13 @@ class Selection(CandidateFits, Verdicts):
                     before, after = present.held_out_rmse, pair.held_out_rmse
                     names = " and ".join(pair.effects[-2:])
                     self.report(f"+ {names}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
+                    gain, ci = self.gain(present, pair)
+                    trials += [
+                        Trial(
+                            number, name, pair, gain, ci, "named", f"{names} together: best on unseen motions"
+                        )
+                        for name in pair.effects[-2:]
+                    ]
                     present = pair
                     break
             name, before, after = best.effects[-1], present.held_out_rmse, best.held_out_rmse

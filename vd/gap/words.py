@@ -29,7 +29,7 @@ def listing(names: Sequence[str], last: str = "and") -> str:
 def joints_text(joints: Sequence[str]) -> str:
     """Joints by name, or their number where they are many."""
     if len(joints) > MAX_NAMED_JOINTS:
-        return f"{len(joints)} joints ({joints[0]} ... {joints[-1]})"
+        return f"{len(joints)} joints ({joints[0]} to {joints[-1]})"
     return listing(joints)
 
 
