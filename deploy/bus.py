@@ -39,6 +39,8 @@ STATE_ADDRESS, STATE_BYTES = 120, 27
 CLOCK_TOLERANCE_S = 0.04
 """A state whose clock went on by so much more or less than ours is an old one, or from after a restart; the
 packet's own time on the line and in the driver is within it."""
+LATE_S = 0.02
+"""Pause before a motor is asked again; what arrives meanwhile is dropped."""
 JUMP_RAD = 0.1
 """Beyond what the largest speed explains, a position that changed by more was not measured."""
 SPEED_MARGIN = 1.5
@@ -180,6 +182,7 @@ class MotorBus:
                 answer, result, error = ask(self._port, *arguments)
             if result == self._sdk.COMM_SUCCESS or attempt == self.retries:
                 break
+            time.sleep(LATE_S)  # an answer that comes now is none to the next question
         return answer, result, error
 
     def ping(self, id: int) -> int | None:
@@ -212,11 +215,21 @@ class MotorBus:
             BusError: No sound answer.
         """
         item = self._items[name]
-        data, result, error = self._ask(self._packets.readTxRx, id, item.address, item.size)
+
+        def receive(_: Any, motor: int, address: int, size: int) -> tuple[bytes, int, int]:
+            result = self._packets.readTx(self._port, motor, address, size)
+            if result != self._sdk.COMM_SUCCESS:
+                return b"", result, 0
+            frame, result = self._packets.rxPacket(self._port, False)
+            body = _status_body(bytes(frame)) if result == self._sdk.COMM_SUCCESS else None
+            # The SDK's own reading takes any answer, such as one to a write that came late.
+            if body is None or body[0] != motor or (not body[1] & ~ALERT and len(body[2]) != size):
+                return b"", result if result != self._sdk.COMM_SUCCESS else self._sdk.COMM_RX_CORRUPT, 0
+            return body[2], result, body[1]
+
+        data, result, error = self._ask(receive, id, item.address, item.size)
         self._check(id, f"read {name}", result, error)
-        if len(data) != item.size:
-            raise BusError(f"motor {id}: read {name}: {len(data)} bytes came, not {item.size}")
-        return item.from_bytes(bytes(data))
+        return item.from_bytes(data)
 
     def write(self, id: int, name: str, value: int) -> None:
         """Write one item of the control table.

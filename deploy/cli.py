@@ -26,6 +26,7 @@ COMMANDS = {
     "check": Entry(
         "vd.deploy.check", "CheckCfg", "check", "preflight: everything that must be right before it moves"
     ),
+    "record": Entry("vd.deploy.record", "RecordCfg", "record", "record motions for vd-gap"),
     "home": Entry("vd.deploy.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"),
 }
 """The commands by name."""

@@ -36,7 +36,7 @@ class HandOptions:
     twin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Simulate the motors and the hand in place of --port."""
     twin_args: str = ""
-    """More options of the twin, such as "--lose 0.01 --cut-off 11"; python -m vd.deploy.twin --help."""
+    """More options of the twin: --twin-args="--lose 0.01"; python -m vd.deploy.twin --help lists them."""
     calibration: Path | None = None
     """Calibration file of the joints' motors; IDs 10, 11, 12, 20, ... with zero in the middle by default."""
     motor: str = MOTOR

@@ -17,10 +17,13 @@ from vd.deploy.joints import Joints
 from vd.deploy.plant import P_GAIN_UNIT, Drive
 from vd.kernels.actions import limit_joint_velocity_kernel
 from vd.paper import PAPER
+from vd.sim.actuators import JointServo, has_effects
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import SHAPE_TABLE, Scene, add_table, build_hand, build_scene, new_builder
 from vd.sim.simulator import AWAY_M, make_solver
 
+SHORTEST_COMMAND_S = 0.005
+"""Commands do not come more often, or some of those that are delayed are lost."""
 LONGEST_S = 0.1
 """Time that is simulated at once at most: after a longer pause the hand is where it was."""
 ROOM = 4
@@ -31,7 +34,7 @@ class NewtonHand:
     """A simulated hand; its axes are the motors', in the joints' order.
 
     A motor at the paper's position gain has the hand's identified stiffness and damping; its stiffness grows
-    with the gain. With its torque off a joint has neither.
+    with the gain. With its torque off a joint has neither. Effects of the hand's layer act as in training.
 
     Args:
         hand: The hand.
@@ -67,11 +70,25 @@ class NewtonHand:
         self._target = np.tile(PAPER.scene.reset_joint_rad, hand.num_fingers).astype(np.float32)
         self._limits = wp.zeros(self._axes, dtype=float, device="cpu")
         self._rest = 0.0
+        self._stiffness, self._damping = np.zeros(self._axes), np.zeros(self._axes)
         self._gains: tuple[tuple[float, float], ...] = ()
         self._write(self._state.joint_q, self._target)
         if item is not None:
             self.place_object((0.0, 0.0, 0.0, 1.0))
+        self._servo: JointServo | None = None
+        if has_effects(hand.servo):
+            self._servo = JointServo(
+                self._solver,
+                self._control,
+                self._state.joint_q.reshape((1, -1)),
+                hand.servo,
+                physics_dt=cfg.physics_dt,
+                control_dt=SHORTEST_COMMAND_S,
+            )
+            self._sent = wp.array(self._target[None], dtype=float, device="cpu")
         self._graph = self._capture()
+        if self._servo is not None:
+            self._servo.reset(wp.ones(1, dtype=wp.int32, device="cpu"))
 
     @property
     def joint_q(self) -> np.ndarray:
@@ -128,22 +145,36 @@ class NewtonHand:
     def _two_steps(self) -> None:
         here, there = self._state, self._next
         for _ in range(2):
+            before, q, qd = (a.reshape((1, -1)) for a in (here.joint_q, there.joint_q, there.joint_qd))
+            if self._servo is not None:
+                self._servo.receive()
+                self._servo.drive(before, here.joint_qd.reshape((1, -1)))
             self._solver.step(here, there, self._control, None, self.cfg.physics_dt)
             wp.launch(
                 limit_joint_velocity_kernel,
                 dim=(1, len(self._limits)),
-                inputs=[self._limits, self.cfg.physics_dt, here.joint_q.reshape((1, -1))],
-                outputs=[there.joint_q.reshape((1, -1)), there.joint_qd.reshape((1, -1))],
+                inputs=[self._limits, self.cfg.physics_dt, before],
+                outputs=[q, qd],
                 device="cpu",
             )
+            if self._servo is not None:
+                self._servo.finish(before, q, qd)
             here, there = there, here
+        if self._servo is not None:
+            self._servo.measure()
 
     def advance(self, seconds: float, drives: Sequence[Drive]) -> None:
         """Go on by ``seconds``, to the pair of physics steps before."""
         self._set_gains(drives)
         goals = np.array([np.nan if drive.goal_rad is None else drive.goal_rad for drive in drives])
-        self._target = np.where(np.isnan(goals), self._target, self.joints.to_joint(goals)).astype(np.float32)
-        self._write(self._control.joint_target_q, self._target)
+        target = np.where(np.isnan(goals), self._target, self.joints.to_joint(goals)).astype(np.float32)
+        if not np.array_equal(target, self._target):
+            self._target = target
+            if self._servo is None:
+                self._write(self._control.joint_target_q, target)
+            else:
+                self._sent.assign(target[None])
+                self._servo.send(self._sent)
         self._limits.assign(np.minimum([drive.velocity_limit for drive in drives], self.hand.velocity_limit))
         self._rest = min(self._rest + seconds, LONGEST_S)
         while self._rest >= 2.0 * self.cfg.physics_dt:
@@ -152,16 +183,13 @@ class NewtonHand:
 
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions [rad], velocities [rad/s] and torques [N m] of the motors, each of shape [D]."""
-        q, qd, stiffness, damping = (
-            array.numpy()[: self._axes].astype(float)
-            for array in (
-                self._state.joint_q,
-                self._state.joint_qd,
-                self._model.joint_target_ke,
-                self._model.joint_target_kd,
-            )
-        )
-        torque = np.clip(stiffness * (self._target - q) - damping * qd, -self.hand.effort, self.hand.effort)
+        q, qd = self.joint_q[: self._axes].astype(float), self.joint_qd[: self._axes].astype(float)
+        reference = self._target if self._servo is None else self._servo.reference.numpy()[0]
+        torque = self._stiffness * (reference - q) - self._damping * qd
+        torque = np.clip(torque, -self.hand.effort, self.hand.effort)
+        if self._servo is not None:  # late, or with an offset
+            q = self._servo.measured_q.numpy()[0].astype(float)
+            qd = self._servo.measured_qd.numpy()[0].astype(float)
         sign = self.joints.sign
         return self.joints.to_motor(q), sign * qd, sign * torque
 
@@ -172,7 +200,11 @@ class NewtonHand:
             return
         self._gains = gains
         on = np.array([switched for _, switched in gains])
-        scale = np.array([p_gain for p_gain, _ in gains]) / P_GAIN_UNIT
-        self._write(self._model.joint_target_ke, self.hand.kp * scale * on)
-        self._write(self._model.joint_target_kd, self.hand.kd * on)
+        scale = on * np.array([p_gain for p_gain, _ in gains]) / P_GAIN_UNIT
+        self._stiffness, self._damping = self.hand.kp * scale, self.hand.kd * on
+        if self._servo is not None:
+            self._servo.power.assign(scale[None].astype(np.float32))
+            return
+        self._write(self._model.joint_target_ke, self._stiffness)
+        self._write(self._model.joint_target_kd, self._damping)
         self._solver.notify_model_changed(newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES)

@@ -176,11 +176,13 @@ class SafeHand:
         self.report: StopReport | None = None
         """How the stop went, once there was one."""
         self._state: JointState | None = None
+        self._goal: np.ndarray | None = None
         self._strained_since = np.full(len(joints.ids), np.inf)
         self._misses = 0
         self._beat_s = self._image_s = np.inf
         self._signal = ""
         self._armed = False
+        self._on = np.ones(len(joints.ids), dtype=bool)
         self._stopping = threading.RLock()
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="safety", daemon=True)
@@ -212,12 +214,13 @@ class SafeHand:
         with self._stopping:
             try:
                 self._state = state = self._read()
+                self._goal = state.position
                 self._armed = True  # from here on whatever happens ends with torque off
                 self.bus.watch(self.cfg.watchdog_s)
                 self.bus.write_goals(self.joints.to_motor(state.position))
                 failed = self.bus.torque(True)
             except BusError as error:
-                raise self._stop(f"could not switch on: {error}") from error
+                raise self._stop(f"could not switch on: {error}", lost=True) from error
             if failed:
                 raise self._stop(f"could not switch on: {next(iter(failed.values()))}")
             self._beat_s = time.monotonic()
@@ -235,7 +238,7 @@ class SafeHand:
         except BusError as error:
             last = self._state
             if last is None or time.monotonic() - last.time_s > self.cfg.lost_s:
-                raise self._stop(f"lost the bus: {error}") from error
+                raise self._stop(f"lost the bus: {error}", lost=True) from error
             self.repeated += 1
             self._check()
             return last
@@ -270,8 +273,25 @@ class SafeHand:
             try:
                 self.bus.write_goals(self.joints.to_motor(goal))
             except BusError as error:
-                raise self._stop(f"lost the bus: {error}") from error
+                raise self._stop(f"lost the bus: {error}", lost=True) from error
+            self._goal = goal
         return goal
+
+    def switch(self, on: np.ndarray) -> None:
+        """Switch the torque of joints on or off; one that is switched on stays where it is.
+
+        Args:
+            on: Shape [D] bool.
+
+        Raises:
+            StoppedError: A motor does not switch.
+        """
+        self.command(self.read().position)
+        for axis in np.flatnonzero(on != self._on):
+            failed = self.bus.torque(bool(on[axis]), [self.joints.ids[axis]])
+            if failed:
+                raise self._stop(next(iter(failed.values())))
+        self._on = np.array(on, dtype=bool)
 
     def beat(self, *, missed: bool = False) -> None:
         """A control step has ended: its goal is sent.
@@ -359,13 +379,18 @@ class SafeHand:
             return f"the newest image is {age:.2f} s old"
         return ""
 
-    def _stop(self, reason: str) -> StoppedError:
-        """Hold, and give what to raise."""
-        self._hold(reason)
+    def _stop(self, reason: str, *, lost: bool = False) -> StoppedError:
+        """Hold, and give what to raise.
+
+        Args:
+            reason: Why.
+            lost: Whether the bus is not to be relied on.
+        """
+        self._hold(reason, lost=lost)
         assert self.report is not None
         return StoppedError(self.report.reason)
 
-    def _hold(self, reason: str) -> None:
+    def _hold(self, reason: str, *, lost: bool = False) -> None:
         """Have every joint stay where it is, once; what fails is told, not raised."""
         detected = time.monotonic()
         with self._stopping:
@@ -374,11 +399,27 @@ class SafeHand:
             self.report = StopReport(reason, detected)
             if not self._armed:
                 return
-            if self._state is None:
-                return
-            # At once, without asking where it is: a lost motor would cost the time that the others have.
-            age = min(detected - self._state.time_s, PERIOD_S)
-            self._hold_at(self._state.position + age * self._state.velocity)
+            where = self._expected() if lost else self._where()
+            if where is not None:
+                self._hold_at(where)
+
+    def _where(self) -> np.ndarray | None:
+        """Where the joints are now [rad]."""
+        try:
+            return JointState.of(self.bus.read_state(), self.joints).position
+        except BusError:
+            return self._expected()
+
+    def _expected(self) -> np.ndarray | None:
+        """Where the joints should be by now [rad], on their way to the last goals; asks nobody.
+
+        A hand with one lost motor cannot be asked in the time that the others have.
+        """
+        if self._state is None or self._goal is None:
+            return None
+        lag = self.hand.kd / self.hand.kp
+        to_go = np.exp(-(time.monotonic() - self._state.time_s) / lag)
+        return self._goal + (self._state.position - self._goal) * to_go
 
     def _hold_at(self, where: np.ndarray) -> None:
         """Send angles of the joints [rad] as goals, whatever else is going on."""

@@ -25,6 +25,7 @@ from vd.deploy.control_table import MODELS
 from vd.deploy.motor import Motor
 from vd.deploy.packets import BROADCAST, MAX_ID, Failure, Instruction, Packet, PacketReader, encode, status
 from vd.deploy.plant import FirstOrderPlant, Plant
+from vd.paper import PAPER
 
 if TYPE_CHECKING:
     from vd.assets_usd.objects.model import ObjectModel
@@ -329,6 +330,10 @@ class TwinCommand:
     """IDs of the motors, on axes without mass; without --hand."""
     hand: str | None = None
     """Hand that the motors move, simulated in Newton: dclaw3, dclaw4 or a hand's USD."""
+    hand_layer: Path | None = None
+    """Identified servo model over it (identified.usda), whose effects act."""
+    physics_hz: float = PAPER.scene.physics_hz
+    """Rate of its simulation; the motors are at most two steps behind."""
     calibration: Path | None = None
     """Calibration file of that hand's motors; IDs 10, 11, 12, 20, ... by default."""
     object: str | None = None
@@ -375,11 +380,15 @@ class TwinCommand:
             from vd.assets_usd.hands import load_hand
             from vd.deploy.joints import read_joints, uncalibrated
             from vd.deploy.newton_hand import NewtonHand
+            from vd.sim.cfg import SimCfg
 
             wp.config.log_level = wp.LOG_WARNING  # what is printed is the path
-            hand = load_hand(self.hand)
+            hand = load_hand(self.hand, layer=self.hand_layer)
             joints = uncalibrated(hand) if self.calibration is None else read_joints(self.calibration, hand)
-            ids, plant = joints.ids, NewtonHand(hand, joints, item=self._item())
+            ids, plant = (
+                joints.ids,
+                NewtonHand(hand, joints, SimCfg(physics_hz=self.physics_hz), item=self._item()),
+            )
             side = self._beside(plant)
         twin = Twin([Motor(MODELS[self.model], id) for id in ids], plant, faults, side=side)
         print(twin.path, flush=True)

@@ -7,7 +7,7 @@ seconds. A command holds from its time stamp on; stamps increase but need not be
 import csv
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -150,8 +150,13 @@ def read_recording(path: str | Path) -> Recording:
     return recording
 
 
-def write_recording(recording: Recording, folder: str | Path) -> Path:
+def write_recording(recording: Recording, folder: str | Path, *, only: Collection[str] | None = None) -> Path:
     """Write a recording into a folder: each file atomically, ``recording.json`` last.
+
+    Args:
+        recording: The recording.
+        folder: Where.
+        only: CSV files to write, where the others are there from before; all by default.
 
     Returns:
         The folder.
@@ -159,7 +164,8 @@ def write_recording(recording: Recording, folder: str | Path) -> Path:
     folder = Path(folder)
     entries = []
     for trajectory in recording.trajectories:
-        _write_csv(folder / trajectory.file, trajectory, recording.joints)
+        if only is None or trajectory.file in only:
+            _write_csv(folder / trajectory.file, trajectory, recording.joints)
         entries.append(
             {
                 "file": trajectory.file,

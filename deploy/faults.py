@@ -1,0 +1,410 @@
+"""What happens when something goes wrong: each fault injected into a moving hand's twin, and how it ended.
+
+``python -m vd.deploy.faults`` prints the table of docs/results/deploy.md. The twin runs in this process,
+behind its pseudo-terminal, so that what its motors really did is known: who had torque, and who pushed.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from vd.assets_usd.hand_model import HandModel
+from vd.assets_usd.hands import load_hand
+from vd.deploy.bus import MotorBus
+from vd.deploy.check import preflight
+from vd.deploy.connect import MOTOR, Connection
+from vd.deploy.control_table import MODELS, HardwareError
+from vd.deploy.joints import Joints, uncalibrated
+from vd.deploy.motor import Motor
+from vd.deploy.newton_hand import NewtonHand
+from vd.deploy.plant import Drive, FirstOrderPlant, Plant
+from vd.deploy.safety import PERIOD_S, SafeHand, SafetyCfg, StoppedError
+from vd.deploy.twin import Faults, Twin
+from vd.files import write_json
+
+PUSH_RAD = 0.29
+"""Distance of the goals from the joints: what the policy asks for at most."""
+TURN_S = 0.5
+"""Time after which the loop pushes another way."""
+BEFORE_S, AFTER_S = 1.0, 3.0
+"""Time that the hand moves before the fault, and longest time after it."""
+SAFE_RAD = 0.15
+"""A motor this near to its goal carries its finger and pushes no more: gravity bends joints by 0.1 rad."""
+REST_S = 0.6
+"""Time after the end in which even a motor that hears nothing has to have stopped by itself."""
+
+
+SETUP_RETRIES = 20
+"""On a busy machine a twin may not run for longer than the SDK waits; before the start that is no matter."""
+
+
+class Witness:
+    """A plant that remembers what its motors did.
+
+    Args:
+        plant: The plant.
+    """
+
+    def __init__(self, plant: Plant):
+        self.plant = plant
+        self.times: list[float] = []
+        """When it went on [s], by the monotonic clock."""
+        self.pushes: list[np.ndarray] = []
+        """How far each motor was from its goal then [rad], zero without torque, shape [D]."""
+
+    def advance(self, seconds: float, drives: Sequence[Drive]) -> None:
+        """Go on, and note it."""
+        self.plant.advance(seconds, drives)
+        where = self.plant.read()[0]
+        goals = np.array([np.nan if drive.goal_rad is None else drive.goal_rad for drive in drives])
+        self.times.append(time.monotonic())
+        self.pushes.append(np.nan_to_num(np.abs(goals - where)))
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the plant reads."""
+        return self.plant.read()
+
+    def safe_after(self, since: float) -> float:
+        """Time from ``since`` until no motor pushed any more, for good [s]; infinite if one still does."""
+        times = np.array(self.times)
+        pushing = (np.array(self.pushes) > SAFE_RAD).any(axis=1)
+        last = np.flatnonzero(pushing & (times >= since))
+        if not len(last):
+            return 0.0
+        return float(times[last[-1] + 1] - since) if last[-1] + 1 < len(times) else float("inf")
+
+
+@dataclass
+class Scene:
+    """A twin with a hand that moves, and what is to go wrong."""
+
+    twin: Twin
+    bus: MotorBus
+    injected_s: float = float("inf")
+    """When the fault came [s]."""
+    camera: bool = False
+    """Whether there is a camera whose newest image is always new."""
+    pause_s: float = 0.0
+    """Time that the loop wastes in each step."""
+    error: Exception | None = None
+    """What the loop raises."""
+
+    def motor(self, id: int) -> Motor:
+        """A motor of the twin, by its ID."""
+        return next(motor for motor in self.twin.motors if motor.id == id)
+
+
+def _faults(scene: Scene, **values: object) -> None:
+    for name, value in values.items():
+        setattr(scene.twin.faults, name, value)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that goes wrong while the hand moves."""
+
+    name: str
+    inject: Callable[[Scene], None]
+    prepare: Callable[[Scene], None] = lambda scene: None
+    """What is so from the start."""
+    stops: bool = True
+    """Whether the hand has to stop; else it has to go on."""
+    cfg: SafetyCfg = field(default_factory=SafetyCfg)
+    reach_rad: float = PUSH_RAD
+    """Distance of the goals from the joints once it came."""
+    blockable: bool = False
+    """On axes without mass that can be blocked, in place of the hand."""
+
+
+def _set(**values: object) -> Callable[[Scene], None]:
+    """A fault that sets attributes of the scene."""
+
+    def inject(scene: Scene) -> None:
+        for name, value in values.items():
+            setattr(scene, name, value)
+
+    return inject
+
+
+def _block(scene: Scene) -> None:
+    plant = scene.twin.plant
+    assert isinstance(plant, Witness) and isinstance(plant.plant, FirstOrderPlant)
+    plant.plant.blocked[2] = True
+
+
+def _overload(scene: Scene) -> None:
+    scene.motor(22).put("hardware_error_status", HardwareError.OVERLOAD)
+
+
+WIDE = SafetyCfg(step_rad=4.0)
+"""Limits that let goals far away through."""
+MOVING = (
+    Fault("1 % of packets lost", lambda s: _faults(s, lose=0.01), stops=False),
+    Fault("1 % of packets corrupted", lambda s: _faults(s, corrupt=0.01), stops=False),
+    Fault("1 % of packets cut off", lambda s: _faults(s, truncate=0.01), stops=False),
+    Fault("1 % of packets 0.1 s late", lambda s: _faults(s, late=0.01), stops=False),
+    Fault("every packet lost", lambda s: _faults(s, lose=1.0)),
+    Fault("every packet corrupted", lambda s: _faults(s, corrupt=1.0)),
+    Fault("every packet 0.1 s late", lambda s: _faults(s, late=1.0)),
+    Fault("cable of one motor loose", lambda s: s.twin.faults.cut_off.add(11)),
+    Fault("cable of all motors loose", lambda s: s.twin.faults.cut_off.update(m.id for m in s.twin.motors)),
+    Fault("adapter unplugged", lambda s: s.bus.close()),
+    Fault("a motor warms by 50 deg C/s", lambda s: setattr(s.motor(21), "heat_c_per_s", 50.0)),
+    Fault("a motor shuts down, too hot", lambda s: setattr(s.motor(21), "heat_c_per_s", 5000.0)),
+    Fault("a joint is blocked", _block, stops=False, blockable=True),
+    Fault("a joint is blocked, goals far away", _block, cfg=WIDE, reach_rad=2.0, blockable=True),
+    Fault("a motor shuts down, overload", _overload),
+    Fault("a motor restarts", lambda s: s.motor(32).reboot()),
+    Fault("a motor takes another ID", lambda s: s.motor(11).put("id", 13)),
+    Fault("the camera stops", _set(camera=False), prepare=_set(camera=True)),
+    Fault("every step takes 0.15 s", _set(pause_s=0.15)),
+    Fault("the loop stands", _set(pause_s=2.0)),
+    Fault("an exception in the loop", _set(error=ArithmeticError("no such number"))),
+    Fault("Ctrl-C", lambda s: os.kill(os.getpid(), signal.SIGINT)),
+    Fault("the terminal closes", lambda s: os.kill(os.getpid(), signal.SIGHUP)),
+)
+"""Faults of a moving hand."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a fault ended."""
+
+    fault: str
+    happened: str
+    detected_s: float | None = None
+    """From the fault to its detection [s]; None if it was not to stop the hand."""
+    safe_s: float | None = None
+    """From its detection until no motor pushed any more [s]."""
+    energised: tuple[int, ...] = ()
+    """Motors with torque at the end."""
+    pushing: tuple[int, ...] = ()
+    """Of these, the ones that push."""
+    right: bool = True
+    """Whether it went as it has to."""
+
+
+@contextlib.contextmanager
+def scene_of(hand: HandModel, joints: Joints, *, blockable: bool = False) -> Iterator[tuple[Scene, Witness]]:
+    """A twin that serves, and a configured bus to it."""
+    plant: Plant = FirstOrderPlant(len(joints.ids)) if blockable else NewtonHand(hand, joints)
+    witness = Witness(plant)
+    motors = [Motor(MODELS[MOTOR], id) for id in joints.ids]
+    with Twin(motors, witness, Faults(seed=1)) as twin, MotorBus(twin.path, joints.ids, MOTOR) as bus:
+        bus.retries = SETUP_RETRIES
+        bus.configure(joints.settings(hand, MOTOR))
+        bus.retries = 1
+        yield Scene(twin, bus), witness
+
+
+def try_fault(fault: Fault, hand: HandModel, joints: Joints) -> Outcome:
+    """Move the hand's twin, inject a fault, and see how it ends."""
+    with scene_of(hand, joints, blockable=fault.blockable) as (scene, witness):
+        fault.prepare(scene)
+        with contextlib.suppress(StoppedError, ArithmeticError):
+            with SafeHand(scene.bus, joints, hand, fault.cfg, lambda text: None) as safe:
+                safe.arm()
+                _move(scene, safe, fault)
+        time.sleep(REST_S)
+        report = safe.report
+        assert report is not None
+        on = tuple(motor.id for motor in scene.twin.motors if motor.get("torque_enable"))
+        push = witness.pushes[-1]
+        pushing = tuple(id for id, by in zip(joints.ids, push, strict=True) if by > SAFE_RAD)
+        if not fault.stops:
+            happened = f"went on; {safe.repeated} readings repeated"
+            right = report.reason == "finished" and not on
+            return Outcome(
+                fault.name, happened if right else report.reason, energised=on, pushing=pushing, right=right
+            )
+        safe_s = witness.safe_after(report.detected_s)
+        # A motor that does not hear stops by its own watchdog, later than one that is told.
+        limit = PERIOD_S if len(report.unreleased) == 0 else PERIOD_S + fault.cfg.watchdog_s
+        right = report.reason != "finished" and not pushing and safe_s <= limit
+        found_s = report.detected_s - scene.injected_s
+        left = f"; {len(report.unreleased)} motors may still be on" if report.unreleased else ""
+        happened = report.reason + left
+        return Outcome(fault.name, happened, found_s, safe_s, on, pushing, right)
+
+
+def _move(scene: Scene, safe: SafeHand, fault: Fault) -> None:
+    """A loop at the control rate that pushes every joint about, and in which the fault comes."""
+    rng = np.random.default_rng(0)
+    begin = time.monotonic()
+    due = begin
+    way = np.zeros(len(safe.lower))
+    for step in range(round((BEFORE_S + AFTER_S) / PERIOD_S)):
+        if step == round(BEFORE_S / PERIOD_S):
+            scene.injected_s = time.monotonic()
+            fault.inject(scene)
+        if scene.error is not None:
+            raise scene.error
+        if step % round(TURN_S / PERIOD_S) == 0:
+            way = rng.choice([-1.0, 1.0], len(way))
+        reach = PUSH_RAD if scene.injected_s == float("inf") else fault.reach_rad
+        safe.command(safe.read().position + reach * way)
+        if scene.camera:
+            safe.image_at(time.monotonic())
+        time.sleep(scene.pause_s)
+        due += PERIOD_S
+        late = time.monotonic() > due
+        safe.beat(missed=late)
+        due = max(due, time.monotonic())  # not to hurry after it
+        time.sleep(due - time.monotonic() if due > time.monotonic() else 0.0)
+
+
+def _put(item: str, value: int, *motors: int) -> Callable[[Twin], None]:
+    """An item of some motors, or all, that is not as it should be."""
+
+    def spoil(twin: Twin) -> None:
+        for motor in twin.motors:
+            if not motors or motor.id in motors:
+                motor.put(item, value)
+
+    return spoil
+
+
+def _stubborn(twin: Twin) -> None:
+    """A motor that does not keep a limit."""
+    motor = twin.motors[4]
+    accept = motor._accept
+    motor._accept = lambda name, value: accept(name, 4000 if name == "max_position_limit" else value)  # type: ignore[method-assign]
+
+
+def _outside(twin: Twin) -> None:
+    plant = twin.plant
+    assert isinstance(plant, Witness) and isinstance(plant.plant, FirstOrderPlant)
+    plant.plant.position[5] = 2.6
+
+
+BEFORE: dict[str, Callable[[Twin], None]] = {
+    "a motor has a wrong ID": _put("id", 13, 11),
+    "two motors have the same ID": _put("id", 11, 12),
+    "a motor does not keep its limit": _stubborn,
+    "a motor's direction was reversed": _put("drive_mode", 1, 20),
+    "a motor has an overload": _put("hardware_error_status", HardwareError.OVERLOAD, 22),
+    "a motor is hot": lambda twin: setattr(twin.motors[0], "temperature", 66.0),
+    "the supply is low": _put("present_input_voltage", 190),
+    "a joint is out of its range": _outside,
+    "a cable is loose": lambda twin: twin.faults.cut_off.add(32),
+}
+"""What the preflight has to find."""
+
+
+def try_preflight(name: str, hand: HandModel, joints: Joints) -> Outcome:
+    """Spoil something before the start; nothing may move."""
+    with scene_of(hand, joints, blockable=True) as (scene, _):
+        scene.bus.release()
+        BEFORE[name](scene.twin)
+        time.sleep(0.1)
+        wrong = [finding for finding in preflight(Connection(hand, joints, scene.bus)) if not finding.ok]
+        on = tuple(motor.id for motor in scene.twin.motors if motor.get("torque_enable"))
+        happened = f"nothing moves: {wrong[0].what}: {wrong[0].found}" if wrong else "was not found"
+        return Outcome(name, happened, energised=on, right=bool(wrong) and not on)
+
+
+def try_process(name: str, number: signal.Signals, hand: HandModel, joints: Joints) -> Outcome:
+    """Send a signal to `vd-deploy home` while it moves the twin."""
+    with scene_of(hand, joints) as (scene, witness):
+        command = [sys.executable, "-m", "vd.deploy.cli", "home", "--port", scene.twin.path, "--yes"]
+        command += ["--hand", hand.name, "--speed", "0.2"]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        end = time.monotonic() + START_S
+        while not all(motor.get("torque_enable") for motor in scene.twin.motors):
+            if process.poll() is not None or time.monotonic() > end:
+                break
+            time.sleep(0.01)
+        time.sleep(0.5)
+        sent = time.monotonic()
+        process.send_signal(number)
+        _, words = process.communicate()
+        time.sleep(REST_S)
+        on = tuple(motor.id for motor in scene.twin.motors if motor.get("torque_enable"))
+        pushing = tuple(id for id, by in zip(joints.ids, witness.pushes[-1], strict=True) if by > SAFE_RAD)
+        stopped = {motor.get("bus_watchdog") for motor in scene.twin.motors} == {-1}
+        said = [line for line in words.splitlines() if line.startswith("stopped")]
+        if number == signal.SIGKILL:
+            happened, right = "the motors stop by themselves and hold", stopped
+        else:
+            happened, right = (said or ["said nothing"])[-1], bool(said) and not on
+        safe_s = witness.safe_after(sent)
+        return Outcome(name, happened, None, safe_s, on, pushing, right and not pushing)
+
+
+START_S = 60.0
+"""Longest start of a command."""
+PROCESS = {
+    "vd-deploy gets Ctrl-C": signal.SIGINT,
+    "vd-deploy is asked to end": signal.SIGTERM,
+    "vd-deploy is killed": signal.SIGKILL,
+}
+"""Signals to a command that moves the hand."""
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """The table as Markdown."""
+    lines = [
+        "| fault | what happened | found after | safe after that | with torque at the end, pushing |",
+        "|---|---|---|---|---|",
+    ]
+    for one in outcomes:
+        found = "-" if one.detected_s is None else f"{1e3 * one.detected_s:.0f} ms"
+        safe = "-" if one.safe_s is None else f"{1e3 * one.safe_s:.0f} ms"
+        on = f"{len(one.energised)}, {len(one.pushing)}"
+        mark = "" if one.right else " **(wrong)**"
+        lines.append(f"| {one.fault} | {one.happened}{mark} | {found} | {safe} | {on} |")
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class FaultsCommand:
+    """Inject every fault into the twin of a hand, and print what happened."""
+
+    hand: str = "dclaw3"
+    """dclaw3 or dclaw4."""
+    only: str = ""
+    """Only faults whose name holds this."""
+    json: Path | None = None
+    """Write the outcomes to this file."""
+
+    def run(self) -> int:
+        """Try all; 1 if one did not end as it has to."""
+        import warp as wp
+
+        wp.config.log_level = wp.LOG_WARNING
+        hand = load_hand(self.hand)
+        joints = uncalibrated(hand)
+        trials: list[tuple[str, Callable[[], Outcome]]] = [
+            *((f.name, lambda f=f: try_fault(f, hand, joints)) for f in MOVING),  # type: ignore[misc]
+            *((name, lambda n=name: try_preflight(n, hand, joints)) for name in BEFORE),  # type: ignore[misc]
+            *((name, lambda n=name: try_process(n, PROCESS[n], hand, joints)) for name in PROCESS),  # type: ignore[misc]
+        ]
+        outcomes = []
+        for name, trial in trials:
+            if self.only in name:
+                outcomes.append(trial())
+                how = "ok   " if outcomes[-1].right else "WRONG"
+                print(f"{how}  {name}: {outcomes[-1].happened}", file=sys.stderr, flush=True)
+        print(table(outcomes))
+        if self.json is not None:
+            write_json(self.json, [asdict(outcome) for outcome in outcomes])
+        return 0 if all(outcome.right for outcome in outcomes) else 1
+
+
+def main() -> int:
+    """Entry point of ``python -m vd.deploy.faults``."""
+    import tyro
+
+    return tyro.cli(FaultsCommand, prog="python -m vd.deploy.faults", description=__doc__).run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

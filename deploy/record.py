@@ -1,0 +1,316 @@
+"""Record motions for vd-gap: the paper's steps and sines, or a plan of vd-gap's, finger by finger."""
+
+import csv
+import itertools
+import json
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+
+from vd.deploy.bus import D_GAIN, P_GAIN
+from vd.deploy.check import ready
+from vd.deploy.connect import Connection, HandOptions, connect
+from vd.deploy.control_table import RAD_PER_COUNT
+from vd.deploy.motion import move
+from vd.deploy.safety import JointState, SafeHand, SafetyCfg
+
+if TYPE_CHECKING:
+    from vd.assets_usd.hand_model import HandModel
+    from vd.gap.excitations import Excitation
+    from vd.gap.recording import Recording, Trajectory
+
+RATE_HZ = 100.0
+"""Rate that is tried, that of the excitations; the bus may be slower."""
+SPEED_RAD_S = 1.0
+"""Of the way to where a motion starts."""
+JOINTS_PER_FINGER = 3
+WIDE = SafetyCfg(step_rad=4.0)
+"""Steps go through most of a joint's range at once, which a policy must not."""
+TWIN_ARGS = "--physics-hz 960"
+"""A twin at the rate of training would answer up to 17 ms late, and that is what vd-gap would find."""
+STATE_CHANNELS = ("velocity", "current", "pwm", "voltage", "temperature")
+
+
+class RecordError(ValueError):
+    """A recording that cannot be made or gone on with; names the file and the remedy."""
+
+
+@dataclass(frozen=True)
+class RecordCfg(HandOptions):
+    """Record motions for vd-gap. Started again with the same options, it goes on where it stopped.
+
+    One joint moves at a time, the others hold; nothing may be in the way, and no object in the hand.
+    """
+
+    out: Path = Path("recording")
+    """Folder of the recording."""
+    fingers: tuple[int, ...] = ()
+    """Fingers to move, from 0; all by default."""
+    excitations: tuple[str, ...] = ("steps_and_sines",)
+    """Sets of motions, as vd-gap names them."""
+    plan: Path | None = None
+    """Plan of vd-gap (next_experiment.json) in place of --excitations; its motions are added to --out."""
+    rate_hz: float = RATE_HZ
+    """Samples a second, as far as the bus allows."""
+    safety: SafetyCfg = field(default_factory=lambda: WIDE)
+    """Limits."""
+    yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Do not ask before it moves."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print what was recorded as JSON."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """One motion to record: an excitation of the whole hand."""
+
+    file: str
+    """Its CSV file, by which it is known to be recorded."""
+    excitation: "Excitation"
+
+    @property
+    def payload(self) -> tuple[float, str]:
+        """Mass that has to hang at a fingertip [kg], and at whose; of nobody without one."""
+        mass = float(self.excitation.conditions.get("payload_kg", 0.0))
+        return mass, self.excitation.joints[0].partition("_")[0] if mass > 0.0 else ""
+
+
+def motions_of(hand: "HandModel", fingers: Sequence[int], sets: Sequence[str]) -> list[Motion]:
+    """The motions of excitation sets, finger by finger.
+
+    Raises:
+        ValueError: A set or a finger is unknown.
+    """
+    from vd.gap.excitations import JointRange, excitation_set
+
+    reach = JointRange(hand.joint_names, hand.lower, hand.upper, p_gain=float(P_GAIN))
+    every = excitation_set(reach, sets)
+    joints = joints_of(hand, fingers)
+    ordered = sorted(
+        (motion for motion in every if motion.joints[0] in joints),
+        key=lambda motion: hand.joint_names.index(motion.joints[0]) // JOINTS_PER_FINGER,
+    )
+    return [
+        Motion(
+            f"{index:03d}_{motion.joints[0]}_{motion.name}.csv",
+            replace(motion, conditions={"p_gain": float(P_GAIN), **motion.conditions}),
+        )
+        for index, motion in enumerate(ordered)
+    ]
+
+
+def read_plan(path: Path, hand: "HandModel") -> list[Motion]:
+    """The motions of a plan that ``vd-gap plan`` wrote; joints that it does not name hold.
+
+    Args:
+        path: ``next_experiment.json``, or the folder with it.
+        hand: The hand.
+
+    Raises:
+        RecordError: It is no such plan, or one of another hand.
+    """
+    from vd.gap.excitations import Excitation
+
+    file = path / "next_experiment.json" if path.is_dir() else path
+    try:
+        plan: dict[str, Any] = json.loads(file.read_text())
+        entries, joints = plan["trajectories"], plan["joints"]
+        columns = [hand.joint_names.index(name) for name in joints]
+    except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise RecordError(f"{file} is no plan for {hand.name}: {error}; vd-gap plan writes one") from error
+    motions = []
+    for entry in entries:
+        with (file.parent / entry["file"]).open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        time_s = np.array([float(row["t"]) for row in rows])
+        command = np.tile(0.5 * (hand.lower + hand.upper), (len(rows), 1))
+        enabled = np.ones(command.shape, dtype=bool)
+        for name, column in zip(joints, columns, strict=True):
+            command[:, column] = [float(row[f"command.{name}"]) for row in rows]
+            enabled[:, column] = [row.get(f"enabled.{name}", "1") == "1" for row in rows]
+        conditions = {"p_gain": float(P_GAIN), **entry["conditions"]}
+        excitation = Excitation(
+            entry["excitation"], tuple(entry["joints"]), time_s, command, conditions, enabled
+        )
+        motions.append(Motion("plan_" + Path(entry["file"]).name, excitation))
+    return motions
+
+
+def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
+    """Joints of some fingers, all without any.
+
+    Raises:
+        ValueError: The hand lacks a finger.
+    """
+    wrong = [finger for finger in fingers if not 0 <= finger < hand.num_fingers]
+    if wrong:
+        raise ValueError(f"--fingers {wrong[0]}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")
+    chosen = sorted(set(fingers)) or range(hand.num_fingers)
+    return tuple(name for f in chosen for name in hand.joint_names[3 * f : 3 * f + JOINTS_PER_FINGER])
+
+
+class Recorder:
+    """Plays motions on an armed hand and keeps what it answers.
+
+    Args:
+        connection: The hand.
+        joints: Names of the recorded joints.
+        rate_hz: Samples a second that are tried.
+    """
+
+    def __init__(self, connection: Connection, joints: Sequence[str], rate_hz: float):
+        self._connection, self._rate = connection, rate_hz
+        names = connection.joints.names
+        self._columns = [names.index(name) for name in joints]
+
+    def play(self, safe: SafeHand, motion: Motion) -> "Trajectory":
+        """Go to where the motion starts, play it, and give what was measured.
+
+        A sample is a state, and the goal that was sent right after it was read.
+
+        Raises:
+            StoppedError: The hand was stopped.
+            BusError: A gain could not be written.
+        """
+        excitation = motion.excitation
+        move(safe, excitation.command[0], SPEED_RAD_S)
+        gain = int(float(excitation.conditions["p_gain"]))
+        self._set_gain(gain)
+        rows: list[tuple[JointState, np.ndarray, np.ndarray]] = []
+        begin, last = time.monotonic(), -np.inf
+        on = np.ones(len(self._connection.joints.ids), dtype=bool)
+        while (now := time.monotonic() - begin) < excitation.duration:
+            at = int(np.searchsorted(excitation.time, now, side="right")) - 1
+            if not np.array_equal(on, excitation.enabled[at]):
+                on = excitation.enabled[at]
+                safe.switch(on)
+            state = safe.read()
+            if state.time_s > last:  # else the last one again, and a goal would have no sample
+                rows.append((state, safe.command(excitation.command[at]), on))
+                last = state.time_s
+            safe.beat()
+            due = begin + (np.floor(now * self._rate) + 1.0) / self._rate
+            time.sleep(max(0.0, due - time.monotonic()))
+        if not on.all():
+            safe.switch(np.ones_like(on))
+        self._set_gain(P_GAIN)
+        return self._trajectory(motion, rows)
+
+    def _set_gain(self, gain: int) -> None:
+        bus = self._connection.bus
+        for column in self._columns:
+            id = self._connection.joints.ids[column]
+            if bus.read(id, "position_p_gain") != gain:
+                bus.write(id, "position_p_gain", gain)
+
+    def _trajectory(
+        self, motion: Motion, rows: Sequence[tuple[JointState, np.ndarray, np.ndarray]]
+    ) -> "Trajectory":
+        from vd.gap.recording import Trajectory
+
+        states = [state for state, _, _ in rows]
+
+        def column(values: Sequence[np.ndarray]) -> np.ndarray:
+            return np.array(values)[:, self._columns]
+
+        measured = {name: column([getattr(state, name) for state in states]) for name in STATE_CHANNELS}
+        excitation = motion.excitation
+        return Trajectory(
+            file=motion.file,
+            excitation=excitation.name,
+            joints=excitation.joints,
+            conditions=excitation.conditions,
+            time=np.array([state.time_s for state in states]) - states[0].time_s,
+            command=column([goal for _, goal, _ in rows]),
+            position=column([state.position for state in states]),
+            enabled=column([on for _, _, on in rows]),
+            # A motor that does not tell its duty cycle says zero.
+            **{name: values for name, values in measured.items() if name != "pwm" or values.any()},
+        )
+
+
+def record(cfg: RecordCfg) -> int:
+    """Record what is not recorded yet."""
+    if not cfg.rate_hz > 0.0:
+        raise ValueError(f"--rate-hz is {cfg.rate_hz}; it has to be above 0")
+    with connect(replace(cfg, twin_args=f"{TWIN_ARGS} {cfg.twin_args}")) as connection:
+        hand = connection.hand
+        joints = joints_of(hand, cfg.fingers)
+        motions = (
+            motions_of(hand, cfg.fingers, cfg.excitations) if cfg.plan is None else read_plan(cfg.plan, hand)
+        )
+        recording = _begun(cfg, connection, joints)
+        done = {trajectory.file for trajectory in recording.trajectories}
+        left = [motion for motion in motions if motion.file not in done]
+        print(f"{len(motions)} motions, {len(motions) - len(left)} of them recorded", file=sys.stderr)
+        left.sort(key=lambda motion: motion.payload)
+        for payload, group in itertools.groupby(left, key=lambda motion: motion.payload):
+            for trajectory in _session(cfg, connection, joints, list(group), *payload):
+                recording = _add(recording, trajectory, cfg.out)
+    if cfg.json:
+        files = [trajectory.file for trajectory in recording.trajectories]
+        print(json.dumps({"recording": str(cfg.out), "trajectories": files}, indent=1))
+    else:
+        print(f"{cfg.out}: {len(recording.trajectories)} motions; vd-gap run {cfg.out} --out gap")
+    return 0
+
+
+def _session(
+    cfg: RecordCfg,
+    connection: Connection,
+    joints: tuple[str, ...],
+    motions: Sequence[Motion],
+    payload_kg: float,
+    finger: str,
+) -> Iterator["Trajectory"]:
+    """Motions with one payload, between preflight and torque off."""
+    seconds = sum(motion.excitation.duration for motion in motions)
+    question = f"The hand will move for about {seconds:.0f} s, one joint at a time and quickly."
+    if payload_kg > 0.0:
+        if cfg.yes or cfg.twin:
+            raise RecordError(f"{motions[0].file}: somebody has to hang {payload_kg:g} kg at the fingertip")
+        question = f"Hang {payload_kg:g} kg at the fingertip of {finger}. {question}"
+    ready(connection, question, yes=cfg.yes, quiet=cfg.json)
+    recorder = Recorder(connection, joints, cfg.rate_hz)
+    with SafeHand(connection.bus, connection.joints, connection.hand, cfg.safety) as safe:
+        safe.arm()
+        for number, motion in enumerate(motions, 1):
+            trajectory = recorder.play(safe, motion)
+            rate = (len(trajectory.time) - 1) / trajectory.time[-1]
+            what = f"{number}/{len(motions)} {Path(motion.file).stem}"
+            print(f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz", file=sys.stderr, flush=True)
+            yield trajectory
+
+
+def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":
+    """The recording in the folder, or an empty one."""
+    from vd.assets_usd.hand_spec import HANDS
+    from vd.gap.recording import Recording, read_recording
+
+    hand = connection.hand
+    if (cfg.out / "recording.json").exists():
+        found = read_recording(cfg.out)
+        if found.joints != joints or found.model != hand.name:
+            raise RecordError(
+                f"{cfg.out} is of {found.model}, {', '.join(found.joints)}; choose another --out"
+            )
+        return found
+    if hand.name not in HANDS:
+        raise RecordError(f"a recording names its hand, and {hand.name} is none of {', '.join(HANDS)}")
+    servo = {"model": connection.bus.model.name, "p_gain": P_GAIN, "d_gain": D_GAIN}
+    return Recording(cfg.out, hand.name, joints, servo, RAD_PER_COUNT, ())
+
+
+def _add(recording: "Recording", trajectory: "Trajectory", folder: Path) -> "Recording":
+    """Write one motion more, so that nothing that was recorded is lost."""
+    from vd.gap.recording import write_recording
+
+    longer = replace(recording, trajectories=(*recording.trajectories, trajectory))
+    write_recording(longer, folder, only=(trajectory.file,))
+    return longer

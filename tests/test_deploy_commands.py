@@ -1,0 +1,208 @@
+"""The commands of vd-deploy on the twin: scan, check, home, record; nothing moves unasked."""
+
+import contextlib
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
+
+from vd.assets_usd.hands import load_hand
+from vd.deploy import check, cli, home, record
+from vd.deploy.bus import MotorBus
+from vd.deploy.connect import MOTOR, Connection, HandOptions, connect
+from vd.deploy.control_table import MODELS
+from vd.deploy.faults import BEFORE, MOVING, try_fault, try_preflight
+from vd.deploy.joints import uncalibrated
+from vd.deploy.motion import reset_pose
+from vd.deploy.motor import Motor
+from vd.deploy.safety import SafetyCfg
+from vd.deploy.scan import FoundMotor, differences, find
+from vd.deploy.twin import Twin
+from vd.gap.recording import read_recording
+
+PATIENT = SafetyCfg(step_rad=4.0, hold_s=0.05, misses=60, lost_s=2.0, watchdog_s=2.0)
+"""On a busy machine the twin may not run for longer than a hand may wait."""
+
+
+@pytest.fixture(scope="module")
+def hand():
+    return load_hand("dclaw3")
+
+
+@pytest.fixture
+def twin(hand):
+    with Twin([Motor(MODELS[MOTOR], id) for id in uncalibrated(hand).ids]) as served:
+        served.plant.position[:] = reset_pose(3) + 0.1
+        yield served
+
+
+@pytest.fixture
+def port(twin, hand, monkeypatch):
+    """What commands connect to: the twin, however long it may take to answer."""
+    joints = uncalibrated(hand)
+
+    @contextlib.contextmanager
+    def patient(options):
+        with MotorBus(options.port, joints.ids, MOTOR, retries=20) as bus:
+            yield Connection(hand, joints, bus)
+
+    for module in (check, home, record):
+        monkeypatch.setattr(module, "connect", patient)
+    monkeypatch.setattr(check, "BUS_SHARE", 100.0)
+    return twin.path
+
+
+def test_find_lists_the_motors(twin):
+    assert find(twin.path, [1_000_000], lambda text: None) == [
+        FoundMotor(motor.id, 1_000_000, MOTOR, 45) for motor in twin.motors
+    ]
+
+
+def test_what_differs_is_named(hand):
+    joints = uncalibrated(hand)
+    found = [FoundMotor(id, 1_000_000, MOTOR, 45) for id in joints.ids]
+    assert differences(found, joints, MOTOR, 1_000_000) == []
+    found[1] = FoundMotor(1, 57_600, MOTOR, 45)
+    found[2] = FoundMotor(12, 1_000_000, "XM430-W210", 44)
+    wrong = "\n".join(differences(found, joints, MOTOR, 1_000_000))
+    assert "f0_j2: no motor 11 answers" in wrong and "is it ID 1?" in wrong
+    assert "motor 12 is XM430-W210, not XH430-V210" in wrong and "firmware 44, 45" in wrong
+    found[1] = FoundMotor(11, 57_600, MOTOR, 45)
+    assert "motor 11 is at 57600 baud" in "\n".join(differences(found, joints, MOTOR, 1_000_000))
+
+
+def test_check_finds_nothing_wrong_and_leaves_the_torque_off(twin, port, capsys):
+    assert check.check(check.CheckCfg(port=port, json=True)) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["ok"] and {"gains and limits", "loop rate"} < {f["what"] for f in report["findings"]}
+    assert not any(motor.get("torque_enable") for motor in twin.motors)
+    assert twin.motors[0].get("position_p_gain") == 200
+
+
+@pytest.mark.parametrize("name", BEFORE)
+def test_the_preflight_finds(name, hand, monkeypatch):
+    monkeypatch.setattr(check, "CYCLES", 1)
+    outcome = try_preflight(name, hand, uncalibrated(hand))
+    assert outcome.right, outcome.happened
+
+
+def test_nothing_moves_unasked(twin, port, monkeypatch):
+    before = twin.plant.position.copy()
+    with pytest.raises(RuntimeError, match="Nobody is there to ask"):
+        home.home(home.HomeCfg(port=port))
+    twin.motors[3].put("hardware_error_status", 32)
+    with pytest.raises(RuntimeError, match="motor 20: overload"):
+        home.home(home.HomeCfg(port=port, yes=True))
+    np.testing.assert_array_equal(twin.plant.position, before)
+
+
+def test_home_comes_to_the_reset_pose(twin, port, capsys):
+    assert home.home(home.HomeCfg(port=port, yes=True, speed=1.0, safety=PATIENT)) == 0
+    np.testing.assert_allclose(twin.plant.position, reset_pose(3), atol=0.01)
+    assert "farthest from its place" in capsys.readouterr().out
+
+
+def test_the_range_is_swept(twin, port, hand, monkeypatch):
+    monkeypatch.setattr(check, "RANGE_SPEED_RAD_S", 8.0)
+    monkeypatch.setattr(check, "FOLLOW_RAD", 2.0)  # at that speed; whether it moves is the question
+    monkeypatch.setattr(check, "SafetyCfg", lambda **_: PATIENT)
+    seen = []
+    advance = twin.plant.advance
+    monkeypatch.setattr(
+        twin.plant, "advance", lambda *a: (advance(*a), seen.append(twin.plant.position.copy()))
+    )
+    assert check.check(check.CheckCfg(port=port, range=True, yes=True)) == 0
+    moved = np.ptp(seen, axis=0) / (hand.upper - hand.lower)
+    assert (moved > 0.7).all() and (moved < 0.9).all()
+
+
+@pytest.fixture
+def plan(tmp_path, hand):
+    """A plan of two short motions, one with a torque release and a lower gain."""
+    folder = tmp_path / "plan"
+    (folder / "next_experiment").mkdir(parents=True)
+    time = np.arange(0.0, 0.6, 0.01)
+    entries = []
+    for index, (joint, gain) in enumerate((("f0_j1", 200.0), ("f0_j2", 100.0))):
+        rows = [f"t,command.{joint},enabled.{joint}"]
+        rows += [f"{t:.6f},{0.3 * np.sin(12 * t):.6f},{int(gain > 150.0 or t < 0.3)}" for t in time]
+        name = f"next_experiment/{index:03d}_{joint}_wave.csv"
+        (folder / name).write_text("\n".join(rows) + "\n")
+        conditions = {"p_gain": gain}
+        entries.append({"file": name, "excitation": "wave", "joints": [joint], "conditions": conditions})
+        path = folder / f"{joint}.json"
+        path.write_text(json.dumps({"joints": [joint], "trajectories": [entries[-1]]}))
+    return folder
+
+
+def test_a_plan_is_recorded_and_gone_on_with(twin, port, plan, hand, tmp_path):
+    out = tmp_path / "rec"
+    first = record.RecordCfg(
+        port=port, out=out, fingers=(0,), plan=plan / "f0_j1.json", yes=True, safety=PATIENT
+    )
+    assert record.record(first) == 0
+    before = (out / "plan_000_f0_j1_wave.csv").read_bytes()
+    second = record.RecordCfg(
+        port=port, out=out, fingers=(0,), plan=plan / "f0_j2.json", yes=True, safety=PATIENT
+    )
+    assert record.record(second) == 0 and record.record(second) == 0
+    assert (out / "plan_000_f0_j1_wave.csv").read_bytes() == before
+    found = read_recording(out)
+    assert found.model == "dclaw3" and found.joints == ("f0_j1", "f0_j2", "f0_j3")
+    wave, release = found.trajectories
+    assert (wave.excitation, wave.joints, wave.conditions) == ("wave", ("f0_j1",), {"p_gain": 200.0})
+    np.testing.assert_allclose(wave.command[:, 0], 0.3 * np.sin(12 * wave.time), atol=0.15)
+    assert np.ptp(wave.position[:, 0]) > 0.1 and np.ptp(wave.position[:, 2]) < 0.02
+    assert wave.enabled.all() and not release.enabled[-1, 1] and release.enabled[0, 1]
+    assert wave.temperature is not None and wave.pwm is None
+    assert {motor.get("position_p_gain") for motor in twin.motors} == {200}
+    assert not any(motor.get("torque_enable") for motor in twin.motors)
+    with pytest.raises(record.RecordError, match="choose another"):
+        record.record(replace(first, fingers=(1,)))
+
+
+def test_motions_go_finger_by_finger(hand):
+    motions = record.motions_of(hand, (), ("gain_ladder", "slow_triangle"))
+    fingers = [motion.excitation.joints[0][:2] for motion in motions]
+    assert fingers == sorted(fingers) and len({motion.file for motion in motions}) == len(motions)
+    assert {motion.excitation.conditions["p_gain"] for motion in motions} == {200.0, 100.0, 50.0}
+    with pytest.raises(ValueError, match="fingers 0 to 2"):
+        record.motions_of(hand, (3,), ("chirp",))
+
+
+def test_a_payload_needs_somebody_to_hang_it(port, hand, tmp_path):
+    cfg = record.RecordCfg(port=port, out=tmp_path, fingers=(0,), excitations=("second_payload",), yes=True)
+    motions = [motion for motion in record.motions_of(hand, (0,), cfg.excitations) if motion.payload[0]]
+    with record.connect(cfg) as connection, pytest.raises(record.RecordError, match=r"hang 0\.05 kg"):
+        list(record._session(cfg, connection, ("f0_j1",), motions, *motions[0].payload))
+
+
+def test_a_file_that_is_no_plan_is_refused(hand, tmp_path):
+    (tmp_path / "next_experiment.json").write_text('{"trajectories": [], "joints": ["f9_j1"]}')
+    with pytest.raises(record.RecordError, match="no plan for dclaw3"):
+        record.read_plan(tmp_path, hand)
+
+
+@pytest.mark.parametrize("name", ["Ctrl-C", "an exception in the loop"])
+def test_a_fault_of_the_table_ends_safely(name, hand):
+    fault = next(fault for fault in MOVING if fault.name == name)
+    outcome = try_fault(fault, hand, uncalibrated(hand))
+    assert not outcome.energised and not outcome.pushing and outcome.detected_s is not None
+
+
+def test_options_and_commands_that_cannot_be_are_refused(capsys):
+    with pytest.raises(ValueError, match="--port"), connect(HandOptions()):
+        pass
+    assert cli.main(["fly"]) == cli.FAILED and "no command 'fly'" in capsys.readouterr().err
+    assert cli.main([]) == cli.OK and "vd-deploy COMMAND" in capsys.readouterr().out
+
+
+def test_a_twin_that_cannot_start_says_why():
+    command = [sys.executable, "-m", "vd.deploy.cli", "scan", "--twin", "--twin-args=--seed no"]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 1 and "the twin did not start" in run.stderr
