@@ -105,6 +105,19 @@ def test_embedding_sees_shapes_but_not_places_nor_the_hand(device):
     assert (other - first).abs().max() > 1e-3
 
 
+def test_every_pair_of_frames_tells_the_rotation(device):
+    """Whatever the weights are: all that voxels leave is the rounding of places to a cell."""
+    net = turn_encoder(device)
+    turn = Rotation.random(random_state=3).as_matrix()
+    points = scene(shape() @ turn.T, shape())
+    sites = Voxeliser(0.0005, device=device)(wp.array(points, dtype=wp.vec3, device=device), ends=ENDS)
+    net.scale *= 0.1
+    net.pairs.weight.data *= 10.0  # long vectors have length 1 in the frames
+    now, aim = (net._frames(sites, which)[0] for which in item_and_goal(sites))
+    expected = torch.from_numpy(turn).float().to(now.device).expand(1, SIZES.pairs, 3, 3)
+    torch.testing.assert_close(now @ aim.mT, expected, rtol=0.0, atol=0.05)
+
+
 def test_goal_apart_gives_the_same(device):
     net = turn_encoder(device)
     points = scene(shape(seed=1), shape())
@@ -118,7 +131,11 @@ def test_goal_apart_gives_the_same(device):
 
 def test_a_cloud_without_an_object_is_finite(device):
     points = scene(np.full((ITEM_POINTS, 3), np.nan), shape())
-    assert torch.isfinite(turn_encoder(device)(voxels(points, device))).all()
+    net = turn_encoder(device)
+    found = net(voxels(points, device))
+    found.sum().backward()
+    assert torch.isfinite(found).all()
+    assert all(p.grad is None or torch.isfinite(p.grad).all() for p in net.parameters())
 
 
 def test_needs_marks(device):

@@ -86,7 +86,7 @@ class TurnCfg:
     hidden: int = 32
     """Width of the layers that weigh a point."""
     pairs: int = 8
-    """Mixtures of them that are multiplied, the object's with the goal's."""
+    """Pairs of mixtures of them; each pair makes a frame of the object and one of the goal."""
 
     def validate(self) -> None:
         """Raise ``ValueError`` for sizes that make no network, naming the field."""

@@ -112,37 +112,46 @@ class ShapeVectors(nn.Module):
 class TurnEncoder(nn.Module):
     """An embedding of how the object of each cloud is turned from the goal.
 
-    Both shapes are pooled by the same weights. What follows sees only products of a vector (tensor) of the
-    one with one of the other.
+    Pairs of vectors make frames, of the object and of the goal by the same weights; two frames of one shape
+    differ by the rotation that is looked for. The embedding is made of these rotations, one for each pair, of
+    their weighted mean, and of the lengths of the vectors: where a shape looks the same from several sides
+    they are short, and the rotations disagree.
     """
 
     def __init__(self, cfg: TurnCfg, voxel_m: float, embedding: int):
         super().__init__()
         self.scale = voxel_m / RADIUS_M
         self.shape = ShapeVectors(cfg)
-        self.mix = nn.ModuleList(nn.Linear(cfg.vectors, cfg.pairs, bias=False) for _ in range(4))
-        products = 2 * 9 * cfg.pairs
-        self.hidden = nn.Sequential(nn.Linear(products, embedding), nn.GELU())
-        self.out = nn.Linear(products + embedding, embedding)
+        self.pairs = nn.Linear(cfg.vectors, 2 * cfg.pairs, bias=False)
+        lengths = 4 * cfg.pairs
+        self.trust = nn.Sequential(
+            nn.Linear(lengths, cfg.hidden), nn.GELU(), nn.Linear(cfg.hidden, cfg.pairs)
+        )
+        width = 9 * (cfg.pairs + 1) + lengths
+        self.hidden = nn.Sequential(nn.Linear(width, embedding), nn.GELU())
+        self.out = nn.Linear(width + embedding, embedding)
 
     def forward(self, sites: Sites, goal: Sites | None = None) -> torch.Tensor:
         """Embeddings [B, E] of the clouds of ``sites``, the goal's voxels among them or in ``goal``."""
         item, wanted = item_and_goal(sites, goal)
         with torch.autocast(sites.device.type, enabled=False):
-            vectors, tensors = self.shape(*self._scaled(sites, item))
-            aims, aim_tensors = self.shape(*self._scaled(sites if goal is None else goal, wanted))
-            turned = self._mixed(0, vectors)[..., :, None] * self._mixed(1, aims)[..., None, :]
-            spread = self._mixed(2, tensors.flatten(2)).unflatten(-1, (3, 3)) @ self._mixed(
-                3, aim_tensors.flatten(2)
-            ).unflatten(-1, (3, 3))
-            products = torch.cat([turned.flatten(1), spread.flatten(1)], dim=1)
-            return self.out(torch.cat([products, self.hidden(products)], dim=1))
+            now, length = self._frames(sites, item)
+            aim, aim_length = self._frames(sites if goal is None else goal, wanted)
+            turns = now @ aim.transpose(-1, -2)
+            lengths = torch.cat([length, aim_length], dim=1).clamp(min=SMALL).log()
+            trust = self.trust(lengths).softmax(dim=1)
+            mean = (trust[..., None, None] * turns).sum(dim=1)
+            known = torch.cat([turns.flatten(1), mean.flatten(1), lengths], dim=1)
+            return self.out(torch.cat([known, self.hidden(known)], dim=1))
 
-    def _scaled(self, sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _frames(self, sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Frames as matrices [B, pairs, 3, 3], and the lengths of the vectors they are of [B, 2 pairs]."""
         points, present = padded(sites, chosen)
         dtype = self.out.weight.dtype
-        return self.scale * points.to(dtype), present.to(dtype)
-
-    def _mixed(self, index: int, values: torch.Tensor) -> torch.Tensor:
-        """Sums over the K vectors [B, K, C] with learned weights: [B, pairs, C]."""
-        return self.mix[index](values.transpose(1, 2)).transpose(1, 2)
+        vectors, _ = self.shape(self.scale * points.to(dtype), present.to(dtype))
+        first, second = self.pairs(vectors.transpose(1, 2)).transpose(1, 2).chunk(2, dim=1)
+        one = unit(first)
+        second = second - (second * one).sum(dim=-1, keepdim=True) * one
+        two = unit(second)
+        matrix = torch.stack((one, two, torch.linalg.cross(one, two)), dim=-1)
+        return matrix, torch.cat([first.norm(dim=-1), second.norm(dim=-1)], dim=1)
