@@ -7,7 +7,17 @@ import pytest
 
 from vd.bench import gap
 from vd.bench.cli import GapCommand
-from vd.bench.gap_score import KINDS, NEIGHBOURS, Case, by_effect, figures, markdown, score
+from vd.bench.gap_beside import beside
+from vd.bench.gap_score import (
+    KINDS,
+    NEIGHBOURS,
+    Case,
+    by_effect,
+    figures,
+    markdown,
+    missed_pairs,
+    score,
+)
 from vd.gap.hidden_plant import OUTSIDE
 from vd.kernels.effects import EFFECTS
 
@@ -189,6 +199,32 @@ def test_pairs_and_outsiders_are_scored():
     ]
     assert value(strange, "outside: unknown or neighbours").value == pytest.approx(3 / 5)
     assert value(strange, "outside: a confident wrong name").value == pytest.approx(1 / 5)
+
+
+def test_pairs_count_apart_in_which_each_effect_shows_beside_the_other():
+    two = case("acceleration_limit", "torque_limit", kind="pair")
+    hidden, found = (
+        {**score(two, report(*named), TRUTH), "beside": {"acceleration_limit": 260.0, "torque_limit": gap}}
+        for named, gap in ((("acceleration_limit",), 1.0), (two.effects, 3.5))
+    )
+    assert value([hidden, found], "two hidden: both named").value == 0.5
+    assert value([hidden, found], "both show: both named").value == 1.0
+    (row,) = missed_pairs([hidden, found])
+    assert row["effects"][1] == ("torque_limit", 1.0) and row["answer"] == "acceleration_limit"
+    assert "`torque_limit` (1.0)" in markdown([hidden, found])
+
+
+def test_what_shows_beside_another_effect():
+    """A limit that a slow profile never asks for shows nothing; dry friction shows as much as alone."""
+
+    def gaps(*effects):
+        return beside(case(*effects, kind="pair").hiding())
+
+    slow = gaps("acceleration_limit", "torque_limit")
+    assert slow["torque_limit"] < 1.1 and slow["acceleration_limit"] > 100.0
+    alone = gaps("acceleration_limit", "coulomb_friction")["coulomb_friction"]
+    assert alone == pytest.approx(6.0, rel=0.25)
+    assert max(gaps("coulomb_friction", "dead_zone").values()) < 1.5, "each imitates the other"
 
 
 def test_a_failed_case_counts_against_every_goal():

@@ -1,4 +1,4 @@
-"""Selection of effects: the rules on made-up fits, and whole analyses of small recordings."""
+"""Selection of effects: the search on made-up fits, and whole analyses of small recordings."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_gap_fit import recorded
+from test_gap_judge import FLOOR, made_up
 
 import vd.kernels.actuators as servo
-from vd.gap.consensus import share
 from vd.gap.coordinates import Coordinate, Scales
-from vd.gap.explanation import Accepted, Explanation, Trial, intervals
+from vd.gap.explanation import Trial
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
 from vd.gap.recording import Recording
@@ -18,129 +18,11 @@ from vd.gap.result import Predictions, Report
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import vetoes
-from vd.gap.verdict import Verdicts, cancelled
 from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain, find
 from vd.kernels.effects import EFFECTS
 
-FLOOR = 1e-3
-COUNT = np.full(10, 500.0)
 SMALL = ("command_delay", "coulomb_friction", "torque_saturation", "thermal_drift", "command_filter")
-
-
-def made_up(effects: tuple[str, ...], errors: np.ndarray | float, fitted: float | None = None) -> JointFit:
-    """A fit with given held-out RMSE of each trajectory [rad]."""
-    held_out = COUNT * np.broadcast_to(errors, COUNT.shape) ** 2
-    size = 3 + len(effects)
-    return JointFit(
-        effects=effects,
-        coordinates=tuple(Coordinate(f"p{i}", i, False, 1.0, -9.0, 9.0) for i in range(size)),
-        x=np.zeros(size),
-        rows=np.zeros((1, servo.PARAMETER_COLUMNS)),
-        sse=held_out if fitted is None else COUNT * fitted**2,
-        held_out=held_out,
-        count=COUNT,
-        gram=np.tile(np.eye(size), (10, 1, 1)),
-        gradient=np.zeros((10, size)),
-    )
-
-
-@pytest.fixture
-def judge() -> Verdicts:
-    return Verdicts(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
-
-
-def test_gain_must_hold_over_trajectories(judge: Verdicts) -> None:
-    before = made_up((), 0.010)
-    assert judge.better(before, made_up(("backlash",), 0.005))[0]
-    assert not judge.better(before, made_up(("backlash",), 0.0097))[0]
-    # One trajectory gains much, others lose a little: the interval over trajectories covers 0.
-    uneven = np.full(10, 0.0102)
-    uneven[0] = 0.0
-    assert not judge.better(before, made_up(("backlash",), uneven))[0]
-
-
-def test_what_is_under_the_noise_floor_is_no_gain(judge: Verdicts) -> None:
-    accepted, why = judge.better(made_up((), 1.15e-3), made_up(("backlash",), 1.05e-3))
-    assert not accepted and "noise floor" in why
-
-
-def test_a_tie_is_a_set(judge: Verdicts) -> None:
-    rng = np.random.default_rng(1)
-    winner = made_up(("coulomb_friction",), 0.004)
-    noise = rng.normal(0.0, 1e-3, 10)
-    assert judge.tied(winner, made_up(("dead_zone",), 0.004 + noise - noise.mean()))[0]
-    assert not judge.tied(winner, made_up(("backlash",), 0.006))[0]
-
-
-def test_at_the_floor_samples_decide(judge: Verdicts) -> None:
-    """An explained recording tells candidates apart even if one motion alone shows the difference."""
-    errors = np.full(10, FLOOR)
-    winner = made_up(("coulomb_friction",), errors)
-    errors = errors.copy()
-    errors[3] = 1.5 * FLOOR
-    assert not judge.tied(winner, made_up(("dead_zone",), errors))[0]
-    assert judge.tied(winner, made_up(("dead_zone",), FLOOR))[0]
-
-
-def test_the_simpler_of_nested_effects_wins_a_tie(judge: Verdicts) -> None:
-    simple = made_up(("coulomb_friction",), 1.000e-3)
-    complex_ = made_up(("stribeck_friction",), 0.970e-3, fitted=0.999e-3)
-    assert judge.winner([complex_, simple]) is simple
-    better = made_up(("stribeck_friction",), 1.0e-3)
-    worse = made_up(("coulomb_friction",), 1.6e-3)
-    assert judge.winner([better, worse]) is better
-
-
-def test_at_the_floor_the_samples_choose_not_the_luck_of_a_motion(judge: Verdicts) -> None:
-    right = made_up(("coulomb_friction",), 1.06 * FLOOR, fitted=1.00 * FLOOR)
-    lucky = made_up(("dead_zone",), 1.01 * FLOOR, fitted=1.02 * FLOOR)
-    assert judge.winner([lucky, right]) is right
-    far = made_up(("dead_zone",), 5.0 * FLOOR, fitted=6.0 * FLOOR)
-    farther = made_up(("coulomb_friction",), 5.5 * FLOOR, fitted=5.0 * FLOOR)
-    assert judge.winner([far, farther]) is far, "away from it unseen motions do"
-
-
-def test_a_small_excess_tells_apart_only_if_most_motions_show_it(judge: Verdicts) -> None:
-    winner = made_up(("coulomb_friction",), FLOOR)
-    everywhere = np.full(10, np.sqrt(1.01) * FLOOR)
-    assert not judge.tied(winner, made_up(("dead_zone",), everywhere))[0]
-    assert judge.tied(winner, made_up(("dead_zone",), everywhere), loose=True)[0]
-    somewhere = np.full(10, np.sqrt(0.996) * FLOOR)
-    somewhere[:2] = np.sqrt(1.07) * FLOOR  # the same in all, but most motions say the opposite
-    assert judge.tied(winner, made_up(("dead_zone",), somewhere))[0]
-    slightly = made_up(("dead_zone",), np.sqrt(1.002) * FLOOR)
-    assert judge.tied(winner, slightly)[0], "what models leave"
-    richer = replace(slightly, x=np.zeros(len(slightly.x) + 2))
-    assert not judge.tied(winner, richer)[0], "more parameters that do worse"
-    assert judge.tied(winner, replace(richer, sse=0.999 * winner.sse))[0]
-
-
-def test_a_fuller_form_that_is_a_little_better_makes_a_set(judge: Verdicts) -> None:
-    limit = made_up(("torque_limit",), FLOOR)
-    for excess, tied in ((0.993, ("torque_speed_limit",)), (0.999, ()), (1.01, ())):
-        line = made_up(("torque_speed_limit",), np.sqrt(excess) * FLOOR)
-        assert judge.accept(limit, "torque_limit", [limit, line], {}, limit).tied == tied
-    friction = made_up(("coulomb_friction",), FLOOR)
-    fuller = made_up(("stribeck_friction",), np.sqrt(0.993) * FLOOR)
-    assert judge.accept(friction, "coulomb_friction", [friction, fuller], {}, friction).tied == ()
-
-
-def test_a_load_and_an_offset_that_cancel_at_rest_are_a_spring() -> None:
-    def fit(torque: float, phase: float, bias: float) -> JointFit:
-        plain = made_up(("gravity_load", "encoder_bias"), FLOOR)
-        keys = ("gravity_load.tau_g_nm", "gravity_load.phase_rad", "encoder_bias.bias_rad")
-        some = tuple(Coordinate(key, 0, False, 1.0, -9.0, 9.0) for key in keys)
-        rows = plain.rows.copy()
-        rows[0, servo.KP] = 3.0
-        x = np.array([0.0, 0.0, torque, phase, bias])
-        return replace(plain, coordinates=(*plain.coordinates[:2], *some), x=x, rows=rows)
-
-    assert "spring" in cancelled(fit(0.015, -1.15, -0.00457), 0, 0.0)
-    assert cancelled(fit(0.015, -1.15, 0.00457), 0, 0.0) == "", "together they hold it off"
-    assert cancelled(fit(0.015, -1.15, -0.0065), 0, 0.0) == ""
-    assert cancelled(fit(0.015, -1.15, -0.00457), 0, 0.8) == "", "and elsewhere it rests elsewhere"
-    assert cancelled(made_up(("gravity_load",), FLOOR), 0, 0.0) == ""
 
 
 def test_friction_with_a_direction_stands_for_dry_friction_and_an_offset(tmp_path: Path) -> None:
@@ -179,70 +61,6 @@ def test_dry_friction_and_an_offset_are_put_together_where_one_cause_does_as_wel
     assert selection.put_together(one) is one, "nothing to put together"
 
 
-def test_a_bound_is_no_estimate(judge: Verdicts) -> None:
-    stuck = made_up(("backlash",), 0.004)
-    end = Coordinate("backlash.width_rad", servo.BACKLASH_WIDTH, False, 1.0, 0.0, 9.0)
-    stuck = replace(stuck, coordinates=(*stuck.coordinates[:-1], end), x=np.array([0.0, 0.0, 0.0, 9.0]))
-    inside = made_up(("dead_zone",), 0.005)
-    assert stuck.at_bound == ("backlash.width_rad",)
-    assert judge.winner([stuck, inside]) is inside
-
-
-def test_sets_of_several_joints_meet_in_one_name() -> None:
-    def explanation(name: str, *tied: str) -> Explanation:
-        accepted = Accepted(name, 0.6 if tied else 1.0, {}, (), tied, False)
-        fits = [made_up((other,), 0.01) for other in (name, *tied)]
-        verdict = "ambiguous" if tied else "effects"
-        return Explanation(made_up((), 0.02), fits[0], verdict, "", (accepted,), (), {name: fits})
-
-    def names(*explanations: Explanation, groups: list[int] | None = None) -> list[str]:
-        shared = share(explanations, [FLOOR] * len(explanations), groups)
-        return [e.accepted[0].name if e.accepted[0].named else "?" for e in shared]
-
-    one, other = explanation("backlash", "dead_zone"), explanation("backlash", "coulomb_friction")
-    assert names(one, other) == ["backlash", "backlash"]
-    assert names(one, explanation("backlash")) == ["backlash", "backlash"]
-    assert names(one, explanation("dead_zone")) == ["dead_zone", "dead_zone"]
-    assert names(one, explanation("thermal_drift")) == ["?", "thermal_drift"]
-    assert names(one) == ["?"]
-    # Separate servos share gravity, not the play of one gear.
-    assert names(one, explanation("backlash"), groups=[0, 1]) == ["?", "backlash"]
-    # What is worse by more than an effect must gain is not adopted, unless it was not fitted to the end.
-    poor = explanation("dead_zone", "backlash")
-    poor.rivals["dead_zone"][1] = made_up(("backlash",), 0.013)  # type: ignore[index]
-    assert names(poor, explanation("backlash")) == ["?", "backlash"]
-    ended = [lambda fit: made_up(fit.effects, 0.0102)] * 2
-    shared = share([poor, explanation("backlash")], [FLOOR] * 2, polish=ended)
-    assert [e.accepted[0].name for e in shared] == ["backlash"] * 2 and shared[0].accepted[0].named
-    assert shared[0].final.held_out_rmse == pytest.approx(0.0102)
-    loaded = explanation("encoder_bias", "gravity_load")
-    assert names(loaded, explanation("gravity_load"), groups=[0, 1]) == ["gravity_load", "gravity_load"]
-    # What another joint adds to a name is said, too.
-    dry = explanation("coulomb_friction").accepted
-    both = replace(
-        loaded, verdict="effects", accepted=(*dry, *loaded.accepted), reason="friction explains it"
-    )
-    adopted = share([both, explanation("gravity_load")], [FLOOR] * 2, [0, 1])[0]
-    assert adopted.reason == "coulomb_friction and gravity_load explain it, as on the other joints"
-
-
-@pytest.mark.parametrize(("floor", "tied"), [(FLOOR, ("supply_sag",)), (10.0 * FLOOR, ())])
-def test_forms_of_one_loss_are_a_set_only_far_from_the_floor(floor: float, tied: tuple[str, ...]) -> None:
-    judge = Verdicts(floor=floor, weights=resamples(10, np.random.default_rng(0)))
-    judge.without["torque_saturation"] = 0.040
-    soft, sag, delay, limit = (
-        made_up((name,), error)
-        for name, error in (
-            ("torque_saturation", 0.012),
-            ("supply_sag", 0.020),
-            ("command_delay", 0.020),
-            ("torque_limit", 0.035),
-        )
-    )
-    accepted = judge.accept(soft, "torque_saturation", [soft, sag, delay, limit], {}, soft)
-    assert accepted.tied == tied
-
-
 def test_friction_of_one_direction_alone_is_a_load() -> None:
     def fit(plus: float, minus: float, *others: str) -> JointFit:
         plain = made_up((*others, "asymmetric_friction"), 0.01)
@@ -266,58 +84,6 @@ def test_load_and_friction_are_found_together(tmp_path: Path) -> None:
     # Neither was the best alone: the evidence says with what each was accepted.
     accepted = {row.name: row.given for row in report.evidence if row.decision == "named"}
     assert accepted == {"coulomb_friction": ("gravity_load",), "gravity_load": ("coulomb_friction",)}
-
-
-def concluded(judge: Verdicts, left: float = FLOOR, **options: object) -> Explanation:
-    """A conclusion about Coulomb friction that is beyond doubt but for ``options``."""
-    baseline, final = made_up((), 0.010), made_up(("coulomb_friction",), left)
-    simpler = made_up(("stribeck_friction",), left)  # a form of it is no rival
-    rivals = {"coulomb_friction": [final, simpler, made_up(("backlash",), 0.004)]}
-    return judge.conclude(baseline, final, rivals, [], "", **options)  # type: ignore[arg-type]
-
-
-def test_two_searches_that_disagree_by_more_than_the_gain_give_no_name(judge: Verdicts) -> None:
-    assert [a.named for a in concluded(judge).accepted] == [True]
-    left = 1.5 * FLOOR
-    # Its gain is what the next best leaves: 4 - 1.5 mrad.
-    near = concluded(judge, left, again=made_up(("coulomb_friction",), 0.0035))
-    assert near.verdict == "effects" and near.accepted[0].named
-    far = concluded(judge, left, again=made_up(("coulomb_friction",), 0.0045))
-    assert far.verdict == "unknown" and not far.accepted[0].named
-    assert "two searches" in far.reason and "3.00 mrad" in far.reason
-
-
-def test_a_worse_optimum_says_nothing_against_a_model_at_the_noise_floor(judge: Verdicts) -> None:
-    worse = concluded(judge, FLOOR, again=made_up(("coulomb_friction",), 0.0095))
-    assert worse.verdict == "effects" and worse.accepted[0].named
-
-
-def test_what_has_structure_is_not_explained(judge: Verdicts) -> None:
-    final = made_up(("coulomb_friction",), FLOOR)
-    pairs = np.full(10, 400.0)
-
-    def with_structure(share: float | np.ndarray, rms: float = 1.1 * FLOOR) -> Explanation:
-        left = replace(final, sse=COUNT * rms**2, structure=np.stack([share * FLOOR**2 * pairs, pairs]))
-        return concluded(judge, refined=left)
-
-    assert with_structure(0.03).verdict == "effects", "what the right models leave"
-    lacking = with_structure(0.3)
-    assert lacking.verdict == "unknown" and "structure" in lacking.reason
-    once = np.zeros(10)
-    once[0] = 3.0  # a single motion is no rule
-    assert with_structure(once).verdict == "effects"
-    # Far from the floor a real machine's repeatability is not known.
-    assert with_structure(8.0, rms=5.0 * FLOOR).verdict == "effects"
-
-
-def test_what_the_time_step_leaves_open_widens_the_interval(judge: Verdicts) -> None:
-    fit = made_up((), FLOOR)
-    plain = intervals(fit, FLOOR)["p0"]
-    wide = intervals(replace(fit, step_error=np.full(3, 0.5)), FLOOR)["p0"]
-    half = 0.5 * (plain[1] - plain[0])
-    assert 0.5 * (wide[1] - wide[0]) == pytest.approx(np.hypot(half, 0.5))
-    given = replace(fit, extents={"p0": (-1.0, 3.0)})
-    assert intervals(given, FLOOR)["p0"] == (-1.0, 3.0)
 
 
 def test_one_delay_stands_for_both(tmp_path: Path) -> None:
@@ -461,21 +227,6 @@ def test_telemetry_contradicts_a_cause() -> None:
     assert "supply_sag" not in vetoes(replace(recording, trajectories=falling), chain, spec, chain.start_row)
 
 
-def test_a_model_with_chance_in_it_is_judged_by_its_likelihood(judge: Verdicts) -> None:
-    """A few motions hold most of the squared error; what matters is how surely all are known."""
-    errors = np.full(10, 1e-3)
-    errors[:2] = 6e-3
-    before = made_up((), errors)
-    spread = errors.copy()
-    spread[0] *= 1.05  # one motion a little worse
-    after = made_up(("command_jitter",), 0.9 * spread)
-    assert judge.better(before, after)[0]
-    assert not judge.better(before, made_up(("command_jitter",), errors.mean() * 2.0))[0]
-    # A motion that is predicted badly without it, but fits, is no sign of chance.
-    fits_well = replace(before, sse=COUNT * (0.9 * spread) ** 2)
-    assert not judge.better(fits_well, after)[0]
-
-
 def searching(answers: list[float]) -> tuple[Selection, list[int]]:
     """A selection whose other searches end at given errors, and the seeds that it asked for."""
     seeds: list[int] = []
@@ -592,3 +343,20 @@ def test_a_search_that_fails_is_repeated_before_it_counts() -> None:
     assert again is not None and again.rmse == pytest.approx(0.010) and len(set(seeds)) == 3
     selection, seeds = searching([])
     assert selection.search_again(made_up(("backlash",), FLOOR)) is None, "nothing is better than the floor"
+
+
+@pytest.mark.parametrize(("needed", "left"), [((), {"command_jitter"}), (("elastic_transmission",), None)])
+def test_what_was_named_for_what_chance_had_done_goes(needed: tuple[str, ...], left: set[str] | None) -> None:
+    selection, _ = searching([])
+    base = made_up(("command_filter", "elastic_transmission"), 0.006)
+
+    def refit(present: JointFit, effects: list[str]) -> JointFit:
+        return made_up(tuple(effects), 0.006)
+
+    def with_chance(present: JointFit) -> JointFit:
+        missing = set(needed) - set(present.effects)
+        return made_up((*present.effects, "command_jitter"), 0.009 if missing else 0.004)
+
+    selection.refit, selection.add_random = refit, with_chance  # type: ignore[method-assign, assignment]
+    found = selection.without_needless(base, with_chance(base))
+    assert set(found.effects) == (left or {"command_jitter", *needed})

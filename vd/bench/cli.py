@@ -276,6 +276,8 @@ class GapCommand:
     """Recordings with nothing hidden, or only other stiffness, damping and mass."""
     pairs: int | None = None
     """Pairs of effects, drawn at random; all by default."""
+    pair_size: int = 2
+    """Size of both effects of a pair."""
     shard: str = "1/1"
     """Part i/n of the cases, for n machines."""
     jobs: int = 1
@@ -306,6 +308,7 @@ class GapCommand:
             first_seed=self.first_seed,
             nothing=self.nothing,
             pairs=self.pairs,
+            pair_size=self.pair_size,
         )
         if not self.collect:
             device = choose_device(self.device)

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from vd.bench.gap_beside import beside
 from vd.bench.gap_score import KINDS, Case, said, score
 from vd.bench.workers import run_tasks
 from vd.files import write_json
@@ -44,6 +45,7 @@ def battery(
     first_seed: int = 0,
     nothing: int = NOTHING_HIDDEN,
     pairs: int | None = None,
+    pair_size: int = PAIR_SIZE,
 ) -> list[Case]:
     """The cases, in a random order with all kinds mixed in proportion: any first part is a fair sample.
 
@@ -56,13 +58,14 @@ def battery(
         first_seed: Seed of the first: recordings that the method has not been tuned on.
         nothing: Recordings with nothing hidden.
         pairs: Pairs of effects, drawn at random; all if None.
+        pair_size: Size of both effects of a pair.
 
     Raises:
         ValueError: An unknown kind, effect or size.
     """
     if unknown := sorted(set(kinds) - set(KINDS)):
         raise ValueError(f"no kinds of cases are called {', '.join(unknown)}; choose from {', '.join(KINDS)}")
-    if bad := [size for size in sizes if size not in range(len(GAPS))]:
+    if bad := [size for size in (*sizes, pair_size) if size not in range(len(GAPS))]:
         raise ValueError(f"there is no size {bad[0]}; sizes are 0 to {len(GAPS) - 1}")
     shown = showing(model)
     if unknown := sorted(set(effects) - set(shown)):
@@ -81,7 +84,7 @@ def battery(
             Case("none", model, (), 0, first_seed + i, changes[i % len(changes)]) for i in range(nothing)
         ],
         "pair": [
-            Case("pair", model, pair, PAIR_SIZE, first_seed + number)
+            Case("pair", model, pair, pair_size, first_seed + number)
             for number, pair in enumerate(itertools.combinations(names, 2))
         ],
         "outside": [
@@ -127,6 +130,8 @@ def run_case(case: Case, folder: Path, device: str = "cpu", keep: bool = False) 
             work / "recording", hand, work / "analysis", seed=case.seed, device=device, workers=1
         )
         result = score(case, report.to_dict(), hidden.truth)
+        if case.kind == "pair":
+            result["beside"] = beside(case.hiding())
     except Exception:  # one case that fails is a figure of the battery, not its end
         result = {"case": asdict(case), "error": traceback.format_exc(limit=6)}
     if not keep:

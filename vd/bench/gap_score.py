@@ -215,6 +215,7 @@ def figures(results: Iterable[Mapping[str, Any]]) -> list[Figure]:
     named = [r for r in single if "error" not in r and r["case"]["effects"][0] in r["named"]]
     parameters = [row for r in named for row in r["parameters"]]
     none, pair, outside = of("none"), of("pair"), of("outside")
+    both = [r for r in pair if shows(r)]
     return [
         _share("first name right", ">= 95 %", single, _first_right, least=0.95),
         _share("right, or in the named set", ">= 99 %", single, lambda r: not r["missed"], least=0.99),
@@ -224,6 +225,8 @@ def figures(results: Iterable[Mapping[str, Any]]) -> list[Figure]:
         _share("nothing hidden: any name at all (mass included)", "", none, lambda r: bool(r["named"])),
         _share("two hidden: both named", ">= 80 %", pair, _all_named, least=0.8),
         _share("two hidden: one or both, none wrong", ">= 98 %", pair, _one_and_none_wrong, least=0.98),
+        _share("both show: both named", ">= 80 %", both, _all_named, least=0.8),
+        _share("both show: one or both, none wrong", ">= 98 %", both, _one_and_none_wrong, least=0.98),
         _share("outside: unknown or neighbours", ">= 90 %", outside, _unknown_or_near, least=0.9),
         _share("outside: a confident wrong name", "<= 2 %", outside, lambda r: bool(r["false"]), most=0.02),
         _median("relative error of parameters", "<= 0.1", [row["error"] for row in parameters], most=0.1),
@@ -237,6 +240,11 @@ def figures(results: Iterable[Mapping[str, Any]]) -> list[Figure]:
 
 def _values(results: Iterable[Mapping[str, Any]], key: str) -> list[float]:
     return [r[key] for r in results if r.get(key) is not None]
+
+
+def shows(result: Mapping[str, Any]) -> bool:
+    """Whether each effect of a pair leaves a clear gap beside the other; unknown counts as that."""
+    return all(gap >= CLEAR_GAP for gap in result.get("beside", {}).values())
 
 
 def _first_right(result: Mapping[str, Any]) -> bool:
@@ -343,8 +351,27 @@ def by_effect(results: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
+def missed_pairs(results: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Pairs of which not both were named, or another was: what each shows beside the other, the answer."""
+    rows = []
+    for result in sorted(results, key=lambda r: (r["case"]["effects"], r["case"]["size"])):
+        case = result["case"]
+        if case["kind"] != "pair" or "error" in result or (_all_named(result) and not result["false"]):
+            continue
+        gaps = result.get("beside", {})
+        rows.append(
+            {
+                "effects": [(name, gaps.get(name)) for name in case["effects"]],
+                "size": case["size"],
+                "answer": said(result) if result["named"] or result["sets"] else result["verdict"],
+                "wrong": result["false"],
+            }
+        )
+    return rows
+
+
 def markdown(results: Sequence[Mapping[str, Any]]) -> str:
-    """The figures as tables: the goals first, then every effect."""
+    """The figures as tables: the goals first, then every effect, then the pairs that were missed."""
     lines = ["| figure | goal | measured | cases | reached |", "|---|---|---|---|---|"]
     for figure in figures(results):
         reached = {True: "yes", False: "no", None: ""}[figure.reached]
@@ -356,6 +383,12 @@ def markdown(results: Sequence[Mapping[str, Any]]) -> str:
         gap = "-" if row["gap"] is None else f"{row['gap']:.1f}"
         counts = " | ".join(str(row[key]) for key in ("named", "in_set", "wrong", "cases"))
         lines.append(f"| `{row['effect']}` | {row['size']} | {gap} | {counts} | {answers} |")
+    if missed := missed_pairs(results):
+        lines += ["", "| pair (gap beside the other) | size | answer | wrong |", "|---|---|---|---|"]
+    for row in missed:
+        shown = [(name, "" if gap is None else f" ({gap:.1f})") for name, gap in row["effects"]]
+        both = ", ".join(f"`{name}`{gap}" for name, gap in shown)
+        lines.append(f"| {both} | {row['size']} | {row['answer']} | {', '.join(row['wrong'])} |")
     return "\n".join(lines) + "\n"
 
 

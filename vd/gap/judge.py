@@ -39,6 +39,9 @@ EXPLAINED = 1.1
 EXCESS_FLOORS = 0.15
 """... so that an alternative that leaves this much more, in noise floors, is worse: thousands of samples
 carry that difference."""
+FULLER_FLOORS = 0.04
+"""What a fuller form of a loss must leave less, in noise floors, not to be the simpler one: chance gives
+that much in one of two hundred recordings."""
 SMALL_EXCESS_FLOORS = 0.07
 """The same for one that leaves more on nearly every choice of motions. Of 130 hidden effects the right one
 was never worse than a wrong one by more than 0.02."""
@@ -81,17 +84,22 @@ class Judge:
         price = PENALTY * np.array([len(fit.x) for fit in fits], float)
         return error + (price if weights is None else price[:, None])
 
+    def best(self, fits: Sequence[JointFit]) -> JointFit:
+        """The fit with the best held-out score; with the best fitted one of those with white residuals.
+
+        Of these, samples tell more than the luck of a held-out motion.
+        """
+        at_floor = [fit for fit in fits if fit.rmse < EXPLAINED * self.floor]
+        found = at_floor or fits
+        return found[int(np.argmin(self.scores(found, fitted=bool(at_floor))))]
+
     def winner(self, fits: Sequence[JointFit]) -> JointFit:
         """The candidate with the best held-out score; the simpler one that it contains if that is as good.
 
         One with a parameter at its bound wins only if all have.
         """
         inside = [fit for fit in fits if not fit.at_bound] or list(fits)
-        best = inside[int(np.argmin(self.scores(inside)))]
-        at_floor = [fit for fit in inside if fit.rmse < EXPLAINED * self.floor]
-        if best in at_floor:
-            # Their residuals are white: samples tell more than the luck of a held-out motion.
-            best = at_floor[int(np.argmin(self.scores(at_floor, fitted=True)))]
+        best = self.best(inside)
         simpler = [f for f in inside if f.effects[-1] in NESTED.get(best.effects[-1], ())]
         loose = best.effects[-1] not in FORMS
         return next((fit for fit in simpler if self.tied(best, fit, loose)[0]), best)
@@ -104,11 +112,19 @@ class Judge:
     def better(self, before: JointFit, after: JointFit, tail: float = 0.025) -> tuple[bool, str]:
         """Whether the step from one model to the larger is earned, and if not why.
 
+        Motions that no fit has seen decide; but a larger model that leaves white residuals is judged on
+        all samples: that a parameter is not known well enough without one motion to predict it, as that of a
+        profile that cannot follow, says nothing against it. Nor does luck with such a motion speak for
+        a larger model if the smaller one leaves white residuals already.
+
         Args:
             before: The smaller model.
             after: The larger.
             tail: Share of the resamples that may see no gain.
         """
+        white = min(before.rmse, after.rmse) < EXPLAINED * self.floor and RANDOM not in before.effects
+        if white:
+            before, after = (replace(fit, held_out=fit.sse) for fit in (before, after))
         old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
         gain = 1.0 - after.held_out_rmse / before.held_out_rmse
         sampled = 1.0 - new / old
@@ -127,7 +143,7 @@ class Judge:
             return False, f"removes {100.0 * gain:.1f} % of the error, less than {100.0 * MIN_GAIN:.0f} %"
         if low <= 0.0:
             return False, "its gain over trajectories is not distinguishable from 0"
-        if closed < MIN_SHARE * self.whole:
+        if closed < MIN_SHARE * self.whole and not white:
             return False, "what it removes is small beside the whole gap"
         if closed < MIN_GAIN_FLOORS * self.floor:
             return False, "what it removes is below the noise floor"

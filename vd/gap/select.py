@@ -82,7 +82,7 @@ class Selection(CandidateFits, Verdicts):
                 continue
             self.restarts -= 1
             other, fits, rows = self.search(baseline, first[name])
-            if int(np.argmin(self.scores([present, other]))) == 1:
+            if self.best([present, other]) is other:
                 self.report(f"from {name}: {1e3 * other.held_out_rmse:.2f} mrad held out is better")
                 present, rivals = other, fits
                 trials += [replace(row, round=row.round + MAX_ROUNDS) for row in rows]
@@ -323,11 +323,24 @@ class Selection(CandidateFits, Verdicts):
         decision = "named" if accepted else "rejected"
         row = Trial(MAX_ROUNDS, RANDOM, best, gain, ci, decision, why or "its spread is what is measured")
         if accepted:
+            best = self.without_needless(present_base, best)
             self.report(
                 f"+ {RANDOM}: as likely as {1e3 * best.held_out_rmse:.2f} mrad of constant width, "
                 f"before {1e3 * present.held_out_rmse:.2f}"
             )
         return (best if accepted else present), [row]
+
+    def without_needless(self, base: JointFit, random: JointFit) -> JointFit:
+        """The model with random delays, less the effects that were named for what chance had done."""
+        for name in base.effects:
+            if name not in random.effects:
+                continue
+            fewer = self.refit(base, [e for e in base.effects if e in random.effects and e != name])
+            simpler = self.add_random(fewer)
+            if not self.better(simpler, random)[0]:
+                self.report(f"- {name}: not needed beside {RANDOM}")
+                random = simpler
+        return random
 
     def judge(
         self,

@@ -101,7 +101,7 @@ def calibrate(model: str, name: str) -> tuple[float, ...] | None:
     base = Hiding(model=model, base_spread=0.0)
     reach, plain = machine(base, np.random.default_rng(0))
     motions = excitation_set(reach)
-    variants = [plain, *_nudged(plain)]
+    variants = [plain, *nudged(plain)]
     for strength in STRENGTHS:
         hiding = replace(base, effects={name: effect_at(name, float(strength))})
         variants.append(machine(hiding, np.random.default_rng(0))[1])
@@ -118,7 +118,7 @@ def calibrate(model: str, name: str) -> tuple[float, ...] | None:
             joint = plain.joints.index(motion.joints[0])
             part = paths[i * len(variants) : (i + 1) * len(variants)]
             per_motion.append((joint, np.stack([path[:, joint] for path in part])))
-    nudges = len(_nudged(plain))
+    nudges = len(nudged(plain))
     answers = np.concatenate([path for _, path in per_motion], axis=1)
     owner = np.concatenate([np.full(path.shape[1], joint) for joint, path in per_motion])
     sensitivity = answers[1 : 1 + nudges] - answers[0]
@@ -153,7 +153,7 @@ def _inverse(gap: np.ndarray) -> tuple[float, ...] | None:
     return tuple(round(value, 5) for value in found)
 
 
-def _nudged(plant: Plant) -> list[Plant]:
+def nudged(plant: Plant) -> list[Plant]:
     """The plant with each base parameter that an identification fits raised a little."""
     names = ["kp", "kd", "velocity_limit"]
     if plant.body is None:

@@ -12,12 +12,12 @@ from vd.gap.judge import (
     AT_FLOOR,
     EXPLAINED,
     FORMS,
+    FULLER_FLOORS,
     MIN_SHARE,
     NESTED,
     RANDOM,
     RECOVERED,
     REPEATABLE,
-    SMALL_EXCESS_FLOORS,
     Judge,
 )
 
@@ -201,7 +201,7 @@ class Verdicts(Judge):
             fit.effects[-1]
             for fit in others
             if {name, fit.effects[-1]} <= FORMS
-            and mine.rmse**2 - fit.rmse**2 > (SMALL_EXCESS_FLOORS * self.floor) ** 2
+            and mine.rmse**2 - fit.rmse**2 > (FULLER_FLOORS * self.floor) ** 2
         }
         tied = [o for o in tied if o in fuller or not {name, *tied} & set(NESTED.get(o, ()))]
         if share < NAMED and not tied:
