@@ -300,6 +300,10 @@ def test_far_from_the_floor_the_search_begins_anew_where_first_effects_tied() ->
         names = {"torque_saturation": "named", "load_friction": "tied", "thermal_drift": "rejected"}
         fits = {name: first if name == first.effects[0] else made_up((name,), 0.08) for name in names}
         rows = [Trial(1, name, fits[name], 0.2, (0.1, 0.3), names[name]) for name in names]
+        pair = made_up(
+            ("load_friction", "gravity_load"), 0.05
+        )  # two that were taken together are no beginning
+        rows += [Trial(1, name, pair, 0.5, (0.4, 0.6), "named") for name in pair.effects]
         return made_up(("torque_saturation", "coulomb_friction"), 0.05), {}, rows
 
     class FoundError(Exception):

@@ -220,7 +220,12 @@ def _gains(axes, group: list[Candidate]) -> None:
             axes.text(left, place, f"   {note}", color=color, fontsize=7, va="center")
         else:
             axes.text(left, place, "  not fitted", color=color, fontsize=7, va="center")
-    names = [f"{plain(row.name)}{' (placebo)' if row.placebo else ''}" for row in reversed(group)]
+    given = _given(group)
+    names = []
+    for row in reversed(group):
+        along = [plain(name) for name in row.given if name not in given]
+        note = " (placebo)" if row.placebo else f"\nwith {listing(along)}" if along else ""
+        names.append(plain(row.name) + note)
     axes.set_yticks(range(len(group)), names, fontsize=8)
     axes.axvline(0.0, color=INK, linewidth=0.8)
     axes.set_xlim(left=left, right=104.0)
@@ -229,11 +234,16 @@ def _gains(axes, group: list[Candidate]) -> None:
     axes.tick_params(axis="x", labelsize=8)
 
 
+def _given(group: list[Candidate]) -> tuple[str, ...]:
+    """What was in the model before a round; two that were taken together are given each other besides."""
+    return min((row.given for row in group), key=len)
+
+
 def _round_title(group: list[Candidate]) -> str:
     """Which round it is, and what was in the model before it."""
-    row = min(group, key=lambda row: len(row.given))  # two that were taken together are given each other
-    beside = f"added to {listing([plain(name) for name in row.given])}" if row.given else "each alone"
-    return textwrap.fill(f"round {row.round}: {beside}", TITLE_LETTERS)
+    given = [plain(name) for name in _given(group)]
+    beside = f"added to {listing(given)}" if given else "each alone"
+    return textwrap.fill(f"round {group[0].round}: {beside}", TITLE_LETTERS)
 
 
 def chosen_overlays(report: Report, curves: Predictions) -> list[tuple[str, int]]:

@@ -404,12 +404,13 @@ class JointProblem:
     def placebo(self, before: JointFit, after: JointFit) -> float:
         """Share of the held-out RMSE that a control removes that must remove nothing.
 
-        The control is the change that the effect made to the prediction, reversed in time and handed
-        to the next trajectory, with a free factor that is fitted without the held-out fold.
+        The control is the change that the effect made to the prediction, less its mean (an offset is the
+        same at any time), reversed in time and handed to the next trajectory, with a free factor that is
+        fitted without the held-out fold.
         """
         old = self.split(self.residuals(before.rows[None])[0])
         new = self.split(self.residuals(after.rows[None])[0])
-        change = [a - b for a, b in zip(old, new, strict=True)]
+        change = [a - b - np.mean(a - b) for a, b in zip(old, new, strict=True)]
         shuffled = [np.resize(change[i - 1][::-1], len(part)) for i, part in enumerate(change)]
         left = 0.0
         for fold in np.unique(self.folds):

@@ -70,7 +70,8 @@ class Selection(CandidateFits, Verdicts):
         trials = self.contradicted(baseline)
         present, rivals, rows = self.search(baseline, baseline)
         trials += rows
-        first = {t.name: t.fit for t in rows if t.round == 1 and not t.placebo and np.isfinite(t.gain)}
+        alone = [t for t in rows if t.round == 1 and len(t.fit.effects) == 1]
+        first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
         tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
         for name in sorted(first, key=lambda n: first[n].rmse):
             if present.effects and present.held_out_rmse <= NO_GAP * self.floor:
