@@ -26,7 +26,7 @@ from vd.deploy.joints import Joints, uncalibrated
 from vd.deploy.motor import Motor
 from vd.deploy.newton_hand import NewtonHand
 from vd.deploy.plant import Drive, FirstOrderPlant, Plant
-from vd.deploy.safety import PERIOD_S, SafeHand, SafetyCfg, StoppedError
+from vd.deploy.safety import FINISHED, PERIOD_S, SafeHand, SafetyCfg, StoppedError
 from vd.deploy.twin import Faults, Twin
 from vd.files import write_json
 
@@ -51,10 +51,13 @@ class Witness:
 
     Args:
         plant: The plant.
+        motors: The motors on it.
     """
 
-    def __init__(self, plant: Plant):
-        self.plant = plant
+    def __init__(self, plant: Plant, motors: Sequence[Motor]):
+        self.plant, self._motors = plant, motors
+        self.own: dict[int, float] = {}
+        """When a motor stopped by its own watchdog [s], by its place."""
         self.times: list[float] = []
         """When it went on [s], by the monotonic clock."""
         self.pushes: list[np.ndarray] = []
@@ -67,15 +70,29 @@ class Witness:
         goals = np.array([np.nan if drive.goal_rad is None else drive.goal_rad for drive in drives])
         self.times.append(time.monotonic())
         self.pushes.append(np.nan_to_num(np.abs(goals - where)))
+        for axis, motor in enumerate(self._motors):
+            if motor.get("bus_watchdog") == -1:
+                self.own.setdefault(axis, self.times[-1])
 
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What the plant reads."""
         return self.plant.read()
 
+    def left(self) -> list[int]:
+        """Places of the motors that have torque."""
+        return [axis for axis, motor in enumerate(self._motors) if motor.get("torque_enable")]
+
+    def pushing(self) -> list[int]:
+        """Places of the motors that push."""
+        return [int(axis) for axis in np.flatnonzero(self.pushes[-1] > SAFE_RAD)]
+
     def safe_after(self, since: float) -> float:
-        """Time from ``since`` until no motor pushed any more, for good [s]; infinite if one still does."""
-        times = np.array(self.times)
-        pushing = (np.array(self.pushes) > SAFE_RAD).any(axis=1)
+        """Time from ``since`` until no motor that has been told pushed any more, for good [s].
+
+        One that has torque now was not told; infinite if another still pushes.
+        """
+        times, told = np.array(self.times), np.setdiff1d(np.arange(len(self._motors)), self.left())
+        pushing = (np.array(self.pushes)[:, told] > SAFE_RAD).any(axis=1)
         last = np.flatnonzero(pushing & (times >= since))
         if not len(last):
             return 0.0
@@ -183,7 +200,9 @@ class Outcome:
     detected_s: float | None = None
     """From the fault to its detection [s]; None if it was not to stop the hand."""
     safe_s: float | None = None
-    """From its detection until no motor pushed any more [s]."""
+    """From its detection until the hand was told to hold, and no motor that heard it pushed any more [s]."""
+    own_s: float | None = None
+    """From the fault until the last motor that could not be told had stopped by its own watchdog [s]."""
     energised: tuple[int, ...] = ()
     """Motors with torque at the end."""
     pushing: tuple[int, ...] = ()
@@ -196,8 +215,8 @@ class Outcome:
 def scene_of(hand: HandModel, joints: Joints, *, blockable: bool = False) -> Iterator[tuple[Scene, Witness]]:
     """A twin that serves, and a configured bus to it."""
     plant: Plant = FirstOrderPlant(len(joints.ids)) if blockable else NewtonHand(hand, joints)
-    witness = Witness(plant)
     motors = [Motor(MODELS[MOTOR], id) for id in joints.ids]
+    witness = Witness(plant, motors)
     with Twin(motors, witness, Faults(seed=1)) as twin, MotorBus(twin.path, joints.ids, MOTOR) as bus:
         bus.retries = SETUP_RETRIES
         bus.configure(joints.settings(hand, MOTOR))
@@ -216,23 +235,49 @@ def try_fault(fault: Fault, hand: HandModel, joints: Joints) -> Outcome:
         time.sleep(REST_S)
         report = safe.report
         assert report is not None
-        on = tuple(motor.id for motor in scene.twin.motors if motor.get("torque_enable"))
-        push = witness.pushes[-1]
-        pushing = tuple(id for id, by in zip(joints.ids, push, strict=True) if by > SAFE_RAD)
         if not fault.stops:
-            happened = f"went on; {safe.repeated} readings repeated"
-            right = report.reason == "finished" and not on
-            return Outcome(
-                fault.name, happened if right else report.reason, energised=on, pushing=pushing, right=right
-            )
-        safe_s = witness.safe_after(report.detected_s)
-        # A motor that does not hear stops by its own watchdog, later than one that is told.
-        limit = PERIOD_S if len(report.unreleased) == 0 else PERIOD_S + fault.cfg.watchdog_s
-        right = report.reason != "finished" and not pushing and safe_s <= limit
-        found_s = report.detected_s - scene.injected_s
+            right = report.reason == FINISHED
+            happened = f"went on; {safe.repeated} readings repeated" if right else report.reason
+            return _outcome(fault.name, happened, witness, joints, right=right)
+        told_s = PERIOD_S if report.held_s is None else report.held_s - report.detected_s
+        safe_s = max(told_s, witness.safe_after(report.detected_s))
         left = f"; {len(report.unreleased)} motors may still be on" if report.unreleased else ""
-        happened = report.reason + left
-        return Outcome(fault.name, happened, found_s, safe_s, on, pushing, right)
+        return _outcome(
+            fault.name,
+            report.reason + left,
+            witness,
+            joints,
+            right=report.reason != FINISHED and safe_s <= PERIOD_S,
+            since_s=scene.injected_s,
+            detected_s=report.detected_s - scene.injected_s,
+            safe_s=None if report.held_s is None else safe_s,
+        )
+
+
+def _outcome(
+    name: str,
+    happened: str,
+    witness: Witness,
+    joints: Joints,
+    *,
+    right: bool,
+    since_s: float = 0.0,
+    detected_s: float | None = None,
+    safe_s: float | None = None,
+) -> Outcome:
+    """How it ended: a motor with torque at the end is right only where it has stopped by itself."""
+    left, pushing = witness.left(), witness.pushing()
+    own_s = max((witness.own.get(axis, float("inf")) - since_s for axis in left), default=None)
+    return Outcome(
+        fault=name,
+        happened=happened,
+        detected_s=detected_s,
+        safe_s=safe_s,
+        own_s=own_s,
+        energised=tuple(joints.ids[axis] for axis in left),
+        pushing=tuple(joints.ids[axis] for axis in pushing),
+        right=right and not pushing and (own_s is None or own_s < float("inf")),
+    )
 
 
 def _move(scene: Scene, safe: SafeHand, fault: Fault) -> None:
@@ -301,14 +346,13 @@ BEFORE: dict[str, Callable[[Twin], None]] = {
 
 def try_preflight(name: str, hand: HandModel, joints: Joints) -> Outcome:
     """Spoil something before the start; nothing may move."""
-    with scene_of(hand, joints, blockable=True) as (scene, _):
+    with scene_of(hand, joints, blockable=True) as (scene, witness):
         scene.bus.release()
         BEFORE[name](scene.twin)
         time.sleep(0.1)
         wrong = [finding for finding in preflight(Connection(hand, joints, scene.bus)) if not finding.ok]
-        on = tuple(motor.id for motor in scene.twin.motors if motor.get("torque_enable"))
         happened = f"nothing moves: {wrong[0].what}: {wrong[0].found}" if wrong else "was not found"
-        return Outcome(name, happened, energised=on, right=bool(wrong) and not on)
+        return _outcome(name, happened, witness, joints, right=bool(wrong) and not witness.left())
 
 
 def try_process(name: str, number: signal.Signals, hand: HandModel, joints: Joints) -> Outcome:
@@ -327,16 +371,13 @@ def try_process(name: str, number: signal.Signals, hand: HandModel, joints: Join
         process.send_signal(number)
         _, words = process.communicate()
         time.sleep(REST_S)
-        on = tuple(motor.id for motor in scene.twin.motors if motor.get("torque_enable"))
-        pushing = tuple(id for id, by in zip(joints.ids, witness.pushes[-1], strict=True) if by > SAFE_RAD)
-        stopped = {motor.get("bus_watchdog") for motor in scene.twin.motors} == {-1}
         said = [line for line in words.splitlines() if line.startswith("stopped")]
         if number == signal.SIGKILL:
-            happened, right = "the motors stop by themselves and hold", stopped
+            happened, right = "the motors stop by themselves and hold", True
         else:
-            happened, right = (said or ["said nothing"])[-1], bool(said) and not on
+            happened, right = (said or ["said nothing"])[-1], bool(said) and not witness.left()
         safe_s = witness.safe_after(sent)
-        return Outcome(name, happened, None, safe_s, on, pushing, right and not pushing)
+        return _outcome(name, happened, witness, joints, right=right, since_s=sent, safe_s=safe_s)
 
 
 START_S = 60.0
@@ -352,15 +393,18 @@ PROCESS = {
 def table(outcomes: Sequence[Outcome]) -> str:
     """The table as Markdown."""
     lines = [
-        "| fault | what happened | found after | safe after that | with torque at the end, pushing |",
-        "|---|---|---|---|---|",
+        "| fault | what happened | found after | safe after that | others by themselves | on, pushing |",
+        "|---|---|---|---|---|---|",
     ]
+
+    def ms(seconds: float | None) -> str:
+        return "-" if seconds is None else f"{1e3 * seconds:.0f} ms"
+
     for one in outcomes:
-        found = "-" if one.detected_s is None else f"{1e3 * one.detected_s:.0f} ms"
-        safe = "-" if one.safe_s is None else f"{1e3 * one.safe_s:.0f} ms"
-        on = f"{len(one.energised)}, {len(one.pushing)}"
         mark = "" if one.right else " **(wrong)**"
-        lines.append(f"| {one.fault} | {one.happened}{mark} | {found} | {safe} | {on} |")
+        times = " | ".join(map(ms, (one.detected_s, one.safe_s, one.own_s)))
+        left = f"{len(one.energised)}, {len(one.pushing)}"
+        lines.append(f"| {one.fault} | {one.happened}{mark} | {times} | {left} |")
     return "\n".join(lines)
 
 

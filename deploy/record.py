@@ -5,7 +5,8 @@ import itertools
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -237,6 +238,8 @@ class Recorder:
 
 def record(cfg: RecordCfg) -> int:
     """Record what is not recorded yet."""
+    from vd.gap.recording import write_recording
+
     if not cfg.rate_hz > 0.0:
         raise ValueError(f"--rate-hz is {cfg.rate_hz}; it has to be above 0")
     with connect(replace(cfg, twin_args=f"{TWIN_ARGS} {cfg.twin_args}")) as connection:
@@ -249,10 +252,21 @@ def record(cfg: RecordCfg) -> int:
         done = {trajectory.file for trajectory in recording.trajectories}
         left = [motion for motion in motions if motion.file not in done]
         print(f"{len(motions)} motions, {len(motions) - len(left)} of them recorded", file=sys.stderr)
-        left.sort(key=lambda motion: motion.payload)
-        for payload, group in itertools.groupby(left, key=lambda motion: motion.payload):
-            for trajectory in _session(cfg, connection, joints, list(group), *payload):
-                recording = _add(recording, trajectory, cfg.out)
+        written: list[Future[Path]] = []
+        # Beside the loop: a hand that holds has to be told so all the time.
+        with ThreadPoolExecutor(1) as writer:
+
+            def keep(trajectory: "Trajectory") -> None:
+                nonlocal recording
+                recording = replace(recording, trajectories=(*recording.trajectories, trajectory))
+                only = (trajectory.file,)
+                written.append(writer.submit(write_recording, recording, cfg.out, only=only))
+
+            left.sort(key=lambda motion: motion.payload)
+            for payload, group in itertools.groupby(left, key=lambda motion: motion.payload):
+                _session(cfg, connection, joints, list(group), *payload, keep)
+        for one in written:
+            one.result()
     if cfg.json:
         files = [trajectory.file for trajectory in recording.trajectories]
         print(json.dumps({"recording": str(cfg.out), "trajectories": files}, indent=1))
@@ -268,7 +282,8 @@ def _session(
     motions: Sequence[Motion],
     payload_kg: float,
     finger: str,
-) -> Iterator["Trajectory"]:
+    keep: Callable[["Trajectory"], None],
+) -> None:
     """Motions with one payload, between preflight and torque off."""
     seconds = sum(motion.excitation.duration for motion in motions)
     question = f"The hand will move for about {seconds:.0f} s, one joint at a time and quickly."
@@ -285,7 +300,7 @@ def _session(
             rate = (len(trajectory.time) - 1) / trajectory.time[-1]
             what = f"{number}/{len(motions)} {Path(motion.file).stem}"
             print(f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz", file=sys.stderr, flush=True)
-            yield trajectory
+            keep(trajectory)
 
 
 def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":
@@ -305,12 +320,3 @@ def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "
         raise RecordError(f"a recording names its hand, and {hand.name} is none of {', '.join(HANDS)}")
     servo = {"model": connection.bus.model.name, "p_gain": P_GAIN, "d_gain": D_GAIN}
     return Recording(cfg.out, hand.name, joints, servo, RAD_PER_COUNT, ())
-
-
-def _add(recording: "Recording", trajectory: "Trajectory", folder: Path) -> "Recording":
-    """Write one motion more, so that nothing that was recorded is lost."""
-    from vd.gap.recording import write_recording
-
-    longer = replace(recording, trajectories=(*recording.trajectories, trajectory))
-    write_recording(longer, folder, only=(trajectory.file,))
-    return longer
