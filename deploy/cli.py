@@ -28,6 +28,9 @@ COMMANDS = {
     ),
     "record": Entry("vd.deploy.record", "RecordCfg", "record", "record motions for vd-gap"),
     "home": Entry("vd.deploy.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"),
+    "shadow": Entry(
+        "vd.deploy.shadow", "ShadowCfg", "shadow", "compare what the policy saw with what the simulator shows"
+    ),
 }
 """The commands by name."""
 

@@ -16,6 +16,7 @@ from vd.files import write_json
 from vd.gap.recording import FORMAT as RECORDING_FORMAT
 from vd.hand_log import (
     EVENTS_FILE,
+    IMAGES,
     JOINT_CHANNELS,
     LOG_FORMAT,
     RECORDING_FILE,
@@ -110,6 +111,11 @@ class LogWriter:
             *truth,
         ]
         self._append(self._steps, ",".join(f"{value:.{DIGITS}f}" for value in row))
+
+    def image(self, step: int, depth_m: np.ndarray) -> None:
+        """Keep the depth image of a step [m] [H, W]."""
+        (self.folder / IMAGES).mkdir(exist_ok=True)
+        np.save(self.folder / IMAGES / f"{step:06d}.npy", depth_m)
 
     def event(self, event: str, **values: Any) -> None:
         """Append an event of this moment."""

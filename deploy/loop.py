@@ -86,6 +86,8 @@ class LoopCfg:
     """Time for each goal [s]."""
     hold_s: float = 1.0
     """How long the hand holds still after each stop [s], before it goes on."""
+    images: bool = False
+    """Keep the depth images in the log."""
     fall_m: float = PAPER.success.fall_m
     """Distance from the place of the goal at which the object counts as lost [m], where its pose is known."""
 
@@ -232,6 +234,8 @@ class ControlLoop:
         end = time.monotonic() - due
         missed = self._clock.end()
         self._safe.beat(missed=missed)
+        if depth is not None and self._cfg.images:
+            self._log.image(len(self.times), depth)
         times = StepTimes(late, state.time_s - due, end, time.process_time() - busy)
         moment = Moment(number, goal, acting, state, known, smoothed, action, sent, distance)
         self._note(moment, times)

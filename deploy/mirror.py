@@ -23,13 +23,13 @@ class Mirror:
             raise ValueError("a mirror is one world that is not randomised")
         self.env = ReorientEnv(task, "cpu")
         self._goal: np.ndarray | None = None
+        self._yes = wp.ones(1, dtype=wp.int32, device="cpu")
 
-    def take(self, sensed: Sensed, *, started: bool = False) -> None:
+    def take(self, sensed: Sensed) -> None:
         """Take a state.
 
         Args:
             sensed: The state, with that of the object.
-            started: Whether the pursuit of this goal has just begun.
 
         Raises:
             ValueError: The object's state is not known.
@@ -38,9 +38,6 @@ class Mirror:
         if pose is None or velocity is None:
             raise ValueError("the state of the object is not known: only a twin tells it")
         env = self.env
-        if self._goal is None or not np.array_equal(self._goal, sensed.goal_quat):
-            self._goal = sensed.goal_quat.copy()
-            env.reset(object_quat=pose[None, 3:], goal_quat=self._goal[None])
         for arrays, values in (
             ((env.sim.joint_q, env.measured_q), np.concatenate([sensed.joint_q, pose])),
             ((env.sim.joint_qd, env.measured_qd), np.concatenate([sensed.joint_qd, velocity])),
@@ -50,7 +47,11 @@ class Mirror:
                 whole = array.numpy()
                 whole[0, : len(values)] = values[: whole.shape[1]]
                 array.assign(whole)
-        env.step_count.fill_(int(not started))
+        if self._goal is None or not np.array_equal(self._goal, sensed.goal_quat):
+            self._goal = sensed.goal_quat.copy()
+            env.goal_quat.assign(self._goal[None].astype(np.float32))
+            if env.views is not None:
+                env.views.choose(self._yes, self._yes)
         env.sim.forward_kinematics()
         env.observe()
 

@@ -69,6 +69,8 @@ class RunCfg(HandOptions):
     """Limits."""
     log: Path | None = None
     """Folder of the log; runs/deploy/ and the time by default."""
+    images: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Keep the depth images in the log, 3 MB a second: vd-deploy shadow compares them."""
     seed: int = 0
     """Of drawn goals and of the choice of points."""
     realtime: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -176,7 +178,7 @@ def _fly(
                     ActionFilter(hand, flight.task),
                     clock,
                     log,
-                    LoopCfg(cfg.goal_s, cfg.hold_s),
+                    LoopCfg(cfg.goal_s, cfg.hold_s, cfg.images),
                     camera=camera,
                     truth=link,
                     symmetry=item.symmetry,

@@ -71,7 +71,7 @@ def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered):
         if rendered:
             sensed = replace(sensed, depth=view.camera.depth.numpy()[0].copy())
         points = sight.points(sensed)
-        expected = _points(view, seen)
+        expected = view.points(seen)
         known = torch.isfinite(expected).all(dim=-1)
         assert torch.equal(known, torch.isfinite(points).all(dim=-1))
         assert (points[known] - expected[known]).abs().max() < POINT_M
@@ -87,25 +87,13 @@ def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered):
         if keys(ours[0]) == keys(theirs[0]):
             np.testing.assert_allclose(one.mean, other.mean, atol=2e-2)
         action = rng.uniform(-1.0, 1.0, env.num_actions).astype(np.float32)
-        actions._smoothed.assign(sensed.smoothed[None])
+        actions.put(sensed.smoothed)
         target = actions.goal(action, sensed.joint_q)
         env.step(wp.array(action[None], dtype=float, device="cpu"))
         np.testing.assert_allclose(target, env.sim.target.numpy()[0, : env.num_actions], atol=1e-6)
         steps += 1
     assert steps == env.max_episode_steps
     assert apart <= 2 * borders, f"{apart} voxels differ, {borders} points lie on borders"
-
-
-def _points(view: StudentView, seen: dict[str, torch.Tensor]) -> torch.Tensor:
-    """The simulator's cloud of a frame [1, P, 3]."""
-    taken = []
-    voxelise = view._voxelise
-    view._voxelise = lambda points, **_: taken.append(points)
-    try:
-        view.sites(seen, augment=False)
-    finally:
-        view._voxelise = voxelise
-    return taken[0]
 
 
 @pytest.mark.slow

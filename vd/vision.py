@@ -177,18 +177,12 @@ class StudentView:
             frame["points"] = points.masked_fill_(unseen[:, None, None], torch.nan)
         return frame
 
-    def sites(
-        self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None, *, augment: bool
-    ) -> tuple[Sites, ...]:
-        """Voxels of frames.
+    def points(self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None) -> torch.Tensor:
+        """Clouds of frames: goal, hand, and the object or what the camera sees [R, P, 3]; base frame [m].
 
         Args:
             frame: ``body_q`` [R, B, 7], ``goal_quat`` [R, 4] and, with a camera, ``points`` [R, K, 3].
             worlds: World of each row [R]; row i is of world i by default.
-            augment: Add noise, as in training.
-
-        Returns:
-            Arguments of :meth:`vd.student.network.Student.encode`.
         """
         rows, columns = frame["body_q"].shape[0], self._clouds.item
         seen = frame["points"].shape[1] if self.camera is not None else columns.stop - columns.start
@@ -202,6 +196,22 @@ class StudentView:
         )
         if self.camera is not None:
             points[:, columns.start :] = frame["points"]
+        return points
+
+    def sites(
+        self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None, *, augment: bool
+    ) -> tuple[Sites, ...]:
+        """Voxels of frames; arguments as of :meth:`points`.
+
+        Args:
+            frame: The frames.
+            worlds: World of each row.
+            augment: Add noise, as in training.
+
+        Returns:
+            Arguments of :meth:`vd.student.network.Student.encode`.
+        """
+        points = self.points(frame, worlds)
         return voxels(points, self._clouds.ends, self._voxelise, network=self._network, augment=augment)
 
     def state_dict(self) -> dict[str, Any]:

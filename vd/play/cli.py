@@ -1,4 +1,7 @@
-"""Command line of the viewer: ``vd-play POLICY``, in the browser or, with ``--video``, to a file."""
+"""Command line of the viewer: ``vd-play POLICY``, in the browser or, with ``--video``, to a file.
+
+``vd-play LOG`` replays a run on a hand.
+"""
 
 import math
 import sys
@@ -12,9 +15,11 @@ import tyro
 
 from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, start_at_rest
 from vd.evaluate.cli import POLICY_HELP
+from vd.hand_log import is_log
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
+    from vd.play.replay import ReplaySession
     from vd.play.session import Session
 
 # Size of a cell's picture in a video [pixel]: alone, and in a grid.
@@ -30,7 +35,8 @@ FAST_WORLDS_CPU = 16
 class PlayCfg:
     """Watch a policy: in the browser, or as a video made without a display or GPU.
 
-    Without arguments it shows the installed policy that turns a cube.
+    The folder of a log that vd-deploy wrote in place of the policy replays that run, all of it, whatever the
+    other settings of the simulation. Without arguments it shows the installed policy that turns a cube.
     """
 
     policy: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = None
@@ -102,6 +108,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cfg = tyro.cli(PlayCfg, args=arguments, prog="vd-play")
     try:
         cfg.validate()
+        if is_log(cfg.agent_name):
+            return replay(cfg)
         print(f"vd-play: {cfg.agent_name}; building the worlds (the first start compiles kernels: minutes)")
         if cfg.video is not None:
             frames = record_video(cfg, cfg.video)
@@ -113,6 +121,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         print()
+    return 0
+
+
+def replay(cfg: PlayCfg) -> int:
+    """Show the log of a run; returns the exit status.
+
+    Raises:
+        LogError: The log cannot be used.
+    """
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    from vd.hand_log import read_log
+    from vd.play.replay import Replay, ReplaySession
+
+    shown = Replay(read_log(cfg.agent_name))
+    if cfg.video is None:
+        _serve(ReplaySession(shown), cfg)
+        return 0
+    from vd.play.video import write_frames
+    from vd.render import Renderer
+
+    width, height = SINGLE_CELL
+    renderer = Renderer(
+        shown.hand,
+        [shown.item],
+        width=width,
+        height=height,
+        goal_size=round(GOAL_SHARE * height),
+        samples=cfg.samples,
+    )
+    frames = write_frames(cfg.video, shown.frames(renderer), shown.control_hz)
+    print(f"{cfg.video} ({frames} frames)")
     return 0
 
 
@@ -156,9 +197,13 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
 
 def serve(cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C."""
+    _serve(open_session(cfg), cfg)
+
+
+def _serve(session: "Session | ReplaySession", cfg: PlayCfg) -> None:
     from vd.play.viewer import PlayViewer
 
-    viewer = PlayViewer(open_session(cfg), host=cfg.host, port=cfg.port)
+    viewer = PlayViewer(session, host=cfg.host, port=cfg.port)
     print(f"open {viewer.url} in a browser; Ctrl-C ends it")
     try:
         viewer.run()

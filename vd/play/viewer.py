@@ -17,6 +17,7 @@ import warp as wp
 from newton.viewer import ViewerViser
 
 from vd.paper import PAPER
+from vd.play.replay import ReplaySession
 from vd.play.session import Session
 from vd.play.video import Snapshot
 from vd.render import Camera, PictureModel
@@ -44,7 +45,7 @@ class PlayViewer:
 
     def __init__(
         self,
-        session: Session,
+        session: Session | ReplaySession,
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
