@@ -1,8 +1,8 @@
 """Compare what a policy saw on a hand with what the simulator shows in the same state, step by step.
 
 Every step of a log is put into a simulated world. Its observation, by the code of the training, is compared
-with the one that the loop makes of the same joints: points, voxels, senses and joint goals, and where a twin's
-images were kept (--images) the depth image too. With --follow it runs beside the loop.
+with the one that the loop makes of the same joints: points, voxels, senses and joint goals, and where images
+of a twin were kept (--images) the depth image too. With --follow it runs beside the loop.
 """
 
 import json
