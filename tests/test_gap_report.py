@@ -353,6 +353,16 @@ def test_a_report_with_hardly_anything_has_a_page(report, tmp_path):
     assert "Nowhere by more than noise" in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.parametrize(("model", "told"), [("servo", True), ("pendulum", False), ("dclaw3", False)])
+def test_torques_of_a_bare_servo_are_said_to_be_relative(report, tmp_path, model, told):
+    write_report(
+        dataclasses.replace(report, recording=dataclasses.replace(report.recording, model=model)),
+        None,
+        tmp_path,
+    )
+    assert ("Torques are relative" in (tmp_path / "report.html").read_text()) == told
+
+
 def test_every_candidate_leaves_a_mark_however_bad_it_is(report):
     unknown = math.nan
     alone = Candidate((JOINTS[0],), 1, "backlash", 2e-3, 0.5, (0.4, 0.6), "named", "best")

@@ -320,10 +320,15 @@ def _parameters(page: Page, report: Report) -> None:
             page.table(["joint", *units], [(j, *row) for j, row in zip(after, cells, strict=True)])
         page.text(
             "The plain servo model, before → after the effects joined the fit. Without the missing effect "
-            "these "
-            "numbers are bent to make up for it.",
+            "these numbers are bent to make up for it.",
             small=True,
         )
+        if report.recording.model == "servo":
+            page.text(
+                "Torques are relative: commands and positions of a bare servo do not show how large they "
+                "are. kp is held at a nominal value, and all that is in N m or kg m² would double with it.",
+                small=True,
+            )
     if report.closing is not None:
         page.text(
             f"All of this is in {report.closing.layer}, USD in plain text. "
