@@ -95,8 +95,8 @@ def test_a_small_excess_tells_apart_only_if_most_motions_show_it(judge: Verdicts
     everywhere = np.full(10, np.sqrt(1.01) * FLOOR)
     assert not judge.tied(winner, made_up(("dead_zone",), everywhere))[0]
     assert judge.tied(winner, made_up(("dead_zone",), everywhere), loose=True)[0]
-    somewhere = np.full(10, np.sqrt(0.996) * FLOOR)
-    somewhere[:2] = np.sqrt(1.07) * FLOOR  # the same in all, but most motions say the opposite
+    somewhere = np.full(10, np.sqrt(0.998) * FLOOR)
+    somewhere[:2] = np.sqrt(1.03) * FLOOR  # half as much in all, but most motions say the opposite
     assert judge.tied(winner, made_up(("dead_zone",), somewhere))[0]
     slightly = made_up(("dead_zone",), np.sqrt(1.002) * FLOOR)
     assert judge.tied(winner, slightly)[0], "what models leave"

@@ -36,15 +36,17 @@ TIE_TAIL = 0.05
 what a name may lose."""
 EXPLAINED = 1.1
 """A winner within this factor of the noise floor leaves white residuals ..."""
-EXCESS_FLOORS = 0.15
+EXCESS_FLOORS = 0.08
 """... so that an alternative that leaves this much more, in noise floors, is worse: thousands of samples
-carry that difference."""
+carry that difference. Of 300 hidden effects the right one was never worse than a wrong one, other than a form
+that contains it, by more than 0.03."""
+SMALL_EXCESS_FLOORS = 0.05
+"""The same for one that leaves more on nearly every choice of motions."""
+CONTAINED_FLOORS = 0.15
+"""The same for one that the winner contains: with more parameters it imitates what the integrator misses."""
 FULLER_FLOORS = 0.04
 """What a fuller form of a loss must leave less, in noise floors, not to be the simpler one: chance gives
 that much in one of two hundred recordings."""
-SMALL_EXCESS_FLOORS = 0.07
-"""The same for one that leaves more on nearly every choice of motions. Of 130 hidden effects the right one
-was never worse than a wrong one by more than 0.02."""
 RECOVERED = 0.5
 """Share of the squared gap that the named effects must recover; less is an unknown cause."""
 REPEATABLE = 2.0
@@ -170,7 +172,7 @@ class Judge:
                 more = max(len(other.x) - len(winner.x), 0)
                 excess += 2.0 * PENALTY * more * (winner.rmse / self.floor) ** 2
             if loose or excess < SMALL_EXCESS_FLOORS**2 or excess >= EXCESS_FLOORS**2:
-                return excess < (EXCESS_FLOORS if loose else SMALL_EXCESS_FLOORS) ** 2, (low, high)
+                return excess < (CONTAINED_FLOORS if loose else SMALL_EXCESS_FLOORS) ** 2, (low, high)
             return float(np.quantile(self.weights @ (other.sse - winner.sse), TIE_TAIL)) <= 0.0, (low, high)
         return float(np.quantile(error - best, TIE_TAIL)) <= 0.0, (low, high)
 
