@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.assets_usd.hand_model import HandModel
+from vd.assets_usd.hand_data import HandModel
 from vd.deploy.bus import MotorSettings
 from vd.deploy.control_table import MODELS, RAD_S_PER_COUNT, to_angle
 from vd.deploy.packets import MAX_ID
