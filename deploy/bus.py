@@ -344,7 +344,7 @@ class MotorBus:
         with self._line():
             result = self._packets.syncWriteTxOnly(self._port, item.address, item.size, rows, len(rows))
         if result != self._sdk.COMM_SUCCESS:
-            raise BusError(f"{name} was not sent: {self._packets.getTxRxResult(result)}")
+            raise BusError(f"{name} was not sent: {self._words(result)}")
 
     def read_state(self) -> BusState:
         """Read all motors at once.
@@ -368,7 +368,7 @@ class MotorBus:
                 self._port, STATE_ADDRESS, STATE_BYTES, ids, len(ids), fast_option=False
             )
             if result != self._sdk.COMM_SUCCESS:
-                raise BusError(f"states were not asked for: {self._packets.getTxRxResult(result)}")
+                raise BusError(f"states were not asked for: {self._words(result)}")
             # One time for all: the SDK counts no time for the answers' bytes.
             answers = [self._answer(id) for id in ids]
             now = time.monotonic()
@@ -379,7 +379,7 @@ class MotorBus:
         while True:
             frame, result = self._packets.rxPacket(self._port, False)
             if result != self._sdk.COMM_SUCCESS:
-                raise BusError(f"motor {id}: no state: {self._packets.getTxRxResult(result)}")
+                raise BusError(f"motor {id}: no state: {self._words(result)}")
             body = _status_body(bytes(frame))
             if body is None:
                 raise BusError(f"motor {id}: what answered is no status packet")
@@ -433,9 +433,13 @@ class MotorBus:
             if moved > SPEED_MARGIN * fastest * elapsed + JUMP_RAD:
                 raise BusError(f"motor {id}: moved {moved:.2f} rad in {elapsed:.3f} s, which it cannot")
 
+    def _words(self, result: int) -> str:
+        """What went wrong in an exchange, in the SDK's words."""
+        return str(self._packets.getTxRxResult(result)).removeprefix("[TxRxResult] ").rstrip("!.")
+
     def _check(self, id: int, what: str, result: int, error: int) -> None:
         if result != self._sdk.COMM_SUCCESS:
-            raise BusError(f"motor {id}: {what}: {self._packets.getTxRxResult(result)}")
+            raise BusError(f"motor {id}: {what}: {self._words(result)}")
         if error & ~ALERT:
             raise BusError(f"motor {id}: {what}: {_failure(error)}")
 

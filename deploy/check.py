@@ -28,6 +28,8 @@ OUTSIDE_RAD = 0.1
 """How far a joint may hang out of its range and still be brought back slowly."""
 PLAIN = {"drive_mode": 0, "homing_offset": 0, "protocol_type": 2, "status_return_level": 2}
 """Items that have to be as from the factory: turned drives and offsets belong in the calibration."""
+NAMED = 3
+"""Motors that a finding names; where more are wrong they have a cause in common."""
 RANGE_SHARE = 0.8
 """Share of a joint's range that --range moves it through."""
 RANGE_SPEED_RAD_S = 0.7
@@ -92,7 +94,8 @@ def preflight(connection: Connection) -> Iterator[Finding]:
 
 
 def _finding(what: str, wrong: list[str], right: str) -> Finding:
-    return Finding(what, not wrong, "; ".join(wrong) or right)
+    more = f"; and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
+    return Finding(what, not wrong, "; ".join(wrong[:NAMED]) + more or right)
 
 
 def _not_plain(connection: Connection) -> list[str]:
