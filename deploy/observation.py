@@ -124,7 +124,14 @@ class StudentSight:
 
     def sites(self, points: torch.Tensor) -> tuple[Sites, ...]:
         """Voxels of a cloud, as :meth:`vd.student.network.Student.encode` takes them."""
-        return voxels(points, self.ends, self._voxelise, network=self._network, augment=False)
+        return voxels(
+            points,
+            self.ends,
+            self._voxelise,
+            network=self._network,
+            augment=False,
+            complete=self._camera is None,
+        )
 
 
 def frame(sensed: Sensed) -> dict[str, torch.Tensor]:

@@ -49,6 +49,7 @@ def voxels(
     *,
     network: StudentCfg,
     augment: bool,
+    complete: bool = False,
 ) -> tuple[Sites, ...]:
     """Voxels of clouds as the student takes them: of all points, or of scene and goal apart.
 
@@ -58,6 +59,7 @@ def voxels(
         voxelise: Makes the voxels.
         network: Whether the goal is a cloud of its own, and whether voxels are marked.
         augment: Add noise, as in training.
+        complete: The other points are of the object alone, not a camera's.
 
     Returns:
         Arguments of :meth:`vd.student.network.Student.encode`.
@@ -65,13 +67,14 @@ def voxels(
     goal, hand = ends
     marked = "marks" in network.encoder.inputs
     if network.goal == "merged":
-        return (voxelise(points, augment=augment, ends=(goal, hand) if marked else ()),)
-    scene, own = points[:, goal:].contiguous(), points[:, :goal].contiguous()
+        scene = voxelise(points, augment=augment, ends=(goal, hand) if marked else ())
+        scene.complete = complete
+        return (scene,)
+    rest, own = points[:, goal:].contiguous(), points[:, :goal].contiguous()
     # Marks are of goal and hand in both: the one has no goal, the other no hand.
-    return (
-        voxelise(scene, augment=augment, ends=(0, hand - goal) if marked else ()),
-        voxelise(own, augment=augment, ends=(goal, goal) if marked else ()),
-    )
+    scene = voxelise(rest, augment=augment, ends=(0, hand - goal) if marked else ())
+    scene.complete = complete
+    return scene, voxelise(own, augment=augment, ends=(goal, goal) if marked else ())
 
 
 class StudentView:
@@ -212,7 +215,14 @@ class StudentView:
             Arguments of :meth:`vd.student.network.Student.encode`.
         """
         points = self.points(frame, worlds)
-        return voxels(points, self._clouds.ends, self._voxelise, network=self._network, augment=augment)
+        return voxels(
+            points,
+            self._clouds.ends,
+            self._voxelise,
+            network=self._network,
+            augment=augment,
+            complete=self.camera is None,
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Random states and what the camera remembers, as NumPy arrays."""

@@ -119,6 +119,7 @@ class RandomScenes:
             self._voxelise,
             network=self._network,
             augment=self._augment,
+            complete=True,
         )
         targets = {
             "category": worlds // self._scales,

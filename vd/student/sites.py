@@ -29,9 +29,11 @@ class Sites:
         clouds: B.
         level: l.
         marks: What the cells hold, columns of 0 and 1, shape [M, C], where that was asked for.
+        complete: Whether all that bears no mark is of the object; a camera sees the hand too.
     """
 
     marks: torch.Tensor | None = None
+    complete: bool = False
 
     def __init__(self, keys: wp.array, clouds: int, level: int = 0, *, sizes: Sequence[int] = ()):
         """Take the cells.
@@ -50,7 +52,7 @@ class Sites:
     def fresh(self) -> "Sites":
         """The same cells without maps, as they come from the voxeliser."""
         same = Sites(self.keys, self.clouds, self.level)
-        same.marks = self.marks
+        same.marks, same.complete = self.marks, self.complete
         return same
 
     def __len__(self) -> int:

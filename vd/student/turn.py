@@ -34,12 +34,13 @@ def marks(sites: Sites) -> torch.Tensor:
 def item_and_goal(sites: Sites, goal: Sites | None = None) -> tuple[torch.Tensor, torch.Tensor]:
     """Which voxels are the object's, and which the goal's (of ``goal``, where that is given), bool [M].
 
-    A voxel is the object's that holds no point of the goal, and neither holds nor touches one of the hand's
-    own model: a camera sees the hand too, between that model's samples. Half of the voxels without a mark
-    would be the hand's (docs/student.md).
+    A voxel is the object's that holds no point of the goal, nor of the hand's own model. Of a camera's points
+    those of the hand that lie between that model's samples are left out too, with all that touches it.
     """
     wanted = marks(sites if goal is None else goal)[:, GOAL] > 0
     free = (marks(sites) == 0).all(dim=1)
+    if sites.complete:
+        return free, wanted
     return free & ~sites.touching(free, marks(sites)[:, HAND] > 0), wanted
 
 
@@ -115,7 +116,7 @@ class TurnEncoder(nn.Module):
     Pairs of vectors make frames, of the object and of the goal by the same weights; two frames of one shape
     differ by the rotation that is looked for. The embedding is made of these rotations, one for each pair, of
     their weighted mean, and of the lengths of the vectors: where a shape looks the same from several sides
-    they are short, and the rotations disagree.
+    they are short, and the rotations disagree. Then products of tensors still tell how its axes lie.
     """
 
     def __init__(self, cfg: TurnCfg, voxel_m: float, embedding: int):
@@ -123,11 +124,12 @@ class TurnEncoder(nn.Module):
         self.scale = voxel_m / RADIUS_M
         self.shape = ShapeVectors(cfg)
         self.pairs = nn.Linear(cfg.vectors, 2 * cfg.pairs, bias=False)
+        self.tensors = nn.Linear(cfg.vectors, cfg.pairs, bias=False)
         lengths = 4 * cfg.pairs
         self.trust = nn.Sequential(
             nn.Linear(lengths, cfg.hidden), nn.GELU(), nn.Linear(cfg.hidden, cfg.pairs)
         )
-        width = 9 * (cfg.pairs + 1) + lengths
+        width = 9 * (2 * cfg.pairs + 1) + lengths
         self.hidden = nn.Sequential(nn.Linear(width, embedding), nn.GELU())
         self.out = nn.Linear(width + embedding, embedding)
 
@@ -135,23 +137,25 @@ class TurnEncoder(nn.Module):
         """Embeddings [B, E] of the clouds of ``sites``, the goal's voxels among them or in ``goal``."""
         item, wanted = item_and_goal(sites, goal)
         with torch.autocast(sites.device.type, enabled=False):
-            now, length = self._frames(sites, item)
-            aim, aim_length = self._frames(sites if goal is None else goal, wanted)
+            now, length, spread = self._frames(sites, item)
+            aim, aim_length, aim_spread = self._frames(sites if goal is None else goal, wanted)
             turns = now @ aim.transpose(-1, -2)
             lengths = torch.cat([length, aim_length], dim=1).clamp(min=SMALL).log()
             trust = self.trust(lengths).softmax(dim=1)
             mean = (trust[..., None, None] * turns).sum(dim=1)
-            known = torch.cat([turns.flatten(1), mean.flatten(1), lengths], dim=1)
+            both = (spread @ aim_spread).flatten(1)
+            known = torch.cat([turns.flatten(1), mean.flatten(1), lengths, both], dim=1)
             return self.out(torch.cat([known, self.hidden(known)], dim=1))
 
-    def _frames(self, sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Frames as matrices [B, pairs, 3, 3], and the lengths of the vectors they are of [B, 2 pairs]."""
+    def _frames(self, sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Frames as matrices [B, pairs, 3, 3], lengths of their vectors [B, 2 pairs], tensors like frames."""
         points, present = padded(sites, chosen)
         dtype = self.out.weight.dtype
-        vectors, _ = self.shape(self.scale * points.to(dtype), present.to(dtype))
+        vectors, tensors = self.shape(self.scale * points.to(dtype), present.to(dtype))
         first, second = self.pairs(vectors.transpose(1, 2)).transpose(1, 2).chunk(2, dim=1)
         one = unit(first)
         second = second - (second * one).sum(dim=-1, keepdim=True) * one
         two = unit(second)
         matrix = torch.stack((one, two, torch.linalg.cross(one, two)), dim=-1)
-        return matrix, torch.cat([first.norm(dim=-1), second.norm(dim=-1)], dim=1)
+        lengths = torch.cat([first.norm(dim=-1), second.norm(dim=-1)], dim=1)
+        return matrix, lengths, self.tensors(tensors.movedim(1, -1)).movedim(-1, 1)
