@@ -1,5 +1,6 @@
 """Calls one after the other, and in threads that simulate together: the same results."""
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from vd.gap.design import design
 from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.statistics import noise_floor
 from vd.gap.team import Bench, Call, JointSpec, Team
-from vd.gap.workflow import baseline_of
+from vd.gap.workflow import _parallel, baseline_of
 
 EFFECTS = ("coulomb_friction", "backlash", "load_friction")
 
@@ -63,3 +64,17 @@ def test_a_failure_reaches_all_who_wait() -> None:
     np.testing.assert_array_equal(
         rollouts.predict(chain.start_row[None]), Rollouts(chain, recording).predict(chain.start_row[None])
     )
+
+
+def test_whoever_stops_does_not_wait_for_the_other_joints() -> None:
+    released, ended = threading.Event(), []
+
+    def work(joint: int) -> None:
+        if joint == 0:
+            raise KeyboardInterrupt
+        ended.append(released.wait(60.0))
+
+    with pytest.raises(KeyboardInterrupt):
+        _parallel(work, [0, 1])
+    assert not ended
+    released.set()

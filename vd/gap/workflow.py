@@ -439,5 +439,9 @@ def replace_baseline(explanation: Explanation, baseline: JointFit) -> Explanatio
 
 def _parallel(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
     """Results in order; threads, since the work waits for processes."""
-    with ThreadPoolExecutor(max(len(items), 1)) as pool:
+    pool = ThreadPoolExecutor(max(len(items), 1))
+    try:
         return list(pool.map(work, items))
+    finally:
+        # Nobody waits for the others after a failure or Ctrl-C: they end with the team's processes.
+        pool.shutdown(wait=False, cancel_futures=True)
