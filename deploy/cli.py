@@ -27,6 +27,12 @@ COMMANDS = {
         "vd.deploy.check", "CheckCfg", "check", "preflight: everything that must be right before it moves"
     ),
     "record": Entry("vd.deploy.record", "RecordCfg", "record", "record motions for vd-gap"),
+    "calibrate": Entry(
+        "vd.deploy.calibrate",
+        "CalibrateCfg",
+        "calibrate",
+        "find where the camera is, by markers on fingertips",
+    ),
     "home": Entry("vd.deploy.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"),
     "shadow": Entry(
         "vd.deploy.shadow", "ShadowCfg", "shadow", "compare what the policy saw with what the simulator shows"

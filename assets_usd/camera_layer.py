@@ -1,0 +1,73 @@
+"""Where a hand's depth camera was found to be, as a USD layer over the hand: ``camera.usda``.
+
+The layer holds the place of ``/<hand>/base/camera`` and nothing else, in the ops that the hand's own file
+has. Like the layer with an identified servo model it can be a sublayer of any stage in which the hand is.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from pxr import Gf, Sdf
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_data import CameraModel, HandError, HandModel
+from vd.assets_usd.hand_model import OPTICAL_FROM_USD, read_hand
+from vd.files import atomic_path
+
+CAMERA_LAYER_FORMAT = "vd-camera-layer/1"
+"""What ``customLayerData`` of a layer says it is."""
+
+
+def write_camera_layer(path: Path, hand: HandModel, pose: np.ndarray, notes: Mapping[str, str]) -> None:
+    """Write a camera's place as a layer over a hand, atomically.
+
+    Args:
+        path: File to write, ``.usda``.
+        hand: The hand.
+        pose: Optical frame (x right, y down, z forward) in the hand's base: position [m], quaternion xyzw.
+        notes: How it was found, for people; goes into ``customLayerData``.
+
+    Raises:
+        HandError: The file is not to be a ``.usda``, or the pose is none.
+    """
+    path, pose = Path(path), np.asarray(pose, dtype=float)
+    if path.suffix != ".usda":
+        raise HandError(f"{path}: a camera layer is plain text; give it the suffix .usda")
+    if pose.shape != (7,) or not np.isfinite(pose).all():
+        raise HandError(f"{path}: the camera's pose is {pose}; it must be 7 finite numbers")
+    layer = Sdf.Layer.CreateAnonymous(".usda")
+    layer.defaultPrim = hand.name
+    layer.documentation = f"Place of the depth camera of {hand.name}, a layer over the hand."
+    layer.customLayerData = {"format": CAMERA_LAYER_FORMAT, **notes}
+    camera = Sdf.CreatePrimInLayer(layer, f"/{hand.name}/base/camera")
+    x, y, z, w = (Rotation.from_quat(pose[3:]) * OPTICAL_FROM_USD.inv()).as_quat()
+    for name, kind, value in (
+        ("xformOp:translate", Sdf.ValueTypeNames.Double3, Gf.Vec3d(*pose[:3])),
+        ("xformOp:orient", Sdf.ValueTypeNames.Quatd, Gf.Quatd(w, x, y, z)),
+    ):
+        Sdf.AttributeSpec(camera, name, kind).default = value
+    with atomic_path(path) as temporary:
+        if not layer.Export(str(temporary)):
+            raise OSError(f"{path}: USD could not write the layer; is the disk full?")
+
+
+def read_camera(hand: HandModel, layer: Path) -> CameraModel:
+    """The hand's camera where a layer says that it is.
+
+    Args:
+        hand: The hand, whatever layer it has already.
+        layer: The camera's layer.
+
+    Raises:
+        HandError: The file is missing, no such layer, or not one of this hand.
+    """
+    found = Sdf.Layer.FindOrOpen(str(layer)) if Path(layer).is_file() else None
+    if found is None or found.customLayerData.get("format") != CAMERA_LAYER_FORMAT:
+        raise HandError(
+            f"{layer}: no camera layer ({CAMERA_LAYER_FORMAT}); name the camera.usda that "
+            "vd-deploy calibrate wrote"
+        )
+    place = read_hand(hand.path, fingertip=hand.fingertip, layer=Path(layer)).camera
+    return replace(hand.camera, position=place.position, quaternion=place.quaternion)
