@@ -427,9 +427,9 @@ class FaultsCommand:
         hand = load_hand(self.hand)
         joints = uncalibrated(hand)
         trials: list[tuple[str, Callable[[], Outcome]]] = [
-            *((f.name, lambda f=f: try_fault(f, hand, joints)) for f in MOVING),  # type: ignore[misc]
-            *((name, lambda n=name: try_preflight(n, hand, joints)) for name in BEFORE),  # type: ignore[misc]
-            *((name, lambda n=name: try_process(n, PROCESS[n], hand, joints)) for name in PROCESS),  # type: ignore[misc]
+            *((f.name, lambda f=f: try_fault(f, hand, joints)) for f in MOVING),
+            *((name, lambda n=name: try_preflight(n, hand, joints)) for name in BEFORE),
+            *((name, lambda n=name: try_process(n, PROCESS[n], hand, joints)) for name in PROCESS),
         ]
         outcomes = []
         for name, trial in trials:

@@ -264,7 +264,7 @@ def record(cfg: RecordCfg) -> int:
 
             left.sort(key=lambda motion: motion.payload)
             for payload, group in itertools.groupby(left, key=lambda motion: motion.payload):
-                _session(cfg, connection, joints, list(group), *payload, keep)
+                _session(cfg, connection, joints, list(group), payload, keep)
         for one in written:
             one.result()
     if cfg.json:
@@ -280,11 +280,11 @@ def _session(
     connection: Connection,
     joints: tuple[str, ...],
     motions: Sequence[Motion],
-    payload_kg: float,
-    finger: str,
+    payload: tuple[float, str],
     keep: Callable[["Trajectory"], None],
 ) -> None:
-    """Motions with one payload, between preflight and torque off."""
+    """Motions with one payload [kg] at one finger, between preflight and torque off."""
+    payload_kg, finger = payload
     seconds = sum(motion.excitation.duration for motion in motions)
     question = f"The hand will move for about {seconds:.0f} s, one joint at a time and quickly."
     if payload_kg > 0.0:

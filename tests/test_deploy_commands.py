@@ -179,7 +179,7 @@ def test_a_payload_needs_somebody_to_hang_it(port, hand, tmp_path):
     cfg = record.RecordCfg(port=port, out=tmp_path, fingers=(0,), excitations=("second_payload",), yes=True)
     motions = [motion for motion in record.motions_of(hand, (0,), cfg.excitations) if motion.payload[0]]
     with record.connect(cfg) as connection, pytest.raises(record.RecordError, match=r"hang 0\.05 kg"):
-        record._session(cfg, connection, ("f0_j1",), motions, *motions[0].payload, print)
+        record._session(cfg, connection, ("f0_j1",), motions, motions[0].payload, print)
 
 
 def test_a_file_that_is_no_plan_is_refused(hand, tmp_path):
