@@ -334,6 +334,7 @@ def test_many_open_sets_are_a_list_by_joint(curves, tmp_path):
     assert len(words.verdict_sentence(report)) < 330
     write_report(report, None, tmp_path)
     page = (tmp_path / "report.html").read_text()
+    assert "<span>3 sets of causes</span>" in page, "a tile has no room for them"
     for line in (*words.open_questions(report), "The commands are in x/; go on."):
         assert f"<li>{line}</li>" in page
 

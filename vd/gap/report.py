@@ -8,6 +8,7 @@ from vd.files import atomic_path
 from vd.gap import figures
 from vd.gap.result import UNITS, Candidate, Predictions, Report, parameter_of
 from vd.gap.words import (
+    MAX_SETS,
     amount,
     decision_text,
     estimate,
@@ -91,15 +92,22 @@ class _Pictures:
         self.files.append(path)
 
 
+def _answer(report: Report) -> str:
+    """What is named, or what is in question, in a few words."""
+    if report.effects:
+        return listing([plain(name) for name in dict.fromkeys(e.name for e in report.effects)])
+    if len(report.open_sets) > MAX_SETS:
+        return f"{len(report.open_sets)} sets of causes"
+    return listing([", ".join(map(plain, group)) for group in report.open_sets] or ["nothing named"])
+
+
 def _headline(page: Page, report: Report) -> None:
     held, floor = report.held_out, report.noise_floor_rad
     tiles = [
         (
             _VERDICT_WORDS[report.verdict],
             "verdict",
-            listing([plain(name) for name in dict.fromkeys(e.name for e in report.effects)])
-            if report.effects
-            else listing([", ".join(map(plain, group)) for group in report.open_sets] or ["nothing named"]),
+            _answer(report),
         ),
         (mrad(held.baseline_rmse_rad), "gap before", "error on held-out motions, plain servo model fitted"),
     ]
