@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vd.assets_usd.camera_layer import read_camera
 from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.objects.model import ObjectModel, load_set
@@ -155,6 +157,23 @@ def open_camera(flight: Flight, link: TwinLink | None, cfg: RealSenseCfg) -> Dep
     if link is not None:
         return TwinCamera(link, flight.camera)
     return RealSense(find_device(cfg.serial), cfg)
+
+
+def look(flight: Flight, source: DepthSource, hand: HandModel, layer: Path | None) -> None:
+    """Let a student see by the camera's own lens, from where it was found to be.
+
+    Args:
+        flight: The policy.
+        source: The camera.
+        hand: The hand.
+        layer: Its place as a layer over the hand; None: where it was in training.
+
+    Raises:
+        HandError: The layer is none of this hand.
+    """
+    if isinstance(flight.pilot, StudentPilot) and flight.camera is not None:
+        place = flight.camera if layer is None else read_camera(hand, layer)
+        flight.pilot.look_by(source.intrinsics.seen_from(place))
 
 
 def warm_up(

@@ -1,6 +1,7 @@
 """Policies as the loop flies them: from what is sensed to an action and the distance to the goal."""
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -60,17 +61,17 @@ class StudentPilot:
             raise ValueError("a student of stage 0 is an encoder, which cannot act; give one of stage 1 or 2")
         self.rule, self._network = spec.stopping, student.network
         self.camera = student_camera(student, hand)
-        self.sight = StudentSight(
-            hand,
-            item,
-            spec.network,
-            camera=self.camera,
-            depth=from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
-            if self.camera is not None
-            else None,
-            seed=seed,
-        )
+        depth = None
+        if self.camera is not None:
+            depth = from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
+        self._make_sight = partial(StudentSight, hand, item, spec.network, depth=depth, seed=seed)
+        self.sight = self._make_sight(camera=self.camera)
         self._hidden = self._network.initial_hidden(1)
+
+    def look_by(self, camera: CameraModel) -> None:
+        """See by a camera with this lens at this place, in place of the one of the training."""
+        self.camera = camera
+        self.sight = self._make_sight(camera=camera)
 
     def begin(self) -> None:
         """A new goal: the memory starts empty, as in training."""

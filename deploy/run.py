@@ -65,6 +65,8 @@ class RunCfg(HandOptions):
     """Give the twin's depth images the errors of a real camera."""
     camera: RealSenseCfg = field(default_factory=RealSenseCfg)
     """The depth camera."""
+    camera_layer: Path | None = None
+    """Where it was found to be (camera.usda of vd-deploy calibrate); where it was in training by default."""
     safety: SafetyCfg = field(default_factory=SafetyCfg)
     """Limits."""
     log: Path | None = None
@@ -131,7 +133,7 @@ def _fly(
     """Preflight, way to the start, the loop, and its log."""
     from vd.deploy.action import ActionFilter
     from vd.deploy.check import ready
-    from vd.deploy.flight import make_goals, open_camera, warm_up
+    from vd.deploy.flight import look, make_goals, open_camera, warm_up
     from vd.deploy.log import LogWriter
     from vd.deploy.loop import Clock, ControlLoop, LoopCfg, summary, undisturbed
 
@@ -142,6 +144,7 @@ def _fly(
         camera = open_camera(flight, link, cfg.camera)
         if camera is not None:
             stack.callback(camera.close)
+            look(flight, camera, hand, cfg.camera_layer)
         ready(
             connection, f"The hand will pursue {len(goals)} goals.", yes=cfg.yes or cfg.twin, quiet=cfg.twin
         )
