@@ -34,6 +34,9 @@ COMMANDS = {
         "find where the camera is, by markers on fingertips",
     ),
     "home": Entry("vd.deploy.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"),
+    "score": Entry(
+        "vd.deploy.score", "ScoreCfg", "score", "the object's error at each stop, by motion capture"
+    ),
     "shadow": Entry(
         "vd.deploy.shadow", "ShadowCfg", "shadow", "compare what the policy saw with what the simulator shows"
     ),

@@ -1,0 +1,209 @@
+"""Scores of runs by motion capture: made-up runs whose object is known, exported as files."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hands import load_hand
+from vd.deploy.log import LogWriter
+from vd.deploy.mocap import MocapError, read_mocap
+from vd.deploy.score import ScoreCfg, find_offset, in_world, score, score_run
+from vd.evaluate.statistics import rotation_angle
+from vd.hand_log import JOINT_CHANNELS, STEP_COLUMNS, read_log
+
+GOALS = 6
+GOAL_S = 5.0
+RATE = 12
+ERRORS = np.array([0.05, 0.15, 0.3, 0.08, 0.5, 0.19])
+"""Angle to each goal at its end [rad]."""
+FIFTH_ENDS_BY_TIME = 4
+QUARTER = Rotation.from_euler("z", 90, degrees=True)
+
+
+class Run:
+    """A log whose object turns evenly from each goal's error of 2 rad to ERRORS, and its true track."""
+
+    def __init__(self, folder, monkeypatch, *, turn=None):
+        generator = np.random.default_rng(4)
+        hand = load_hand("dclaw3")
+        goals = Rotation.random(GOALS, random_state=generator)
+        axis = np.array([0.3, -0.5, 0.81])
+        axis /= np.linalg.norm(axis)
+        run = {
+            "policy": "made up",
+            "object": {"name": "cube", "set": "cube"},
+            "goals": goals.as_quat().tolist(),
+        }
+        log = LogWriter(folder, hand, run, servo={})
+        joints = {channel: np.zeros(hand.num_joints) for channel in JOINT_CHANNELS}
+        steps = int(GOAL_S * RATE)
+        self.t = np.arange(GOALS * steps) / RATE
+        turns = []
+        for number, goal in enumerate(goals):
+            # Uneven in time, so that no two goals look alike to a search for the offset.
+            share = np.linspace(0.0, 1.0, steps) ** (0.5 + 0.4 * number)
+            angle = 2.0 + (ERRORS[number] - 2.0) * share
+            for step in range(steps):
+                here = number * steps + step
+                turns.append((Rotation.from_rotvec(angle[step] * axis) * goal).as_quat())
+                values = dict.fromkeys(STEP_COLUMNS, 0.0) | {"goal": number, "distance": angle[step] + 0.02}
+                log.step(log.started_s + self.t[here], joints, list(values.values()))
+            end = self.t[(number + 1) * steps - 1]
+            monkeypatch.setattr("vd.deploy.log.time.monotonic", lambda end=end: log.started_s + end)
+            outcome = "time limit" if number == FIFTH_ENDS_BY_TIME else "stopped"
+            log.event("stop", goal=number, outcome=outcome, distance=ERRORS[number] + 0.02)
+        log.finish("all goals pursued")
+        monkeypatch.undo()
+        self.log = read_log(folder)
+        self.turn = np.array(turns)
+        if turn is not None:
+            self.turn = (Rotation.from_quat(self.turn) * turn).as_quat()
+
+    def export(self, path, *, start=0.0, lost=(), rate=60.0):
+        """A plain export; ``start`` is its time at the log's beginning."""
+        t = np.arange(0.0, self.t[-1] + 1.0, 1.0 / rate)
+        row = np.clip(np.rint(t * RATE).astype(int), 0, len(self.t) - 1)
+        rows = ["time,x,y,z,qx,qy,qz,qw,tracked"]
+        for when, turn in zip(t, self.turn[row], strict=True):
+            tracked = not any(low <= when <= high for low, high in lost)
+            numbers = ",".join(f"{v:.6f}" for v in (0.0, 0.0, 0.1, *turn))
+            rows.append(f"{start + when:.6f},{numbers},{int(tracked)}")
+        path.write_text("\n".join(rows) + "\n")
+        return path
+
+    def optitrack(self, path, *, frame):
+        """OptiTrack's layout: y up, millimetres, two rigid bodies, lost samples empty."""
+        head = "Format Version,1.23,Take Name,a,Rotation Type,Quaternion,Length Units,Millimeters"
+        blank = [""] * 2
+        columns = [
+            (body, kind, axis)
+            for body in ("hand", "cube")
+            for kind, axes in (("Rotation", "XYZW"), ("Position", "XYZ"), ("Mean Marker Error", "E"))
+            for axis in axes
+        ]
+        rows = [head, ""]
+        rows.append(",".join(["", "Type", *["Rigid Body"] * len(columns)]))
+        rows.append(",".join(["", "Name", *[c[0] for c in columns]]))
+        rows.append(",".join(["", "ID", *["1"] * len(columns)]))
+        rows.append(",".join([*blank, *[c[1] for c in columns]]))
+        rows.append(",".join(["Frame", "Time (Seconds)", *[c[2].replace("E", "") for c in columns]]))
+        place = frame.inv().apply([0.01, 0.02, 0.1]) * 1e3
+        for number, when in enumerate(np.arange(0.0, self.t[-1], 1.0 / 60)):
+            turn = self.turn[min(round(when * RATE), len(self.t) - 1)]
+            turn = (frame.inv() * Rotation.from_quat(turn)).as_quat()
+            cells = [f"{v:.6f}" for v in (*turn, *place, 0.1)] if number != 30 else [""] * 8
+            rows.append(",".join([str(number), f"{when:.6f}", *["0"] * 3, "1", *["0"] * 4, *cells]))
+        path.write_text("﻿" + "\n".join(rows) + "\n", encoding="utf-8")
+        return path
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    return Run(tmp_path / "log", monkeypatch)
+
+
+NONE = np.array([[0.0, 0.0, 0.0, 1.0]])
+
+
+def test_errors_are_those_at_the_stops_and_lost_markers_discard(run, tmp_path):
+    ends = [stop.time_s for stop in run.log.stops]
+    lost = [(ends[2] - 0.5, ends[2] + 0.5), (ends[0] + 1.0, ends[0] + 2.0)]  # at a stop, and on the way
+    mocap = read_mocap(run.export(tmp_path / "m.csv", lost=lost))
+    result = score_run(run.log, mocap, NONE, offset_s=0.0)
+    errors = [trial.error_rad for trial in result.trials]
+    assert errors[2] is None
+    assert errors[4] is None
+    assert [trial.discarded for trial in result.trials] == [False, False, True, False, False, False]
+    np.testing.assert_allclose([errors[i] for i in (0, 1, 3, 5)], ERRORS[[0, 1, 3, 5]], atol=1e-4)
+    assert result.scored == 5
+    assert result.median.value == pytest.approx(np.median(ERRORS[[0, 1, 3, 5]]), abs=1e-4)
+    assert result.median.low <= result.median.value <= result.median.high
+    shares = {tolerance: share.value for tolerance, share in result.within}
+    assert shares[0.1] == pytest.approx(2 / 5)
+    assert shares[0.2] == pytest.approx(4 / 5)  # the one out of time never
+    for _, share in result.within:
+        assert 0.0 <= share.low <= share.value <= share.high <= 1.0
+
+
+@pytest.mark.parametrize("start", [1234.5, -3.0])
+def test_a_clock_of_its_own_is_matched_by_the_predictions(run, tmp_path, start):
+    mocap = read_mocap(run.export(tmp_path / "m.csv", start=start))
+    assert find_offset(run.log, mocap) == pytest.approx(start, abs=0.05)
+    result = score_run(run.log, mocap, NONE)
+    assert result.trials[0].error_rad == pytest.approx(ERRORS[0], abs=0.05)
+
+
+def test_seconds_since_1970_need_no_search(run, tmp_path):
+    mocap = read_mocap(run.export(tmp_path / "m.csv", start=run.log.run["unix_s"]))
+    result = score_run(run.log, mocap, NONE)
+    assert result.offset_s == run.log.run["unix_s"]
+    assert result.trials[0].error_rad == pytest.approx(ERRORS[0], abs=1e-3)
+
+
+def test_a_track_of_something_else_matches_no_offset(run, tmp_path):
+    generator = np.random.default_rng(0)
+    run.turn = Rotation.random(len(run.turn), random_state=generator).as_quat()
+    with pytest.raises(MocapError, match="--offset-s"):
+        find_offset(run.log, read_mocap(run.export(tmp_path / "m.csv", start=50.0)))
+    mocap = read_mocap(run.export(tmp_path / "m.csv", start=run.log.run["unix_s"] + 3600.0))
+    with pytest.raises(MocapError, match="right take"):
+        score_run(run.log, mocap, NONE)
+
+
+def test_symmetric_objects_count_up_to_their_symmetry(tmp_path, monkeypatch, capsys):
+    """A cube that was put down a quarter turn further is scored as if it had not been."""
+    turned = Run(tmp_path / "log", monkeypatch, turn=QUARTER)
+    path = turned.export(tmp_path / "m.csv")
+    cfg = ScoreCfg(log=tmp_path / "log", mocap=path, offset_s=0.0, json=True, page=tmp_path / "page.html")
+    assert score(cfg) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["trials"][0]["error_rad"] == pytest.approx(ERRORS[0], abs=1e-3)
+    plain = score_run(turned.log, read_mocap(path), NONE, offset_s=0.0)
+    assert plain.trials[0].error_rad > 1.0
+    page = (tmp_path / "page.html").read_text()
+    assert page.count("<img") == 2
+    assert "time limit" in page
+
+
+def test_an_optitrack_export_is_read(run, tmp_path):
+    frame = Rotation.from_euler("z", 30, degrees=True) * Rotation.from_euler("x", 90, degrees=True)
+    path = run.optitrack(tmp_path / "take.csv", frame=frame)
+    with pytest.raises(MocapError, match="hand, cube"):
+        read_mocap(path)
+    mocap = read_mocap(path, "cube")
+    assert np.flatnonzero(~mocap.tracked).tolist() == [30]
+    world = tuple(Rotation.from_euler("z", 30, degrees=True).as_quat())
+    mocap = in_world(mocap, up="y", world=world, marker=(0.0, 0.0, 0.0, 1.0))
+    np.testing.assert_allclose(mocap.pose[0, :3], [0.01, 0.02, 0.1], atol=1e-6)
+    assert rotation_angle(mocap.pose[0, 3:], run.turn[0]) < 1e-5
+
+
+def test_the_markers_frame_on_the_object_is_taken_out(run, tmp_path):
+    path = run.export(tmp_path / "m.csv")
+    mocap = in_world(read_mocap(path), up="z", world=(0, 0, 0, 1), marker=tuple(QUARTER.as_quat()))
+    expected = (Rotation.from_quat(run.turn[0]) * QUARTER).as_quat()
+    assert rotation_angle(mocap.pose[0, 3:], expected) < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("time,x\n0,1\n", "no column 'y'"),
+        ("time,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,one\n", "line 2: 'one'"),
+        ("time,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,2\n1,0,0,0,0,0,0,2\n", "not 1"),
+        ("time,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n0,0,0,0,0,0,0,1\n", "must rise"),
+        ("time,x,y,z,qx,qy,qz,qw\n", "no samples"),
+        ("", "no column"),
+        ("Format Version,1.23,Rotation Type,XYZ\n", "as quaternions"),
+        ("Format Version,1.23,Length Units,Feet\n", "feet"),
+        ("Format Version,1.23\n", "Name and Frame"),
+    ],
+)
+def test_bad_exports_are_refused_by_name(tmp_path, text, why):
+    path = tmp_path / "export.csv"
+    path.write_text(text)
+    with pytest.raises(MocapError, match=why) as error:
+        read_mocap(path)
+    assert "export.csv" in str(error.value)
