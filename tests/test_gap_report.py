@@ -354,6 +354,19 @@ def test_a_report_with_hardly_anything_has_a_page(report, tmp_path):
     assert "Nowhere by more than noise" in (tmp_path / "report.html").read_text()
 
 
+def test_of_one_recorded_finger_the_layer_of_all_is_to_be_trained_with(report, tmp_path):
+    assert "pass identified.usda with --hand-layer" in words.next_step(report)
+    closing = dataclasses.replace(report.closing, whole_hand_layer="identified-all-fingers.usda")
+    one = dataclasses.replace(report, closing=closing, hand="dclaw3")
+    assert "pass identified-all-fingers.usda with --hand-layer" in words.next_step(one)
+    write_report(one, None, tmp_path)
+    page = (tmp_path / "report.html").read_text()
+    assert "vd-train teacher --hand dclaw3 --hand-layer identified-all-fingers.usda" in page
+    assert "--hand-layer identified.usda --out DIR" in page, (
+        "what was recorded is compared with the recording"
+    )
+
+
 @pytest.mark.parametrize(("model", "told"), [("servo", True), ("pendulum", False), ("dclaw3", False)])
 def test_torques_of_a_bare_servo_are_said_to_be_relative(report, tmp_path, model, told):
     write_report(

@@ -18,7 +18,6 @@ from vd.kernels.effects import BASELINE, EFFECTS
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
 
-LAYER = "identified.usda"
 WHOLE_HAND_LAYER = "identified-all-fingers.usda"
 """The same on every finger, as the paper applies what it identified on one."""
 GRAVITY_EFFECT = "gravity_load"

@@ -22,6 +22,7 @@ from vd.gap.words import (
     percent_range,
     plain,
     sentences,
+    training_layer,
     unit_text,
     verdict_sentence,
     where_text,
@@ -338,13 +339,15 @@ def _parameters(page: Page, report: Report) -> None:
                 small=True,
             )
     if report.closing is not None:
+        layer = training_layer(report)
         page.text(
-            f"All of this is in {report.closing.layer}, USD in plain text. "
+            f"All of this is in {report.closing.layer}, USD in plain text"
+            + (f"; {layer} has it on every finger. " if layer != report.closing.layer else ". ")
             + ("To train with it (vd-eval and vd-play take it too), and to " if report.hand else "To ")
             + "see whether a new recording agrees with it:"
         )
         if report.hand is not None:
-            page.code(f"vd-train teacher --hand {report.hand} --hand-layer {report.closing.layer}")
+            page.code(f"vd-train teacher --hand {report.hand} --hand-layer {layer}")
         page.code(f"vd-gap run NEW_RECORDING --hand-layer {report.closing.layer} --out DIR")
 
 

@@ -20,6 +20,8 @@ from vd.files import atomic_path, write_json
 from vd.kernels.effects import BASELINE, EFFECTS, EQUIVALENT, TOGETHER, Parameter
 
 FORMAT = "vd-gap-report/1"
+LAYER = "identified.usda"
+"""Identified model, beside the report."""
 _OPTIONAL = ("hand", "hand_layer", "closing")
 """Fields of a report in which None means none, not a number that is unknown."""
 
@@ -188,6 +190,8 @@ class Closing:
     per_joint: dict[str, Interval]
     """(baseline, identified) RMSE [rad] of each joint."""
     note: str = ""
+    whole_hand_layer: str = ""
+    """The layer with the same on every finger, where not all were recorded: the one to train with."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ import numpy as np
 from vd.config import from_dict, to_dict
 from vd.files import write_json
 from vd.gap.recording import BARE_MODELS, Recording, read_recording
-from vd.gap.result import Closing, Predictions, Report
+from vd.gap.result import LAYER, Closing, Predictions, Report
 from vd.versions import installed_versions
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 RUN = "run.json"
 FIND, EXPLAIN, CLOSE, CLOSING_CURVES = "find.json", "explain.json", "close.json", "closing.npz"
-CURVES, LAYER, PAGE = "predictions.npz", "identified.usda", "report.html"
+CURVES, PAGE = "predictions.npz", "report.html"
 OUTPUTS = {
     "find": (FIND,),
     "explain": (EXPLAIN, CURVES),
@@ -247,7 +247,8 @@ def _close(analysis: Analysis) -> None:
     whole = layer.with_name(WHOLE_HAND_LAYER)
     whole.unlink(missing_ok=True)
     write_identified(report, layer, analysis.recording, analysis.hand, analysis.start)
-    if one_finger(analysis.recording, analysis.hand):
+    partly = one_finger(analysis.recording, analysis.hand)
+    if partly:
         write_identified(report, whole, analysis.recording, analysis.hand, analysis.start, every_finger=True)
     closing, curves = simulate_again(
         report,
@@ -258,6 +259,7 @@ def _close(analysis: Analysis) -> None:
         Predictions.read(analysis.out / CURVES),
         device=analysis.settings.device,
     )
+    closing = replace(closing, whole_hand_layer=whole.name if partly else "")
     curves.write(analysis.out / CLOSING_CURVES)
     (analysis.out / PLAN_JSON).unlink(missing_ok=True)
     if report.verdict == "under_excited" or report.open_sets:

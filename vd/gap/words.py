@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Sequence
 
-from vd.gap.result import Candidate, Estimate, Finding, Interval, NamedEffect, Report
+from vd.gap.result import LAYER, Candidate, Estimate, Finding, Interval, NamedEffect, Report
 
 MAX_NAMED_JOINTS = 4
 """More joints than this are counted rather than listed."""
@@ -178,14 +178,22 @@ def next_step(report: Report) -> str:
             "with --hand-layer identified.usda on a new recording to confirm that the gap is closed."
         )
     if report.verdict == "effects":
+        layer = training_layer(report)
+        other = "" if layer == LAYER else f" ({LAYER} is the same for the recorded finger alone)"
         return (
-            "Nothing is open. Use the identified model: pass identified.usda with --hand-layer to vd-train, "
-            "vd-eval and vd-play, and run vd-gap with it on a new recording to confirm that the gap is "
+            f"Nothing is open. Use the identified model: pass {layer} with --hand-layer to vd-train, vd-eval "
+            f"and vd-play{other}, and run vd-gap with it on a new recording to confirm that the gap is "
             "closed."
         )
     if report.verdict == "no_gap":
         return "Nothing to do. Use the identified baseline; record other motions only if the task needs them."
     return "Record the same joints with other motions; vd-gap plan proposes which."
+
+
+def training_layer(report: Report) -> str:
+    """The layer to train and evaluate with: every finger's."""
+    closing = report.closing
+    return LAYER if closing is None else closing.whole_hand_layer or closing.layer
 
 
 def open_questions(report: Report) -> list[str]:
