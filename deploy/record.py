@@ -31,6 +31,9 @@ RATE_HZ = 100.0
 SPEED_RAD_S = 1.0
 """Of the way to where a motion starts."""
 JOINTS_PER_FINGER = 3
+ASIDE = 0.8
+"""Where the other fingers swing to meanwhile, outward, as a share of half their range: on the three-finger
+hand a straight finger that bends through its range would press on its neighbour."""
 WIDE = SafetyCfg(step_rad=4.0)
 """Steps go through most of a joint's range at once, which a policy must not."""
 TWIN_ARGS = "--physics-hz 960"
@@ -98,16 +101,25 @@ def motions_of(hand: "HandModel", fingers: Sequence[int], sets: Sequence[str]) -
         key=lambda motion: hand.joint_names.index(motion.joints[0]) // JOINTS_PER_FINGER,
     )
     return [
-        Motion(
-            f"{index:03d}_{motion.joints[0]}_{motion.name}.csv",
-            replace(motion, conditions={"p_gain": float(P_GAIN), **motion.conditions}),
-        )
+        _motion(f"{index:03d}_{motion.joints[0]}_{motion.name}.csv", motion, hand)
         for index, motion in enumerate(ordered)
     ]
 
 
+def _motion(file: str, excitation: "Excitation", hand: "HandModel") -> Motion:
+    """An excitation with the fingers aside that it does not move, and the usual gain if it names none."""
+    command = excitation.command.copy()
+    moved = {name.partition("_")[0] for name in excitation.joints}
+    for swing in range(0, len(hand.joint_names), JOINTS_PER_FINGER):
+        if hand.joint_names[swing].partition("_")[0] not in moved:
+            low, high = hand.lower[swing], hand.upper[swing]
+            command[:, swing] = 0.5 * (low + high) + ASIDE * 0.5 * (high - low)
+    conditions = {"p_gain": float(P_GAIN), **excitation.conditions}
+    return Motion(file, replace(excitation, command=command, conditions=conditions))
+
+
 def read_plan(path: Path, hand: "HandModel") -> list[Motion]:
-    """The motions of a plan that ``vd-gap plan`` wrote; joints that it does not name hold.
+    """The motions of a plan that ``vd-gap plan`` wrote; joints that it does not name are straight.
 
     Args:
         path: ``next_experiment.json``, or the folder with it.
@@ -135,11 +147,10 @@ def read_plan(path: Path, hand: "HandModel") -> list[Motion]:
         for name, column in zip(joints, columns, strict=True):
             command[:, column] = [float(row[f"command.{name}"]) for row in rows]
             enabled[:, column] = [row.get(f"enabled.{name}", "1") == "1" for row in rows]
-        conditions = {"p_gain": float(P_GAIN), **entry["conditions"]}
         excitation = Excitation(
-            entry["excitation"], tuple(entry["joints"]), time_s, command, conditions, enabled
+            entry["excitation"], tuple(entry["joints"]), time_s, command, entry["conditions"], enabled
         )
-        motions.append(Motion("plan_" + Path(entry["file"]).name, excitation))
+        motions.append(_motion("plan_" + Path(entry["file"]).name, excitation, hand))
     return motions
 
 

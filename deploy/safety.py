@@ -404,9 +404,9 @@ class SafeHand:
                 self._hold_at(where)
 
     def _where(self) -> np.ndarray | None:
-        """Where the joints are now [rad]."""
+        """Where the joints are now [rad]; asks once."""
         try:
-            return JointState.of(self.bus.read_state(), self.joints).position
+            return JointState.of(self.bus.read_state(retries=0), self.joints).position
         except BusError:
             return self._expected()
 

@@ -20,10 +20,13 @@ from vd.deploy.faults import BEFORE, MOVING, try_fault, try_preflight
 from vd.deploy.joints import uncalibrated
 from vd.deploy.motion import reset_pose
 from vd.deploy.motor import Motor
+from vd.deploy.newton_hand import NewtonHand
+from vd.deploy.plant import Drive
 from vd.deploy.safety import SafetyCfg
 from vd.deploy.scan import FoundMotor, differences, find
 from vd.deploy.twin import Twin
 from vd.gap.recording import read_recording
+from vd.sim.cfg import SimCfg
 
 PATIENT = SafetyCfg(step_rad=4.0, hold_s=0.05, misses=60, lost_s=2.0, watchdog_s=2.0)
 """On a busy machine the twin may not run for longer than a hand may wait."""
@@ -173,6 +176,21 @@ def test_motions_go_finger_by_finger(hand):
     assert {motion.excitation.conditions["p_gain"] for motion in motions} == {200.0, 100.0, 50.0}
     with pytest.raises(ValueError, match="fingers 0 to 2"):
         record.motions_of(hand, (3,), ("chirp",))
+
+
+@pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])
+def test_the_largest_motions_touch_nothing(name):
+    hand = load_hand(name)
+    joints = uncalibrated(hand)
+    plant = NewtonHand(hand, joints, SimCfg(physics_hz=240.0))
+    for motion in record.motions_of(hand, (0,), ("steps_and_sines",)):
+        if motion.excitation.name != "step_large":
+            continue
+        commands = [*[motion.excitation.command[0]] * 200, *motion.excitation.command]
+        for index, command in enumerate(commands):
+            plant.advance(0.01, [Drive(float(angle), 200.0, 8.0, 2.6) for angle in command])
+            touching = int(plant._solver.mjw_data.nacon.numpy()[0])
+            assert index < 200 or touching == 0, f"{motion.file}: {touching} contacts"
 
 
 def test_a_payload_needs_somebody_to_hang_it(port, hand, tmp_path):

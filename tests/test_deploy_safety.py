@@ -20,6 +20,8 @@ from vd.deploy.safety import PERIOD_S, SafeHand, SafetyCfg, StoppedError
 from vd.deploy.twin import Twin
 
 MODEL = "XH430-V210"
+BUSY_S = 3.0 * PERIOD_S
+"""A hold takes one period at most where the machine has time: docs/results/deploy.md has it measured."""
 QUICK = SafetyCfg(hold_s=0.05)
 PATIENT = SafetyCfg(hold_s=0.05, misses=60, lost_s=2.0, watchdog_s=2.0)
 """Where it is not about times: on a busy machine the twin may not run for longer than a hand may wait."""
@@ -175,10 +177,10 @@ def test_a_loop_that_stands_is_stopped_by_the_watchdog(bus, twin, hand, joints):
         safe.command(reset_pose(3) + 0.3)
         begin = time.monotonic()
         safe.beat()
-        while safe.report is None and time.monotonic() < begin + 5.0:
+        while (safe.report is None or safe.report.held_s is None) and time.monotonic() < begin + 5.0:
             time.sleep(0.005)
-        assert 3 * PERIOD_S <= safe.report.detected_s - begin < 3 * PERIOD_S + 0.2
-        assert safe.report.held_s - safe.report.detected_s < PERIOD_S
+        assert 3 * PERIOD_S <= safe.report.detected_s - begin < 3 * PERIOD_S + BUSY_S
+        assert safe.report.held_s - safe.report.detected_s < BUSY_S
         with pytest.raises(StoppedError, match="the loop stands"):
             safe.read()
 
@@ -205,7 +207,7 @@ def test_an_exception_stops_the_hand(bus, twin, hand, joints):
             safe.arm()
             safe.command(reset_pose(3) + 0.3)
             _ = 1 / 0
-    assert safe.report.held_s - safe.report.detected_s < PERIOD_S
+    assert safe.report.held_s - safe.report.detected_s < BUSY_S
     assert energised(twin) == [] and said == ["stopped: ZeroDivisionError: division by zero; torque off"]
 
 
