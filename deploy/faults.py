@@ -91,8 +91,10 @@ class Witness:
 
         One that has torque now was not told; infinite if another still pushes.
         """
-        times, told = np.array(self.times), np.setdiff1d(np.arange(len(self._motors)), self.left())
-        pushing = (np.array(self.pushes)[:, told] > SAFE_RAD).any(axis=1)
+        told = np.setdiff1d(np.arange(len(self._motors)), self.left())
+        pushes = np.array(self.pushes)[:, told]
+        times = np.array(self.times[: len(pushes)])  # the twin goes on meanwhile
+        pushing = (pushes > SAFE_RAD).any(axis=1)
         last = np.flatnonzero(pushing & (times >= since))
         if not len(last):
             return 0.0
