@@ -3,6 +3,7 @@
 import importlib
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 OK, FAILED, INTERRUPTED = 0, 1, 130
@@ -26,7 +27,6 @@ COMMANDS = {
     "check": Entry(
         "vd.deploy.check", "CheckCfg", "check", "preflight: everything that must be right before it moves"
     ),
-    "record": Entry("vd.deploy.record", "RecordCfg", "record", "record motions for vd-gap"),
     "calibrate": Entry(
         "vd.deploy.calibrate",
         "CalibrateCfg",
@@ -34,22 +34,23 @@ COMMANDS = {
         "find where the camera is, by markers on fingertips",
     ),
     "home": Entry("vd.deploy.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"),
-    "score": Entry(
-        "vd.deploy.score", "ScoreCfg", "score", "the object's error at each stop, by motion capture"
-    ),
+    "record": Entry("vd.deploy.record", "RecordCfg", "record", "record motions for vd-gap"),
     "shadow": Entry(
         "vd.deploy.shadow", "ShadowCfg", "shadow", "compare what the policy saw with what the simulator shows"
+    ),
+    "score": Entry(
+        "vd.deploy.score", "ScoreCfg", "score", "the object's error at each stop, by motion capture"
     ),
 }
 """The commands by name."""
 
-USAGE = """usage: vd-deploy [flags]            {run}
+USAGE = """usage: vd-deploy [POLICY] [flags]   {run}
        vd-deploy COMMAND [flags]
 
 commands:
 {commands}
 
-Every command takes --hand dclaw3|dclaw4 and either --port DEVICE or --twin, a simulated hand on a
+What talks to motors takes --hand dclaw3|dclaw4 and either --port DEVICE or --twin, a simulated hand on a
 pseudo-terminal. Nothing moves before the preflight has passed and you have said yes (--yes says so at once).
 vd-deploy COMMAND --help lists the flags of a command, vd-deploy --hand dclaw3 --help those of a run."""
 
@@ -67,12 +68,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(usage())
         return OK
     name, entry = "", RUN
-    if not arguments[0].startswith("-"):
+    if arguments[0] in COMMANDS:
         name = arguments.pop(0)
-        if name not in COMMANDS:
-            print(f"vd-deploy: no command {name!r}; choose of {', '.join(COMMANDS)}", file=sys.stderr)
-            return FAILED
         entry = COMMANDS[name]
+    elif not arguments[0].startswith("-") and not Path(arguments[0]).exists():
+        print(
+            f"vd-deploy: no command and no policy {arguments[0]!r}; commands are {', '.join(COMMANDS)}",
+            file=sys.stderr,
+        )
+        return FAILED
     import tyro
 
     module = importlib.import_module(entry.module)

@@ -216,7 +216,7 @@ def test_a_fault_of_the_table_ends_safely(name, hand):
 def test_options_and_commands_that_cannot_be_are_refused(capsys):
     with pytest.raises(ValueError, match="--port"), connect(HandOptions()):
         pass
-    assert cli.main(["fly"]) == cli.FAILED and "no command 'fly'" in capsys.readouterr().err
+    assert cli.main(["fly"]) == cli.FAILED and "no policy 'fly'" in capsys.readouterr().err
     assert cli.main([]) == cli.OK and "vd-deploy COMMAND" in capsys.readouterr().out
 
 
