@@ -1,44 +1,16 @@
 """A twin as a process of its own, which ends with the one that started it."""
 
-import contextlib
-import os
 import select
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 START_S = 300.0
 """Longest start: on a machine that has not compiled the simulator's kernels, that takes minutes."""
 END_S = 5.0
 """Time that a twin has to end."""
-
-
-@contextlib.contextmanager
-def real_time(wanted: bool = True) -> Iterator[None]:
-    """Run before all ordinary programs, as loop and twin need it on a busy machine; both mostly sleep.
-
-    Args:
-        wanted: Whether to.
-
-    Raises:
-        OSError: The system does not have it, or does not permit it.
-    """
-    if not wanted:
-        yield
-        return
-    try:
-        before = os.sched_getscheduler(0), os.sched_getparam(0)
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(os.sched_get_priority_min(os.SCHED_RR)))
-    except (AttributeError, PermissionError) as error:
-        raise OSError(
-            f"no real-time priority ({error}); on Linux allow it with `ulimit -r 1`, or leave --realtime out"
-        ) from error
-    try:
-        yield
-    finally:
-        os.sched_setscheduler(0, *before)
 
 
 class TwinError(RuntimeError):

@@ -1,9 +1,7 @@
 """The control loop: one process, 12 Hz on a monotonic clock, from senses to goals, its lateness measured."""
 
-import gc
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -306,16 +304,3 @@ def summary(times: Sequence[StepTimes]) -> dict[str, dict[str, float]]:
         for name, values in columns.items()
         if len(values)
     }
-
-
-@contextmanager
-def undisturbed() -> Iterator[None]:
-    """Without the garbage collector, which pauses for a second where there is much; a run makes little."""
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()
-        gc.unfreeze()

@@ -20,11 +20,11 @@ import numpy as np
 import tyro
 
 from vd.deploy.bus import D_GAIN, P_GAIN
-from vd.deploy.child import real_time
 from vd.deploy.connect import Connection, HandOptions, connect
 from vd.deploy.motion import MOVE_S, move, reset_pose
 from vd.deploy.realsense import RealSenseCfg
 from vd.deploy.safety import SafeHand, SafetyCfg
+from vd.deploy.timely import Priority, real_time, undisturbed
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -75,8 +75,9 @@ class RunCfg(HandOptions):
     """Keep the depth images in the log, 3 MB a second: vd-deploy shadow compares them."""
     seed: int = 0
     """Of drawn goals and of the choice of points."""
-    realtime: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Run before all ordinary programs, the twin too; needs the right to (root, or ulimit -r)."""
+    realtime: Priority = "auto"
+    """Run before all ordinary programs, the twin too: where that is permitted (root, ulimit -r), always, or
+    never."""
     threads: int = 1
     """Threads of the network; more than one only helps on cores that nothing else uses."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -113,7 +114,7 @@ def run(cfg: RunCfg) -> int:
         raise ValueError(
             f"{cfg.policy} needs the object's true pose, which no real hand tells; give a student of stage 2"
         )
-    with real_time(cfg.realtime), contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
         twin_options: list[str] = []
         side = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vd-twin-"))) / "side"
         if cfg.twin:
@@ -121,7 +122,7 @@ def run(cfg: RunCfg) -> int:
             pose = [f"{value:.9g}" for value in (*camera.position, *camera.quaternion)]
             twin_options = ["--object", cfg.object, "--side", str(side), "--camera", *pose]
             twin_options += ["--realistic"] if cfg.realistic else []
-            twin_options += ["--realtime"] if cfg.realtime else []
+            twin_options += ["--realtime", cfg.realtime]
         connection = stack.enter_context(connect(cfg, twin_options))
         link = stack.enter_context(TwinLink(side)) if cfg.twin else None
         return _fly(cfg, flight, connection, item, link)
@@ -135,7 +136,7 @@ def _fly(
     from vd.deploy.check import ready
     from vd.deploy.flight import look, make_goals, open_camera, warm_up
     from vd.deploy.log import LogWriter
-    from vd.deploy.loop import Clock, ControlLoop, LoopCfg, summary, undisturbed
+    from vd.deploy.loop import Clock, ControlLoop, LoopCfg, summary
 
     hand = connection.hand
     goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
@@ -145,10 +146,12 @@ def _fly(
         if camera is not None:
             stack.callback(camera.close)
             look(flight, camera, hand, cfg.camera_layer)
+        warm_up(flight.pilot, hand, goals[0], camera, link)
+        stack.enter_context(undisturbed())
+        stack.enter_context(real_time(cfg.realtime))
         ready(
             connection, f"The hand will pursue {len(goals)} goals.", yes=cfg.yes or cfg.twin, quiet=cfg.twin
         )
-        warm_up(flight.pilot, hand, goals[0], camera, link)
         folder = cfg.log or Path("runs/deploy") / datetime.now().strftime("%Y%m%d-%H%M%S")
         log = LogWriter(
             folder,
@@ -171,7 +174,7 @@ def _fly(
         status = StatusLine()
         loop: ControlLoop | None = None
         try:
-            with undisturbed(), SafeHand(connection.bus, connection.joints, hand, cfg.safety) as safe:
+            with SafeHand(connection.bus, connection.joints, hand, cfg.safety) as safe:
                 safe.arm()
                 move(safe, pose, HOME_RAD_S)
                 place(safe, pose, link, yes=cfg.yes)

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vd.deploy.child import real_time
 from vd.deploy.control_table import MODELS
 from vd.deploy.motor import Motor
 from vd.deploy.packets import BROADCAST, MAX_ID, Failure, Instruction, Packet, PacketReader, encode, status
 from vd.deploy.plant import FirstOrderPlant, Plant
+from vd.deploy.timely import Priority, real_time, undisturbed
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -358,8 +358,8 @@ class TwinCommand:
     """IDs of motors with a loose cable."""
     seed: int = 0
     """Of the faults."""
-    realtime: bool = False
-    """Run before all ordinary programs, where that is permitted."""
+    realtime: Priority = "off"
+    """Run before all ordinary programs: where that is permitted, always, or never."""
     attached: bool = False
     """End when standard input does: with the program that started it, however that ended."""
 
@@ -395,7 +395,7 @@ class TwinCommand:
         if self.attached:
             threading.Thread(target=_end_with_input, args=(twin,), daemon=True).start()
         try:
-            with real_time(self.realtime):
+            with undisturbed(), real_time(self.realtime, level=1):
                 twin.serve()
         except KeyboardInterrupt:
             pass

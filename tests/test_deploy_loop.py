@@ -8,7 +8,6 @@ import pytest
 from vd.assets_usd.hands import load_hand
 from vd.deploy import cli
 from vd.deploy.action import ActionFilter
-from vd.deploy.child import real_time
 from vd.deploy.log import LogWriter
 from vd.deploy.loop import Clock, ControlLoop, LoopCfg
 from vd.deploy.pilot import Decision
@@ -177,12 +176,7 @@ def test_there_is_nothing_to_stop_before_the_first_action(parts):
 @pytest.fixture
 def patient() -> list[str]:
     """Flags for a machine with other work: late steps are not for the safety."""
-    flags = ["--safety.misses", "1000", "--safety.lost-s", "30", "--safety.watchdog-s", "2.5"]
-    try:
-        with real_time():
-            return [*flags, "--realtime"]
-    except OSError:
-        return flags
+    return ["--safety.misses", "1000", "--safety.lost-s", "30", "--safety.watchdog-s", "2.5"]
 
 
 @pytest.mark.slow

@@ -2,7 +2,8 @@
 
 Authors the hand and a few objects, imports meshes if a folder is given, finds an effect that is hidden in a
 servo, trains a teacher with the preset that fits the machine, evaluates it beside a random and a zero agent,
-records a video, lets a student of point clouds begin to imitate an installed teacher, and writes a page.
+records a video, lets a student of point clouds begin to imitate an installed teacher, flies simulated hands
+behind their motors' protocol, and writes a page.
 Most stages are calls of the public commands; what is finished is not repeated by the next call.
 
 It ends in time whatever the machine: the import has a share of the time, training ends where the stages
@@ -26,6 +27,7 @@ import tyro
 from vd.config import to_dict
 from vd.files import write_json
 from vd.train.demo_agents import AGENTS, GoalCount, compare_agents, record_training_task
+from vd.train.demo_deploy import HANDS, deploy_commands, deploy_files, fly_twins, replay_command
 from vd.train.demo_gap import find_hidden_gap, gap_commands, gap_report
 from vd.train.demo_import import IMPORT_SEARCH, IMPORT_SHARE, import_for
 from vd.train.demo_stages import Budget, Stages
@@ -40,7 +42,7 @@ OBJECTS = ("cube",)
 SHOWN = ("procedural-3-seed0",)
 """Built-in sets that are authored beside them, and only appear in the evaluation."""
 
-STAGES, MESH_STAGES = 9, 2
+STAGES, MESH_STAGES = 10, 2
 """Stages of every demo, and those that imported meshes add after their import."""
 
 # Time kept back from training for what follows it on two cores: comparison, video, student, evaluation, page;
@@ -48,8 +50,9 @@ STAGES, MESH_STAGES = 9, 2
 RESERVE_MIN, RESERVE_MESHES_MIN = 5.5, 1.75
 # Time kept back for the page alone.
 PAGE_MIN = 0.3
-# Time kept back from the student for the evaluation after it.
+# Time kept back from the student for the twins, and from both for the evaluation after them.
 PAPER_MIN = 0.8
+TWINS_MIN = 1.0
 # Training is worth starting with at least this much time left.
 LEAST_TRAINING_MIN = 1.0
 # Wanted duration of an agent's episodes in the comparison; their number follows from the speed of training.
@@ -293,7 +296,7 @@ class _Demo:
         """Let a student learn one scene by heart and begin to imitate on many; returns whether it did."""
         commands = [f"vd-train {' '.join(a)}" for a in student_commands(self.folder, self.cfg.seed)]
         self.commands += commands
-        keep = PAGE_MIN + PAPER_MIN
+        keep = PAGE_MIN + PAPER_MIN + TWINS_MIN
         return self.stages.run_if_time(
             "student",
             "let a student of point clouds learn a scene by heart, then imitate on many",
@@ -301,6 +304,24 @@ class _Demo:
                 self.folder, self.cfg.seed, minutes=self.stages.budget.left_s(keep_min=keep) / 60.0
             ),
             products=student_files(self.folder),
+            keep_min=PAGE_MIN,
+            command=" && ".join(commands),
+        )
+
+    def deploy(self) -> bool:
+        """Fly twins of both hands by the installed teachers; returns whether they flew."""
+        flights = deploy_commands(self.folder, self.cfg.seed)
+        replays = [replay_command(self.folder, hand) for hand in HANDS]
+        commands = [" ".join(command) for command in (*flights, *replays)]
+        self.commands += commands
+        keep = PAGE_MIN + PAPER_MIN
+        return self.stages.run_if_time(
+            "deploy",
+            "fly simulated hands through the protocol of their motors",
+            lambda: fly_twins(
+                self.folder, self.cfg.seed, minutes=self.stages.budget.left_s(keep_min=keep) / 60.0
+            ),
+            products=deploy_files(self.folder),
             keep_min=PAGE_MIN,
             command=" && ".join(commands),
         )
@@ -406,6 +427,7 @@ def run_demo(cfg: DemoCfg, *, started: float | None = None) -> Path:
         imported = demo.compare_imported()
         imported_video = demo.record(demo.imported, "imported-video", "record it with imported meshes")
     student = demo.imitate()
+    deployed = demo.deploy()
     paper = demo.judge_as_paper()
 
     page = cfg.out / "index.html"
@@ -423,6 +445,7 @@ def run_demo(cfg: DemoCfg, *, started: float | None = None) -> Path:
             imported=imported,
             gap=gap,
             student=student,
+            deployed=deployed,
             folder=folder,
             paper=paper,
             video=video,

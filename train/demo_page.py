@@ -12,6 +12,7 @@ from vd.evaluate.report import number, percent
 from vd.evaluate.result import EvalResult
 from vd.page import Page
 from vd.paper import PAPER
+from vd.train.demo_deploy import add_deploy
 from vd.train.demo_gap import add_gap
 from vd.train.demo_student import add_student
 from vd.train.metrics import PROGRESS_FILE, read_progress
@@ -41,6 +42,7 @@ STAGE_NAMES = {
     "imported": "compare on imported meshes",
     "imported-video": "record with imported meshes",
     "student": "let a student imitate",
+    "deploy": "fly simulated hands",
     "paper": "evaluate by the paper's criteria",
 }
 
@@ -60,6 +62,7 @@ class DemoResults:
         imported: The same on the imported meshes; empty if there are none or there was no time.
         gap: Whether a hidden gap was looked for; its report is in ``folder``.
         student: Whether students were trained; their runs are in ``folder``.
+        deployed: Whether twins of the hands were flown; their logs are in ``folder``.
         folder: Files of this demo.
         paper: Result of the trained policy under the paper's criteria and goals.
         video: Recording of the trained policy.
@@ -79,6 +82,7 @@ class DemoResults:
     imported: "dict[str, tuple[EvalResult, GoalCount]]"
     gap: bool
     student: bool
+    deployed: bool
     folder: Path
     paper: "EvalResult | None"
     video: Path | None
@@ -118,6 +122,8 @@ def write_page(results: DemoResults, path: Path) -> None:
         _paper_criteria(page, results, results.paper)
     if results.student:
         add_student(page, results.folder)
+    if results.deployed:
+        add_deploy(page, results.folder)
     if results.gap:
         add_gap(page, results.folder, path.parent)
     if results.left_out:
