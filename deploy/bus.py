@@ -34,6 +34,9 @@ from vd.deploy.packets import ALERT, MAX_ID, Failure
 BAUD_RATE = 1_000_000
 P_GAIN, D_GAIN = 200, 10
 """Position gains of the paper's motors, in their units."""
+WAIT_S = 0.002
+"""How long a read of the port sleeps at most until its bytes are there. The SDK's own does not sleep but asks
+again and again, which takes a core, and keeps whatever shares it from answering."""
 STATE_ADDRESS, STATE_BYTES = 120, 27
 """From the realtime tick to the temperature: one read for the whole state."""
 CLOCK_TOLERANCE_S = 0.04
@@ -150,6 +153,7 @@ class MotorBus:
             ) from error
         if not opened:
             raise BusError(f"{port}: no baud rate {baud_rate}")
+        self._port.ser.timeout = WAIT_S
 
     def __enter__(self) -> "MotorBus":
         return self

@@ -1,7 +1,6 @@
 """Running in time: before other programs, and without pauses of the interpreter."""
 
 import contextlib
-import ctypes
 import gc
 import os
 from collections.abc import Iterator
@@ -10,9 +9,6 @@ from typing import Literal
 Priority = Literal["auto", "on", "off"]
 """Real-time priority: where it is permitted, always, or never."""
 
-LOCK_MEMORY = 7
-"""mlockall of Linux: pages of the present and the future, each from when it is first used."""
-
 
 @contextlib.contextmanager
 def real_time(wanted: Priority, *, level: int = 0) -> Iterator[bool]:
@@ -20,8 +16,8 @@ def real_time(wanted: Priority, *, level: int = 0) -> Iterator[bool]:
 
     Args:
         wanted: Whether to.
-        level: Above the lowest real-time priority. A twin's is higher than the loop's: the SDK waits for
-            motors without sleeping, and would keep the twin from answering.
+        level: Above the lowest real-time priority. A twin's is higher than the loop's, as motors' processors
+            do not wait for ours.
 
     Yields:
         Whether it does.
@@ -42,12 +38,9 @@ def real_time(wanted: Priority, *, level: int = 0) -> Iterator[bool]:
             ) from error
         yield False
         return
-    libc = ctypes.CDLL(None)
-    libc.mlockall(LOCK_MEMORY)  # as far as it is permitted: what was read from a disk once is not read again
     try:
         yield True
     finally:
-        libc.munlockall()
         os.sched_setscheduler(0, *before)
 
 
