@@ -29,7 +29,7 @@ from vd.gap.recording import BARE_MODELS
 from vd.gap.sizes import GAPS, showing
 
 PAIR_SIZE = 2
-"""Size of both effects of a pair, about six noise floors each: from there on single effects are told apart."""
+"""Size of both effects of a pair, some six noise floors each: from there on single effects are told apart."""
 NOTHING_HIDDEN = 200
 CASE_LIMIT_S = 1800.0
 """Longest time of a case [s]."""
