@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from test_demo_deploy import made_up_flights
 from test_demo_student import student_rows
 from test_gap_report import sample_curves, sample_report
 
@@ -84,6 +85,7 @@ def small(monkeypatch, tmp_path) -> demo.DemoCfg:
     monkeypatch.setattr(demo_agents, "VIDEO_CELLS", 1)
     monkeypatch.setattr(demo, "find_hidden_gap", made_up_gap)
     monkeypatch.setattr(demo, "train_students", made_up_students)
+    monkeypatch.setattr(demo, "fly_twins", made_up_flights)
     return demo.DemoCfg(
         out=tmp_path / "demo", minutes=20.0, objects=("cube",), preset="cpu-demo", num_worlds=4, max_steps=128
     )
@@ -103,7 +105,7 @@ def test_demo_ends_with_a_page_and_repeats_nothing(small, cone, capsys):
     small = replace(small, meshes=cone)
     page = demo.run_demo(small)
     text = page.read_text()
-    assert text.count("<video") == 2
+    assert text.count("<video") == 4  # its own objects, imported ones, both twins
     assert text.count("<img") >= 5  # comparison, learning, curves, contact sheet, student
     assert "lacks command delay" in text
     assert "begins to imitate" in text and "0.45 on held-out episodes" in text
@@ -127,7 +129,7 @@ def test_demo_ends_with_a_page_and_repeats_nothing(small, cone, capsys):
     assert demo.run_demo(small) == page
     assert page.is_file()
     assert {path: path.stat().st_mtime_ns for path in before} == before
-    # Import, objects, gap, training, comparison, video, both again with meshes, student, evaluation.
+    # Import, objects, gap, training, comparison, video, both again with meshes, student, twins, evaluation.
     assert capsys.readouterr().out.count("done before") == total - 2
 
 
@@ -151,7 +153,7 @@ def test_a_used_up_budget_still_ends_with_a_page_that_says_what_is_missing(small
         assert f"by hand: {command}" in output
         assert command in text.partition("Left out")[2]
     assert "cone.stl" in text
-    assert "[10/10, " in output  # nothing is announced for meshes that are not there
+    assert "[11/11, " in output  # nothing is announced for meshes that are not there
 
 
 def test_a_machine_too_slow_for_the_comparison_ends_with_the_remedy(tmp_path):
