@@ -88,6 +88,9 @@ def test_the_object_has_no_voxel_that_touches_the_hand(device):
     found = sites.coordinates[item][:, 1:].cpu().numpy()
     assert set(map(tuple, found)) == set(map(tuple, own[ENDS[1] :].astype(int)))
     assert len(sites) > len(np.unique(own, axis=0))  # some of what the camera sees is not marked
+    sites.complete = True  # then all without a mark is the object's
+    whole, _ = item_and_goal(sites)
+    assert torch.equal(whole, (sites.marks == 0).all(dim=1)) and whole.sum() > item.sum()
     none = torch.zeros_like(item)
     assert not sites.touching(none, item).any() and not sites.touching(item, none).any()
 

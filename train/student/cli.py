@@ -34,7 +34,7 @@ class CalibrateCfg:
     objects: tuple[str, ...] = ()
     """Object sets to calibrate on, not those of the training; the training's by default."""
     episodes: int = 256
-    """Episodes, all side by side."""
+    """Episodes, all side by side; rounded up to as many of each object."""
     tolerance_rad: float = PAPER.success.rotation_rad
     """Largest true distance that counts as right [rad]."""
     randomise: bool = False
