@@ -10,8 +10,9 @@ import numpy as np
 from vd.assets_usd.camera_layer import read_camera
 from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.hand_model import HandModel
-from vd.assets_usd.objects.model import ObjectModel, load_set
+from vd.assets_usd.objects.model import ObjectModel
 from vd.deploy.camera import DepthSource
+from vd.deploy.goals import read_goals
 from vd.deploy.mirror import Mirror
 from vd.deploy.motion import reset_pose
 from vd.deploy.observation import Sensed
@@ -47,18 +48,6 @@ class Flight:
     """Where its depth camera has to be; None: it has none."""
     needs_truth: bool = False
     """Whether it needs the object's true pose, which only a twin knows."""
-
-
-def one_object(name: str) -> ObjectModel:
-    """The object that is named.
-
-    Raises:
-        ValueError: Several are.
-    """
-    found = load_set(name)
-    if len(found) > 1:
-        raise ValueError(f"--object {name} holds {len(found)} objects; name the file of one")
-    return found[0]
 
 
 def make_flight(
@@ -116,7 +105,7 @@ def make_goals(texts: Sequence[str], drawn: int, max_angle: float, *, seed: int)
     """Goals as they were typed, or drawn ones, each within an angle of the one before.
 
     Args:
-        texts: Quaternions x,y,z,w.
+        texts: Orientations as :func:`vd.deploy.goals.read_goals` reads them.
         drawn: How many to draw where there are none.
         max_angle: Largest angle between two drawn goals [rad]; the first from no rotation.
         seed: Of the draw.
@@ -125,17 +114,9 @@ def make_goals(texts: Sequence[str], drawn: int, max_angle: float, *, seed: int)
         Quaternions xyzw.
 
     Raises:
-        ValueError: A text that is no quaternion.
+        ValueError: A text that is no orientation.
     """
-    goals = []
-    for text in texts:
-        try:
-            goal = np.array([float(part) for part in text.split(",")])
-        except ValueError:
-            goal = np.zeros(0)
-        if goal.shape != (4,) or not np.linalg.norm(goal) > 0.0:
-            raise ValueError(f"--goal {text}: give a quaternion x,y,z,w, such as 0,0,0.7071,0.7071")
-        goals.append(goal / np.linalg.norm(goal))
+    goals = read_goals(texts)
     if goals:
         return goals
     rng = np.random.default_rng(seed)

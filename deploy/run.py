@@ -48,9 +48,10 @@ class RunCfg(HandOptions):
     """Bundle or file of a student, or with --twin also a teacher: a file or an installed policy; with --twin
     the installed teacher of the hand by default. "still" does nothing."""
     object: str = "cube"
-    """The object: name of a built-in set, or its USD."""
+    """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj, .glb)."""
     goal: tuple[str, ...] = ()
-    """Orientations of the object to reach, one after the other: quaternions x,y,z,w in the world frame."""
+    """Orientations of the object to reach, one after the other, in the world frame: quaternions x,y,z,w,
+    turns x,y,z@degrees about an axis, or files (.txt, .csv) with one on each line."""
     random_goals: int = 1
     """How many goals to draw where --goal names none."""
     max_goal_angle: float = np.pi
@@ -85,12 +86,16 @@ class RunCfg(HandOptions):
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
+        from vd.deploy.goals import SCAN_SUFFIXES
+
         if self.random_goals < 1 or self.threads < 1:
             raise ValueError("--random-goals and --threads have to be at least 1")
         if not self.goal_s > 0.0 or self.hold_s < 0.0:
             raise ValueError("--goal-s has to be positive, and --hold-s must not be negative")
         if (self.air or self.realistic) and not self.twin:
             raise ValueError("--air and --realistic are for --twin")
+        if self.twin and Path(self.object).suffix.lower() in SCAN_SUFFIXES:
+            raise ValueError(f"--object {self.object}: a twin cannot hold a scan; vd-assets import it first")
         if self.policy is None and not self.twin:
             raise ValueError("name the policy: the folder of a bundle that vd-train bundle wrote")
 
@@ -102,7 +107,8 @@ def run(cfg: RunCfg) -> int:
     import warp as wp
 
     from vd.deploy.connect import read_hand_and_joints
-    from vd.deploy.flight import make_flight, one_object
+    from vd.deploy.flight import make_flight
+    from vd.deploy.goals import one_object
     from vd.deploy.twin_link import TwinLink
 
     wp.config.log_level = wp.LOG_WARNING  # a line for each kernel would scroll the preflight away

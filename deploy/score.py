@@ -14,10 +14,11 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
+from vd.deploy.goals import one_object
 from vd.deploy.mocap import Mocap, MocapError, read_mocap
 from vd.evaluate.result import TOLERANCES_RAD
 from vd.evaluate.statistics import Interval, median_interval, rate_intervals, symmetric_error
-from vd.hand_log import HandLog, LogError, read_log
+from vd.hand_log import HandLog, read_log
 
 NEAR_S = 0.1
 """Farthest sample [s] from a stop that counts for it: the object rests, and lost markers come back late."""
@@ -122,19 +123,14 @@ class Score:
 
 def score(cfg: ScoreCfg) -> int:
     """Print the table; 1 if no trial could be scored."""
-    from vd.assets_usd.objects.model import load_set
-
     log = read_log(cfg.log)
-    items = {item.name: item for item in load_set(log.run["object"]["set"])}
-    name = log.run["object"]["name"]
-    if name not in items:
-        raise LogError(f"{cfg.log}: its object {name} is not in {log.run['object']['set']} any more")
+    symmetry = one_object(log.run["object"]["set"]).symmetry
     mocap = in_world(read_mocap(cfg.mocap, cfg.body), up=cfg.up, world=cfg.world, marker=cfg.marker)
-    result = score_run(log, mocap, items[name].symmetry, offset_s=cfg.offset_s)
+    result = score_run(log, mocap, symmetry, offset_s=cfg.offset_s)
     if cfg.page is not None:
         from vd.deploy.score_page import write_page
 
-        write_page(cfg.page, result, items[name].symmetry)
+        write_page(cfg.page, result, symmetry)
     print(json.dumps(result.record(), indent=1) if cfg.json else "\n".join(lines(result)))
     return 0 if result.scored else 1
 

@@ -95,7 +95,8 @@ class Shadow:
     def __init__(self, log: "HandLog", policy: str | None = None):
         from vd.assets_usd.hands import load_hand
         from vd.deploy.action import ActionFilter
-        from vd.deploy.flight import STILL, mirror_task, one_object
+        from vd.deploy.flight import STILL, mirror_task
+        from vd.deploy.goals import one_object
         from vd.deploy.mirror import Mirror
         from vd.deploy.observation import StudentSight
         from vd.evaluate.agents import is_saved_student, open_policy

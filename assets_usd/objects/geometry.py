@@ -281,12 +281,17 @@ def surface_points(
     while len(candidates) < count:
         more = random_surface_points(vertices, faces, CANDIDATES_PER_POINT * count, rng)
         candidates = np.concatenate([candidates, more[union_depth(outside, more) > -tolerance]])
+    return candidates[spread(candidates, count)]
+
+
+def spread(points: np.ndarray, count: int) -> np.ndarray:
+    """Rows of ``count`` points [N, 3] far from each other: farthest-point sampling from the first one."""
     chosen = np.zeros(count, dtype=int)
-    distance = np.full(len(candidates), np.inf)
+    distance = np.full(len(points), np.inf)
     for i in range(1, count):
-        np.minimum(distance, ((candidates - candidates[chosen[i - 1]]) ** 2).sum(axis=1), out=distance)
+        np.minimum(distance, ((points - points[chosen[i - 1]]) ** 2).sum(axis=1), out=distance)
         chosen[i] = int(np.argmax(distance))
-    return candidates[chosen]
+    return chosen
 
 
 def cluster_vertices(

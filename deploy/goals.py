@@ -1,0 +1,258 @@
+"""What to reach: the shape of an object, from its USD or any scan, and the orientations it shall take.
+
+A scan is a mesh or a cloud of points, with noise, holes and what floats about it. Only its surface samples
+are needed, the goal's cloud of a student, so it need not be closed as for a simulation (vd-assets import).
+
+Orientations are quaternions ``x,y,z,w`` or turns ``x,y,z@degrees`` about an axis, from how the object is in
+its file, in the world frame; or a file with one on each line.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy import ndimage
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_data import compose, invert
+from vd.assets_usd.objects.geometry import (
+    Solid,
+    convex_hull,
+    random_surface_points,
+    solid_of_mesh,
+    solid_of_voxels,
+    spread,
+)
+from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, UNITS_M, MeshError, check_file, repair_mesh
+from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectError, ObjectModel, build_model, load_set
+from vd.paper import PAPER
+from vd.sensors.depth_cloud import BASE_IN_WORLD
+
+SCAN_SUFFIXES = (".ply", ".obj", ".glb")
+"""Files that are taken as scans."""
+GOALS_SUFFIXES = (".txt", ".csv")
+"""Files that are taken as lists of orientations."""
+CANDIDATES = 20_000
+"""Samples of a scan from which those of the goal are chosen: 1 mm apart on an object of the paper's size."""
+LEAST_POINTS = 200
+"""Points of a scan below which its shape is a guess."""
+NEIGHBOURS = 24
+"""Samples that make a piece of the surface: a plane is laid through them, which takes noise out."""
+FAR = 6.0
+"""Distance to the neighbours, of the usual, from which a sample floats about by itself."""
+LEAST_PIECE = 0.05
+"""Share of all samples below which a separate piece is taken for dirt."""
+VOXELS = 64
+"""Voxels along the longest side of a scan, to find its centre of mass."""
+CLOSED_VOXELS = 6
+"""Half the width of holes that are closed for that: a tenth of the object."""
+LARGER = 1.5
+"""How much larger or smaller than the objects of the paper an object may be."""
+
+
+class GoalError(ValueError):
+    """A shape or an orientation that cannot be used; names it and the remedy."""
+
+
+def one_object(name: str) -> ObjectModel:
+    """The object of a name: that of a set, a USD, or a scan.
+
+    Raises:
+        GoalError: Several are, or the scan is of no use.
+        ObjectError: There is none.
+    """
+    if Path(name).suffix.lower() in SCAN_SUFFIXES:
+        return scan_object(Path(name))
+    found = load_set(name)
+    if len(found) > 1:
+        raise GoalError(f"--object {name} holds {len(found)} objects; name the file of one")
+    return found[0]
+
+
+def scan_object(path: Path, unit: str | None = None, *, seed: int = 0) -> ObjectModel:
+    """An object from a scan, for its cloud; its collision shape is its convex hull.
+
+    Args:
+        path: PLY, OBJ or GLB; a mesh or points.
+        unit: m, cm or mm; None for the one in which it is as large as objects are.
+        seed: Of the samples.
+
+    Raises:
+        GoalError: The file is of no use; names it, what is wrong, and the remedy.
+    """
+    path = Path(path)
+    try:
+        points, centre = _samples(path, np.random.default_rng(seed))
+    except MeshError as error:
+        raise GoalError(f"{path}: {error}; scan it again, or export it as PLY") from error
+    longest = float(np.ptp(points, axis=0).max())
+    factor = _unit(path, longest, unit)
+    points = points * factor
+    hull = convex_hull(points)
+    solid = filled(points)
+    if centre is not None:
+        solid = solid._replace(centroid=centre * factor)
+    chosen = points[spread(points, SURFACE_POINTS)]
+    try:
+        return build_model(
+            "scan",
+            hull.vertices,
+            hull.faces,
+            [hull],
+            solid,
+            chosen,
+            source=str(path),
+            family="scan",
+            scale=factor,
+        )
+    except ObjectError as error:
+        raise GoalError(f"{path}: {error}; scan it from more sides") from error
+
+
+def goal_cloud(item: ObjectModel, quat: np.ndarray) -> np.ndarray:
+    """The goal's cloud as a student sees it: in the hand's base frame, behind the palm, [500, 3] [m].
+
+    Args:
+        item: The object.
+        quat: Wanted orientation in the world frame, xyzw [4].
+    """
+    base = invert(np.array(BASE_IN_WORLD))
+    turn = compose(base, np.array([0.0, 0.0, 0.0, *quat]))[3:]
+    return Rotation.from_quat(turn).apply(item.surface_points) + PAPER.cloud.goal_position_m
+
+
+def read_goals(texts: Sequence[str]) -> list[np.ndarray]:
+    """Orientations as they were typed, or from files, in their order.
+
+    Args:
+        texts: ``x,y,z,w``, ``x,y,z@degrees``, or a file (.txt, .csv) with one on each line, # for comments.
+
+    Returns:
+        Unit quaternions xyzw.
+
+    Raises:
+        GoalError: One is none, or a file cannot be read.
+    """
+    goals = []
+    for text in texts:
+        if Path(text).suffix.lower() not in GOALS_SUFFIXES:
+            goals.append(_goal(text, f"--goal {text}"))
+            continue
+        try:
+            rows = [line.split("#")[0].strip() for line in Path(text).read_text().splitlines()]
+        except (OSError, UnicodeDecodeError) as error:
+            raise GoalError(f"--goal {text} cannot be read ({error})") from error
+        found = [_goal(row, f"{text}, line {i + 1}: {row}") for i, row in enumerate(rows) if row]
+        if not found:
+            raise GoalError(f"--goal {text} holds no orientation; write one on each line, such as 0,0,1@90")
+        goals += found
+    return goals
+
+
+def _goal(text: str, where: str) -> np.ndarray:
+    turn, _, degrees = text.partition("@")
+    try:
+        numbers = np.array([float(part) for part in turn.split(",")])
+        angle = np.radians(float(degrees)) if degrees else None
+    except ValueError:
+        numbers, angle = np.zeros(0), None
+    wanted = 4 if "@" not in text else 3
+    length = float(np.linalg.norm(numbers))
+    if (
+        len(numbers) != wanted
+        or not (np.isfinite(length) and length > 0.0)
+        or (wanted == 3 and angle is None)
+    ):
+        raise GoalError(f"{where}: give a quaternion x,y,z,w or a turn x,y,z@degrees, such as 0,0,1@90")
+    if angle is None:
+        return numbers / length
+    return Rotation.from_rotvec(angle * numbers / length).as_quat()
+
+
+def _samples(path: Path, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray | None]:
+    """Dense samples of a scan's surface [N, 3] in its own unit; the centre of mass of a closed mesh [3]."""
+    import trimesh
+
+    check_file(path)
+    try:
+        loaded: Any = trimesh.load(path, process=False, skip_materials=True)
+        if isinstance(loaded, trimesh.Scene):
+            loaded = loaded.to_mesh()
+    except Exception as error:  # parsers raise anything on a broken file
+        raise MeshError(f"neither mesh nor points: {type(error).__name__}: {error}") from error
+    vertices = np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))), dtype=float)
+    if not len(vertices):
+        raise MeshError("no points")
+    if not np.isfinite(vertices).all():
+        raise MeshError("some points are NaN or infinite")
+    faces = getattr(loaded, "faces", None)
+    if faces is not None and len(faces):
+        mesh = repair_mesh(loaded)
+        points = random_surface_points(mesh.vertices, mesh.faces, CANDIDATES, generator)
+        if mesh.watertight:
+            return points, solid_of_mesh(mesh.vertices, mesh.faces).centroid
+    else:
+        points = vertices[generator.permutation(len(vertices))[:CANDIDATES]]
+    if len(points) < LEAST_POINTS:
+        raise MeshError(f"{len(points)} points; {LEAST_POINTS} at least make a shape")
+    points = _smooth(_without_dirt(points))
+    if np.ptp(
+        points @ np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2].T, axis=0
+    ).min() < (1e-3 * np.ptp(points, axis=0).max()):
+        raise MeshError("flat: the scan shows one side only")
+    return points, None
+
+
+def filled(points: np.ndarray) -> Solid:
+    """Mass properties (density 1) of the solid behind samples of its surface [N, 3], holes closed."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    pitch = float((high - low).max()) / VOXELS
+    margin = CLOSED_VOXELS + 2
+    origin = low - margin * pitch
+    surface = np.zeros(np.ceil((high - low) / pitch).astype(int) + 1 + 2 * margin, dtype=bool)
+    surface[tuple(np.rint((points - origin) / pitch).astype(int).T)] = True
+    grown = ndimage.binary_fill_holes(ndimage.distance_transform_edt(~surface) <= CLOSED_VOXELS)
+    shrunk = ndimage.distance_transform_edt(grown) > CLOSED_VOXELS
+    return solid_of_voxels(ndimage.binary_fill_holes(shrunk | surface), origin, pitch)
+
+
+def _without_dirt(points: np.ndarray) -> np.ndarray:
+    """The samples without those that float about, by themselves or in small pieces."""
+    near = cKDTree(points).query(points, NEIGHBOURS)[0][:, -1]
+    points = points[near < FAR * np.median(near)]
+    pairs = cKDTree(points).query_pairs(2.0 * float(np.median(near)), output_type="ndarray")
+    ones = np.ones(len(pairs), dtype=bool)
+    graph = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
+    piece = connected_components(graph, directed=False)[1]
+    size = np.bincount(piece)
+    return points[size[piece] >= LEAST_PIECE * len(points)]
+
+
+def _smooth(points: np.ndarray) -> np.ndarray:
+    """Each sample moved onto the plane through its neighbours."""
+    rows = cKDTree(points).query(points, NEIGHBOURS)[1]
+    middle = points[rows].mean(axis=1)
+    apart = points[rows] - middle[:, None]
+    normal = np.linalg.eigh(np.einsum("nki,nkj->nij", apart, apart))[1][:, :, 0]
+    off = np.einsum("ni,ni->n", points - middle, normal)
+    return points - off[:, None] * normal
+
+
+def _unit(path: Path, longest: float, unit: str | None) -> float:
+    """Factor from the scan's unit to metres."""
+    low, high = LONGEST_SIDE_M[0] / LARGER, LONGEST_SIDE_M[1] * LARGER
+    if unit is not None and unit not in UNITS_M:
+        raise GoalError(f"{path}: unit {unit!r}; choose {', '.join(UNITS_M)}")
+    options = UNITS_M if unit is None else {unit: UNITS_M[unit]}
+    fitting = [factor for factor in options.values() if low <= longest * factor <= high]
+    if not fitting:
+        raise GoalError(
+            f"{path}: its longest side is {longest:.4g} units, which in {' or '.join(options)} is not within "
+            f"{100 * low:.0f} to {100 * high:.0f} cm; cut away what is not the object, or scale the file to "
+            "metres"
+        )
+    return fitting[0]

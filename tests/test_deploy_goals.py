@@ -1,0 +1,132 @@
+"""Goals: clouds from scans with noise, holes and dirt, and orientations as people write them."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.model import load_set
+from vd.deploy.goals import GoalError, goal_cloud, one_object, read_goals, scan_object
+from vd.deploy.observation import Sensed, StudentSight
+from vd.student.cfg import PRESETS
+
+NOISE_M = 0.001
+HOLE_M = 0.012
+"""Radius of what is missing around three spots."""
+
+
+@pytest.fixture(scope="module", params=[0, 90])
+def item(request):
+    return load_set("procedural-150-seed0")[request.param]
+
+
+def surface(item, count=25_000, seed=1):
+    mesh = trimesh.Trimesh(item.vertices, item.faces, process=False)
+    points, face = trimesh.sample.sample_surface(mesh, count, seed=seed)
+    return points, mesh.face_normals[face]
+
+
+def dirty(item, seed=2):
+    """Points with noise, holes and some that float about."""
+    generator = np.random.default_rng(seed)
+    points, normal = surface(item)
+    scan = points + NOISE_M * generator.standard_normal((len(points), 1)) * normal
+    for _ in range(3):
+        scan = scan[np.linalg.norm(scan - scan[generator.integers(len(scan))], axis=1) > HOLE_M]
+    return np.concatenate([scan, generator.uniform(-0.12, 0.12, (60, 3))])
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_a_dirty_cloud_keeps_its_shape(item, tmp_path, unit):
+    """In the frame of the true centre of mass: a wrong centre counts too, by 5 mm at most."""
+    path = tmp_path / "scan.ply"
+    trimesh.PointCloud(dirty(item) * unit).export(path)
+    scan = scan_object(path)
+    assert scan.surface_points.shape == (500, 3)
+    assert scan.scale == pytest.approx(1.0 / unit)
+    true = surface(item, seed=3)[0]
+    tree = cKDTree(true)
+    # The scan lies in the object's frame but for its origin: the shift that brings them together.
+    shift = np.zeros(3)
+    for _ in range(30):
+        near = true[tree.query(scan.surface_points + shift)[1]]
+        shift += (near - scan.surface_points - shift).mean(axis=0)
+    assert np.linalg.norm(shift) < 0.005
+    away = tree.query(scan.surface_points + shift)[0]
+    assert np.median(away) < 0.0012
+    assert np.quantile(away, 0.99) < 0.004
+    covered = cKDTree(scan.surface_points + shift).query(true)[0]
+    assert np.quantile(covered, 0.9) < 0.008
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])
+def test_a_closed_mesh_is_taken_as_it_is(item, tmp_path, suffix):
+    mesh = trimesh.convex.convex_hull(item.vertices)
+    mesh.apply_translation([0.3, 0.1, -0.2])
+    mesh.export(tmp_path / f"object{suffix}")
+    scan = scan_object(tmp_path / f"object{suffix}")
+    centred = mesh.vertices - mesh.center_mass
+    assert np.abs(np.ptp(scan.surface_points, axis=0) - np.ptp(centred, axis=0)).max() < 0.005
+    # On a convex mesh a point's largest height over the faces' planes is its distance from the surface.
+    corner = centred[mesh.faces[:, 0]]
+    height = np.einsum("pfi,fi->pf", scan.surface_points[:, None] - corner, mesh.face_normals)
+    assert np.abs(height.max(axis=1)).max() < 1e-5
+
+
+def test_the_goals_cloud_is_that_of_the_student(item):
+    """Bit for bit the kernel's, but for rounding, for any orientation."""
+    hand, network = load_hand("dclaw3"), PRESETS["small"]
+    sight = StudentSight(hand, item, network)
+    quat = Rotation.random(random_state=np.random.default_rng(3)).as_quat()
+    zero = np.zeros(hand.num_joints)
+    pose = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0])
+    seen = sight.points(Sensed(zero, zero, zero, quat, object_pose=pose))[0, : sight.ends[0]].numpy()
+    np.testing.assert_allclose(goal_cloud(item, quat), seen, atol=1e-6)
+
+
+def test_scans_of_no_use_are_refused_by_name(tmp_path):
+    generator = np.random.default_rng(0)
+
+    def refused(name, why):
+        with pytest.raises(GoalError, match=why) as error:
+            one_object(str(tmp_path / name))
+        assert name in str(error.value)
+
+    refused("none.ply", "no such file")
+    (tmp_path / "text.ply").write_text("not a scan")
+    refused("text.ply", "neither mesh nor points")
+    trimesh.PointCloud(generator.normal(0, 0.03, (50, 3))).export(tmp_path / "few.ply")
+    refused("few.ply", "50 points")
+    trimesh.PointCloud(generator.uniform(-0.05, 0.05, (5000, 3)) * [1, 1, 0]).export(tmp_path / "flat.ply")
+    refused("flat.ply", "one side only")
+    trimesh.creation.box((2.0, 1.0, 1.0)).export(tmp_path / "table.ply")
+    refused("table.ply", "scale the file to metres")
+    with pytest.raises(GoalError, match="--object"):
+        one_object("procedural-150-seed0")
+
+
+def test_orientations_are_read_as_written(tmp_path):
+    file = tmp_path / "goals.txt"
+    file.write_text("# a sequence\n0,0,1@90\n\n0,0,0,2  # twice as long\n")
+    goals = read_goals(["1,0,0@180", str(file)])
+    half = np.sqrt(0.5)
+    np.testing.assert_allclose(goals, [[1, 0, 0, 0], [0, 0, half, half], [0, 0, 0, 1]], atol=1e-12)
+
+
+@pytest.mark.parametrize("text", ["1,2,3", "0,0,0@90", "0,0,0,0", "a,b,c,d", "0,0,1,0@90", "nan,0,0,1"])
+def test_what_is_no_orientation_is_refused(text, tmp_path):
+    with pytest.raises(GoalError, match="such as 0,0,1@90"):
+        read_goals([text])
+    (tmp_path / "goals.csv").write_text(f"0,0,0,1\n{text}\n")
+    with pytest.raises(GoalError, match="line 2"):
+        read_goals([str(tmp_path / "goals.csv")])
+
+
+def test_files_without_orientations_are_refused(tmp_path):
+    (tmp_path / "empty.txt").write_text("# nothing\n")
+    with pytest.raises(GoalError, match="no orientation"):
+        read_goals([str(tmp_path / "empty.txt")])
+    with pytest.raises(GoalError, match="cannot be read"):
+        read_goals([str(tmp_path / "none.txt")])
