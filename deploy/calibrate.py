@@ -17,7 +17,6 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.camera_layer import write_camera_layer
 from vd.assets_usd.hand_data import HandModel, compose, invert
 from vd.deploy.calibration_poses import plan
 from vd.deploy.calibration_twin import CalibrationTwin
@@ -349,6 +348,8 @@ def turned(views: Views) -> np.ndarray:
 
 def write_layer(path: Path, hand: HandModel, found: HandEye, record: dict[str, Any]) -> None:
     """Write the layer, with what is known of its errors."""
+    from vd.assets_usd.camera_layer import write_camera_layer
+
     notes = {
         "tool": "vd-deploy calibrate",
         "position_half_width_m": json.dumps(record["position_half_width_m"]),
