@@ -18,7 +18,7 @@ from vd.deploy.motion import reset_pose
 from vd.deploy.observation import Sensed
 from vd.deploy.pilot import Pilot, StillPilot, StudentPilot, TeacherPilot
 from vd.deploy.realsense import RealSense, RealSenseCfg, find_device
-from vd.deploy.twin_link import TwinCamera, TwinLink
+from vd.deploy.twin_link import SdkTwinCamera, TwinCamera, TwinLink
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.agents import check_bundle, is_saved_student, open_policy, task_for, trained_task
 from vd.evaluate.rollout import draw_goals
@@ -127,8 +127,16 @@ def make_goals(texts: Sequence[str], drawn: int, max_angle: float, *, seed: int)
     return goals
 
 
-def open_camera(flight: Flight, link: TwinLink | None, cfg: RealSenseCfg) -> DepthSource | None:
+def open_camera(
+    flight: Flight, link: TwinLink | None, cfg: RealSenseCfg, *, sdk: bool = False
+) -> DepthSource | None:
     """The depth camera of a policy, a twin's or a real one; None if it needs none.
+
+    Args:
+        flight: The policy.
+        link: A twin; None for a real camera.
+        cfg: Settings of the real one.
+        sdk: Take a twin's images through the camera's SDK.
 
     Raises:
         CameraError: There is none, or its images are not those of the training.
@@ -136,7 +144,8 @@ def open_camera(flight: Flight, link: TwinLink | None, cfg: RealSenseCfg) -> Dep
     if flight.camera is None:
         return None
     if link is not None:
-        return TwinCamera(link, flight.camera)
+        camera = TwinCamera(link, flight.camera)
+        return SdkTwinCamera(camera) if sdk else camera
     return RealSense(find_device(cfg.serial), cfg)
 
 

@@ -64,6 +64,8 @@ class RunCfg(HandOptions):
     """Take the twin's table away after 2 s, as the paper's test in the air does."""
     realistic: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Give the twin's depth images the errors of a real camera."""
+    sdk: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Take the twin's depth images through the software device of the camera's SDK."""
     camera: RealSenseCfg = field(default_factory=RealSenseCfg)
     """The depth camera."""
     camera_layer: Path | None = None
@@ -92,8 +94,8 @@ class RunCfg(HandOptions):
             raise ValueError("--random-goals and --threads have to be at least 1")
         if not self.goal_s > 0.0 or self.hold_s < 0.0:
             raise ValueError("--goal-s has to be positive, and --hold-s must not be negative")
-        if (self.air or self.realistic) and not self.twin:
-            raise ValueError("--air and --realistic are for --twin")
+        if (self.air or self.realistic or self.sdk) and not self.twin:
+            raise ValueError("--air, --realistic and --sdk are for --twin")
         if self.twin and Path(self.object).suffix.lower() in SCAN_SUFFIXES:
             raise ValueError(f"--object {self.object}: a twin cannot hold a scan; vd-assets import it first")
         if self.policy is None and not self.twin:
@@ -148,7 +150,7 @@ def _fly(
     goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
     pose = reset_pose(hand.num_fingers)
     with contextlib.ExitStack() as stack:
-        camera = open_camera(flight, link, cfg.camera)
+        camera = open_camera(flight, link, cfg.camera, sdk=cfg.sdk)
         if camera is not None:
             stack.callback(camera.close)
             look(flight, camera, hand, cfg.camera_layer)

@@ -98,6 +98,45 @@ class TwinLink:
         self._socket.close()
 
 
+class SdkTwinCamera:
+    """The camera of a twin behind the RealSense SDK's software device: its images come as a real camera's do.
+
+    Args:
+        twin: Makes the images.
+
+    Raises:
+        CameraError: The SDK is not installed.
+    """
+
+    def __init__(self, twin: "TwinCamera"):
+        from vd.deploy.camera_twin import CameraTwin
+        from vd.deploy.realsense import FilterCfg, RealSense, RealSenseCfg
+
+        lens = twin.intrinsics
+        self._twin, self._device = twin, CameraTwin(lens)
+        cfg = RealSenseCfg(width=lens.width, height=lens.height, filters=FilterCfg(decimation=1))
+        self._eye = RealSense(self._device.device, cfg)
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of its images."""
+        return self._eye.intrinsics
+
+    def read(self, timeout_s: float) -> DepthFrame:
+        """An image of the present, in the SDK's millimetres.
+
+        Raises:
+            StaleCamera: None came in time.
+        """
+        image = self._twin.read(timeout_s)
+        self._device.show(image.depth_m, image.time_s)
+        return self._eye.read(timeout_s)
+
+    def close(self) -> None:
+        """Stop the device."""
+        self._eye.close()
+
+
 class TwinCamera:
     """The depth camera of a twin: an image whenever one is wanted.
 

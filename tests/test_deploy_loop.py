@@ -4,8 +4,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from student_dummy import TINY
 
 from vd.assets_usd.hands import load_hand
+from vd.bundle.store import write_student
+from vd.config import to_dict
 from vd.deploy import cli
 from vd.deploy.action import ActionFilter
 from vd.deploy.log import LogWriter
@@ -16,6 +19,9 @@ from vd.deploy.twin_link import TwinState
 from vd.envs.cfg import ReorientCfg
 from vd.hand_log import read_log
 from vd.paper import PAPER
+from vd.sensors.cfg import DepthCameraCfg
+from vd.student.network import Student
+from vd.student.saved import SavedStudent, StudentSpec
 from vd.student.stopping import StoppingRule
 
 HZ = PAPER.scene.control_hz
@@ -200,6 +206,28 @@ def test_a_teacher_flies_a_twin(hand, tmp_path, capsys, patient):
     step = PAPER.action.scale_rad_s / HZ
     assert np.abs(log.channel("command") - log.channel("position")).max() < step + 0.3
     assert np.isfinite(log.object_pose).all() and log.object_pose[:, 2].max() < 0.2
+
+
+@pytest.mark.slow
+def test_a_student_sees_a_twin_through_the_cameras_sdk(tmp_path, capsys, patient):
+    """Random weights that never stop; the simulator shows what the student saw, images included."""
+    pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
+    pytest.importorskip("pyrealsense2", reason="needs the extra `hardware`")
+    spec = StudentSpec(TINY, 9, 2, "none", None, StoppingRule(-100.0, 1.0))
+    network = Student(TINY, 9).eval().requires_grad_(False)
+    task, depth = to_dict(ReorientCfg(hand="dclaw3")), to_dict(DepthCameraCfg())
+    write_student(tmp_path / "student", SavedStudent(spec, network, task, depth, 0, 0), load_hand("dclaw3"))
+    folder = tmp_path / "log"
+    flags = ["--hand", "dclaw3", "--twin", "--sdk", "--images", "--goal-s", "1", "--hold-s", "0"]
+    status = cli.main([*flags, *patient, "--log", str(folder), str(tmp_path / "student")])
+    words = capsys.readouterr().err
+    if "loop rate" in words or "asked again" in words:
+        pytest.skip(f"this machine is too busy: {words.splitlines()[-1]}")
+    assert status == 0, words
+    log = read_log(folder)
+    assert log.run["kind"] == "student" and len(log.columns["t"]) == 12
+    assert log.image(11).shape == (180, 320) and (log.image(11) > 0.0).mean() > 0.5
+    assert cli.main(["shadow", str(folder), "--every", "5"]) == 0, capsys.readouterr().out
 
 
 def test_what_cannot_be_flown_is_refused(tmp_path, capsys):
