@@ -1,0 +1,55 @@
+"""A student on a hand sees by the real camera's lens, from where calibration found it to be."""
+
+import numpy as np
+
+from vd.assets_usd.camera_layer import write_camera_layer
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.model import load_set
+from vd.config import to_dict
+from vd.deploy.camera import Intrinsics
+from vd.deploy.flight import Flight, look
+from vd.deploy.observation import Sensed
+from vd.deploy.pilot import StudentPilot
+from vd.envs.cfg import ReorientCfg
+from vd.sensors.cfg import DepthCameraCfg
+from vd.student.cfg import PRESETS
+from vd.student.network import Student
+from vd.student.saved import SavedStudent, StudentSpec
+
+SHIFT_M = 0.01
+
+
+class Source:
+    """A camera with another lens and size than the training's."""
+
+    intrinsics = Intrinsics(64, 36, 55.0, 55.0, 31.0, 19.0)
+
+
+def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
+    hand, network = load_hand("dclaw3"), PRESETS["small"]
+    spec = StudentSpec(network, 9, 2)
+    task, depth = to_dict(ReorientCfg(hand="dclaw3", objects=("cube",))), to_dict(DepthCameraCfg(points=500))
+    student = SavedStudent(spec, Student(network, 9).eval(), task, depth, 1, 1)
+    pilot = StudentPilot(student, hand, load_set("cube")[0])
+    flight = Flight("student", "student", pilot, ReorientCfg(hand="dclaw3"), pilot.camera)
+    zero, image = np.zeros(9), np.full((36, 64), 0.6, dtype=np.float32)
+    sensed = Sensed(zero, zero, zero, np.array([0.0, 0.0, 0.0, 1.0]), depth=image)
+
+    def middle():
+        points = pilot.sight.points(sensed)[0, pilot.sight.ends[1] :].numpy()
+        return points[np.isfinite(points).all(axis=1)]
+
+    look(flight, Source(), hand, None)
+    before = middle()
+    # Every point is one of the image by this lens, from the place of the training.
+    seen = pilot.camera.project(before)
+    assert len(before) == len(seen) > 100
+    np.testing.assert_allclose(seen[:, 2], 0.6, atol=1e-5)
+    np.testing.assert_allclose(seen[:, :2] % 1.0, 0.5, atol=2e-3)
+
+    place = np.concatenate([hand.camera.position, hand.camera.quaternion])
+    place[1] += SHIFT_M
+    write_camera_layer(tmp_path / "camera.usda", hand, place, {})
+    look(flight, Source(), hand, tmp_path / "camera.usda")
+    # Sideways in the base is level: the crop by height keeps the same pixels.
+    np.testing.assert_allclose(np.sort(middle()[:, 1]), np.sort(before[:, 1]) + SHIFT_M, atol=1e-5)
