@@ -391,11 +391,11 @@ class TwinCommand:
             )
             side = self._beside(plant)
         twin = Twin([Motor(MODELS[self.model], id) for id in ids], plant, faults, side=side)
-        print(twin.path, flush=True)
         if self.attached:
             threading.Thread(target=_end_with_input, args=(twin,), daemon=True).start()
         try:
             with undisturbed(), real_time(self.realtime, level=1):
+                print(twin.path, flush=True)  # once it can answer at once: the collector takes a while
                 twin.serve()
         except KeyboardInterrupt:
             pass
