@@ -15,14 +15,17 @@ from vd.envs.reorient import ReorientEnv
 from vd.evaluate import student as module
 from vd.evaluate.cli import main
 from vd.evaluate.comparison import Comparison
+from vd.evaluate.scanned import MISSING, NOISE_M, ScannedGoalView, scan
 from vd.evaluate.student import StudentActor
 from vd.evaluate.trace import NEVER_RAD, record
+from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.network import Student
 from vd.student.saved import SavedStudent, StudentSpec, student_export
 from vd.student.stopping import StoppingRule
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main as train
+from vd.vision import StudentView
 
 TASK = ReorientCfg(
     hand="dclaw3",
@@ -110,6 +113,38 @@ def test_what_it_sees_is_as_its_stage_was_trained_unless_told(env):
         StudentActor(env, make_student(0))
     with pytest.raises(ValueError, match="moves 12 joints, the hand dclaw3 has 9"):
         StudentActor(env, make_student(num_actions=12))
+
+
+def test_a_scan_is_noisy_and_misses_one_side():
+    rng = np.random.default_rng(0)
+    ball = rng.normal(size=(4000, 3))
+    ball *= 0.05 / np.linalg.norm(ball, axis=1, keepdims=True)
+    scanned = scan(ball, rng)
+    assert scanned.shape == ball.shape
+    off = np.linalg.norm(scanned, axis=1) - 0.05  # across the surface only one axis of the noise shows
+    assert off.std() == pytest.approx(NOISE_M, rel=0.1)
+    side = -scanned.mean(axis=0) / np.linalg.norm(scanned.mean(axis=0))
+    # A cap with a fifth of a sphere's area begins at 0.6 of its radius.
+    assert (scanned @ side > (0.6 * 0.05 + 3 * NOISE_M)).mean() < 0.01
+    assert (ball @ side > 0.6 * 0.05).mean() == pytest.approx(MISSING, abs=0.03)
+
+
+@pytest.mark.parametrize("rendered", [False, True], ids=["complete", "rendered"])
+def test_only_the_goal_is_scanned(env, rendered):
+    env.reset()
+    settings = dict(rendered=rendered, depth=DepthCameraCfg(points=300))
+    exact, scanned = (view(env, TINY, **settings) for view in (StudentView, ScannedGoalView))
+    frame = exact.frame()
+    rows = torch.tensor([2, 0])
+    chosen = {key: value[rows] for key, value in frame.items()}
+    clouds = [view.points(chosen, rows) for view in (exact, scanned)]
+    goal = len(env.objects[0].surface_points)
+    np.testing.assert_array_equal(*(cloud[:, goal:].numpy() for cloud in clouds))
+    centre = np.array(PAPER.cloud.goal_position_m)
+    reach = [np.linalg.norm(cloud[:, :goal].numpy() - centre, axis=-1).max() for cloud in clouds]
+    assert not torch.allclose(clouds[0][:, :goal], clouds[1][:, :goal], atol=NOISE_M)
+    assert reach[1] < reach[0] + 5 * NOISE_M, "the goal is where it belongs"
+    np.testing.assert_array_equal(scanned.points(chosen, rows).numpy(), clouds[1].numpy())
 
 
 def test_without_a_table_objects_fall_and_it_comes_back(env):

@@ -178,7 +178,7 @@ def test_every_episode_is_in_one_class():
 
 
 def test_what_predictions_are_worth():
-    _, prediction = compared()
+    rows, prediction = compared()
     true = np.abs(0.85 - STEP_RAD * np.arange(12))
     assert prediction.states == 8 * 12
     assert prediction.mean_error_rad == pytest.approx(0.3, abs=1e-4)
@@ -186,11 +186,12 @@ def test_what_predictions_are_worth():
     assert (near.bound_rad, far.bound_rad) == (0.1, 0.4)
     said = true - 0.3 <= 0.4
     assert far.seen == 1.0 and far.right == pytest.approx((true[said] <= 0.4).mean())
-    assert far.by_prediction.value == 0.0, "it stops at 0.65 rad"
-    assert far.by_truth.value == 1.0 and near.by_truth.value == 1.0
-    _, sure = compared(offset=0.0)
+    by_prediction, by_truth = (row.stops_within for row in rows)
+    assert by_prediction["0.4"].value == 0.0, "it stops at 0.65 rad"
+    assert by_truth["0.4"].value == by_truth["0.1"].value == 1.0
+    rows, sure = compared(offset=0.0)
     assert [bound.right for bound in sure.bounds] == [1.0, 1.0]
-    assert [bound.by_prediction for bound in sure.bounds] == [bound.by_truth for bound in sure.bounds]
+    assert rows[0].stops_within == rows[1].stops_within
 
 
 def test_page_and_file(tmp_path):

@@ -217,6 +217,8 @@ class ReorientCfg:
     """Reset the world on success (evaluation) instead of giving a new goal (training)."""
     visuals: bool = False
     """Keep visual shapes, for rendering."""
+    table_friction: float = PAPER.materials.table_friction
+    """Friction coefficient of the table where nothing is randomised; its contacts get the mean of the two."""
     sim: SimCfg = field(default_factory=SimCfg)
     action: ActionCfg = field(default_factory=ActionCfg)
     observation: ObservationCfg = field(default_factory=ObservationCfg)
@@ -250,5 +252,7 @@ class ReorientCfg:
             raise ValueError(f"fingertip = {self.fingertip!r}; choose rigid or soft")
         if self.success.rotation_rad <= 0.0:
             raise ValueError(f"success.rotation_rad = {self.success.rotation_rad}; it must be positive")
+        if self.table_friction < 0.0:
+            raise ValueError(f"table_friction = {self.table_friction}; it must not be negative")
         if self.goal.max_angle_rad <= 0.0:
             raise ValueError(f"goal.max_angle_rad = {self.goal.max_angle_rad}; it must be positive")

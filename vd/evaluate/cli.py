@@ -20,6 +20,21 @@ if TYPE_CHECKING:
 WORLDS_CPU, WORLDS_GPU = 64, 8192
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0
+DEFAULT_OBJECTS = ("cube",)
+OF_THE_SUITE = (
+    "episodes",
+    "max_goal_angle",
+    "at_rest",
+    "no_at_rest",
+    "stop_tolerance",
+    "episode_s",
+    "in_air",
+    "table_friction",
+    "scanned_goals",
+    "sees",
+)
+"""Settings that a suite decides."""
+EXIT_INTERRUPTED = 130
 POLICY_HELP = (
     "A policy.pt or student.pt, a checkpoint, the folder of a bundle or of a run, or the name of an "
     f"installed policy: {', '.join(SHIPPED_POLICIES)}."
@@ -38,14 +53,22 @@ class EvalCfg:
     teacher is stopped, and its error measured, at the first step at which all success criteria hold.
     Students, several policies, groups of objects and --in-air are compared side by side: students are stopped
     by the distance that they predict and, for comparison, by the true one.
+
+    --suite paper runs all of the paper's evaluations in simulation and writes paper.json and paper.html, its
+    figures beside ours. What is finished is not repeated by the next call.
     """
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = ()
     agent: str | None = None
     """zero or random, alone or beside policies."""
-    objects: tuple[str, ...] = ("cube",)
-    """Object sets by name, folders or files (vd-assets makes them). NAME=SET puts one into a group, which
-    gets figures of its own: training=FOLDER held-out=FOLDER symmetric=symmetric."""
+    suite: Literal["paper"] | None = None
+    """Run the paper's evaluations, on the installed policies if none is named. --objects training=FOLDER
+    held-out=FOLDER names the objects; without, our procedural sets stand for them."""
+    quick: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Of the suite only a part, with few objects and episodes: minutes on two CPU cores."""
+    objects: tuple[str, ...] = ()
+    """Object sets by name, folders or files (vd-assets makes them); cube by default. NAME=SET puts one into a
+    group, which gets figures of its own: training=FOLDER held-out=FOLDER symmetric=symmetric."""
     episodes: int = 20
     """Starts and goals of every object."""
     hand: str | None = None
@@ -66,6 +89,10 @@ class EvalCfg:
     """Time limit of an episode [s]; 10 by default, 15 with --in-air."""
     in_air: tyro.conf.FlagCreatePairsOff[bool] = False
     """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
+    table_friction: float | None = None
+    """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
+    scanned_goals: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Students get goals with the errors of a scan: 4 mm of noise, a fifth of the points missing."""
     sees: Literal["auto", "complete", "rendered"] = "auto"
     """What students see: complete clouds, a depth camera's, or what their stage was trained on."""
     randomise: bool = False
@@ -90,12 +117,19 @@ class EvalCfg:
             ValueError: Nothing is named.
         """
         names = tuple(dict.fromkeys((*self.policies, *([] if self.agent is None else [self.agent]))))
+        if not names and self.suite is not None:
+            return tuple(SHIPPED_POLICIES)
         if not names:
             raise ValueError(
                 "name a policy: a file, --agent zero, --agent random, or an installed policy "
                 f"({', '.join(SHIPPED_POLICIES)})"
             )
         return names
+
+    @property
+    def object_sets(self) -> tuple[str, ...]:
+        """The sets of ``objects``, the default included."""
+        return self.objects or DEFAULT_OBJECTS
 
     @property
     def limit_s(self) -> float:
@@ -118,11 +152,27 @@ class EvalCfg:
             )
         if self.limit_s <= 0.0:
             raise ValueError(f"--episode-s is {self.episode_s}; it must be positive")
+        if self.table_friction is not None and self.randomise:
+            raise ValueError("--table-friction and --randomise exclude each other; give one of them")
+        if self.table_friction is not None and self.table_friction < 0.0:
+            raise ValueError(f"--table-friction is {self.table_friction}; it must not be negative")
+        self._validate_suite()
         start_at_rest(self.at_rest, self.no_at_rest)
         if self.num_worlds is not None and self.num_worlds < 1:
             raise ValueError(
                 f"--num-worlds is {self.num_worlds}; at least one world for each object is needed"
             )
+
+    def _validate_suite(self) -> None:
+        if self.suite is None:
+            if self.quick:
+                raise ValueError("--quick is of a suite; add --suite paper, or lower --episodes")
+            return
+        default = EvalCfg()
+        for name in OF_THE_SUITE:
+            if getattr(self, name) != getattr(default, name):
+                flag = name.replace("_", "-")
+                raise ValueError(f"--{flag} is decided by --suite {self.suite}; leave it out")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -131,12 +181,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         cfg.validate()
         names = cfg.agent_names  # before anything slow is imported
-        if len(names) > 1 or cfg.in_air or "=" in "".join(cfg.objects) or sees_clouds(names[0]):
+        if cfg.suite is not None:
+            return _run_suite(cfg)
+        traced = cfg.in_air or cfg.table_friction is not None or cfg.scanned_goals
+        if len(names) > 1 or traced or "=" in "".join(cfg.objects) or sees_clouds(names[0]):
             return _compare(cfg)
         return _evaluate(cfg)
     except (ValueError, FileNotFoundError, RuntimeError) as error:
         print(f"vd-eval: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        hint = "; the same command goes on from here" if cfg.suite else ""
+        print(f"\nvd-eval: interrupted{hint}", file=sys.stderr)
+        return EXIT_INTERRUPTED
 
 
 def _evaluate(cfg: EvalCfg) -> int:
@@ -173,6 +230,22 @@ def _compare(cfg: EvalCfg) -> int:
     return 0
 
 
+def _run_suite(cfg: EvalCfg) -> int:
+    from vd.evaluate.suite_page import terminal_table
+    from vd.evaluate.suite_run import PAGE_FILE, RESULT_FILE, run_suite
+
+    result = run_suite(cfg)
+    if cfg.json:
+        print(json.dumps(result.summary(), indent=1))
+    else:
+        print(f"{terminal_table(result)}\n")
+        if result.found:
+            print(f"{cfg.output / RESULT_FILE}\n{cfg.output / PAGE_FILE}")
+    for (condition, policy), why in result.failed.items():
+        print(f"vd-eval: {condition} of {policy} failed: {why}", file=sys.stderr)
+    return 1 if result.failed else 0
+
+
 def evaluate(cfg: EvalCfg) -> "EvalResult":
     """Run an evaluation and write its JSON and page into ``cfg.output``.
 
@@ -197,11 +270,11 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
     device = resolve_device(cfg.device)
     (name,) = cfg.agent_names
     trained = open_teacher(name, device)
-    count = len(load_set(list(cfg.objects)))
+    count = len(load_set(list(cfg.object_sets)))
     task = task_for(
         trained,
         hand=cfg.hand,
-        objects=cfg.objects,
+        objects=cfg.object_sets,
         num_worlds=cfg.num_worlds or worlds_for(count, cfg.episodes, device),
         seed=cfg.seed,
         stop_tolerance_rad=cfg.stop_tolerance,
@@ -239,7 +312,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
     env.close()
     protocol = Protocol(
         policy=name,
-        objects=", ".join(cfg.objects),
+        objects=", ".join(cfg.object_sets),
         hand=task.hand,
         hand_layer=task.hand_layer,
         episodes=cfg.episodes,

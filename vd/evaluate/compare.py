@@ -7,7 +7,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vd.evaluate.agents import BUILT_IN, built_in, check_bundle, open_policy, start_at_rest, task_for
+from vd.evaluate.agents import (
+    BUILT_IN,
+    built_in,
+    check_bundle,
+    open_policy,
+    sees_clouds,
+    start_at_rest,
+    task_for,
+)
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -55,11 +63,11 @@ def compare(cfg: "EvalCfg") -> "Comparison":
     from vd.evaluate.result import Protocol
 
     device = resolve_device(cfg.device)
-    groups = parse_groups(cfg.objects)
+    groups = parse_groups(cfg.object_sets)
     everything = tuple(dict.fromkeys(s for sets in groups.values() for s in sets))
     members = {name: [item.name for item in load_set(list(sets))] for name, sets in groups.items()}
     count = len(load_set(list(everything)))
-    limit = None if device == "cpu" else STUDENT_WORLDS_GPU
+    limit = STUDENT_WORLDS_GPU if device != "cpu" and any(map(sees_clouds, cfg.agent_names)) else None
     worlds = cfg.num_worlds or worlds_for(count, cfg.episodes, device, limit=limit)
     rows, predictions = [], []
     env: Any = None
@@ -92,6 +100,8 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             at_rest=wanted.start.at_rest,
             goals_about_vertical=wanted.start.at_rest and wanted.goal.about_vertical,
             in_air=cfg.in_air,
+            table_friction=cfg.table_friction,
+            scanned_goals=cfg.scanned_goals,
         )
         index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
@@ -133,6 +143,8 @@ def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
     )
+    if cfg.table_friction is not None:
+        task = replace(task, table_friction=cfg.table_friction)
     if cfg.randomise:
         return task
     # Noise that is switched off anyway, and would keep a teacher and its student from sharing the worlds.
@@ -158,7 +170,7 @@ def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str)
 
     assert policy is not None
     rendered = None if cfg.sees == "auto" else cfg.sees == "rendered"
-    actor = StudentActor(env, policy, rendered=rendered, seed=cfg.seed)
+    actor = StudentActor(env, policy, rendered=rendered, scanned_goals=cfg.scanned_goals, seed=cfg.seed)
     sees = "rendered clouds" if actor.rendered else "complete clouds"
     return actor, f"student of stage {policy.spec.stage}", sees, policy.spec.stopping
 

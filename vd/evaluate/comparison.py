@@ -12,16 +12,16 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.evaluate.result import EvalResult, Protocol, summarise
-from vd.evaluate.statistics import Interval, choose_unit, rate_intervals
+from vd.evaluate.statistics import Interval, Unit, choose_unit, rate_intervals
 from vd.evaluate.trace import Trace
 from vd.files import write_json
 from vd.student.stopping import StoppingRule
 
-COMPARISON_FORMAT = "visual-dexterity comparison 1"
+COMPARISON_FORMAT = "visual-dexterity comparison 2"
 OUTCOMES = ("success", "orientation error", "time-out", "object falls")
 """Classes of episodes: stopped within the tolerance, stopped outside of it, never stopped, lost."""
 BOUNDS_RAD = (0.1, 0.4)
-"""Distances at which predictions are judged, as in the paper."""
+"""Bounds on the distance at which stops and predictions are judged, as in the paper."""
 SCATTER = 2000
 """Pairs of predicted and true distance that are kept for a figure."""
 
@@ -45,23 +45,22 @@ class Row:
     """Bounds of the distance and of the action's norm."""
     outcomes: dict[str, Interval]
     """Share of episodes in each class."""
+    stops_within: dict[str, Interval]
+    """By bound [rad] (as text): share of episodes that stop within it if the distance has to be below this
+    bound rather than the rule's."""
     result: EvalResult
     """Episodes and summaries; their stops are those of ``stopped_by``."""
 
 
 @dataclass(frozen=True)
 class Bound:
-    """How well a bound on the distance works, in one group."""
+    """How well predictions tell which states are within a bound, in one group."""
 
     bound_rad: float
     seen: float | None
     """Share of the states truly within the bound that are predicted within it; None without such states."""
     right: float | None
     """Share of the states predicted within the bound that truly are; None without such states."""
-    by_prediction: Interval
-    """Share of episodes that stop within the bound when the prediction has to be below it."""
-    by_truth: Interval
-    """The same for the true distance."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +150,8 @@ def judge(
         ways.insert(0, ("prediction", rule))
     rows = []
     for stopped_by, bounds in ways:
-        episodes = trace.episodes(bounds, by_prediction=stopped_by == "prediction")
+        by_prediction = stopped_by == "prediction"
+        episodes = trace.episodes(bounds, by_prediction=by_prediction)
         result = summarise(
             protocol,
             tuple(item.name for item in objects),
@@ -159,9 +159,22 @@ def judge(
             episodes,
             resample=resample,
         )
-        outcomes = outcome_shares(result, resample=resample)
-        rows.append(Row(protocol.policy, kind, sees, group, stopped_by, bounds, outcomes, result))
-    return rows, _prediction(trace, protocol.policy, group, rule.action_norm, resample)
+        rows.append(
+            Row(
+                policy=protocol.policy,
+                kind=kind,
+                sees=sees,
+                group=group,
+                stopped_by=stopped_by,
+                rule=bounds,
+                outcomes=outcome_shares(result, resample=resample),
+                stops_within=_stops_within(
+                    trace, rule.action_norm, by_prediction, choose_unit(len(objects), resample)
+                ),
+                result=result,
+            )
+        )
+    return rows, _prediction(trace, protocol.policy, group)
 
 
 def outcome_shares(
@@ -179,24 +192,21 @@ def outcome_shares(
     return dict(zip(OUTCOMES, rate_intervals(classes, unit), strict=True))
 
 
-def _prediction(
-    trace: Trace,
-    policy: str,
-    group: str,
-    action_norm: float,
-    resample: Literal["auto", "object", "episode"],
-) -> Prediction | None:
+def _stops_within(trace: Trace, action_norm: float, by_prediction: bool, unit: Unit) -> dict[str, Interval]:
+    """Share of episodes that stop within each of BOUNDS_RAD with the bound in place of the rule's."""
+    within = []
+    for bound in BOUNDS_RAD:
+        steps, stopped = trace.ends(StoppingRule(bound, action_norm), by_prediction=by_prediction)
+        error = np.take_along_axis(trace.error, steps[..., None], axis=-1)[..., 0]
+        within.append(stopped & (error <= bound))
+    return dict(zip(map(str, BOUNDS_RAD), rate_intervals(np.stack(within), unit), strict=True))
+
+
+def _prediction(trace: Trace, policy: str, group: str) -> Prediction | None:
     if trace.predicted is None:
         return None
     there = np.isfinite(trace.predicted)
     true, predicted = trace.distance[there], trace.predicted[there]
-    unit = choose_unit(len(trace.steps), resample)
-
-    def stops_within(bound: float, *, by_prediction: bool) -> Interval:
-        steps, stopped = trace.ends(StoppingRule(bound, action_norm), by_prediction=by_prediction)
-        error = np.take_along_axis(trace.error, steps[..., None], axis=-1)[..., 0]
-        return rate_intervals((stopped & (error <= bound))[None], unit)[0]
-
     bounds = []
     for bound in BOUNDS_RAD:
         near, said = true <= bound, predicted <= bound
@@ -205,8 +215,6 @@ def _prediction(
                 bound_rad=bound,
                 seen=float(said[near].mean()) if near.any() else None,
                 right=float(near[said].mean()) if said.any() else None,
-                by_prediction=stops_within(bound, by_prediction=True),
-                by_truth=stops_within(bound, by_prediction=False),
             )
         )
     shown = np.random.default_rng(0).permutation(len(true))[:SCATTER]

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from vd.evaluate.comparison import OUTCOMES, Comparison, Prediction, Row
+from vd.evaluate.comparison import OUTCOMES, Comparison, Row
 from vd.evaluate.plots import BLUE, GREEN, GREY, ORANGE, ecdf
 from vd.evaluate.report import goals_text, number, percent, starts_text
 from vd.evaluate.result import TOLERANCES_RAD
-from vd.evaluate.statistics import Interval, chance_cdf
+from vd.evaluate.statistics import chance_cdf
 from vd.page import Page
 from vd.paper import PAPER
 
@@ -87,7 +87,7 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
             "Predicted beside true distance to the goal, before symmetry, in a sample of all states of all "
             "episodes; right, the near ones. Lines are 0.1 rad apart from equal.",
         )
-        page.table(_BOUND_HEADER, _bound_cells(comparison.predictions, short), words=(1,))
+        page.table(_BOUND_HEADER, _bound_cells(comparison, short), words=(1,))
         page.text(
             "Near and seen so: of the states truly within the bound, the share predicted within it. Said and "
             "right: of those predicted within it, the share that is. The paper reports 29.4 % and 85.9 % for "
@@ -236,13 +236,11 @@ def _cells(row: Row, short: dict[str, str]) -> tuple[str, ...]:
     )
 
 
-def _bound_cells(predictions: tuple[Prediction, ...], short: dict[str, str]) -> list[tuple[str, ...]]:
+def _bound_cells(comparison: Comparison, short: dict[str, str]) -> list[tuple[str, ...]]:
     def share(value: float | None) -> str:
         return "none" if value is None else f"{100 * value:.1f} %"
 
-    def rate(interval: Interval) -> str:
-        return percent(interval)
-
+    rows = {(row.policy, row.group, row.stopped_by): row for row in comparison.rows}
     return [
         (
             short[entry.policy],
@@ -250,11 +248,11 @@ def _bound_cells(predictions: tuple[Prediction, ...], short: dict[str, str]) -> 
             f"{bound.bound_rad:g}",
             share(bound.seen),
             share(bound.right),
-            rate(bound.by_prediction),
-            rate(bound.by_truth),
+            percent(rows[entry.policy, entry.group, "prediction"].stops_within[str(bound.bound_rad)]),
+            percent(rows[entry.policy, entry.group, "true distance"].stops_within[str(bound.bound_rad)]),
             f"{entry.mean_error_rad:.2f}",
         )
-        for entry in predictions
+        for entry in comparison.predictions
         for bound in entry.bounds
     ]
 
@@ -279,6 +277,10 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
         ("table", f"taken away after {PAPER.scene.air_table_s:g} s" if protocol.in_air else "there"),
         ("randomisation, noise, disturbances", "on" if protocol.randomised else "off"),
     ]
+    if protocol.table_friction is not None:
+        rows.append(("friction of the table", f"{protocol.table_friction:g}"))
+    if protocol.scanned_goals:
+        rows.append(("goals of students", "from scans"))
     by_group = {row.group: row.result.protocol.objects for row in comparison.rows}
     rows += [(f"objects: {name}", sets) for name, sets in by_group.items()]
     for row in comparison.rows:

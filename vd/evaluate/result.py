@@ -89,6 +89,10 @@ class Protocol:
     """Layer over the hand with an identified servo model, if any."""
     in_air: bool = False
     """The table is taken away once the hand had time to grasp."""
+    table_friction: float | None = None
+    """Coefficient of the table if it is not the nominal one."""
+    scanned_goals: bool = False
+    """Students get their goals from scans, with the errors of these."""
 
     @property
     def hand_name(self) -> str:

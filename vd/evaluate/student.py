@@ -6,6 +6,7 @@ import torch
 import warp as wp
 
 from vd.config import from_dict
+from vd.evaluate.scanned import ScannedGoalView
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.saved import SavedStudent
 from vd.vision import StudentView
@@ -26,14 +27,23 @@ class StudentActor:
         active: Where it acts, shape [N], bool; elsewhere its actions are 0 and cost nothing.
     """
 
-    def __init__(self, env: Any, student: SavedStudent, *, rendered: bool | None = None, seed: int = 0):
+    def __init__(
+        self,
+        env: Any,
+        student: SavedStudent,
+        *,
+        rendered: bool | None = None,
+        scanned_goals: bool = False,
+        seed: int = 0,
+    ):
         """Open its eyes in every world.
 
         Args:
             env: The environment.
             student: The student.
             rendered: See by a depth camera, or complete clouds; as its stage was trained by default.
-            seed: Of the camera's errors.
+            scanned_goals: Show it goals with the errors of a scan, not exact ones.
+            seed: Of the errors of camera and scans.
 
         Raises:
             ValueError: It is one of stage 0, which cannot act, or of another hand.
@@ -48,7 +58,7 @@ class StudentActor:
             )
         self.env, self.num_actions, self._student = env, spec.num_actions, student.network
         self.rendered = spec.stage == RENDERED if rendered is None else rendered
-        self._view = StudentView(
+        self._view = (ScannedGoalView if scanned_goals else StudentView)(
             env,
             spec.network,
             rendered=self.rendered,

@@ -1,0 +1,74 @@
+"""Goals as a scan gives them: the student's goal cloud with noise and a side that the scanner did not see.
+
+The paper's goals for household objects come from a tablet's scans, which are imperfect in ways it does not
+quantify (its Figure 5). Here a scan errs as much as a cloud in training may, but lastingly: the same points
+are wrong in every step.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from vd.paper import PAPER
+from vd.student.cfg import StudentCfg
+from vd.student.clouds import SceneClouds
+from vd.vision import StudentView
+
+NOISE_M = PAPER.cloud.jitter_std_m
+"""Standard deviation of a scanned point along each axis [m]."""
+MISSING = PAPER.cloud.dropout_ratio[1]
+"""Share of the points that are missing, all on one side."""
+
+
+def scan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Samples of a shape as a scan of it has them.
+
+    Args:
+        points: Samples [m], shape [K, 3], body frame.
+        rng: Where randomness comes from.
+
+    Returns:
+        As many points: those of the missing side are replaced by others, and all are noisy.
+    """
+    side = rng.normal(size=3)
+    seen = np.argsort(points @ side)[: round(len(points) * (1.0 - MISSING))]
+    again = rng.choice(seen, len(points) - len(seen))
+    return points[np.concatenate([seen, again])] + rng.normal(scale=NOISE_M, size=points.shape)
+
+
+class ScannedGoalView(StudentView):
+    """What a student sees whose goals were scanned; one scan for each object."""
+
+    def __init__(self, env: Any, network: StudentCfg, *, seed: int = 0, **settings: Any):
+        """Scan the objects; arguments are those of :class:`vd.vision.StudentView`."""
+        super().__init__(env, network, seed=seed, **settings)
+        rng = np.random.default_rng(seed)
+        scene = env.scene
+        self._scanned = SceneClouds(
+            env.hand,
+            [replace(item, surface_points=scan(item.surface_points, rng)) for item in env.objects],
+            link_body=scene.link_body,
+            object_body=scene.object_body,
+            world_object=scene.world_object,
+            world_scale=scene.world_scale,
+            device=env.device,
+        )
+
+    def points(self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None) -> torch.Tensor:
+        """Clouds as of the base class, with the scanned goal in its columns."""
+        points = super().points(frame, worlds)
+        goal = self._scanned.goal
+        scanned = torch.empty((len(points), self._scanned.item.start, 3), device=self.device)
+        self._scanned.write(
+            wp.from_torch(scanned, dtype=wp.vec3),
+            wp.from_torch(frame["body_q"].contiguous(), dtype=wp.transform),
+            wp.from_torch(frame["goal_quat"].contiguous(), dtype=wp.quat),
+            with_object=False,
+            worlds=None if worlds is None else wp.from_torch(worlds.int()),
+        )
+        points[:, goal] = scanned[:, goal]
+        return points

@@ -1,0 +1,241 @@
+"""The paper's evaluations in simulation: what is run (CONDITIONS), and what the paper says of it (CLAIMS).
+
+:mod:`vd.evaluate.suite_run` runs the list, :mod:`vd.evaluate.suite_page` shows what came out.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from vd.evaluate.comparison import Comparison, Row, StoppedBy
+from vd.evaluate.statistics import Interval, choose_unit, order_interval, rate_intervals
+from vd.paper import PAPER
+
+Group = Literal["training", "held-out", "symmetric"]
+
+OWN_SETS: dict[Group, str] = {
+    "training": "procedural-150-seed0",
+    "held-out": "procedural-heldout",
+    "symmetric": "symmetric",
+}
+"""Object sets where none is given: ours, which are made on demand. The paper's are meshes."""
+
+FRICTIONS = (*PAPER.randomisation.table_friction, 0.25, 0.75)
+"""Frictions of the table beside the nominal one. The paper's five materials have no published values; these
+span the range of its training."""
+
+NO_STUDENT = "no policy shipped"
+"""What is said in place of a student's figures where there is no student."""
+
+QUICK_OBJECTS, QUICK_EPISODES = 6, 4
+"""Objects of a group and episodes of each in the reduced suite."""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One evaluation of every policy: an invocation of ``vd-eval`` with a name.
+
+    Attributes:
+        name: Of its folder.
+        title: Of its section.
+        objects: Group of objects.
+        episodes: Starts and goals of every object.
+        paper: Where the paper shows the same.
+        in_air: The table is taken away.
+        table_friction: Of the table; None: nominal.
+        scanned_goals: Goals have the errors of a scan. A teacher's are orientations, so it is left out.
+        quick: Part of the reduced suite.
+    """
+
+    name: str
+    title: str
+    objects: Group
+    episodes: int
+    paper: str
+    in_air: bool = False
+    table_friction: float | None = None
+    scanned_goals: bool = False
+    quick: bool = True
+
+    @property
+    def flags(self) -> str:
+        """What ``vd-eval`` is told to do the same, policy and objects apart."""
+        flags = [f"--episodes {self.episodes}", "--no-at-rest"]
+        flags += ["--in-air"] if self.in_air else []
+        flags += [] if self.table_friction is None else [f"--table-friction {self.table_friction:g}"]
+        flags += ["--scanned-goals"] if self.scanned_goals else []
+        return " ".join(flags)
+
+
+CONDITIONS = (
+    Condition("training", "On the table, training objects", "training", 50, "Table 1, Figures 2D and 7D"),
+    Condition("held-out", "On the table, held-out objects", "held-out", 100, "Table 1, Figures 2D, 4E, 7E-G"),
+    Condition("symmetric", "On the table, symmetric solids", "symmetric", 100, "Figure 4F"),
+    *(
+        Condition(
+            f"friction-{friction:g}",
+            f"On a table of friction {friction:g}, held-out objects",
+            "held-out",
+            100,
+            "Figures 2F and 2G (real materials)",
+            table_friction=friction,
+            quick=friction in PAPER.randomisation.table_friction,
+        )
+        for friction in sorted(FRICTIONS)
+    ),
+    Condition("air", "In the air, held-out objects", "held-out", 100, "Figures S12 to S14", in_air=True),
+    Condition(
+        "air-training",
+        "In the air, training objects",
+        "training",
+        20,
+        "Figures S12 to S14",
+        in_air=True,
+        quick=False,
+    ),
+    Condition(
+        "scanned-goals", "Goals from scans, held-out objects", "held-out", 100, "Figure 5", scanned_goals=True
+    ),
+)
+"""What the suite runs, in this order."""
+
+Measure = Callable[[Comparison, Row], Interval | float | None]
+"""A number of one row of a condition, or None where it has no meaning."""
+
+
+def within(tolerance_rad: float) -> Measure:
+    """Share of episodes whose error at the stop or end is at most this."""
+    return lambda _, row: row.result.overall.success[str(tolerance_rad)]
+
+
+def stops_within(bound_rad: float) -> Measure:
+    """Share of episodes that stop within a bound which the distance has to be below to stop."""
+    return lambda _, row: row.stops_within[str(bound_rad)]
+
+
+def seen_within(bound_rad: float) -> Measure:
+    """Share of the states truly within a bound that a student predicts within it."""
+
+    def measure(comparison: Comparison, row: Row) -> float | None:
+        for prediction in comparison.predictions:
+            for bound in prediction.bounds:
+                if prediction.group == row.group and bound.bound_rad == bound_rad:
+                    return bound.seen
+        return None
+
+    return measure
+
+
+def median_error(_: Comparison, row: Row) -> Interval:
+    """Median of the errors at the stop or end, a lost object counting as pi [rad]."""
+    return row.result.overall.median_error_rad
+
+
+def dropped(_: Comparison, row: Row) -> Interval:
+    """Share of episodes that lost the object before a stop."""
+    return row.outcomes["object falls"]
+
+
+def dropped_at_once(_: Comparison, row: Row) -> Interval:
+    """Share of episodes that lost the object in the half second after the table went."""
+    hz = row.result.protocol.control_hz
+    gone = round(PAPER.scene.air_table_s * hz)
+    soon = [e.fell and gone < e.steps <= gone + round(0.5 * hz) for e in row.result.episodes]
+    objects = len(row.result.object_names)
+    return rate_intervals(np.reshape(soon, (1, objects, -1)), choose_unit(objects))[0]
+
+
+def time_to_success(_: Comparison, row: Row) -> Interval | None:
+    """Median time of the episodes that were stopped within the tolerance [s]; None if none was."""
+    protocol = row.result.protocol
+    steps = [e.steps for e in row.result.episodes if e.stopped and e.error_rad <= protocol.stop_tolerance_rad]
+    return order_interval(np.array(steps) / protocol.control_hz) if steps else None
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A figure of the paper, and how ours beside it is measured.
+
+    Attributes:
+        text: What it is.
+        condition: Name of the condition.
+        measure: Takes it from a row.
+        paper: Name of the paper's figure in ``PAPER.results``; None: it gives no number.
+        unit: share, rad or s.
+        stopped_by: Whose rule: that of each policy (students by their prediction, others by the true
+            distance), predictions alone, or the true distance for all.
+    """
+
+    text: str
+    condition: str
+    measure: Measure
+    paper: str | None = None
+    unit: Literal["share", "rad", "s"] = "share"
+    stopped_by: Literal["own"] | StoppedBy = "own"
+
+    def of(self, comparison: Comparison) -> Interval | float | None:
+        """Ours, from the comparison of one policy; None where it has no such figure."""
+        rows = {row.stopped_by: row for row in comparison.rows}
+        if self.stopped_by == "own":
+            return self.measure(comparison, rows.get("prediction", rows["true distance"]))
+        row = rows.get(self.stopped_by)
+        return None if row is None else self.measure(comparison, row)
+
+
+def _table(name: str, key: str) -> tuple[Claim, ...]:
+    """What is asked on the table; ``key`` begins the names of the paper's figures."""
+    return (
+        Claim("error at most 0.4 rad", name, within(0.4), key),
+        Claim("error at most 0.8 rad", name, within(0.8), f"{key}_rad08"),
+        Claim("median error", name, median_error, f"{key}_median_rad", "rad"),
+        Claim("stopped within 0.1 rad", name, stops_within(0.1)),
+        Claim("median time to success", name, time_to_success, unit="s"),
+        Claim("object lost", name, dropped),
+    )
+
+
+def _air(name: str) -> tuple[Claim, ...]:
+    """What is asked in the air."""
+    ways: tuple[tuple[StoppedBy, str], ...] = (("prediction", "prediction"), ("true distance", "truth"))
+    bounds = ((0.4, ""), (0.1, "_rad01"))
+    stops = (
+        Claim(
+            f"stopped within {bound} rad by {way}",
+            name,
+            stops_within(bound),
+            f"air_by_{key}{suffix}",
+            stopped_by=way,
+        )
+        for way, key in ways
+        for bound, suffix in bounds
+    )
+    return (
+        *stops,
+        Claim("median time to success", name, time_to_success, "air_time_s", "s"),
+        Claim("object lost", name, dropped, "air_dropped"),
+        Claim("object lost within 0.5 s of the table", name, dropped_at_once, "air_dropped_at_once"),
+        *(
+            Claim(
+                f"states within {bound} rad predicted so",
+                name,
+                seen_within(bound),
+                f"near_seen{suffix}",
+                stopped_by="prediction",
+            )
+            for bound, suffix in bounds
+        ),
+    )
+
+
+def _claims(condition: Condition) -> tuple[Claim, ...]:
+    if condition.in_air:
+        return _air(condition.name)
+    if condition.name in ("training", "held-out"):
+        return _table(condition.name, f"table_{condition.name.replace('-', '_')}")
+    return (Claim("error at most 0.4 rad", condition.name, within(0.4)),)
+
+
+CLAIMS = tuple(claim for condition in CONDITIONS for claim in _claims(condition))
+"""The paper's figures and what we measure beside them, in the order of the conditions."""
