@@ -105,7 +105,8 @@ def chain_dynamics(q: wp.vec3, speed: wp.vec3, links: Links):
     acceleration = -links.gravity
     for i in range(MAX_JOINTS):
         axis = links.axis[i]
-        turn = wp.transpose(wp.quat_to_matrix(wp.quat_from_axis_angle(axis, q[i])))
+        cosine = wp.cos(q[i])
+        turn = wp.diag(wp.vec3(cosine)) - wp.sin(q[i]) * wp.skew(axis) + (1.0 - cosine) * wp.outer(axis, axis)
         if i > 0:
             offset = links.offset[i]
             acceleration += wp.cross(alpha, offset) + wp.cross(omega, wp.cross(omega, offset))
