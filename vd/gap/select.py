@@ -222,7 +222,9 @@ class Selection(CandidateFits, Verdicts):
             trials += self.screened_out(number, present, fits)
             if not accepted:
                 break
-            if FRICTION_AND_LOAD in fits and len(present.effects) + 2 <= MAX_EFFECTS:
+            # What explains everything needs no two in its place, unless it is what two do together.
+            open_ = best.rmse > EXPLAINED * self.floor or best.effects[-1] == FRICTION_AND_LOAD
+            if open_ and FRICTION_AND_LOAD in fits and len(present.effects) + 2 <= MAX_EFFECTS:
                 apart = self.take_apart(present, fits[FRICTION_AND_LOAD])
                 pair = self.winner(apart) if apart else best
                 if apart and best.effects[-1] == FRICTION_AND_LOAD:
