@@ -5,16 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_gap_fit import recorded
+from test_gap_fit import TRUE, blank, recorded
 from test_gap_judge import FLOOR, made_up
 
 import vd.kernels.actuators as servo
+from vd.gap.chain import chains
 from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.explanation import Trial
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
+from vd.gap.rollout import Rollouts
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import vetoes
@@ -59,6 +61,35 @@ def test_dry_friction_and_an_offset_are_put_together_where_one_cause_does_as_wel
     assert (found is one) == merged and (found is two) != merged
     assert selection.apart == ({"asymmetric_friction": two} if merged else {})
     assert selection.put_together(one) is one, "nothing to put together"
+
+
+@pytest.mark.parametrize("bias", [0.01, -0.01])
+def test_both_ways_is_the_friction_that_moves_as_dry_friction_and_an_offset_do(bias: float) -> None:
+    rollouts = Rollouts(chains(blank())[0], blank())
+    row = rollouts.chain.start_row.copy()
+    row[0, list(TRUE)] = list(TRUE.values())
+    keys = "coulomb_friction.tau_c_nm", "encoder_bias.bias_rad"
+    fit = replace(
+        made_up(("coulomb_friction", "encoder_bias"), FLOOR),
+        coordinates=tuple(Coordinate(key, 0, False, 1.0, -9.0, 9.0) for key in keys),
+        x=np.array([0.06, bias]),
+        rows=row,
+    )
+    two, one = row.copy(), row.copy()
+    two[0, [servo.COULOMB_TORQUE, servo.ENCODER_BIAS]] = fit.x
+    sides = Selection(
+        floor=FLOOR,
+        weights=resamples(10, np.random.default_rng(0)),
+        run=lambda calls: [],
+        joint=0,
+        others=(),
+        candidates=(),
+        scales=Scales(3.0, 0.5, 2.0, 6.0, 70.0, 1e-3, 1e-3, 12.0),
+    ).both_ways(fit)
+    one[0, [servo.FRICTION_PLUS, servo.FRICTION_MINUS]] = list(sides.values())
+    paths = rollouts.predict(np.stack([two, one, row]))
+    assert np.abs(paths[0] - paths[1]).max() < 1e-6
+    assert np.abs(paths[0] - paths[2]).max() > 1e-2
 
 
 def test_friction_of_one_direction_alone_is_a_load() -> None:

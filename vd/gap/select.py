@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+import vd.kernels.actuators as servo
 from vd.gap.candidates import BETTER, FULL_ITERATIONS, CandidateFits
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import Explanation, Trial
@@ -299,13 +300,27 @@ class Selection(CandidateFits, Verdicts):
             return present
         kept = [name for name in present.effects if name not in parts[0]]
         without = self.refit(present, kept)
-        starts = self.starts(without, sizes(FRICTION_AND_LOAD, self.others, self.scales))
+        given = [self.both_ways(present), *sizes(FRICTION_AND_LOAD, self.others, self.scales)]
+        starts = self.starts(without, given)
         fit = self.run([self.call(without, FRICTION_AND_LOAD, starts, FULL_ITERATIONS)])[0]
         if fit.at_bound or not self.tied(present, fit)[0]:
             return present
         self.report(f"~ {' and '.join(sorted(parts[0]))} are {FRICTION_AND_LOAD}")
         self.apart[FRICTION_AND_LOAD] = present
         return fit
+
+    def both_ways(self, present: JointFit) -> dict[str, float]:
+        """The asymmetric friction that dry friction or a dead zone and an offset of a model are together."""
+        values, kp = present.values, float(present.rows[self.joint, servo.KP])
+        level = values.get("coulomb_friction.tau_c_nm", 0.5 * kp * values.get("dead_zone.width_rad", 0.0))
+        load = kp * values.get("encoder_bias.bias_rad", 0.0)
+        if "gravity_load" in present.effects:
+            angle = self.rest + values["gravity_load.phase_rad"]
+            load -= values["gravity_load.tau_g_nm"] * float(np.sin(angle))
+        return {
+            f"{FRICTION_AND_LOAD}.tau_plus_nm": max(level - load, 0.0),
+            f"{FRICTION_AND_LOAD}.tau_minus_nm": max(level + load, 0.0),
+        }
 
     def try_random(self, baseline: JointFit, present: JointFit) -> tuple[JointFit, list[Trial]]:
         """What nothing else explains can be chance: random delays in the final model, or alone."""
