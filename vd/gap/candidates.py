@@ -208,14 +208,19 @@ class CandidateFits:
         return result
 
     def call(
-        self, present: JointFit, name: str, starts: Sequence[Mapping[str, float]], iterations: int
+        self,
+        present: JointFit,
+        added: str | Sequence[str],
+        starts: Sequence[Mapping[str, float]],
+        iterations: int,
     ) -> Call:
-        """The call that fits ``present`` with one more effect."""
+        """The call that fits ``present`` with one more effect, or several."""
+        names = (added,) if isinstance(added, str) else tuple(added)
         return (
             "fit",
             {
                 "base": present.rows,
-                "effects": (*present.effects, name),
+                "effects": (*present.effects, *names),
                 "starts": list(starts),
                 "scales": self.scales,
                 "iterations": iterations,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 import vd.kernels.actuators as servo
-from vd.gap.candidates import BETTER, FULL_ITERATIONS, CandidateFits
+from vd.gap.candidates import BETTER, FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIONS, CandidateFits
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import Explanation, Trial
 from vd.gap.joint_fit import JointFit
@@ -223,12 +223,15 @@ class Selection(CandidateFits, Verdicts):
             trials += self.screened_out(number, present, fits)
             if not accepted:
                 break
-            # What explains everything needs no two in its place, unless it is what two do together.
-            open_ = best.rmse > EXPLAINED * self.floor or best.effects[-1] == FRICTION_AND_LOAD
-            if open_ and FRICTION_AND_LOAD in fits and len(present.effects) + 2 <= MAX_EFFECTS:
-                apart = self.take_apart(present, fits[FRICTION_AND_LOAD])
+            room = MAX_EFFECTS - len(present.effects)
+            both = fits.get(FRICTION_AND_LOAD)
+            # What explains everything needs no two in its place, unless it is what two do together; nor do
+            # two explain what both as one are far from.
+            open_ = best is both or best.rmse > EXPLAINED * self.floor
+            if both is not None and open_ and both.rmse < HOPELESS * best.rmse and room >= 2:
+                apart = self.take_apart(present, both)
                 pair = self.winner(apart) if apart else best
-                if apart and best.effects[-1] == FRICTION_AND_LOAD:
+                if apart and best is both:
                     self.apart[FRICTION_AND_LOAD] = pair
                 better = int(np.argmin(self.scores([best, pair]))) == 1
                 if better and not self.tied(pair, best)[0]:  # in a tie one effect is simpler than two
@@ -280,9 +283,11 @@ class Selection(CandidateFits, Verdicts):
                 continue
             others = sizes(name, self.others, self.scales)
             given = [{**base, **dry[friction], **start} for start in (starts[name], *others)]
-            call = self.call(present, friction, given, FULL_ITERATIONS)
-            calls.append(("fit", {**call[1], "effects": (*present.effects, friction, name)}))
-        return self.run(calls)
+            calls.append(self.call(present, (friction, name), given, SCREEN_ITERATIONS))
+        screened = self.run(calls)
+        least = min((fit.rmse for fit in screened), default=0.0)
+        near = [fit for fit in screened if fit.rmse < HOPELESS * least]
+        return self.run([self.call(present, f.effects[-2:], [f.values], FULL_ITERATIONS) for f in near])
 
     def put_together(self, present: JointFit) -> JointFit:
         """The model with asymmetric friction in the place of dry friction and an offset, if that is as good.
