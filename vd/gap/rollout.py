@@ -3,6 +3,7 @@
 Chains: :mod:`vd.gap.chain`. Physics: :mod:`vd.kernels.chains`.
 """
 
+import copy
 import threading
 import zlib
 from collections.abc import Sequence
@@ -110,6 +111,13 @@ class Rollouts:
                     self.chain, self.recording, dt=dt, device=self.device, crowd=self.crowd
                 )
             return self._finer[dt]
+
+    def with_chain(self, chain: Chain) -> "Rollouts":
+        """The same motions of a chain with other links; joints and columns are the same."""
+        other = copy.copy(self)
+        other.chain, other.crowd, other._finer = chain, None, {}
+        other.__dict__.pop("_links", None)
+        return other
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the device's arrays behind: another process makes its own."""

@@ -116,7 +116,8 @@ def verdict_sentence(report: Report) -> str:
         model = "plain servo model" if report.hand_layer is None else f"model in {report.hand_layer}"
         return (
             f"No gap: the {model} explains this recording. What remains, {before} on held-out "
-            f"motions, is no more than noise ({floor}) or than any candidate explains."
+            f"motions, is no more than noise ({floor}), than a small error of the links' masses, or than any "
+            "candidate explains."
         )
     if report.verdict == "ambiguous" and many:
         return (

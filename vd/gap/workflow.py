@@ -31,7 +31,8 @@ from vd.gap.explanation import Explanation, polished
 from vd.gap.find import findings
 from vd.gap.fit import candidates, others_in
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import RANDOM
+from vd.gap.judge import NO_GAP, RANDOM
+from vd.gap.masses import Masses, fit_masses
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S
@@ -363,9 +364,14 @@ def _explain_all(
     team: Team, joints: Sequence[Joint], recording: Recording, options: Options, progress: Progress
 ) -> list[Explanation]:
     """Select the effects of every joint."""
+    masses = _masses(team, joints)
 
     def one(joint: Joint) -> Explanation:
         chain = team.bench.chains[joint.spec.chain]
+        if joint.spec.chain in masses:
+            text = masses[joint.spec.chain].text
+            progress(f"explain: {joint.name}: no_gap: {text}")
+            return Explanation(joint.fit, joint.fit, "no_gap", text)
         rng = np.random.default_rng([options.seed, joint.spec.chain, joint.spec.joint])
         names = candidates(chain, options.effects)
         told = vetoes(recording, chain, joint.spec, joint.fit.rows)
@@ -403,6 +409,20 @@ def _explain_all(
 
     ends = [partial(finished, joint) for joint in joints]
     return _consistent(team, joints, share(_parallel(one, joints), floors, fingers, ends))
+
+
+def _masses(team: Team, joints: Sequence[Joint]) -> dict[int, Masses]:
+    """By chain, the masses of links that explain a gap on all joints that have one."""
+    result = {}
+    for index, chain in enumerate(team.bench.chains):
+        own = [joint for joint in joints if joint.spec.chain == index]
+        floors = np.array([NO_GAP * joint.spec.floor for joint in own])
+        if not chain.bodies or all(j.fit.held_out_rmse < floor for j, floor in zip(own, floors, strict=True)):
+            continue
+        masses = fit_masses([team.bench.problem(joint.spec) for joint in own], [joint.fit for joint in own])
+        if (masses.errors < floors).all():
+            result[index] = masses
+    return result
 
 
 def _rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:
