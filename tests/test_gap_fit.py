@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import vd.gap.fit
 import vd.kernels.actuators as servo
 from vd.gap.chain import chains
 from vd.gap.coordinates import coordinate
@@ -120,6 +121,23 @@ def test_effect_is_recovered_with_the_baseline(effect: str, column: int, value: 
     assert fit.rmse < 1.2 * problem.floor
     alone = [problem.fit(base, (effect,), [start], scales, iterations=15).rmse for start in starts]
     assert fit.rmse <= 1.001 * min(alone), "the best start wins"
+
+
+def test_refits_near_the_floor_keep_the_slopes_of_the_whole_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer simulations, and the same errors on motions that they have not seen."""
+    problem = problem_of(recorded({servo.COULOMB_TORQUE: 0.06}))
+    base = problem.rollouts.chain.start_row
+    scales = problem.scales(base[0], problem.floor)
+    fits, simulated = [], []
+    for near in (vd.gap.fit.NEAR, 0.0):
+        monkeypatch.setattr(vd.gap.fit, "NEAR", near)
+        problem.simulated = 0
+        start = {"coulomb_friction.tau_c_nm": 0.1}
+        fits.append(problem.fit(base, ("coulomb_friction",), [start], scales, iterations=15, refits=3))
+        simulated.append(problem.simulated)
+    assert fits[0].rmse < 1.2 * problem.floor
+    assert simulated[0] < 0.8 * simulated[1]
+    assert fits[0].held_out == pytest.approx(fits[1].held_out, rel=1e-2)
 
 
 def test_a_refined_fit_depends_less_on_the_step() -> None:

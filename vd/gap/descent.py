@@ -109,6 +109,7 @@ class LeastSquares:
         keep: np.ndarray | None = None,
         known: Descent | None = None,
         race: bool = False,
+        chord: bool = False,
     ) -> Descent:
         """Descend.
 
@@ -118,6 +119,8 @@ class LeastSquares:
             keep: Trajectories that count in each [B, S]; all by default.
             known: Residuals and Jacobians at the starts.
             race: Only the best is wanted: the others end once they meet it or fall behind.
+            chord: The end is near: Jacobians are kept until a step falls short of what they promise, and a
+                step of which nothing is expected is the last.
 
         Returns:
             The ends; their Jacobians are those of the last steps.
@@ -130,12 +133,14 @@ class LeastSquares:
         jacobian = np.zeros((*x.shape, residual.shape[1])) if known is None else known.jacobian
         cost = np.einsum("bn,bn->b", residual, residual)
         damping, failures = np.full(len(x), FIRST_DAMPING), np.zeros(len(x), int)
-        active = np.arange(len(x))
+        active, stale = np.arange(len(x)), np.full(len(x), known is None)
         for number in range(iterations):
             here, kept = x[active], None if keep is None else keep[active]
-            if known is None or number > 0:
-                widened = WIDEN ** failures[active]
-                jacobian[active] = self.jacobian(here, residual[active], widened, kept)
+            renewed = active[stale[active]]
+            if len(renewed):
+                theirs = None if keep is None else keep[renewed]
+                widened = WIDEN ** failures[renewed]
+                jacobian[renewed] = self.jacobian(x[renewed], residual[renewed], widened, theirs)
             slopes = jacobian[active]
             gram = slopes @ slopes.transpose(0, 2, 1) + self.ridge * np.eye(x.shape[1])
             gradient = np.einsum("bpn,bn->bp", slopes, residual[active])
@@ -149,9 +154,11 @@ class LeastSquares:
             promised -= np.einsum("blp,bpq,blq->bl", moved, gram, moved)
             costs, best = np.full(trials.shape[:2], np.inf), np.empty((len(active), residual.shape[1]))
             self._try(trials, origin[active], kept, np.arange(len(active)), slice(0, 1), costs, best)
-            short = np.flatnonzero(cost[active] - costs[:, 0] < ENOUGH * promised[:, 0])
-            if len(short):
-                self._try(trials, origin[active], kept, short, slice(1, None), costs, best)
+            flat = promised[:, 0] < TOLERANCE * cost[active]
+            short = cost[active] - costs[:, 0] < ENOUGH * promised[:, 0]
+            again = np.flatnonzero(short & ~flat if chord else short)
+            if len(again):
+                self._try(trials, origin[active], kept, again, slice(1, None), costs, best)
             chosen, each = np.argmin(costs, axis=1), np.arange(len(active))
             gain = (cost[active] - costs[each, chosen]) / np.maximum(cost[active], 1e-300)
             better = gain > 0.0
@@ -160,8 +167,9 @@ class LeastSquares:
             cost[won] = costs[each, chosen][better]
             damping[won] = np.maximum(damping[won] * LAMBDAS[chosen[better]] * 0.3, LEAST_DAMPING)
             damping[lost] *= 3.0
-            flat = promised[:, 0] < TOLERANCE * cost[active]
-            failures[active] = np.where(gain > TOLERANCE, 0, failures[active] + np.where(flat, 2, 1))
+            least = FAILURES if chord else 2
+            failures[active] = np.where(gain > TOLERANCE, 0, failures[active] + np.where(flat, least, 1))
+            stale[active] = short if chord else True
             active = active[failures[active] < FAILURES]
             if race and number % RACE_EVERY == RACE_EVERY - 1:
                 active = _leaders(active, x, cost)

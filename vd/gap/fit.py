@@ -26,6 +26,10 @@ CMA_SIGMA = 0.7
 CMA_TRAJECTORIES = 4
 CMA_POPULATION = 16
 
+NEAR = 2.0
+"""Error, in noise floors, up to which refits without a fold keep the slopes of the whole fit: they end close
+to it, where the model is all but linear."""
+
 FINER = (2, 4)
 """Divisors of the time step at which an estimate is finished: what the last one changes is its error."""
 FINER_ITERATIONS = 4
@@ -261,7 +265,8 @@ class JointProblem:
             start = replace(
                 start, residual=start.residual * inside, jacobian=start.jacobian * inside[:, None]
             )
-            x = model.descend(start.x, iterations, keep=~out, known=start).x
+            near = fit.rmse < NEAR * self.floor
+            x = model.descend(start.x, iterations, keep=~out, known=start, chord=near).x
             # A refit that found no way down is still the fit that has seen the fold.
             for stuck in np.flatnonzero((x == start.x).all(axis=1)):
                 x[stuck] = self._without(fit, out[stuck])
