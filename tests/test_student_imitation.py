@@ -51,7 +51,8 @@ def test_gradients_equal_those_of_an_unrolled_loop(kind):
     rollout.done = torch.tensor([[0, 1, 0], [0, 0, 0], [1, 1, 0], [0, 0, 0], [0, 0, 1]], dtype=torch.bool)
     rollout.hidden = torch.randn(3, TINY.memory)
     student = dagger.student.eval()  # one batch or five: the same statistics
-    imitation, distance, _ = dagger.losses(rollout)
+    losses = dagger.losses(rollout)
+    imitation, distance = losses["imitation"], losses["distance"]
     (imitation + 0.5 * distance).backward()
     found = {name: p.grad.clone() for name, p in student.named_parameters() if p.grad is not None}
 
@@ -101,8 +102,7 @@ def test_no_gradient_crosses_the_end_of_an_episode():
         embedding = student.encode(*dagger.view.sites(frames, augment=True)).view(4, 2, -1)
         output = student(embedding, action, rollout.hidden, rollout.done)
         rollout.label[0] = output.mean[0]  # no error in the first step: its own loss has no gradient
-    imitation, _, _ = dagger.losses(rollout)
-    (gradient,) = torch.autograd.grad(imitation, action)
+    (gradient,) = torch.autograd.grad(dagger.losses(rollout)["imitation"], action)
     assert float(gradient[0, 0].abs().max()) < 1e-9 < 1e-6 < float(gradient[0, 1].abs().max())
     assert float(gradient[1, 0].abs().max()) > 1e-6
 
@@ -142,8 +142,8 @@ def test_kept_rollouts_are_learned_from_too():
     together = taken(rollouts, torch.tensor([4, 0, 1, 5, 2, 3]))
     parts = [dagger.student.eval() and dagger.losses(one) for one in rollouts]
     whole = dagger.losses(together)
-    for loss, (first, second) in zip(whole[:2], zip(*(p[:2] for p in parts), strict=True), strict=True):
-        torch.testing.assert_close(loss, 0.5 * (first + second))
+    for name, loss in whole.items():
+        torch.testing.assert_close(loss, 0.5 * (parts[0][name] + parts[1][name]))
     drawn = torch.cat([batch for _ in range(40) for batch in dagger.minibatches(2)])
     assert len(drawn) == 120 and set(drawn.tolist()) == set(range(6))
     assert [len(dagger._kept) for _ in range(4) if dagger.iterate(lambda: False)] == [1, 2, 3, 3]
@@ -417,7 +417,7 @@ def test_half_precision_of_the_encoder_hardly_changes_the_losses():
     rollout = single.collect()
     for dagger in (single, half):
         dagger.student.eval()
-    for one, two in zip(single.losses(rollout)[:2], half.losses(rollout)[:2], strict=True):
+    for one, two in zip(single.losses(rollout).values(), half.losses(rollout).values(), strict=True):
         assert one.dtype == two.dtype == torch.float32
         assert two.item() == pytest.approx(one.item(), rel=0.05) and two.item() != one.item()
     half.update([half.collect()])

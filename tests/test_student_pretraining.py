@@ -12,6 +12,7 @@ from student_dummy import weights
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
 from vd.config import to_dict
+from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import EncoderCfg, NoiseCfg, StudentCfg
 from vd.student.network import Student
 from vd.student.saved import StudentSpec
@@ -96,6 +97,46 @@ def test_scenes_are_what_their_targets_say(assets):
         last = links[hand.point_link[-1]]
         expected = Rotation.from_quat(last[3:]).apply(hand.link_points[-1]) + last[:3]
         np.testing.assert_allclose(points[row, clouds.hand][-500:], expected, atol=2e-5)
+
+
+def test_a_part_of_the_scenes_is_seen_by_a_camera(assets):
+    """From the camera's side: of the object what faces it, near its surface, and some of the hand."""
+    torch.manual_seed(0)
+    hand, objects = assets
+    scenes = RandomScenes(
+        hand,
+        objects,
+        NETWORK,
+        rendered_share=0.5,
+        depth=DepthCameraCfg(points=400),
+        noise=NoiseCfg(),
+        batch=12,
+        device="cpu",
+    )
+    first = scenes.state_dict()
+    (sites,), targets = scenes.draw()
+    assert not sites.complete and targets["category"][:6].tolist() == [0, 1] * 3
+    clouds, points = scenes._clouds, scenes._points.numpy()
+    body_q = wp.to_torch(scenes._body_q).numpy()
+    base = Rotation.from_quat(body_q[:, 0, 3:])
+    for row in range(12):
+        own = points[row, clouds.item.start :]
+        own = own[np.isfinite(own).all(axis=1)]
+        place = base[row].inv().apply(body_q[row, -1, :3] - body_q[row, 0, :3])
+        near = own[np.linalg.norm(own - place, axis=1) < 0.12] - place
+        towards = hand.camera.position - place
+        depth = near @ (towards / np.linalg.norm(towards))
+        if row < 6:
+            assert 0 < len(own) <= 400 and depth.mean() > 0.005
+        else:
+            assert len(own) == 500 and abs(depth.mean()) < 0.02
+    again = wp.clone(scenes._points)
+    torch.manual_seed(0)
+    scenes.load_state_dict(first)
+    scenes.draw()
+    np.testing.assert_array_equal(scenes._points.numpy(), again.numpy())
+    with pytest.raises(ValueError, match="rendered-share"):
+        RandomScenes(hand, objects, NETWORK, rendered_share=0.1, batch=12, device="cpu")
 
 
 def test_objects_stay_in_their_box_and_goals_are_near_as_asked(assets):

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.student.cfg import EncoderCfg, StudentCfg, TurnCfg
 from vd.student.clouds import Voxeliser
+from vd.student.match import PointMatch, orthogonal
 from vd.student.network import Student
 from vd.student.turn import ShapeVectors, TurnEncoder, item_and_goal, padded
 from vd.train.student.rotations import angle_between, random_rotations, two_columns
@@ -47,11 +48,11 @@ def test_vectors_and_tensors_turn_with_the_cloud():
     points = torch.from_numpy(shape() / 0.05)[None]
     present = torch.ones_like(points[..., :1])
     matrix = torch.from_numpy(Rotation.random(random_state=1).as_matrix())
-    vectors, tensors = pool(points, present)
-    turned_vectors, turned_tensors = pool(points @ matrix.T + 3.0, present)
-    torch.testing.assert_close(turned_vectors, vectors @ matrix.T)
-    torch.testing.assert_close(turned_tensors, matrix @ tensors @ matrix.T)
-    assert vectors.norm(dim=-1).min() > 0.05  # they do say something
+    here, there = pool(points, present, whole=True), pool(points @ matrix.T + 3.0, present, whole=True)
+    torch.testing.assert_close(there.vectors, here.vectors @ matrix.T)
+    torch.testing.assert_close(there.tensors, matrix @ here.tensors @ matrix.T)
+    torch.testing.assert_close(there.seen, here.seen)
+    assert here.vectors.norm(dim=-1).min() > 0.05  # they do say something
 
 
 def test_absent_points_count_for_nothing():
@@ -61,8 +62,17 @@ def test_absent_points_count_for_nothing():
     present = torch.ones_like(points[..., :1])
     more = torch.cat([points, torch.full((1, 7, 3), 5.0)], dim=1)
     fewer = torch.cat([present, torch.zeros(1, 7, 1)], dim=1)
-    for one, other in zip(pool(points, present), pool(more, fewer), strict=True):
-        torch.testing.assert_close(one, other)
+    one, other = pool(points, present, whole=False), pool(more, fewer, whole=False)
+    torch.testing.assert_close(one.vectors, other.vectors)
+    torch.testing.assert_close(one.tensors, other.tensors)
+    match = PointMatch(SIZES, pool.values)
+    found = [
+        match((one.points, shape.points), (one.seen, shape.seen), (present, shape.present))
+        for shape in (one, other)
+    ]
+    torch.testing.assert_close(found[0], found[1])
+    found = match((other.points, one.points), (other.seen, one.seen), (fewer, present))
+    torch.testing.assert_close(found, match(*(((part), (part)) for part in (one.points, one.seen, present))))
 
 
 def test_padded_rows_hold_the_voxels_of_their_cloud(device):
@@ -70,12 +80,19 @@ def test_padded_rows_hold_the_voxels_of_their_cloud(device):
     sites = voxels(clouds, device)
     item, goal = item_and_goal(sites)
     assert not (item & goal).any()
-    points, present = padded(sites, goal)
+    points, present = padded(sites, goal, GOAL_POINTS)
     for i in range(3):
         own = np.unique(np.floor(clouds[i, :GOAL_POINTS] / 0.005), axis=0) + 0.5
         found = points[i][present[i, :, 0] > 0].cpu().numpy()
         assert np.array_equal(own, np.unique(found, axis=0))
-    points, present = padded(sites, torch.zeros_like(goal))
+    most, whole = 7, [points[i][present[i, :, 0] > 0] for i in range(3)]
+    points, present = padded(sites, goal, most)
+    assert points.shape == (3, most, 3) and present.all()
+    for all_of_them, some in zip(whole, points, strict=True):
+        rows = [(all_of_them == point).all(dim=1).nonzero().item() for point in some]
+        steps = np.diff([*rows, len(all_of_them)])
+        assert rows[0] == 0 and max(steps) - min(steps) <= 1  # as far apart as can be
+    points, present = padded(sites, torch.zeros_like(goal), most)
     assert points.shape == (3, 1, 3) and not present.any()
 
 
@@ -116,7 +133,10 @@ def test_every_pair_of_frames_tells_the_rotation(device):
     sites = Voxeliser(0.0005, device=device)(wp.array(points, dtype=wp.vec3, device=device), ends=ENDS)
     net.scale *= 0.1
     net.pairs.weight.data *= 10.0  # long vectors have length 1 in the frames
-    now, aim = (net._frames(sites, which)[0] for which in item_and_goal(sites))
+    now, aim = (
+        net._frames(net._shape(sites, which, whole=bool(whole)))[0]
+        for whole, which in enumerate(item_and_goal(sites))
+    )
     expected = torch.from_numpy(turn).float().to(now.device).expand(1, SIZES.pairs, 3, 3)
     torch.testing.assert_close(now @ aim.mT, expected, rtol=0.0, atol=0.05)
 
@@ -161,7 +181,9 @@ def test_gradients_agree_with_finite_differences():
 
     def outputs(*values):
         names = [name for name, _ in pool.named_parameters()]
-        return torch.func.functional_call(pool, dict(zip(names, values, strict=True)), (points, present))
+        state = dict(zip(names, values, strict=True))
+        found = torch.func.functional_call(pool, state, (points, present), {"whole": True})
+        return found.vectors, found.tensors, found.seen
 
     assert torch.autograd.gradcheck(outputs, parameters)
 
@@ -175,13 +197,13 @@ def test_relative_rotation_is_learned_where_neither_cloud_alone_says_anything():
     cloud = torch.from_numpy(shape(48) / 0.05).float()
     cloud[:, 0] += cloud[:, 1].square() + cloud[:, 2].abs()  # no symmetry
     present, errors = torch.ones(32, 48, 1), []
-    for _ in range(300):
+    for _ in range(600):
         turn, goal = (random_rotations(32, torch.device("cpu")) for _ in range(2))
         clouds = [
             cloud @ torch.from_numpy(Rotation.from_quat(q.numpy()).as_matrix()).float().mT
             for q in (turn, goal)
         ]
-        (one, _), (other, _) = (pool(points, present) for points in clouds)
+        one, other = (pool(points, present, whole=False).vectors for points in clouds)
         predicted = head(torch.einsum("k,bki,bkj->bij", weights, one, other).flatten(1))
         true = two_columns(relative_rotation(turn, goal))
         loss = (predicted - true).square().mean()
@@ -190,3 +212,34 @@ def test_relative_rotation_is_learned_where_neither_cloud_alone_says_anything():
         optimizer.step()
         errors.append(float(angle_between(predicted.detach(), true).mean()))
     assert np.mean(errors[-20:]) < 0.3  # of any guess the mean is 2.2
+
+
+def test_matched_points_tell_the_rotation_whichever_part_is_seen():
+    """With descriptions that say where on the shape a point is, half of it is enough."""
+    torch.manual_seed(0)
+    cfg = dataclasses.replace(SIZES, match=16)
+    match = PointMatch(cfg, 3)
+    goal = torch.from_numpy(shape(80) / 0.05).float()
+    frequencies = 8.0 * torch.randn(3, cfg.match // 2)
+    match.describe = torch.nn.Module()  # waves over the shape: alike where they are near
+
+    def describe(places):
+        waves = torch.cat([(places @ frequencies).sin(), (places @ frequencies).cos()], dim=-1)
+        return torch.cat([6.0 * waves, torch.zeros_like(places[..., :1])], dim=-1)
+
+    match.describe.forward = describe
+    turn = torch.from_numpy(Rotation.random(random_state=4).as_matrix()).float()
+    part = goal[goal[:, 0] > 0.0]
+    own = (part - part.mean(dim=0)) @ turn.T
+    ones = (torch.ones(1, len(part), 1), torch.ones(1, len(goal), 1))
+    found = match((own[None], goal[None]), (part[None], goal[None]), ones)
+    rotation, scaled = found[0, :9].view(3, 3), found[0, 9:18].view(3, 3)
+    torch.testing.assert_close(rotation, turn, rtol=0.0, atol=0.05)
+    assert float(scaled.norm()) == pytest.approx(1.0, abs=0.01) and float(found[0, -1]) > 0.0
+
+
+def test_the_nearest_rotation_is_that_of_the_singular_values():
+    torch.manual_seed(0)
+    left, right = (torch.linalg.qr(torch.randn(20, 3, 3, dtype=torch.double))[0] for _ in range(2))
+    values = torch.tensor([0.8, 0.5, 0.2], dtype=torch.double)
+    torch.testing.assert_close(orthogonal(left * values @ right), left @ right, rtol=0.0, atol=1e-4)

@@ -66,7 +66,7 @@ class MeanAction(nn.Module):
             scale = weights["obs_normalizer._std"] + _NORMALISER_EPSILON
         self.register_buffer("offset", offset)
         self.register_buffer("scale", scale)
-        self.layers = _network(spec)
+        self.layers = perceptron(spec)
         inside = {key.removeprefix("mlp."): value for key, value in weights.items() if key.startswith("mlp.")}
         self.layers.load_state_dict(inside)
         self.eval().requires_grad_(False)
@@ -217,7 +217,7 @@ def policy_export(state: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _network(spec: PolicySpec) -> nn.Sequential:
+def perceptron(spec: PolicySpec) -> nn.Sequential:
     """The multilayer perceptron with the layer names rsl-rl gives it."""
     if spec.activation not in _ACTIVATIONS:
         raise ValueError(f"unknown activation '{spec.activation}'; known: {', '.join(_ACTIVATIONS)}")

@@ -106,12 +106,20 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     from vd.policy import load_policy
     from vd.student.network import Student
     from vd.student.saved import StudentSpec
+    from vd.student.state import state_cfg
     from vd.train.distributed import Processes, join_processes
     from vd.train.student.runner import StudentRunner
 
     device = cfg.run.device
     teacher = load_policy(find_policy(cfg.teacher), device)
     task = student_task(teacher, cfg)
+    if cfg.init is None and cfg.dagger.state_weight > 0.0:
+        if task.observation.view != "world":
+            raise ValueError(
+                f"{cfg.teacher} observes in views of its goal, which a student does not; "
+                "add --dagger.state-weight 0"
+            )
+        cfg = replace(cfg, network=replace(cfg.network, state=state_cfg(teacher.spec)))
     if rank == 0:
         # Before anything is built: a run that fails at once still says what it was.
         saved = to_dict(replace(cfg, resume=None))
@@ -124,6 +132,8 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     torch.manual_seed(cfg.task.seed)
     torch.set_float32_matmul_precision("high")
     student = Student(cfg.network, teacher.num_actions).to(device)
+    if student.state is not None:
+        student.state.adopt(teacher.network)
     if cfg.init is not None:
         begin_from(cfg.init, student, device)
     torch.manual_seed(cfg.task.seed + rank)
@@ -219,6 +229,8 @@ def _pretrainer(cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", wor
         scales=[float(scale) for scale in scales],
         near_share=cfg.pretrain.near_share,
         noise=cfg.noise,
+        rendered_share=cfg.pretrain.rendered_share,
+        depth=cfg.depth,
         batch=cfg.pretrain.batch,
         seed=task.seed,
         device=cfg.run.device,

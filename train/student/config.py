@@ -53,6 +53,10 @@ class DaggerCfg:
     """Weight of the squared error of where the object is, and how it is turned from the goal, predicted from
     the embedding by a head of the training alone. The teacher acts by these; labels alone teach the encoder
     to see them much later. 0, as in the released code: no such head."""
+    state_weight: float = 0.0
+    """Weight of the squared error of an estimate of the teacher's observation, normalised, on which the
+    teacher's own layers act (:mod:`vd.student.state`). 0, as in the released code: no such head. A student
+    to begin from decides for itself whether it has one."""
     clip_labels: bool = False
     """Clip the teacher's mean to [-1, 1], where the environment clips actions; the released code does not."""
     teacher_share: float = PAPER.dagger.teacher_share
@@ -106,6 +110,8 @@ class PretrainCfg:
     near_share: float = 0.0
     """Share of goals at an angle uniform in [0, pi]. The others are uniform on SO(3), where near goals are
     rare: 1 in 300 lies within 0.4 rad."""
+    rendered_share: float = 0.0
+    """Share of the scenes that are seen by the depth camera; the others are whole, as in stage 1."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """Of the encoder's products."""
 
@@ -187,6 +193,7 @@ SHORT_ROLLOUTS = DaggerCfg(
     grad_norm=1.0,
     imitation="squared",
     pose_weight=2.0,
+    state_weight=2.0,
     clip_labels=True,
     teacher_share=1.0,
     teacher_share_last=0.2,
@@ -226,6 +233,7 @@ def gpu(stage: Stage) -> StudentTrainCfg:
             amsgrad=False,
             distance="6d",
             near_share=0.5,
+            rendered_share=0.5,
             precision="bf16",
         ),
         network=LEAN,
@@ -330,6 +338,7 @@ def validate(cfg: StudentTrainCfg) -> None:
     weights = {
         "--dagger.distance-weight": dagger.distance_weight,
         "--dagger.pose-weight": dagger.pose_weight,
+        "--dagger.state-weight": dagger.state_weight,
         "--dagger.teacher-share-iterations": dagger.teacher_share_iterations,
         "--dagger.warmup-steps": dagger.warmup_steps,
         "--dagger.decay-after-steps": dagger.decay_after_steps,
@@ -346,6 +355,7 @@ def validate(cfg: StudentTrainCfg) -> None:
         "--dagger.teacher-share": dagger.teacher_share,
         "--dagger.teacher-share-last": dagger.teacher_share_last,
         "--pretrain.near-share": pretrain.near_share,
+        "--pretrain.rendered-share": pretrain.rendered_share,
     }
     for flag, share in shares.items():
         if not 0.0 <= share <= 1.0:

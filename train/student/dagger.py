@@ -15,6 +15,7 @@ from torch import nn
 from vd.policy import Policy
 from vd.student.network import Student, StudentOutput
 from vd.student.sites import Sites
+from vd.student.state import StateHead
 from vd.train.ending import TrainingDivergedError
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import DaggerCfg
@@ -24,11 +25,11 @@ from vd.train.student.rollout import UNCLIPPED, Rollout, moved, rollout_bytes, t
 from vd.train.student.rotations import angle_between
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 
-STATISTICS = ("loss/imitation", "loss/distance", "loss/pose", "loss/grad_norm")
-"""What every minibatch reports."""
 CHECKPOINT_ROLLOUT_BYTES = 2**28
 """Kept rollouts that are larger together, those with camera points, are not written into checkpoints: a run
 that goes on from one begins with the rollouts to come."""
+FIT_BATCHES = 16
+"""Minibatches of the first rollout that the first estimate of the teacher's observation is fitted to."""
 LOWER_RATES = "lower --dagger.learning-rate or --dagger.grad-norm, or take --dagger.precision fp32"
 """Remedy for a network that diverges."""
 
@@ -93,6 +94,13 @@ class Dagger:
             width, inside = student.cfg.encoder.embedding, student.cfg.distance_hidden
             layers = (nn.Linear(width, inside), nn.GELU(), nn.Linear(inside, POSE_VALUES))
             self.pose = nn.Sequential(*layers).to(self.device)
+        self.weights = {
+            "imitation": 1.0,
+            "distance": cfg.distance_weight,
+            "pose": cfg.pose_weight,
+            "state": cfg.state_weight,
+        }
+        """Weights of the losses."""
         self.network = nn.ModuleList([student, *([] if self.pose is None else [self.pose])])
         """All that is trained."""
         self.optimizer = make_optimizer(self.network, cfg.learning_rate, amsgrad=cfg.amsgrad)
@@ -139,6 +147,9 @@ class Dagger:
         if self.cfg.validation_worlds and len(self._held_out) < self._episode_rollouts:
             held_out = torch.arange(self._learned_worlds, self.env.num_envs, device=self.device)
             self._held_out.append(taken([rollout], held_out))
+        state = self.student.state
+        if state is not None and not state.fitted:
+            self._fit_state(state, rollout)
         losses = self.update(list(self._kept))
         learned = time.perf_counter()
         figures = self.validate()
@@ -185,6 +196,8 @@ class Dagger:
                     self._means.clear()
                     return None
                 frame = self.view.frame()
+                if self.student.state is not None:
+                    frame["observation"] = observation[OBSERVATION_GROUP].clone()
                 for name, value in frame.items():
                     if step == 0:
                         # A tenth of a millimetre is lost of camera points, and half of the memory won.
@@ -250,15 +263,16 @@ class Dagger:
         return self._read(figures)
 
     def update(self, rollouts: Sequence[Rollout]) -> dict[str, float]:
-        """All passes over rollouts; means of :data:`STATISTICS` over its minibatches."""
+        """All passes over rollouts; means of its losses over the minibatches."""
         self.student.train()
         batches = self.minibatches(len(rollouts))
-        steps = torch.stack([self._minibatch_step(taken(rollouts, sequences)) for sequences in batches])
+        steps = [self._minibatch_step(taken(rollouts, sequences)) for sequences in batches]
         if self._world_size > 1:
             # Each process averaged its own batch statistics; from here on all use those of the first.
             for buffer in self.student.buffers():
                 torch.distributed.broadcast(buffer, 0)
-        losses = dict(zip(STATISTICS, steps.mean(dim=0).tolist(), strict=True))
+        means = torch.stack([torch.stack(tuple(step.values())) for step in steps]).mean(dim=0)
+        losses = dict(zip(steps[0], means.tolist(), strict=True))
         bad = [name for name, value in losses.items() if not math.isfinite(value)]
         if bad or not all_finite(self.network):
             raise TrainingDivergedError(
@@ -277,18 +291,22 @@ class Dagger:
             order = torch.randperm(rollouts * learned, device=self.device)[:learned]
             yield from (order // learned * worlds + order % learned).split(self.cfg.minibatch_worlds)
 
-    def losses(self, rollout: Rollout) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Imitation, distance and pose loss of sequences, with new noise on their clouds."""
+    def losses(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        """Losses of sequences by name, with new noise on their clouds; their weights are in ``weights``."""
         output, embedding = self._run(rollout, rollout.hidden, augment=True)
-        imitation = imitation_loss(output, rollout.label, self.cfg.imitation, bounded=self.cfg.clip_labels)
-        distance = distance_loss(output.distance, rollout.frames["distance"])
-        if self.pose is None:
-            return imitation, distance, torch.zeros_like(distance)
-        return (
-            imitation,
-            distance,
-            (self.pose(embedding) - poses(rollout.frames, self._object)).square().mean(),
-        )
+        found = {
+            "imitation": imitation_loss(
+                output, rollout.label, self.cfg.imitation, bounded=self.cfg.clip_labels
+            ),
+            "distance": distance_loss(output.distance, rollout.frames["distance"]),
+        }
+        if self.pose is not None:
+            error = self.pose(embedding) - poses(rollout.frames, self._object)
+            found["pose"] = error.square().mean()
+        if self.student.state is not None:
+            error = output.state - self.student.state.target(rollout.frames["observation"])
+            found["state"] = error.square().mean()
+        return found
 
     def state_dict(self) -> dict[str, Any]:
         """What all processes share besides the network: optimiser, and the window of rates."""
@@ -378,9 +396,26 @@ class Dagger:
         output = self.student(embedding, self.student.senses(rollout.frames), hidden, rollout.done)
         return output, embedding
 
-    def _minibatch_step(self, rollout: Rollout) -> torch.Tensor:
-        """One optimiser step; :data:`STATISTICS` on the device."""
-        imitation, distance, pose = self.losses(rollout)
+    def _fit_state(self, state: StateHead, rollout: Rollout) -> None:
+        """Let the estimate of the teacher's observation begin with the best one in least squares."""
+        self.student.train()  # as in the updates that follow
+        seen, observed = [], []
+        worlds = torch.arange(self._learned_worlds, device=self.device)
+        with torch.no_grad():
+            for some in worlds.split(self.cfg.minibatch_worlds)[:FIT_BATCHES]:
+                part = taken([rollout], some)
+                output, _ = self._run(part, part.hidden, augment=True)
+                seen.append(output.seen.flatten(0, 1))
+                observed.append(part.frames["observation"].flatten(0, 1))
+        state.fit(torch.cat(seen), torch.cat(observed))
+        if self._world_size > 1:
+            for weight in state.estimate.parameters():
+                torch.distributed.broadcast(weight.data, 0)
+
+    def _minibatch_step(self, rollout: Rollout) -> dict[str, torch.Tensor]:
+        """One optimiser step; its losses and the gradient's norm, on the device."""
+        losses = self.losses(rollout)
+        total = torch.stack([self.weights[name] * loss for name, loss in losses.items()]).sum()
         self._steps_done += 1
         for group in self.optimizer.param_groups:
             group["lr"] = scheduled(
@@ -392,11 +427,11 @@ class Dagger:
         norm = descend(
             self.network,
             self.optimizer,
-            imitation + self.cfg.distance_weight * distance + self.cfg.pose_weight * pose,
+            total,
             self.cfg.grad_norm,
             self._world_size,
         )
-        return torch.stack((imitation.detach(), distance.detach(), pose.detach(), norm))
+        return {f"loss/{name}": loss.detach() for name, loss in losses.items()} | {"loss/grad_norm": norm}
 
     def _read(self, figures: dict[str, torch.Tensor]) -> dict[str, float]:
         """Scalars averaged over the processes; waits for the device."""

@@ -15,6 +15,9 @@ from torch import nn
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.paper import PAPER
+from vd.sensors.cfg import DepthCameraCfg
+from vd.sensors.depth_camera import DepthCamera
+from vd.sensors.surfaces import hand_surfaces
 from vd.sim.scene import hand_mount
 from vd.student.cfg import NoiseCfg, StudentCfg
 from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
@@ -39,6 +42,9 @@ EMBEDDING_PARTS = 3
 class RandomScenes:
     """Draws scenes: joints within their limits, any object at any pose, any goal.
 
+    The first rows of a batch may be seen by a depth camera, the others whole. What the camera sees of is
+    copied to the device once: these rows keep their objects, and have new poses in every batch.
+
     Args:
         hand: The hand.
         objects: The objects.
@@ -46,9 +52,14 @@ class RandomScenes:
         scales: Sizes of objects, factors; each is as likely as the others.
         near_share: Share of goals at an angle uniform in [0, pi].
         noise: Augmentation; none by default.
+        rendered_share: Share of the rows that are seen by a depth camera.
+        depth: Its settings.
         batch: R.
         seed: Of the augmentation; scenes come from torch's generator.
         device: Warp device.
+
+    Raises:
+        ValueError: There are fewer rows for the camera than objects in their sizes.
     """
 
     def __init__(
@@ -60,6 +71,8 @@ class RandomScenes:
         scales: Sequence[float] = (1.0,),
         near_share: float = 0.0,
         noise: NoiseCfg | None = None,
+        rendered_share: float = 0.0,
+        depth: DepthCameraCfg | None = None,
         batch: int,
         seed: int = 0,
         device: str,
@@ -69,19 +82,41 @@ class RandomScenes:
         self._device, self._network = torch.device(wp.device_to_torch(device)), network
         self._scales, self._augment = len(scales), noise is not None
         # A "world" for each object in each size.
+        world_object = np.repeat(np.arange(len(objects)), len(scales))
+        world_scale = np.tile(scales, len(objects))
+        placed: dict[str, Any] = {"link_body": np.arange(links), "object_body": links, "device": device}
         self._clouds = SceneClouds(
-            hand,
-            objects,
-            link_body=np.arange(links),
-            object_body=links,
-            world_object=np.repeat(np.arange(len(objects)), len(scales)),
-            world_scale=np.tile(scales, len(objects)),
-            device=device,
+            hand, objects, world_object=world_object, world_scale=world_scale, **placed
         )
         self._kinematics = HandKinematics(hand, link_body=np.arange(links), base=hand_mount(), device=device)
         self._voxelise = Voxeliser(network.voxel_m, noise=noise, clouds=batch, seed=seed, device=device)
-        self._points = wp.empty((batch, self._clouds.item.stop), dtype=wp.vec3, device=device)
         self._body_q = wp.zeros((batch, links + 1), dtype=wp.transform, device=device)
+        self._seen = torch.arange(round(rendered_share * batch), device=self._device) % len(world_object)
+        self._camera: DepthCamera | None = None
+        stop = self._clouds.item.stop
+        if len(self._seen):
+            if len(self._seen) < len(world_object):
+                raise ValueError(
+                    f"a camera sees {len(self._seen)} scenes of a batch, but there are {len(world_object)} "
+                    "objects in their sizes; raise --pretrain.batch or --pretrain.rendered-share"
+                )
+            worlds = self._seen.cpu().numpy()
+            self._camera = DepthCamera(
+                hand_surfaces(
+                    hand,
+                    objects,
+                    world_object=world_object[worlds],
+                    world_scale=world_scale[worlds],
+                    **placed,
+                ),
+                hand.camera,
+                self._body_q[: len(worlds)],
+                cfg=depth,
+                camera_body=0,
+                seed=seed,
+            )
+            stop = max(stop, self._clouds.item.start + self._camera.points.shape[1])
+        self._points = wp.full((batch, stop), wp.vec3(math.nan), dtype=wp.vec3, device=device)
         self._lower = torch.as_tensor(hand.lower, dtype=torch.float32, device=self._device)
         self._span = torch.as_tensor(hand.upper, dtype=torch.float32, device=self._device) - self._lower
         low, high = np.array(OBJECT_RANGE_M).T
@@ -99,6 +134,7 @@ class RandomScenes:
         count, device = self._batch, self._device
         share = torch.rand((count, len(self._lower)), device=device)
         worlds = torch.randint(self._objects * self._scales, (count,), device=device)
+        worlds[: len(self._seen)] = self._seen
         orientation = random_rotations(count, device)
         goal = random_rotations(count, device)
         near = torch.rand((count, 1), device=device) < self._near_share
@@ -113,13 +149,21 @@ class RandomScenes:
             wp.from_torch(goal.contiguous(), dtype=wp.quat),
             worlds=wp.from_torch(worlds.int()),
         )
+        if self._camera is not None:
+            self._camera.capture()
+            # Without a pixel in the crop the cloud is one false point: it counts for nothing.
+            unseen = wp.to_torch(self._camera.count) == 0
+            rows, first = wp.to_torch(self._points)[: len(self._seen)], self._clouds.item.start
+            rows[:, first:] = torch.nan
+            seen = wp.to_torch(self._camera.points)
+            rows[:, first : first + seen.shape[1]] = seen.masked_fill(unseen[:, None, None], torch.nan)
         sites = voxels(
             wp.to_torch(self._points),
             self._clouds.ends,
             self._voxelise,
             network=self._network,
             augment=self._augment,
-            complete=True,
+            complete=self._camera is None,
         )
         targets = {
             "category": worlds // self._scales,
@@ -130,12 +174,16 @@ class RandomScenes:
         return sites, targets
 
     def state_dict(self) -> dict[str, Any]:
-        """Random state of the augmentation."""
-        return {"noise": self._voxelise.rng.numpy().copy()}
+        """Random states of augmentation and camera."""
+        return {name: array.numpy().copy() for name, array in self._stateful().items()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore it."""
-        self._voxelise.rng.assign(state["noise"])
+        for name, array in self._stateful().items():
+            array.assign(state[name])
+
+    def _stateful(self) -> dict[str, wp.array]:
+        return {"noise": self._voxelise.rng} | ({} if self._camera is None else self._camera.stateful())
 
 
 class PretrainHeads(nn.Module):

@@ -87,11 +87,34 @@ class TurnCfg:
     """Width of the layers that weigh a point."""
     pairs: int = 8
     """Pairs of mixtures of them; each pair makes a frame of the object and one of the goal."""
+    points: int = 256
+    """Voxels of object and goal that are looked at, at most."""
+    match: int = 32
+    """Features by which their points find each other (:mod:`vd.student.match`); 0: they do not look."""
 
     def validate(self) -> None:
         """Raise ``ValueError`` for sizes that make no network, naming the field."""
-        if self.vectors < 0 or min(self.rounds, self.hidden, self.pairs) < 1:
-            raise ValueError("turn: vectors must not be negative and every other size be positive")
+        if min(self.vectors, self.match) < 0 or min(self.rounds, self.hidden, self.pairs, self.points) < 1:
+            raise ValueError("turn: vectors and match must not be negative and every other size be positive")
+
+
+@dataclass(frozen=True)
+class StateCfg:
+    """An estimate of the teacher's observation, and the teacher's layers on it (:mod:`vd.student.state`)."""
+
+    values: int = 0
+    """Length of the observation; 0, as in the paper: actions are read from the memory alone."""
+    hidden: tuple[int, ...] = ()
+    """Widths of the teacher's hidden layers."""
+    activation: str = "elu"
+    """Their activation."""
+    inside: int = 256
+    """Width of the layer that reads the estimate."""
+
+    def validate(self) -> None:
+        """Raise ``ValueError`` for sizes that make no network, naming the field."""
+        if self.values < 0 or min((self.inside, *self.hidden)) < 1:
+            raise ValueError("state: values must not be negative and every other size be positive")
 
 
 @dataclass(frozen=True)
@@ -109,6 +132,9 @@ class StudentCfg:
     senses: tuple[Sense, ...] = ("action", "position", "velocity")
     """What it knows of itself besides clouds: the previous action (all that the paper has), positions and
     velocities of the joints, as the encoders report them."""
+    state: StateCfg = field(default_factory=StateCfg)
+    """What the teacher would observe, estimated, and the teacher's layers that act by it. Its sizes are the
+    teacher's; training fills them in (``--dagger.state-weight``)."""
     action_hidden: int = 128
     """Width of the layers for the senses."""
     memory: int = PAPER.student.memory
@@ -129,6 +155,7 @@ class StudentCfg:
         """Raise ``ValueError`` for what cannot be built, naming the field."""
         self.encoder.validate()
         self.turn.validate()
+        self.state.validate()
         if self.turn.vectors and "marks" not in self.encoder.inputs:
             raise ValueError("student.turn needs voxels that are marked: add marks to encoder.inputs")
         if "action" not in self.senses or len(set(self.senses)) != len(self.senses):

@@ -14,6 +14,7 @@ from vd.paper import PAPER
 from vd.student.cfg import EncoderCfg, StudentCfg
 from vd.student.sites import Sites
 from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool
+from vd.student.state import StateHead
 from vd.student.turn import TurnEncoder, marks
 
 POSITION_SCALE_M = 0.1
@@ -36,6 +37,10 @@ class StudentOutput:
     """Logarithm of their standard deviation [.., D]."""
     distance: torch.Tensor
     """Predicted angle to the goal by each distance head [rad], in the order of the configuration [.., H]."""
+    state: torch.Tensor
+    """Estimate of the teacher's observation, normalised [.., O]; O is 0 without such a head."""
+    seen: torch.Tensor
+    """What that is read from: features of the memory, the embedding, the senses [.., W]."""
     hidden: torch.Tensor
     """Memory after the last step [N, G]."""
 
@@ -164,6 +169,12 @@ class Student(nn.Module):
         self.memory = nn.GRU(width, cfg.memory)
         self.head = nn.Sequential(nn.Linear(cfg.memory, cfg.head_hidden), nn.GELU())
         self.mean = nn.Linear(cfg.head_hidden, num_actions)
+        self.state: StateHead | None = None
+        if cfg.state.values:
+            self.state = StateHead(cfg.state, cfg.head_hidden + width + self.num_senses, num_actions)
+            # What the teacher does at the estimate stands, until there is something to add.
+            nn.init.zeros_(self.mean.weight)
+            nn.init.zeros_(self.mean.bias)
         self.log_std = nn.Linear(cfg.head_hidden, num_actions)
         if cfg.std_range is not None:
             # Broad at first, as without bounds: the likelihood weighs the error of random means by 1 / std^2.
@@ -245,12 +256,19 @@ class Student(nn.Module):
         if self.cfg.std_range is not None:
             low, high = (math.log(bound) for bound in self.cfg.std_range)
             log_std = low + (high - low) * torch.sigmoid(log_std)
+        mean, seen = self.mean(features), torch.cat([features, embedding, senses], dim=-1)
+        state = seen[..., :0]
+        if self.state is not None:
+            state, action = self.state(seen)
+            mean = mean + action
         # Autocast may have computed in half precision; losses and the next step should not have to.
         precision = self.mean.weight.dtype
         return StudentOutput(
-            self.mean(features).to(precision),
+            mean.to(precision),
             log_std.to(precision),
             torch.cat(distance, dim=-1).to(precision),
+            state.to(precision),
+            seen.to(precision),
             hidden.to(precision),
         )
 
@@ -259,7 +277,14 @@ class Student(nn.Module):
     ) -> StudentOutput:
         """One step of N clouds: ``senses`` [N, S] and ``hidden`` [N, G] give leading shape [N]."""
         output = self(self.encode(scene, goal)[None], senses[None], hidden)
-        return StudentOutput(output.mean[0], output.log_std[0], output.distance[0], output.hidden)
+        return StudentOutput(
+            output.mean[0],
+            output.log_std[0],
+            output.distance[0],
+            output.state[0],
+            output.seen[0],
+            output.hidden,
+        )
 
     def _remember(
         self, inputs: torch.Tensor, hidden: torch.Tensor, done: torch.Tensor | None

@@ -10,14 +10,20 @@ unknown ones, of which neither cloud alone says anything, so there is no gradien
 (docs/results/student.md). G clouds, P points, K vectors.
 """
 
+from dataclasses import dataclass
+
 import torch
 from torch import nn
 
 from vd.student.cfg import TurnCfg
+from vd.student.match import VALUES, PointMatch
 from vd.student.sites import Sites
 
 RADIUS_M = 0.05
 """Points are given in units of this, about the radius of an object."""
+FAR, WHOSE = 3, 2
+"""Values that are known of a point at first: its distance from the centre, the square, and whether it is of a
+goal, which no side of is hidden; the column of the last."""
 SMALL = 1e-2
 """Vectors are scaled to length 1, those that are not much longer than this less: noise stays small."""
 GOAL, HAND = 0, 1
@@ -44,12 +50,14 @@ def item_and_goal(sites: Sites, goal: Sites | None = None) -> tuple[torch.Tensor
     return free & ~sites.touching(free, marks(sites)[:, HAND] > 0), wanted
 
 
-def padded(sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def padded(sites: Sites, chosen: torch.Tensor, most: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Coordinates of some voxels, a row for each cloud.
 
     Args:
         sites: Voxels of B clouds.
         chosen: Which, bool [M].
+        most: Voxels of a cloud at most. Of more, every so many-th one is taken in the order of their keys,
+            in which neighbours follow each other.
 
     Returns:
         Coordinates of their centres [voxels], zeros where a cloud has fewer, shape [B, P, 3], and 1 where
@@ -58,17 +66,37 @@ def padded(sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tens
     rows = sites.coordinates[chosen]
     cloud = rows[:, 0].long()
     counts = torch.bincount(cloud, minlength=sites.clouds)
-    place = torch.arange(len(cloud), device=cloud.device) - (counts.cumsum(0) - counts)[cloud]
-    points = torch.zeros((sites.clouds, max(1, int(counts.max())), 3), device=cloud.device)
+    rank = torch.arange(len(cloud), device=cloud.device) - (counts.cumsum(0) - counts)[cloud]
+    # Voxels that are left out would share a place with the one before them.
+    share = counts.clamp(min=most)[cloud]
+    place = rank * most // share
+    first = (rank == 0) | ((rank - 1) * most // share < place)
+    points = torch.zeros((sites.clouds, min(most, max(1, int(counts.max()))), 3), device=cloud.device)
     present = torch.zeros_like(points[..., :1])
-    points[cloud, place] = rows[:, 1:] + 0.5
-    present[cloud, place] = 1.0
+    points[cloud[first], place[first]] = rows[first, 1:] + 0.5
+    present[cloud[first], place[first]] = 1.0
     return points, present
 
 
 def unit(values: torch.Tensor) -> torch.Tensor:
     """Values [.., C] scaled to length 1 at most."""
     return values * torch.rsqrt(values.square().sum(dim=-1, keepdim=True) + SMALL * SMALL)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A cloud as it is pooled: what turns with it, and what does not."""
+
+    points: torch.Tensor
+    """Points about their centre, zeros where there is none [G, P, 3]."""
+    present: torch.Tensor
+    """1 where there is a point [G, P, 1]."""
+    vectors: torch.Tensor
+    """Weighted sums of them, at most of length 1 [G, K, 3]."""
+    tensors: torch.Tensor
+    """Weighted sums of their products, symmetric and without trace [G, K, 3, 3]."""
+    seen: torch.Tensor
+    """How far each point is, and how it lies to vectors and tensors: what does not turn [G, P, F]."""
 
 
 class ShapeVectors(nn.Module):
@@ -80,7 +108,8 @@ class ShapeVectors(nn.Module):
 
     def __init__(self, cfg: TurnCfg):
         super().__init__()
-        widths = [2] + [2 + 3 * cfg.vectors] * (cfg.rounds - 1)
+        self.values = FAR + 3 * cfg.vectors
+        widths = [FAR] + [self.values] * (cfg.rounds - 1)
         self.weigh = nn.ModuleList(
             nn.Sequential(
                 nn.Linear(width, cfg.hidden),
@@ -91,23 +120,31 @@ class ShapeVectors(nn.Module):
             )
             for width in widths
         )
+        for layers in self.weigh:
+            nn.init.zeros_(layers[0].weight[:, WHOSE])  # object and goal alike, until they are told apart
 
-    def forward(self, points: torch.Tensor, present: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Vectors [G, K, 3] and tensors [G, K, 3, 3] of points [G, P, 3], present or not [G, P, 1]."""
+    def forward(self, points: torch.Tensor, present: torch.Tensor, *, whole: bool) -> Shape:
+        """Pool points.
+
+        Args:
+            points: Points [G, P, 3].
+            present: 1 where there is one, else 0 [G, P, 1].
+            whole: Whether they are of a goal, which is never cut off.
+        """
         share = present / present.sum(dim=1, keepdim=True).clamp(min=1.0)
         centred = (points - (points * share).sum(dim=1, keepdim=True)) * present
         square = centred.square().sum(dim=-1, keepdim=True)
         identity = torch.eye(3, device=points.device, dtype=points.dtype).flatten()
         spread = (centred[..., :, None] * centred[..., None, :]).flatten(-2) - square / 3.0 * identity
         both = torch.cat([centred, spread], dim=-1)
-        far = torch.cat([square.sqrt(), square], dim=-1)
+        far = torch.cat([square.sqrt(), square, torch.full_like(square, float(whole))], dim=-1)
         seen, vectors, tensors = far, points, points
         for weigh in self.weigh:
             pooled = (weigh(seen) * share).transpose(1, 2) @ both
             vectors, tensors = unit(pooled[..., :3]), unit(pooled[..., 3:])
             along = centred @ vectors.transpose(1, 2)
             seen = torch.cat([far, along, along.square(), spread @ tensors.transpose(1, 2)], dim=-1)
-        return vectors, tensors.unflatten(-1, (3, 3))
+        return Shape(centred, present, vectors, tensors.unflatten(-1, (3, 3)), seen)
 
 
 class TurnEncoder(nn.Module):
@@ -116,12 +153,13 @@ class TurnEncoder(nn.Module):
     Pairs of vectors make frames, of the object and of the goal by the same weights; two frames of one shape
     differ by the rotation that is looked for. The embedding is made of these rotations, one for each pair, of
     their weighted mean, and of the lengths of the vectors: where a shape looks the same from several sides
-    they are short, and the rotations disagree. Then products of tensors still tell how its axes lie.
+    they are short, and the rotations disagree. Then products of tensors still tell how its axes lie. What
+    points that find each other say (:mod:`vd.student.match`) goes beside these.
     """
 
     def __init__(self, cfg: TurnCfg, voxel_m: float, embedding: int):
         super().__init__()
-        self.scale = voxel_m / RADIUS_M
+        self.scale, self.points = voxel_m / RADIUS_M, cfg.points
         self.shape = ShapeVectors(cfg)
         self.pairs = nn.Linear(cfg.vectors, 2 * cfg.pairs, bias=False)
         self.tensors = nn.Linear(cfg.vectors, cfg.pairs, bias=False)
@@ -129,7 +167,8 @@ class TurnEncoder(nn.Module):
         self.trust = nn.Sequential(
             nn.Linear(lengths, cfg.hidden), nn.GELU(), nn.Linear(cfg.hidden, cfg.pairs)
         )
-        width = 9 * (2 * cfg.pairs + 1) + lengths
+        self.match = PointMatch(cfg, self.shape.values) if cfg.match else None
+        width = 9 * (2 * cfg.pairs + 1) + lengths + (VALUES if cfg.match else 0)
         self.hidden = nn.Sequential(nn.Linear(width, embedding), nn.GELU())
         self.out = nn.Linear(width + embedding, embedding)
 
@@ -137,25 +176,33 @@ class TurnEncoder(nn.Module):
         """Embeddings [B, E] of the clouds of ``sites``, the goal's voxels among them or in ``goal``."""
         item, wanted = item_and_goal(sites, goal)
         with torch.autocast(sites.device.type, enabled=False):
-            now, length, spread = self._frames(sites, item)
-            aim, aim_length, aim_spread = self._frames(sites if goal is None else goal, wanted)
+            one = self._shape(sites, item, whole=False)
+            other = self._shape(sites if goal is None else goal, wanted, whole=True)
+            (now, length, spread), (aim, aim_length, aim_spread) = self._frames(one), self._frames(other)
             turns = now @ aim.transpose(-1, -2)
             lengths = torch.cat([length, aim_length], dim=1).clamp(min=SMALL).log()
             trust = self.trust(lengths).softmax(dim=1)
             mean = (trust[..., None, None] * turns).sum(dim=1)
             both = (spread @ aim_spread).flatten(1)
-            known = torch.cat([turns.flatten(1), mean.flatten(1), lengths, both], dim=1)
+            parts = [turns.flatten(1), mean.flatten(1), lengths, both]
+            if self.match is not None:
+                pair = ((one.points, other.points), (one.seen, other.seen), (one.present, other.present))
+                parts.append(self.match(*pair))
+            known = torch.cat(parts, dim=1)
             return self.out(torch.cat([known, self.hidden(known)], dim=1))
 
-    def _frames(self, sites: Sites, chosen: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Frames as matrices [B, pairs, 3, 3], lengths of their vectors [B, 2 pairs], tensors like frames."""
-        points, present = padded(sites, chosen)
+    def _shape(self, sites: Sites, chosen: torch.Tensor, *, whole: bool) -> Shape:
+        """The shape of some voxels of each cloud."""
+        points, present = padded(sites, chosen, self.points)
         dtype = self.out.weight.dtype
-        vectors, tensors = self.shape(self.scale * points.to(dtype), present.to(dtype))
-        first, second = self.pairs(vectors.transpose(1, 2)).transpose(1, 2).chunk(2, dim=1)
+        return self.shape(self.scale * points.to(dtype), present.to(dtype), whole=whole)
+
+    def _frames(self, shape: Shape) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Frames as matrices [B, pairs, 3, 3], lengths of their vectors [B, 2 pairs], tensors like frames."""
+        first, second = self.pairs(shape.vectors.transpose(1, 2)).transpose(1, 2).chunk(2, dim=1)
         one = unit(first)
         second = second - (second * one).sum(dim=-1, keepdim=True) * one
         two = unit(second)
         matrix = torch.stack((one, two, torch.linalg.cross(one, two)), dim=-1)
         lengths = torch.cat([first.norm(dim=-1), second.norm(dim=-1)], dim=1)
-        return matrix, lengths, self.tensors(tensors.movedim(1, -1)).movedim(-1, 1)
+        return matrix, lengths, self.tensors(shape.tensors.movedim(1, -1)).movedim(-1, 1)
