@@ -15,6 +15,7 @@ from test_gap_report import sample_curves, sample_report
 
 from vd.assets_usd.objects import importer
 from vd.envs.cfg import ReorientCfg
+from vd.evaluate.agents import SHIPPED_POLICIES
 from vd.evaluate.result import Episode, EvalResult, Protocol, summarise
 from vd.gap.report import write_report
 from vd.train import cli, demo, demo_agents, demo_page
@@ -118,7 +119,10 @@ def test_demo_ends_with_a_page_and_repeats_nothing(small, cone, capsys):
     (folder,) = (path.parent for path in small.out.rglob("stages.json"))
     assert EvalResult.read(folder / "trained.json").object_names == ("cube",)
     assert EvalResult.read(folder / "imported" / "zero.json").object_names == ("cone",)
-    assert "cone" in EvalResult.read(folder / "evaluation" / "eval.json").object_names
+    judged = EvalResult.read(folder / "evaluation" / "eval.json")
+    assert "cone" in judged.object_names
+    assert judged.protocol.policy in SHIPPED_POLICIES and not judged.protocol.at_rest
+    assert f"are of {judged.protocol.policy}" in text
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.pt")}
     output = capsys.readouterr().out
     total = demo.STAGES + 1 + demo.MESH_STAGES
