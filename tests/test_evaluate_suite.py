@@ -21,6 +21,7 @@ from vd.evaluate.suite import (
     QUICK_OBJECTS,
     dropped_at_once,
     seen_within,
+    success_without_table,
     time_to_success,
 )
 from vd.evaluate.suite_page import paper_text
@@ -83,6 +84,7 @@ def test_every_figure_of_the_paper_is_claimed_once_per_setting_and_has_a_conditi
     assert claimed == {item.name for item in fields(ResultConstants)}
     assert {claim.condition for claim in CLAIMS} == names
     for claim in CLAIMS:
+        assert claim.source.startswith("P: ") == (claim.paper is not None)
         if claim.paper is not None and claim.unit == "share":
             value, *interval = getattr(PAPER.results, claim.paper)
             assert not interval or interval[0] <= value <= interval[1]
@@ -268,6 +270,7 @@ def test_measures_count_what_they_say():
     row = replace(compared()[0][0], result=result, outcomes=outcome_shares(result))
     comparison = Comparison((row,), ())
     assert dropped_at_once(comparison, row).value == pytest.approx(2 / 8)
+    assert success_without_table(comparison, row).value == pytest.approx(1 / 8)
     assert time_to_success(comparison, row).value == pytest.approx(np.median([12, 36]) / 12.0)
     assert seen_within(0.4)(comparison, row) is None
     never = replace(result, episodes=(episode(180),) * 8)

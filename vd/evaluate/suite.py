@@ -11,7 +11,7 @@ import numpy as np
 
 from vd.evaluate.comparison import Comparison, Row, StoppedBy
 from vd.evaluate.statistics import Interval, choose_unit, order_interval, rate_intervals
-from vd.paper import PAPER
+from vd.paper import PAPER, provenance
 
 Group = Literal["training", "held-out", "symmetric"]
 
@@ -101,6 +101,9 @@ CONDITIONS = (
 )
 """What the suite runs, in this order."""
 
+SOURCES = {name: f"{tag}: {note}" for name, _, tag, note in provenance()}
+"""Where every constant of the paper comes from."""
+
 Measure = Callable[[Comparison, Row], Interval | float | None]
 """A number of one row of a condition, or None where it has no meaning."""
 
@@ -142,9 +145,21 @@ def dropped_at_once(_: Comparison, row: Row) -> Interval:
     """Share of episodes that lost the object in the half second after the table went."""
     hz = row.result.protocol.control_hz
     gone = round(PAPER.scene.air_table_s * hz)
-    soon = [e.fell and gone < e.steps <= gone + round(0.5 * hz) for e in row.result.episodes]
+    return _share(row, [e.fell and gone < e.steps <= gone + round(0.5 * hz) for e in row.result.episodes])
+
+
+def success_without_table(_: Comparison, row: Row) -> Interval:
+    """Share of episodes that were stopped within the tolerance when the table had gone."""
+    protocol = row.result.protocol
+    gone, tolerance = round(PAPER.scene.air_table_s * protocol.control_hz), protocol.stop_tolerance_rad
+    return _share(
+        row, [e.stopped and e.error_rad <= tolerance and e.steps > gone for e in row.result.episodes]
+    )
+
+
+def _share(row: Row, chosen: list[bool]) -> Interval:
     objects = len(row.result.object_names)
-    return rate_intervals(np.reshape(soon, (1, objects, -1)), choose_unit(objects))[0]
+    return rate_intervals(np.reshape(chosen, (1, objects, -1)), choose_unit(objects))[0]
 
 
 def time_to_success(_: Comparison, row: Row) -> Interval | None:
@@ -174,6 +189,11 @@ class Claim:
     paper: str | None = None
     unit: Literal["share", "rad", "s"] = "share"
     stopped_by: Literal["own"] | StoppedBy = "own"
+
+    @property
+    def source(self) -> str:
+        """Tag and place of the paper's figure (:mod:`vd.paper`); empty without one."""
+        return "" if self.paper is None else SOURCES[f"results.{self.paper}"]
 
     def of(self, comparison: Comparison) -> Interval | float | None:
         """Ours, from the comparison of one policy; None where it has no such figure."""
@@ -213,6 +233,7 @@ def _air(name: str) -> tuple[Claim, ...]:
     )
     return (
         *stops,
+        Claim("stopped within 0.4 rad after the table went", name, success_without_table),
         Claim("median time to success", name, time_to_success, "air_time_s", "s"),
         Claim("object lost", name, dropped, "air_dropped"),
         Claim("object lost within 0.5 s of the table", name, dropped_at_once, "air_dropped_at_once"),

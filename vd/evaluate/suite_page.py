@@ -28,6 +28,17 @@ def write_suite(result: "SuiteResult", path: Path) -> None:
     page.section("The paper's figures beside ours")
     _add_figures(page, result)
     page.text(_HOW_TO_READ, small=True)
+    named = {condition.name: condition.title for condition in result.conditions}
+    page.table(
+        ("figure", "condition", "paper", "source"),
+        [
+            (claim.text, named[claim.condition], paper_text(claim), claim.source)
+            for claim in CLAIMS
+            if claim.paper is not None and claim.condition in named
+        ],
+        words=(1, 3),
+        folded="Where the paper's figures come from (P: the paper)",
+    )
     for (condition, policy), why in result.failed.items():
         page.text(f"Not measured: {condition} of {policy}. {why}")
     _errors(page, result)
@@ -102,20 +113,20 @@ def paper_text(claim: Claim) -> str:
 
 
 def _columns(result: "SuiteResult") -> tuple[str, ...]:
-    """Headings of the policies' columns: name and kind, and one for students where there is none."""
+    """Headings of the policies' columns: name and kind, and first one for students where there is none."""
     short = labels(result.policies)
     kinds = {row.policy: row.kind for part in result.found.values() for row in part.rows}
     named = (
         short[name] if kinds.get(name, name) == name else f"{short[name]} ({kinds[name]})"
         for name in result.policies
     )
-    return (*named, *(() if result.students else ("students",)))
+    return (*(() if result.students else ("students",)), *named)
 
 
 def _cells(result: "SuiteResult", claim: Claim, condition: Condition) -> tuple[str, ...]:
     """The paper's figure and that of each column of :func:`_columns`."""
     ours = (_cell(result, claim, condition, name) for name in result.policies)
-    return (paper_text(claim), *ours, *(() if result.students else (NO_STUDENT,)))
+    return (paper_text(claim), *(() if result.students else (NO_STUDENT,)), *ours)
 
 
 def _cell(result: "SuiteResult", claim: Claim, condition: Condition, policy: str) -> str:

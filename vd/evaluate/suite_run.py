@@ -124,6 +124,7 @@ class SuiteResult:
             "unit": claim.unit,
             "stopped_by": claim.stopped_by,
             "paper": None if claim.paper is None else list(getattr(PAPER.results, claim.paper)),
+            "source": claim.source,
             "ours": {
                 policy: value(self.found[claim.condition, policy])
                 for policy in self.policies
