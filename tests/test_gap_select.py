@@ -36,7 +36,7 @@ def test_friction_with_a_direction_stands_for_dry_friction_and_an_offset(tmp_pat
     assert report.open_sets == () and "stands for" in verdict_sentence(report)
 
 
-@pytest.mark.parametrize(("excess", "merged"), [(1.0, True), (1.1, False)])
+@pytest.mark.parametrize(("excess", "merged"), [(1.0, True), (1.015, True), (1.1, False)])
 def test_dry_friction_and_an_offset_are_put_together_where_one_cause_does_as_well(
     excess: float, merged: bool
 ) -> None:

@@ -22,6 +22,8 @@ MIN_TRAJECTORIES = 3
 MAX_EFFECTS = 3
 FRICTION_AND_LOAD = "asymmetric_friction"
 """The effect that is also what two others do together (:meth:`Selection.take_apart`)."""
+EXACTLY = {"coulomb_friction", "encoder_bias"}
+"""The two of them that move a joint exactly as it does: what one fits better, the integrator has done."""
 MAX_ROUNDS = 6
 """Rounds in all, with those after a revision."""
 WIDE = 15.0
@@ -234,7 +236,8 @@ class Selection(CandidateFits, Verdicts):
                 if apart and best is both:
                     self.apart[FRICTION_AND_LOAD] = pair
                 better = int(np.argmin(self.scores([best, pair]))) == 1
-                if better and not self.tied(pair, best)[0]:  # in a tie one effect is simpler than two
+                same = best is both and {*pair.effects[-2:]} == EXACTLY
+                if better and not self.tied(pair, best, same)[0]:  # in a tie one effect is simpler than two
                     before, after = present.held_out_rmse, pair.held_out_rmse
                     names = " and ".join(pair.effects[-2:])
                     self.report(f"+ {names}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
@@ -308,7 +311,7 @@ class Selection(CandidateFits, Verdicts):
         given = [self.both_ways(present), *sizes(FRICTION_AND_LOAD, self.others, self.scales)]
         starts = self.starts(without, given)
         fit = self.run([self.call(without, FRICTION_AND_LOAD, starts, FULL_ITERATIONS)])[0]
-        if fit.at_bound or not self.tied(present, fit)[0]:
+        if fit.at_bound or not self.tied(present, fit, parts[0] == EXACTLY)[0]:
             return present
         self.report(f"~ {' and '.join(sorted(parts[0]))} are {FRICTION_AND_LOAD}")
         self.apart[FRICTION_AND_LOAD] = present
