@@ -1,35 +1,40 @@
 """The motors of a hand through dynamixel-sdk: goals out, states in, gains and limits written and read back.
 
-Angles in radians with zero in the middle of a motor's range, velocities in rad/s, currents in A. A state is
-accepted only whole and fresh: right motor, right length, no error number, a clock that went on as ours did,
-and no farther from the last one than the motor can turn. Everything goes through one lock.
+Angles in radians with zero in the middle of a motor's range, velocities in rad/s, currents in A. Which states
+are accepted, :mod:`vd.deploy.answers` says. Everything goes through one lock.
 """
 
 import contextlib
 import termios
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from vd.deploy.answers import (
+    CLOCK_TOLERANCE_S,
+    STATE_ADDRESS,
+    STATE_BYTES,
+    Answer,
+    BusError,
+    HandState,
+    StateCheck,
+    read_answer,
+)
+from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.control_table import (
-    FULL_PWM,
     MODELS,
     POSITION_MODE,
     RAD_S_PER_COUNT,
-    TICK_MODULUS,
     WATCHDOG_UNIT_S,
-    Item,
     Model,
     describe_hardware_error,
     table,
-    to_angle,
     to_counts,
 )
-from vd.deploy.packets import ALERT, MAX_ID, Failure
+from vd.deploy.packets import MAX_ID
 
 BAUD_RATE = 1_000_000
 P_GAIN, D_GAIN = 200, 10
@@ -37,43 +42,8 @@ P_GAIN, D_GAIN = 200, 10
 WAIT_S = 0.002
 """How long a read of the port sleeps at most until its bytes are there. The SDK's own does not sleep but asks
 again and again, which takes a core, and keeps whatever shares it from answering."""
-STATE_ADDRESS, STATE_BYTES = 120, 27
-"""From the realtime tick to the temperature: one read for the whole state."""
-CLOCK_TOLERANCE_S = 0.04
-"""A state whose clock went on by so much more or less than ours is an old one, or from after a restart; the
-packet's own time on the line and in the driver is within it."""
 LATE_S = 0.02
 """Pause before a motor is asked again; what arrives meanwhile is dropped."""
-JUMP_RAD = 0.1
-"""Beyond what the largest speed explains, a position that changed by more was not measured."""
-SPEED_MARGIN = 1.5
-"""Motors turn faster than their limit of speed when pushed."""
-
-
-class BusError(RuntimeError):
-    """The bus or a motor did not do what was asked; says which, and what to try."""
-
-
-@dataclass(frozen=True)
-class BusState:
-    """State of all motors at one reading."""
-
-    time_s: float
-    """When it was read, by the monotonic clock [s]."""
-    position: np.ndarray
-    """Angles [rad], shape [D]."""
-    velocity: np.ndarray
-    """Speeds [rad/s], shape [D]."""
-    current: np.ndarray
-    """Currents [A], shape [D]."""
-    pwm: np.ndarray
-    """Duty cycles in [-1, 1], shape [D]."""
-    voltage: np.ndarray
-    """Voltages of the supply [V], shape [D]."""
-    temperature: np.ndarray
-    """Temperatures of the motors [deg C], shape [D]."""
-    alert: np.ndarray
-    """Whether a motor reports a hardware error, shape [D]."""
 
 
 @dataclass(frozen=True)
@@ -107,15 +77,47 @@ class MotorSettings:
         }
 
 
+def open_port(path: str, baud_rate: int = BAUD_RATE) -> Any:
+    """A serial port as the SDK takes it.
+
+    Args:
+        path: Device, such as /dev/ttyUSB0.
+        baud_rate: Of the port; the motors' own has to be the same.
+
+    Raises:
+        BusError: It cannot be opened, or there is no SDK.
+    """
+    port = _sdk().PortHandler(path)
+    try:
+        opened = port.setBaudRate(baud_rate)
+    except OSError as error:  # the SDK lets errors of the serial port through
+        raise BusError(
+            f"cannot open {path}: {error}; is the adapter plugged in, and yours to use?"
+        ) from error
+    if not opened:
+        raise BusError(f"{path}: no baud rate {baud_rate}")
+    port.ser.timeout = WAIT_S
+    return port
+
+
+def _sdk() -> Any:
+    try:
+        import dynamixel_sdk
+    except ImportError as error:
+        raise BusError("motors need dynamixel-sdk: pip install 'visual-dexterity[hardware]'") from error
+    return dynamixel_sdk
+
+
 class MotorBus:
     """Motors of one model on one serial port.
 
     Args:
-        port: Device, such as /dev/ttyUSB0.
+        port: Device, such as /dev/ttyUSB0, or an open port of the SDK's kind.
         ids: Motors in the order of the arrays.
         model: Name of their model.
-        baud_rate: Of the port; the motors' own has to be the same.
+        baud_rate: To open the device with.
         retries: How often to ask again where no sound answer came.
+        clock: Time.
 
     Raises:
         BusError: The port cannot be opened.
@@ -123,37 +125,30 @@ class MotorBus:
     """
 
     def __init__(
-        self, port: str, ids: Sequence[int], model: str, *, baud_rate: int = BAUD_RATE, retries: int = 1
+        self,
+        port: Any,
+        ids: Sequence[int],
+        model: str,
+        *,
+        baud_rate: int = BAUD_RATE,
+        retries: int = 1,
+        clock: Clock = MONOTONIC,
     ):
         """Open the port."""
         if model not in MODELS:
             raise ValueError(f"no motor {model!r}; choose of {', '.join(MODELS)}")
         if not ids or len(set(ids)) != len(ids) or not all(0 <= id <= MAX_ID for id in ids):
             raise ValueError(f"ids are {list(ids)}; give each motor's own, within 0 and {MAX_ID}")
-        try:
-            import dynamixel_sdk
-        except ImportError as error:
-            raise BusError("motors need dynamixel-sdk: pip install 'visual-dexterity[hardware]'") from error
-        self.ids, self.model, self.retries = tuple(ids), MODELS[model], retries
+        self.ids, self.model, self.retries, self.clock = tuple(ids), MODELS[model], retries, clock
         self._items = table(self.model)
-        self._sdk: Any = dynamixel_sdk
+        self._sdk = _sdk()
         self._lock = threading.RLock()
-        self._port = dynamixel_sdk.PortHandler(port)
-        self._packets = dynamixel_sdk.PacketHandler(2.0)
-        self._last: BusState | None = None
-        self._ticks = np.zeros(len(self.ids), dtype=int)
+        self._packets = self._sdk.PacketHandler(2.0)
+        self._states = StateCheck(self.ids, self.model)
         self._settings: dict[int, MotorSettings] = {}
         self.rejected = 0
         """States that were not accepted."""
-        try:
-            opened = self._port.setBaudRate(baud_rate)
-        except OSError as error:  # the SDK lets errors of the serial port through
-            raise BusError(
-                f"cannot open {port}: {error}; is the adapter plugged in, and yours to use?"
-            ) from error
-        if not opened:
-            raise BusError(f"{port}: no baud rate {baud_rate}")
-        self._port.ser.timeout = WAIT_S
+        self._port = open_port(port, baud_rate) if isinstance(port, str) else port
 
     def __enter__(self) -> "MotorBus":
         return self
@@ -186,7 +181,7 @@ class MotorBus:
                 answer, result, error = ask(self._port, *arguments)
             if result == self._sdk.COMM_SUCCESS or attempt == self.retries:
                 break
-            time.sleep(LATE_S)  # an answer that comes now is none to the next question
+            self.clock.sleep(LATE_S)  # an answer that comes now is none to the next question
         return answer, result, error
 
     def ping(self, id: int) -> int | None:
@@ -225,11 +220,11 @@ class MotorBus:
             if result != self._sdk.COMM_SUCCESS:
                 return b"", result, 0
             frame, result = self._packets.rxPacket(self._port, False)
-            body = _status_body(bytes(frame)) if result == self._sdk.COMM_SUCCESS else None
+            answer = read_answer(bytes(frame)) if result == self._sdk.COMM_SUCCESS else None
             # The SDK's own reading takes any answer, such as one to a write that came late.
-            if body is None or body[0] != motor or (not body[1] & ~ALERT and len(body[2]) != size):
+            if answer is None or answer.id != motor or (not answer.refused and len(answer.data) != size):
                 return b"", result if result != self._sdk.COMM_SUCCESS else self._sdk.COMM_RX_CORRUPT, 0
-            return body[2], result, body[1]
+            return answer.data, result, answer.error
 
         data, result, error = self._ask(receive, id, item.address, item.size)
         self._check(id, f"read {name}", result, error)
@@ -270,7 +265,8 @@ class MotorBus:
             raise BusError("; ".join(wrong))
         with self._lock:
             self._settings = dict(settings)
-            self._last = None
+            self._states.fastest[:] = [settings[id].velocity_limit_rad_s for id in self.ids]
+            self._states.forget()
 
     def torque(self, on: bool, ids: Iterable[int] | None = None) -> dict[int, str]:
         """Switch torque on or off. Goes on to the other motors if one does not answer.
@@ -307,11 +303,22 @@ class MotorBus:
             if seconds > 0.0:
                 self.write(id, "bus_watchdog", max(1, round(seconds / WATCHDOG_UNIT_S)))
 
+    def freeze(self) -> None:
+        """Have the motors stop by themselves where they are, without an answer, within two units of silence.
+
+        The shortest bus watchdog, in one packet: what a line that brings no states still can do.
+
+        Raises:
+            BusError: The packet could not be sent.
+        """
+        self._write_all("bus_watchdog", [1] * len(self.ids))
+        self.clock.sleep(2.0 * WATCHDOG_UNIT_S)
+
     def reboot(self, id: int) -> None:
         """Restart a motor: clears its hardware error. Torque is off afterwards; configure it before use."""
         with self._line():
             result, error = self._packets.reboot(self._port, id)
-            self._last = None
+            self._states.forget()
         self._check(id, "reboot", result, error)
 
     def hardware_errors(self) -> dict[int, str]:
@@ -350,7 +357,7 @@ class MotorBus:
         if result != self._sdk.COMM_SUCCESS:
             raise BusError(f"{name} was not sent: {self._words(result)}")
 
-    def read_state(self, *, retries: int | None = None) -> BusState:
+    def read_state(self, *, retries: int | None = None) -> HandState:
         """Read all motors at once.
 
         Args:
@@ -369,10 +376,10 @@ class MotorBus:
                     raise
         raise AssertionError("retries are not negative")
 
-    def _read_state(self) -> BusState:
+    def _read_state(self) -> HandState:
         ids = list(self.ids)
         with self._line():
-            asked = time.monotonic()
+            asked = self.clock.now()
             result = self._packets.syncReadTx(
                 self._port, STATE_ADDRESS, STATE_BYTES, ids, len(ids), fast_option=False
             )
@@ -380,70 +387,24 @@ class MotorBus:
                 raise BusError(f"states were not asked for: {self._words(result)}")
             # One time for all: the SDK counts no time for the answers' bytes.
             answers = [self._answer(id) for id in ids]
-            now = time.monotonic()
-            if now - asked > CLOCK_TOLERANCE_S:
+            took = self.clock.now() - asked
+            if took > CLOCK_TOLERANCE_S:
                 # This process did not run: whose time is not known is nothing to compare later ones with.
-                raise BusError(f"the state took {now - asked:.3f} s")
-            return self._accept(now, answers)
+                raise BusError(f"the state took {took:.3f} s")
+            # Motors measure when they are asked or when they answer: in the middle, half of it off at most.
+            return self._states.accept(asked + 0.5 * took, answers)
 
-    def _answer(self, id: int) -> tuple[bytes, int]:
-        """State and error byte of this motor's next answer."""
+    def _answer(self, id: int) -> Answer:
+        """This motor's next answer."""
         while True:
             frame, result = self._packets.rxPacket(self._port, False)
             if result != self._sdk.COMM_SUCCESS:
                 raise BusError(f"motor {id}: no state: {self._words(result)}")
-            body = _status_body(bytes(frame))
-            if body is None:
+            answer = read_answer(bytes(frame))
+            if answer is None:
                 raise BusError(f"motor {id}: what answered is no status packet")
-            if body[0] == id:
-                break  # others' come late from an exchange before; the time limit is one for all
-        _, error, data = body
-        if error & ~ALERT:
-            raise BusError(f"motor {id}: {_failure(error)}")
-        if len(data) != STATE_BYTES:
-            raise BusError(f"motor {id}: {len(data)} bytes of state came, not {STATE_BYTES}")
-        return data, error
-
-    def _accept(self, now: float, answers: Sequence[tuple[bytes, int]]) -> BusState:
-        def column(name: str) -> np.ndarray:
-            item: Item = self._items[name]
-            start = item.address - STATE_ADDRESS
-            return np.array([item.from_bytes(data[start : start + item.size]) for data, _ in answers])
-
-        ticks = column("realtime_tick")
-        state = BusState(
-            time_s=now,
-            position=np.array([to_angle(int(count)) for count in column("present_position")]),
-            velocity=column("present_velocity") * RAD_S_PER_COUNT,
-            current=column("present_current") * self.model.current_unit_a,
-            pwm=column("present_pwm") / FULL_PWM,
-            voltage=0.1 * column("present_input_voltage"),
-            temperature=column("present_temperature").astype(float),
-            alert=np.array([bool(error & ALERT) for _, error in answers]),
-        )
-        if self._last is not None:
-            self._compare(self._last, state, ticks)
-        self._last, self._ticks = state, ticks
-        return state
-
-    def _compare(self, last: BusState, state: BusState, ticks: np.ndarray) -> None:
-        """Refuse a state that cannot follow the last one."""
-        elapsed = state.time_s - last.time_s
-        gone = (ticks - self._ticks) % TICK_MODULUS / 1000.0
-        span = TICK_MODULUS / 1000.0
-        difference = (gone - elapsed + 0.5 * span) % span - 0.5 * span
-        for id, late in zip(self.ids, difference, strict=True):
-            if abs(late) > CLOCK_TOLERANCE_S:
-                # A motor that restarted is not heard again before configure(): its gains and limits are gone.
-                raise BusError(
-                    f"motor {id}: its clock differs from ours by {late:.3f} s since the last state: that "
-                    "state was an old one; if this goes on, the motor restarted and has to be configured"
-                )
-        for axis, id in enumerate(self.ids):
-            fastest = self._settings[id].velocity_limit_rad_s if id in self._settings else np.inf
-            moved = abs(state.position[axis] - last.position[axis])
-            if moved > SPEED_MARGIN * fastest * elapsed + JUMP_RAD:
-                raise BusError(f"motor {id}: moved {moved:.2f} rad in {elapsed:.3f} s, which it cannot")
+            if answer.id == id:
+                return answer  # others' come late from an exchange before; the time limit is one for all
 
     def _words(self, result: int) -> str:
         """What went wrong in an exchange, in the SDK's words."""
@@ -452,22 +413,5 @@ class MotorBus:
     def _check(self, id: int, what: str, result: int, error: int) -> None:
         if result != self._sdk.COMM_SUCCESS:
             raise BusError(f"motor {id}: {what}: {self._words(result)}")
-        if error & ~ALERT:
-            raise BusError(f"motor {id}: {what}: {_failure(error)}")
-
-
-def _failure(error: int) -> str:
-    number = error & ~ALERT
-    return f"refused: {Failure(number).name.lower() if number in set(Failure) else f'error {number}'}"
-
-
-def _status_body(frame: bytes) -> tuple[int, int, bytes] | None:
-    """ID, error byte and data of a status packet whose stuffing the SDK has removed; None if it is not whole.
-
-    The SDK has checked the CRC of what came before it removed the stuffing; length and instruction it leaves
-    to us.
-    """
-    length = int.from_bytes(frame[5:7], "little")
-    if len(frame) < 7 + length or length < 4 or frame[7] != 0x55:
-        return None
-    return frame[4], frame[8], frame[9 : 5 + length]
+        if refused := Answer(id, error, b"").refused:
+            raise BusError(f"motor {id}: {what}: {refused}")

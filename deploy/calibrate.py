@@ -24,10 +24,11 @@ from vd.deploy.camera import GrayFrame, Intrinsics, StaleCamera
 from vd.deploy.check import ready
 from vd.deploy.connect import Connection, HandOptions, connect, read_hand_and_joints
 from vd.deploy.hand_eye import HandEye, Views, solve
+from vd.deploy.limits import SafetyCfg
 from vd.deploy.markers import CELLS, MARGIN_CELLS, MarkerFinder, save_marker
 from vd.deploy.motion import move, reset_pose
 from vd.deploy.realsense import RealSenseCfg, RealSenseInfrared, find_device
-from vd.deploy.safety import SafeHand, SafetyCfg
+from vd.deploy.safety import SafeHand
 from vd.files import atomic_path, write_json
 from vd.paper import PAPER
 from vd.sensors.depth_cloud import BASE_IN_WORLD

@@ -2,7 +2,6 @@
 
 import json
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from typing import Annotated
@@ -10,11 +9,12 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from vd.deploy.bus import BusError
+from vd.deploy.answers import BusError
 from vd.deploy.connect import Connection, HandOptions, connect
 from vd.deploy.joints import CalibrationError
+from vd.deploy.limits import PERIOD_S, SafetyCfg
 from vd.deploy.motion import move
-from vd.deploy.safety import PERIOD_S, SafeHand, SafetyCfg
+from vd.deploy.safety import SafeHand
 
 CYCLES = 24
 """Control cycles whose times are measured: two seconds."""
@@ -141,17 +141,17 @@ def _state(connection: Connection) -> Iterator[Finding]:
 
 def _cycles(connection: Connection) -> Finding:
     """Time that a reading takes, at the control rate."""
-    bus = connection.bus
+    bus, clock = connection.bus, connection.bus.clock
     rejected, took, failed = bus.rejected, [], 0
-    begin = time.monotonic()
+    begin = clock.now()
     for cycle in range(CYCLES):
-        time.sleep(max(0.0, begin + cycle * PERIOD_S - time.monotonic()))
-        start = time.monotonic()
+        clock.sleep(begin + cycle * PERIOD_S - clock.now())
+        start = clock.now()
         try:
             bus.read_state()
         except BusError:
             failed += 1
-        took.append(time.monotonic() - start)
+        took.append(clock.now() - start)
     found = (
         f"{1e3 * float(np.median(took)):.1f} ms a reading, longest {1e3 * max(took):.1f}; "
         f"{bus.rejected - rejected} of {CYCLES} asked again, {failed} failed"
@@ -172,7 +172,8 @@ def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
         StoppedError: A limit was passed.
     """
     home = safe.arm().position
-    centre, half = 0.5 * (safe.lower + safe.upper), 0.5 * RANGE_SHARE * (safe.upper - safe.lower)
+    lower, upper = safe.limits.lower, safe.limits.upper
+    centre, half = 0.5 * (lower + upper), 0.5 * RANGE_SHARE * (upper - lower)
     for axis, name in enumerate(connection.joints.names):
         worst = 0.0
         for end in (centre[axis] - half[axis], centre[axis] + half[axis], home[axis]):

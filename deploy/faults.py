@@ -23,11 +23,13 @@ from vd.deploy.check import preflight
 from vd.deploy.connect import MOTOR, Connection
 from vd.deploy.control_table import MODELS, HardwareError
 from vd.deploy.joints import Joints, uncalibrated
+from vd.deploy.limits import PERIOD_S, SafetyCfg
+from vd.deploy.line import Faults
 from vd.deploy.motor import Motor
 from vd.deploy.newton_hand import NewtonHand
 from vd.deploy.plant import Drive, FirstOrderPlant, Plant
-from vd.deploy.safety import FINISHED, PERIOD_S, SafeHand, SafetyCfg, StoppedError
-from vd.deploy.twin import Faults, Twin
+from vd.deploy.safety import FINISHED, SafeHand, StoppedError
+from vd.deploy.twin import Twin
 from vd.files import write_json
 
 PUSH_RAD = 0.29
@@ -287,7 +289,7 @@ def _move(scene: Scene, safe: SafeHand, fault: Fault) -> None:
     rng = np.random.default_rng(0)
     begin = time.monotonic()
     due = begin
-    way = np.zeros(len(safe.lower))
+    way = np.zeros(len(safe.limits.lower))
     for step in range(round((BEFORE_S + AFTER_S) / PERIOD_S)):
         if step == round(BEFORE_S / PERIOD_S):
             scene.injected_s = time.monotonic()
@@ -296,6 +298,8 @@ def _move(scene: Scene, safe: SafeHand, fault: Fault) -> None:
             raise scene.error
         if step % round(TURN_S / PERIOD_S) == 0:
             way = rng.choice([-1.0, 1.0], len(way))
+        if fault.blockable and step >= round(BEFORE_S / PERIOD_S):
+            way = np.sign(safe.limits.lower + safe.limits.upper - 2.0 * safe.read().position)
         reach = PUSH_RAD if scene.injected_s == float("inf") else fault.reach_rad
         safe.command(safe.read().position + reach * way)
         if scene.camera:

@@ -8,8 +8,9 @@ import tyro
 
 from vd.deploy.check import ready
 from vd.deploy.connect import HandOptions, connect
+from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import move, reset_pose
-from vd.deploy.safety import SafeHand, SafetyCfg
+from vd.deploy.safety import SafeHand
 
 SPEED_RAD_S = 0.5
 """A tenth of what the joints can: time to reach the switch."""

@@ -4,13 +4,14 @@ A motor's angle is ``sign * q + offset`` of its joint's angle q [rad].
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
+from vd.deploy.answers import HandState
 from vd.deploy.bus import MotorSettings
 from vd.deploy.control_table import MODELS, RAD_S_PER_COUNT, to_angle
 from vd.deploy.packets import MAX_ID
@@ -45,6 +46,16 @@ class Joints:
     def to_joint(self, motor: np.ndarray) -> np.ndarray:
         """Angles of the joints [rad] from those of the motors, shape [..., D]."""
         return self.sign * (motor - self.offset)
+
+    def state(self, motors: HandState) -> HandState:
+        """A state of the motors, in the joints' frame."""
+        return replace(
+            motors,
+            position=self.to_joint(motors.position),
+            velocity=self.sign * motors.velocity,
+            current=self.sign * motors.current,
+            pwm=self.sign * motors.pwm,
+        )
 
     def settings(self, hand: HandModel, model: str) -> dict[int, MotorSettings]:
         """Limits of every motor: the hand's, as far as the motor has them.

@@ -11,6 +11,7 @@ import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hand_spec import HANDS
+from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.control_table import RAD_PER_COUNT
 from vd.files import write_json
 from vd.gap.recording import FORMAT as RECORDING_FORMAT
@@ -38,6 +39,7 @@ class LogWriter:
         run: What runs: policy, object, goals (quaternions xyzw), and whatever is worth to know.
         servo: What is known of the motors: model, gains.
         truth: Whether the object's pose is known: a twin's.
+        clock: Time.
 
     Raises:
         FileExistsError: There is a log already.
@@ -51,12 +53,13 @@ class LogWriter:
         *,
         servo: Mapping[str, Any],
         truth: bool = False,
+        clock: Clock = MONOTONIC,
     ):
         if (folder / RUN_FILE).exists():
             raise FileExistsError(f"{folder} holds a log; choose another folder")
         folder.mkdir(parents=True, exist_ok=True)
         self.folder, self._joints = folder, hand.joint_names
-        self.started_s = time.monotonic()
+        self._clock, self.started_s = clock, clock.now()
         self._run = {
             "format": LOG_FORMAT,
             "hand": hand.name,
@@ -119,7 +122,7 @@ class LogWriter:
 
     def event(self, event: str, **values: Any) -> None:
         """Append an event of this moment."""
-        line = {"t": round(self.since(time.monotonic()), DIGITS), "event": event, **values}
+        line = {"t": round(self.since(self._clock.now()), DIGITS), "event": event, **values}
         self._append(self._events, json.dumps(line))
 
     def finish(self, reason: str, **summary: Any) -> None:

@@ -8,11 +8,13 @@ from typing import Protocol
 import numpy as np
 
 from vd.deploy.action import ActionFilter
+from vd.deploy.answers import HandState
 from vd.deploy.camera import DepthSource
+from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.log import LogWriter
 from vd.deploy.observation import Sensed
 from vd.deploy.pilot import Pilot
-from vd.deploy.safety import JointState, SafeHand
+from vd.deploy.safety import SafeHand
 from vd.deploy.twin_link import TwinState
 from vd.evaluate.statistics import symmetric_error
 from vd.paper import PAPER
@@ -23,7 +25,7 @@ STATUS_STEPS = 3
 """Control steps between two refreshes of the status line: four a second."""
 
 
-class Clock:
+class Pacer:
     """The grid of control steps.
 
     A step is due at a point of the grid and has to end by the next. One that ends later misses each point
@@ -31,17 +33,11 @@ class Clock:
 
     Args:
         hz: Steps a second.
-        now: Time [s].
-        sleep: Waits for seconds.
+        clock: Time.
     """
 
-    def __init__(
-        self,
-        hz: float,
-        now: Callable[[], float] = time.monotonic,
-        sleep: Callable[[float], None] = time.sleep,
-    ):
-        self.period_s, self._now, self._sleep = 1.0 / hz, now, sleep
+    def __init__(self, hz: float, clock: Clock = MONOTONIC):
+        self.period_s, self.clock = 1.0 / hz, clock
         self.due_s: float | None = None
         """When the present step was due [s]."""
         self.missed = 0
@@ -49,7 +45,7 @@ class Clock:
 
     def wait(self) -> float:
         """Wait for the next step; how late it begins [s]."""
-        now = self._now()
+        now = self.clock.now()
         if self.due_s is None:
             self.due_s = now
             return 0.0
@@ -57,14 +53,14 @@ class Clock:
         behind = int((now - self.due_s) // self.period_s)
         if behind > 0:
             self.due_s += behind * self.period_s
-        while (left := self.due_s - self._now()) > 0.0:
-            self._sleep(left)
-        return self._now() - self.due_s
+        while (left := self.due_s - self.clock.now()) > 0.0:
+            self.clock.sleep(left)
+        return self.clock.now() - self.due_s
 
     def end(self) -> bool:
         """The step's work is done; whether after its deadline."""
         assert self.due_s is not None
-        passed = int((self._now() - self.due_s) // self.period_s)
+        passed = int((self.clock.now() - self.due_s) // self.period_s)
         self.missed += max(passed, 0)
         return passed > 0
 
@@ -114,7 +110,7 @@ class Moment:
     """Wanted orientation [4]."""
     acting: bool
     """Whether the policy acts; else the hand holds still."""
-    state: JointState
+    state: HandState
     """As measured."""
     known: TwinState | None
     """The truth: a twin's only."""
@@ -135,7 +131,7 @@ class ControlLoop:
         safe: The hand, behind its limits, armed.
         pilot: The policy.
         actions: From its actions to joint goals.
-        clock: The grid of control steps.
+        pacer: The grid of control steps.
         log: Takes every step.
         cfg: Times.
         camera: Depth camera; None: the policy needs none.
@@ -149,7 +145,7 @@ class ControlLoop:
         safe: SafeHand,
         pilot: Pilot,
         actions: ActionFilter,
-        clock: Clock,
+        pacer: Pacer,
         log: LogWriter,
         cfg: LoopCfg,
         *,
@@ -158,7 +154,7 @@ class ControlLoop:
         symmetry: np.ndarray | None = None,
         status: Callable[[str], None] = lambda line: None,
     ):
-        self._safe, self._pilot, self._actions, self._clock, self._log = safe, pilot, actions, clock, log
+        self._safe, self._pilot, self._actions, self._pacer, self._log = safe, pilot, actions, pacer, log
         self._cfg, self._camera, self._truth, self._status = cfg, camera, truth, status
         self._symmetry = np.array([[0.0, 0.0, 0.0, 1.0]]) if symmetry is None else symmetry
         self._target = safe.read().position
@@ -178,7 +174,7 @@ class ControlLoop:
             self._log.event("stop", goal=number, outcome=outcome, distance=distance)
             if outcome == "lost":
                 break
-            for _ in range(round(self._cfg.hold_s / self._clock.period_s)):
+            for _ in range(round(self._cfg.hold_s / self._pacer.period_s)):
                 self._step(number, goal, acting=False)
         return outcomes
 
@@ -188,7 +184,7 @@ class ControlLoop:
         self._actions.reset()
         self._log.event("goal", goal=number)
         distance: float | None = None
-        for step in range(round(self._cfg.goal_s / self._clock.period_s)):
+        for step in range(round(self._cfg.goal_s / self._pacer.period_s)):
             outcome, distance = self._step(number, goal, acting=True, first=step == 0)
             if outcome:
                 return outcome, distance
@@ -198,12 +194,12 @@ class ControlLoop:
         self, number: int, goal: np.ndarray, *, acting: bool, first: bool = False
     ) -> tuple[str, float | None]:
         """One control step; what ends the pursuit, if anything, and the distance [rad]."""
-        late, busy = self._clock.wait(), time.process_time()
-        due = self._clock.due_s
+        late, busy = self._pacer.wait(), time.process_time()
+        due = self._pacer.due_s
         assert due is not None
         depth = None
         if self._camera is not None:
-            image = self._camera.read(CAMERA_SHARE * self._clock.period_s)
+            image = self._camera.read(CAMERA_SHARE * self._pacer.period_s)
             self._safe.image_at(image.time_s)
             depth = image.depth_m
         known = self._truth.state() if self._truth is not None else None
@@ -229,8 +225,8 @@ class ControlLoop:
                 action = decision.action
                 self._target = self._actions.goal(action, state.position)
         sent = self._safe.command(self._target)
-        end = time.monotonic() - due
-        missed = self._clock.end()
+        end = self._pacer.clock.now() - due
+        missed = self._pacer.end()
         self._safe.beat(missed=missed)
         if depth is not None and self._cfg.images:
             self._log.image(len(self.times), depth)
@@ -258,7 +254,7 @@ class ControlLoop:
             pose = moment.known.object_pose.astype(float)
             error = symmetric_error(pose[None, 3:], moment.goal[None], self._symmetry)
             truth = [*(float(value) for value in pose), float(error[0])]
-        state, missed = moment.state, self._clock.missed
+        state, missed = moment.state, self._pacer.missed
         joints = {
             "command": moment.sent,
             "position": state.position,

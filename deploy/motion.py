@@ -1,7 +1,6 @@
 """Slow movements of a hand, outside of any policy."""
 
 import math
-import time
 
 import numpy as np
 
@@ -36,11 +35,12 @@ def move(safe: SafeHand, goal: np.ndarray, speed: float) -> np.ndarray:
     start = safe.read().position
     steps = max(1, math.ceil(float(np.abs(goal - start).max()) / (speed * MOVE_S)))
     worst = np.zeros(len(start))
-    begin = time.monotonic()
+    clock = safe.bus.clock
+    begin = clock.now()
     for step in range(1, steps + SETTLE_STEPS + 1):
         target = start + (goal - start) * min(1.0, step / steps)
         safe.command(target)
-        time.sleep(max(0.0, begin + step * MOVE_S - time.monotonic()))
+        clock.sleep(begin + step * MOVE_S - clock.now())
         worst = np.maximum(worst, np.abs(safe.read().position - target))
         safe.beat()
     return worst

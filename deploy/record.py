@@ -4,7 +4,6 @@ import csv
 import itertools
 import json
 import sys
-import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -14,12 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
+from vd.deploy.answers import HandState
 from vd.deploy.bus import D_GAIN, P_GAIN
 from vd.deploy.check import ready
 from vd.deploy.connect import Connection, HandOptions, connect
 from vd.deploy.control_table import RAD_PER_COUNT
+from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import move
-from vd.deploy.safety import JointState, SafeHand, SafetyCfg
+from vd.deploy.safety import SafeHand
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
@@ -184,7 +185,7 @@ class Recorder:
     def play(self, safe: SafeHand, motion: Motion) -> "Trajectory":
         """Go to where the motion starts, play it, and give what was measured.
 
-        A sample is a state, and the goal that was sent right after it was read.
+        A sample is a state, and the goal that was sent right before it was read.
 
         Raises:
             StoppedError: The hand was stopped.
@@ -194,21 +195,22 @@ class Recorder:
         move(safe, excitation.command[0], SPEED_RAD_S)
         gain = int(float(excitation.conditions["p_gain"]))
         self._set_gain(gain)
-        rows: list[tuple[JointState, np.ndarray, np.ndarray]] = []
-        begin, last = time.monotonic(), -np.inf
+        rows: list[tuple[HandState, np.ndarray, np.ndarray]] = []
+        clock = self._connection.bus.clock
+        begin, last = clock.now(), -np.inf
         on = np.ones(len(self._connection.joints.ids), dtype=bool)
-        while (now := time.monotonic() - begin) < excitation.duration:
+        while (now := clock.now() - begin) < excitation.duration:
             at = int(np.searchsorted(excitation.time, now, side="right")) - 1
             if not np.array_equal(on, excitation.enabled[at]):
                 on = excitation.enabled[at]
                 safe.switch(on)
+            goal = safe.command(excitation.command[at])
             state = safe.read()
-            if state.time_s > last:  # else the last one again, and a goal would have no sample
-                rows.append((state, safe.command(excitation.command[at]), on))
+            if state.time_s > last:  # else the last one again
+                rows.append((state, goal, on))
                 last = state.time_s
             safe.beat()
-            due = begin + (np.floor(now * self._rate) + 1.0) / self._rate
-            time.sleep(max(0.0, due - time.monotonic()))
+            clock.sleep(begin + (np.floor(now * self._rate) + 1.0) / self._rate - clock.now())
         if not on.all():
             safe.switch(np.ones_like(on))
         self._set_gain(P_GAIN)
@@ -222,7 +224,7 @@ class Recorder:
                 bus.write(id, "position_p_gain", gain)
 
     def _trajectory(
-        self, motion: Motion, rows: Sequence[tuple[JointState, np.ndarray, np.ndarray]]
+        self, motion: Motion, rows: Sequence[tuple[HandState, np.ndarray, np.ndarray]]
     ) -> "Trajectory":
         from vd.gap.recording import Trajectory
 

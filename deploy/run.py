@@ -21,9 +21,10 @@ import tyro
 
 from vd.deploy.bus import D_GAIN, P_GAIN
 from vd.deploy.connect import Connection, HandOptions, connect
+from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import MOVE_S, move, reset_pose
 from vd.deploy.realsense import RealSenseCfg
-from vd.deploy.safety import SafeHand, SafetyCfg
+from vd.deploy.safety import SafeHand
 from vd.deploy.timely import Priority, real_time, undisturbed
 from vd.paper import PAPER
 
@@ -144,7 +145,7 @@ def _fly(
     from vd.deploy.check import ready
     from vd.deploy.flight import look, make_goals, open_camera, warm_up
     from vd.deploy.log import LogWriter
-    from vd.deploy.loop import Clock, ControlLoop, LoopCfg, summary
+    from vd.deploy.loop import ControlLoop, LoopCfg, Pacer, summary
 
     hand = connection.hand
     goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
@@ -177,7 +178,7 @@ def _fly(
             servo={"model": cfg.motor, "p_gain": P_GAIN, "d_gain": D_GAIN},
             truth=link is not None,
         )
-        clock = Clock(flight.task.sim.control_hz)
+        pacer = Pacer(flight.task.sim.control_hz)
         reason, outcomes = "aborted", list[str]()
         status = StatusLine()
         loop: ControlLoop | None = None
@@ -190,7 +191,7 @@ def _fly(
                     safe,
                     flight.pilot,
                     ActionFilter(hand, flight.task),
-                    clock,
+                    pacer,
                     log,
                     LoopCfg(cfg.goal_s, cfg.hold_s, cfg.images),
                     camera=camera,
@@ -210,8 +211,8 @@ def _fly(
             status.end()
             times = {} if loop is None else summary(loop.times)
             steps = 0 if loop is None else len(loop.times)
-            log.finish(reason, outcomes=outcomes, steps=steps, missed=clock.missed, times=times)
-            print(report(folder, outcomes, steps, clock.missed, times))
+            log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
+            print(report(folder, outcomes, steps, pacer.missed, times))
     return int(reason == "lost")
 
 
@@ -226,12 +227,13 @@ def place(safe: SafeHand, pose: np.ndarray, link: "TwinLink | None", *, yes: boo
         link.place_object((0.0, 0.0, 0.0, 1.0))
     elif asked:
         print("Put the object between the fingers, then press Enter. ", end="", file=sys.stderr, flush=True)
-    end = time.monotonic() + SETTLE_S
-    while time.monotonic() < end or (asked and not select.select([sys.stdin], [], [], 0.0)[0]):
+    clock = safe.bus.clock
+    end = clock.now() + SETTLE_S
+    while clock.now() < end or (asked and not select.select([sys.stdin], [], [], 0.0)[0]):
         safe.read()
         safe.command(pose)
         safe.beat()
-        time.sleep(MOVE_S)
+        clock.sleep(MOVE_S)
     if asked:
         sys.stdin.readline()
 

@@ -20,20 +20,21 @@ import contextlib
 import signal
 import sys
 import threading
-import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import FrameType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.deploy.bus import BusError, BusState, MotorBus
+from vd.deploy.answers import BusError, HandState
+from vd.deploy.bus import MotorBus
 from vd.deploy.joints import Joints
-from vd.paper import PAPER
+from vd.deploy.limits import PERIOD_S, Limits, SafetyCfg
 
-PERIOD_S = 1.0 / PAPER.scene.control_hz
 WATCH_S = 0.01
 """How often the watchdog looks."""
 OFF_S = 1.0
@@ -46,82 +47,6 @@ SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "asked to end", signal.SIGHU
 
 class StoppedError(RuntimeError):
     """The hand was stopped; the message says why."""
-
-
-@dataclass(frozen=True)
-class SafetyCfg:
-    """Limits that hold whatever the policy asks for."""
-
-    margin_rad: float = 0.0
-    """Distance that goals keep from the ends of the joints' ranges [rad]."""
-    step_rad: float = 0.35
-    """Farthest goal from where a joint is [rad]: the policy asks for 3.5 rad/s / 12 Hz = 0.29 at most. It
-    limits the torque as well, to stiffness times this."""
-    velocity_share: float = 1.5
-    """Speed over the joints' own limit at which the hand is stopped; it turns faster only when something
-    else moves it."""
-    current_share: float = 0.8
-    """Current over the one for the joints' largest torque at which the hand is stopped, if it lasts; motors
-    shut down by themselves near 1."""
-    current_s: float = 0.5
-    """How long [s] a current may be above that."""
-    temperature_c: float = 70.0
-    """Temperature [deg C] of a motor at which the hand is stopped; motors shut down at 80."""
-    lost_s: float = 3.0 * PERIOD_S
-    """Time [s] without a sound state after which the bus is lost; shorter gaps repeat the last state."""
-    misses: int = 3
-    """Deadlines missed in a row at which the hand is stopped; also this many periods without a beat."""
-    stale_s: float = 3.0 * PERIOD_S
-    """Age [s] of the newest image at which the hand is stopped, once there was one."""
-    watchdog_s: float = 0.3
-    """Silence [s] after which the motors stop by themselves; 0 for never. Above three control periods."""
-    then: Literal["off", "hold"] = "off"
-    """After the hold: torque off, or leave the hand holding."""
-    hold_s: float = 1.0
-    """How long [s] the hand holds before its torque goes off: time to support what it carries."""
-
-    def __post_init__(self) -> None:
-        """Refuse numbers that would switch a limit off by accident."""
-        positive = ("step_rad", "velocity_share", "current_share", "current_s", "temperature_c", "lost_s")
-        for name in (*positive, "misses", "stale_s"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"safety.{name} is {getattr(self, name)}; it has to be above 0")
-        for name in ("margin_rad", "watchdog_s", "hold_s"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"safety.{name} is {getattr(self, name)}; it must not be negative")
-
-
-@dataclass(frozen=True)
-class JointState:
-    """State of the joints at one reading; arrays of shape [D]."""
-
-    time_s: float
-    """When it was read [s], by the monotonic clock."""
-    position: np.ndarray
-    """Angles [rad]."""
-    velocity: np.ndarray
-    """Speeds [rad/s]."""
-    current: np.ndarray
-    """Currents of the motors, positive in the joint's direction [A]."""
-    pwm: np.ndarray
-    """Duty cycles of the motors, positive in the joint's direction, in [-1, 1]."""
-    voltage: np.ndarray
-    """Voltages at the motors [V]."""
-    temperature: np.ndarray
-    """Temperatures of the motors [deg C]."""
-
-    @classmethod
-    def of(cls, state: BusState, joints: Joints) -> "JointState":
-        """In the joints' frame."""
-        return cls(
-            time_s=state.time_s,
-            position=joints.to_joint(state.position),
-            velocity=joints.sign * state.velocity,
-            current=joints.sign * state.current,
-            pwm=joints.sign * state.pwm,
-            voltage=state.voltage,
-            temperature=state.temperature,
-        )
 
 
 @dataclass(frozen=True)
@@ -159,14 +84,8 @@ class SafeHand:
     ):
         """Nothing is sent before :meth:`arm`."""
         self.bus, self.joints, self.hand, self.cfg, self._say = bus, joints, hand, cfg or SafetyCfg(), say
-        self.lower = hand.lower + self.cfg.margin_rad
-        self.upper = hand.upper - self.cfg.margin_rad
-        if (self.lower >= self.upper).any():
-            raise ValueError(f"safety.margin_rad is {self.cfg.margin_rad}; some joint's range is no wider")
-        strongest = bus.model.current_limit * bus.model.current_unit_a
-        torque_current = np.minimum(hand.effort / bus.model.torque_nm_per_a, strongest)
-        self._current_limit = self.cfg.current_share * torque_current
-        self._velocity_limit = self.cfg.velocity_share * hand.velocity_limit
+        names = [f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)]
+        self.limits = Limits(hand, bus.model, names, self.cfg)
         self.limited = 0
         """Goals that were limited."""
         self.missed = 0
@@ -175,23 +94,21 @@ class SafeHand:
         """Readings without a sound answer, for which the last state stood in."""
         self.report: StopReport | None = None
         """How the stop went, once there was one."""
-        self._state: JointState | None = None
-        self._goal: np.ndarray | None = None
-        self._strained_since = np.full(len(joints.ids), np.inf)
+        self._state: HandState | None = None
         self._misses = 0
         self._beat_s = self._image_s = np.inf
         self._signal = ""
         self._armed = False
         self._on = np.ones(len(joints.ids), dtype=bool)
+        self._loop = threading.get_ident()
         self._stopping = threading.RLock()
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="safety", daemon=True)
+        self._unwatch: Callable[[], None] = lambda: None
         self._handlers: dict[signal.Signals, Any] = {}
 
     def __enter__(self) -> "SafeHand":
         if threading.current_thread() is threading.main_thread():
             self._handlers = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
-        self._thread.start()
+        self._unwatch = self.bus.clock.every(WATCH_S, self._watch)
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
@@ -200,12 +117,11 @@ class SafeHand:
                 self._hold(FINISHED if error is None else f"{kind.__name__ if kind else ''}: {error}")
                 self._off()
         finally:
-            self._end.set()
-            self._thread.join()
+            self._unwatch()
             for number, handler in self._handlers.items():
                 signal.signal(number, handler)
 
-    def arm(self) -> JointState:
+    def arm(self) -> HandState:
         """Switch the torque on where the hand is, and start the watchdogs.
 
         Raises:
@@ -214,7 +130,6 @@ class SafeHand:
         with self._stopping:
             try:
                 self._state = state = self._read()
-                self._goal = state.position
                 self._armed = True  # from here on whatever happens ends with torque off
                 self.bus.watch(self.cfg.watchdog_s)
                 self.bus.write_goals(self.joints.to_motor(state.position))
@@ -223,10 +138,10 @@ class SafeHand:
                 raise self._stop(f"could not switch on: {error}", lost=True) from error
             if failed:
                 raise self._stop(f"could not switch on: {next(iter(failed.values()))}")
-            self._beat_s = time.monotonic()
+            self._beat_s = self.bus.clock.now()
             return state
 
-    def read(self) -> JointState:
+    def read(self) -> HandState:
         """Read the joints; for a short gap in the bus the last state once more, with its own time.
 
         Raises:
@@ -237,7 +152,7 @@ class SafeHand:
             state = self._read()
         except BusError as error:
             last = self._state
-            if last is None or time.monotonic() - last.time_s > self.cfg.lost_s:
+            if last is None or self.bus.clock.now() - last.time_s > self.cfg.lost_s:
                 raise self._stop(f"lost the bus: {error}", lost=True) from error
             self.repeated += 1
             self._check()
@@ -262,11 +177,9 @@ class SafeHand:
         target = np.asarray(target, dtype=float)
         if self._state is None or not self._armed:
             raise RuntimeError("arm() has to come before command()")
-        if target.shape != self.lower.shape or not np.isfinite(target).all():
-            raise self._stop(f"the target is not {len(self.lower)} finite angles: {target}")
-        here = self._state.position
-        near = np.clip(target, here - self.cfg.step_rad, here + self.cfg.step_rad)
-        goal = np.clip(near, self.lower, self.upper)
+        if target.shape != self.limits.lower.shape or not np.isfinite(target).all():
+            raise self._stop(f"the target is not {len(self.joints.ids)} finite angles: {target}")
+        goal = self.limits.goal(target, self._state.position)
         self.limited += int((goal != target).any())
         with self._stopping:  # never after the hold
             self._check()
@@ -274,7 +187,6 @@ class SafeHand:
                 self.bus.write_goals(self.joints.to_motor(goal))
             except BusError as error:
                 raise self._stop(f"lost the bus: {error}", lost=True) from error
-            self._goal = goal
         return goal
 
     def switch(self, on: np.ndarray) -> None:
@@ -303,7 +215,7 @@ class SafeHand:
             StoppedError: Too many in a row.
         """
         self._check()
-        self._beat_s = time.monotonic()
+        self._beat_s = self.bus.clock.now()
         self.missed += missed
         self._misses = self._misses + 1 if missed else 0
         if self._misses >= self.cfg.misses:
@@ -321,15 +233,16 @@ class SafeHand:
         """
         raise self._stop(reason)
 
-    def _read(self) -> JointState:
+    def _read(self) -> HandState:
         raw = self.bus.read_state()
-        state = JointState.of(raw, self.joints)
+        state = self.joints.state(raw)
         if raw.alert.any():
             raise self._stop(self._errors(raw))
-        self._compare(state)
+        if passed := self.limits.passed(state):
+            raise self._stop(passed)
         return state
 
-    def _errors(self, raw: BusState) -> str:
+    def _errors(self, raw: HandState) -> str:
         """What the motors with an alert report."""
         try:
             errors = self.bus.hardware_errors()
@@ -337,28 +250,6 @@ class SafeHand:
             errors = {}
         alerted = [id for id, alert in zip(self.bus.ids, raw.alert, strict=True) if alert]
         return "; ".join(f"motor {id}: {errors.get(id, 'a hardware error')}" for id in alerted)
-
-    def _compare(self, state: JointState) -> None:
-        """Stop if a limit was passed."""
-        fast = np.abs(state.velocity) > self._velocity_limit
-        hot = state.temperature > self.cfg.temperature_c
-        strained = np.abs(state.current) > self._current_limit
-        self._strained_since = np.where(strained, np.minimum(self._strained_since, state.time_s), np.inf)
-        long = state.time_s - self._strained_since > self.cfg.current_s
-        for axis, id in enumerate(self.joints.ids):
-            name = f"{self.joints.names[axis]}, motor {id}"
-            if fast[axis]:
-                raise self._stop(
-                    f"{name}: {state.velocity[axis]:.1f} rad/s, over {self._velocity_limit[axis]:.1f}"
-                )
-            if hot[axis]:
-                raise self._stop(
-                    f"{name}: {state.temperature[axis]:.0f} deg C, over {self.cfg.temperature_c:g}"
-                )
-            if long[axis]:
-                raise self._stop(
-                    f"{name}: {state.current[axis]:.2f} A for {self.cfg.current_s:g} s; is it blocked?"
-                )
 
     def _check(self) -> None:
         if self.report is not None:
@@ -369,15 +260,24 @@ class SafeHand:
 
     def _due(self) -> str:
         """Why the hand has to stop now, whatever its motors say; empty if it has not."""
-        now = time.monotonic()
+        now = self.bus.clock.now()
         silent, age = now - self._beat_s, now - self._image_s
         if self._signal:
             return self._signal
         if silent > self.cfg.misses * PERIOD_S:
-            return f"the loop stands: no step ended for {silent:.2f} s"
+            return f"the loop stands: no step ended for {silent:.2f} s{self._place()}"
         if age > self.cfg.stale_s:
             return f"the newest image is {age:.2f} s old"
         return ""
+
+    def _place(self) -> str:
+        """What of ours the loop is in at present; empty where it is the loop itself that asks."""
+        if threading.get_ident() == self._loop:
+            return ""
+        own = Path(__file__).parent
+        stack = traceback.extract_stack(sys._current_frames().get(self._loop))
+        at = next((call for call in reversed(stack) if Path(call.filename).parent == own), None)
+        return "" if at is None else f", in {at.name} ({Path(at.filename).name}, line {at.lineno})"
 
     def _stop(self, reason: str, *, lost: bool = False) -> StoppedError:
         """Hold, and give what to raise.
@@ -392,58 +292,49 @@ class SafeHand:
 
     def _hold(self, reason: str, *, lost: bool = False) -> None:
         """Have every joint stay where it is, once; what fails is told, not raised."""
-        detected = time.monotonic()
+        detected = self.bus.clock.now()
         with self._stopping:
             if self.report is not None:
                 return
             self.report = StopReport(reason, detected)
             if not self._armed:
                 return
-            where = self._expected() if lost else self._where()
-            if where is not None:
-                self._hold_at(where)
-
-    def _where(self) -> np.ndarray | None:
-        """Where the joints are now [rad]; asks once."""
-        try:
-            return JointState.of(self.bus.read_state(retries=0), self.joints).position
-        except BusError:
-            return self._expected()
-
-    def _expected(self) -> np.ndarray | None:
-        """Where the joints should be by now [rad], on their way to the last goals; asks nobody.
-
-        A hand with one lost motor cannot be asked in the time that the others have.
-        """
-        if self._state is None or self._goal is None:
-            return None
-        lag = self.hand.kd / self.hand.kp
-        to_go = np.exp(-(time.monotonic() - self._state.time_s) / lag)
-        return self._goal + (self._state.position - self._goal) * to_go
+            try:
+                if not lost:
+                    self._hold_at(self.joints.state(self.bus.read_state(retries=0)).position)
+            except BusError:
+                lost = True
+            if lost:  # nobody tells where the joints are, but the motors know
+                self._tell(self.bus.freeze)
 
     def _hold_at(self, where: np.ndarray) -> None:
         """Send angles of the joints [rad] as goals, whatever else is going on."""
+        goals = self.joints.to_motor(np.clip(where, self.limits.lower, self.limits.upper))
+        self._tell(lambda: self.bus.write_goals(goals))
+
+    def _tell(self, send: Callable[[], None]) -> None:
+        """Tell the motors to hold, and note when."""
         assert self.report is not None
         try:
-            self.bus.write_goals(self.joints.to_motor(np.clip(where, self.lower, self.upper)))
+            send()
         except BusError as error:
             self._say(f"could not be told to hold: {error}")
         else:
-            self.report = replace(self.report, held_s=self.report.held_s or time.monotonic())
+            self.report = replace(self.report, held_s=self.report.held_s or self.bus.clock.now())
 
     def _off(self) -> None:
         """Settle where the hand came to rest, then torque off as configured."""
         assert self.report is not None
         with contextlib.suppress(BusError):
-            self._hold_at(JointState.of(self.bus.read_state(), self.joints).position)
+            self._hold_at(self.joints.state(self.bus.read_state()).position)
         why = "" if self.report.reason == FINISHED else f"stopped: {self.report.reason}; "
         if self.cfg.then == "hold":
             self._say(f"{why}the hand holds, its torque is on")
             return
-        end = time.monotonic() + self.cfg.hold_s
+        end = self.bus.clock.now() + self.cfg.hold_s
         self._signal = ""
-        while time.monotonic() < end and not self._signal:  # a signal: at once
-            time.sleep(WATCH_S)
+        while self.bus.clock.now() < end and not self._signal:  # a signal: at once
+            self.bus.clock.sleep(WATCH_S)
         left = self._release()
         self.report = replace(self.report, unreleased=left)
         self._say(f"{why}torque off")
@@ -452,7 +343,7 @@ class SafeHand:
 
     def _release(self) -> dict[int, str]:
         """Switch all motors off; those of which that is not known, with the reason."""
-        end = time.monotonic() + OFF_S
+        end = self.bus.clock.now() + OFF_S
         left: dict[int, str] = dict.fromkeys(self.bus.ids, "")
         while True:
             try:
@@ -463,7 +354,7 @@ class SafeHand:
             if not left:
                 with contextlib.suppress(BusError):
                     self.bus.watch(0.0)  # what it guarded is off; other programs would find it in their way
-            if not left or time.monotonic() > end:
+            if not left or self.bus.clock.now() > end:
                 return left
 
     def _on_signal(self, number: int, _: FrameType | None) -> None:
@@ -474,9 +365,5 @@ class SafeHand:
 
     def _watch(self) -> None:
         """Stop the hand when the loop does not."""
-        while not self._end.wait(WATCH_S):
-            if not self._armed or self.report is not None:
-                continue
-            due = self._due()
-            if due:
-                self._hold(due)
+        if self._armed and self.report is None and (due := self._due()):
+            self._hold(due)

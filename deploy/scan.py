@@ -46,7 +46,8 @@ def find(port: str, baud_rates: Sequence[int], say: Callable[[str], None]) -> li
     Raises:
         BusError: The port cannot be opened.
     """
-    from vd.deploy.bus import BusError, MotorBus
+    from vd.deploy.answers import BusError
+    from vd.deploy.bus import MotorBus
     from vd.deploy.control_table import MODELS
 
     names = {model.number: name for name, model in MODELS.items()}

@@ -1,29 +1,28 @@
 """A simulated motor bus behind a pseudo-terminal: programs talk to it as to a serial port with motors on it.
 
-``python -m vd.deploy.twin`` owns such a port and prints its path. Packets are read and answered byte by byte;
-faults can be injected. Behind the motors stands any :class:`vd.deploy.plant.Plant`.
+``python -m vd.deploy.twin`` owns such a port and prints its path. The motors are those of
+:mod:`vd.deploy.line`, which answer byte by byte; behind them stands any :class:`vd.deploy.plant.Plant`.
 """
 
 import os
 import pty
-import random
 import select
 import sys
 import termios
 import threading
-import time
 import tty
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from vd.deploy.control_table import MODELS
+from vd.deploy.line import Faults, MotorLine
 from vd.deploy.motor import Motor
-from vd.deploy.packets import BROADCAST, MAX_ID, Failure, Instruction, Packet, PacketReader, encode, status
-from vd.deploy.plant import FirstOrderPlant, Plant
+from vd.deploy.packets import MAX_ID
+from vd.deploy.plant import Plant
 from vd.deploy.timely import Priority, real_time, undisturbed
 from vd.paper import PAPER
 
@@ -32,39 +31,17 @@ if TYPE_CHECKING:
     from vd.deploy.newton_hand import NewtonHand
     from vd.deploy.twin_side import TwinSide
 
-RETURN_DELAY_UNIT_S = 2e-6
-SILENCE_S = 0.01
-"""A packet that has begun and not gone on for this long was cut off."""
 IDLE_S = 0.005
 """Longest wait for bytes: the plant goes on in steps of this size at most."""
 
 
-@dataclass
-class Faults:
-    """What goes wrong on the bus. Shares are of status packets, drawn from ``seed``."""
-
-    lose: float = 0.0
-    """Share that never arrives."""
-    corrupt: float = 0.0
-    """Share with one byte changed."""
-    truncate: float = 0.0
-    """Share that is cut off."""
-    late: float = 0.0
-    """Share that is held back for ``late_s``."""
-    late_s: float = 0.1
-    cut_off: set[int] = field(default_factory=set)
-    """Motors that neither hear nor answer: a loose cable."""
-    seed: int = 0
-
-
-class Twin:
-    """Motors on a bus, stepped in real time, behind a pseudo-terminal.
+class Twin(MotorLine):
+    """Motors on a line, stepped in real time, behind a pseudo-terminal.
 
     Args:
         motors: Motors in the order of the plant's axes.
         plant: What they move; axes without mass by default.
         faults: What goes wrong; may be changed while it runs.
-        clock: Time [s].
         side: What it tells beside the motors, if anything.
     """
 
@@ -73,18 +50,11 @@ class Twin:
         motors: Sequence[Motor],
         plant: Plant | None = None,
         faults: Faults | None = None,
-        clock: Callable[[], float] = time.monotonic,
         side: "TwinSide | None" = None,
     ):
         """Open the pseudo-terminal; serves once started."""
-        self.motors = list(motors)
-        self.plant = plant or FirstOrderPlant(len(self.motors))
-        self.faults = faults or Faults()
-        self._clock, self._then, self._side = clock, clock(), side
-        self._random = random.Random(self.faults.seed)
-        self._reader = PacketReader()
-        self._held: list[tuple[float, bytes]] = []
-        self._heard_at = 0.0
+        super().__init__(motors, plant, faults, put=self._write)
+        self._side = side
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
         self._near, self._far = pty.openpty()
@@ -92,7 +62,6 @@ class Twin:
         os.set_blocking(self._near, False)
         self.path = os.ttyname(self._far)
         """Device for a program to open."""
-        self._sense(0.0)
 
     def __enter__(self) -> "Twin":
         self._thread = threading.Thread(target=self.serve, name="twin", daemon=True)
@@ -119,202 +88,25 @@ class Twin:
     def serve(self) -> None:
         """Answer until it has to end."""
         while not self._end.is_set():
-            due = min((at for at, _ in self._held), default=float("inf")) - self._clock()
             beside = {} if self._side is None else {one.fileno(): one for one in self._side.sockets}
-            ready, _, _ = select.select([self._near, *beside], [], [], max(0.0, min(IDLE_S, due)))
-            self._advance()
+            wait_s = max(0.0, min(IDLE_S, self.due_s - self._clock.now()))
+            ready, _, _ = select.select([self._near, *beside], [], [], wait_s)
+            self.go_on(self._read() if self._near in ready else b"")
             for one in ready:
                 if one in beside and self._side is not None:
                     self._side.serve(beside[one])
-            if self._near in ready:
-                self._heard_at = self._clock()
-                for packet in self._reader.feed(self._receive()):
-                    self.handle(packet)
-            elif self._reader.waiting and self._clock() - self._heard_at > SILENCE_S:
-                for packet in self._reader.give_up():
-                    self.handle(packet)
-            self._release()
 
-    def handle(self, packet: Packet) -> None:
-        """Carry out one instruction and send what the motors answer."""
-        named = list(ORDER[packet.instruction](packet.parameters)) if packet.instruction in ORDER else []
-        # Motors that a packet names answer in its order; each waits for the one before.
-        for motor in sorted(self.motors, key=lambda m: named.index(m.id) if m.id in named else len(named)):
-            if motor.id not in self.faults.cut_off:
-                for answer in self._answers(motor, packet):
-                    self._send(motor, answer)
-
-    def _answers(self, motor: Motor, packet: Packet) -> list[Packet]:
-        """What one motor makes of a packet on the bus."""
-        shared = SHARED.get(packet.instruction)
-        if packet.id == BROADCAST and shared is not None:
-            motor.heard()
-            return shared(motor, packet.parameters)
-        if packet.id not in (motor.id, BROADCAST) or packet.instruction == Instruction.STATUS:
-            return []
-        motor.heard()
-        single = SINGLE.get(packet.instruction)
-        if single is None:
-            failure, data = int(Failure.INSTRUCTION), b""
-        else:
-            failure, data = single(motor, packet.parameters)
-        level = motor.get("status_return_level")
-        quiet = level == 0 or (level == 1 and packet.instruction != Instruction.READ)
-        if packet.instruction != Instruction.PING and (quiet or packet.id == BROADCAST):
-            return []
-        return [status(motor.id, failure | motor.alert, data)]
-
-    def _receive(self) -> bytes:
+    def _read(self) -> bytes:
         try:
             return os.read(self._near, 4096)
         except (BlockingIOError, OSError):
             return b""
 
-    def _send(self, motor: Motor, packet: Packet) -> None:
-        time.sleep(motor.get("return_delay_time") * RETURN_DELAY_UNIT_S)
-        data, draw, faults = bytearray(encode(packet)), self._random.random, self.faults
-        if draw() < faults.lose:
-            return
-        if draw() < faults.corrupt:
-            data[self._random.randrange(len(data))] ^= self._random.randrange(1, 256)
-        if draw() < faults.truncate:
-            del data[self._random.randrange(1, len(data)) :]
-        if draw() < faults.late:
-            self._held.append((self._clock() + faults.late_s, bytes(data)))
-            return
-        self._put(bytes(data))
-
-    def _release(self) -> None:
-        now = self._clock()
-        for at, data in [held for held in self._held if held[0] <= now]:
-            self._held.remove((at, data))
-            self._put(data)
-
-    def _put(self, data: bytes) -> None:
+    def _write(self, data: bytes) -> None:
         try:
             os.write(self._near, data)
         except BlockingIOError:  # nobody reads: as on a wire, what is not read is lost
             termios.tcflush(self._far, termios.TCIFLUSH)
-
-    def _advance(self) -> None:
-        now = self._clock()
-        seconds, self._then = now - self._then, now
-        if seconds > 0.0:
-            self.plant.advance(seconds, [motor.drive for motor in self.motors])
-            self._sense(seconds)
-
-    def _sense(self, seconds: float) -> None:
-        state = zip(*self.plant.read(), strict=True)
-        for motor, (position, velocity, torque) in zip(self.motors, state, strict=True):
-            motor.sense(seconds, float(position), float(velocity), float(torque))
-
-
-Result = tuple[int, bytes]
-
-
-def _word(data: bytes, at: int = 0) -> int:
-    return int.from_bytes(data[at : at + 2], "little")
-
-
-def _ping(motor: Motor, parameters: bytes) -> Result:
-    if parameters:
-        return Failure.LENGTH, b""
-    return Failure.NONE, motor.read(0, 2)[1] + motor.read(6, 1)[1]
-
-
-def _read(motor: Motor, parameters: bytes) -> Result:
-    return (
-        motor.read(_word(parameters), _word(parameters, 2)) if len(parameters) == 4 else (Failure.LENGTH, b"")
-    )
-
-
-def _write(motor: Motor, parameters: bytes) -> Result:
-    return motor.write(_word(parameters), parameters[2:]), b""
-
-
-def _register(motor: Motor, parameters: bytes) -> Result:
-    if len(parameters) < 3:
-        return Failure.LENGTH, b""
-    motor.registered = _word(parameters), parameters[2:]
-    motor.put("registered_instruction", 1)
-    return Failure.NONE, b""
-
-
-def _action(motor: Motor, parameters: bytes) -> Result:
-    if motor.registered is None:
-        return Failure.RESULT, b""
-    failure = motor.write(*motor.registered)
-    motor.registered = None
-    motor.put("registered_instruction", 0)
-    return failure, b""
-
-
-def _reboot(motor: Motor, parameters: bytes) -> Result:
-    motor.reboot()
-    return Failure.NONE, b""
-
-
-def _sync_read(motor: Motor, parameters: bytes) -> list[Packet]:
-    if len(parameters) < 5 or motor.id not in parameters[4:]:
-        return []
-    failure, data = motor.read(_word(parameters), _word(parameters, 2))
-    return [status(motor.id, failure | motor.alert, data)]
-
-
-def _sync_write(motor: Motor, parameters: bytes) -> list[Packet]:
-    address, length = _word(parameters), _word(parameters, 2)
-    rows = parameters[4:]
-    if length and len(rows) % (length + 1) == 0:
-        for start in range(0, len(rows), length + 1):
-            if rows[start] == motor.id:
-                motor.write(address, rows[start + 1 : start + 1 + length])
-    return []
-
-
-def _bulk_read(motor: Motor, parameters: bytes) -> list[Packet]:
-    if len(parameters) % 5:
-        return []
-    answers = []
-    for start in range(0, len(parameters), 5):
-        if parameters[start] == motor.id:
-            failure, data = motor.read(_word(parameters, start + 1), _word(parameters, start + 3))
-            answers.append(status(motor.id, failure | motor.alert, data))
-    return answers
-
-
-def _bulk_write(motor: Motor, parameters: bytes) -> list[Packet]:
-    while len(parameters) >= 5:
-        length = _word(parameters, 3)
-        data = parameters[5 : 5 + length]
-        if parameters[0] == motor.id and len(data) == length:
-            motor.write(_word(parameters, 1), data)
-        parameters = parameters[5 + length :]
-    return []
-
-
-SINGLE: dict[int, Callable[[Motor, bytes], Result]] = {
-    Instruction.PING: _ping,
-    Instruction.READ: _read,
-    Instruction.WRITE: _write,
-    Instruction.REG_WRITE: _register,
-    Instruction.ACTION: _action,
-    Instruction.REBOOT: _reboot,
-}
-"""Instructions to one motor, or broadcast."""
-SHARED: dict[int, Callable[[Motor, bytes], list[Packet]]] = {
-    Instruction.SYNC_READ: _sync_read,
-    Instruction.SYNC_WRITE: _sync_write,
-    Instruction.BULK_READ: _bulk_read,
-    Instruction.BULK_WRITE: _bulk_write,
-}
-"""Instructions to many motors, which name them in their parameters."""
-
-
-ORDER: dict[int, Callable[[bytes], bytes]] = {
-    Instruction.SYNC_READ: lambda parameters: parameters[4:],
-    Instruction.BULK_READ: lambda parameters: parameters[::5],
-}
-"""Where the instructions that several motors answer name them."""
 
 
 def _end_with_input(twin: Twin) -> None:

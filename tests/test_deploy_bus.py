@@ -12,12 +12,16 @@ import pytest
 
 sdk = pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
-from vd.deploy.bus import BusError, MotorBus, MotorSettings  # noqa: E402
+from simulated_clock import SimulatedClock  # noqa: E402
+
+from vd.deploy.answers import BusError  # noqa: E402
+from vd.deploy.bus import MotorBus, MotorSettings  # noqa: E402
 from vd.deploy.control_table import MODELS, HardwareError, table, to_angle, to_counts  # noqa: E402
+from vd.deploy.line import Faults, MotorLine  # noqa: E402
 from vd.deploy.motor import Motor  # noqa: E402
 from vd.deploy.packets import ALERT, Failure  # noqa: E402
 from vd.deploy.plant import FirstOrderPlant  # noqa: E402
-from vd.deploy.twin import Faults, Twin  # noqa: E402
+from vd.deploy.twin import Twin  # noqa: E402
 
 IDS = (10, 11, 12)
 MODEL = "XH430-V210"
@@ -212,20 +216,19 @@ def test_a_motor_of_another_model_is_named():
 
 
 def test_the_bus_watchdog_stops_a_motor_that_hears_nothing():
-    now = [0.0]
+    clock = SimulatedClock()
     motor = Motor(MODELS[MODEL], 1)
-    twin = Twin([motor], clock=lambda: now[0])
+    line = MotorLine([motor], clock=clock, put=lambda data: None)
     motor.put("torque_enable", 1)
     motor.put("goal_position", to_counts(1.0))
     motor.put("bus_watchdog", 5)
     for _ in range(30):
-        now[0] += 0.005
-        twin._advance()
+        clock.sleep(0.005)
+        line.go_on()
     assert motor.get("bus_watchdog") == -1
     held = motor.get("present_position")
     assert motor.get("goal_position") == held < to_counts(0.9)
     assert motor.write(motor.items["goal_position"].address, bytes(4)) == Failure.ACCESS
-    twin.close()
 
 
 def test_a_lost_port_is_an_error_of_the_bus(bus, twin):
@@ -281,7 +284,7 @@ class Noise:
 
     def __init__(self, twin: Twin, seed: int):
         self.twin, self.random, self.sent = twin, random.Random(seed), 0
-        twin._put = self.put
+        twin.put = self.put
 
     def put(self, data: bytes) -> None:
         """Send something else than ``data``."""
@@ -305,7 +308,7 @@ class Noise:
             at = rng.randrange(len(broken))
             broken[at:at] = rng.randbytes(rng.randrange(1, 6))
         if bytes(broken) != data:
-            Twin._put(self.twin, bytes(broken))
+            self.twin._write(bytes(broken))
 
 
 @pytest.mark.slow
@@ -331,7 +334,8 @@ def test_ten_thousand_broken_packets_make_no_hang_no_crash_and_no_position():
                 np.testing.assert_array_equal(state.position, true.position)
             slowest = max(slowest, time.monotonic() - begin)
         assert slowest < 2.0
-        del twin._put, bus._port.setPacketTimeout
+        del bus._port.setPacketTimeout
+        twin.put = twin._write
         bus.retries = 20
         bus.read_state()
 

@@ -18,11 +18,11 @@ from vd.deploy.connect import MOTOR, Connection, HandOptions, connect
 from vd.deploy.control_table import MODELS
 from vd.deploy.faults import BEFORE, MOVING, try_fault, try_preflight
 from vd.deploy.joints import uncalibrated
+from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import reset_pose
 from vd.deploy.motor import Motor
 from vd.deploy.newton_hand import NewtonHand
 from vd.deploy.plant import Drive
-from vd.deploy.safety import SafetyCfg
 from vd.deploy.scan import FoundMotor, differences, find
 from vd.deploy.twin import Twin
 from vd.gap.recording import read_recording

@@ -9,7 +9,7 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy import record
-from vd.deploy.safety import SafetyCfg
+from vd.deploy.limits import SafetyCfg
 from vd.gap import cli as gap
 
 PATIENT = SafetyCfg(step_rad=4.0, hold_s=0.05, misses=60, lost_s=2.0, watchdog_s=2.0)

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from simulated_clock import SimulatedClock
 from student_dummy import TINY
 
 from vd.assets_usd.hands import load_hand
@@ -11,10 +12,10 @@ from vd.bundle.store import write_student
 from vd.config import to_dict
 from vd.deploy import cli
 from vd.deploy.action import ActionFilter
+from vd.deploy.answers import HandState
 from vd.deploy.log import LogWriter
-from vd.deploy.loop import Clock, ControlLoop, LoopCfg
+from vd.deploy.loop import ControlLoop, LoopCfg, Pacer
 from vd.deploy.pilot import Decision
-from vd.deploy.safety import JointState
 from vd.deploy.twin_link import TwinState
 from vd.envs.cfg import ReorientCfg
 from vd.hand_log import read_log
@@ -29,37 +30,23 @@ GOAL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @dataclass
-class Time:
-    """A clock that only moves when told, or slept on."""
-
-    now: float = 100.0
-
-    def __call__(self) -> float:
-        """The time [s]."""
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        """Let time pass."""
-        self.now += seconds
-
-
-@dataclass
 class Hand:
     """Joints that are at once where they are told to be; each exchange takes ``work`` seconds."""
 
-    time: Time
+    clock: SimulatedClock
     work: list[float] = field(default_factory=list)
     position: np.ndarray = field(default_factory=lambda: np.tile([0.0, 0.8, -1.1], 3))
     missed: list[bool] = field(default_factory=list)
 
-    def read(self) -> JointState:
+    def read(self) -> HandState:
         """As :class:`SafeHand`."""
         zero = np.zeros(9)
-        return JointState(self.time.now, self.position.copy(), zero, zero, zero, zero + 12.0, zero + 30.0)
+        now, here = self.clock.now(), self.position.copy()
+        return HandState(now, here, zero, zero, zero, zero + 12.0, zero + 30.0, zero > 0.0)
 
     def command(self, target: np.ndarray) -> np.ndarray:
         """As :class:`SafeHand`."""
-        self.time.now += self.work.pop(0) if self.work else 0.01
+        self.clock.sleep(self.work.pop(0) if self.work else 0.01)
         self.position = np.asarray(target)
         return self.position
 
@@ -89,13 +76,12 @@ class Countdown:
 
 
 @pytest.fixture
-def parts(tmp_path, monkeypatch):
-    time = Time()
-    monkeypatch.setattr("vd.deploy.loop.time.monotonic", time)
+def parts(tmp_path):
+    clock = SimulatedClock()
     hand = load_hand("dclaw3")
-    log = LogWriter(tmp_path / "log", hand, {"goals": [list(GOAL)] * 2}, servo={}, truth=True)
+    log = LogWriter(tmp_path / "log", hand, {"goals": [list(GOAL)] * 2}, servo={}, truth=True, clock=clock)
     actions = ActionFilter(hand, ReorientCfg())
-    return Hand(time), Countdown(), actions, Clock(HZ, time, time.sleep), log
+    return Hand(clock), Countdown(), actions, Pacer(HZ, clock), log
 
 
 @dataclass
@@ -111,23 +97,23 @@ class Truth:
 
 
 def test_the_grid_stays_where_it_was_whatever_is_late():
-    time = Time()
-    clock = Clock(10.0, time, time.sleep)
-    assert clock.wait() == 0.0 and clock.due_s == 100.0
-    time.now += 0.03
-    assert not clock.end()
-    assert clock.wait() == pytest.approx(0.0) and clock.due_s == pytest.approx(100.1)
-    time.now += 0.25  # two deadlines pass
-    assert clock.end() and clock.missed == 2
-    assert clock.wait() == pytest.approx(0.05) and clock.due_s == pytest.approx(100.3)
-    time.now += 0.01
-    assert not clock.end() and clock.missed == 2
-    assert clock.wait() == pytest.approx(0.0) and clock.due_s == pytest.approx(100.4)
+    clock = SimulatedClock()
+    pacer = Pacer(10.0, clock)
+    assert pacer.wait() == 0.0 and pacer.due_s == 100.0
+    clock.sleep(0.03)
+    assert not pacer.end()
+    assert pacer.wait() == pytest.approx(0.0) and pacer.due_s == pytest.approx(100.1)
+    clock.sleep(0.25)  # two deadlines pass
+    assert pacer.end() and pacer.missed == 2
+    assert pacer.wait() == pytest.approx(0.05) and pacer.due_s == pytest.approx(100.3)
+    clock.sleep(0.01)
+    assert not pacer.end() and pacer.missed == 2
+    assert pacer.wait() == pytest.approx(0.0) and pacer.due_s == pytest.approx(100.4)
 
 
 def test_it_acts_until_the_policy_has_arrived_then_holds_and_goes_on(parts):
-    hand, pilot, actions, clock, log = parts
-    loop = ControlLoop(hand, pilot, actions, clock, log, LoopCfg(goal_s=10.0, hold_s=0.5), truth=Truth())
+    hand, pilot, actions, pacer, log = parts
+    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=10.0, hold_s=0.5), truth=Truth())
     assert loop.run([GOAL, GOAL]) == ["stopped", "stopped"]
     log.finish("done")
     read = read_log(log.folder)
@@ -151,30 +137,30 @@ def test_it_acts_until_the_policy_has_arrived_then_holds_and_goes_on(parts):
 
 
 def test_a_goal_that_is_not_reached_ends_by_its_time_and_a_lost_object_the_run(parts):
-    hand, pilot, actions, clock, log = parts
+    hand, pilot, actions, pacer, log = parts
     pilot.start = 9.0
-    loop = ControlLoop(hand, pilot, actions, clock, log, LoopCfg(goal_s=1.0, hold_s=0.0), truth=Truth())
+    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=1.0, hold_s=0.0), truth=Truth())
     assert loop.run([GOAL]) == ["time limit"]
     assert len(pilot.seen) == 12
     away = Truth((0.3, 0.0, 0.03))
-    lost = ControlLoop(hand, pilot, actions, clock, log, LoopCfg(goal_s=1.0, hold_s=0.0), truth=away)
+    lost = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=1.0, hold_s=0.0), truth=away)
     assert lost.run([GOAL, GOAL]) == ["lost"]
 
 
 def test_missed_deadlines_are_counted_and_told(parts):
-    hand, pilot, actions, clock, log = parts
+    hand, pilot, actions, pacer, log = parts
     hand.work = [0.01, 0.01, 0.1, 0.01]
     pilot.start = 9.0
-    loop = ControlLoop(hand, pilot, actions, clock, log, LoopCfg(goal_s=0.5, hold_s=0.0))
+    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=0.5, hold_s=0.0))
     loop.run([GOAL])
-    assert hand.missed == [False, False, True, False, False, False] and clock.missed == 1
+    assert hand.missed == [False, False, True, False, False, False] and pacer.missed == 1
     assert loop.times[2].sent_s == pytest.approx(0.1) and loop.times[3].late_s == pytest.approx(0.1 - 1 / HZ)
 
 
 def test_there_is_nothing_to_stop_before_the_first_action(parts):
-    hand, pilot, actions, clock, log = parts
+    hand, pilot, actions, pacer, log = parts
     pilot.start = 0.1
-    loop = ControlLoop(hand, pilot, actions, clock, log, LoopCfg(hold_s=0.0))
+    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(hold_s=0.0))
     assert loop.run([GOAL]) == ["stopped"]
     assert len(pilot.seen) == 2
 

@@ -1,0 +1,162 @@
+"""What motors answer, and which of their states are accepted.
+
+A state counts only whole and fresh: right motor, right length, no error number, a clock that went on as ours
+did, and no farther from the last one than the motor can turn.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vd.deploy.control_table import FULL_PWM, RAD_S_PER_COUNT, TICK_MODULUS, Item, Model, table, to_angle
+from vd.deploy.packets import ALERT, Failure
+
+STATE_ADDRESS, STATE_BYTES = 120, 27
+"""From the realtime tick to the temperature: one read for the whole state."""
+CLOCK_TOLERANCE_S = 0.04
+"""A state whose clock went on by so much more or less than ours is an old one, or from after a restart; the
+packet's own time on the line and in the driver is within it."""
+JUMP_RAD = 0.1
+"""Beyond what the largest speed explains, a position that changed by more was not measured."""
+SPEED_MARGIN = 1.5
+"""Motors turn faster than their limit of speed when pushed."""
+
+
+class BusError(RuntimeError):
+    """The bus or a motor did not do what was asked; says which, and what to try."""
+
+
+@dataclass(frozen=True)
+class HandState:
+    """State at one reading of all motors, or by :meth:`vd.deploy.joints.Joints.state` of their joints.
+
+    Arrays have shape [D].
+    """
+
+    time_s: float
+    """When it was read [s]: the middle of the exchange."""
+    position: np.ndarray
+    """Angles [rad]."""
+    velocity: np.ndarray
+    """Speeds [rad/s]."""
+    current: np.ndarray
+    """Currents [A], positive in the direction of the angles."""
+    pwm: np.ndarray
+    """Duty cycles in [-1, 1], positive in the direction of the angles."""
+    voltage: np.ndarray
+    """Voltages at the motors [V]."""
+    temperature: np.ndarray
+    """Temperatures of the motors [deg C]."""
+    alert: np.ndarray
+    """Whether a motor reports a hardware error."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A status packet."""
+
+    id: int
+    error: int
+    """Error number, with the alert bit."""
+    data: bytes
+
+    @property
+    def refused(self) -> str:
+        """Why the motor did not do it, in words; empty if it did."""
+        number = self.error & ~ALERT
+        if not number:
+            return ""
+        return f"refused: {Failure(number).name.lower() if number in set(Failure) else f'error {number}'}"
+
+
+def read_answer(frame: bytes) -> Answer | None:
+    """A status packet whose stuffing the SDK has removed; None if it is not whole.
+
+    The SDK has checked the CRC of what came before it removed the stuffing; length and instruction it leaves
+    to us.
+    """
+    length = int.from_bytes(frame[5:7], "little")
+    if len(frame) < 7 + length or length < 4 or frame[7] != 0x55:
+        return None
+    return Answer(frame[4], frame[8], frame[9 : 5 + length])
+
+
+class StateCheck:
+    """Makes states of answers, and refuses those that cannot follow the last one.
+
+    Args:
+        ids: The motors, in the order of the arrays.
+        model: Their model.
+
+    Attributes:
+        fastest: Limits of the motors' speeds, as far as they are known [rad/s] [D].
+    """
+
+    def __init__(self, ids: Sequence[int], model: Model):
+        self._ids, self._model, self._items = tuple(ids), model, table(model)
+        self.fastest = np.full(len(self._ids), np.inf)
+        self._last: HandState | None = None
+        self._ticks = np.zeros(len(self._ids), dtype=int)
+
+    def forget(self) -> None:
+        """The next state follows none: motors were configured, or restarted."""
+        self._last = None
+
+    def accept(self, time_s: float, answers: Sequence[Answer]) -> HandState:
+        """The state in the motors' answers.
+
+        Args:
+            time_s: When it was read [s].
+            answers: One of each motor, in their order.
+
+        Raises:
+            BusError: A motor refused, sent something else, or a state that cannot be.
+        """
+        for answer in answers:
+            if answer.refused:
+                raise BusError(f"motor {answer.id}: {answer.refused}")
+            if len(answer.data) != STATE_BYTES:
+                raise BusError(
+                    f"motor {answer.id}: {len(answer.data)} bytes of state came, not {STATE_BYTES}"
+                )
+        columns = [answer.data for answer in answers]
+
+        def column(name: str) -> np.ndarray:
+            item: Item = self._items[name]
+            start = item.address - STATE_ADDRESS
+            return np.array([item.from_bytes(data[start : start + item.size]) for data in columns])
+
+        ticks = column("realtime_tick")
+        state = HandState(
+            time_s=time_s,
+            position=np.array([to_angle(int(count)) for count in column("present_position")]),
+            velocity=column("present_velocity") * RAD_S_PER_COUNT,
+            current=column("present_current") * self._model.current_unit_a,
+            pwm=column("present_pwm") / FULL_PWM,
+            voltage=0.1 * column("present_input_voltage"),
+            temperature=column("present_temperature").astype(float),
+            alert=np.array([bool(answer.error & ALERT) for answer in answers]),
+        )
+        if self._last is not None:
+            self._compare(self._last, state, ticks)
+        self._last, self._ticks = state, ticks
+        return state
+
+    def _compare(self, last: HandState, state: HandState, ticks: np.ndarray) -> None:
+        """Refuse a state that cannot follow the last one."""
+        elapsed = state.time_s - last.time_s
+        gone = (ticks - self._ticks) % TICK_MODULUS / 1000.0
+        span = TICK_MODULUS / 1000.0
+        difference = (gone - elapsed + 0.5 * span) % span - 0.5 * span
+        for id, late in zip(self._ids, difference, strict=True):
+            if abs(late) > CLOCK_TOLERANCE_S:
+                # A motor that restarted is not heard again before configure(): its gains and limits are gone.
+                raise BusError(
+                    f"motor {id}: its clock differs from ours by {late:.3f} s since the last state: that "
+                    "state was an old one; if this goes on, the motor restarted and has to be configured"
+                )
+        for axis, id in enumerate(self._ids):
+            moved = abs(state.position[axis] - last.position[axis])
+            if moved > SPEED_MARGIN * self.fastest[axis] * elapsed + JUMP_RAD:
+                raise BusError(f"motor {id}: moved {moved:.2f} rad in {elapsed:.3f} s, which it cannot")
