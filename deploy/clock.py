@@ -3,6 +3,7 @@
 A simulated clock makes a run exact and repeatable: it goes on only when somebody waits.
 """
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -52,3 +53,42 @@ class MonotonicClock:
 
 
 MONOTONIC = MonotonicClock()
+
+
+class Pacer:
+    """The grid of control steps, or of samples.
+
+    A step is due at a point of the grid and has to end by the next. One that ends later misses each point
+    passed; the step after it begins at once, and the grid stays where it was.
+
+    Args:
+        hz: Steps a second.
+        clock: Time.
+    """
+
+    def __init__(self, hz: float, clock: Clock = MONOTONIC):
+        self.period_s, self.clock = 1.0 / hz, clock
+        self.due_s = -math.inf
+        """When the present step was due [s]; before the first one long ago."""
+        self.missed = 0
+        """Deadlines missed so far."""
+
+    def wait(self) -> float:
+        """Wait for the next step; how late it begins [s]."""
+        now = self.clock.now()
+        if self.due_s == -math.inf:
+            self.due_s = now
+            return 0.0
+        self.due_s += self.period_s
+        behind = int((now - self.due_s) // self.period_s)
+        if behind > 0:
+            self.due_s += behind * self.period_s
+        while (left := self.due_s - self.clock.now()) > 0.0:
+            self.clock.sleep(left)
+        return self.clock.now() - self.due_s
+
+    def end(self) -> bool:
+        """The step's work is done; whether after its deadline."""
+        passed = int((self.clock.now() - self.due_s) // self.period_s)
+        self.missed += max(passed, 0)
+        return passed > 0

@@ -10,7 +10,7 @@ import numpy as np
 from vd.deploy.action import ActionFilter
 from vd.deploy.answers import HandState
 from vd.deploy.camera import DepthSource
-from vd.deploy.clock import MONOTONIC, Clock
+from vd.deploy.clock import Pacer
 from vd.deploy.log import LogWriter
 from vd.deploy.observation import Sensed
 from vd.deploy.pilot import Pilot
@@ -23,46 +23,6 @@ CAMERA_SHARE = 0.5
 """Share of a control period for which an image is waited for."""
 STATUS_STEPS = 3
 """Control steps between two refreshes of the status line: four a second."""
-
-
-class Pacer:
-    """The grid of control steps.
-
-    A step is due at a point of the grid and has to end by the next. One that ends later misses each point
-    passed; the step after it begins at once, and the grid stays where it was.
-
-    Args:
-        hz: Steps a second.
-        clock: Time.
-    """
-
-    def __init__(self, hz: float, clock: Clock = MONOTONIC):
-        self.period_s, self.clock = 1.0 / hz, clock
-        self.due_s: float | None = None
-        """When the present step was due [s]."""
-        self.missed = 0
-        """Deadlines missed so far."""
-
-    def wait(self) -> float:
-        """Wait for the next step; how late it begins [s]."""
-        now = self.clock.now()
-        if self.due_s is None:
-            self.due_s = now
-            return 0.0
-        self.due_s += self.period_s
-        behind = int((now - self.due_s) // self.period_s)
-        if behind > 0:
-            self.due_s += behind * self.period_s
-        while (left := self.due_s - self.clock.now()) > 0.0:
-            self.clock.sleep(left)
-        return self.clock.now() - self.due_s
-
-    def end(self) -> bool:
-        """The step's work is done; whether after its deadline."""
-        assert self.due_s is not None
-        passed = int((self.clock.now() - self.due_s) // self.period_s)
-        self.missed += max(passed, 0)
-        return passed > 0
 
 
 class Truth(Protocol):
@@ -196,7 +156,6 @@ class ControlLoop:
         """One control step; what ends the pursuit, if anything, and the distance [rad]."""
         late, busy = self._pacer.wait(), time.process_time()
         due = self._pacer.due_s
-        assert due is not None
         depth = None
         if self._camera is not None:
             image = self._camera.read(CAMERA_SHARE * self._pacer.period_s)

@@ -16,6 +16,7 @@ import tyro
 from vd.deploy.answers import HandState
 from vd.deploy.bus import D_GAIN, P_GAIN
 from vd.deploy.check import ready
+from vd.deploy.clock import Pacer
 from vd.deploy.connect import Connection, HandOptions, connect
 from vd.deploy.control_table import RAD_PER_COUNT
 from vd.deploy.limits import SafetyCfg
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 RATE_HZ = 100.0
 """Rate that is tried, that of the excitations; the bus may be slower."""
+ROUNDING_S = 1e-6
+"""Of times on the grid of samples."""
 SPEED_RAD_S = 1.0
 """Of the way to where a motion starts."""
 JOINTS_PER_FINGER = 3
@@ -196,11 +199,12 @@ class Recorder:
         gain = int(float(excitation.conditions["p_gain"]))
         self._set_gain(gain)
         rows: list[tuple[HandState, np.ndarray, np.ndarray]] = []
-        clock = self._connection.bus.clock
-        begin, last = clock.now(), -np.inf
+        pacer, last = Pacer(self._rate, self._connection.bus.clock), -np.inf
+        pacer.wait()
+        begin = pacer.due_s
         on = np.ones(len(self._connection.joints.ids), dtype=bool)
-        while (now := clock.now() - begin) < excitation.duration:
-            at = int(np.searchsorted(excitation.time, now, side="right")) - 1
+        while (now := pacer.due_s - begin) < excitation.duration:
+            at = int(np.searchsorted(excitation.time, now + ROUNDING_S, side="right")) - 1
             if not np.array_equal(on, excitation.enabled[at]):
                 on = excitation.enabled[at]
                 safe.switch(on)
@@ -210,7 +214,7 @@ class Recorder:
                 rows.append((state, goal, on))
                 last = state.time_s
             safe.beat()
-            clock.sleep(begin + (np.floor(now * self._rate) + 1.0) / self._rate - clock.now())
+            pacer.wait()
         if not on.all():
             safe.switch(np.ones_like(on))
         self._set_gain(P_GAIN)

@@ -143,9 +143,10 @@ def _fly(
     """Preflight, way to the start, the loop, and its log."""
     from vd.deploy.action import ActionFilter
     from vd.deploy.check import ready
+    from vd.deploy.clock import Pacer
     from vd.deploy.flight import look, make_goals, open_camera, warm_up
     from vd.deploy.log import LogWriter
-    from vd.deploy.loop import ControlLoop, LoopCfg, Pacer, summary
+    from vd.deploy.loop import ControlLoop, LoopCfg, summary
 
     hand = connection.hand
     goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)

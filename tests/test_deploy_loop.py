@@ -13,8 +13,9 @@ from vd.config import to_dict
 from vd.deploy import cli
 from vd.deploy.action import ActionFilter
 from vd.deploy.answers import HandState
+from vd.deploy.clock import Pacer
 from vd.deploy.log import LogWriter
-from vd.deploy.loop import ControlLoop, LoopCfg, Pacer
+from vd.deploy.loop import ControlLoop, LoopCfg
 from vd.deploy.pilot import Decision
 from vd.deploy.twin_link import TwinState
 from vd.envs.cfg import ReorientCfg
