@@ -1,20 +1,31 @@
 """Preflight: everything that must be right before a hand moves. With --range it moves, after asking."""
 
+import contextlib
+import itertools
 import json
 import sys
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
-from typing import Annotated
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
 from vd.deploy.answers import BusError
+from vd.deploy.child import TwinError
 from vd.deploy.connect import Connection, HandOptions, connect
+from vd.deploy.finding import Finding, finding, show
 from vd.deploy.joints import CalibrationError
 from vd.deploy.limits import PERIOD_S, SafetyCfg
 from vd.deploy.motion import move
+from vd.deploy.realsense import RealSenseCfg
 from vd.deploy.safety import SafeHand
+from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.assets_usd.hand_model import HandModel
 
 CYCLES = 24
 """Control cycles whose times are measured: two seconds."""
@@ -28,8 +39,6 @@ OUTSIDE_RAD = 0.1
 """How far a joint may hang out of its range and still be brought back slowly."""
 PLAIN = {"drive_mode": 0, "homing_offset": 0, "protocol_type": 2, "status_return_level": 2}
 """Items that have to be as from the factory: turned drives and offsets belong in the calibration."""
-NAMED = 3
-"""Motors that a finding names; where more are wrong they have a cause in common."""
 RANGE_SHARE = 0.8
 """Share of a joint's range that --range moves it through."""
 RANGE_SPEED_RAD_S = 0.7
@@ -42,23 +51,18 @@ FOLLOW_RAD = 0.25
 class CheckCfg(HandOptions):
     """Look at everything that must be right before the hand moves."""
 
+    camera: RealSenseCfg = field(default_factory=RealSenseCfg)
+    """The depth camera."""
+    camera_layer: Path | None = None
+    """Where it was found to be (camera.usda of vd-deploy calibrate); where the hand has it by default."""
+    no_camera: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Leave the camera out: homing and recording need none."""
     range: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Also move each joint slowly through its range, after asking."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print JSON."""
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that was looked at."""
-
-    what: str
-    """What was looked at."""
-    ok: bool
-    found: str
-    """How it is; where it is wrong with the remedy."""
 
 
 def preflight(connection: Connection) -> Iterator[Finding]:
@@ -69,18 +73,18 @@ def preflight(connection: Connection) -> Iterator[Finding]:
     bus = connection.bus
     try:
         missing = bus.missing()
-        yield _finding(
+        yield finding(
             "motors answer", [f"motor {id} {why}" for id, why in missing.items()], f"all {len(bus.ids)}"
         )
         if missing:
             return
         errors = bus.hardware_errors()
-        yield _finding(
+        yield finding(
             "no hardware error",
             [f"motor {id}: {why}; reboot it once it is mended" for id, why in errors.items()],
             "none",
         )
-        yield _finding("factory items", _not_plain(connection), "as they should be")
+        yield finding("factory items", _not_plain(connection), "as they should be")
         try:
             bus.configure(connection.joints.settings(connection.hand, bus.model.name))
         except (BusError, CalibrationError) as error:
@@ -91,11 +95,6 @@ def preflight(connection: Connection) -> Iterator[Finding]:
         yield _cycles(connection)
     except BusError as error:
         yield Finding("bus", False, str(error))
-
-
-def _finding(what: str, wrong: list[str], right: str) -> Finding:
-    more = f"; and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
-    return Finding(what, not wrong, "; ".join(wrong[:NAMED]) + more or right)
 
 
 def _not_plain(connection: Connection) -> list[str]:
@@ -121,14 +120,14 @@ def _state(connection: Connection) -> Iterator[Finding]:
         for id, t in zip(bus.ids, state.temperature, strict=True)
         if t > limit
     ]
-    yield _finding("temperature", hot, f"up to {state.temperature.max():.0f} deg C")
+    yield finding("temperature", hot, f"up to {state.temperature.max():.0f} deg C")
     supply, apart = bus.model.supply_v, VOLTAGE_SHARE * bus.model.supply_v
     weak = [
         f"motor {id}: {v:.1f} V, not {supply:g}: check the supply and its wires"
         for id, v in zip(bus.ids, state.voltage, strict=True)
         if abs(v - supply) > apart
     ]
-    yield _finding("voltage", weak, f"{state.voltage.min():.1f} to {state.voltage.max():.1f} V")
+    yield finding("voltage", weak, f"{state.voltage.min():.1f} to {state.voltage.max():.1f} V")
     q = joints.to_joint(state.position)
     out = np.maximum(hand.lower - q, q - hand.upper)
     outside = [
@@ -136,7 +135,7 @@ def _state(connection: Connection) -> Iterator[Finding]:
         for name, angle, low, high, by in zip(joints.names, q, hand.lower, hand.upper, out, strict=True)
         if by > OUTSIDE_RAD
     ]
-    yield _finding("pose within limits", outside, "every joint")
+    yield finding("pose within limits", outside, "every joint")
 
 
 def _cycles(connection: Connection) -> Finding:
@@ -188,24 +187,16 @@ def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
         )
 
 
-def show(findings: Iterator[Finding], *, quiet: bool = False) -> list[Finding]:
-    """All findings, printed as they come unless ``quiet``."""
-    kept = []
-    for finding in findings:
-        kept.append(finding)
-        if not quiet:
-            print(f"{'ok   ' if finding.ok else 'WRONG'}  {finding.what:<20} {finding.found}", flush=True)
-    return kept
-
-
-def ready(connection: Connection, question: str, *, yes: bool, quiet: bool = False) -> list[Finding]:
-    """Preflight, then have the person confirm.
+def ready(
+    connection: Connection, question: str, *, yes: bool, quiet: bool = False, more: Iterable[Finding] = ()
+) -> list[Finding]:
+    """Preflight, and ``more`` of it, then have the person confirm.
 
     Raises:
         RuntimeError: Something is wrong, or the person did not say yes.
     """
-    findings = show(preflight(connection), quiet=quiet)
-    wrong = [finding for finding in findings if not finding.ok]
+    findings = show(itertools.chain(preflight(connection), more), quiet=quiet)
+    wrong = [one for one in findings if not one.ok]
     if wrong:
         raise RuntimeError(f"nothing moves: {wrong[0].what}: {wrong[0].found}")
     confirm(question, yes=yes)
@@ -227,16 +218,48 @@ def confirm(question: str, *, yes: bool) -> None:
         raise RuntimeError("nothing moves: not confirmed")
 
 
+def camera_preflight(cfg: CheckCfg, hand: "HandModel", side: Path) -> Iterator[Finding]:
+    """Find the camera, and look at it.
+
+    Args:
+        cfg: Which camera.
+        hand: The hand.
+        side: Socket of the twin, if there is one.
+    """
+    from vd.assets_usd.camera_layer import read_camera
+    from vd.deploy.camera import CameraError
+    from vd.deploy.check_camera import camera_findings
+    from vd.deploy.eyes import open_camera
+    from vd.deploy.twin_link import TwinLink
+
+    place = hand.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
+    with contextlib.ExitStack() as stack:
+        try:
+            link = stack.enter_context(TwinLink(side)) if cfg.twin else None
+            source, name = open_camera(place, link, cfg.camera, sdk=None)
+        except (CameraError, TwinError) as error:
+            yield Finding("camera", False, str(error))
+            return
+        stack.callback(source.close)
+        yield Finding("camera", True, name)
+        yield from camera_findings(source, place, fps=PAPER.scene.control_hz if cfg.twin else cfg.camera.fps)
+
+
 def check(cfg: CheckCfg) -> int:
     """Look, and print a table; 1 if something is wrong."""
-    with connect(cfg) as connection:
+    with contextlib.ExitStack() as stack:
+        side = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vd-twin-"))) / "side"
+        seen = ["--object", "cube", "--side", str(side)] if cfg.twin and not cfg.no_camera else []
+        connection = stack.enter_context(connect(cfg, seen))
         findings = show(preflight(connection), quiet=cfg.json)
-        if cfg.range and all(finding.ok for finding in findings):
+        if not cfg.no_camera:
+            findings += show(camera_preflight(cfg, connection.hand, side), quiet=cfg.json)
+        if cfg.range and all(one.ok for one in findings):
             confirm("Every joint will move slowly through its range.", yes=cfg.yes)
             limits = replace(SafetyCfg(), then="off")
-            with SafeHand(connection.bus, connection.joints, connection.hand, limits) as safe:
-                findings += show(sweep(connection, safe), quiet=cfg.json)
-    right = all(finding.ok for finding in findings)
+            safe = stack.enter_context(SafeHand(connection.bus, connection.joints, connection.hand, limits))
+            findings += show(sweep(connection, safe), quiet=cfg.json)
+    right = all(one.ok for one in findings)
     if cfg.json:
-        print(json.dumps({"ok": right, "findings": [asdict(finding) for finding in findings]}, indent=1))
+        print(json.dumps({"ok": right, "findings": [asdict(one) for one in findings]}, indent=1))
     return 0 if right else 1

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 MOTOR = "XH430-V210"
 """The motors whose stall torque is the hand's effort limit."""
 BAUD_RATE = 1_000_000
-TWIN_RETRIES = 3
+RETRIES, TWIN_RETRIES = 1, 3
 """The twin is a process among others, which may not run for longer than the SDK waits for an answer."""
 
 
@@ -118,7 +118,7 @@ def connect(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[
     from vd.deploy.bus import MotorBus
 
     hand, joints = read_hand_and_joints(options)
-    retries = {"retries": TWIN_RETRIES} if options.twin else {}
+    retries = TWIN_RETRIES if options.twin else RETRIES
     with open_port(options, twin_options) as port:
-        with MotorBus(port, joints.ids, options.motor, baud_rate=options.baud_rate, **retries) as bus:
+        with MotorBus(port, joints.ids, options.motor, baud_rate=options.baud_rate, retries=retries) as bus:
             yield Connection(hand, joints, bus)

@@ -251,7 +251,7 @@ def try_fault(fault: Fault, hand: HandModel, joints: Joints) -> Outcome:
             report.reason + left,
             witness,
             joints,
-            right=report.reason != FINISHED and safe_s <= PERIOD_S,
+            right=report.reason != FINISHED and report.detected_s >= scene.injected_s and safe_s <= PERIOD_S,
             since_s=scene.injected_s,
             detected_s=report.detected_s - scene.injected_s,
             safe_s=None if report.held_s is None else safe_s,

@@ -17,8 +17,7 @@ from vd.deploy.mirror import Mirror
 from vd.deploy.motion import reset_pose
 from vd.deploy.observation import Sensed
 from vd.deploy.pilot import Pilot, StillPilot, StudentPilot, TeacherPilot
-from vd.deploy.realsense import RealSense, RealSenseCfg, find_device
-from vd.deploy.twin_link import SdkTwinCamera, TwinCamera, TwinLink
+from vd.deploy.twin_link import TwinLink
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.agents import check_bundle, is_saved_student, open_policy, task_for, trained_task
 from vd.evaluate.rollout import draw_goals
@@ -127,43 +126,26 @@ def make_goals(texts: Sequence[str], drawn: int, max_angle: float, *, seed: int)
     return goals
 
 
-def open_camera(
-    flight: Flight, link: TwinLink | None, cfg: RealSenseCfg, *, sdk: bool = False
-) -> DepthSource | None:
-    """The depth camera of a policy, a twin's or a real one; None if it needs none.
-
-    Args:
-        flight: The policy.
-        link: A twin; None for a real camera.
-        cfg: Settings of the real one.
-        sdk: Take a twin's images through the camera's SDK.
-
-    Raises:
-        CameraError: There is none, or its images are not those of the training.
-    """
-    if flight.camera is None:
-        return None
-    if link is not None:
-        camera = TwinCamera(link, flight.camera)
-        return SdkTwinCamera(camera) if sdk else camera
-    return RealSense(find_device(cfg.serial), cfg)
-
-
-def look(flight: Flight, source: DepthSource, hand: HandModel, layer: Path | None) -> None:
+def look(flight: Flight, source: DepthSource, hand: HandModel, layer: Path | None) -> CameraModel:
     """Let a student see by the camera's own lens, from where it was found to be.
 
     Args:
-        flight: The policy.
+        flight: The policy, one that has a camera.
         source: The camera.
         hand: The hand.
         layer: Its place as a layer over the hand; None: where it was in training.
 
+    Returns:
+        The camera by which it sees.
+
     Raises:
         HandError: The layer is none of this hand.
     """
-    if isinstance(flight.pilot, StudentPilot) and flight.camera is not None:
-        place = flight.camera if layer is None else read_camera(hand, layer)
-        flight.pilot.look_by(source.intrinsics.seen_from(place))
+    assert isinstance(flight.pilot, StudentPilot) and flight.camera is not None
+    place = flight.camera if layer is None else read_camera(hand, layer)
+    seen = source.intrinsics.seen_from(place)
+    flight.pilot.look_by(seen)
+    return seen
 
 
 def warm_up(

@@ -1,9 +1,13 @@
-"""Writing the log of a run on a hand: rows and events are appended whole: a crash loses at most one."""
+"""Writing the log of a run on a hand: rows and events are appended whole, by a thread.
+
+A write can wait for the disk as long as other programs keep that busy, and the hand must not.
+"""
 
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +88,8 @@ class LogWriter:
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
         self._steps = os.open(folder / STEPS_FILE, flags, 0o644)
         self._events = os.open(folder / EVENTS_FILE, flags, 0o644)
+        self._writer = ThreadPoolExecutor(1, "log")
+        self._written: Future[Any] | None = None
         self._append(self._steps, ",".join(self._columns))
         write_json(folder / RECORDING_FILE, recording)
         write_json(folder / RUN_FILE, self._run)
@@ -118,7 +124,7 @@ class LogWriter:
     def image(self, step: int, depth_m: np.ndarray) -> None:
         """Keep the depth image of a step [m] [H, W]."""
         (self.folder / IMAGES).mkdir(exist_ok=True)
-        np.save(self.folder / IMAGES / f"{step:06d}.npy", depth_m)
+        self._later(np.save, self.folder / IMAGES / f"{step:06d}.npy", depth_m.copy())
 
     def event(self, event: str, **values: Any) -> None:
         """Append an event of this moment."""
@@ -126,12 +132,26 @@ class LogWriter:
         self._append(self._events, json.dumps(line))
 
     def finish(self, reason: str, **summary: Any) -> None:
-        """Say how it ended, and close the files."""
+        """Say how it ended, and close the files.
+
+        Raises:
+            OSError: Something could not be written.
+        """
         self.event("end", reason=reason)
+        self._writer.shutdown()
         os.close(self._steps)
         os.close(self._events)
         write_json(self.folder / RUN_FILE, {**self._run, "end": {"reason": reason, **summary}})
+        self._check()
 
-    @staticmethod
-    def _append(file: int, line: str) -> None:
-        os.write(file, line.encode() + b"\n")  # one call: whole, or not at all
+    def _append(self, file: int, line: str) -> None:
+        self._later(os.write, file, line.encode() + b"\n")  # one call: whole, or not at all
+
+    def _later(self, write: Callable[..., Any], *arguments: Any) -> None:
+        self._check()
+        self._written = self._writer.submit(write, *arguments)
+
+    def _check(self) -> None:
+        """Raise what went wrong in writing: a run without its log is not worth going on with."""
+        if self._written is not None and self._written.done():
+            self._written.result()

@@ -145,6 +145,13 @@ def find_device(serial: str = "") -> Any:
     return devices[serial] if serial else next(iter(devices.values()))
 
 
+def describe(device: Any) -> str:
+    """Name, serial number and USB of a device, as far as it tells them."""
+    info = sdk().camera_info
+    asked = (("", info.name), ("", info.serial_number), ("USB ", info.usb_type_descriptor))
+    return ", ".join(f"{what}{device.get_info(one)}" for what, one in asked if device.supports(one))
+
+
 def open_recording(path: Path) -> Any:
     """A recording as a device that plays in real time, once.
 

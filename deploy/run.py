@@ -10,6 +10,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
@@ -20,7 +21,9 @@ import numpy as np
 import tyro
 
 from vd.deploy.bus import D_GAIN, P_GAIN
+from vd.deploy.camera import DepthSource
 from vd.deploy.connect import Connection, HandOptions, connect
+from vd.deploy.finding import Finding
 from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import MOVE_S, move, reset_pose
 from vd.deploy.realsense import RealSenseCfg
@@ -143,8 +146,10 @@ def _fly(
     """Preflight, way to the start, the loop, and its log."""
     from vd.deploy.action import ActionFilter
     from vd.deploy.check import ready
+    from vd.deploy.check_camera import camera_findings
     from vd.deploy.clock import Pacer
-    from vd.deploy.flight import look, make_goals, open_camera, warm_up
+    from vd.deploy.eyes import open_camera
+    from vd.deploy.flight import look, make_goals, warm_up
     from vd.deploy.log import LogWriter
     from vd.deploy.loop import ControlLoop, LoopCfg, summary
 
@@ -152,16 +157,19 @@ def _fly(
     goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
     pose = reset_pose(hand.num_fingers)
     with contextlib.ExitStack() as stack:
-        camera = open_camera(flight, link, cfg.camera, sdk=cfg.sdk)
-        if camera is not None:
+        camera: DepthSource | None = None
+        seen: Iterable[Finding] = ()
+        if flight.camera is not None:
+            camera, _ = open_camera(flight.camera, link, cfg.camera, sdk=cfg.sdk)
             stack.callback(camera.close)
-            look(flight, camera, hand, cfg.camera_layer)
+            view = look(flight, camera, hand, cfg.camera_layer)
+            fps = flight.task.sim.control_hz if cfg.twin else cfg.camera.fps
+            seen = camera_findings(camera, view, fps=fps)
         warm_up(flight.pilot, hand, goals[0], camera, link)
         stack.enter_context(undisturbed())
         stack.enter_context(real_time(cfg.realtime))
-        ready(
-            connection, f"The hand will pursue {len(goals)} goals.", yes=cfg.yes or cfg.twin, quiet=cfg.twin
-        )
+        question = f"The hand will pursue {len(goals)} goals."
+        ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=seen)
         folder = cfg.log or Path("runs/deploy") / datetime.now().strftime("%Y%m%d-%H%M%S")
         log = LogWriter(
             folder,

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -23,6 +24,7 @@ from vd.deploy.motion import reset_pose
 from vd.deploy.motor import Motor
 from vd.deploy.newton_hand import NewtonHand
 from vd.deploy.plant import Drive
+from vd.deploy.realsense import RealSenseCfg
 from vd.deploy.scan import FoundMotor, differences, find
 from vd.deploy.twin import Twin
 from vd.gap.recording import read_recording
@@ -50,7 +52,7 @@ def port(twin, hand, monkeypatch):
     joints = uncalibrated(hand)
 
     @contextlib.contextmanager
-    def patient(options):
+    def patient(options, twin_options=()):
         with MotorBus(options.port, joints.ids, MOTOR, retries=20) as bus:
             yield Connection(hand, joints, bus)
 
@@ -80,11 +82,25 @@ def test_what_differs_is_named(hand):
 
 
 def test_check_finds_nothing_wrong_and_leaves_the_torque_off(twin, port, capsys):
-    assert check.check(check.CheckCfg(port=port, json=True)) == 0
+    assert check.check(check.CheckCfg(port=port, json=True, no_camera=True)) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["ok"] and {"gains and limits", "loop rate"} < {f["what"] for f in report["findings"]}
     assert not any(motor.get("torque_enable") for motor in twin.motors)
     assert twin.motors[0].get("position_p_gain") == 200
+
+
+def test_check_misses_the_camera(port, capsys):
+    assert check.check(check.CheckCfg(port=port, camera=RealSenseCfg(serial="none"))) == 1
+    assert re.search("WRONG  camera .*(no RealSense|SDK cannot be imported)", capsys.readouterr().out)
+
+
+@pytest.mark.slow
+def test_check_looks_through_the_eyes_of_the_twin(capsys):
+    """Its line may be late on a busy machine; that is not the question here."""
+    check.check(check.CheckCfg(twin=True, json=True))
+    found = {f["what"]: f for f in json.loads(capsys.readouterr().out)["findings"]}
+    assert all(found[f"camera {what}"]["ok"] for what in ("streams", "lens", "depth")), found
+    assert "the twin's" in found["camera"]["found"] and "320 x 180" in found["camera lens"]["found"]
 
 
 @pytest.mark.parametrize("name", BEFORE)
@@ -119,7 +135,7 @@ def test_the_range_is_swept(twin, port, hand, monkeypatch):
     monkeypatch.setattr(
         twin.plant, "advance", lambda *a: (advance(*a), seen.append(twin.plant.position.copy()))
     )
-    assert check.check(check.CheckCfg(port=port, range=True, yes=True)) == 0
+    assert check.check(check.CheckCfg(port=port, range=True, yes=True, no_camera=True)) == 0
     moved = np.ptp(seen, axis=0) / (hand.upper - hand.lower)
     assert (moved > 0.7).all() and (moved < 0.9).all()
 

@@ -1,6 +1,8 @@
 """The log of a run: appended whole, read also where it was cut short, and a recording for vd-gap."""
 
 import json
+import os
+import threading
 
 import numpy as np
 import pytest
@@ -65,6 +67,29 @@ def test_a_log_cut_short_is_read_to_its_last_whole_row(folder):
     (folder / "events.jsonl").write_text(events[:-20])
     log = read_log(folder)
     assert len(log.columns["t"]) == STEPS - 1 and len(log.stops) == 2
+
+
+def test_the_loop_does_not_wait_for_the_disk(tmp_path, monkeypatch):
+    log = LogWriter(tmp_path / "log", load_hand("dclaw3"), {"goals": GOALS}, servo={})
+    busy, write = threading.Event(), os.write
+    monkeypatch.setattr("vd.deploy.log.os.write", lambda *a: busy.wait(60.0) and write(*a))
+    joints = dict.fromkeys(JOINT_CHANNELS, np.zeros(9))
+    for step in range(3):
+        log.step(log.started_s + step, joints, [0.0] * len(STEP_COLUMNS))  # nothing is written yet
+    assert len((tmp_path / "log" / STEPS_FILE).read_text().splitlines()) <= 1
+    busy.set()
+    log.finish("done")
+    np.testing.assert_allclose(read_log(tmp_path / "log").columns["t"], [0.0, 1.0, 2.0])
+
+
+def test_a_full_disk_is_told(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    log = LogWriter(tmp_path / "log", load_hand("dclaw3"), {"goals": GOALS}, servo={})
+    monkeypatch.setattr("vd.deploy.log.os.write", full)
+    with pytest.raises(OSError, match="No space"):
+        log.finish("done")
 
 
 def test_what_is_no_log_is_refused(folder, tmp_path):

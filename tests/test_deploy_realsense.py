@@ -4,7 +4,9 @@ Oracles: an inclined plane, whose depth is known in every pixel, and the rendere
 """
 
 import dataclasses
+import gzip
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,6 +37,7 @@ LENS = Intrinsics(640, 360, 455.0, 456.0, 323.5, 177.0)
 NORMAL, DISTANCE = np.array([0.3, -0.2, 1.0]), 0.7
 """An inclined plane: NORMAL . p = DISTANCE in the optical frame [m]."""
 PATIENCE_S = 2.0
+BAG = Path(__file__).parent / "data" / "realsense-2.54.bag.gz"
 OFF = FilterCfg(decimation=1)
 
 
@@ -172,6 +175,22 @@ def test_a_recording_plays_back_what_was_sent(twin, tmp_path):
     assert 2 <= len(frames) <= 5
     np.testing.assert_allclose(frames[-1].depth_m, sent[-1], atol=6e-4)
     assert time.monotonic() - 5.0 < frames[0].time_s < frames[-1].time_s <= time.monotonic()
+
+
+def test_a_bag_of_an_earlier_sdk_plays_back(tmp_path):
+    """Five images of 64 x 36, sent at 30 Hz by a software device of pyrealsense2 2.54.2, which wrote bags."""
+    path = tmp_path / "depth.bag"
+    path.write_bytes(gzip.decompress(BAG.read_bytes()))
+    camera = RealSense(open_recording(path), RealSenseCfg(filters=OFF))
+    lens = (64, 36, 45.5, 45.6, 32.3, 17.7)
+    assert dataclasses.astuple(camera.intrinsics) == pytest.approx(lens)
+    frames = []
+    with pytest.raises(StaleCamera, match="recording ended"):
+        while True:
+            frames.append(camera.read(0.5))
+    camera.close()
+    assert 2 <= len(frames) <= 5
+    np.testing.assert_allclose(frames[-1].depth_m, 0.54, atol=1e-6)
 
 
 def test_infrared_comes_with_the_pattern_off(twin):

@@ -1,0 +1,34 @@
+"""What a preflight finds: one line for each thing that was looked at."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+NAMED = 3
+"""Parts that a finding names; where more are wrong they have a cause in common."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    """What was looked at."""
+    ok: bool
+    found: str
+    """How it is; where it is wrong with the remedy."""
+
+
+def finding(what: str, wrong: Sequence[str], right: str) -> Finding:
+    """Whether nothing is wrong, and else what is."""
+    more = f"; and {len(wrong) - NAMED} more" if len(wrong) > NAMED else ""
+    return Finding(what, not wrong, "; ".join(wrong[:NAMED]) + more or right)
+
+
+def show(findings: Iterable[Finding], *, quiet: bool = False) -> list[Finding]:
+    """All findings, printed as they come unless ``quiet``."""
+    kept = []
+    for one in findings:
+        kept.append(one)
+        if not quiet:
+            print(f"{'ok   ' if one.ok else 'WRONG'}  {one.what:<20} {one.found}", flush=True)
+    return kept
