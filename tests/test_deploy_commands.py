@@ -12,9 +12,10 @@ import pytest
 
 pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
+from simulated_hand import simulated_bus
+
 from vd.assets_usd.hands import load_hand
 from vd.deploy import check, cli, home, record
-from vd.deploy.bus import MotorBus
 from vd.deploy.connect import MOTOR, Connection, HandOptions, connect
 from vd.deploy.control_table import MODELS
 from vd.deploy.faults import BEFORE, MOVING, try_fault, try_preflight
@@ -30,8 +31,8 @@ from vd.deploy.twin import Twin
 from vd.gap.recording import read_recording
 from vd.sim.cfg import SimCfg
 
-PATIENT = SafetyCfg(step_rad=4.0, hold_s=0.05, misses=60, lost_s=2.0, watchdog_s=2.0)
-"""On a busy machine the twin may not run for longer than a hand may wait."""
+PORT = "/dev/simulated"
+QUICK = SafetyCfg(step_rad=4.0, hold_s=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -40,32 +41,25 @@ def hand():
 
 
 @pytest.fixture
-def twin(hand):
-    with Twin([Motor(MODELS[MOTOR], id) for id in uncalibrated(hand).ids]) as served:
-        served.plant.position[:] = reset_pose(3) + 0.1
-        yield served
-
-
-@pytest.fixture
-def port(twin, hand, monkeypatch):
-    """What commands connect to: the twin, however long it may take to answer."""
+def line(hand, monkeypatch):
+    """What commands connect to: motors on a simulated line, where nothing is late on a busy machine."""
     joints = uncalibrated(hand)
+    with simulated_bus(hand, joints) as (motors, bus):
+        motors.plant.position[:] = reset_pose(3) + 0.1
 
-    @contextlib.contextmanager
-    def patient(options, twin_options=()):
-        with MotorBus(options.port, joints.ids, MOTOR, retries=20) as bus:
+        @contextlib.contextmanager
+        def connect(options, twin_options=()):
             yield Connection(hand, joints, bus)
 
-    for module in (check, home, record):
-        monkeypatch.setattr(module, "connect", patient)
-    monkeypatch.setattr(check, "BUS_SHARE", 100.0)
-    return twin.path
+        for module in (check, home, record):
+            monkeypatch.setattr(module, "connect", connect)
+        yield motors
 
 
-def test_find_lists_the_motors(twin):
-    assert find(twin.path, [1_000_000], lambda text: None) == [
-        FoundMotor(motor.id, 1_000_000, MOTOR, 45) for motor in twin.motors
-    ]
+def test_find_lists_the_motors(hand):
+    with Twin([Motor(MODELS[MOTOR], id) for id in uncalibrated(hand).ids]) as twin:
+        found = find(twin.path, [1_000_000], lambda text: None)
+        assert found == [FoundMotor(motor.id, 1_000_000, MOTOR, 45) for motor in twin.motors]
 
 
 def test_what_differs_is_named(hand):
@@ -81,16 +75,16 @@ def test_what_differs_is_named(hand):
     assert "motor 11 is at 57600 baud" in "\n".join(differences(found, joints, MOTOR, 1_000_000))
 
 
-def test_check_finds_nothing_wrong_and_leaves_the_torque_off(twin, port, capsys):
-    assert check.check(check.CheckCfg(port=port, json=True, no_camera=True)) == 0
+def test_check_finds_nothing_wrong_and_leaves_the_torque_off(line, capsys):
+    assert check.check(check.CheckCfg(port=PORT, json=True, no_camera=True)) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["ok"] and {"gains and limits", "loop rate"} < {f["what"] for f in report["findings"]}
-    assert not any(motor.get("torque_enable") for motor in twin.motors)
-    assert twin.motors[0].get("position_p_gain") == 200
+    assert not any(motor.get("torque_enable") for motor in line.motors)
+    assert line.motors[0].get("position_p_gain") == 200
 
 
-def test_check_misses_the_camera(port, capsys):
-    assert check.check(check.CheckCfg(port=port, camera=RealSenseCfg(serial="none"))) == 1
+def test_check_misses_the_camera(line, capsys):
+    assert check.check(check.CheckCfg(port=PORT, camera=RealSenseCfg(serial="none"))) == 1
     assert re.search("WRONG  camera .*(no RealSense|SDK cannot be imported)", capsys.readouterr().out)
 
 
@@ -110,32 +104,32 @@ def test_the_preflight_finds(name, hand, monkeypatch):
     assert outcome.right, outcome.happened
 
 
-def test_nothing_moves_unasked(twin, port, monkeypatch):
-    before = twin.plant.position.copy()
+def test_nothing_moves_unasked(line, monkeypatch):
+    before = line.plant.position.copy()
     with pytest.raises(RuntimeError, match="Nobody is there to ask"):
-        home.home(home.HomeCfg(port=port))
-    twin.motors[3].put("hardware_error_status", 32)
+        home.home(home.HomeCfg(port=PORT))
+    line.motors[3].put("hardware_error_status", 32)
     with pytest.raises(RuntimeError, match="motor 20: overload"):
-        home.home(home.HomeCfg(port=port, yes=True))
-    np.testing.assert_array_equal(twin.plant.position, before)
+        home.home(home.HomeCfg(port=PORT, yes=True))
+    np.testing.assert_array_equal(line.plant.position, before)
 
 
-def test_home_comes_to_the_reset_pose(twin, port, capsys):
-    assert home.home(home.HomeCfg(port=port, yes=True, speed=1.0, safety=PATIENT)) == 0
-    np.testing.assert_allclose(twin.plant.position, reset_pose(3), atol=0.01)
+def test_home_comes_to_the_reset_pose(line, capsys):
+    assert home.home(home.HomeCfg(port=PORT, yes=True, speed=1.0, safety=QUICK)) == 0
+    np.testing.assert_allclose(line.plant.position, reset_pose(3), atol=0.01)
     assert "farthest from its place" in capsys.readouterr().out
 
 
-def test_the_range_is_swept(twin, port, hand, monkeypatch):
+def test_the_range_is_swept(line, hand, monkeypatch):
     monkeypatch.setattr(check, "RANGE_SPEED_RAD_S", 8.0)
     monkeypatch.setattr(check, "FOLLOW_RAD", 2.0)  # at that speed; whether it moves is the question
-    monkeypatch.setattr(check, "SafetyCfg", lambda **_: PATIENT)
+    monkeypatch.setattr(check, "SafetyCfg", lambda **_: QUICK)
     seen = []
-    advance = twin.plant.advance
+    advance = line.plant.advance
     monkeypatch.setattr(
-        twin.plant, "advance", lambda *a: (advance(*a), seen.append(twin.plant.position.copy()))
+        line.plant, "advance", lambda *a: (advance(*a), seen.append(line.plant.position.copy()))
     )
-    assert check.check(check.CheckCfg(port=port, range=True, yes=True, no_camera=True)) == 0
+    assert check.check(check.CheckCfg(port=PORT, range=True, yes=True, no_camera=True)) == 0
     moved = np.ptp(seen, axis=0) / (hand.upper - hand.lower)
     assert (moved > 0.7).all() and (moved < 0.9).all()
 
@@ -159,15 +153,15 @@ def plan(tmp_path, hand):
     return folder
 
 
-def test_a_plan_is_recorded_and_gone_on_with(twin, port, plan, hand, tmp_path):
+def test_a_plan_is_recorded_and_gone_on_with(line, plan, hand, tmp_path):
     out = tmp_path / "rec"
     first = record.RecordCfg(
-        port=port, out=out, fingers=(0,), plan=plan / "f0_j1.json", yes=True, safety=PATIENT
+        port=PORT, out=out, fingers=(0,), plan=plan / "f0_j1.json", yes=True, safety=QUICK
     )
     assert record.record(first) == 0
     before = (out / "plan_000_f0_j1_wave.csv").read_bytes()
     second = record.RecordCfg(
-        port=port, out=out, fingers=(0,), plan=plan / "f0_j2.json", yes=True, safety=PATIENT
+        port=PORT, out=out, fingers=(0,), plan=plan / "f0_j2.json", yes=True, safety=QUICK
     )
     assert record.record(second) == 0 and record.record(second) == 0
     assert (out / "plan_000_f0_j1_wave.csv").read_bytes() == before
@@ -179,8 +173,8 @@ def test_a_plan_is_recorded_and_gone_on_with(twin, port, plan, hand, tmp_path):
     assert np.ptp(wave.position[:, 0]) > 0.1 and np.ptp(wave.position[:, 2]) < 0.02
     assert wave.enabled.all() and not release.enabled[-1, 1] and release.enabled[0, 1]
     assert wave.temperature is not None and wave.pwm is None
-    assert {motor.get("position_p_gain") for motor in twin.motors} == {200}
-    assert not any(motor.get("torque_enable") for motor in twin.motors)
+    assert {motor.get("position_p_gain") for motor in line.motors} == {200}
+    assert not any(motor.get("torque_enable") for motor in line.motors)
     with pytest.raises(record.RecordError, match="choose another"):
         record.record(replace(first, fingers=(1,)))
 
@@ -209,8 +203,8 @@ def test_the_largest_motions_touch_nothing(name):
             assert index < 200 or touching == 0, f"{motion.file}: {touching} contacts"
 
 
-def test_a_payload_needs_somebody_to_hang_it(port, hand, tmp_path):
-    cfg = record.RecordCfg(port=port, out=tmp_path, fingers=(0,), excitations=("second_payload",), yes=True)
+def test_a_payload_needs_somebody_to_hang_it(line, hand, tmp_path):
+    cfg = record.RecordCfg(port=PORT, out=tmp_path, fingers=(0,), excitations=("second_payload",), yes=True)
     motions = [motion for motion in record.motions_of(hand, (0,), cfg.excitations) if motion.payload[0]]
     with record.connect(cfg) as connection, pytest.raises(record.RecordError, match=r"hang 0\.05 kg"):
         record._session(cfg, connection, ("f0_j1",), motions, motions[0].payload, print)
