@@ -170,6 +170,27 @@ def test_a_state_that_is_not_finite_stops_the_run_and_can_be_replayed(tmp_path):
         list(replay(tmp_path / "bad.json"))
 
 
+@pytest.mark.parametrize("effects", [{}, {"command_delay.delay_s": (0.0, 0.04)}], ids=["drives", "servos"])
+def test_a_run_goes_on_without_the_few_worlds_that_fail(effects):
+    random = RandomisationCfg(enabled=bool(effects), effects=effects)
+    env = make(failures_per_million=1e5, randomisation=random)  # one more in ten steps
+    run(env, 5)
+    before = env.step_count.numpy().copy()
+    env.sim.joint_qd.numpy()[2, 0] = np.nan
+    env.step(env.action)
+    assert env.timed_out.numpy()[2] == 1 and env.done.numpy()[2] == 1 and env.step_count.numpy()[2] == 0
+    np.testing.assert_array_equal(np.delete(env.step_count.numpy(), 2), np.delete(before + 1, 2))
+    assert env.reward.numpy()[2] == 0.0
+    run(env, 3)
+    for array in (env.observation, env.reward, env.reward_terms, env.rotation_error, env.tip_pos, env.effort):
+        assert np.isfinite(array.numpy()).all()
+    for _ in range(8):
+        env.sim.joint_qd.numpy()[1, 0] = np.nan
+        env.step(env.action)
+    with pytest.raises(SimulationError, match=r"2 of \d+ worlds left the finite numbers"):
+        env.check()
+
+
 def test_saved_state_continues_exactly():
     cfg = {"randomisation": RandomisationCfg(enabled=True)}
     env = make(**cfg)

@@ -98,6 +98,10 @@ class DummyEnv:
         self.difficulty = min(1.0, self.difficulty + 0.01)
         return {"difficulty": self.difficulty}
 
+    def failed_steps(self) -> int:
+        """Nothing fails here."""
+        return 0
+
     @property
     def parameters(self) -> "DummyEnv":
         """Holder of the difficulty: this."""

@@ -128,7 +128,8 @@ class ReorientVecEnv(VecEnv):
         """Once an iteration: check the simulation, move the curriculum.
 
         Returns:
-            ``task/difficulty``: 0 to 1, 1 is the configured task.
+            ``task/difficulty``: 0 to 1, 1 is the configured task; ``task/failed_steps``: those of worlds here
+            that were put back since the begin (``ReorientCfg.failures_per_million``).
 
         Raises:
             SimulationError: NaN or lost contacts, with the numbers and the setting to change.
@@ -137,7 +138,10 @@ class ReorientVecEnv(VecEnv):
         if torch.distributed.is_initialized():
             # Every process counts all goals, and so moves to the same difficulty.
             torch.distributed.all_reduce(wp.to_torch(self.env.goal_counts))
-        return {"task/difficulty": self.env.update_curriculum()["difficulty"]}
+        return {
+            "task/difficulty": self.env.update_curriculum()["difficulty"],
+            "task/failed_steps": float(self.env.failed_steps()),
+        }
 
     def state_dict(self) -> dict[str, Any]:
         """Simulation, episodes, curriculum and random state of the environment (arrays and plain values)."""

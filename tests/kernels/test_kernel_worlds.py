@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, SENTINEL, device_array, unwritten
 
 from vd.kernels.contacts import pair_force_kernel
-from vd.kernels.guard import collect_overflow_kernel, guard_kernel
+from vd.kernels.guard import collect_overflow_kernel, guard_kernel, put_back_kernel, void_step_kernel
 from vd.kernels.worlds import (
     copy_columns_kernel,
     count_goals_kernel,
@@ -91,7 +91,9 @@ def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
     if where == "q" and np.isfinite(value):
         pytest.skip("positions have no bound")
     (q if where == "q" else qd)[bad, 2] = value
-    flags = device_array(np.zeros(worlds), int, device)
+    failures, failed = (
+        device_array(values, int, device) for values in (np.zeros(worlds), [SENTINEL] * worlds)
+    )
     dumps = [device_array(np.full((worlds, n), np.nan), float, device) for n in (4, 3, 2)]
 
     def launch(start: float, q: np.ndarray, qd: np.ndarray) -> None:
@@ -106,16 +108,46 @@ def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
                 device_array(np.full((worlds, 2), start), float, device),
                 500.0,
             ],
-            outputs=[flags, *dumps],
+            outputs=[failures, *dumps, failed],
             device=device,
         )
 
     launch(good, q, qd)
+    np.testing.assert_array_equal(failed.numpy(), [0, 1, 0])
     launch(good + 1.0, 0.0 * np.nan_to_num(q, posinf=0.0), 0.0 * np.nan_to_num(qd, posinf=0.0))
-    np.testing.assert_array_equal(flags.numpy(), [0, 1, 0])
+    np.testing.assert_array_equal(failed.numpy(), 0)
+    launch(good + 2.0, q, qd)
+    np.testing.assert_array_equal(failures.numpy(), [0, 2, 0])
     for dump in dumps:
-        assert (dump.numpy()[bad] == good).all(), "frozen at the step that went bad"
-        assert (dump.numpy()[[0, 2]] == good + 1.0).all(), "good worlds go on"
+        assert (dump.numpy()[bad] == good).all(), "frozen at the first step that failed"
+        assert (dump.numpy()[[0, 2]] == good + 2.0).all(), "good worlds go on"
+
+
+def test_a_failed_step_is_put_back_and_counts_for_nothing(device):
+    failed = device_array([0, 1, 0], int, device)
+    start = np.arange(12.0).reshape(3, 4)
+    q, qd = (device_array(np.full((3, n), np.nan), float, device) for n in (4, 3))
+    steps = device_array([5, 5, 5], int, device)
+    wp.launch(
+        put_back_kernel,
+        dim=3,
+        inputs=[failed, device_array(start, float, device), 59],
+        outputs=[q, qd, steps],
+        device=device,
+    )
+    np.testing.assert_array_equal(q.numpy()[1], start[1])
+    np.testing.assert_array_equal(qd.numpy()[1], 0.0)
+    assert np.isnan(q.numpy()[[0, 2]]).all() and np.isnan(qd.numpy()[[0, 2]]).all(), "others are left alone"
+    np.testing.assert_array_equal(steps.numpy(), [5, 59, 5])
+
+    reward, terms = (
+        device_array([1.0, np.nan, 1.0], float, device),
+        device_array([[1.0], [np.nan], [1.0]], float, device),
+    )
+    success, fell = (device_array([1, 1, 1], int, device) for _ in range(2))
+    wp.launch(void_step_kernel, dim=3, inputs=[failed], outputs=[reward, terms, success, fell], device=device)
+    for array in (reward, terms, success, fell):
+        np.testing.assert_array_equal(array.numpy().ravel(), [1, 0, 1])
 
 
 @EXAMPLES

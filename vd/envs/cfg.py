@@ -219,6 +219,9 @@ class ReorientCfg:
     """Keep visual shapes, for rendering."""
     table_friction: float = PAPER.materials.table_friction
     """Friction coefficient of the table where nothing is randomised; its contacts get the mean of the two."""
+    failures_per_million: float = 0.0
+    """Steps of worlds in a million that may leave the finite numbers or fly off: their episode ends like one
+    that times out. One more (two at first) stops the run, at 0 the first one does."""
     sim: SimCfg = field(default_factory=SimCfg)
     action: ActionCfg = field(default_factory=ActionCfg)
     observation: ObservationCfg = field(default_factory=ObservationCfg)
@@ -244,6 +247,8 @@ class ReorientCfg:
                 f"start.at_rest needs start.poses >= 1 (now {self.start.poses}) and start.settle_s > 0 "
                 f"(now {self.start.settle_s})"
             )
+        if self.failures_per_million < 0.0:
+            raise ValueError(f"failures_per_million = {self.failures_per_million}; it is 0 or positive")
         if self.num_worlds < 1:
             raise ValueError(f"num_worlds = {self.num_worlds}; at least 1 world is needed")
         if self.max_episode_steps < 1:

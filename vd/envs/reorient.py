@@ -20,8 +20,10 @@ from vd.envs.randomise import Randomiser
 from vd.envs.servo import needs_servo, servo_ranges
 from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
+from vd.envs.state import load_state, save_state
 from vd.envs.symmetry import Views
 from vd.kernels.actions import apply_action_kernel, joint_effort_kernel
+from vd.kernels.guard import void_step_kernel
 from vd.kernels.observations import fingertip_kernel, teacher_observation_kernel, teacher_observation_size
 from vd.kernels.resets import episode_kernel, reset_kernel
 from vd.kernels.rewards import REWARD_TERMS, reward_kernel
@@ -131,7 +133,8 @@ class ReorientEnv:
         self.rng = zeros(n, dtype=wp.uint32)
         """Random stream of each world, shape [N]."""
 
-        self._previous_error = zeros(n)
+        self.previous_error = zeros(n)
+        """Rotation error at the end of the last step, for the progress in it [rad], shape [N]."""
         self._reset = zeros(n, dtype=wp.int32)
         self._new_goal = zeros(n, dtype=wp.int32)
         self._world_mask = zeros(n + 1, dtype=wp.bool)
@@ -159,10 +162,12 @@ class ReorientEnv:
         """Curriculum difficulty in [0, 1]; 1 is the configured task."""
         self.parameters.set_difficulty(self.difficulty)
         self.dump_dir = Path()
-        """Where :meth:`check` saves the step of a state that went bad."""
+        """Where :meth:`check` saves the step that failed."""
         self._graph: Any = None
         self._kernels_loaded = False
-        self._steps = 0
+        self.steps = 0
+        """Control steps of all worlds since the begin of the run, with those of a checkpoint."""
+        self._own_steps = 0
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         if cfg.start.at_rest:
             self._rest_poses = find_rest_poses(self)
@@ -209,8 +214,9 @@ class ReorientEnv:
                     self.launch_step()
                 self._graph = capture.graph
             wp.capture_launch(self._graph)
-        self._steps += 1
-        self.randomiser.after_step(self._steps)
+        self.steps += 1
+        self._own_steps += 1
+        self.randomiser.after_step(self.steps)
 
     def launch_physics(self) -> None:
         """Apply the action and run the solver's steps, nothing else (for benchmarks)."""
@@ -246,6 +252,8 @@ class ReorientEnv:
         self._apply_action()
         self.randomiser.disturb()
         sim.step()
+        if self.cfg.failures_per_million > 0.0:
+            sim.put_back(self.step_count, self.max_episode_steps - 1)
         self._fingertips()
         self._motor_torque()
         wp.launch(
@@ -261,9 +269,16 @@ class ReorientEnv:
                 self.goal_quat,
                 self.smoothed,
                 sim.table_force,
-                self._previous_error,
+                self.previous_error,
             ],
             outputs=[self.reward, self.reward_terms, self.rotation_error, self.success, self.fell],
+            device=self.device,
+        )
+        wp.launch(
+            void_step_kernel,
+            dim=n,
+            inputs=[sim.failed],
+            outputs=[self.reward, self.reward_terms, self.success, self.fell],
             device=self.device,
         )
         wp.launch(
@@ -324,7 +339,7 @@ class ReorientEnv:
                 self.step_count,
                 self.goals_reached,
                 self.goal_quat,
-                self._previous_error,
+                self.previous_error,
             ],
             device=self.device,
         )
@@ -415,12 +430,14 @@ class ReorientEnv:
         return self.sim.joint_q.numpy()[:, self.num_actions : self.num_actions + 7].copy()
 
     def check(self) -> None:
-        """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or a state went bad.
+        """Raise :class:`vd.sim.simulator.SimulationError` if contacts were lost or too many steps failed.
 
-        The control step of a state that went bad is saved in ``dump_dir`` for ``vd-bench replay``.
+        The first control step that failed is saved in ``dump_dir`` for ``vd-bench replay``.
         """
+        rate = self.cfg.failures_per_million
+        tolerated = 1.0 + rate * 1e-6 * self._own_steps * self.num_worlds if rate > 0.0 else 0.0
         try:
-            self.sim.check()
+            self.sim.check(tolerated)
         except SimulationError as error:
             dumps = self.sim.dumps()
             if not dumps:
@@ -436,6 +453,10 @@ class ReorientEnv:
                 sim=cfg.sim,
             )
             raise SimulationError(f"{error} (dump: {path})") from error
+
+    def failed_steps(self) -> int:
+        """Steps of worlds that failed and were put back (:attr:`ReorientCfg.failures_per_million`)."""
+        return int(self.sim.failures.numpy().sum())
 
     # Curriculum and checkpoints
 
@@ -458,58 +479,13 @@ class ReorientEnv:
             "difficulty": self.difficulty,
         }
 
-    def _stateful(self) -> dict[str, wp.array]:
-        data = self.sim.solver.mjw_data
-        return {
-            "joint_q": self.sim.joint_q,
-            "joint_qd": self.sim.joint_qd,
-            "target": self.sim.target,
-            "warm_start": data.qacc_warmstart,
-            "smoothed": self.smoothed,
-            "goal_quat": self.goal_quat,
-            "step_count": self.step_count,
-            "goals_reached": self.goals_reached,
-            "previous_error": self._previous_error,
-            "goal_counts": self.goal_counts,
-            "observation": self.observation,
-            "rng": self.rng,
-            **({} if self.views is None else {"view": self.views.view}),
-            **self.randomiser.stateful(),
-            **({} if self.sim.servo is None else self.sim.servo.stateful()),
-            **({} if self.sim.restitution is None else self.sim.restitution.stateful()),
-        }
-
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to continue exactly: simulation, episodes, randomisation, curriculum, RNG."""
-        arrays = {name: array.numpy().copy() for name, array in self._stateful().items()}
-        return {"arrays": arrays, "difficulty": self.difficulty, "steps": self._steps}
+        """Everything needed to continue exactly, see :func:`vd.envs.state.save_state`."""
+        return save_state(self)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`.
-
-        Raises:
-            ValueError: If it belongs to another number of worlds, another hand or another servo model.
-        """
-        if state["arrays"].keys() != self._stateful().keys():
-            raise ValueError(
-                "the saved environment has other servos, views or contacts; resume with hand_layer, "
-                "observation.view, randomisation.effects and randomisation.restitution of the checkpoint, "
-                "or from one without worlds (vd-train export --resumable)"
-            )
-        for name, array in self._stateful().items():
-            saved = state["arrays"][name]
-            if saved.shape != array.numpy().shape:
-                raise ValueError(
-                    f"the saved environment has {name} of shape {saved.shape}, "
-                    f"this one {array.numpy().shape}; "
-                    "resume with the num_worlds and hand of the checkpoint"
-                )
-            array.assign(saved)
-        self._steps = int(state["steps"])
-        self.difficulty = float(state["difficulty"])
-        self.parameters.set_difficulty(self.difficulty)
-        self.randomiser.push()
-        self.sim.forward_kinematics()
+        """Continue from :meth:`state_dict`, see :func:`vd.envs.state.load_state`."""
+        load_state(self, state)
 
     def close(self) -> None:
         """Release the captured graph."""

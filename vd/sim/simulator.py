@@ -9,7 +9,7 @@ from newton.solvers import SolverMuJoCo
 
 from vd.kernels.actions import limit_joint_velocity_kernel
 from vd.kernels.contacts import pair_force_kernel
-from vd.kernels.guard import collect_overflow_kernel, guard_kernel
+from vd.kernels.guard import collect_overflow_kernel, guard_kernel, put_back_kernel
 from vd.paper import PAPER
 from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
@@ -142,7 +142,10 @@ class Simulator:
         self.table_force = wp.zeros(n, dtype=float, device=self.device)
         """Normal force between object and table at the end of the control step [N], shape [N]."""
         self.overflow = wp.zeros(n, dtype=wp.int32, device=self.device)
-        self.bad = wp.zeros(n, dtype=wp.int32, device=self.device)
+        self.failures = wp.zeros(n, dtype=wp.int32, device=self.device)
+        """Control steps that left the finite numbers or were too fast, shape [N]."""
+        self.failed = wp.zeros(n, dtype=wp.int32, device=self.device)
+        """1 where the latest control step did, shape [N]."""
         self._start_q, self._start_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
         self._dump_q, self._dump_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
         self._dump_target = wp.clone(self.target)
@@ -176,7 +179,17 @@ class Simulator:
             guard_kernel,
             dim=self.num_worlds,
             inputs=[self.joint_q, self.joint_qd, self._start_q, self._start_qd, self.target, MAX_SPEED],
-            outputs=[self.bad, self._dump_q, self._dump_qd, self._dump_target],
+            outputs=[self.failures, self._dump_q, self._dump_qd, self._dump_target, self.failed],
+            device=self.device,
+        )
+
+    def put_back(self, step_count: wp.array, last_step: int) -> None:
+        """Put worlds of which this step failed back to its begin, as :func:`put_back_kernel` says."""
+        wp.launch(
+            put_back_kernel,
+            dim=self.num_worlds,
+            inputs=[self.failed, self._start_q, last_step],
+            outputs=[self.joint_q, self.joint_qd, step_count],
             device=self.device,
         )
 
@@ -258,8 +271,11 @@ class Simulator:
         """Refresh ``body_q`` and ``body_qd`` of all worlds from the joint state (after a reset)."""
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
-    def check(self) -> None:
-        """Raise if any step since the last check lost contacts or went non-finite (one host read).
+    def check(self, tolerated: float = 0.0) -> None:
+        """Raise if a step lost contacts, or if more steps failed than are tolerated (two host reads).
+
+        Args:
+            tolerated: Control steps of worlds that may have left the finite numbers or been too fast.
 
         Raises:
             SimulationError: Names the worlds, the numbers and the setting to change.
@@ -277,9 +293,9 @@ class Simulator:
                 f"{len(worlds)} of {self.num_worlds} worlds lost contacts (first: world {worlds[0]}; "
                 f"objects: {', '.join(sorted(names)[:5])}): {'; '.join(lines)}"
             )
-        bad = self.bad.numpy()
-        if bad.any():
-            worlds = np.flatnonzero(bad)
+        failures = self.failures.numpy()
+        if failures.sum() > tolerated:
+            worlds = np.flatnonzero(failures)
             name = self.scene.objects[self.scene.world_object[worlds[0]]].name
             raise SimulationError(
                 f"{len(worlds)} of {self.num_worlds} worlds left the finite numbers or exceeded "
@@ -295,5 +311,5 @@ class Simulator:
         dofs = len(self.velocity_limit)
         return [
             NanDump(int(w), names[self.scene.world_object[w]].name, q[w], qd[w], target[w, :dofs])
-            for w in np.flatnonzero(self.bad.numpy())
+            for w in np.flatnonzero(self.failures.numpy())
         ]

@@ -1,0 +1,65 @@
+"""Saving an environment in the middle of its episodes, and going on from there."""
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
+
+
+def save_state(env: "ReorientEnv") -> dict[str, Any]:
+    """Everything needed to continue exactly: simulation, episodes, randomisation, curriculum, RNG."""
+    arrays = {name: array.numpy().copy() for name, array in _arrays(env).items()}
+    return {"arrays": arrays, "difficulty": env.difficulty, "steps": env.steps}
+
+
+def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
+    """Continue from :func:`save_state`.
+
+    Raises:
+        ValueError: If it belongs to another number of worlds, another hand or another servo model.
+    """
+    here = _arrays(env)
+    if state["arrays"].keys() != here.keys():
+        raise ValueError(
+            "the saved environment has other servos, views or contacts; resume with hand_layer, "
+            "observation.view, randomisation.effects and randomisation.restitution of the checkpoint, "
+            "or from one without worlds (vd-train export --resumable)"
+        )
+    for name, array in here.items():
+        saved = state["arrays"][name]
+        if saved.shape != array.numpy().shape:
+            raise ValueError(
+                f"the saved environment has {name} of shape {saved.shape}, "
+                f"this one {array.numpy().shape}; "
+                "resume with the num_worlds and hand of the checkpoint"
+            )
+        array.assign(saved)
+    env.steps = int(state["steps"])
+    env.difficulty = float(state["difficulty"])
+    env.parameters.set_difficulty(env.difficulty)
+    env.randomiser.push()
+    env.sim.forward_kinematics()
+
+
+def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
+    sim = env.sim
+    return {
+        "joint_q": sim.joint_q,
+        "joint_qd": sim.joint_qd,
+        "target": sim.target,
+        "warm_start": sim.solver.mjw_data.qacc_warmstart,
+        "smoothed": env.smoothed,
+        "goal_quat": env.goal_quat,
+        "step_count": env.step_count,
+        "goals_reached": env.goals_reached,
+        "previous_error": env.previous_error,
+        "goal_counts": env.goal_counts,
+        "observation": env.observation,
+        "rng": env.rng,
+        **({} if env.views is None else {"view": env.views.view}),
+        **env.randomiser.stateful(),
+        **({} if sim.servo is None else sim.servo.stateful()),
+        **({} if sim.restitution is None else sim.restitution.stateful()),
+    }
