@@ -169,6 +169,11 @@ def time_to_success(_: Comparison, row: Row) -> Interval | None:
     return order_interval(np.array(steps) / protocol.control_hz) if steps else None
 
 
+def own_row(comparison: Comparison) -> Row:
+    """The row of a policy's own rule: by its prediction if it is a student, else by the true distance."""
+    return min(comparison.rows, key=lambda row: row.stopped_by != "prediction")
+
+
 @dataclass(frozen=True)
 class Claim:
     """A figure of the paper, and how ours beside it is measured.
@@ -197,11 +202,10 @@ class Claim:
 
     def of(self, comparison: Comparison) -> Interval | float | None:
         """Ours, from the comparison of one policy; None where it has no such figure."""
-        rows = {row.stopped_by: row for row in comparison.rows}
         if self.stopped_by == "own":
-            return self.measure(comparison, rows.get("prediction", rows["true distance"]))
-        row = rows.get(self.stopped_by)
-        return None if row is None else self.measure(comparison, row)
+            return self.measure(comparison, own_row(comparison))
+        rows = [row for row in comparison.rows if row.stopped_by == self.stopped_by]
+        return self.measure(comparison, rows[0]) if rows else None
 
 
 def _table(name: str, key: str) -> tuple[Claim, ...]:

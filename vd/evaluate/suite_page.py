@@ -8,7 +8,7 @@ from vd.evaluate.comparison import Row
 from vd.evaluate.comparison_page import ecdf_figure, labels, outcome_figure, scatter_figure
 from vd.evaluate.report import number, percent
 from vd.evaluate.statistics import Interval
-from vd.evaluate.suite import CLAIMS, NO_STUDENT, Claim, Condition, within
+from vd.evaluate.suite import CLAIMS, NO_STUDENT, Claim, Condition, own_row, within
 from vd.evaluate.suite_plots import distance_figure, friction_figure, object_outcomes_figure
 from vd.page import Page
 from vd.paper import PAPER
@@ -147,7 +147,7 @@ def _cell(result: "SuiteResult", claim: Claim, condition: Condition, policy: str
 def _own(result: "SuiteResult", condition: str, policy: str) -> Row | None:
     """The row of a policy's own rule."""
     comparison = result.found.get((condition, policy))
-    return None if comparison is None else comparison.rows[0]
+    return None if comparison is None else own_row(comparison)
 
 
 def _errors(page: Page, result: "SuiteResult") -> None:
