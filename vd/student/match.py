@@ -72,7 +72,7 @@ class PointMatch(nn.Module):
         spread = self._spread(points[0], found, weight)
         size = spread.flatten(1).norm(dim=1)[:, None, None]
         scaled = spread / (size + TINY)
-        turned = torch.linalg.det(scaled)[:, None]
+        turned = (torch.linalg.cross(scaled[:, 0], scaled[:, 1]) * scaled[:, 2]).sum(dim=1, keepdim=True)
         parts = (orthogonal(scaled), scaled, spread, size.clamp(min=TINY).log())
         return torch.cat([*(part.flatten(1) for part in parts), turned], dim=1)
 
