@@ -28,7 +28,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.kernels": ("vd.kernels",),
     "vd.assets_usd": (*LEAVES, "vd.kernels", "vd.assets_usd"),
     "vd.sim": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim"),
-    "vd.student": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.student"),
+    "vd.student": (*LEAVES, "vd.config", "vd.policy", "vd.kernels", "vd.assets_usd", "vd.student"),
     "vd.envs": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim", "vd.envs"),
     "vd.sensors": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim", "vd.sensors"),
     "vd": ("vd",),
