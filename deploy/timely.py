@@ -4,6 +4,7 @@ import contextlib
 import gc
 import os
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Literal
 
 Priority = Literal["auto", "on", "off"]
@@ -13,6 +14,9 @@ Priority = Literal["auto", "on", "off"]
 @contextlib.contextmanager
 def real_time(wanted: Priority, *, level: int = 0) -> Iterator[bool]:
     """Run before all ordinary programs, as loop and twin need it on a busy machine; both mostly sleep.
+
+    All threads do, those that begin later too: the loop waits for the network's, and the watchdog must not
+    wait for other programs.
 
     Args:
         wanted: Whether to.
@@ -25,13 +29,17 @@ def real_time(wanted: Priority, *, level: int = 0) -> Iterator[bool]:
     Raises:
         OSError: It is wanted, but the system does not have it, or does not permit it.
     """
+    before: dict[int, tuple[int, os.sched_param]] = {}
     try:
         if wanted == "off":
             raise PermissionError("off")
-        before = os.sched_getscheduler(0), os.sched_getparam(0)
         priority = os.sched_param(os.sched_get_priority_min(os.SCHED_RR) + level)
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, priority)
-    except (AttributeError, PermissionError) as error:
+        for thread in (int(entry.name) for entry in Path("/proc/self/task").iterdir()):
+            with contextlib.suppress(ProcessLookupError):  # it has just ended
+                had = os.sched_getscheduler(thread), os.sched_getparam(thread)
+                os.sched_setscheduler(thread, os.SCHED_RR, priority)
+                before[thread] = had
+    except (AttributeError, FileNotFoundError, PermissionError) as error:
         if wanted == "on":
             raise OSError(
                 f"no real-time priority ({error}); on Linux allow it with `ulimit -r 1`, or leave it out"
@@ -41,7 +49,9 @@ def real_time(wanted: Priority, *, level: int = 0) -> Iterator[bool]:
     try:
         yield True
     finally:
-        os.sched_setscheduler(0, *before)
+        for thread, had in before.items():
+            with contextlib.suppress(ProcessLookupError):
+                os.sched_setscheduler(thread, *had)
 
 
 @contextlib.contextmanager
