@@ -171,9 +171,10 @@ def test_a_state_that_is_not_finite_stops_the_run_and_can_be_replayed(tmp_path):
 
 
 @pytest.mark.parametrize("effects", [{}, {"command_delay.delay_s": (0.0, 0.04)}], ids=["drives", "servos"])
-def test_a_run_goes_on_without_the_few_worlds_that_fail(effects):
+def test_a_run_goes_on_without_the_few_worlds_that_fail(tmp_path, effects):
     random = RandomisationCfg(enabled=bool(effects), effects=effects)
     env = make(failures_per_million=1e5, randomisation=random)  # one more in ten steps
+    env.dump_dir = tmp_path
     run(env, 5)
     before = env.step_count.numpy().copy()
     env.sim.joint_qd.numpy()[2, 0] = np.nan
