@@ -13,6 +13,7 @@ from vd.config import to_dict
 from vd.envs.cfg import RandomisationCfg, ReorientCfg, SuccessCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import student as module
+from vd.evaluate.agents import SHIPPED_POLICIES, sees_clouds
 from vd.evaluate.cli import main
 from vd.evaluate.comparison import Comparison
 from vd.evaluate.scanned import MISSING, NOISE_M, ScannedGoalView, scan
@@ -113,6 +114,13 @@ def test_what_it_sees_is_as_its_stage_was_trained_unless_told(env):
         StudentActor(env, make_student(0))
     with pytest.raises(ValueError, match="moves 12 joints, the hand dclaw3 has 9"):
         StudentActor(env, make_student(num_actions=12))
+
+
+def test_an_installed_student_is_known_as_one(tmp_path, monkeypatch):
+    path = tmp_path / "dclaw3-seen.pt"
+    save_student(path, 2)
+    monkeypatch.setitem(SHIPPED_POLICIES, "dclaw3-seen", path)
+    assert sees_clouds("dclaw3-seen") and not sees_clouds("dclaw3-table") and not sees_clouds("zero")
 
 
 def test_a_scan_is_noisy_and_misses_one_side():

@@ -93,7 +93,7 @@ def sees_clouds(name: str) -> bool:
     Raises:
         FileNotFoundError: There is no such policy.
     """
-    if name in BUILT_IN or name in SHIPPED_POLICIES:
+    if name in BUILT_IN:
         return False
     path = find_policy(name)
     if is_bundle(path):
