@@ -109,6 +109,32 @@ class Twin(MotorLine):
             termios.tcflush(self._far, termios.TCIFLUSH)
 
 
+def spoil(motors: Sequence[Motor], put: Sequence[str], heat: Sequence[str]) -> None:
+    """Have motors not be as they should be.
+
+    Args:
+        motors: The motors.
+        put: Items of theirs, each as ID:ITEM=VALUE.
+        heat: How fast they warm [deg C/s], each as ID=DEGREES.
+
+    Raises:
+        ValueError: Names what cannot be.
+    """
+    by_id = {str(motor.id): motor for motor in motors}
+    for text in put:
+        id, _, rest = text.partition(":")
+        item, _, value = rest.partition("=")
+        if id not in by_id or item not in by_id[id].items or not value.lstrip("-").isdigit():
+            raise ValueError(f"--put {text}: give motor, item and whole number, such as 11:id=13")
+        by_id[id].put(item, int(value))
+    for text in heat:
+        id, _, degrees = text.partition("=")
+        try:
+            by_id[id].heat_c_per_s = float(degrees)
+        except (KeyError, ValueError):
+            raise ValueError(f"--heat {text}: give motor and degrees a second, such as 21=50") from None
+
+
 def _end_with_input(twin: Twin) -> None:
     sys.stdin.read()
     twin.end()
@@ -148,6 +174,10 @@ class TwinCommand:
     """Share that is held back for 0.1 s."""
     cut_off: tuple[int, ...] = ()
     """IDs of motors with a loose cable."""
+    put: tuple[str, ...] = ()
+    """Items that are not as they should be, each as ID:ITEM=VALUE: 11:id=13, 22:hardware_error_status=32."""
+    heat: tuple[str, ...] = ()
+    """Motors that warm by themselves, each as ID=DEGREES a second: 21=50."""
     seed: int = 0
     """Of the faults."""
     realtime: Priority = "off"
@@ -182,7 +212,9 @@ class TwinCommand:
                 NewtonHand(hand, joints, SimCfg(physics_hz=self.physics_hz), item=self._item()),
             )
             side = self._beside(plant)
-        twin = Twin([Motor(MODELS[self.model], id) for id in ids], plant, faults, side=side)
+        motors = [Motor(MODELS[self.model], id) for id in ids]
+        spoil(motors, self.put, self.heat)
+        twin = Twin(motors, plant, faults, side=side)
         if self.attached:
             threading.Thread(target=_end_with_input, args=(twin,), daemon=True).start()
         try:

@@ -21,7 +21,7 @@ from vd.deploy.line import Faults, MotorLine  # noqa: E402
 from vd.deploy.motor import Motor  # noqa: E402
 from vd.deploy.packets import ALERT, Failure  # noqa: E402
 from vd.deploy.plant import FirstOrderPlant  # noqa: E402
-from vd.deploy.twin import Twin  # noqa: E402
+from vd.deploy.twin import Twin, spoil  # noqa: E402
 
 IDS = (10, 11, 12)
 MODEL = "XH430-V210"
@@ -229,6 +229,16 @@ def test_the_bus_watchdog_stops_a_motor_that_hears_nothing():
     held = motor.get("present_position")
     assert motor.get("goal_position") == held < to_counts(0.9)
     assert motor.write(motor.items["goal_position"].address, bytes(4)) == Failure.ACCESS
+
+
+def test_a_twin_is_spoilt_on_request():
+    motors = [Motor(MODELS[MODEL], id) for id in IDS]
+    spoil(motors, ["11:id=13", "12:hardware_error_status=32"], ["10=50"])
+    assert [motor.id for motor in motors] == [10, 13, 12]
+    assert motors[2].shut_down and motors[0].heat_c_per_s == 50.0
+    for put, heat in (("99:id=1", "10=1"), ("10:none=1", "10=1"), ("10:id=x", "10=1"), ("10:id=1", "10:1")):
+        with pytest.raises(ValueError, match="such as"):
+            spoil(motors, [put], [heat])
 
 
 def test_a_lost_port_is_an_error_of_the_bus(bus, twin):
