@@ -1,0 +1,174 @@
+"""A run of several processes: the same parameters, own worlds, and errors and hangs of one of them."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from train_dummy import DummyEnv, make_runner
+
+from vd.train.checkpoint import find_checkpoint
+from vd.train.metrics import read_progress
+
+DISTRIBUTED = """
+import json, sys
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+sys.path.insert(0, {tests!r})
+from train_dummy import DummyEnv, make_runner
+from vd.train.checkpoint import find_checkpoint
+import os
+rank, folder = int(os.environ["RANK"]), Path({folder!r})
+runner = make_runner(folder, env=DummyEnv(num_worlds=8, seed=rank), seed=rank, save_every=2)
+runner.learn(2)
+torch.manual_seed(100 + rank)
+runner.load(str(find_checkpoint(folder, "latest")))
+draw = float(torch.rand(()))
+networks = (runner.alg.actor, runner.alg.critic)
+weights = torch.cat([p.detach().flatten() for network in networks for p in network.parameters()])
+target = runner.env.env._target.sum()
+(folder / f"rank{{rank}}.json").write_text(json.dumps(dict(
+    weights=weights.tolist(), draw=draw, target=float(target), steps=runner.env_steps, main=runner.is_main)))
+runner.shutdown()
+"""
+
+
+def _two_processes(code: str, **options) -> list[subprocess.Popen]:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = str(probe.getsockname()[1])
+    # No PATH: nothing may depend on a git binary, which rsl-rl's logger looks for.
+    shared = os.environ | {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "PATH": ""}
+    return [
+        subprocess.Popen(
+            [sys.executable, "-c", code], env=shared | {"RANK": str(r), "LOCAL_RANK": str(r)}, **options
+        )
+        for r in range(2)
+    ]
+
+
+@pytest.mark.slow
+def test_two_processes_keep_the_same_parameters_and_their_own_worlds(tmp_path):
+    code = DISTRIBUTED.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    assert [p.wait(timeout=120) for p in _two_processes(code)] == [0, 0]
+    one, two = (json.loads((tmp_path / f"rank{r}.json").read_text()) for r in range(2))
+    assert one["weights"] == two["weights"]
+    assert one["draw"] != two["draw"] and one["target"] != two["target"]
+    assert one["steps"] == two["steps"] == 2 * 8 * 8 * 2
+    assert one["main"] and not two["main"]
+    assert [row["iteration"] for row in read_progress(tmp_path / "progress.jsonl")] == [1, 2]
+
+    # One process goes on with what two have begun.
+    alone = make_runner(tmp_path, env=DummyEnv(num_worlds=8))
+    alone.load(str(find_checkpoint(tmp_path, "latest")))
+    assert alone.new_episodes == "it is of 2 processes, this run has 1"
+    assert alone.env_steps == one["steps"] and alone.env.env.difficulty == pytest.approx(0.02)
+    networks = (alone.alg.actor, alone.alg.critic)
+    weights = torch.cat([p.detach().flatten() for network in networks for p in network.parameters()])
+    assert weights.tolist() == one["weights"]
+    alone.learn(1)
+    assert [row["env_steps"] for row in read_progress(tmp_path / "progress.jsonl")] == [128, 256, 256 + 64]
+
+
+FAILING = """
+import os, sys
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+sys.path.insert(0, {tests!r})
+from train_dummy import DummyEnv, make_runner
+from vd.train.distributed import ending_together
+rank = int(os.environ["RANK"])
+env = DummyEnv(num_worlds=8, seed=rank)
+runner = make_runner(Path({folder!r}), env=env, seed=rank)
+def check():
+    if rank == 0 and env.steps >= 16:
+        raise RuntimeError("a world went bad")
+env.check = check
+def hang():
+    import time
+    time.sleep(600)
+runner.shutdown = hang  # with NCCL, leaving the group waits for the others
+try:
+    with ending_together():
+        runner.learn(5)
+finally:
+    runner.shutdown()
+"""
+
+
+@pytest.mark.slow
+def test_the_error_of_one_process_is_told_and_ends_it_at_once(tmp_path):
+    code = FAILING.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
+    processes = _two_processes(code, stderr=subprocess.PIPE, text=True)
+    try:
+        _, error = processes[0].communicate(timeout=60)
+        assert processes[0].returncode == 1
+        assert "process 0 failed" in error and "a world went bad" in error
+        # The other one was waiting for it in a collective.
+        assert processes[1].wait(timeout=60) != 0
+    finally:
+        for process in processes:
+            process.kill()
+
+
+HANGING = """
+import os, signal, sys, time
+from datetime import timedelta
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+sys.path.insert(0, {tests!r})
+from train_dummy import DummyEnv, make_runner
+from vd.train import distributed, watchdog
+distributed.COLLECTIVE_TIMEOUT = timedelta(seconds=6)
+watchdog.REPORT_AFTER_S, watchdog.PUBLISH_EVERY_S = 1.5, 0.2
+rank = int(os.environ["RANK"])
+env = DummyEnv(num_worlds=8, seed=rank)
+runner = make_runner(Path({folder!r}), env=env, seed=rank)
+def check():
+    if rank == 1 and env.steps >= 16:
+        {hang}
+env.check = check
+with distributed.ending_together():
+    runner.learn(5)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("hang", "named"),
+    [
+        ("time.sleep(600)", "Process 1 does something else while the others wait for it."),
+        ("os.kill(os.getpid(), signal.SIGSTOP)", "Process 1 does not answer: the others wait for it."),
+    ],
+)
+def test_a_process_that_hangs_is_named_and_the_run_ends(tmp_path, hang, named):
+    code = HANGING.format(tests=str(Path(__file__).parent), folder=str(tmp_path), hang=hang)
+    processes = _two_processes(code, stderr=subprocess.PIPE, text=True)
+    try:
+        _, error = processes[0].communicate(timeout=60)
+        assert processes[0].returncode == 1
+        assert named in error and "--resume" in error
+        assert "process 0: iteration 2, waits for others at vd.train." in error
+        assert "process 0 failed and ends the run" in error  # the wait reached its limit
+    finally:
+        for process in processes:
+            process.kill()
+
+
+def test_the_odd_one_out_is_named_where_no_wait_shows():
+    from vd.train.watchdog import verdict
+
+    def messages(*places):
+        return {rank: [1, 1, False, place] for rank, place in enumerate(places)}
+
+    assert "Process 1 is elsewhere" in verdict(messages("a", "b", "a"), [], 3)
+    assert "Nothing tells" in verdict(messages("a", "b"), [], 2)
+    assert "Nothing tells" in verdict(messages("a", "a", "a"), [], 3)
