@@ -14,11 +14,13 @@ from vd.assets_usd.objects.model import load_set
 from vd.config import to_dict
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import EncoderCfg, NoiseCfg, StudentCfg
+from vd.student.match import Matches
 from vd.student.network import Student
 from vd.student.saved import StudentSpec
 from vd.train.checkpoint import list_checkpoints
 from vd.train.config import RunCfg
 from vd.train.student.config import PretrainCfg
+from vd.train.student.losses import match_loss
 from vd.train.student.pretrain import (
     OBJECT_RANGE_M,
     Pretrainer,
@@ -97,6 +99,22 @@ def test_scenes_are_what_their_targets_say(assets):
         last = links[hand.point_link[-1]]
         expected = Rotation.from_quat(last[3:]).apply(hand.link_points[-1]) + last[:3]
         np.testing.assert_allclose(points[row, clouds.hand][-500:], expected, atol=2e-5)
+
+
+def test_matched_points_are_right_where_the_goal_has_them(assets):
+    """Samples of goal and object are the same points of the shape, in the same order."""
+    scenes = make(assets, replace(QUICK, batch=8), scales=(0.95, 1.05)).scenes
+    _, targets = scenes.draw()
+    points, clouds = wp.to_torch(scenes._points), scenes._clouds
+    item, goal = points[:, clouds.item], points[:, clouds.goal]
+    poses = {"body_q": targets["body_q"], "goal_quat": targets["goal"], "base": 0, "item": -1}
+    present = torch.ones_like(item[..., :1])
+    assert float(match_loss(Matches(item, goal, present), **poses)) < 1e-4
+    off = torch.tensor([0.0, 0.0, 0.02])  # 0.4 units: beyond the bend, 0.4 - 0.5 x 0.2
+    assert float(match_loss(Matches(item, goal + off, present), **poses)) == pytest.approx(0.3, rel=1e-3)
+    present[:, 250:] = 0.0
+    wrong = torch.cat([goal[:, :250], goal[:, 250:] + 1.0], dim=1)
+    assert float(match_loss(Matches(item, wrong, present), **poses)) < 1e-4
 
 
 def test_a_part_of_the_scenes_is_seen_by_a_camera(assets):

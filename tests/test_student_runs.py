@@ -16,6 +16,7 @@ from student_dummy import TINY, make_student_runner
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
+from vd.evaluate.agents import open_teacher
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import NoiseCfg, StudentCfg
 from vd.student.saved import load_student, read_student
@@ -213,10 +214,12 @@ def test_another_network_or_no_teacher_is_explained(tmp_path, stage, capsys):
 def test_stages_on_the_command_line(tmp_path, capsys):
     """Stage 1 by imitation of an installed teacher, stage 2 from it, resumed; then its stopping rule."""
     small = ["--preset", "cpu-demo", "--num-worlds", "2", "--dagger.rollout-steps", "3", "--no-tensorboard"]
-    small += ["--dagger.validation-worlds", "1"]
+    small += ["--dagger.validation-worlds", "1", "--network.turn.vectors", "4"]
     small += ["--task.at-rest", "False"]  # the search for poses at rest takes long
     assert main(["student", *small, "--run-dir", str(tmp_path / "stage1"), "--max-steps", "6"]) == 0
-    second = ["student", *small, "--stage", "2", "--run-dir", str(tmp_path / "stage2")]
+    (row,) = read_progress(tmp_path / "stage1" / "progress.jsonl")
+    assert all(row[f"loss/{name}"] > 0.0 for name in ("imitation", "distance", "pose", "state", "match"))
+    second = ["student", *small[:-2], "--stage", "2", "--run-dir", str(tmp_path / "stage2")]
     assert main([*second, "--max-steps", "6"]) == 0
     assert "begins with the weights of" in capsys.readouterr().out
     resume = ["student", "--run-dir", str(tmp_path / "stage2"), "--resume", "--max-steps", "12"]
@@ -226,6 +229,10 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     path = tmp_path / "stage2" / "student.pt"
     saved = load_student(path)
     assert saved.spec.stage == 2 and saved.spec.teacher == "dclaw4-cube"
+    network = saved.spec.network
+    teacher = open_teacher("dclaw4-cube", "cpu")
+    assert teacher is not None
+    assert network.turn.vectors == 4 and network.state.values == teacher.num_observations
     assert saved.depth["points"] == 2000 and saved.task["randomisation"]["observation_noise_std"] == 0.0
     state = read_student(path)
     state["task"]["episode_s"] = 0.5

@@ -71,8 +71,10 @@ def test_absent_points_count_for_nothing():
         for shape in (one, other)
     ]
     torch.testing.assert_close(found[0], found[1])
-    found = match((other.points, one.points), (other.seen, one.seen), (fewer, present))
-    torch.testing.assert_close(found, match(*(((part), (part)) for part in (one.points, one.seen, present))))
+    found, _ = match((other.points, one.points), (other.seen, one.seen), (fewer, present))
+    torch.testing.assert_close(
+        found, match(*(((part), (part)) for part in (one.points, one.seen, present)))[0]
+    )
 
 
 def test_padded_rows_hold_the_voxels_of_their_cloud(device):
@@ -116,12 +118,12 @@ def test_embedding_sees_shapes_but_not_places_nor_the_hand(device):
     net = turn_encoder(device)
     turned = shape() @ Rotation.random(random_state=2).as_matrix().T
     points = scene(turned, shape())
-    first = net(voxels(points, device))
+    first, _ = net(voxels(points, device))
     moved = points.copy()
     moved[:, ENDS[1] :] += np.float32(0.04)  # 8 voxels, away from goal and hand
     moved[:, ENDS[0] : ENDS[1]] *= np.float32(1.1)
-    torch.testing.assert_close(net(voxels(moved, device)), first, rtol=1e-4, atol=1e-5)
-    other = net(voxels(scene(shape(), shape()), device))
+    torch.testing.assert_close(net(voxels(moved, device))[0], first, rtol=1e-4, atol=1e-5)
+    other, _ = net(voxels(scene(shape(), shape()), device))
     assert (other - first).abs().max() > 1e-3
 
 
@@ -145,17 +147,17 @@ def test_goal_apart_gives_the_same(device):
     net = turn_encoder(device)
     points = scene(shape(seed=1), shape())
     voxelise = Voxeliser(device=device)
-    whole = net(voxels(points, device))
+    whole, _ = net(voxels(points, device))
     parts = [wp.array(part, dtype=wp.vec3, device=device) for part in np.split(points, [GOAL_POINTS], axis=1)]
     goal = voxelise(parts[0], ends=(GOAL_POINTS, GOAL_POINTS))
     rest = voxelise(parts[1], ends=(0, HAND_POINTS))
-    torch.testing.assert_close(net(rest, goal), whole)
+    torch.testing.assert_close(net(rest, goal)[0], whole)
 
 
 def test_a_cloud_without_an_object_is_finite(device):
     points = scene(np.full((ITEM_POINTS, 3), np.nan), shape())
     net = turn_encoder(device)
-    found = net(voxels(points, device))
+    found, _ = net(voxels(points, device))
     found.sum().backward()
     assert torch.isfinite(found).all()
     assert all(p.grad is None or torch.isfinite(p.grad).all() for p in net.parameters())
@@ -232,7 +234,8 @@ def test_matched_points_tell_the_rotation_whichever_part_is_seen():
     part = goal[goal[:, 0] > 0.0]
     own = (part - part.mean(dim=0)) @ turn.T
     ones = (torch.ones(1, len(part), 1), torch.ones(1, len(goal), 1))
-    found = match((own[None], goal[None]), (part[None], goal[None]), ones)
+    found, places = match((own[None], goal[None]), (part[None], goal[None]), ones)
+    assert (places[0] - part).norm(dim=1).median() < 0.1  # of shapes of about one
     rotation, scaled = found[0, :9].view(3, 3), found[0, 9:18].view(3, 3)
     torch.testing.assert_close(rotation, turn, rtol=0.0, atol=0.05)
     assert float(scaled.norm()) == pytest.approx(1.0, abs=0.01) and float(found[0, -1]) > 0.0

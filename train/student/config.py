@@ -57,6 +57,9 @@ class DaggerCfg:
     """Weight of the squared error of an estimate of the teacher's observation, normalised, on which the
     teacher's own layers act (:mod:`vd.student.state`). 0, as in the released code: no such head. A student
     to begin from decides for itself whether it has one."""
+    match_weight: float = 0.0
+    """Weight of how far points of the object are found from where they are on the goal, for a network whose
+    points look for each other (``--network.turn.match``)."""
     clip_labels: bool = False
     """Clip the teacher's mean to [-1, 1], where the environment clips actions; the released code does not."""
     teacher_share: float = PAPER.dagger.teacher_share
@@ -107,6 +110,8 @@ class PretrainCfg:
     """Weight of the squared error of the distance (or of the two columns); 0 leaves it out."""
     joint_weight: float = 1.0
     """Weight of the squared error of joint positions, scaled to [-1, 1]; 0 leaves it out."""
+    match_weight: float = 0.0
+    """Weight of how far points are found from where they are on the goal, as in imitation."""
     near_share: float = 0.0
     """Share of goals at an angle uniform in [0, pi]. The others are uniform on SO(3), where near goals are
     rare: 1 in 300 lies within 0.4 rad."""
@@ -194,6 +199,7 @@ SHORT_ROLLOUTS = DaggerCfg(
     imitation="squared",
     pose_weight=2.0,
     state_weight=2.0,
+    match_weight=1.0,
     clip_labels=True,
     teacher_share=1.0,
     teacher_share_last=0.2,
@@ -232,6 +238,7 @@ def gpu(stage: Stage) -> StudentTrainCfg:
             decay_after_steps=1000,
             amsgrad=False,
             distance="6d",
+            match_weight=1.0,
             near_share=0.5,
             rendered_share=0.5,
             precision="bf16",
@@ -339,6 +346,7 @@ def validate(cfg: StudentTrainCfg) -> None:
         "--dagger.distance-weight": dagger.distance_weight,
         "--dagger.pose-weight": dagger.pose_weight,
         "--dagger.state-weight": dagger.state_weight,
+        "--dagger.match-weight": dagger.match_weight,
         "--dagger.teacher-share-iterations": dagger.teacher_share_iterations,
         "--dagger.warmup-steps": dagger.warmup_steps,
         "--dagger.decay-after-steps": dagger.decay_after_steps,
@@ -347,6 +355,7 @@ def validate(cfg: StudentTrainCfg) -> None:
         "--pretrain.category-weight": pretrain.category_weight,
         "--pretrain.distance-weight": pretrain.distance_weight,
         "--pretrain.joint-weight": pretrain.joint_weight,
+        "--pretrain.match-weight": pretrain.match_weight,
     }
     for flag, value in weights.items():
         if value < 0:

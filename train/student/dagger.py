@@ -13,13 +13,21 @@ import torch
 from torch import nn
 
 from vd.policy import Policy
+from vd.student.match import Matches
 from vd.student.network import Student, StudentOutput
 from vd.student.sites import Sites
 from vd.student.state import StateHead
 from vd.train.ending import TrainingDivergedError
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import DaggerCfg
-from vd.train.student.losses import POSE_VALUES, distance_loss, imitation_figures, imitation_loss, poses
+from vd.train.student.losses import (
+    POSE_VALUES,
+    distance_loss,
+    imitation_figures,
+    imitation_loss,
+    match_loss,
+    poses,
+)
 from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer, scheduled
 from vd.train.student.rollout import UNCLIPPED, Rollout, moved, rollout_bytes, taken
 from vd.train.student.rotations import angle_between
@@ -99,6 +107,7 @@ class Dagger:
             "distance": cfg.distance_weight,
             "pose": cfg.pose_weight,
             "state": cfg.state_weight,
+            "match": cfg.match_weight,
         }
         """Weights of the losses."""
         self.network = nn.ModuleList([student, *([] if self.pose is None else [self.pose])])
@@ -207,7 +216,7 @@ class Dagger:
                 labels.append(self._label(observation[OBSERVATION_GROUP]))
                 sites = self.view.sites(frame, augment=True)
                 senses = self.student.senses(frame)
-                output = self.student(self._encode(sites)[None], senses[None], self._hidden)
+                output = self.student(self._look(sites)[0][None], senses[None], self._hidden)
                 action, std = output.mean[0], output.log_std[0].exp()
                 means.append(action)
                 error = (output.distance[0, :, -1] - frame["distance"]).abs().mean()
@@ -245,7 +254,7 @@ class Dagger:
         means, errors, turns = [], [], []
         with torch.no_grad():
             for part in self._held_out:
-                output, embedding = self._run(part, hidden, augment=False)
+                output, embedding, _ = self._run(part, hidden, augment=False)
                 hidden = output.hidden.masked_fill(part.done[-1, :, None], 0.0)
                 means.append(output.mean)
                 if self.pose is not None:
@@ -293,7 +302,7 @@ class Dagger:
 
     def losses(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Losses of sequences by name, with new noise on their clouds; their weights are in ``weights``."""
-        output, embedding = self._run(rollout, rollout.hidden, augment=True)
+        output, embedding, matches = self._run(rollout, rollout.hidden, augment=True)
         found = {
             "imitation": imitation_loss(
                 output, rollout.label, self.cfg.imitation, bounded=self.cfg.clip_labels
@@ -306,6 +315,11 @@ class Dagger:
         if self.student.state is not None:
             error = output.state - self.student.state.target(rollout.frames["observation"])
             found["state"] = error.square().mean()
+        if matches is not None and self.cfg.match_weight > 0.0:
+            poses_of = (rollout.frames[name].flatten(0, 1) for name in ("body_q", "goal_quat"))
+            scene = self.env.env.scene
+            base, item = int(scene.link_body[0]), scene.object_body
+            found["match"] = match_loss(matches, *poses_of, base=base, item=item)
         return found
 
     def state_dict(self) -> dict[str, Any]:
@@ -376,25 +390,27 @@ class Dagger:
         label = self.teacher.act(observation)
         return label.clamp(-1.0, 1.0) if self.cfg.clip_labels else label
 
-    def _encode(self, sites: tuple[Sites, ...]) -> torch.Tensor:
-        """Embeddings; what follows the encoder is small, and stays in single precision."""
+    def _look(self, sites: tuple[Sites, ...]) -> tuple[torch.Tensor, Matches | None]:
+        """Embeddings and matches; what follows the encoder is small, and stays in single precision."""
         with autocast(self.device, self.cfg.precision):
-            return self.student.encode(*sites).float()
+            embedding, matches = self.student.look(*sites)
+        return embedding.float(), matches
 
     def _run(
         self, rollout: Rollout, hidden: torch.Tensor, *, augment: bool
-    ) -> tuple[StudentOutput, torch.Tensor]:
+    ) -> tuple[StudentOutput, torch.Tensor, Matches | None]:
         """What the student says to sequences of frames, with memory before the first of them [N, G].
 
         Returns:
-            That, and the embeddings of the clouds [T, N, E].
+            That, the embeddings of the clouds [T, N, E], and the matches of the T N clouds.
         """
         steps, count = rollout.done.shape
         flat = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
         sites = self.view.sites(flat, rollout.worlds.repeat(steps), augment=augment)
-        embedding = self._encode(sites).view(steps, count, -1)
+        embedding, matches = self._look(sites)
+        embedding = embedding.view(steps, count, -1)
         output = self.student(embedding, self.student.senses(rollout.frames), hidden, rollout.done)
-        return output, embedding
+        return output, embedding, matches
 
     def _fit_state(self, state: StateHead, rollout: Rollout) -> None:
         """Let the estimate of the teacher's observation begin with the best one in least squares."""
@@ -404,7 +420,7 @@ class Dagger:
         with torch.no_grad():
             for some in worlds.split(self.cfg.minibatch_worlds)[:FIT_BATCHES]:
                 part = taken([rollout], some)
-                output, _ = self._run(part, part.hidden, augment=True)
+                output, _, _ = self._run(part, part.hidden, augment=True)
                 seen.append(output.seen.flatten(0, 1))
                 observed.append(part.frames["observation"].flatten(0, 1))
         state.fit(torch.cat(seen), torch.cat(observed))

@@ -4,13 +4,21 @@ import math
 from collections.abc import Mapping
 
 import torch
+from torch import nn
 
+from vd.paper import PAPER
+from vd.student.match import Matches
 from vd.student.network import StudentOutput
-from vd.train.student.rotations import two_columns
+from vd.train.student.rotations import matrices, two_columns
 from vd.vision import relative_rotation
 
 POSE_SCALE_M = 0.05
 """Positions of objects are predicted in units of this, about their spread."""
+MATCH_SCALE_M = 0.05
+"""Errors of matched points are in units of this, about the radius of an object; beyond a fifth of it they
+count no more than linearly: a camera's points may be of the hand."""
+MATCH_BEND = 0.2
+"""Error at which squared becomes linear, in these units."""
 POSE_VALUES = 9
 """Position 3, two columns of the rotation from the goal 6."""
 
@@ -76,3 +84,32 @@ def poses(frames: Mapping[str, torch.Tensor], body: int) -> torch.Tensor:
     pose = frames["body_q"][..., body, :]
     turn = two_columns(relative_rotation(pose[..., 3:], frames["goal_quat"]))
     return torch.cat((pose[..., :3] / POSE_SCALE_M, turn), dim=-1)
+
+
+def match_loss(
+    matches: Matches, body_q: torch.Tensor, goal_quat: torch.Tensor, *, base: int, item: int
+) -> torch.Tensor:
+    """How far points of objects are found from where they are on their goals, the mean over all.
+
+    Args:
+        matches: Of R clouds.
+        body_q: Body poses in the world frame [R, B, 7].
+        goal_quat: Wanted orientations in the world frame [R, 4].
+        base: The hand's base, a column of ``body_q``.
+        item: The object's column.
+
+    Returns:
+        A scalar.
+    """
+    origin, place = body_q[:, base], body_q[:, item]
+    world, now, wanted = (
+        matrices(two_columns(quaternion)) for quaternion in (origin[:, 3:], place[:, 3:], goal_quat)
+    )
+    centre = (place[:, None, :3] - origin[:, None, :3]) @ world
+    # Rows times a matrix: turned by its transpose. From the base to the object, to the goal, to the base.
+    own = (matches.points - centre) @ world.transpose(1, 2) @ now
+    goal = own @ wanted.transpose(1, 2) @ world + own.new_tensor(PAPER.cloud.goal_position_m)
+    error = nn.functional.smooth_l1_loss(
+        matches.found / MATCH_SCALE_M, goal / MATCH_SCALE_M, reduction="none", beta=MATCH_BEND
+    )
+    return (error.sum(dim=-1, keepdim=True) * matches.present).sum() / matches.present.sum().clamp(min=1.0)

@@ -25,6 +25,7 @@ from vd.student.network import Student
 from vd.student.sites import Sites
 from vd.train.ending import TrainingDivergedError
 from vd.train.student.config import PretrainCfg
+from vd.train.student.losses import match_loss
 from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer, scheduled
 from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
 from vd.vision import relative_rotation, rotation_distance, voxels
@@ -129,7 +130,8 @@ class RandomScenes:
 
         Returns:
             Voxels, and the targets: ``category`` [R], ``distance`` [R] [rad], ``rotation`` [R, 6] (first two
-            columns of the matrix of q_object conj(q_goal)), ``joints`` [R, D] in [-1, 1].
+            columns of the matrix of q_object conj(q_goal)), ``joints`` [R, D] in [-1, 1]; and what they are
+            of, ``body_q`` [R, B, 7], the object last, and ``goal`` [R, 4], until the next batch.
         """
         count, device = self._batch, self._device
         share = torch.rand((count, len(self._lower)), device=device)
@@ -170,6 +172,8 @@ class RandomScenes:
             "distance": rotation_distance(orientation, goal),
             "rotation": two_columns(relative_rotation(orientation, goal)),
             "joints": 2.0 * share - 1.0,
+            "body_q": wp.to_torch(self._body_q),
+            "goal": goal,
         }
         return sites, targets
 
@@ -301,8 +305,8 @@ class Pretrainer:
         """Weighted loss of a batch, and figures to log."""
         cfg = self.cfg
         with autocast(sites[0].device, cfg.precision):
-            embedding = self.student.encode(*sites).float()
-        predictions = self.heads(embedding, self.student)
+            embedding, matches = self.student.look(*sites)
+        predictions = self.heads(embedding.float(), self.student)
         total = targets["distance"].new_zeros(())
         figures: dict[str, torch.Tensor] = {}
         if "category" in predictions:
@@ -327,6 +331,10 @@ class Pretrainer:
             total = total + cfg.joint_weight * error.square().mean()
             radians = (error.detach() * self.scenes.joint_scale_rad).square().mean().sqrt()
             figures |= {"student/joint_error": radians, "loss/joints": error.detach().square().mean()}
+        if matches is not None and cfg.match_weight > 0.0:
+            loss = match_loss(matches, targets["body_q"], targets["goal"], base=0, item=-1)
+            total = total + cfg.match_weight * loss
+            figures |= {"loss/match": loss.detach()}
         return total, figures
 
     def state_dict(self) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def profile_iteration(dagger: Dagger, *, warm_up: int = 1) -> dict[str, float]:
         (view, "frame", "frames, depth images"),
         (view, "sites", "clouds"),
         (view, "_voxelise", "voxels"),
-        (dagger, "_encode", "maps, encoder"),
+        (dagger, "_look", "maps, encoder"),
         (dagger, "_run", "memory, heads"),
         (dagger.optimizer, "step", "optimiser"),
         (torch.Tensor, "backward", "backward"),

@@ -7,6 +7,8 @@ spreads holds the rotation from one to the other (Kabsch 1976), whichever part t
 G clouds, P points of the object, Q of the goal, F values that stay as they are when a cloud is turned.
 """
 
+from dataclasses import dataclass
+
 import torch
 from torch import nn
 
@@ -20,6 +22,18 @@ POLAR_STEPS = 8
 """Steps of Newton and Schulz from a matrix of norm 1 to the nearest rotation."""
 VALUES = 3 * 9 + 2
 """Values of a match: rotation, spread scaled and not, its size and orientation."""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Voxels of objects, and where each is thought to be on the goal; the hand's base frame [m]."""
+
+    points: torch.Tensor
+    """Centres of the object's voxels [G, P, 3]."""
+    found: torch.Tensor
+    """Where the same points are in the goal's cloud [G, P, 3]."""
+    present: torch.Tensor
+    """1 where there is a voxel [G, P, 1]."""
 
 
 def orthogonal(matrix: torch.Tensor) -> torch.Tensor:
@@ -53,7 +67,7 @@ class PointMatch(nn.Module):
         points: tuple[torch.Tensor, torch.Tensor],
         seen: tuple[torch.Tensor, torch.Tensor],
         present: tuple[torch.Tensor, torch.Tensor],
-    ) -> torch.Tensor:
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """What the matched points say.
 
         Args:
@@ -62,7 +76,7 @@ class PointMatch(nn.Module):
             present: 1 where there is a point [G, P, 1], [G, Q, 1].
 
         Returns:
-            Values [G, VALUES].
+            Values [G, VALUES], and where among the goal's points each of the object's is [G, P, 3].
         """
         mine, theirs = (self.describe(values) for values in seen)
         weight = (mine[..., -1:] + ABSENT * (1.0 - present[0])).softmax(dim=1) * present[0]
@@ -74,7 +88,7 @@ class PointMatch(nn.Module):
         scaled = spread / (size + TINY)
         turned = (torch.linalg.cross(scaled[:, 0], scaled[:, 1]) * scaled[:, 2]).sum(dim=1, keepdim=True)
         parts = (orthogonal(scaled), scaled, spread, size.clamp(min=TINY).log())
-        return torch.cat([*(part.flatten(1) for part in parts), turned], dim=1)
+        return torch.cat([*(part.flatten(1) for part in parts), turned], dim=1), found
 
     @staticmethod
     def _spread(points: torch.Tensor, found: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:

@@ -12,6 +12,7 @@ from torch import nn
 
 from vd.paper import PAPER
 from vd.student.cfg import EncoderCfg, StudentCfg
+from vd.student.match import Matches
 from vd.student.sites import Sites
 from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool
 from vd.student.state import StateHead
@@ -207,7 +208,11 @@ class Student(nn.Module):
         return self.mean.weight.new_zeros((worlds, self.cfg.memory))
 
     def encode(self, scene: Sites, goal: Sites | None = None) -> torch.Tensor:
-        """Embeddings [B, E] of clouds.
+        """Embeddings [B, E] of clouds; arguments as of :meth:`look`."""
+        return self.look(scene, goal)[0]
+
+    def look(self, scene: Sites, goal: Sites | None = None) -> tuple[torch.Tensor, Matches | None]:
+        """Embeddings [B, E] of clouds, and what was found of the object on its goal, if that is looked for.
 
         Args:
             scene: Voxels of scene and goal together, or of the scene alone with separate encoders.
@@ -227,10 +232,12 @@ class Student(nn.Module):
         if self.goal_encoder is not None and self.merge_goal is not None and goal is not None:
             both = torch.cat([embedding, self.goal_encoder(goal).to(precision)], dim=-1)
             embedding = torch.relu(self.merge_goal(both))
+        matches = None
         if self.turn is not None and self.merge_turn is not None:
-            both = torch.cat([embedding, self.turn(scene, goal).to(precision)], dim=-1)
+            turned, matches = self.turn(scene, goal)
+            both = torch.cat([embedding, turned.to(precision)], dim=-1)
             embedding = torch.relu(self.merge_turn(both))
-        return embedding
+        return embedding, matches
 
     def forward(
         self,

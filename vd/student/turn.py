@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from vd.student.cfg import TurnCfg
-from vd.student.match import VALUES, PointMatch
+from vd.student.match import VALUES, Matches, PointMatch
 from vd.student.sites import Sites
 
 RADIUS_M = 0.05
@@ -89,6 +89,8 @@ class Shape:
 
     points: torch.Tensor
     """Points about their centre, zeros where there is none [G, P, 3]."""
+    centre: torch.Tensor
+    """Their centre [G, 1, 3]."""
     present: torch.Tensor
     """1 where there is a point [G, P, 1]."""
     vectors: torch.Tensor
@@ -132,7 +134,8 @@ class ShapeVectors(nn.Module):
             whole: Whether they are of a goal, which is never cut off.
         """
         share = present / present.sum(dim=1, keepdim=True).clamp(min=1.0)
-        centred = (points - (points * share).sum(dim=1, keepdim=True)) * present
+        centre = (points * share).sum(dim=1, keepdim=True)
+        centred = (points - centre) * present
         square = centred.square().sum(dim=-1, keepdim=True)
         identity = torch.eye(3, device=points.device, dtype=points.dtype).flatten()
         spread = (centred[..., :, None] * centred[..., None, :]).flatten(-2) - square / 3.0 * identity
@@ -144,7 +147,7 @@ class ShapeVectors(nn.Module):
             vectors, tensors = unit(pooled[..., :3]), unit(pooled[..., 3:])
             along = centred @ vectors.transpose(1, 2)
             seen = torch.cat([far, along, along.square(), spread @ tensors.transpose(1, 2)], dim=-1)
-        return Shape(centred, present, vectors, tensors.unflatten(-1, (3, 3)), seen)
+        return Shape(centred, centre, present, vectors, tensors.unflatten(-1, (3, 3)), seen)
 
 
 class TurnEncoder(nn.Module):
@@ -172,8 +175,12 @@ class TurnEncoder(nn.Module):
         self.hidden = nn.Sequential(nn.Linear(width, embedding), nn.GELU())
         self.out = nn.Linear(width + embedding, embedding)
 
-    def forward(self, sites: Sites, goal: Sites | None = None) -> torch.Tensor:
-        """Embeddings [B, E] of the clouds of ``sites``, the goal's voxels among them or in ``goal``."""
+    def forward(self, sites: Sites, goal: Sites | None = None) -> tuple[torch.Tensor, Matches | None]:
+        """Embeddings [B, E] of the clouds of ``sites``, the goal's voxels among them or in ``goal``.
+
+        Returns:
+            Embeddings, and the points that found each other.
+        """
         item, wanted = item_and_goal(sites, goal)
         with torch.autocast(sites.device.type, enabled=False):
             one = self._shape(sites, item, whole=False)
@@ -184,12 +191,15 @@ class TurnEncoder(nn.Module):
             trust = self.trust(lengths).softmax(dim=1)
             mean = (trust[..., None, None] * turns).sum(dim=1)
             both = (spread @ aim_spread).flatten(1)
-            parts = [turns.flatten(1), mean.flatten(1), lengths, both]
+            parts, matches = [turns.flatten(1), mean.flatten(1), lengths, both], None
             if self.match is not None:
                 pair = ((one.points, other.points), (one.seen, other.seen), (one.present, other.present))
-                parts.append(self.match(*pair))
+                values, found = self.match(*pair)
+                parts.append(values)
+                seen, found = RADIUS_M * (one.points + one.centre), RADIUS_M * (found + other.centre)
+                matches = Matches(seen, found, one.present)
             known = torch.cat(parts, dim=1)
-            return self.out(torch.cat([known, self.hidden(known)], dim=1))
+            return self.out(torch.cat([known, self.hidden(known)], dim=1)), matches
 
     def _shape(self, sites: Sites, chosen: torch.Tensor, *, whole: bool) -> Shape:
         """The shape of some voxels of each cloud."""
