@@ -213,9 +213,9 @@ def _table(name: str, key: str) -> tuple[Claim, ...]:
     return (
         Claim("error at most 0.4 rad", name, within(0.4), key),
         Claim("error at most 0.8 rad", name, within(0.8), f"{key}_rad08"),
-        Claim("median error", name, median_error, f"{key}_median_rad", "rad"),
+        Claim("median error [rad]", name, median_error, f"{key}_median_rad", "rad"),
         Claim("stopped within 0.1 rad", name, stops_within(0.1)),
-        Claim("median time to success", name, time_to_success, unit="s"),
+        Claim("median time to success [s]", name, time_to_success, unit="s"),
         Claim("object lost", name, dropped),
     )
 
@@ -237,8 +237,8 @@ def _air(name: str) -> tuple[Claim, ...]:
     )
     return (
         *stops,
-        Claim("stopped within 0.4 rad after the table went", name, success_without_table),
-        Claim("median time to success", name, time_to_success, "air_time_s", "s"),
+        Claim("stopped within 0.4 rad without the table", name, success_without_table),
+        Claim("median time to success [s]", name, time_to_success, "air_time_s", "s"),
         Claim("object lost", name, dropped, "air_dropped"),
         Claim("object lost within 0.5 s of the table", name, dropped_at_once, "air_dropped_at_once"),
         *(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 from vd.evaluate import plots
 from vd.evaluate.comparison import Row
 from vd.evaluate.comparison_page import ecdf_figure, labels, outcome_figure, scatter_figure
-from vd.evaluate.report import number, percent
+from vd.evaluate.report import number
 from vd.evaluate.statistics import Interval
 from vd.evaluate.suite import CLAIMS, NO_STUDENT, Claim, Condition, own_row, within
 from vd.evaluate.suite_plots import distance_figure, friction_figure, object_outcomes_figure
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from vd.evaluate.suite_run import SuiteResult
 
 NOTHING = "–"  # noqa: RUF001
+LEAST_POINTS = 30
+"""Episodes that did not lose their object, below which errors by distance are not drawn."""
 
 
 def write_suite(result: "SuiteResult", path: Path) -> None:
@@ -100,27 +102,20 @@ def terminal_table(result: "SuiteResult") -> str:
 
 
 def paper_text(claim: Claim) -> str:
-    """What the paper says: ``96.0 % (94.0 to 97.0)``, ``0.12 to 0.13``, ``below 7``, or a dash."""
+    """What the paper says: ``96 % (94 to 97)``, ``0.12 to 0.13``, ``below 7``, or a dash."""
     if claim.paper is None:
         return NOTHING
     value: tuple[float, ...] = getattr(PAPER.results, claim.paper)
     if claim.unit == "share":
-        texts = [f"{100 * part:.1f}" for part in value]
-        return f"{texts[0]} %" if len(texts) == 1 else f"{texts[0]} % ({texts[1]} to {texts[2]})"
+        return _share(*value)
     if claim.unit == "rad":
-        return f"{value[0]:.2f} to {value[1]:.2f} rad"
-    return f"below {value[0]:g} s"
+        return f"{value[0]:.2f} to {value[1]:.2f}"
+    return f"below {value[0]:g}"
 
 
 def _columns(result: "SuiteResult") -> tuple[str, ...]:
-    """Headings of the policies' columns: name and kind, and first one for students where there is none."""
-    short = labels(result.policies)
-    kinds = {row.policy: row.kind for part in result.found.values() for row in part.rows}
-    named = (
-        short[name] if kinds.get(name, name) == name else f"{short[name]} ({kinds[name]})"
-        for name in result.policies
-    )
-    return (*(() if result.students else ("students",)), *named)
+    """Headings of the policies' columns, and first one for students where there is none."""
+    return (*(() if result.students else ("students",)), *labels(result.policies).values())
 
 
 def _cells(result: "SuiteResult", claim: Claim, condition: Condition) -> tuple[str, ...]:
@@ -140,8 +135,16 @@ def _cell(result: "SuiteResult", claim: Claim, condition: Condition, policy: str
         lacks = claim.stopped_by == "prediction" and policy not in result.students
         return "predicts nothing" if lacks else NOTHING
     if isinstance(value, Interval):
-        return percent(value) if claim.unit == "share" else number(value, f" {claim.unit}")
-    return f"{100 * value:.1f} %"
+        share = claim.unit == "share"
+        return _share(value.value, value.low, value.high) if share else number(value)
+    return _share(value)
+
+
+def _share(value: float, *interval: float) -> str:
+    """``85 % (82 to 88)``, with a decimal where whole per cents would hide how small it is."""
+    digits = 0 if interval and value >= 0.1 else 1
+    texts = [f"{100.0 * part:.{digits}f}" for part in (value, *interval)]
+    return f"{texts[0]} %" + (f" ({texts[1]} to {texts[2]})" if interval else "")
 
 
 def _own(result: "SuiteResult", condition: str, policy: str) -> Row | None:
@@ -214,11 +217,12 @@ def _air(page: Page, result: "SuiteResult") -> None:
                 object_outcomes_figure(row),
                 f"{short[policy]}, held-out objects: how episodes of each object end (Figure S12c).",
             )
-            page.figure(
-                distance_figure(row),
-                f"{short[policy]}: error beside the distance that was to go, lost objects left out "
-                "(Figure S12b).",
-            )
+            if sum(not e.fell for e in row.result.episodes) >= LEAST_POINTS:
+                page.figure(
+                    distance_figure(row),
+                    f"{short[policy]}: error beside the distance that was to go, lost objects left out "
+                    "(Figure S12b).",
+                )
 
 
 def _students(page: Page, result: "SuiteResult") -> None:
@@ -246,8 +250,13 @@ def _students(page: Page, result: "SuiteResult") -> None:
 
 
 def _lead(result: "SuiteResult") -> str:
-    reduced = ", the reduced suite" if result.quick else ""
-    return f"{', '.join(labels(result.policies).values())} beside what the paper reports{reduced}"
+    short = labels(result.policies)
+    kinds = {row.policy: row.kind for part in result.found.values() for row in part.rows}
+    named = (
+        short[name] if kinds.get(name, name) == name else f"{short[name]} ({kinds[name]})"
+        for name in result.policies
+    )
+    return f"{', '.join(named)} beside what the paper reports{', the reduced suite' if result.quick else ''}"
 
 
 _HOW_TO_READ = (
