@@ -22,6 +22,7 @@ from vd.deploy.control_table import RAD_PER_COUNT
 from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import move
 from vd.deploy.safety import SafeHand
+from vd.deploy.timely import Priority, real_time, undisturbed
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
@@ -68,6 +69,9 @@ class RecordCfg(HandOptions):
     """Samples a second, as far as the bus allows."""
     safety: SafetyCfg = field(default_factory=lambda: WIDE)
     """Limits."""
+    realtime: Priority = "auto"
+    """Run before all ordinary programs, the twin too: where that is permitted (root, ulimit -r), always, or
+    never."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -259,7 +263,12 @@ def record(cfg: RecordCfg) -> int:
 
     if not cfg.rate_hz > 0.0:
         raise ValueError(f"--rate-hz is {cfg.rate_hz}; it has to be above 0")
-    with connect(replace(cfg, twin_args=f"{TWIN_ARGS} {cfg.twin_args}")) as connection:
+    twin_args = f"{TWIN_ARGS} --realtime {cfg.realtime} {cfg.twin_args}"
+    with (
+        connect(replace(cfg, twin_args=twin_args)) as connection,
+        undisturbed(),
+        real_time(cfg.realtime),
+    ):
         hand = connection.hand
         joints = joints_of(hand, cfg.fingers)
         motions = (

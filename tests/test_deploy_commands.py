@@ -156,12 +156,12 @@ def plan(tmp_path, hand):
 def test_a_plan_is_recorded_and_gone_on_with(line, plan, hand, tmp_path):
     out = tmp_path / "rec"
     first = record.RecordCfg(
-        port=PORT, out=out, fingers=(0,), plan=plan / "f0_j1.json", yes=True, safety=QUICK
+        port=PORT, out=out, fingers=(0,), plan=plan / "f0_j1.json", yes=True, safety=QUICK, realtime="off"
     )
     assert record.record(first) == 0
     before = (out / "plan_000_f0_j1_wave.csv").read_bytes()
     second = record.RecordCfg(
-        port=PORT, out=out, fingers=(0,), plan=plan / "f0_j2.json", yes=True, safety=QUICK
+        port=PORT, out=out, fingers=(0,), plan=plan / "f0_j2.json", yes=True, safety=QUICK, realtime="off"
     )
     assert record.record(second) == 0 and record.record(second) == 0
     assert (out / "plan_000_f0_j1_wave.csv").read_bytes() == before

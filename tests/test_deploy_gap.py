@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -51,8 +52,8 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
 
     monkeypatch.setattr(record, "connect", connect)
     monkeypatch.setattr(record, "motions_of", lambda *_: chosen)
-    cfg = record.RecordCfg(hand="dclaw4", port="simulated", out=tmp_path / "rec", fingers=(0,), yes=True)
-    assert record.record(cfg) == 0
+    cfg = record.RecordCfg(hand="dclaw4", port="simulated", out=tmp_path / "rec", fingers=(0,))
+    assert record.record(replace(cfg, yes=True, realtime="off")) == 0
     candidates = "command_delay,coulomb_friction,backlash"
     out = tmp_path / "gap"
     assert gap.main(["run", str(tmp_path / "rec"), "--out", str(out), "--effects", candidates]) == 0
