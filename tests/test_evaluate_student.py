@@ -206,15 +206,17 @@ def test_students_and_teacher_side_by_side(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_a_bundled_student_in_the_air(tmp_path, capsys):
+def test_a_bundled_student_with_scanned_goals_in_the_air(tmp_path, capsys):
     path = str(tmp_path / "bundle")
     assert train(["bundle", save_student(tmp_path / "student.pt", 1), path]) == 0
-    flags = ["--in-air", "--episodes", "2", "--device", "cpu", "--episode-s", "2.5"]
+    flags = ["--in-air", "--scanned-goals", "--episodes", "2", "--device", "cpu", "--episode-s", "2.5"]
     assert main([path, *flags, "--sees", "rendered", "--output", str(tmp_path / "out")]) == 0
     assert "object falls" in capsys.readouterr().out
     comparison = Comparison.read(tmp_path / "out" / "eval.json")
     by_prediction, by_truth = comparison.rows
     assert by_prediction.sees == "rendered clouds" and by_prediction.result.protocol.in_air
+    assert by_prediction.result.protocol.scanned_goals
+    assert "from scans" in (tmp_path / "out" / "eval.html").read_text()
     assert by_truth.outcomes["object falls"].value + by_truth.outcomes["success"].value > 0.0
 
 
