@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -34,6 +33,7 @@ from vd.paper import PAPER
 if TYPE_CHECKING:
     from vd.assets_usd.objects.model import ObjectModel
     from vd.deploy.flight import Flight
+    from vd.deploy.log import LogWriter
     from vd.deploy.twin_link import TwinLink
 
 HOME_RAD_S = 0.5
@@ -209,8 +209,9 @@ def _fly(
                     status=status.show,
                 )
                 if cfg.air and link is not None:
-                    away = partial(link.place_table, present=False)
-                    threading.Timer(PAPER.scene.air_table_s, away).start()
+                    timer = threading.Timer(PAPER.scene.air_table_s, take_table_away, (link, log))
+                    timer.start()
+                    stack.callback(timer.cancel)
                 outcomes = loop.run(goals)
                 reason = "lost" if "lost" in outcomes else "all goals pursued"
         except BaseException as error:
@@ -245,6 +246,12 @@ def place(safe: SafeHand, pose: np.ndarray, link: "TwinLink | None", *, yes: boo
         clock.sleep(MOVE_S)
     if asked:
         sys.stdin.readline()
+
+
+def take_table_away(link: "TwinLink", log: "LogWriter") -> None:
+    """Leave the object in the air."""
+    link.place_table(present=False)
+    log.event("table", present=False)
 
 
 class StatusLine:
