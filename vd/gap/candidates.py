@@ -193,6 +193,10 @@ class CandidateFits:
                 break
         return best
 
+    def refined(self, fit: JointFit) -> JointFit:
+        """A fit at finer time steps, with the structure of what it leaves."""
+        return self.run([("refine", {"fit": fit, "scales": self.scales})])[0]
+
     def starts(self, present: JointFit, added: Sequence[dict[str, float]]) -> list[dict[str, float]]:
         """Where a fit with a further effect starts: at the present model, and from the nominal one.
 

@@ -14,7 +14,7 @@ from vd.gap.candidates import BETTER, FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIO
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import Explanation, Trial
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXPLAINED, NESTED, NO_GAP, RANDOM
+from vd.gap.judge import EXPLAINED, NESTED, NO_GAP, RANDOM, REPEATABLE
 from vd.gap.telemetry import BEHIND_SENSOR
 from vd.gap.verdict import Verdicts, cancelled
 
@@ -116,7 +116,7 @@ class Selection(CandidateFits, Verdicts):
             self.report(f"another search finds {1e3 * again.rmse:.2f} mrad, not {1e3 * present.rmse:.2f}")
             present = self.refit(again, again.effects)
             rivals = {k: [present if fit is found else fit for fit in fits] for k, fits in rivals.items()}
-        refined = self.run([("refine", {"fit": present, "scales": self.scales})])[0]
+        refined = self.refined(present)
         return self.explained(self.conclude(baseline, present, rivals, evidence, loose, refined, again))
 
     def explained(self, explanation: Explanation) -> Explanation:
@@ -156,7 +156,7 @@ class Selection(CandidateFits, Verdicts):
                 present = revised
                 if settled:
                     break
-            if not grown or present.held_out_rmse < NO_GAP * self.floor:
+            if not grown or self.finished(present):
                 break
             if len(present.effects) >= MAX_EFFECTS:
                 break
@@ -212,6 +212,8 @@ class Selection(CandidateFits, Verdicts):
                 fits = self.look_wider(present, fits)
                 best = self.winner(list(fits.values()))
             accepted, why = self.better(present, best, SEARCH_TAIL)
+            if not accepted and self.whitens(present, best):
+                accepted, why = True, ""
             if not accepted:
                 # The simpler of two stands for the one that contains it only if it earns its place as well.
                 name = best.effects[-1]
@@ -254,9 +256,25 @@ class Selection(CandidateFits, Verdicts):
             self.report(f"+ {name}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
             rivals[name] = list(fits.values())
             present = best
-            if present.held_out_rmse < NO_GAP * self.floor or len(present.effects) >= MAX_EFFECTS:
+            if self.finished(present) or len(present.effects) >= MAX_EFFECTS:
                 break
         return present, rivals, trials
+
+    def finished(self, present: JointFit) -> bool:
+        """Whether a model leaves nothing to explain: noise, of no more than its size."""
+        return present.held_out_rmse < NO_GAP * self.floor and not self.lack_of_fit(self.refined(present))
+
+    def whitens(self, before: JointFit, after: JointFit) -> bool:
+        """Whether a larger model leaves noise where the smaller leaves structure.
+
+        Such a step is earned however little of the error it removes: two limits of one motor do nearly the same,
+        and the smaller model would be refused for what it leaves.
+        """
+        if after.at_bound or after.rmse > EXPLAINED * self.floor or before.rmse > REPEATABLE * self.floor:
+            return False
+        if float(np.quantile(self.weights @ (before.sse - after.sse), 0.025)) <= 0.0:
+            return False
+        return bool(self.lack_of_fit(self.refined(before))) and not self.lack_of_fit(self.refined(after))
 
     def take_apart(self, present: JointFit, asymmetric: JointFit) -> list[JointFit]:
         """Fits with asymmetric friction taken apart: dry friction or a dead zone, and a load or an offset.
@@ -409,7 +427,7 @@ class Selection(CandidateFits, Verdicts):
                 if len(present.effects) < 2:
                     break
                 without = self.refit(present, [e for e in present.effects if e != name])
-                if not self.better(without, present, KEEP_TAIL)[0]:
+                if not self.better(without, present, KEEP_TAIL)[0] and not self.whitens(without, present):
                     self.report(f"- {name}: not needed beside the others")
                     present, changed = without, True
                     break
