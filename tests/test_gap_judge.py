@@ -275,3 +275,27 @@ def test_white_residuals_are_judged_on_all_samples(judge: Verdicts) -> None:
     white = made_up(("acceleration_limit",), unseen, fitted=1.02 * FLOOR)
     lucky = made_up(("acceleration_limit", "load_friction"), FLOOR, fitted=FLOOR)
     assert not judge.better(white, lucky)[0]
+
+
+def test_beside_a_sharp_optimum_that_was_not_found_nothing_else_is_named(judge: Verdicts) -> None:
+    final = made_up(("acceleration_limit", "stribeck_friction"), 9.0 * FLOOR)
+    judge.without = {"acceleration_limit": 0.3, "stribeck_friction": 0.012}
+    assert "acceleration_limit" in judge.beside_sharp(final, "stribeck_friction")
+    assert judge.beside_sharp(final, "acceleration_limit") == ""
+    assert judge.beside_sharp(made_up(final.effects, FLOOR), "stribeck_friction") == "", "found"
+    judge.without["acceleration_limit"] = 0.03
+    assert judge.beside_sharp(final, "stribeck_friction") == "", "not sharp"
+
+
+def test_behind_chance_samples_tell_less(judge: Verdicts) -> None:
+    winner, other = made_up(("dead_zone",), FLOOR), made_up(("coulomb_friction",), 1.008 * FLOOR)
+    assert not judge.tied(winner, other)[0]
+    veiled = replace(judge, veiled=True)
+    assert veiled.tied(winner, other)[0] and not veiled.tied(winner, made_up(("backlash",), 1.2 * FLOOR))[0]
+    assert judge.no_gap(winner) and not veiled.no_gap(winner), (
+        "an effect of six floors leaves half of one there"
+    )
+    assert (
+        veiled.better(made_up((), 1.1 * FLOOR), winner)[0]
+        and not judge.better(made_up((), 1.1 * FLOOR), winner)[0]
+    )

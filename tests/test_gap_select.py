@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from test_gap_judge import FLOOR, made_up
 import vd.kernels.actuators as servo
 from vd.gap.chain import chains
 from vd.gap.coordinates import Coordinate, Scales
-from vd.gap.explanation import Trial
+from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
 from vd.gap.recording import Recording
@@ -20,6 +21,7 @@ from vd.gap.rollout import Rollouts
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import vetoes
+from vd.gap.veil import Veil
 from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain, find
 from vd.kernels.effects import EFFECTS
@@ -380,18 +382,50 @@ def test_a_search_that_fails_is_repeated_before_it_counts() -> None:
     assert selection.search_again(made_up(("backlash",), FLOOR)) is None, "nothing is better than the floor"
 
 
-@pytest.mark.parametrize(("needed", "left"), [((), {"command_jitter"}), (("elastic_transmission",), None)])
-def test_what_was_named_for_what_chance_had_done_goes(needed: tuple[str, ...], left: set[str] | None) -> None:
+def test_an_effect_that_leaves_noise_where_structure_was_is_earned_however_small() -> None:
+    pairs = np.full(10, 400.0)
+
+    def leaving(effects: tuple[str, ...], error: float, shared: float) -> JointFit:
+        return replace(made_up(effects, error), structure=np.stack([shared * FLOOR**2 * pairs, pairs]))
+
     selection, _ = searching([])
-    base = made_up(("command_filter", "elastic_transmission"), 0.006)
+    selection.refined = lambda fit: fit  # type: ignore[method-assign]
+    one = leaving(("supply_sag",), 1.05 * FLOOR, 0.3)
+    both = leaving(("supply_sag", "torque_limit"), 0.95 * FLOOR, 0.02)
+    assert not selection.better(one, both)[0] and selection.whitens(one, both)
+    assert not selection.finished(one) and selection.finished(both)
+    assert not selection.whitens(one, leaving(both.effects, 0.95 * FLOOR, 0.2)), "structure is left"
+    assert not selection.whitens(leaving(("supply_sag",), 1.05 * FLOOR, 0.02), both), "there was none"
+    assert not selection.whitens(leaving((), 9.0 * FLOOR, 9.0), both), "far from the floor it says nothing"
 
-    def refit(present: JointFit, effects: list[str]) -> JointFit:
-        return made_up(tuple(effects), 0.006)
 
-    def with_chance(present: JointFit) -> JointFit:
-        missing = set(needed) - set(present.effects)
-        return made_up((*present.effects, "command_jitter"), 0.009 if missing else 0.004)
+def test_beside_chance_the_search_goes_on_until_the_spread_stays() -> None:
+    baseline, asked = made_up((), 0.010), []
+    spreads = iter([0.003, 0.007, 0.0072, 0.5])
+    veil = Veil(np.zeros(3), np.ones(3))
 
-    selection.refit, selection.add_random = refit, with_chance  # type: ignore[method-assign, assignment]
-    found = selection.without_needless(base, with_chance(base))
-    assert set(found.effects) == (left or {"command_jitter", *needed})
+    def run(calls: list[tuple[str, dict[str, Any]]]) -> list[object]:
+        ((name, options),) = calls
+        asked.append((name, options.get("veil") is veil))
+        if name == "look":
+            return [((next(spreads), 0.1), veil)]
+        return [made_up((*options["fit"].effects, "command_jitter") if name == "fit_jitter" else (), 0.005)]
+
+    selection = replace(searching([])[0], run=run, candidates=("encoder_bias", "command_jitter"))
+    searched: list[Selection] = []
+
+    def explain(inner: Selection, plain: JointFit) -> Explanation:
+        searched.append(inner)
+        final = made_up(("encoder_bias",), FLOOR)
+        one = Accepted("encoder_bias", 1.0, {}, (), (), False)
+        return Explanation(plain, final, "effects", "", (one,))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Selection, "explain", explain)
+        fit, beside = selection.with_random(baseline)
+    assert fit.effects == ("encoder_bias", "command_jitter") and [one.name for one in beside] == [
+        "encoder_bias"
+    ]
+    assert [name for name, _ in asked] == ["look", "fit", "look", "fit", "look", "fit_jitter"]
+    assert all(seen == (name == "fit") for name, seen in asked), "the rest is fitted through the veil"
+    assert all(inner.veiled and "command_jitter" not in inner.candidates for inner in searched)

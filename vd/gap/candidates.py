@@ -8,7 +8,7 @@ import numpy as np
 
 from vd.gap.coordinates import Scales, best_two, sizes, smaller, torque_power
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import AT_FLOOR, EXPLAINED, RANDOM
+from vd.gap.judge import AT_FLOOR, EXPLAINED, RANDOM, SHARP
 from vd.kernels.effects import EFFECTS, EQUIVALENT
 
 SHORT_LIST = 10
@@ -28,7 +28,6 @@ HALF_ITERATIONS = 4
 FULL_ITERATIONS = 12
 SEARCHES = 3
 """Searches for the final model from elsewhere, until one comes back to it."""
-JITTER_START_S = 0.005
 ASTRAY = 2.0
 """Factor from the nominal model beyond which a fit starts from that as well."""
 SEED_STEP = 1000
@@ -56,6 +55,7 @@ class CandidateFits:
         vetoes: Effects that telemetry contradicts, with the reason.
         nominal: Nominal values of the baseline's parameters, by key.
         promised: Share of the squared error that each candidate of the last round could remove at best.
+        veiled: Whether the samples are seen through what chance does to them.
     """
 
     floor: float
@@ -69,6 +69,7 @@ class CandidateFits:
     vetoes: Mapping[str, str] = field(default_factory=dict)
     nominal: Mapping[str, float] = field(default_factory=dict)
     promised: dict[str, float] = field(default_factory=dict)
+    veiled: bool = False
 
     def fit_candidates(
         self, present: JointFit, skip: Sequence[str] = (), vetoed: Sequence[str] = ()
@@ -111,7 +112,7 @@ class CandidateFits:
 
         screened = screen(ranked[:FIRST])
         rest = ranked[FIRST:]
-        if min(fit.rmse for fit in screened) < EXPLAINED * self.floor:
+        if not self.veiled and min(fit.rmse for fit in screened) < EXPLAINED * self.floor:
             # What explains everything has only those to fear that promised nearly as much.
             enough = ALIKE * promise[order[ranked[0]][0]]
             rest = [name for name in rest if promise[order[name][0]] > enough]
@@ -139,6 +140,24 @@ class CandidateFits:
             if found.rmse < fits[name].rmse:
                 fits[name] = found
         return fits
+
+    def look_beside(self, fit: JointFit, whole: float) -> JointFit:
+        """The fit, or a better one beside it where nearly all of the error is gone.
+
+        A profile that cannot follow its command leaves an error with many sharp valleys.
+
+        Args:
+            fit: What was found.
+            whole: Error without any effect [rad].
+        """
+        for number in range(SEARCHES):
+            if not AT_FLOOR * self.floor < fit.rmse < SHARP * whole:
+                break
+            call = {"fit": fit, "scales": self.scales, "seed": self.seed + number * SEED_STEP}
+            found = self.run([("nearby", call)])[0]
+            if found.rmse < BETTER * fit.rmse:
+                fit = self.refit(found, found.effects)
+        return fit
 
     def look_wider(self, present: JointFit, fits: Mapping[str, JointFit]) -> dict[str, JointFit]:
         """The fits of a round, and those of all candidates from every start where these are better."""
@@ -168,17 +187,10 @@ class CandidateFits:
                 result[refit.effects[-1]] = refit
         return result
 
-    def add_random(self, present: JointFit) -> JointFit:
-        """A model with random delays as well."""
-        start = {**present.values, "command_delay.delay_s": JITTER_START_S}
-        call = {
-            "base": present.rows,
-            "effects": present.effects,
-            "starts": [start, {**start, **self.nominal}],
-            "scales": self.scales,
-            "iterations": FULL_ITERATIONS,
-        }
-        return self.run([("fit_jitter", call)])[0]
+    def plain(self, baseline: JointFit) -> Call:
+        """The call that fits the plain model anew."""
+        call = {"base": baseline.rows, "effects": (), "starts": [{}, self.nominal], "scales": self.scales}
+        return "fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits}
 
     def search_again(self, present: JointFit) -> JointFit | None:
         """The final model as searches from elsewhere find it; None at the noise floor: none is better."""

@@ -4,6 +4,7 @@ Every simulation is a rollout of the whole trajectory; all perturbed parameter s
 one call of :class:`vd.gap.rollout.Rollouts`.
 """
 
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -15,6 +16,7 @@ from vd.gap.coordinates import BASELINE_PARAMETERS, Coordinate, Scales, coordina
 from vd.gap.descent import FIRST_DAMPING, LOG_TRUST, Descent, LeastSquares
 from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
+from vd.gap.veil import Veil
 from vd.kernels.chains import MAX_JOINTS
 from vd.kernels.effects import EFFECTS
 
@@ -41,6 +43,8 @@ OTHER_SPREAD = 0.2
 EFFECT_SPREAD = 0.5
 """The same of the effects' parameters."""
 OTHER_ITERATIONS = 16
+NEARBY = (0.001, 0.003, 0.01, 0.03)
+"""Standard deviations of the logarithms of all parameters at starts beside an optimum."""
 
 Trajectories = Sequence[int] | np.ndarray | None
 """Indices of trajectories; None: all."""
@@ -79,6 +83,16 @@ class JointProblem:
             int(t): rollouts.measured[rollouts.sample_trajectory == t, joint] for t in self.trajectories
         }
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
+        self._growth: dict[int, np.ndarray] = {}
+
+    def through(self, veil: Veil) -> "JointProblem":
+        """The same data seen through what chance does to them."""
+        seen = copy.copy(self)
+        names = [int(t) for t in self.trajectories]
+        shift = dict(zip(names, self.split(veil.shift), strict=True))
+        seen._measured = {t: self._measured[t] - shift[t] for t in names}
+        seen._growth = dict(zip(names, self.split(veil.growth), strict=True))
+        return seen
 
     def residuals(
         self,
@@ -98,6 +112,8 @@ class JointProblem:
         predicted = simulation.predict(rows, chosen, joint=self.joint, keep=keep)
         self.simulated += len(rows) * len(chosen) if keep is None else int(keep.sum())
         residual = measured - predicted
+        if self._growth:
+            residual /= np.concatenate([self._growth[t] for t in chosen])
         if keep is not None:
             residual *= np.repeat(keep, [len(self._measured[t]) for t in chosen], axis=1)
         return residual
@@ -316,7 +332,7 @@ class JointProblem:
             residual = self.residuals(result.rows[None])[0]
         finally:
             self.rollouts, self.coarse = rollouts, None
-        structure = self._structure(residual)
+        structure = None if self._growth else self._structure(residual)  # chance has a memory
         return replace(
             result,
             held_out=fit.held_out,
@@ -363,14 +379,30 @@ class JointProblem:
                     {key: fit.values[key] * np.exp(rng.normal(0.0, EFFECT_SPREAD)) for key in inside}
                 )
             starts.append(start)
-        return self.fit(
-            fit.rows,
-            fit.effects,
-            starts,
-            scales,
-            iterations=OTHER_ITERATIONS,
-            trajectories=self.trajectories,
-        )
+        return self._elsewhere(fit, starts, scales)
+
+    def nearby(self, fit: JointFit, scales: Scales, *, seed: int) -> JointFit:
+        """The same model from starts close by, where an optimum is so sharp that there are others beside it.
+
+        Args:
+            fit: What was found.
+            scales: Sizes of the joint's motion.
+            seed: Of the starts.
+
+        Returns:
+            The best, without held-out errors.
+        """
+        rng = np.random.default_rng(seed)
+        starts = [
+            {key: value * np.exp(rng.normal(0.0, spread)) for key, value in fit.values.items()}
+            for spread in NEARBY
+        ]
+        return self._elsewhere(fit, starts, scales)
+
+    def _elsewhere(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> JointFit:
+        """The best fit of the same model from other starts, without held-out errors."""
+        options = {"iterations": OTHER_ITERATIONS, "trajectories": self.trajectories}
+        return self.fit(fit.rows, fit.effects, starts, scales, **options)
 
     def _nominal(self) -> dict[str, float]:
         row = self.rollouts.chain.start_row[self.joint]

@@ -7,16 +7,18 @@ delay. Its result stands in the table as the RMSE that a normal distribution of 
 the same likelihood.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import minimize
 
-from vd.gap.coordinates import Coordinate, Scales, coordinate
+from vd.gap.coordinates import Scales, coordinate
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
+from vd.gap.judge import RANDOM
 from vd.gap.rollout import Rollouts
+from vd.gap.veil import Veil
 
 DRAWS = 16
 """Realisations of the delays."""
@@ -26,11 +28,12 @@ START_SIGMA_DROP = tuple((sigma, drop) for sigma in (0.0015, 0.005, 0.015) for d
 """Where the search starts: [s] and the share of commands dropped."""
 ROUNDS = 2
 """Searches, with the rest of the model linearised anew before the second."""
-NOT_NEAR = 1.5
-"""Error of the best start, in that of a model without chance, from which a search has nothing to find. One of
-1.2 has come down to 0.9."""
+NOISES = (1.0, 3.0, 10.0)
+"""Noise floors that the first guess allows: what the model lacks besides must not look like chance."""
 LARGEST = 2.0
 """Logarithm of the largest equivalent error squared [rad^2]: as good as none."""
+NARROW = 0.5
+"""Share of the first guess that is believed: behind more chance than there is an effect would not show."""
 DAMPING = 1e-4
 TRUST = 0.5
 """Largest shift of a coordinate of the rest of the model in a round."""
@@ -54,7 +57,7 @@ class JitterFit:
 
     Args:
         problem: The joint's data.
-        base: Fit with a constant command delay besides the effects that the joint has.
+        base: Fit of the rest of the model.
         scales: Sizes of the joint's motion.
     """
 
@@ -75,38 +78,48 @@ class JitterFit:
         )
         self.measured = np.concatenate([t.position[:, self._column] for t in chosen])
         self.ends = np.cumsum([len(t.time) for t in chosen])[:-1]
-        self.keep = [i for i, c in enumerate(base.coordinates) if c.key != "command_delay.delay_s"]
-        self.jacobian = problem.jacobian(base)[self.keep]
-        self.shift = np.zeros(len(self.keep))
+        self.jacobian = problem.jacobian(base)
+        self.shift = np.zeros(len(base.x))
 
     @property
     def _column(self) -> int:
         return int(self.problem.rollouts.chain.columns[self.problem.joint])
 
     def row(self, sigma: float, drop: float) -> np.ndarray:
-        """Rows of the chain with the jitter in place of the constant delay."""
+        """Rows of the chain with the jitter."""
         rows = self.base.rows.copy()
-        for c in self.base.coordinates:
-            if c.key == "command_delay.delay_s":
-                rows[self.problem.joint, c.column] = 0.0
         for c, value in zip(self.coordinates, (sigma, drop), strict=True):
             rows[self.problem.joint, c.column] = value
         return rows
 
-    def losses(self, sigma: float, drop: float) -> np.ndarray:
-        """Negative log-likelihood of each trajectory [S], less a constant that all models share.
-
-        The rest of the model moves along, to first order, by weighted least squares.
-        """
+    def draws(self, sigma: float, drop: float) -> tuple[np.ndarray, np.ndarray]:
+        """Mean of the positions [N] [rad] over draws of the delays, and their variance [N] [rad^2]."""
         predicted = self.rollouts.predict(self.row(sigma, drop)[None], joint=self.problem.joint)[0]
         self.problem.simulated += DRAWS * self.size
         draws = predicted.reshape(DRAWS, -1).astype(float)
-        error = self.measured - draws.mean(axis=0)
         spread = np.split(draws.var(axis=0, ddof=1), self.ends)
         kernel = np.ones(SMOOTH) / SMOOTH
         smooth = np.concatenate([np.convolve(part, kernel, mode="same") for part in spread])
         # The mean of the draws has an error of its own.
-        variance = self.problem.floor**2 + (1.0 + 1.0 / DRAWS) * smooth
+        return draws.mean(axis=0), (1.0 + 1.0 / DRAWS) * smooth
+
+    def losses(self, sigma: float, drop: float, noises: Sequence[float] = (1.0,)) -> np.ndarray:
+        """Negative log-likelihood of each trajectory [S], less a constant that all models share.
+
+        The rest of the model moves along, to first order, by weighted least squares.
+
+        Args:
+            sigma: Standard deviation of the delays [s].
+            drop: Share of commands dropped.
+            noises: Factors on the noise floor; the likeliest counts.
+        """
+        mean, spread = self.draws(sigma, drop)
+        tried = [
+            self._likelihood(self.measured - mean, spread + (n * self.problem.floor) ** 2) for n in noises
+        ]
+        return min(tried, key=lambda losses: float(losses.sum()))
+
+    def _likelihood(self, error: np.ndarray, variance: np.ndarray) -> np.ndarray:
         weighted = self.jacobian / variance
         gram = weighted @ self.jacobian.T
         gram += np.diag(DAMPING * np.diag(gram) + DAMPING)
@@ -115,32 +128,32 @@ class JitterFit:
         losses = 0.5 * (np.log(variance) + error**2 / variance)
         return np.array([part.sum() for part in np.split(losses, self.ends)])
 
-    def fit(self, worst: float) -> JointFit:
-        """The jitter with the largest likelihood, as a fit like any other.
+    def guess(self) -> tuple[float, float]:
+        """Less than the likeliest of the starts, whatever else the model lacks: that counts as noise."""
+        totals = [float(self.losses(*start, NOISES).sum()) for start in START_SIGMA_DROP]
+        sigma, drop = START_SIGMA_DROP[int(np.argmin(totals))]
+        return NARROW * sigma, NARROW * drop
 
-        Args:
-            worst: Squared error of a model without chance [rad^2]. Where no start of the search comes near
-                that (``NOT_NEAR``) there is no jitter to be found.
-        """
+    def veil(self, sigma: float, drop: float) -> Veil:
+        """What the delays do to the samples, for fits of the rest of the model."""
+        mean, spread = self.draws(sigma, drop)
+        without = self.measured - self.problem.residuals(self.base.rows[None])[0]
+        return Veil(mean - without, np.sqrt(1.0 + spread / self.problem.floor**2))
+
+    def search(self, start: tuple[float, float]) -> tuple[float, float]:
+        """The values of the largest likelihood; the rest of the model moves along."""
 
         def total(x: np.ndarray) -> float:
             return float(self.losses(*self._values(x)).sum())
 
-        starts = np.log(np.array(START_SIGMA_DROP))
-        totals = [total(x) for x in starts]
-        start = starts[int(np.argmin(totals))]
-        sigma, drop = self._values(start)
-        here = self.losses(sigma, drop)
-        if self._equivalent(here).sum() > NOT_NEAR**2 * worst:
-            return self._as_fit(sigma, drop, here)
+        x = np.log(np.array(start))
         for _ in range(ROUNDS):
-            simplex = start + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0]])
+            simplex = x + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, 1.0]])
             options = {"maxfev": EVALUATIONS, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.5}
-            start = minimize(total, start, method="Nelder-Mead", options=options).x
-            sigma, drop = self._values(start)
-            self.losses(sigma, drop)
+            x = minimize(total, x, method="Nelder-Mead", options=options).x
+            self.losses(*self._values(x))
             self._move(self.shift)
-        return self._result(sigma, drop)
+        return self._values(x)
 
     def _equivalent(self, losses: np.ndarray) -> np.ndarray:
         """Squared errors that a normal distribution of constant width has at the same likelihood [S]."""
@@ -181,18 +194,17 @@ class JitterFit:
     def _move(self, shift: np.ndarray) -> None:
         """Take the shift of the rest of the model, and linearise it there."""
         x = self.base.x.copy()
-        for i, change in zip(self.keep, shift, strict=True):
-            c = self.base.coordinates[i]
+        for i, (c, change) in enumerate(zip(self.base.coordinates, shift, strict=True)):
             x[i] = min(max(x[i] + change, c.lower), c.upper)
         rows = self.problem.rows(self.base.rows, self.base.coordinates, x[None])[0]
         self.base = replace(self.base, x=x, rows=rows)
-        self.jacobian = self.problem.jacobian(self.base)[self.keep]
+        self.jacobian = self.problem.jacobian(self.base)
 
     def _values(self, x: np.ndarray) -> tuple[float, float]:
         sigma, drop = (float(v) for v in np.exp(x))
         return self._limited(sigma, drop)
 
-    def _result(self, sigma: float, drop: float) -> JointFit:
+    def result(self, sigma: float, drop: float) -> JointFit:
         """Equivalent errors, and the likelihood's curvature in the place of the Gauss-Newton matrices."""
         x = np.array([c.inverse(v) for c, v in zip(self.coordinates, (sigma, drop), strict=True)])
         steps = np.maximum(STEP * x, [c.inverse(LEAST_DROP) for c in self.coordinates])
@@ -218,18 +230,14 @@ class JitterFit:
 
     def _as_fit(self, sigma: float, drop: float, here: np.ndarray) -> JointFit:
         """A pair of values, and the losses there, as a fit whose matrices leave them out."""
-        keep = self.keep
         x = [c.inverse(v) for c, v in zip(self.coordinates, (sigma, drop), strict=True)]
-        size, equivalent = len(keep) + 2, self._equivalent(here)
+        size, equivalent = len(self.base.x) + 2, self._equivalent(here)
         gram, gradient = np.zeros((self.size, size, size)), np.zeros((self.size, size))
-        gram[:, : size - 2, : size - 2] = self.base.gram[:, keep][:, :, keep]
-        gradient[:, : size - 2] = self.base.gradient[:, keep]
-        coordinates: list[Coordinate] = [*(self.base.coordinates[i] for i in keep), *self.coordinates]
-        effects = tuple(e for e in self.base.effects if e != "command_delay")
+        gram[:, : size - 2, : size - 2], gradient[:, : size - 2] = self.base.gram, self.base.gradient
         return JointFit(
-            effects=(*effects, "command_jitter"),
-            coordinates=tuple(coordinates),
-            x=np.concatenate([self.base.x[keep], x]),
+            effects=(*self.base.effects, RANDOM),
+            coordinates=(*self.base.coordinates, *self.coordinates),
+            x=np.concatenate([self.base.x, x]),
             rows=self.row(sigma, drop),
             sse=equivalent,
             held_out=equivalent,
@@ -239,15 +247,20 @@ class JitterFit:
         )
 
 
-def fit_jitter(
-    problem: JointProblem,
-    base: np.ndarray,
-    effects: Sequence[str],
-    starts: Sequence[Mapping[str, float]],
-    scales: Scales,
-    iterations: int,
-) -> JointFit:
-    """Fit ``effects`` and jitter: first with a constant delay for its mean, then its spread."""
-    fit = problem.fit(base, (*effects, "command_delay"), starts, scales, iterations=iterations)
-    left = problem.residuals(base[None])[0]
-    return JitterFit(problem, fit, scales).fit(float(left @ left))
+def look(
+    problem: JointProblem, fit: JointFit, scales: Scales, start: tuple[float, float] | None = None
+) -> tuple[tuple[float, float], Veil]:
+    """The likeliest jitter of a model and what it does to the samples; a first guess without a start."""
+    jitter = JitterFit(problem, fit, scales)
+    values = jitter.guess() if start is None else jitter.search(start)
+    return values, jitter.veil(*values)
+
+
+def fit_jitter(problem: JointProblem, fit: JointFit, scales: Scales, start: tuple[float, float]) -> JointFit:
+    """The model with jitter of the largest likelihood, as a fit like any other."""
+    jitter = JitterFit(problem, fit, scales)
+    return jitter.result(*jitter.search(start))
+
+
+CALLS = {"look": look, "fit_jitter": fit_jitter}
+"""What is asked of a joint's problem by name, besides its methods."""

@@ -26,6 +26,10 @@ MIN_GAIN = 0.05
 """Share of the held-out RMSE that an effect must remove."""
 MIN_GAIN_FLOORS = 0.7
 """Gap that an effect must close, as sqrt(before^2 - after^2), in noise floors."""
+VEILED_GAIN_FLOORS = 0.3
+"""The same through what chance does to the samples: an effect of six floors leaves half of one there."""
+MEMORY = 8.0
+"""Samples in a row that say the same through it: what a late command does lasts that long."""
 MIN_SHARE = 0.02
 """The same in whole gaps: no fit of a large effect is better than that. With half of it, an acceleration
 limit of 300 noise floors, whose optimum is sharp, comes with a second effect that is not there."""
@@ -57,6 +61,8 @@ AT_FLOOR = 1.3
 search ends in above it is that search's failure."""
 FORMS = {"torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag"}
 """Forms of one loss, of torque where much is asked."""
+SHARP = 0.1
+"""Share of an error from which what an effect leaves of it lies in a valley that is sharp."""
 RANDOM = "command_jitter"
 """The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
 
@@ -70,12 +76,22 @@ class Judge:
         weights: Bootstrap weights of the trajectories [R, S].
         whole: Held-out RMSE of the baseline [rad]; what is small beside it is the model's own error.
         without: Held-out RMSE of the present model without each of its effects [rad].
+        veiled: Whether the samples are seen through what chance does to them (:mod:`vd.gap.veil`).
     """
 
     floor: float
     weights: np.ndarray
     whole: float = 0.0
     without: dict[str, float] = field(default_factory=dict)
+    veiled: bool = False
+
+    def white(self, fit: JointFit) -> bool:
+        """Whether samples tell how good a fit is: it leaves no more than noise, or chance, on all of them."""
+        return self.veiled or fit.rmse < EXPLAINED * self.floor
+
+    def no_gap(self, fit: JointFit) -> bool:
+        """Whether a fit predicts as well as noise lets it; how well chance does is not known as exactly."""
+        return not self.veiled and fit.held_out_rmse < NO_GAP * self.floor
 
     def scores(
         self, fits: Sequence[JointFit], weights: np.ndarray | None = None, fitted: bool = False
@@ -91,7 +107,7 @@ class Judge:
 
         Of these, samples tell more than the luck of a held-out motion.
         """
-        at_floor = [fit for fit in fits if fit.rmse < EXPLAINED * self.floor]
+        at_floor = [fit for fit in fits if self.white(fit)]
         found = at_floor or fits
         return found[int(np.argmin(self.scores(found, fitted=bool(at_floor))))]
 
@@ -124,7 +140,7 @@ class Judge:
             after: The larger.
             tail: Share of the resamples that may see no gain.
         """
-        white = min(before.rmse, after.rmse) < EXPLAINED * self.floor and RANDOM not in before.effects
+        white = (self.white(before) or self.white(after)) and RANDOM not in before.effects
         if white:
             before, after = (replace(fit, held_out=fit.sse) for fit in (before, after))
         old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
@@ -147,7 +163,7 @@ class Judge:
             return False, "its gain over trajectories is not distinguishable from 0"
         if closed < MIN_SHARE * self.whole and not white:
             return False, "what it removes is small beside the whole gap"
-        if closed < MIN_GAIN_FLOORS * self.floor:
+        if closed < (VEILED_GAIN_FLOORS if self.veiled else MIN_GAIN_FLOORS) * self.floor:
             return False, "what it removes is below the noise floor"
         return True, ""
 
@@ -166,11 +182,12 @@ class Judge:
         """
         best, error = (rmse(fit.held_out, fit.count, self.weights) for fit in (winner, other))
         low, high = interval(error - best)
-        if winner.rmse < EXPLAINED * self.floor:
+        if self.white(winner):
             excess = (other.rmse**2 - winner.rmse**2) / self.floor**2
             if excess > 0.0:  # what needs more parameters to do worse is no equal
                 more = max(len(other.x) - len(winner.x), 0)
                 excess += 2.0 * PENALTY * more * (winner.rmse / self.floor) ** 2
+            excess /= MEMORY if self.veiled else 1.0
             if loose or excess < SMALL_EXCESS_FLOORS**2 or excess >= EXCESS_FLOORS**2:
                 return excess < (CONTAINED_FLOORS if loose else SMALL_EXCESS_FLOORS) ** 2, (low, high)
             return float(np.quantile(self.weights @ (other.sse - winner.sse), TIE_TAIL)) <= 0.0, (low, high)

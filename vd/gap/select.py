@@ -6,16 +6,18 @@ A step of the search is tentative; :mod:`vd.gap.verdict` has the last word.
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 import vd.kernels.actuators as servo
-from vd.gap.candidates import BETTER, FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIONS, CandidateFits
+from vd.gap.candidates import BETTER, FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIONS, Call, CandidateFits
 from vd.gap.coordinates import sizes
-from vd.gap.explanation import Explanation, Trial
+from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXPLAINED, NESTED, NO_GAP, RANDOM, REPEATABLE
+from vd.gap.judge import EXPLAINED, NESTED, RANDOM, REPEATABLE
 from vd.gap.telemetry import BEHIND_SENSOR
+from vd.gap.veil import Veil
 from vd.gap.verdict import Verdicts, cancelled
 
 MIN_TRAJECTORIES = 3
@@ -33,6 +35,10 @@ LOOKS = 2
 """Rounds in which they are: each costs as much as several others."""
 NEAR = 4.0
 """A final error between ``NO_GAP`` and this, in noise floors, is worth a search from another first effect."""
+VEILS = 2
+"""Searches for what there is beside random delays, each with these as they are beside what the last found."""
+SAME_SPREAD = 0.1
+"""Relative change of their standard deviation up to which they are the same."""
 SEARCH_TAIL = 0.4
 """Share of the resamples that may see no gain from an effect while the search goes on: one of two causes
 alone can make some motions worse."""
@@ -66,7 +72,7 @@ class Selection(CandidateFits, Verdicts):
                 f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_TRAJECTORIES} at least"
             )
             return Explanation(baseline, baseline, "under_excited", text)
-        if baseline.held_out_rmse < NO_GAP * self.floor:
+        if self.no_gap(baseline):
             if loose:
                 return Explanation(baseline, baseline, "under_excited", loose)
             return Explanation(baseline, baseline, "no_gap", "the plain model is within the noise floor")
@@ -77,7 +83,7 @@ class Selection(CandidateFits, Verdicts):
         first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
         tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
         for name in sorted(first, key=lambda n: first[n].rmse):
-            if present.effects and present.held_out_rmse <= NO_GAP * self.floor:
+            if present.effects and self.no_gap(present):
                 break
             # Far from the floor another path would change little, unless its beginning was as good.
             far = present.effects and present.held_out_rmse >= NEAR * self.floor
@@ -98,8 +104,9 @@ class Selection(CandidateFits, Verdicts):
         behind = set(BEHIND_SENSOR) & set(self.vetoes) & set(self.candidates)
         if present.effects and (behind or (len(present.effects) > 1 and set(rivals) != set(present.effects))):
             rivals = {name: self.rivals(present, name) for name in present.effects}
-        if present.held_out_rmse > NO_GAP * self.floor:
-            chance, rows = self.try_random(baseline, present)
+        beside: tuple[Accepted, ...] = ()
+        if not self.no_gap(present):
+            chance, beside, rows = self.try_random(baseline, present)
             trials += rows
             if chance is not present:
                 present, rivals = chance, {}
@@ -109,7 +116,7 @@ class Selection(CandidateFits, Verdicts):
             rivals = {name: self.rivals(present, name) for name in present.effects}
         evidence = self.settle(trials, present)
         if not present.effects or RANDOM in present.effects:
-            return self.conclude(baseline, present, rivals, evidence, loose)
+            return self.conclude(baseline, present, rivals, evidence, loose, known=beside)
         found = present
         again = self.search_again(present)
         if again is not None and again.rmse < BETTER * present.rmse:
@@ -211,6 +218,7 @@ class Selection(CandidateFits, Verdicts):
                 self.looks -= 1
                 fits = self.look_wider(present, fits)
                 best = self.winner(list(fits.values()))
+            best = fits[best.effects[-1]] = self.look_beside(best, self.whole)
             accepted, why = self.better(present, best, SEARCH_TAIL)
             if not accepted and self.whitens(present, best):
                 accepted, why = True, ""
@@ -262,13 +270,13 @@ class Selection(CandidateFits, Verdicts):
 
     def finished(self, present: JointFit) -> bool:
         """Whether a model leaves nothing to explain: noise, of no more than its size."""
-        return present.held_out_rmse < NO_GAP * self.floor and not self.lack_of_fit(self.refined(present))
+        return self.no_gap(present) and not self.lack_of_fit(self.refined(present))
 
     def whitens(self, before: JointFit, after: JointFit) -> bool:
         """Whether a larger model leaves noise where the smaller leaves structure.
 
-        Such a step is earned however little of the error it removes: two limits of one motor do nearly the same,
-        and the smaller model would be refused for what it leaves.
+        Such a step is earned however little of the error it removes: two limits of one motor do nearly the
+        same, and the smaller model would be refused for what it leaves.
         """
         if after.at_bound or after.rmse > EXPLAINED * self.floor or before.rmse > REPEATABLE * self.floor:
             return False
@@ -348,43 +356,66 @@ class Selection(CandidateFits, Verdicts):
             f"{FRICTION_AND_LOAD}.tau_minus_nm": max(level + load, 0.0),
         }
 
-    def try_random(self, baseline: JointFit, present: JointFit) -> tuple[JointFit, list[Trial]]:
-        """What nothing else explains can be chance: random delays in the final model, or alone."""
-        if RANDOM not in self.candidates or RANDOM in self.vetoes:
-            return present, []
-        if "command_delay" in present.effects:
-            present_base = self.refit(present, [e for e in present.effects if e != "command_delay"])
-        else:
-            present_base = present
-        tries = [self.add_random(present_base)]
-        if present_base.effects:
-            alone = self.add_random(baseline)
-            if not self.better(alone, tries[0])[0]:
-                tries = [alone]
-        best = self.winner(tries)
-        accepted, why = self.better(present, best)
-        gain, ci = self.gain(present, best)
-        decision = "named" if accepted else "rejected"
-        row = Trial(MAX_ROUNDS, RANDOM, best, gain, ci, decision, why or "its spread is what is measured")
-        if accepted:
-            best = self.without_needless(present_base, best)
-            self.report(
-                f"+ {RANDOM}: as likely as {1e3 * best.held_out_rmse:.2f} mrad of constant width, "
-                f"before {1e3 * present.held_out_rmse:.2f}"
-            )
-        return (best if accepted else present), [row]
+    def try_random(
+        self, baseline: JointFit, present: JointFit
+    ) -> tuple[JointFit, tuple[Accepted, ...], list[Trial]]:
+        """What nothing else explains can be chance: random delays, and what is to be found beside them.
 
-    def without_needless(self, base: JointFit, random: JointFit) -> JointFit:
-        """The model with random delays, less the effects that were named for what chance had done."""
-        for name in base.effects:
-            if name not in random.effects:
-                continue
-            fewer = self.refit(base, [e for e in base.effects if e in random.effects and e != name])
-            simpler = self.add_random(fewer)
-            if not self.better(simpler, random)[0]:
-                self.report(f"- {name}: not needed beside {RANDOM}")
-                random = simpler
-        return random
+        Returns:
+            The better model; what it has besides random delays, if it has these; and the evidence.
+        """
+        if RANDOM not in self.candidates or RANDOM in self.vetoes:
+            return present, (), []
+        random, beside = self.with_random(baseline)
+        accepted, why = self.better(present, random)
+        gain, ci = self.gain(present, random)
+        decision = "named" if accepted else "rejected"
+        row = Trial(MAX_ROUNDS, RANDOM, random, gain, ci, decision, why or "its spread is what is measured")
+        if not accepted:
+            return present, (), [row]
+        names, before, after = " and ".join(random.effects), present.held_out_rmse, random.held_out_rmse
+        text = f"as likely as {1e3 * after:.2f} mrad of constant width, before {1e3 * before:.2f}"
+        self.report(f"+ {names}: {text}")
+        return random, beside, [row]
+
+    def with_random(self, baseline: JointFit) -> tuple[JointFit, tuple[Accepted, ...]]:
+        """The model with random delays, and what is named beside them.
+
+        The search is the same, through what the delays do to the samples; they and what is found beside them
+        are looked for in turn.
+        """
+        jitter, veil = self.run([("look", {"fit": baseline, "scales": self.scales})])[0]
+        for _ in range(VEILS):
+            inner = self.behind(veil)
+            plain = inner.run([self.plain(baseline)])[0]
+            found = inner.explain(plain)
+            clear = found.verdict in ("effects", "ambiguous")
+            rest, beside = (found.final, found.accepted) if clear else (plain, ())
+            before = jitter
+            call = {"fit": rest, "scales": self.scales, "start": jitter}
+            jitter, veil = self.run([("look", call)])[0]
+            if abs(np.log(jitter[0] / before[0])) < SAME_SPREAD:
+                break
+        call = {"fit": rest, "scales": self.scales, "start": jitter}
+        return self.run([("fit_jitter", call)])[0], beside
+
+    def behind(self, veil: Veil) -> "Selection":
+        """The same search, through what chance does to the samples."""
+
+        def run(calls: list[Call]) -> list[Any]:
+            return self.run([(name, {**options, "veil": veil}) for name, options in calls])
+
+        return replace(
+            self,
+            run=run,
+            candidates=[name for name in self.candidates if name != RANDOM],
+            restarts=0,
+            veiled=True,
+            report=lambda line: self.report(f"beside {RANDOM}: {line}"),
+            without={},
+            apart={},
+            promised={},
+        )
 
     def judge(
         self,

@@ -16,7 +16,7 @@ import warp as wp
 from vd.gap.chain import Chain
 from vd.gap.crowd import Crowd
 from vd.gap.fit import JointProblem
-from vd.gap.jitter import fit_jitter
+from vd.gap.jitter import CALLS
 from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
 
@@ -106,13 +106,16 @@ class Bench:
         return self._problems[key]
 
     def call(self, spec: JointSpec, call: Call) -> Answer:
-        """Run a method of the problem."""
-        problem = copy.copy(self.problem(spec))  # calls side by side count, and change the time step
+        """Run a method of the problem, seen through the ``veil`` among its arguments."""
+        name, options = call[0], dict(call[1])
+        veil = options.pop("veil", None)
+        problem = self.problem(spec)
+        # Calls side by side count, and change the time step.
+        problem = copy.copy(problem) if veil is None else problem.through(veil)
         problem.simulated, begin = 0, time.perf_counter()
-        if call[0] == "fit_jitter":
-            result = fit_jitter(problem, **call[1])
-        else:
-            result = getattr(problem, call[0])(**call[1])
+        call_of = CALLS.get(name, getattr(JointProblem, name, None))
+        assert call_of is not None, f"nothing of a joint's problem is called {name}"
+        result = call_of(problem, **options)
         return Answer(result, problem.simulated, time.perf_counter() - begin)
 
 

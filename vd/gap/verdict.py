@@ -10,7 +10,6 @@ from vd.gap.explanation import NAMED, Accepted, Explanation, Trial, estimates, i
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import (
     AT_FLOOR,
-    EXPLAINED,
     FORMS,
     FULLER_FLOORS,
     MIN_SHARE,
@@ -18,6 +17,7 @@ from vd.gap.judge import (
     RANDOM,
     RECOVERED,
     REPEATABLE,
+    SHARP,
     Judge,
 )
 
@@ -77,6 +77,7 @@ class Verdicts(Judge):
         loose: str,
         refined: JointFit | None = None,
         again: JointFit | None = None,
+        known: Sequence[Accepted] = (),
     ) -> Explanation:
         """Confidence, sets and verdict of the final model.
 
@@ -88,15 +89,17 @@ class Verdicts(Judge):
             loose: What of the baseline the motions leave open.
             refined: The final model at finer time steps, whose values are reported.
             again: The final model as another search finds it.
+            known: Effects that are judged already.
         """
         told = final if refined is None else refined
         spread = intervals(told, self.floor)
-        accepted = []
-        for name in final.effects:
+        accepted = [*known]
+        for name in [n for n in final.effects if n not in {one.name for one in known}]:
             fits = rivals.get(name, [final])
             one = self.accept(final, name, fits, spread, told)
             if not one.tied:
-                one = replace(one, doubt=self.disagreement(baseline, final, name, fits, again))
+                doubt = self.disagreement(baseline, final, name, fits, again)
+                one = replace(one, doubt=doubt or self.beside_sharp(final, name))
             accepted.append(one)
         explanation = Explanation(baseline, told, "unknown", "", tuple(accepted), tuple(trials), rivals)
         if not accepted:
@@ -172,6 +175,17 @@ class Verdicts(Judge):
             "that it gains"
         )
 
+    def beside_sharp(self, final: JointFit, name: str) -> str:
+        """Why an effect is no name beside one whose sharp optimum was not found, or nothing.
+
+        It may stand for what the other fit still lacks.
+        """
+        sharp = [o for o in final.effects if o != name and SHARP * self.without.get(o, 0.0) > final.rmse]
+        if not sharp or final.rmse < AT_FLOOR * self.floor:
+            return ""
+        floors = final.rmse / self.floor
+        return f"{name} can be what the fit of {sharp[0]} lacks, which ends {floors:.1f} noise floors off"
+
     def accept(
         self,
         final: JointFit,
@@ -184,7 +198,7 @@ class Verdicts(Judge):
         own = next((fit for fit in rivals if fit.effects and fit.effects[-1] == name), None)
         mine = final if own is None or any(fit is final for fit in rivals) else own
         others = [fit for fit in rivals if fit is not mine and fit.effects[-1] != name]
-        white = mine.rmse < EXPLAINED * self.floor
+        white = self.white(mine)
         choice = np.argmin(self.scores([mine, *others], self.weights, fitted=white), axis=0)
         simple = {i + 1 for i, fit in enumerate(others) if name in NESTED.get(fit.effects[-1], ())}
         share = float(np.mean([c == 0 or c in simple for c in choice]))

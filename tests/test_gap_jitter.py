@@ -1,0 +1,94 @@
+"""Delays that vary by chance: how much they vary, what that does to samples, what is found beside them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_gap_fit import problem_of
+
+from vd.gap.explanation import intervals
+from vd.gap.fit import JointProblem
+from vd.gap.hide import Hidden, Hiding, simulate_hidden
+from vd.gap.jitter import fit_jitter, look
+from vd.gap.joint_fit import JointFit
+from vd.gap.veil import Veil
+from vd.gap.workflow import explain
+
+JITTER = {"sigma_s": 0.008, "p_drop": 0.05}
+BIAS = {"bias_rad": 0.005}
+
+
+def hidden(**effects: dict[str, float]) -> Hidden:
+    (found,) = simulate_hidden([Hiding("servo", effects={"command_jitter": JITTER, **effects}, seed=11)])
+    return found
+
+
+def fitted(problem: JointProblem, *effects: str, start: dict[str, float] | None = None) -> JointFit:
+    base = problem.rollouts.chain.start_row
+    scales = problem.scales(base[0], problem.floor)
+    speed = {"velocity_limit": 1.05 * scales.speed}
+    return problem.fit(base, effects, [{**speed, **(start or {})}], scales)
+
+
+def test_a_veil_takes_the_mean_and_weighs_by_the_spread() -> None:
+    seen = problem_of(hidden().recording)
+    rows = seen.rollouts.chain.start_row[None]
+    plain = seen.residuals(rows)[0]
+    rng = np.random.default_rng(0)
+    veil = Veil(rng.normal(0.0, 1e-3, plain.size), rng.uniform(1.0, 9.0, plain.size))
+    through = seen.through(veil)
+    assert through.residuals(rows)[0] == pytest.approx((plain - veil.shift) / veil.growth, rel=1e-9)
+    last = [int(seen.trajectories[-1])]
+    part = seen.split(veil.shift)[-1], seen.split(veil.growth)[-1]
+    assert through.residuals(rows, last)[0] == pytest.approx((seen.split(plain)[-1] - part[0]) / part[1])
+    assert seen.residuals(rows)[0] == pytest.approx(plain), "the problem itself has not changed"
+
+
+def test_through_its_veil_a_right_model_leaves_the_noise_floor_and_chance_bends_no_parameter() -> None:
+    made = hidden()
+    seen = problem_of(made.recording)
+    naive = fitted(seen)
+    jitter, veil = look(seen, naive, seen.scales(naive.rows[0], seen.floor))
+    for _ in range(2):
+        behind = fitted(seen.through(veil))
+        jitter, veil = look(seen, behind, seen.scales(behind.rows[0], seen.floor), jitter)
+    behind = fitted(seen.through(veil))
+    assert 0.5 < jitter[0] / JITTER["sigma_s"] < 1.5, "what is dropped is late as well"
+    assert naive.rmse > 3.0 * seen.floor
+    assert 0.7 * seen.floor < behind.rmse < 1.3 * seen.floor
+    true = [made.truth["base"][key]["joint"] for key in ("inertia", "kp")]
+    inertia = 3.0 * true[0] / true[1]  # torques are known up to one factor, which the nominal stiffness holds
+    assert abs(behind.values["inertia"] - inertia) < 0.5 * abs(naive.values["inertia"] - inertia)
+    calm = np.concatenate([np.abs(t.command[:, 0] - t.command[0, 0]) < 1e-9 for t in _motions(seen)])
+    assert np.median(veil.growth[calm]) < 1.1 < np.median(veil.growth[~calm])
+
+
+def test_the_likelihood_finds_the_jitter_beside_an_effect() -> None:
+    seen = problem_of(hidden(encoder_bias=BIAS).recording)
+    fit = fitted(seen, "encoder_bias", start={"encoder_bias.bias_rad": 0.002})
+    scales = seen.scales(fit.rows[0], seen.floor)
+    both = fit_jitter(seen, fit, scales, (0.003, 0.01))
+    assert both.effects == ("encoder_bias", "command_jitter")
+    low, high = intervals(both, seen.floor)["command_jitter.sigma_s"]
+    assert low < JITTER["sigma_s"] < high
+    alone = fit_jitter(seen, fitted(seen), scales, (0.003, 0.01))
+    assert both.rmse < 0.8 * alone.rmse
+
+
+def test_an_effect_is_named_beside_chance(tmp_path: Path) -> None:
+    effects = ("command_jitter", "encoder_bias", "dead_zone")
+    report = explain(hidden(encoder_bias=BIAS).recording, None, tmp_path, workers=1, effects=effects)
+    assert {effect.name for effect in report.effects} == {"command_jitter", "encoder_bias"}
+    bias = next(e for e in report.effects if e.name == "encoder_bias").parameters["bias_rad"]
+    assert bias.value == pytest.approx(BIAS["bias_rad"], rel=0.2) and bias.ci95[0] < bias.value < bias.ci95[1]
+
+
+def test_nothing_is_named_beside_chance_alone(tmp_path: Path) -> None:
+    effects = ("command_jitter", "command_filter")
+    report = explain(hidden().recording, None, tmp_path, workers=1, effects=effects)
+    assert [effect.name for effect in report.effects] == ["command_jitter"]
+
+
+def _motions(problem: JointProblem) -> list:
+    recording = problem.rollouts.recording
+    return [recording.trajectories[int(t)] for t in problem.trajectories]
