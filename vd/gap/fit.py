@@ -401,8 +401,14 @@ class JointProblem:
 
     def _elsewhere(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> JointFit:
         """The best fit of the same model from other starts, without held-out errors."""
-        options = {"iterations": OTHER_ITERATIONS, "trajectories": self.trajectories}
-        return self.fit(fit.rows, fit.effects, starts, scales, **options)
+        return self.fit(
+            fit.rows,
+            fit.effects,
+            starts,
+            scales,
+            iterations=OTHER_ITERATIONS,
+            trajectories=self.trajectories,
+        )
 
     def _nominal(self) -> dict[str, float]:
         row = self.rollouts.chain.start_row[self.joint]

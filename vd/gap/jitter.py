@@ -2,13 +2,14 @@
 
 Many draws of the delays give the mean and variance of the position at every sample. The likelihood of
 what was measured, under a normal distribution with that mean and that variance on top of the noise
-floor, is maximised over the jitter's two parameters; the rest of the model is that of the best constant
-delay. Its result stands in the table as the RMSE that a normal distribution of constant width would need for
+floor, is maximised over the jitter's two parameters; the rest of the model is fitted through what the delays
+do to the samples (:mod:`vd.gap.veil`). The result stands in the table as the RMSE that a normal distribution of constant width would need for
 the same likelihood.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -262,5 +263,5 @@ def fit_jitter(problem: JointProblem, fit: JointFit, scales: Scales, start: tupl
     return jitter.result(*jitter.search(start))
 
 
-CALLS = {"look": look, "fit_jitter": fit_jitter}
+CALLS: dict[str, Callable[..., Any]] = {"look": look, "fit_jitter": fit_jitter}
 """What is asked of a joint's problem by name, besides its methods."""

@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import warp as wp
@@ -113,9 +114,8 @@ class Bench:
         # Calls side by side count, and change the time step.
         problem = copy.copy(problem) if veil is None else problem.through(veil)
         problem.simulated, begin = 0, time.perf_counter()
-        call_of = CALLS.get(name, getattr(JointProblem, name, None))
-        assert call_of is not None, f"nothing of a joint's problem is called {name}"
-        result = call_of(problem, **options)
+        method = partial(CALLS[name], problem) if name in CALLS else getattr(problem, name)
+        result = method(**options)
         return Answer(result, problem.simulated, time.perf_counter() - begin)
 
 
