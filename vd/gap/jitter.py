@@ -2,9 +2,9 @@
 
 Many draws of the delays give the mean and variance of the position at every sample. The likelihood of
 what was measured, under a normal distribution with that mean and that variance on top of the noise
-floor, is maximised over the jitter's two parameters; the rest of the model is fitted through what the delays
-do to the samples (:mod:`vd.gap.veil`). The result stands in the table as the RMSE that a normal distribution of constant width would need for
-the same likelihood.
+floor, is maximised over the jitter's two parameters; the rest of the model is fitted through what the
+delays do to the samples (:mod:`vd.gap.veil`). The result stands in the table as the RMSE that a normal
+distribution of constant width would need for the same likelihood.
 """
 
 from collections.abc import Callable, Sequence
