@@ -34,6 +34,14 @@ SEED_STEP = 1000
 BETTER = 0.98
 """Share of the error from which another search for the same model has found a better one."""
 
+IN_RICHER = {
+    "stribeck_friction": ("tau_s_nm", "tau_c_nm"),
+    "asymmetric_friction": ("tau_plus_nm", "tau_minus_nm"),
+    "torque_speed_limit": ("tau_stall_nm",),
+    "elastic_transmission": ("j_kgm2",),
+}
+"""Parameters of an effect whose mean is the only one of the simpler effect in it."""
+
 Call = tuple[str, dict[str, Any]]
 Run = Callable[[list[Call]], list[Any]]
 """Runs methods of the joint's :class:`vd.gap.fit.JointProblem` by name, in parallel."""
@@ -243,6 +251,19 @@ class CandidateFits:
                 "refits": self.refits if iterations == FULL_ITERATIONS else 0,
             },
         )
+
+    def from_richer(self, present: JointFit, name: str, simpler: str) -> JointFit:
+        """The fit with a simpler effect in the place of one that contains it, from what that one found."""
+        rows, values = present.rows.copy(), present.values
+        own = {p.name: values[f"{name}.{p.name}"] for p in EFFECTS[name].parameters}
+        for parameter in EFFECTS[name].parameters:
+            rows[self.joint, parameter.column] = parameter.neutral
+        size = float(np.mean([own[key] for key in IN_RICHER[name]]))
+        start = {key: value for key, value in values.items() if not key.startswith(f"{name}.")}
+        start[f"{simpler}.{EFFECTS[simpler].parameters[0].name}"] = size
+        kept = tuple(effect for effect in present.effects if effect != name)
+        call = {"base": rows, "effects": (*kept, simpler), "starts": [start], "scales": self.scales}
+        return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0]
 
     def refit(self, present: JointFit, effects: Sequence[str]) -> JointFit:
         """The fit with only some of a model's effects."""

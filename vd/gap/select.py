@@ -105,7 +105,7 @@ class Selection(CandidateFits, Verdicts):
         if present.effects and (behind or (len(present.effects) > 1 and set(rivals) != set(present.effects))):
             rivals = {name: self.rivals(present, name) for name in present.effects}
         beside: tuple[Accepted, ...] = ()
-        if not self.no_gap(present):
+        if not self.no_gap(present) and not self.white(present):  # what is fitted well leaves none to chance
             chance, beside, rows = self.try_random(baseline, present)
             trials += rows
             if chance is not present:
@@ -481,4 +481,13 @@ class Selection(CandidateFits, Verdicts):
         # Beside Coulomb friction, a friction that contains it is no other cause.
         contains = [c for c, simpler in NESTED.items() if set(simpler) & set(without.effects)]
         fits = self.fit_candidates(without, skip=(name, *contains), vetoed=tuple(BEHIND_SENSOR))
+        for simpler in {*NESTED.get(name, ())} & {*self.candidates} - {
+            *self.vetoes,
+            *contains,
+            *without.effects,
+        }:
+            # Near a sharp optimum a simpler effect is found from what contains it, if from anywhere.
+            inside = self.from_richer(present, name, simpler)
+            if simpler not in fits or inside.rmse < fits[simpler].rmse:
+                fits[simpler] = inside
         return [present, *fits.values()]
