@@ -299,3 +299,14 @@ def test_behind_chance_samples_tell_less(judge: Verdicts) -> None:
         veiled.better(made_up((), 1.1 * FLOOR), winner)[0]
         and not judge.better(made_up((), 1.1 * FLOOR), winner)[0]
     )
+
+
+def test_beside_a_gap_of_hundreds_of_floors_a_small_excess_tells_nothing(judge: Verdicts) -> None:
+    winner, other = (
+        made_up(("stribeck_friction",), 1.02 * FLOOR),
+        made_up(("coulomb_friction",), 1.09 * FLOOR),
+    )
+    assert not judge.tied(winner, other)[0] and judge.winner([winner, other]) is winner
+    sharp = replace(judge, whole=280.0 * FLOOR)
+    assert sharp.tied(winner, other)[0] and sharp.winner([winner, other]) is other
+    assert not sharp.tied(winner, made_up(("backlash",), 1.5 * FLOOR))[0]

@@ -51,6 +51,9 @@ CONTAINED_FLOORS = 0.15
 FULLER_FLOORS = 0.04
 """What a fuller form of a loss must leave less, in noise floors, not to be the simpler one: chance gives
 that much in one of two hundred recordings."""
+SHARP_SHARE = 0.002
+"""All three in whole gaps: beside an acceleration limit of 283 noise floors one right model ended 0.5 floors
+above a wrong one, as no descent ends at the very bottom of so sharp an optimum."""
 RECOVERED = 0.5
 """Share of the squared gap that the named effects must recover; less is an unknown cause."""
 REPEATABLE = 2.0
@@ -188,8 +191,12 @@ class Judge:
                 more = max(len(other.x) - len(winner.x), 0)
                 excess += 2.0 * PENALTY * more * (winner.rmse / self.floor) ** 2
             excess /= MEMORY if self.veiled else 1.0
-            if loose or excess < SMALL_EXCESS_FLOORS**2 or excess >= EXCESS_FLOORS**2:
-                return excess < (CONTAINED_FLOORS if loose else SMALL_EXCESS_FLOORS) ** 2, (low, high)
+            least = SHARP_SHARE * self.whole / self.floor
+            contained, small, sure = (
+                max(floors, least) ** 2 for floors in (CONTAINED_FLOORS, SMALL_EXCESS_FLOORS, EXCESS_FLOORS)
+            )
+            if loose or excess < small or excess >= sure:
+                return excess < (contained if loose else small), (low, high)
             return float(np.quantile(self.weights @ (other.sse - winner.sse), TIE_TAIL)) <= 0.0, (low, high)
         return float(np.quantile(error - best, TIE_TAIL)) <= 0.0, (low, high)
 
