@@ -110,6 +110,8 @@ class Selection(CandidateFits, Verdicts):
             trials += rows
             if chance is not present:
                 present, rivals = chance, {}
+                if RANDOM not in present.effects:
+                    present, rivals = self.revise(present)
         together = self.put_together(present)
         if together is not present:
             present = together
@@ -367,6 +369,11 @@ class Selection(CandidateFits, Verdicts):
         if RANDOM not in self.candidates or RANDOM in self.vetoes:
             return present, (), []
         random, beside = self.with_random(baseline)
+        rest = self.refit(random, [name for name in random.effects if name != RANDOM])
+        if rest.effects and not self.better(rest, random)[0] and self.best([present, rest]) is rest:
+            # No chance is needed: it has only smoothed the way to where the search before did not come.
+            self.report(f"+ {' and '.join(rest.effects)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")
+            return rest, (), []
         accepted, why = self.better(present, random)
         gain, ci = self.gain(present, random)
         decision = "named" if accepted else "rejected"
