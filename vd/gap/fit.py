@@ -393,22 +393,14 @@ class JointProblem:
             The best, without held-out errors.
         """
         rng = np.random.default_rng(seed)
-        starts = [
-            {key: value * np.exp(rng.normal(0.0, spread)) for key, value in fit.values.items()}
-            for spread in NEARBY
-        ]
+        values = fit.values.items()
+        starts = [{key: value * np.exp(rng.normal(0.0, near)) for key, value in values} for near in NEARBY]
         return self._elsewhere(fit, starts, scales)
 
     def _elsewhere(self, fit: JointFit, starts: Sequence[Mapping[str, float]], scales: Scales) -> JointFit:
         """The best fit of the same model from other starts, without held-out errors."""
-        return self.fit(
-            fit.rows,
-            fit.effects,
-            starts,
-            scales,
-            iterations=OTHER_ITERATIONS,
-            trajectories=self.trajectories,
-        )
+        number, every = OTHER_ITERATIONS, self.trajectories
+        return self.fit(fit.rows, fit.effects, starts, scales, iterations=number, trajectories=every)
 
     def _nominal(self) -> dict[str, float]:
         row = self.rollouts.chain.start_row[self.joint]
