@@ -23,10 +23,10 @@ PANELS = (
     ("student/distance_error", "mean error of the predicted distance [rad]", 1.0),
     ("success_per_goal", "goals reached while it explores [%]", 100.0),
     ("student/category", "objects told right [%]", 100.0),
+    ("student/rotation_error", "mean error of the predicted rotation\nfrom the goal, stage 0 [rad]", 1.0),
     ("student/joint_error", "error of joint positions,\nroot mean square [rad]", 1.0),
     ("loss/imitation", "imitation loss", 1.0),
-    ("loss/distance", "loss of the distance", 1.0),
-    ("policy/std", "mean std of the actions", 1.0),
+    ("loss/state", "loss of the estimated observation", 1.0),
     ("steps_per_s", "control steps (stage 0: clouds) per second", 1.0),
 )
 """Quantity, title and factor of each panel; those that no run has are left out."""
