@@ -21,8 +21,8 @@ from vd.deploy.plant import Plant
 
 BYTE_S = 10.0 / BAUD_RATE
 """Eight bits, a start bit and a stop bit."""
-TICK_S = 0.001
-"""How often the plant goes on."""
+TICK_S = 0.005
+"""How often the plant goes on where nobody asks, as in the twin."""
 POLL_S = 0.0005
 """Time that a program spends on asking for bytes that are not there."""
 
