@@ -233,6 +233,7 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     teacher = open_teacher("dclaw4-cube", "cpu")
     assert teacher is not None
     assert network.turn.vectors == 4 and network.state.values == teacher.num_observations
+    assert saved.network.state is not None and saved.network.state.fitted
     assert saved.depth["points"] == 2000 and saved.task["randomisation"]["observation_noise_std"] == 0.0
     state = read_student(path)
     state["task"]["episode_s"] = 0.5
