@@ -11,6 +11,7 @@ from test_gap_judge import FLOOR, made_up
 
 import vd.kernels.actuators as servo
 from vd.gap.chain import chains
+from vd.gap.chance import with_random
 from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.fit import JointProblem
@@ -419,13 +420,18 @@ def test_beside_chance_the_search_goes_on_until_the_spread_stays() -> None:
         searched.append(inner)
         final = made_up(("encoder_bias",), FLOOR)
         one = Accepted("encoder_bias", 1.0, {}, (), (), False)
-        return Explanation(plain, final, "effects", "", (one,))
+        return Explanation(
+            plain, final, "effects", "", (one,), (Trial(1, one.name, final, 0.5, (0.4, 0.6), "named"),)
+        )
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Selection, "explain", explain)
-        fit, beside = selection.with_random(baseline)
+        fit, beside, rows = with_random(selection, baseline)
     assert fit.effects == ("encoder_bias", "command_jitter") and [one.name for one in beside] == [
         "encoder_bias"
+    ]
+    assert [(row.name, row.fit.effects) for row in rows] == [
+        ("encoder_bias", ("command_jitter", "encoder_bias"))
     ]
     assert [name for name, _ in asked] == ["look", "fit", "look", "fit", "look", "fit_jitter"]
     assert all(seen == (name == "fit") for name, seen in asked), "the rest is fitted through the veil"

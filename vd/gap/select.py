@@ -6,18 +6,17 @@ A step of the search is tentative; :mod:`vd.gap.verdict` has the last word.
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 import vd.kernels.actuators as servo
-from vd.gap.candidates import BETTER, FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIONS, Call, CandidateFits
+from vd.gap.candidates import BETTER, FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIONS, CandidateFits
+from vd.gap.chance import try_random
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import EXPLAINED, NESTED, RANDOM, REPEATABLE
 from vd.gap.telemetry import BEHIND_SENSOR
-from vd.gap.veil import Veil
 from vd.gap.verdict import Verdicts, cancelled
 
 MIN_TRAJECTORIES = 3
@@ -35,10 +34,6 @@ LOOKS = 2
 """Rounds in which they are: each costs as much as several others."""
 NEAR = 4.0
 """A final error between ``NO_GAP`` and this, in noise floors, is worth a search from another first effect."""
-VEILS = 2
-"""Searches for what there is beside random delays, each with these as they are beside what the last found."""
-SAME_SPREAD = 0.1
-"""Relative change of their standard deviation up to which they are the same."""
 SEARCH_TAIL = 0.4
 """Share of the resamples that may see no gain from an effect while the search goes on: one of two causes
 alone can make some motions worse."""
@@ -106,8 +101,8 @@ class Selection(CandidateFits, Verdicts):
             rivals = {name: self.rivals(present, name) for name in present.effects}
         beside: tuple[Accepted, ...] = ()
         if not self.no_gap(present) and not self.white(present):  # what is fitted well leaves none to chance
-            chance, beside, rows = self.try_random(baseline, present)
-            trials += rows
+            chance, beside, rows = try_random(self, baseline, present)
+            trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
             if chance is not present:
                 present, rivals = chance, {}
                 if RANDOM not in present.effects:
@@ -357,72 +352,6 @@ class Selection(CandidateFits, Verdicts):
             f"{FRICTION_AND_LOAD}.tau_plus_nm": max(level - load, 0.0),
             f"{FRICTION_AND_LOAD}.tau_minus_nm": max(level + load, 0.0),
         }
-
-    def try_random(
-        self, baseline: JointFit, present: JointFit
-    ) -> tuple[JointFit, tuple[Accepted, ...], list[Trial]]:
-        """What nothing else explains can be chance: random delays, and what is to be found beside them.
-
-        Returns:
-            The better model; what it has besides random delays, if it has these; and the evidence.
-        """
-        if RANDOM not in self.candidates or RANDOM in self.vetoes:
-            return present, (), []
-        random, beside = self.with_random(baseline)
-        rest = self.refit(random, [name for name in random.effects if name != RANDOM])
-        if rest.effects and not self.better(rest, random)[0] and self.best([present, rest]) is rest:
-            # No chance is needed: it has only smoothed the way to where the search before did not come.
-            self.report(f"+ {' and '.join(rest.effects)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")
-            return rest, (), []
-        accepted, why = self.better(present, random)
-        gain, ci = self.gain(present, random)
-        decision = "named" if accepted else "rejected"
-        row = Trial(MAX_ROUNDS, RANDOM, random, gain, ci, decision, why or "its spread is what is measured")
-        if not accepted:
-            return present, (), [row]
-        names, before, after = " and ".join(random.effects), present.held_out_rmse, random.held_out_rmse
-        text = f"as likely as {1e3 * after:.2f} mrad of constant width, before {1e3 * before:.2f}"
-        self.report(f"+ {names}: {text}")
-        return random, beside, [row]
-
-    def with_random(self, baseline: JointFit) -> tuple[JointFit, tuple[Accepted, ...]]:
-        """The model with random delays, and what is named beside them.
-
-        The search is the same, through what the delays do to the samples; they and what is found beside them
-        are looked for in turn.
-        """
-        jitter, veil = self.run([("look", {"fit": baseline, "scales": self.scales})])[0]
-        for _ in range(VEILS):
-            inner = self.behind(veil)
-            plain = inner.run([self.plain(baseline)])[0]
-            found = inner.explain(plain)
-            clear = found.verdict in ("effects", "ambiguous")
-            rest, beside = (found.final, found.accepted) if clear else (plain, ())
-            before = jitter
-            call = {"fit": rest, "scales": self.scales, "start": jitter}
-            jitter, veil = self.run([("look", call)])[0]
-            if abs(np.log(jitter[0] / before[0])) < SAME_SPREAD:
-                break
-        call = {"fit": rest, "scales": self.scales, "start": jitter}
-        return self.run([("fit_jitter", call)])[0], beside
-
-    def behind(self, veil: Veil) -> "Selection":
-        """The same search, through what chance does to the samples."""
-
-        def run(calls: list[Call]) -> list[Any]:
-            return self.run([(name, {**options, "veil": veil}) for name, options in calls])
-
-        return replace(
-            self,
-            run=run,
-            candidates=[name for name in self.candidates if name != RANDOM],
-            restarts=0,
-            veiled=True,
-            report=lambda line: self.report(f"beside {RANDOM}: {line}"),
-            without={},
-            apart={},
-            promised={},
-        )
 
     def judge(
         self,

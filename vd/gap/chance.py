@@ -1,0 +1,100 @@
+"""Random delays as the cause of what a search leaves, and the search for what there is beside them.
+
+No single prediction shows them (:mod:`vd.gap.jitter`). So the same search is made once more through what they
+do to the samples (:mod:`vd.gap.veil`); they and what is found beside them are looked for in turn.
+"""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vd.gap.candidates import Call
+from vd.gap.explanation import Accepted, Trial
+from vd.gap.joint_fit import JointFit
+from vd.gap.judge import RANDOM
+from vd.gap.veil import Veil
+
+if TYPE_CHECKING:
+    from vd.gap.select import Selection
+
+VEILS = 2
+"""Searches for what there is beside random delays, each with these as they are beside what the last found."""
+SAME_SPREAD = 0.1
+"""Relative change of their standard deviation up to which they are the same."""
+
+
+def try_random(
+    search: "Selection", baseline: JointFit, present: JointFit
+) -> tuple[JointFit, tuple[Accepted, ...], list[Trial]]:
+    """What nothing else explains can be chance: random delays, and what is to be found beside them.
+
+    Args:
+        search: The search that has come to its end.
+        baseline: The plain model.
+        present: What the search has found.
+
+    Returns:
+        The better model; what it has besides random delays, if it has these; and the evidence.
+    """
+    if RANDOM not in search.candidates or RANDOM in search.vetoes:
+        return present, (), []
+    random, beside, rows = with_random(search, baseline)
+    rest = search.refit(random, [name for name in random.effects if name != RANDOM])
+    if rest.effects and not search.better(rest, random)[0] and search.best([present, rest]) is rest:
+        # No chance is needed: it has only smoothed the way to where the search before did not come.
+        search.report(f"+ {' and '.join(rest.effects)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")
+        return rest, (), []
+    accepted, why = search.better(present, random)
+    gain, ci = search.gain(present, random)
+    decision = "named" if accepted else "rejected"
+    row = Trial(1, RANDOM, random, gain, ci, decision, why or "its spread is what is measured")
+    if not accepted:
+        return present, (), [row]
+    names, before, after = " and ".join(random.effects), present.held_out_rmse, random.held_out_rmse
+    text = f"as likely as {1e3 * after:.2f} mrad of constant width, before {1e3 * before:.2f}"
+    search.report(f"+ {names}: {text}")
+    return random, beside, [row, *rows]
+
+
+def with_random(
+    search: "Selection", baseline: JointFit
+) -> tuple[JointFit, tuple[Accepted, ...], list[Trial]]:
+    """The model with random delays, what is named beside them, and the evidence for that."""
+    jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
+    for _ in range(VEILS):
+        inner = behind(search, veil)
+        plain = inner.run([inner.plain(baseline)])[0]
+        found = inner.explain(plain)
+        clear = found.verdict in ("effects", "ambiguous")
+        rest, beside = (found.final, found.accepted) if clear else (plain, ())
+        before = jitter
+        call = {"fit": rest, "scales": search.scales, "start": jitter}
+        jitter, veil = search.run([("look", call)])[0]
+        if abs(np.log(jitter[0] / before[0])) < SAME_SPREAD:
+            break
+    call = {"fit": rest, "scales": search.scales, "start": jitter}
+    rows = [
+        replace(row, round=row.round + 1, fit=replace(row.fit, effects=(RANDOM, *row.fit.effects)))
+        for row in found.trials
+    ]
+    return search.run([("fit_jitter", call)])[0], beside, rows
+
+
+def behind(search: "Selection", veil: Veil) -> "Selection":
+    """The same search, through what chance does to the samples."""
+
+    def run(calls: list[Call]) -> list[Any]:
+        return search.run([(name, {**options, "veil": veil}) for name, options in calls])
+
+    return replace(
+        search,
+        run=run,
+        candidates=[name for name in search.candidates if name != RANDOM],
+        restarts=0,
+        veiled=True,
+        report=lambda line: search.report(f"beside {RANDOM}: {line}"),
+        without={},
+        apart={},
+        promised={},
+    )
