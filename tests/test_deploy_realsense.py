@@ -23,6 +23,7 @@ from vd.deploy.realsense import (
     RealSense,
     RealSenseCfg,
     RealSenseInfrared,
+    describe,
     find_device,
     open_recording,
 )
@@ -201,6 +202,10 @@ def test_infrared_comes_with_the_pattern_off(twin):
     assert dataclasses.astuple(camera.intrinsics) == pytest.approx(dataclasses.astuple(LENS))
     assert not twin.emitter
     camera.close()
+
+
+def test_a_device_says_what_it_is(twin):
+    assert describe(twin.device) == "twin of a RealSense, twin"
 
 
 def test_refusals_name_the_remedy(twin, tmp_path):
