@@ -1,12 +1,13 @@
 """Rules of evidence and verdicts, on made-up fits."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import vd.kernels.actuators as servo
-from vd.gap.consensus import share
+from vd.gap.consensus import agree, share
 from vd.gap.coordinates import Coordinate
 from vd.gap.explanation import Accepted, Explanation, intervals
 from vd.gap.joint_fit import JointFit
@@ -177,6 +178,36 @@ def test_sets_of_several_joints_meet_in_one_name() -> None:
     )
     adopted = share([both, explanation("gravity_load")], [FLOOR] * 2, [0, 1])[0]
     assert adopted.reason == "coulomb_friction and gravity_load explain it, as on the other joints"
+
+
+@pytest.mark.parametrize(
+    ("error", "own", "adopted"),
+    [
+        (1.0, ("command_filter", "gravity_load"), True),
+        (1.2, ("command_filter", "gravity_load"), False),  # worse by more than chance
+        (1.0, ("gravity_load",), False),  # more effects than the joint's own
+        (1.0, (), False),  # nothing to explain
+    ],
+)
+def test_a_joint_takes_the_model_of_all_others_where_it_is_as_good(
+    error: float, own: tuple[str, ...], adopted: bool
+) -> None:
+    def explanation(*names: str) -> Explanation:
+        accepted = tuple(Accepted(name, 1.0, {}, (), (), False) for name in names)
+        verdict = "effects" if names else "no_gap"
+        return Explanation(made_up((), 0.02), made_up(names, FLOOR), verdict, "", accepted)
+
+    def fit(effects: tuple[str, ...], starts: Sequence[Mapping[str, float]]) -> JointFit:
+        assert effects == both and all(start for start in starts)
+        return made_up(effects, error * FLOOR)
+
+    both = ("command_delay", "gravity_load")
+    three = [explanation(*own), explanation(*both), explanation(*both)]
+    found = agree(three, [FLOOR] * 3, [0, 0, 0], [fit] * 3)
+    assert {a.name for a in found[0].accepted} == {*(both if adopted else own)}
+    assert found[1:] == three[1:]
+    assert agree(three, [FLOOR] * 3, [0, 1, 2], [fit] * 3) == three, "of other fingers"
+    assert agree(three[:2], [FLOOR] * 2, [0, 0], [fit] * 2) == three[:2], "one other is no agreement"
 
 
 @pytest.mark.parametrize(("floor", "tied"), [(FLOOR, ("supply_sag",)), (10.0 * FLOOR, ())])

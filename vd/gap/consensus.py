@@ -1,11 +1,11 @@
 """What the joints of one machine tell each other: a set on one of them that another settles."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from vd.gap.explanation import NAMED, Explanation, estimates, intervals
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import MIN_GAIN
+from vd.gap.judge import MIN_GAIN, RANDOM, SMALL_EXCESS_FLOORS
 from vd.gap.verdict import explains
 
 OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}
@@ -13,6 +13,8 @@ OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag",
 
 Polish = Callable[[JointFit], JointFit]
 """Fits a model to the end."""
+Fit = Callable[[tuple[str, ...], Sequence[Mapping[str, float]]], JointFit]
+"""Fits the model with these effects to the end, from these starts."""
 
 
 def share(
@@ -40,6 +42,52 @@ def share(
         alike = [e for e, other in zip(explanations, fingers, strict=True) if other == finger]
         named = _named(alike) | (_named(explanations) & OF_THE_MACHINE)
         result.append(_adopt(explanation, named, floor, end))
+    return result
+
+
+def agree(
+    explanations: Sequence[Explanation], floors: Sequence[float], groups: Sequence[int], fits: Sequence[Fit]
+) -> list[Explanation]:
+    """Explain a joint as all others of its finger are explained, where that is as good.
+
+    A search can end where no step leads out: with a filter and another load in the place of the delay and the
+    load that the other joints have. Their values are a start that it did not have.
+
+    Args:
+        explanations: Of the joints.
+        floors: Their noise floors [rad].
+        groups: Number of the finger of each joint.
+        fits: Of each joint.
+    """
+    result = list(explanations)
+    for i, own in enumerate(explanations):
+        others = [e for j, e in enumerate(explanations) if j != i and groups[j] == groups[i]]
+        models = {frozenset(e.final.effects) for e in others}
+        certain = all(e.verdict == "effects" and all(a.named for a in e.accepted) for e in others)
+        if len(others) < 2 or len(models) != 1 or not certain:
+            continue
+        model = others[0]
+        effects = model.final.effects
+        mine = own.final.effects
+        if RANDOM in effects or set(effects) == set(mine) or len(effects) > len(mine):
+            continue
+        theirs = {key: value for key, value in model.final.values.items() if "." in key}
+        starts = [
+            {**{k: v for k, v in fit.values.items() if "." not in k}, **theirs}
+            for fit in (own.final, own.baseline, model.final)
+        ]
+        fit = fits[i](effects, starts)
+        worse = (fit.rmse**2 - own.final.rmse**2) / floors[i] ** 2
+        if fit.at_bound or worse > SMALL_EXCESS_FLOORS**2:
+            continue
+        spread = intervals(fit, floors[i])
+        result[i] = replace(
+            own,
+            final=fit,
+            accepted=tuple(replace(a, estimates=estimates(fit, a.name, spread)) for a in model.accepted),
+            verdict="effects",
+            reason=f"{explains(effects)}, as on the other joints",
+        )
     return result
 
 

@@ -23,7 +23,7 @@ from vd.files import write_json
 from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
 from vd.gap.chain import Chain, chains
-from vd.gap.consensus import share
+from vd.gap.consensus import agree, share
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.crowd import Crowd
 from vd.gap.design import design, pieces
@@ -401,14 +401,19 @@ def _explain_all(
 
     floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))
 
-    def finished(joint: Joint, fit: JointFit) -> JointFit:
-        call = {"base": fit.rows, "effects": fit.effects, "starts": [fit.values], "scales": joint.scales}
+    def fitted(joint: Joint, effects: tuple[str, ...], starts: Sequence[Mapping[str, float]]) -> JointFit:
+        call = {"base": joint.fit.rows, "effects": effects, "starts": list(starts), "scales": joint.scales}
         call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
         whole = team.run(joint.spec, [("fit", call)])[0]
         return team.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales})])[0]
 
+    def finished(joint: Joint, fit: JointFit) -> JointFit:
+        return fitted(joint, fit.effects, [fit.values])
+
     ends = [partial(finished, joint) for joint in joints]
-    return _consistent(team, joints, share(_parallel(one, joints), floors, fingers, ends))
+    shared = share(_parallel(one, joints), floors, fingers, ends)
+    agreed = agree(shared, floors, fingers, [partial(fitted, joint) for joint in joints])
+    return _consistent(team, joints, agreed)
 
 
 def _masses(team: Team, joints: Sequence[Joint]) -> dict[int, Masses]:
