@@ -19,6 +19,7 @@ from vd.kernels.actuators import (
     INERTIA,
     JITTER_DROP,
     JITTER_SIGMA,
+    LOAD_FRICTION,
     NO_EFFORT_LIMIT,
     PAYLOAD_INERTIA,
     READ_DELAY,
@@ -162,6 +163,7 @@ def drive_joint_kernel(
     # Model:
     parameters: wp.array2d[float],
     inverse_inertia: wp.array2d[float],
+    effort: wp.array2d[float],
     # In:
     dt: float,
     reference_in: wp.array2d[float],
@@ -193,6 +195,7 @@ def drive_joint_kernel(
     Args:
         parameters: Parameter rows, shape [N D, PARAMETER_COLUMNS].
         inverse_inertia: Diagonal of the inverse inertia matrix [1/(kg m^2)], shape [N, *].
+        effort: Largest torques of the drives [N m], which the solver keeps, shape [N, *].
         dt: Physics time step [s].
         reference_in: Mean reference of this step [rad], shape [N, D].
         power_in: Factor on the controller's gains, 0 with the torque off, shape [N, D].
@@ -241,7 +244,9 @@ def drive_joint_kernel(
     gain_out[world, joint][0] = drive.stiffness
     bias_out[world, joint][1] = -drive.stiffness
     bias_out[world, joint][2] = -damping
-    friction_out[world, joint] = drive.friction
+    # The load of load friction is what the drive can give, not what the controller wants of it.
+    beyond = wp.max(drive.motor - effort[world, joint], 0.0)
+    friction_out[world, joint] = wp.max(drive.friction - parameters[row, LOAD_FRICTION] * beyond, 0.0)
     stop = 1.0 / dt + damping * mobility
     friction_solref_out[world, joint] = wp.vec2(-1.0, -stop * FRICTION_IMPEDANCE)
     friction_solimp_out[world, joint] = vec5(FRICTION_IMPEDANCE, FRICTION_IMPEDANCE, 0.001, 0.5, 2.0)

@@ -89,6 +89,19 @@ def test_newton_agrees_with_the_rollouts_under_every_kind_of_effect():
     assert np.allclose(squared, expected, rtol=1e-3, atol=1e-6)
 
 
+def test_load_friction_follows_what_the_drive_gives_not_what_its_controller_wants():
+    """Steps so large that the drive is at its limit, which the solver keeps."""
+    recording = motions("step_large", ("f0_j2",), 3.0)
+    command = recording.trajectories[0].command[:, 1]
+    assert np.ptp(command) * HAND.kp[1] > 1.5 * HAND.effort[1]
+    each = np.stack([rows(), rows(LOAD_FRICTION=0.3)])
+    replay = HandReplay(recording, HAND, np.array([[0, -1, -1]] * 2), keep_positions=True)
+    replay.run(each)
+    newton = replay.positions.numpy()[:, :, 1]
+    predicted = Rollouts(chains(recording, HAND)[0], recording).predict(each[:, :3], joint=1)
+    assert np.sqrt(np.mean((newton - predicted) ** 2, axis=1)).max() < 2e-3
+
+
 def test_positions_come_in_the_columns_of_the_recording():
     recording = motions("sine_0.50hz", ("f0_j1", "f0_j2"), 0.3)
     columns = [4, 1, 0]

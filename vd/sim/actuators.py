@@ -127,6 +127,7 @@ class JointServo:
             model.dof_solimp,
         ]
         self._armature = solver.model.joint_armature.reshape((n, -1))
+        self._effort = solver.model.joint_effort_limit.reshape((n, -1))
         self.set_rows(rows)
         self.reset(wp.ones(n, dtype=wp.int32, device=self.device))
 
@@ -210,8 +211,9 @@ class JointServo:
             joint_q: Joint positions at the start of the step [rad], shape [N, *].
             joint_qd: Joint velocities [rad/s], shape [N, *].
         """
-        inputs = [self.parameters, self._inverse_inertia, self.dt, self.reference, self.power]
-        self._launch(drive_joint_kernel, [*inputs, joint_q, joint_qd, self.state], self._outputs)
+        model = [self.parameters, self._inverse_inertia, self._effort]
+        inputs = [self.dt, self.reference, self.power, joint_q, joint_qd, self.state]
+        self._launch(drive_joint_kernel, [*model, *inputs], self._outputs)
 
     def finish(self, previous_q: wp.array2d, joint_q: wp.array2d, joint_qd: wp.array2d) -> None:
         """Apply the velocity limits to the state after a physics step, and remember the positions.
