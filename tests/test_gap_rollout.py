@@ -180,7 +180,7 @@ def test_a_joint_that_friction_holds_starts_at_the_mean_of_its_readings(hand):
     command[:, 2] = wave(4.0)[:, 0]
     read = np.zeros((200, 3))
     read[:, 0] = count * (np.arange(200) % 4 == 0)  # a quarter of its readings one count up, the first too
-    read[:100, 1], read[100:, 1] = -count * (np.arange(100) % 2), 0.1  # moved in the end
+    read[:100, 1], read[100:, 1] = -count * (np.arange(100) % 2), 0.1  # moves in the end
     read[0, 2] = 0.01
     data = recording("dclaw3", names, trajectory("a", command, joints=names[2:], position=read))
     (chain,) = chains(data, hand)
@@ -188,7 +188,7 @@ def test_a_joint_that_friction_holds_starts_at_the_mean_of_its_readings(hand):
     row[:2, servo.COULOMB_TORQUE] = 2.0
     path = Rollouts(chain, data).predict(row[None])[0]
     assert path[:, 0] == pytest.approx(np.full(200, 0.25 * count), abs=1e-6)
-    assert path[:, 1] == pytest.approx(np.full(200, -0.5 * count), abs=1e-6)
+    assert path[:, 1] == pytest.approx(np.zeros(200), abs=1e-6), "what moves slowly has no mean to start at"
     assert path[0, 2] == pytest.approx(0.01, abs=1e-6)
 
 

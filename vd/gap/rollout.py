@@ -109,17 +109,14 @@ class Rollouts:
     def _rest(self, position: np.ndarray, command: np.ndarray) -> np.ndarray:
         """Where the joints rest before a trajectory [T, J] moves them: what was read first [n] [rad].
 
-        Of a joint that is to hold all the time, the mean of what was read until it moves: where dry friction
-        holds it, an error of its start would stay to the end.
+        Of a joint that is to hold and does not move, the mean of what was read: where dry friction holds it,
+        an error of its start would stay to the end.
         """
         columns = self.chain.columns
         read = position[:, columns]
-        start = read[0].astype(float)
-        limit = STILL_COUNTS * self.recording.encoder_resolution_rad
-        for joint in np.flatnonzero(np.ptp(command[:, columns], axis=0) == 0.0):
-            moved = np.abs(read[:, joint] - start[joint]) > limit
-            start[joint] = read[: int(np.argmax(moved)) if moved.any() else len(read), joint].mean()
-        return start
+        still = np.abs(read - read[0]).max(axis=0) < STILL_COUNTS * self.recording.encoder_resolution_rad
+        holds = np.ptp(command[:, columns], axis=0) == 0.0
+        return np.where(still & holds, read.mean(axis=0), read[0])
 
     def at(self, dt: float) -> "Rollouts":
         """The same with another time step [s]; kept, so that who asks again simulates with the same."""
