@@ -16,6 +16,7 @@ from vd.gap.design import design
 from vd.gap.explanation import intervals
 from vd.gap.find import findings, phases
 from vd.gap.fit import JointProblem, candidates
+from vd.gap.holding import Holding
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import covariance, noise_floor, resamples, rmse
@@ -121,6 +122,24 @@ def test_effect_is_recovered_with_the_baseline(effect: str, column: int, value: 
     assert fit.rmse < 1.2 * problem.floor
     alone = [problem.fit(base, (effect,), [start], scales, iterations=15).rmse for start in starts]
     assert fit.rmse <= 1.001 * min(alone), "the best start wins"
+
+
+def test_the_error_of_the_first_reading_is_forgiven_where_friction_holds_a_joint() -> None:
+    """Of a joint that is to hold and is predicted to; not of one that moves, nor where it is commanded."""
+    recording = recorded({})
+    held = replace(recording.trajectories[0], command=np.zeros_like(recording.trajectories[0].command))
+    recording = replace(recording, trajectories=(held, *recording.trajectories[1:]))
+    holding = Holding(recording, 0, [0, 1])
+    count = len(held.time)
+    predicted = np.zeros((2, 2 * count))
+    predicted[1, :count] = np.linspace(0.0, COUNT, count)
+    residual = np.full((2, 2 * count), 0.5 * COUNT)
+    residual[0, 0] += COUNT
+    before = residual.copy()
+    holding.forgive(residual, predicted, [0, 1])
+    assert residual[0, :count].mean() == pytest.approx(0.0, abs=1e-12)
+    assert np.ptp(residual[0, :count]) == pytest.approx(COUNT), "noise stays"
+    assert np.array_equal(residual[1], before[1]) and np.array_equal(residual[:, count:], before[:, count:])
 
 
 def test_refits_near_the_floor_keep_the_slopes_of_the_whole_fit(monkeypatch: pytest.MonkeyPatch) -> None:

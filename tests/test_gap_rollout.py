@@ -173,25 +173,6 @@ def test_a_finger_with_play_rests_where_its_weight_asks(hand):
     )
 
 
-def test_a_joint_that_friction_holds_starts_at_the_mean_of_its_readings(hand):
-    """The error of its first reading would else stay to the end; a joint that is commanded has only that."""
-    names, count = tuple(hand.joint_names[:3]), 1.5e-3  # the recording's
-    command = np.zeros((200, 3))
-    command[:, 2] = wave(4.0)[:, 0]
-    read = np.zeros((200, 3))
-    read[:, 0] = count * (np.arange(200) % 4 == 0)  # a quarter of its readings one count up, the first too
-    read[:100, 1], read[100:, 1] = -count * (np.arange(100) % 2), 0.1  # moves in the end
-    read[0, 2] = 0.01
-    data = recording("dclaw3", names, trajectory("a", command, joints=names[2:], position=read))
-    (chain,) = chains(data, hand)
-    row = chain.start_row.copy()
-    row[:2, servo.COULOMB_TORQUE] = 2.0
-    path = Rollouts(chain, data).predict(row[None])[0]
-    assert path[:, 0] == pytest.approx(np.full(200, 0.25 * count), abs=1e-6)
-    assert path[:, 1] == pytest.approx(np.zeros(200), abs=1e-6), "what moves slowly has no mean to start at"
-    assert path[0, 2] == pytest.approx(0.01, abs=1e-6)
-
-
 def test_a_finger_droops_as_its_weight_asks(hand):
     """In rest the springs carry the weight: the gradient of the potential energy by the hand's kinematics."""
     names = ("f1_j3", "f1_j1", "f1_j2")  # columns in another order than the finger's

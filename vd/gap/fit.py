@@ -14,6 +14,7 @@ import vd.kernels.actuators as servo
 from vd.gap.chain import Chain
 from vd.gap.coordinates import BASELINE_PARAMETERS, Coordinate, Scales, coordinate, keys, sizes
 from vd.gap.descent import FIRST_DAMPING, LOG_TRUST, Descent, LeastSquares
+from vd.gap.holding import Holding
 from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
 from vd.gap.veil import Veil
@@ -82,6 +83,7 @@ class JointProblem:
         self._measured = {
             int(t): rollouts.measured[rollouts.sample_trajectory == t, joint] for t in self.trajectories
         }
+        self._holding = Holding(rollouts.recording, int(rollouts.chain.columns[joint]), trajectories)
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
         self._growth: dict[int, np.ndarray] = {}
 
@@ -112,6 +114,7 @@ class JointProblem:
         predicted = simulation.predict(rows, chosen, joint=self.joint, keep=keep)
         self.simulated += len(rows) * len(chosen) if keep is None else int(keep.sum())
         residual = measured - predicted
+        self._holding.forgive(residual, predicted, chosen)
         if self._growth:
             residual /= np.concatenate([self._growth[t] for t in chosen])
         if keep is not None:

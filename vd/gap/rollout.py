@@ -26,8 +26,6 @@ STREAM_BITS = 28
 CUDA_BLOCK = 32
 """Threads of a block: few, so that the few thousand rollouts of a launch are spread over all processors."""
 CPU_BLOCK = 256
-STILL_COUNTS = 1.5
-"""Encoder counts from its first reading within which a joint has not moved: noise turns to the next count."""
 _MAKING = threading.Lock()
 
 
@@ -102,21 +100,8 @@ class Rollouts:
         self.time = np.concatenate([t.time for t in trajectories])
         self.measured = np.concatenate([t.position[:, chain.columns] for t in trajectories])
         self.sample_trajectory = np.repeat(np.arange(len(trajectories)), counts)
-        self._start = np.array([self._rest(t.position, t.command) for t in trajectories])
         excited = np.array([[joint in t.joints for joint in chain.joints] for t in trajectories])
         self.excited = excited[self.sample_trajectory]
-
-    def _rest(self, position: np.ndarray, command: np.ndarray) -> np.ndarray:
-        """Where the joints rest before a trajectory [T, J] moves them: what was read first [n] [rad].
-
-        Of a joint that is to hold and does not move, the mean of what was read: where dry friction holds it,
-        an error of its start would stay to the end.
-        """
-        columns = self.chain.columns
-        read = position[:, columns]
-        still = np.abs(read - read[0]).max(axis=0) < STILL_COUNTS * self.recording.encoder_resolution_rad
-        holds = np.ptp(command[:, columns], axis=0) == 0.0
-        return np.where(still & holds, read.mean(axis=0), read[0])
 
     def at(self, dt: float) -> "Rollouts":
         """The same with another time step [s]; kept, so that who asks again simulates with the same."""
@@ -283,7 +268,7 @@ class Rollouts:
                 integers(self._count[trajectory]),
                 integers(output),
                 integers(self._stream[trajectory]),
-                wp.array(self._start[trajectory], dtype=float, device=device),
+                wp.array(self.measured[first], dtype=float, device=device),
                 integers(wanted),
                 slot,
                 lower,
