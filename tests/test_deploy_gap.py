@@ -46,7 +46,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
 
     @contextlib.contextmanager
     def connect(_):
-        plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=960.0))
+        plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=3840.0))
         with simulated_bus(hand, joints, plant) as (_, bus):
             yield Connection(hand, joints, bus)
 
@@ -60,5 +60,5 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     report = json.loads((out / "report.json").read_text())
     found = {effect["name"]: effect for effect in report["effects"] if "f0_j1" in effect["joints"]}
     assert set(found) == {"command_delay"}
-    # The goal is heard 0.5 ms before the state it is written beside is asked for; the twin's steps are 1 ms.
+    # The goal is heard 0.5 ms before its state is asked for; the twin's steps are 0.3 ms.
     assert found["command_delay"]["parameters"]["delay_s"]["value"] == pytest.approx(DELAY_S, abs=0.001)
