@@ -240,7 +240,6 @@ def gpu(stage: Stage) -> StudentTrainCfg:
             distance="6d",
             match_weight=1.0,
             near_share=0.5,
-            rendered_share=0.5,
             precision="bf16",
         ),
         network=LEAN,
