@@ -27,7 +27,7 @@ def friction_figure(rates: dict[str, list[tuple[float, Interval]]]) -> Figure:
         axes.errorbar(x, y, yerr=np.maximum(spread, 0.0), color=colour, marker="o", capsize=3, label=name)
     axes.set(xlabel="friction coefficient of the table", ylim=(0.0, None))
     axes.set_ylabel(f"error at most {HEADLINE_TOLERANCE_RAD} rad")
-    axes.legend(frameon=False, fontsize=8)
+    axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
