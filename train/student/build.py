@@ -114,12 +114,10 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     teacher = load_policy(find_policy(cfg.teacher), device)
     task = student_task(teacher, cfg)
     if cfg.init is None and cfg.dagger.state_weight > 0.0:
-        if task.observation.view != "world":
-            raise ValueError(
-                f"{cfg.teacher} observes in views of its goal, which a student does not; "
-                "add --dagger.state-weight 0"
-            )
-        cfg = replace(cfg, network=replace(cfg.network, state=state_cfg(teacher.spec)))
+        if task.observation.view == "world":
+            cfg = replace(cfg, network=replace(cfg.network, state=state_cfg(teacher.spec)))
+        elif rank == 0:
+            print(f"{cfg.teacher} sees goals in views that no cloud tells: only its actions are imitated")
     if rank == 0:
         # Before anything is built: a run that fails at once still says what it was.
         saved = to_dict(replace(cfg, resume=None))
