@@ -426,13 +426,13 @@ def test_beside_chance_the_search_goes_on_until_the_spread_stays() -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Selection, "explain", explain)
-        fit, beside, rows = with_random(selection, baseline)
+        fit, beside, rows = with_random(selection, baseline, made_up(("backlash",), 0.02))
     assert fit.effects == ("encoder_bias", "command_jitter") and [one.name for one in beside] == [
         "encoder_bias"
     ]
     assert [(row.name, row.fit.effects) for row in rows] == [
         ("encoder_bias", ("command_jitter", "encoder_bias"))
     ]
-    assert [name for name, _ in asked] == ["look", "fit", "look", "fit", "look", "fit_jitter"]
+    assert [name for name, _ in asked] == ["look", *2 * ["fit", "look", "fit_jitter"]]
     assert all(seen == (name == "fit") for name, seen in asked), "the rest is fitted through the veil"
     assert all(inner.veiled and "command_jitter" not in inner.candidates for inner in searched)

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 VEILS = 2
 """Searches for what there is beside random delays, each with these as they are beside what the last found."""
+NOT_NEAR = 1.5
+"""Error after the first of them, in that of the model without chance, from which the next is not made."""
 SAME_SPREAD = 0.1
 """Relative change of their standard deviation up to which they are the same."""
 
@@ -39,9 +41,9 @@ def try_random(
     """
     if RANDOM not in search.candidates or RANDOM in search.vetoes:
         return present, (), []
-    random, beside, rows = with_random(search, baseline)
+    random, beside, rows = with_random(search, baseline, present)
     rest = search.refit(random, [name for name in random.effects if name != RANDOM])
-    if rest.effects and not search.better(rest, random)[0] and search.best([present, rest]) is rest:
+    if rest.effects and search.white(rest) and not search.better(rest, random)[0]:
         # No chance is needed: it has only smoothed the way to where the search before did not come.
         search.report(f"+ {' and '.join(rest.effects)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")
         return rest, (), []
@@ -58,9 +60,12 @@ def try_random(
 
 
 def with_random(
-    search: "Selection", baseline: JointFit
+    search: "Selection", baseline: JointFit, present: JointFit
 ) -> tuple[JointFit, tuple[Accepted, ...], list[Trial]]:
-    """The model with random delays, what is named beside them, and the evidence for that."""
+    """The model with random delays, what is named beside them, and the evidence for that.
+
+    The arguments are those of :func:`try_random`.
+    """
     jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
     for _ in range(VEILS):
         inner = behind(search, veil)
@@ -71,14 +76,21 @@ def with_random(
         before = jitter
         call = {"fit": rest, "scales": search.scales, "start": jitter}
         jitter, veil = search.run([("look", call)])[0]
-        if abs(np.log(jitter[0] / before[0])) < SAME_SPREAD:
+        call = {"fit": rest, "scales": search.scales, "start": jitter}
+        random = search.run([("fit_jitter", call)])[0]
+        same = abs(np.log(jitter[0] / before[0])) < SAME_SPREAD
+        if same or random.rmse > NOT_NEAR * equivalent(present):
             break
-    call = {"fit": rest, "scales": search.scales, "start": jitter}
     rows = [
         replace(row, round=row.round + 1, fit=replace(row.fit, effects=(RANDOM, *row.fit.effects)))
         for row in found.trials
     ]
-    return search.run([("fit_jitter", call)])[0], beside, rows
+    return random, beside, rows
+
+
+def equivalent(fit: JointFit) -> float:
+    """RMSE of a fit on the scale of one with chance in it: the geometric mean of the widths of motions."""
+    return float(np.exp(0.5 * np.sum(fit.count * np.log(fit.sse / fit.count)) / fit.count.sum()))
 
 
 def behind(search: "Selection", veil: Veil) -> "Selection":

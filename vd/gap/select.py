@@ -78,7 +78,7 @@ class Selection(CandidateFits, Verdicts):
         first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
         tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
         for name in sorted(first, key=lambda n: first[n].rmse):
-            if present.effects and self.no_gap(present):
+            if present.effects and (self.no_gap(present) or self.noise_only(present)):
                 break
             # Far from the floor another path would change little, unless its beginning was as good.
             far = present.effects and present.held_out_rmse >= NEAR * self.floor
@@ -97,7 +97,8 @@ class Selection(CandidateFits, Verdicts):
                 self.report(f"taken back: {why}")
                 present, rivals = baseline, {}
         behind = set(BEHIND_SENSOR) & set(self.vetoes) & set(self.candidates)
-        if present.effects and (behind or (len(present.effects) > 1 and set(rivals) != set(present.effects))):
+        stale = any(len(fit.effects) != len(present.effects) for fits in rivals.values() for fit in fits)
+        if present.effects and (behind or stale or set(rivals) != set(present.effects)):
             rivals = {name: self.rivals(present, name) for name in present.effects}
         beside: tuple[Accepted, ...] = ()
         if not self.no_gap(present) and not self.white(present):  # what is fitted well leaves none to chance
@@ -268,6 +269,10 @@ class Selection(CandidateFits, Verdicts):
     def finished(self, present: JointFit) -> bool:
         """Whether a model leaves nothing to explain: noise, of no more than its size."""
         return self.no_gap(present) and not self.lack_of_fit(self.refined(present))
+
+    def noise_only(self, present: JointFit) -> bool:
+        """Whether a model leaves noise on what it was fitted to: no other search finds a better one."""
+        return self.white(present) and not self.lack_of_fit(self.refined(present))
 
     def whitens(self, before: JointFit, after: JointFit) -> bool:
         """Whether a larger model leaves noise where the smaller leaves structure.
