@@ -85,8 +85,6 @@ class RunCfg(HandOptions):
     realtime: Priority = "auto"
     """Run before all ordinary programs, the twin too: where that is permitted (root, ulimit -r), always, or
     never."""
-    threads: int = 1
-    """Threads of the network; more than one only helps on cores that nothing else uses."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves; a twin is not asked for."""
 
@@ -94,8 +92,8 @@ class RunCfg(HandOptions):
         """Raise ValueError naming the flag and the remedy."""
         from vd.deploy.goals import SCAN_SUFFIXES
 
-        if self.random_goals < 1 or self.threads < 1:
-            raise ValueError("--random-goals and --threads have to be at least 1")
+        if self.random_goals < 1:
+            raise ValueError("--random-goals has to be at least 1")
         if not self.goal_s > 0.0 or self.hold_s < 0.0:
             raise ValueError("--goal-s has to be positive, and --hold-s must not be negative")
         if (self.air or self.realistic or self.sdk) and not self.twin:
@@ -118,7 +116,7 @@ def run(cfg: RunCfg) -> int:
     from vd.deploy.twin_link import TwinLink
 
     wp.config.log_level = wp.LOG_WARNING  # a line for each kernel would scroll the preflight away
-    torch.set_num_threads(cfg.threads)
+    torch.set_num_threads(1)  # of several, some would wait for one that has no core
     hand, _ = read_hand_and_joints(cfg)
     item = one_object(cfg.object)
     flight = make_flight(cfg.policy or f"{hand.name}-table", cfg.hand, cfg.object, hand, item, seed=cfg.seed)

@@ -33,6 +33,8 @@ FOLLOW_S = 0.5
 """How often a log is looked at that is still being written."""
 SILENT_S = 30.0
 """Time without a new step after which a log is taken to be finished."""
+BEGIN_S = 300.0
+"""Longest wait for a log to begin: a twin that compiles its kernels takes minutes."""
 UNKNOWN_POSE = (0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0)
 """Where an object is put whose pose nobody knows: out of the way."""
 
@@ -46,7 +48,7 @@ class ShadowCfg:
     policy: str | None = None
     """The student whose clouds are compared; by default the policy of the log, or the lean network."""
     follow: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Go on as the log grows, until it ends: beside the loop."""
+    """Wait for the log to begin, and go on as it grows until it ends: beside the loop."""
     every: int = 1
     """Compare each so many steps."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -184,11 +186,18 @@ def shadow(cfg: ShadowCfg) -> int:
 
 def differences(cfg: ShadowCfg) -> Iterator[Difference]:
     """Every compared step of a log, with ``follow`` as it grows."""
-    from vd.hand_log import read_log
+    from vd.hand_log import LogError, read_log
 
     beside, step, silent = None, 0, 0.0
     while True:
-        log = read_log(cfg.log)
+        try:
+            log = read_log(cfg.log)
+        except LogError:  # it has not begun
+            if not cfg.follow or silent > BEGIN_S:
+                raise
+            silent += FOLLOW_S
+            time.sleep(FOLLOW_S)
+            continue
         beside = beside or Shadow(log, cfg.policy)
         steps = len(log.columns["t"])
         silent = 0.0 if step < steps else silent + FOLLOW_S

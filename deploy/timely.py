@@ -15,8 +15,7 @@ Priority = Literal["auto", "on", "off"]
 def real_time(wanted: Priority, *, level: int = 0) -> Iterator[bool]:
     """Run before all ordinary programs, as loop and twin need it on a busy machine; both mostly sleep.
 
-    All threads do, those that begin later too: the loop waits for the network's, and the watchdog must not
-    wait for other programs.
+    All threads do, those that begin later too: the watchdog must not wait for other programs.
 
     Args:
         wanted: Whether to.

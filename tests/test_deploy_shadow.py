@@ -1,6 +1,7 @@
 """A log beside the simulator, and the same log shown."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -69,6 +70,29 @@ def test_without_the_objects_pose_the_rest_is_compared(tmp_path):
     folder = write(tmp_path / "log", truth=False)
     found = list(differences(ShadowCfg(folder, every=12)))
     assert len(found) == 2 and all(one.ok for one in found)
+
+
+def test_a_log_is_followed_from_before_its_first_step(tmp_path, monkeypatch):
+    """It does not exist, then has no row, then grows, then ends; nobody waits in truth."""
+    whole, folder = write(tmp_path / "whole"), tmp_path / "log"
+    run = json.loads((whole / "run.json").read_text())
+    head, *rows = (whole / "steps.csv").read_text().splitlines(keepends=True)
+    run.pop("end", None)
+    done = {}
+
+    def grow(_):
+        folder.mkdir(exist_ok=True)
+        steps = folder / "steps.csv"
+        written = len(steps.read_text().splitlines()) if steps.exists() else 0
+        steps.write_text("".join([head, *rows][: written * 2 or 1]))
+        shutil.copy(whole / "events.jsonl", folder)
+        if written > len(rows):
+            done["end"] = {"reason": "done"}
+        (folder / "run.json").write_text(json.dumps({**run, **done}))
+
+    monkeypatch.setattr("vd.deploy.shadow.time.sleep", grow)
+    found = list(differences(ShadowCfg(folder, follow=True, every=6)))
+    assert len(found) == STEPS // 6 and all(one.ok for one in found)
 
 
 def test_what_differs_is_not_rounding():

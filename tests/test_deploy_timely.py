@@ -1,4 +1,4 @@
-"""Real-time priority: of every thread, since the loop waits for some and is watched by others."""
+"""Real-time priority: of every thread, for the loop is watched by others than its own."""
 
 import os
 import threading
