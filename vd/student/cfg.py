@@ -87,7 +87,7 @@ class TurnCfg:
     """Width of the layers that weigh a point."""
     pairs: int = 8
     """Pairs of mixtures of them; each pair makes a frame of the object and one of the goal."""
-    points: int = 256
+    points: int = 512
     """Voxels of object and goal that are looked at, at most."""
     match: int = 32
     """Features by which their points find each other (:mod:`vd.student.match`); 0: they do not look."""
