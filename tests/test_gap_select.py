@@ -10,6 +10,7 @@ from test_gap_fit import TRUE, blank, recorded
 from test_gap_judge import FLOOR, made_up
 
 import vd.kernels.actuators as servo
+from vd.gap import chance
 from vd.gap.chain import chains
 from vd.gap.chance import with_random
 from vd.gap.coordinates import Coordinate, Scales
@@ -401,6 +402,18 @@ def test_an_effect_that_leaves_noise_where_structure_was_is_earned_however_small
     assert not selection.whitens(leaving((), 9.0 * FLOOR, 9.0), both), "far from the floor it says nothing"
 
 
+@pytest.mark.parametrize(("left", "named"), [(1.2, True), (5.0, False)])
+def test_what_leaves_more_than_chance_does_is_no_chance(left: float, named: bool) -> None:
+    present, random = made_up(("backlash",), 0.02), made_up(("command_jitter",), 0.01)
+    selection = replace(searching([])[0], candidates=("backlash", "command_jitter"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chance, "with_random", lambda *_: (random, (), [], left * FLOOR))
+        patch.setattr(Selection, "refit", lambda *_: made_up((), 0.02))
+        found, _, (row,) = chance.try_random(selection, made_up((), 0.03), present)
+    assert (found is random) == named and (found is present) != named
+    assert named or "more than chance" in row.reason
+
+
 def test_beside_chance_the_search_goes_on_until_the_spread_stays() -> None:
     baseline, asked = made_up((), 0.010), []
     spreads = iter([0.003, 0.007, 0.0072, 0.5])
@@ -426,13 +439,14 @@ def test_beside_chance_the_search_goes_on_until_the_spread_stays() -> None:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Selection, "explain", explain)
-        fit, beside, rows = with_random(selection, baseline, made_up(("backlash",), 0.02))
+        fit, beside, rows, left = with_random(selection, baseline, made_up(("backlash",), 0.02))
     assert fit.effects == ("encoder_bias", "command_jitter") and [one.name for one in beside] == [
         "encoder_bias"
     ]
     assert [(row.name, row.fit.effects) for row in rows] == [
         ("encoder_bias", ("command_jitter", "encoder_bias"))
     ]
+    assert left == pytest.approx(FLOOR)
     assert [name for name, _ in asked] == ["look", *2 * ["fit", "look", "fit_jitter"]]
     assert all(seen == (name == "fit") for name, seen in asked), "the rest is fitted through the veil"
     assert all(inner.veiled and "command_jitter" not in inner.candidates for inner in searched)

@@ -12,7 +12,7 @@ import numpy as np
 from vd.gap.candidates import Call
 from vd.gap.explanation import Accepted, Trial
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import RANDOM
+from vd.gap.judge import RANDOM, REPEATABLE
 from vd.gap.veil import Veil
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ VEILS = 2
 """Searches for what there is beside random delays, each with these as they are beside what the last found."""
 NOT_NEAR = 1.5
 """Error after the first of them, in that of the model without chance, from which the next is not made."""
+HOPELESS = 3.0
+"""The same of what is left through it, in what may be left in the end: the first is too narrow a veil."""
 SAME_SPREAD = 0.1
 """Relative change of their standard deviation up to which they are the same."""
 
@@ -41,13 +43,15 @@ def try_random(
     """
     if RANDOM not in search.candidates or RANDOM in search.vetoes:
         return present, (), []
-    random, beside, rows = with_random(search, baseline, present)
+    random, beside, rows, left = with_random(search, baseline, present)
     rest = search.refit(random, [name for name in random.effects if name != RANDOM])
     if rest.effects and search.white(rest) and not search.better(rest, random)[0]:
         # No chance is needed: it has only smoothed the way to where the search before did not come.
         search.report(f"+ {' and '.join(rest.effects)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")
         return rest, (), []
     accepted, why = search.better(present, random)
+    if left > REPEATABLE * search.floor:
+        accepted, why = False, f"leaves {left / search.floor:.1f} noise floors besides, more than chance does"
     gain, ci = search.gain(present, random)
     decision = "named" if accepted else "rejected"
     row = Trial(1, RANDOM, random, gain, ci, decision, why or "its spread is what is measured")
@@ -61,10 +65,11 @@ def try_random(
 
 def with_random(
     search: "Selection", baseline: JointFit, present: JointFit
-) -> tuple[JointFit, tuple[Accepted, ...], list[Trial]]:
+) -> tuple[JointFit, tuple[Accepted, ...], list[Trial], float]:
     """The model with random delays, what is named beside them, and the evidence for that.
 
-    The arguments are those of :func:`try_random`.
+    The arguments are those of :func:`try_random`. The last result is the error of the rest of the model, seen
+    through what the delays do [rad]: the noise floor if it is right.
     """
     jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
     for _ in range(VEILS):
@@ -79,17 +84,18 @@ def with_random(
         call = {"fit": rest, "scales": search.scales, "start": jitter}
         random = search.run([("fit_jitter", call)])[0]
         same = abs(np.log(jitter[0] / before[0])) < SAME_SPREAD
-        if same or random.rmse > NOT_NEAR * equivalent(present):
+        hopeless = rest.rmse > HOPELESS * REPEATABLE * search.floor
+        if same or hopeless or equivalent(random) > NOT_NEAR * equivalent(present):
             break
     rows = [
         replace(row, round=row.round + 1, fit=replace(row.fit, effects=(RANDOM, *row.fit.effects)))
         for row in found.trials
     ]
-    return random, beside, rows
+    return random, beside, rows, rest.rmse
 
 
 def equivalent(fit: JointFit) -> float:
-    """RMSE of a fit on the scale of one with chance in it: the geometric mean of the widths of motions."""
+    """RMSE of a fit as a likelihood has it that knows a width of each motion: their geometric mean [rad]."""
     return float(np.exp(0.5 * np.sum(fit.count * np.log(fit.sse / fit.count)) / fit.count.sum()))
 
 
