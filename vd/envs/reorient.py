@@ -274,13 +274,14 @@ class ReorientEnv:
             outputs=[self.reward, self.reward_terms, self.rotation_error, self.success, self.fell],
             device=self.device,
         )
-        wp.launch(
-            void_step_kernel,
-            dim=n,
-            inputs=[sim.failed],
-            outputs=[self.reward, self.reward_terms, self.success, self.fell],
-            device=self.device,
-        )
+        if self.cfg.failures_per_million > 0.0:
+            wp.launch(
+                void_step_kernel,
+                dim=n,
+                inputs=[sim.failed],
+                outputs=[self.reward, self.reward_terms, self.success, self.fell],
+                device=self.device,
+            )
         wp.launch(
             episode_kernel,
             dim=n,

@@ -1,5 +1,6 @@
 """A comparison as one HTML page, its figures, and lines for a terminal."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -126,10 +127,15 @@ def terminal_table(comparison: Comparison) -> str:
     for row in comparison.rows:
         cells = _cells(row, short)
         rows.append(tuple(c.split(" (")[0] if i in shares else c for i, c in enumerate(cells)))
-    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEADER))]
+    return aligned(rows, words=3)
+
+
+def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
+    """Rows of cells as lines of text: the first ``words`` columns flush left, the others right."""
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     return "\n".join(
         "  ".join(
-            cell.ljust(width) if column < 3 else cell.rjust(width)
+            cell.ljust(width) if column < words else cell.rjust(width)
             for column, (cell, width) in enumerate(zip(row, widths, strict=True))
         ).rstrip()
         for row in rows

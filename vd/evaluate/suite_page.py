@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from vd.evaluate import plots
 from vd.evaluate.comparison import Row
-from vd.evaluate.comparison_page import ecdf_figure, labels, outcome_figure, scatter_figure
+from vd.evaluate.comparison_page import aligned, ecdf_figure, labels, outcome_figure, scatter_figure
 from vd.evaluate.report import number
 from vd.evaluate.statistics import Interval
 from vd.evaluate.suite import CLAIMS, NO_STUDENT, Claim, Condition, own_row, within
@@ -91,14 +91,7 @@ def terminal_table(result: "SuiteResult") -> str:
             cells = _cells(result, claim, named[claim.condition])
             # Intervals are in the files: a line has to fit.
             table.append((claim.condition, claim.text, *(cell.split(" (")[0] for cell in cells)))
-    widths = [max(len(row[column]) for row in table) for column in range(len(table[0]))]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if column < 2 else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in table
-    )
+    return aligned(table, words=2)
 
 
 def paper_text(claim: Claim) -> str:
