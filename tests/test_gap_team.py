@@ -8,6 +8,7 @@ import pytest
 from test_gap_fit import TRUE, recorded
 
 import vd.kernels.actuators as servo
+from vd.gap.assemble import curves
 from vd.gap.chain import chains
 from vd.gap.crowd import Crowd
 from vd.gap.design import design
@@ -50,6 +51,20 @@ def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
     # Start and end, three steps of a Jacobian and two sets of trials; two of the refits, whose first
     # Jacobian is known; one prediction.
     assert crowd.launches <= 2 + 3 * 3 + (2 * 3 - 1) + 1
+
+
+def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
+    recording = recorded({servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2})
+    (chain,) = chains(recording)
+    trajectories, folds = design(recording, chain, 0)
+    spec = JointSpec(0, 0, trajectories, folds, noise_floor(recording, 0), baseline_of(chain))
+    rows = chain.start_row.copy()
+    for column, value in {**TRUE, servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2}.items():
+        rows[0, column] = value
+    exact = Rollouts(chain, recording, dt=STEP_S / 32).predict(rows[None])[0]
+    drawn = curves(recording, Bench(recording, [chain], STEP_S, "cpu"), [("j", spec, rows)])
+    searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
+    assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)
 
 
 def test_a_failure_reaches_all_who_wait() -> None:

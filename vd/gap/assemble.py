@@ -11,6 +11,7 @@ from vd.assets_usd.hand_data import HandModel
 from vd.gap.coordinates import BASELINE_PARAMETERS, GRAVITY, Scales
 from vd.gap.design import varied
 from vd.gap.explanation import Accepted, Explanation
+from vd.gap.fit import FINER
 from vd.gap.recording import Recording
 from vd.gap.result import (
     Alternative,
@@ -66,6 +67,8 @@ def curves(
 ) -> np.ndarray:
     """Positions of all trajectories one after the other [S, J] [rad]; NaN where no joint was fitted.
 
+    They are simulated with the time step at which an estimate is finished.
+
     Args:
         recording: The recording.
         bench: Its chains.
@@ -80,7 +83,7 @@ def curves(
         rows = chain.start_row.copy()
         for spec, own in fitted:
             rows[spec.joint] = own[spec.joint]
-        rollouts = Rollouts(chain, recording, dt=bench.dt, device=bench.device)
+        rollouts = Rollouts(chain, recording, dt=bench.dt / FINER[-1], device=bench.device)
         predicted = rollouts.predict(rows[None])[0]
         result[:, chain.columns] = predicted
     return result

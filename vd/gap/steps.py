@@ -6,6 +6,7 @@ was made from, so that an interrupted run goes on where it stopped.
 
 import hashlib
 import json
+import shutil
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -18,6 +19,7 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import write_json
+from vd.gap.answers import FOLDER
 from vd.gap.recording import BARE_MODELS, Recording, read_recording
 from vd.gap.result import LAYER, Closing, Predictions, Report
 from vd.versions import installed_versions
@@ -163,6 +165,8 @@ class Analysis:
             return
         for file in files:  # a step that is interrupted must not look finished
             file.unlink(missing_ok=True)
+        if fresh:
+            shutil.rmtree(self.out / FOLDER, ignore_errors=True)
         self.out.mkdir(parents=True, exist_ok=True)
         record["settings"] = to_dict(self.settings)
         write_json(self.out / RUN, record)

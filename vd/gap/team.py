@@ -1,9 +1,7 @@
 """Who fits: worker processes that each hold the recording, or on a GPU threads that simulate together."""
 
 import copy
-import hashlib
 import multiprocessing
-import pickle
 import threading
 import time
 from collections.abc import Sequence
@@ -14,6 +12,7 @@ from typing import Any
 
 import warp as wp
 
+from vd.gap.answers import Answers, digest_of
 from vd.gap.chain import Chain
 from vd.gap.crowd import Crowd
 from vd.gap.fit import JointProblem
@@ -119,11 +118,6 @@ class Bench:
         return Answer(result, problem.simulated, time.perf_counter() - begin)
 
 
-def _key(spec: JointSpec, call: Call) -> bytes:
-    """What a result depends on: searches that meet ask for the same fits."""
-    return hashlib.sha256(pickle.dumps((spec.chain, spec.joint, call))).digest()
-
-
 _bench: Bench | None = None
 """Of a worker process."""
 
@@ -142,16 +136,21 @@ def _work(spec: JointSpec, call: Call) -> Answer:
 class Team:
     """Runs calls in worker processes, on a GPU in threads, or one by one with ``workers`` below 2.
 
+    Args:
+        bench: The problems.
+        workers: Processes.
+        answers: To calls that were made before, and where new ones go.
+
     Attributes:
         simulated: Trajectories simulated so far.
         spent: Trajectories simulated and time taken [s], summed over workers, by kind of call.
     """
 
-    def __init__(self, bench: Bench, workers: int):
+    def __init__(self, bench: Bench, workers: int, answers: Answers | None = None):
         self.bench, self.workers = bench, workers
+        self.answers = Answers() if answers is None else answers
         self.simulated = 0
         self.spent: dict[str, tuple[int, float]] = {}
-        self._known: dict[bytes, Any] = {}
         self._lock = threading.Lock()
         self._pool: Executor | None = None
 
@@ -179,21 +178,21 @@ class Team:
 
     def run(self, spec: JointSpec, calls: Sequence[Call]) -> list[Any]:
         """Results of the calls, in order; of a call that was made before, the same. For several threads."""
-        keys = [_key(spec, call) for call in calls]
+        # Searches that meet ask for the same fits.
+        keys = [digest_of(spec.chain, spec.joint, call) for call in calls]
         with self._lock:
-            known = {key: self._known[key] for key in keys if key in self._known}
-        new = {key: call for key, call in zip(keys, calls, strict=True) if key not in known}
-        answers = dict(zip(new, self._answers(spec, list(new.values())), strict=True))
+            new = {key: call for key, call in zip(keys, calls, strict=True) if key not in self.answers}
+        answers = dict(zip(new, self._made(spec, list(new.values())), strict=True))
         with self._lock:
             for key, answer in answers.items():
                 name = new[key][0]
                 rollouts, seconds = self.spent.get(name, (0, 0.0))
                 self.spent[name] = rollouts + answer.simulated, seconds + answer.seconds
                 self.simulated += answer.simulated
-                self._known[key] = known[key] = answer.result
-        return [known[key] for key in keys]
+                self.answers.add(key, answer.result)
+            return [self.answers[key] for key in keys]
 
-    def _answers(self, spec: JointSpec, calls: Sequence[Call]) -> list[Answer]:
+    def _made(self, spec: JointSpec, calls: Sequence[Call]) -> list[Answer]:
         """Run calls."""
         if self._pool is None:
             with self._lock:

@@ -2,7 +2,7 @@
 
 ``find`` identifies the baseline and says where it fails (``DIR/find.json``); ``explain`` selects the
 effects (``DIR/explain.json``, ``DIR/predictions.npz``). Both are skipped where their result is there
-already and its inputs are the same.
+already and its inputs are the same, and a step that was interrupted goes on from the fits that it had made.
 """
 
 import hashlib
@@ -20,6 +20,7 @@ import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
+from vd.gap.answers import FOLDER, Answers
 from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
 from vd.gap.chain import Chain, chains
@@ -137,7 +138,8 @@ def find(
         progress("find: already done")
         return [Finding(**f) for f in known["findings"]]
     begin = time.perf_counter()
-    with _team(recording, hand, chosen) as team:
+    answers = Answers(out / FOLDER, key)
+    with _team(recording, hand, chosen, answers) as team:
         joints = _identify(team, _specs(recording, team.bench.chains), chosen, progress)
         predicted = curves(recording, team.bench, [(j.name, j.spec, j.fit.rows) for j in joints])
         floors = {j.name: j.spec.floor for j in joints}
@@ -152,6 +154,7 @@ def find(
         }
         progress(f"find: {team.summary}")
     write_json(out / "find.json", value)
+    answers.forget()
     for finding in found:
         progress(f"  {finding.where}")
     return found
@@ -191,7 +194,8 @@ def explain(
     found = find(recording, hand, out, progress=progress, **options)
     known = json.loads((out / "find.json").read_text())
     begin = time.perf_counter()
-    with _team(recording, hand, chosen) as team:
+    answers = Answers(out / FOLDER, key)
+    with _team(recording, hand, chosen, answers) as team:
         joints = _resume(team, _specs(recording, team.bench.chains), known["joints"])
         explained = _explain_all(team, joints, recording, chosen, progress)
         analysed = [
@@ -214,6 +218,7 @@ def explain(
     predictions.write(out / "predictions.npz")
     report.write(out / "explain.json")
     write_json(out / "explain.key.json", {"key": key})
+    answers.forget()
     progress(f"explain: {report.verdict} after {seconds:.0f} s")
     return report
 
@@ -255,12 +260,12 @@ def _read(path: Path, key: str) -> dict[str, Any] | None:
     return value if isinstance(value, dict) and value.get("key") == key else None
 
 
-def _team(recording: Recording, hand: HandModel | None, options: Options) -> Team:
+def _team(recording: Recording, hand: HandModel | None, options: Options, answers: Answers) -> Team:
     length = sum(float(t.time[-1]) for t in recording.trajectories)
     dt = LONG_STEP_S if length > LONG_S else STEP_S
     parts = [_started(chain, options.start) for chain in chains(recording, hand)]
     crowd = None if options.device == "cpu" else Crowd()
-    return Team(Bench(recording, parts, dt, options.device, crowd), options.processes)
+    return Team(Bench(recording, parts, dt, options.device, crowd), options.processes, answers)
 
 
 def _started(chain: Chain, start: Mapping[str, np.ndarray]) -> Chain:
