@@ -1,4 +1,4 @@
-"""Behaviour of the environment: determinism, fresh observations, goals, guards, curriculum, randomisation."""
+"""Behaviour of the environment: determinism, fresh observations, goals, guards, randomisation."""
 
 import dataclasses
 
@@ -8,7 +8,6 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.envs.cfg import (
-    CurriculumCfg,
     GoalCfg,
     ObservationCfg,
     RandomisationCfg,
@@ -208,48 +207,6 @@ def test_state_of_another_size_is_refused():
     state = make().state_dict()
     with pytest.raises(ValueError, match="num_worlds"):
         make(num_worlds=2).load_state_dict(state)
-
-
-def test_curriculum_tightens_only_while_goals_are_reached():
-    curriculum = CurriculumCfg(enabled=True, rate=0.25, stillness_start=8.0, goal_start_rad=0.5)
-    env = make(curriculum=curriculum, goal=GoalCfg(max_angle_rad=1.5))
-    limits = SuccessCfg()
-
-    def present() -> tuple[float, float]:
-        return (
-            float(env.parameters.success.numpy()["joint_speed"][0]),
-            float(env.parameters.goal.numpy()["max_angle"][0]),
-        )
-
-    assert present() == pytest.approx((8.0 * limits.joint_speed_rad_s, 0.5))
-    env.goal_counts.assign(np.array([10.0, 9.0, 0.0], dtype=np.float32))
-    assert env.update_curriculum()["difficulty"] == 0.25
-    assert present()[0] < 8.0 * limits.joint_speed_rad_s and present()[1] > 0.5
-    for _ in range(5):
-        env.goal_counts.assign(np.array([10.0, 9.0, 0.0], dtype=np.float32))
-        env.update_curriculum()
-    assert present() == pytest.approx((limits.joint_speed_rad_s, 1.5)), "difficulty 1 is the configured task"
-    env.goal_counts.assign(np.array([10.0, 1.0, 3.0], dtype=np.float32))
-    numbers = env.update_curriculum()
-    assert numbers["difficulty"] == 0.75
-    assert numbers["success_per_goal"] == pytest.approx(0.1)
-    assert numbers["drop_per_goal"] == pytest.approx(0.3)
-
-
-def test_goals_can_widen_before_stillness_tightens():
-    curriculum = CurriculumCfg(
-        enabled=True, goal_start_rad=0.5, stillness_start=4.0, goal_span=(0.0, 0.5), stillness_span=(0.5, 1.0)
-    )
-    env = make(curriculum=curriculum, goal=GoalCfg(max_angle_rad=2.5))
-    limit = SuccessCfg().object_spin_rad_s
-    seen = []
-    for difficulty in (0.0, 0.25, 0.5, 0.75, 1.0):
-        env.parameters.set_difficulty(difficulty)
-        spin = float(env.parameters.success.numpy()["object_spin"][0])
-        seen.append((float(env.parameters.goal.numpy()["max_angle"][0]), spin / limit))
-    assert np.allclose(seen, [(0.5, 4.0), (1.5, 4.0), (2.5, 4.0), (2.5, 2.0), (2.5, 1.0)], rtol=1e-5)
-    with pytest.raises(ValueError, match=r"curriculum\.goal_span is 0\.5 0\.5"):
-        make(curriculum=dataclasses.replace(curriculum, goal_span=(0.5, 0.5)))
 
 
 def test_the_shape_is_seen_behind_the_state_and_changes_nothing_else(device):

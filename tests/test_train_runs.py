@@ -11,6 +11,7 @@ import pytest
 import torch
 from train_dummy import SMALL_PPO, DummyEnv, make_runner
 
+from vd.envs.curriculum import Stage
 from vd.policy import RandomPolicy, ZeroPolicy, load_policy
 from vd.train.checkpoint import (
     checkpoint_path,
@@ -62,7 +63,7 @@ def test_three_and_three_more_equal_six(tmp_path, schedule):
     assert [row["iteration"] for row in _rows(part)] == [1, 2, 3, 4, 5, 6]
     assert resumed.env_steps == whole.env_steps
     assert resumed.alg.learning_rate == whole.alg.learning_rate
-    assert resumed.env.env.difficulty == whole.env.env.difficulty
+    assert resumed.env.env.stage.difficulty == whole.env.env.stage.difficulty
 
 
 def test_resuming_from_an_older_checkpoint_rewrites_the_curve(tmp_path):
@@ -301,12 +302,62 @@ def test_a_checkpoint_without_worlds_goes_on_with_new_episodes(tmp_path):
     before, after = _weights(whole), _weights(resumed)
     assert all(torch.equal(before[name], after[name]) for name in before)
     assert resumed.alg.learning_rate == whole.alg.learning_rate
-    assert env.difficulty == whole.env.env.difficulty > 0.0
+    assert env.stage.difficulty == whole.env.env.stage.difficulty > 0.0
     assert not env.step_count.numpy().any(), "an episode went on"
     assert resumed.env_steps == whole.env_steps
     resumed.learn(2)
     assert [row["iteration"] for row in _rows(tmp_path)] == [1, 2, 3, 4, 5]
     assert _rows(tmp_path)[-1]["task/difficulty"] == pytest.approx(0.05)
+
+
+def test_the_floor_of_the_std_falls_as_stillness_tightens(tmp_path):
+    from dataclasses import replace
+
+    from train_dummy import SMALL_POLICY
+
+    policy = replace(SMALL_POLICY, std_range=(0.2, 1.0), quiet_std=0.05)
+    env = DummyEnv(num_worlds=16)
+    runner = make_runner(tmp_path, env=env, policy=policy)
+    observation = torch.randn(50, env.num_observations)
+    seen = []
+    for tightness in (0.0, 0.5, 1.0):
+        env.stage = Stage(1.0, tightness)
+        runner.learn(1)
+        with torch.no_grad():  # an output that asks for as little noise as there can be
+            runner.alg.actor.mlp[-2].bias[2:] = -50.0
+        seen.append(_outputs(runner, observation)[1])
+    for std, floor in zip(seen, (0.2, 0.1, 0.05), strict=True):
+        assert torch.allclose(std, torch.full_like(std, floor), rtol=1e-4)
+
+    again = make_runner(tmp_path, env=DummyEnv(num_worlds=16), policy=policy)
+    again.env.env.stage = Stage(1.0, 0.5)
+    again.learn(1)
+    assert again.alg.actor.distribution.log_std_range[0] == pytest.approx(np.log(0.1))
+
+
+@pytest.mark.parametrize(
+    "change", [{"quiet_std": 0.3}, {"quiet_std": 0.0}, {"quiet_std": 0.1, "distribution": "gaussian"}]
+)
+def test_a_quiet_std_above_the_floor_or_of_another_distribution_is_refused(tmp_path, change):
+    from dataclasses import replace
+
+    from train_dummy import SMALL_POLICY
+
+    with pytest.raises(ValueError, match=r"--policy\.quiet-std"):
+        make_runner(tmp_path, policy=replace(SMALL_POLICY, **{"std_range": (0.2, 1.0), **change}))
+
+
+def test_the_best_is_the_tightest_before_the_most_successful(tmp_path):
+    env = DummyEnv(num_worlds=16)
+    runner = make_runner(tmp_path, env=env, save_every=1)
+    runner._window = GoalWindow(1)
+    scores = []
+    for tightness in (0.0, 0.5, 0.25):
+        env.stage = Stage(1.0, tightness)
+        runner.learn(1)
+        scores.append(runner._score)
+    assert [score[0] for score in scores] == [0.0, 0.5, 0.25]
+    assert load_checkpoint(find_checkpoint(tmp_path, "best"))["iter"] == 2
 
 
 class SeeingEnv(DummyEnv):
@@ -349,7 +400,7 @@ def test_networks_that_see_more_act_as_before_and_learn_on(tmp_path, how, normal
     before, after = _outputs(blind, observation[:, :5]), _outputs(seeing, observation)
     assert all(torch.allclose(one, two, atol=1e-6) for one, two in zip(before, after, strict=True))
     assert seeing.current_learning_iteration == 3 and seeing.env_steps == blind.env_steps
-    assert seeing.env.env.difficulty == blind.env.env.difficulty > 0.0
+    assert seeing.env.env.stage.difficulty == blind.env.env.stage.difficulty > 0.0
     assert seeing.alg.learning_rate == blind.alg.learning_rate
 
     old, new = (r.alg.optimizer.state_dict()["state"] for r in (blind, seeing))

@@ -1,12 +1,14 @@
 """A tiny environment with the interface of ReorientEnv, whose every state is known and restorable."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
 
+from vd.envs.cfg import CurriculumCfg
+from vd.envs.curriculum import Stage
 from vd.paper import PAPER
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg
 from vd.train.runner import TeacherRunner
@@ -20,6 +22,7 @@ torch.set_num_threads(1)
 class DummyCfg:
     hand: str = "dummy"
     seed: int = 0
+    curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
 
 
 class DummyEnv:
@@ -50,7 +53,7 @@ class DummyEnv:
         self.done = wp.zeros(n, dtype=wp.int32, device=device)
         self.step_count = wp.zeros(n, dtype=wp.int32, device=device)
         self.goal_counts = wp.zeros(3, dtype=float, device=device)
-        self.difficulty = 0.0
+        self.stage = Stage(difficulty=0.0)
         self.updates = 0
         self.checks = 0
         self.steps = 0
@@ -95,21 +98,16 @@ class DummyEnv:
     def update_curriculum(self) -> dict[str, float]:
         """Raise the difficulty a little."""
         self.updates += 1
-        self.difficulty = min(1.0, self.difficulty + 0.01)
-        return {"difficulty": self.difficulty}
+        self.stage = replace(self.stage, difficulty=min(1.0, self.stage.difficulty + 0.01))
+        return asdict(self.stage)
 
     def failed_steps(self) -> int:
         """Nothing fails here."""
         return 0
 
-    @property
-    def parameters(self) -> "DummyEnv":
-        """Holder of the difficulty: this."""
-        return self
-
-    def set_difficulty(self, difficulty: float) -> None:
+    def set_stage(self, stage: Stage) -> None:
         """Nothing depends on it."""
-        self.difficulty = difficulty
+        self.stage = stage
 
     def reset(self) -> None:
         """New episodes everywhere."""
@@ -124,7 +122,7 @@ class DummyEnv:
             "generator": self._generator.bit_generator.state["state"]["state"].to_bytes(16, "little").hex(),
             "increment": self._generator.bit_generator.state["state"]["inc"].to_bytes(16, "little").hex(),
             "steps": self.steps,
-            "difficulty": self.difficulty,
+            "difficulty": self.stage.difficulty,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -137,7 +135,7 @@ class DummyEnv:
             "inc": int.from_bytes(bytes.fromhex(state["increment"]), "little"),
         }
         self._generator.bit_generator.state = inner
-        self.steps, self.difficulty = state["steps"], state["difficulty"]
+        self.steps, self.stage = state["steps"], Stage(state["difficulty"])
         self._observe()
 
     def close(self) -> None:

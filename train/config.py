@@ -61,6 +61,9 @@ class PolicyCfg:
     """Standard deviation of every action at the start."""
     std_range: tuple[float, float] = (1e-6, 1e6)
     """Bounds of the standard deviation; the default leaves it free, as in the paper's code."""
+    quiet_std: float | None = None
+    """Lower bound of the standard deviation where stillness has tightened to that of success
+    (--env.curriculum.tightening); the bound falls towards it with the tightness. None: it stays."""
     normalise_observations: bool = False
     """Subtract a running mean and divide by a running std; the paper does not."""
 
@@ -128,6 +131,13 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
         raise ValueError(
             f"--policy.std-range is {low} {high}; it has to be positive and hold --policy.initial-std "
             f"{policy.initial_std} inside"
+        )
+    if policy.quiet_std is not None and (
+        policy.distribution != "state-dependent" or not 0.0 < policy.quiet_std <= low
+    ):
+        raise ValueError(
+            f"--policy.quiet-std is {policy.quiet_std}; it has to be positive and at most the lower end "
+            f"{low} of --policy.std-range, and needs --policy.distribution state-dependent"
         )
 
 

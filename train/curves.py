@@ -43,7 +43,7 @@ def plot_curves(progress: Path | Sequence[Path], output: Path) -> None:
         (axes[0, 1], "mean_reward", "mean reward per control step", 1.0),
         (axes[1, 0], "task/rotation_error", "mean rotation error [rad]", 1.0),
         (axes[1, 1], "action_std", "mean std of the actions", 1.0),
-        (axes[0, 3], "task/difficulty", "difficulty of the curriculum (1: the configured task)", 1.0),
+        (axes[0, 3], "task/difficulty", "difficulty; dashed: tightness (1 and 1: the configured task)", 1.0),
         (axes[1, 2], "drop_rate", "episodes that end in a fall [%]", 100.0),
         (axes[1, 3], "steps_per_s", "control steps per second, learning included", 1.0),
     ]
@@ -51,6 +51,9 @@ def plot_curves(progress: Path | Sequence[Path], output: Path) -> None:
         for index, (name, rows) in enumerate(runs.items()):
             draw_line(axis, rows, key, scale, factor=factor, color=f"C{index}", label=name)
         axis.set_title(title)
+    for index, rows in enumerate(runs.values()):
+        if rows[0].get("task/tightness", 1.0) < 1.0:  # runs that tighten begin below
+            draw_line(axes[0, 3], rows, "task/tightness", scale, color=f"C{index}", label=None, style="--")
     first = next(iter(runs.values()))
     terms = [key for key in first[-1] if key.startswith("reward/") and key != "reward/total"]
     for index, key in enumerate(terms):
@@ -101,7 +104,8 @@ def draw_line(
     *,
     factor: float = 1.0,
     color: str,
-    label: str,
+    label: str | None,
+    style: str = "-",
 ) -> None:
     """One quantity: raw values pale, a running mean on top. Iterations without a value leave a gap."""
     points = [(row["env_steps"] / scale, row[key] * factor) for row in rows if row.get(key) is not None]
@@ -110,10 +114,16 @@ def draw_line(
     x, y = np.array(points).T
     width = max(1, round(len(y) * SMOOTHING))
     axis.plot(
-        x, y, color=color, alpha=0.25 if width > 1 else 1.0, linewidth=1.0, label=None if width > 1 else label
+        x,
+        y,
+        style,
+        color=color,
+        alpha=0.25 if width > 1 else 1.0,
+        linewidth=1.0,
+        label=None if width > 1 else label,
     )
     if width > 1:
         # Divide by the number of samples at hand, so that the ends are not pulled to zero.
         weights = np.ones(width)
         smooth = np.convolve(y, weights, "same") / np.convolve(np.ones_like(y), weights, "same")
-        axis.plot(x, smooth, color=color, linewidth=1.8, label=label)
+        axis.plot(x, smooth, style, color=color, linewidth=1.8, label=label)

@@ -21,6 +21,8 @@ class BoundedStdGaussian(HeteroscedasticGaussianDistribution):
         std_range: Open interval ``(low, high)`` of the standard deviation.
     """
 
+    log_std_range: list[float]
+
     def __init__(
         self, output_dim: int, init_std: float = 0.5, std_range: tuple[float, float] = (0.02, 1.0)
     ) -> None:
@@ -30,6 +32,10 @@ class BoundedStdGaussian(HeteroscedasticGaussianDistribution):
                 f"the std range {low} to {high} has to be positive and hold the initial std {init_std} inside"
             )
         super().__init__(output_dim, init_std=init_std, std_range=std_range, std_type="log")
+
+    def set_floor(self, std: float) -> None:
+        """Lower the standard deviation's least value to ``std``, or raise it; those above move with it."""
+        self.log_std_range = [math.log(std), self.log_std_range[1]]
 
     def update(self, mlp_output: torch.Tensor) -> None:
         """Set mean and standard deviation from the network's output, shape ``[..., 2, D]``."""

@@ -49,6 +49,7 @@ def summary(row: Mapping[str, Any], total: int, left_s: float | None) -> str:
     return (
         f"iteration {row['iteration']}/{total} | {format_steps(row['env_steps'])} steps, "
         f"{format_steps(row['steps_per_s'])}/s | success {_percent(row['success_per_goal'])} of goals | "
+        f"stage {row['task/difficulty']:.2f} {row['task/tightness']:.2f} | "
         f"reward {row['mean_reward']:.3f} | error {row['task/rotation_error']:.2f} rad | "
         f"std {row['action_std']:.3f} | left {format_duration(left_s)}"
     )

@@ -13,6 +13,7 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from vd.config import to_dict
+from vd.envs.curriculum import blend
 from vd.policy import PolicySpec, policy_export
 from vd.train.checkpoint import (
     BEST_NAME,
@@ -176,6 +177,7 @@ class TeacherRunner(OnPolicyRunner):
             The row for ``progress.jsonl``, or ``None`` if a signal cut the rollout short; the observation.
         """
         start = time.perf_counter()
+        self._set_std_floor()
         with torch.inference_mode():
             for _ in range(self.cfg["num_steps_per_env"]):
                 # With several processes all must do the same collectives, so they stop between iterations.
@@ -218,8 +220,16 @@ class TeacherRunner(OnPolicyRunner):
             **self.env.end_iteration(),
             **{f"loss/{name}": value for name, value in losses.items()},
         }
-        self._score = (row["task/difficulty"], row["success_per_goal"] or 0.0, row["mean_reward"])
+        stage = row["task/difficulty"] + row["task/tightness"] - 1.0  # 1: the configured task
+        self._score = (stage, row["success_per_goal"] or 0.0, row["mean_reward"])
         return row, observation
+
+    def _set_std_floor(self) -> None:
+        """Let the least std of the actions fall as stillness tightens (``PolicyCfg.quiet_std``)."""
+        quiet = self.policy_cfg.quiet_std
+        if quiet is not None:
+            floor = blend(self.policy_cfg.std_range[0], quiet, self.env.tightness)
+            self.alg.actor.distribution.set_floor(floor)
 
     def save(self, path: str, infos: dict | None = None) -> None:
         """Write a checkpoint, whole or not at all. With several processes every one has to call it.
@@ -309,7 +319,7 @@ class TeacherRunner(OnPolicyRunner):
             self.new_episodes = ""
         self._stagger_due = bool(self.new_episodes)
         if self.new_episodes:
-            self.env.start_anew(ranks[0]["env"]["difficulty"])
+            self.env.start_anew(ranks[0]["env"])
             return
         mine = ranks[self.gpu_global_rank]
         self.env.load_state_dict(mine["env"])
@@ -345,7 +355,7 @@ class TeacherRunner(OnPolicyRunner):
     def _save_periodic(self) -> None:
         """Write the checkpoint of this iteration, and the best if it is one.
 
-        The best is chosen by difficulty of the curriculum, then success per goal over the last two
+        The best is chosen by the curriculum's stage, then success per goal over the last two
         episodes, then mean reward, in that order: while nothing succeeds the reward decides. Until two
         episodes are over the latest takes its place: worlds whose goal is near succeed first, so that early
         rates are too high and no later one would beat them.

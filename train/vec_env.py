@@ -8,6 +8,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from vd.config import to_dict
+from vd.envs.state import saved_stage
 from vd.paper import PAPER
 
 OBSERVATION_GROUP = "policy"
@@ -128,8 +129,9 @@ class ReorientVecEnv(VecEnv):
         """Once an iteration: check the simulation, move the curriculum.
 
         Returns:
-            ``task/difficulty``: 0 to 1, 1 is the configured task; ``task/failed_steps``: those of worlds here
-            that were put back since the begin (``ReorientCfg.failures_per_million``).
+            ``task/difficulty`` and ``task/tightness``: the stage of the curriculum, 1 and 1 is the configured
+            task; ``task/failed_steps``: those of worlds here that were put back since the begin
+            (``ReorientCfg.failures_per_million``).
 
         Raises:
             SimulationError: NaN or lost contacts, with the numbers and the setting to change.
@@ -138,10 +140,17 @@ class ReorientVecEnv(VecEnv):
         if torch.distributed.is_initialized():
             # Every process counts all goals, and so moves to the same difficulty.
             torch.distributed.all_reduce(wp.to_torch(self.env.goal_counts))
+        numbers = self.env.update_curriculum()
         return {
-            "task/difficulty": self.env.update_curriculum()["difficulty"],
+            "task/difficulty": numbers["difficulty"],
+            "task/tightness": numbers["tightness"],
             "task/failed_steps": float(self.env.failed_steps()),
         }
+
+    @property
+    def tightness(self) -> float:
+        """How tight stillness is at present, 0 to 1 (:class:`vd.envs.cfg.TighteningCfg`)."""
+        return self.env.stage.tightness
 
     def state_dict(self) -> dict[str, Any]:
         """Simulation, episodes, curriculum and random state of the environment (arrays and plain values)."""
@@ -151,14 +160,13 @@ class ReorientVecEnv(VecEnv):
         """Restore what :meth:`state_dict` gave."""
         self.env.load_state_dict(state)
 
-    def start_anew(self, difficulty: float) -> None:
+    def start_anew(self, state: dict[str, Any]) -> None:
         """Begin new episodes in all worlds.
 
         Args:
-            difficulty: That of the curriculum, 0 to 1.
+            state: What :meth:`state_dict` gave, of which the stage of the curriculum is taken.
         """
-        self.env.difficulty = difficulty
-        self.env.parameters.set_difficulty(difficulty)
+        self.env.set_stage(saved_stage(state, self.env.cfg.curriculum))
         self.env.reset()
 
     def close(self) -> None:

@@ -106,6 +106,48 @@ class StartCfg:
 
 
 @dataclass(frozen=True)
+class TighteningCfg:
+    """Ours: ask for little stillness at first, later for that of ``success``. Off by default.
+
+    Noise in the actions moves the fingers more than the paper's success allows, and without noise nothing
+    is learned, so both have to fall together (``policy.quiet_std``). Where the difficulty is 1, the tightness
+    grows by ``rate`` per update while the success rate of goals is above ``raise_at``, and shrinks while it
+    is below ``lower_at``. At 0 the thresholds are these, at 1 those of ``success``, geometric in between.
+    """
+
+    enabled: bool = False
+    """Whether tightness starts at 0 rather than 1."""
+    joint_speed_rad_s: float = 3.0
+    """Largest norm of the joint velocities at tightness 0 [rad/s]; fingers at a std of 0.2 have about 1."""
+    object_speed_m_s: float = 0.16
+    """Largest speed of the object at tightness 0 [m/s]."""
+    object_spin_rad_s: float = 2.0
+    """Largest angular speed of the object at tightness 0 [rad/s]."""
+    action_norm: float = 3.5
+    """Largest norm of the smoothed action at tightness 0; that of twelve actions of 1 is 3.46."""
+    raise_at: float = 0.5
+    """Success rate of goals above which stillness tightens."""
+    lower_at: float = 0.3
+    """Success rate of goals below which it loosens."""
+    rate: float = 0.005
+    """Change of the tightness per update (one update each training iteration)."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        for name in ("joint_speed_rad_s", "object_speed_m_s", "object_spin_rad_s", "action_norm"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(
+                    f"curriculum.tightening.{name} is {getattr(self, name):g}; it has to be positive "
+                    "(a threshold that is not asked for at all is 0 in success)"
+                )
+        if not 0.0 <= self.lower_at <= self.raise_at <= 1.0:
+            raise ValueError(
+                f"curriculum.tightening.lower_at is {self.lower_at:g} and raise_at {self.raise_at:g}; "
+                "they have to rise within 0 and 1"
+            )
+
+
+@dataclass(frozen=True)
 class CurriculumCfg:
     """Ours: make the task harder as the success rate allows. Off by default.
 
@@ -134,9 +176,11 @@ class CurriculumCfg:
     """Change of the difficulty per update (one update each training iteration)."""
     energy_start: float = 0.0
     """Factor on the energy term at difficulty 0; it grows to 1."""
+    tightening: TighteningCfg = field(default_factory=TighteningCfg)
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
+        self.tightening.validate()
         for name, (low, high) in {"stillness_span": self.stillness_span, "goal_span": self.goal_span}.items():
             if not 0.0 <= low < high <= 1.0:
                 raise ValueError(

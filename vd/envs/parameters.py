@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 
 from vd.envs.cfg import ReorientCfg
+from vd.envs.curriculum import Stage, blend
 from vd.kernels.actions import ActionParams
 from vd.kernels.observations import ObservationParams
 from vd.kernels.randomisation import ForceParams, RandomisationParams
@@ -73,16 +74,21 @@ class TaskParameters:
         self.success = array(SuccessParams)
         self.goal = array(GoalParams)
         self._staging = {name: getattr(self, name).numpy() for name in ("reward", "success", "goal")}
-        self.set_difficulty(1.0)
+        self.set_stage(Stage())
 
-    def set_difficulty(self, difficulty: float) -> None:
-        """Write reward, success and goal parameters for a difficulty in [0, 1] (1: as configured)."""
-        cfg, curriculum = self.cfg, self.cfg.curriculum
+    def set_stage(self, stage: Stage) -> None:
+        """Write reward, success and goal parameters for a stage of the curriculum."""
+        cfg, curriculum, difficulty = self.cfg, self.cfg.curriculum, stage.difficulty
+        loose = curriculum.tightening
         # Thresholds shrink geometrically: each step of difficulty tightens by the same factor.
         slack = curriculum.stillness_start ** (1.0 - _progress(difficulty, curriculum.stillness_span))
         energy = curriculum.energy_start + (1.0 - curriculum.energy_start) * difficulty
         start = min(curriculum.goal_start_rad, cfg.goal.max_angle_rad)
         reward, success = cfg.reward, cfg.success
+
+        def threshold(tightest: float, loosest: float) -> float:
+            return slack * blend(loosest, tightest, stage.tightness) if tightest > 0.0 else 0.0
+
         self._write(
             "reward",
             success=reward.success,
@@ -103,10 +109,10 @@ class TaskParameters:
         self._write(
             "success",
             rotation=success.rotation_rad,
-            joint_speed=success.joint_speed_rad_s * slack,
-            object_speed=success.object_speed_m_s * slack,
-            object_spin=success.object_spin_rad_s * slack,
-            action_norm=success.action_norm * slack,
+            joint_speed=threshold(success.joint_speed_rad_s, loose.joint_speed_rad_s),
+            object_speed=threshold(success.object_speed_m_s, loose.object_speed_m_s),
+            object_spin=threshold(success.object_spin_rad_s, loose.object_spin_rad_s),
+            action_norm=threshold(success.action_norm, loose.action_norm),
             no_table_contact=int(success.no_table_contact),
             fall_distance=success.fall_m,
             fall_center=np.array(PAPER.scene.goal_position_m, dtype=np.float32),

@@ -15,6 +15,7 @@ from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.envs.cfg import ReorientCfg
+from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.parameters import TaskParameters
 from vd.envs.randomise import Randomiser
 from vd.envs.servo import needs_servo, servo_ranges
@@ -158,9 +159,9 @@ class ReorientEnv:
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
         self.randomiser = Randomiser(self)
 
-        self.difficulty = 0.0 if cfg.curriculum.enabled else 1.0
-        """Curriculum difficulty in [0, 1]; 1 is the configured task."""
-        self.parameters.set_difficulty(self.difficulty)
+        self.stage = first_stage(cfg.curriculum)
+        """How hard the task is at present; all ones is the configured task."""
+        self.parameters.set_stage(self.stage)
         self.dump_dir = Path()
         """Where :meth:`check` saves the step that failed."""
         self._graph: Any = None
@@ -462,23 +463,25 @@ class ReorientEnv:
     # Curriculum and checkpoints
 
     def update_curriculum(self) -> dict[str, float]:
-        """Move the difficulty by the success rate since the last call; returns numbers to log."""
+        """Move the stage by the success rate since the last call; returns numbers to log."""
         ended, reached, dropped = (float(v) for v in self.goal_counts.numpy())
         self.goal_counts.zero_()
         rate = reached / max(ended, 1.0)
-        cfg = self.cfg.curriculum
-        if cfg.enabled and ended > 0:
-            change = cfg.rate if rate > cfg.raise_at else -cfg.rate if rate < cfg.lower_at else 0.0
-            difficulty = min(1.0, max(0.0, self.difficulty + change))
-            if difficulty != self.difficulty:
-                self.difficulty = difficulty
-                self.parameters.set_difficulty(difficulty)
+        stage = next_stage(self.stage, rate, self.cfg.curriculum) if ended > 0 else self.stage
+        if stage != self.stage:
+            self.set_stage(stage)
         return {
             "success_per_goal": rate,
             "drop_per_goal": dropped / max(ended, 1.0),
             "goals_ended": ended,
-            "difficulty": self.difficulty,
+            "difficulty": stage.difficulty,
+            "tightness": stage.tightness,
         }
+
+    def set_stage(self, stage: Stage) -> None:
+        """Go to a stage of the curriculum."""
+        self.stage = stage
+        self.parameters.set_stage(stage)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue exactly, see :func:`vd.envs.state.save_state`."""

@@ -4,6 +4,9 @@ from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
+from vd.envs.cfg import CurriculumCfg
+from vd.envs.curriculum import Stage, first_stage
+
 if TYPE_CHECKING:
     from vd.envs.reorient import ReorientEnv
 
@@ -11,7 +14,24 @@ if TYPE_CHECKING:
 def save_state(env: "ReorientEnv") -> dict[str, Any]:
     """Everything needed to continue exactly: simulation, episodes, randomisation, curriculum, RNG."""
     arrays = {name: array.numpy().copy() for name, array in _arrays(env).items()}
-    return {"arrays": arrays, "difficulty": env.difficulty, "steps": env.steps}
+    return {
+        "arrays": arrays,
+        "difficulty": env.stage.difficulty,
+        "tightening": env.cfg.curriculum.tightening.enabled,
+        "tightness": env.stage.tightness,
+        "steps": env.steps,
+    }
+
+
+def saved_stage(state: dict[str, Any], cfg: CurriculumCfg) -> Stage:
+    """Stage at which a run goes on from what :func:`save_state` gave.
+
+    The tightness is that of the saved run only if it had one and this run has one too.
+    """
+    first = first_stage(cfg)
+    known = cfg.tightening.enabled and state.get("tightening", False)
+    tightness = float(state["tightness"]) if known else first.tightness
+    return Stage(float(state["difficulty"]), tightness)
 
 
 def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
@@ -37,8 +57,7 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
             )
         array.assign(saved)
     env.steps = int(state["steps"])
-    env.difficulty = float(state["difficulty"])
-    env.parameters.set_difficulty(env.difficulty)
+    env.set_stage(saved_stage(state, env.cfg.curriculum))
     env.randomiser.push()
     env.sim.forward_kinematics()
 

@@ -1,0 +1,136 @@
+"""How hard the task is while it is learned: when a stage is left, and what each asks for."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TighteningCfg
+from vd.envs.curriculum import Stage, first_stage, next_stage
+from vd.envs.reorient import ReorientEnv
+from vd.paper import PAPER
+
+TIGHTENING = TighteningCfg(enabled=True, rate=0.25, raise_at=0.5, lower_at=0.3)
+WELL, SO_SO, BADLY = 0.9, 0.4, 0.1
+
+
+def make(curriculum: CurriculumCfg, **changes) -> ReorientEnv:
+    cfg = ReorientCfg(
+        hand="dclaw3",
+        objects=("cube",),
+        num_worlds=2,
+        randomisation=RandomisationCfg(enabled=False),
+        curriculum=curriculum,
+    )
+    return ReorientEnv(dataclasses.replace(cfg, **changes), "cpu")
+
+
+def update(env: ReorientEnv, success_rate: float) -> dict[str, float]:
+    """An update after ten goals."""
+    env.goal_counts.assign(np.array([10.0, 10.0 * success_rate, 3.0], dtype=np.float32))
+    return env.update_curriculum()
+
+
+def thresholds(env: ReorientEnv) -> list[float]:
+    """Joint speed, speed and spin of the object, norm of the action: what success asks at present."""
+    values = env.parameters.success.numpy()
+    return [float(values[name][0]) for name in ("joint_speed", "object_speed", "object_spin", "action_norm")]
+
+
+def test_goals_recede_only_while_they_are_reached():
+    curriculum = CurriculumCfg(enabled=True, rate=0.25, stillness_start=8.0, goal_start_rad=0.5)
+    env = make(curriculum, goal=GoalCfg(max_angle_rad=1.5))
+
+    def present() -> tuple[float, float]:
+        return thresholds(env)[0], float(env.parameters.goal.numpy()["max_angle"][0])
+
+    limit = SuccessCfg().joint_speed_rad_s
+    assert present() == pytest.approx((8.0 * limit, 0.5))
+    assert update(env, WELL)["difficulty"] == 0.25
+    assert present()[0] < 8.0 * limit and present()[1] > 0.5
+    for _ in range(5):
+        update(env, WELL)
+    assert present() == pytest.approx((limit, 1.5)), "difficulty 1 is the configured task"
+    numbers = update(env, BADLY)
+    assert numbers["difficulty"] == 0.75 and numbers["tightness"] == 1.0
+    assert numbers["success_per_goal"] == pytest.approx(0.1)
+    assert numbers["drop_per_goal"] == pytest.approx(0.3)
+
+
+def test_goals_can_widen_before_stillness_tightens():
+    curriculum = CurriculumCfg(
+        enabled=True, goal_start_rad=0.5, stillness_start=4.0, goal_span=(0.0, 0.5), stillness_span=(0.5, 1.0)
+    )
+    env = make(curriculum, goal=GoalCfg(max_angle_rad=2.5))
+    limit = SuccessCfg().object_spin_rad_s
+    seen = []
+    for difficulty in (0.0, 0.25, 0.5, 0.75, 1.0):
+        env.set_stage(Stage(difficulty))
+        seen.append((float(env.parameters.goal.numpy()["max_angle"][0]), thresholds(env)[2] / limit))
+    assert np.allclose(seen, [(0.5, 4.0), (1.5, 4.0), (2.5, 4.0), (2.5, 2.0), (2.5, 1.0)], rtol=1e-5)
+    with pytest.raises(ValueError, match=r"curriculum\.goal_span is 0\.5 0\.5"):
+        make(dataclasses.replace(curriculum, goal_span=(0.5, 0.5)))
+
+
+def test_stillness_tightens_after_the_goals_and_loosens_before_them():
+    cfg = CurriculumCfg(enabled=True, rate=0.5, raise_at=0.5, lower_at=0.3, tightening=TIGHTENING)
+    stage = first_stage(cfg)
+    seen = [stage]
+    for rate in [WELL] * 6 + [SO_SO, WELL] + [BADLY] * 5:
+        stage = next_stage(stage, rate, cfg)
+        seen.append(stage)
+    assert [s.difficulty for s in seen] == [0, 0.5] + 11 * [1.0] + [0.5]
+    assert [s.tightness for s in seen] == [0, 0, 0, 0.25, 0.5, 0.75, 1, 1, 1, 0.75, 0.5, 0.25, 0, 0]
+
+
+def test_without_tightening_the_thresholds_are_those_of_success_from_the_start():
+    assert first_stage(CurriculumCfg()) == Stage(1.0, 1.0)
+    assert first_stage(CurriculumCfg(enabled=True)) == Stage(0.0, 1.0)
+    cfg = CurriculumCfg(enabled=True, lower_at=0.3, rate=0.5)
+    assert next_stage(Stage(1.0, 1.0), BADLY, cfg) == Stage(0.5, 1.0)
+    assert next_stage(Stage(1.0, 1.0), BADLY, CurriculumCfg()) == Stage(1.0, 1.0)
+
+
+def test_thresholds_shrink_by_the_same_factor_from_loose_to_those_of_success():
+    env = make(CurriculumCfg(tightening=TIGHTENING), success=SuccessCfg(object_spin_rad_s=0.0))
+    loose = [TIGHTENING.joint_speed_rad_s, TIGHTENING.object_speed_m_s, 0.0, TIGHTENING.action_norm]
+    success = PAPER.success
+    tight = [success.joint_speed_rad_s, success.object_speed_m_s, 0.0, success.action_norm]
+    seen = [thresholds(env)]
+    for tightness in (0.25, 0.5, 0.75, 1.0):
+        assert update(env, WELL)["tightness"] == tightness
+        seen.append(thresholds(env))
+    assert seen[0] == pytest.approx(loose) and seen[-1] == pytest.approx(tight)
+    assert seen[2] == pytest.approx(np.sqrt(np.multiply(loose, tight)), rel=1e-5)
+    assert update(env, SO_SO)["tightness"] == 1.0
+    assert update(env, BADLY)["tightness"] == 0.75
+    assert thresholds(env) == pytest.approx(seen[3])
+
+
+def test_a_saved_environment_goes_on_with_its_tightness():
+    cfg = CurriculumCfg(tightening=TIGHTENING)
+    env = make(cfg)
+    update(env, WELL)
+    state = env.state_dict()
+    other = make(cfg)
+    other.load_state_dict(state)
+    assert other.stage == Stage(1.0, 0.25) and thresholds(other) == thresholds(env)
+
+    plain = make(CurriculumCfg())
+    plain.load_state_dict(state)
+    assert plain.stage == Stage(), "a run that does not tighten asks for what success says"
+    before = {key: value for key, value in state.items() if key not in ("tightening", "tightness")}
+    for old in (before, plain.state_dict()):
+        begun = make(cfg)
+        begun.load_state_dict(old)
+        assert begun.stage == Stage(1.0, 0.0), "a run that did not tighten had learned none of it"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"action_norm": 0.0}, r"action_norm is 0; it has to be positive"), ({"lower_at": 0.6}, "have to rise")],
+)
+def test_a_tightening_that_cannot_work_is_refused(change, message):
+    cfg = dataclasses.replace(TIGHTENING, **change)
+    with pytest.raises(ValueError, match=rf"curriculum\.tightening.*{message}"):
+        CurriculumCfg(tightening=cfg).validate()
