@@ -21,8 +21,8 @@ from vd.train.student.config import (
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
+    from vd.student.cfg import StateCfg
     from vd.student.network import Student
-    from vd.student.saved import StudentSpec
     from vd.train.student.runner import Learner, StudentRunner
 
 CONFIG_NAME = "config.json"
@@ -106,18 +106,17 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     from vd.policy import load_policy
     from vd.student.network import Student
     from vd.student.saved import StudentSpec
-    from vd.student.state import state_cfg
     from vd.train.distributed import Processes, join_processes
     from vd.train.student.runner import StudentRunner
 
     device = cfg.run.device
     teacher = load_policy(find_policy(cfg.teacher), device)
     task = student_task(teacher, cfg)
-    if cfg.init is None and cfg.dagger.state_weight > 0.0:
-        if task.observation.view == "world":
-            cfg = replace(cfg, network=replace(cfg.network, state=state_cfg(teacher.spec)))
-        elif rank == 0:
-            print(f"{cfg.teacher} sees goals in views that no cloud tells: only its actions are imitated")
+    if checkpoint is None:
+        cfg = replace(cfg, network=replace(cfg.network, state=state_head(cfg, teacher)))
+    if cfg.network.state.views:
+        # The teacher's views are the student's to choose.
+        task = replace(task, observation=replace(task.observation, view="world"))
     if rank == 0:
         # Before anything is built: a run that fails at once still says what it was.
         saved = to_dict(replace(cfg, resume=None))
@@ -130,10 +129,10 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     torch.manual_seed(cfg.task.seed)
     torch.set_float32_matmul_precision("high")
     student = Student(cfg.network, teacher.num_actions).to(device)
-    if student.state is not None:
-        student.state.adopt(teacher.network)
-    if cfg.init is not None:
-        begin_from(cfg.init, student, device)
+    if cfg.init is not None and checkpoint is None:
+        anew = begin_from(cfg.init, student, device)
+        if anew and rank == 0:
+            print(f"of {cfg.init} these do not fit, and begin anew: {', '.join(anew)}")
     torch.manual_seed(cfg.task.seed + rank)
     world_size = int(os.environ.get("WORLD_SIZE", "1"))
     own_task = replace(task, seed=cfg.task.seed + rank)
@@ -190,25 +189,53 @@ def check_start(cfg: StudentTrainCfg) -> None:
         )
 
 
-def begin_from(path: Path, student: "Student", device: str) -> "StudentSpec":
-    """Take over the weights of another student.
+def state_head(cfg: StudentTrainCfg, teacher: "TrainedPolicy") -> "StateCfg":
+    """The head for what the teacher observes: a student that acts already keeps to having one, or none."""
+    from vd.evaluate.agents import trained_task
+    from vd.kernels.observations import JOINTS_PER_FINGER
+    from vd.student.cfg import StateCfg
+    from vd.student.saved import read_student, saved_spec
+    from vd.student.state import state_cfg
+
+    wanted = cfg.dagger.state_weight > 0.0
+    if cfg.init is not None and saved_spec(read_student(cfg.init), cfg.init).stage != PRETRAINING:
+        wanted = cfg.network.state.values > 0
+    if not wanted:
+        return StateCfg()
+    in_views = trained_task(teacher).observation.view == "goal"
+    return state_cfg(teacher.spec, views=teacher.num_actions // JOINTS_PER_FINGER if in_views else 0)
+
+
+def begin_from(path: Path, student: "Student", device: str) -> list[str]:
+    """Take over the weights of another student, as far as they fit.
+
+    The layers that act on an estimate of what the teacher observes may be of other sizes; of a pre-trained
+    encoder, all that belongs to a hand may.
+
+    Returns:
+        Parts of the network that begin anew.
 
     Raises:
-        ValueError: It is of another network or hand.
+        ValueError: It is of another network, or has learned to move another hand.
     """
     from vd.student.saved import read_student, saved_spec
 
     state = read_student(path, device)
     spec = saved_spec(state, path)
-    if spec.num_actions != student.num_actions:
+    if spec.num_actions != student.num_actions and spec.stage != PRETRAINING:
         raise ValueError(
             f"{path} moves {spec.num_actions} joints, the teacher {student.num_actions}; "
-            "give a student of the same hand"
+            "give a student of the same hand, or one of stage 0"
         )
-    if to_dict(spec.network) != to_dict(student.cfg):
+    if to_dict(replace(spec.network, state=student.cfg.state)) != to_dict(student.cfg):
         raise ValueError(f"{path} is of another network than --network says; leave those flags out")
-    student.load_state_dict(state["student_state_dict"])
-    return spec
+    own, theirs = student.state_dict(), state["student_state_dict"]
+    if spec.network.state != student.cfg.state:
+        # Actions were read from the memory alone, or added to those of another teacher.
+        theirs = {name: value for name, value in theirs.items() if not name.startswith(("state.", "mean."))}
+    fits = {name: value for name, value in theirs.items() if own[name].shape == value.shape}
+    student.load_state_dict(fits, strict=False)
+    return sorted({name.split(".")[0] for name in own.keys() - fits.keys()})
 
 
 def _pretrainer(cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", world_size: int) -> Any:
@@ -248,7 +275,8 @@ def _dagger(
     import torch
 
     from vd.envs.reorient import ReorientEnv
-    from vd.envs.symmetry import WorldOrder
+    from vd.envs.symmetry import WorldOrder, view_tables
+    from vd.student.views import EveryView
     from vd.train.student.dagger import Dagger
     from vd.train.vec_env import ReorientVecEnv
     from vd.vision import StudentView
@@ -274,4 +302,14 @@ def _dagger(
         batch=cfg.dagger.minibatch_worlds * cfg.dagger.rollout_steps,
         seed=task.seed,
     )
-    return Dagger(env, view, student, WorldOrder(teacher, simulation), cfg.dagger, world_size=world_size)
+    labels: Any = WorldOrder(teacher, simulation)
+    state = student.state
+    if state is not None:
+        tables = view_tables(simulation) if state.views is not None else None
+        if fresh and state.adopt(teacher.network, tables):
+            # What is added to the actions of another teacher's layers is of no use to these.
+            torch.nn.init.zeros_(student.mean.weight)
+            torch.nn.init.zeros_(student.mean.bias)
+        if state.views is not None:
+            labels = EveryView(teacher, state.views)
+    return Dagger(env, view, student, labels, cfg.dagger, world_size=world_size)

@@ -25,6 +25,7 @@ from vd.train.student.losses import (
     distance_loss,
     imitation_figures,
     imitation_loss,
+    in_view,
     match_loss,
     poses,
 )
@@ -79,7 +80,8 @@ class Dagger:
         env: The worlds.
         view: What the student sees of them.
         student: The network.
-        teacher: Labels observations of ``env``.
+        teacher: Labels observations of ``env``, once [N, D] or in each view that the student may take
+            [N, F, D]: then the label of a state is that of the view the student takes.
         cfg: Settings.
         world_size: Processes of the run: gradients are averaged over them.
     """
@@ -196,6 +198,7 @@ class Dagger:
         taught = torch.rand((worlds, 1), device=self.device) < self.teacher_share()
         frames: dict[str, torch.Tensor] = {}
         labels: list[torch.Tensor] = []
+        wanted: list[torch.Tensor] = []
         means: list[torch.Tensor] = []
         done = torch.zeros((cfg.rollout_steps, worlds), dtype=torch.bool, device=self.device)
         with torch.no_grad():
@@ -204,25 +207,26 @@ class Dagger:
                 if stopping():
                     self._means.clear()
                     return None
-                frame = self.view.frame()
+                frame, observed = self.view.frame(), observation[OBSERVATION_GROUP]
                 if self.student.state is not None:
-                    frame["observation"] = observation[OBSERVATION_GROUP].clone()
+                    frame["observation"] = observed.clone()
                 for name, value in frame.items():
                     if step == 0:
                         # A tenth of a millimetre is lost of camera points, and half of the memory won.
                         dtype = torch.half if name in UNCLIPPED else value.dtype
                         frames[name] = value.new_empty((cfg.rollout_steps, *value.shape), dtype=dtype)
                     frames[name][step] = value
-                labels.append(self._label(observation[OBSERVATION_GROUP]))
+                labels.append(self._label(observed))
                 sites = self.view.sites(frame, augment=True)
                 senses = self.student.senses(frame)
                 output = self.student(self._look(sites)[0][None], senses[None], self._hidden)
                 action, std = output.mean[0], output.log_std[0].exp()
                 means.append(action)
+                wanted.append(in_view(labels[-1], output.view[0]))
                 error = (output.distance[0, :, -1] - frame["distance"]).abs().mean()
                 if cfg.imitation == "likelihood":
                     action = action + std * torch.randn_like(action)
-                action = torch.where(taught, labels[-1], action)
+                action = torch.where(taught, in_view(labels[-1], self._true_view(observed)), action)
                 observation, _, ended, extras = self.env.step(action)
                 done[step] = ended.bool()
                 self._hidden = output.hidden.masked_fill(done[step, :, None], 0.0)
@@ -233,7 +237,7 @@ class Dagger:
                 self._means.add(log | {"policy/std": std.mean()})
         rollout = Rollout(frames, torch.stack(labels), done, first, torch.arange(worlds, device=self.device))
         own = ~taught[:, 0] if not bool(taught.all()) else taught[:, 0]
-        self._figures = imitation_figures("student", torch.stack(means)[:, own], rollout.label[:, own])
+        self._figures = imitation_figures("student", torch.stack(means)[:, own], torch.stack(wanted)[:, own])
         self._check_rollout(rollout)
         return rollout
 
@@ -251,12 +255,13 @@ class Dagger:
             return {f"validation/{name}": None for name in names}
         self.student.eval()
         hidden = self.student.initial_hidden(self.cfg.validation_worlds)
-        means, errors, turns = [], [], []
+        means, wanted, errors, turns = [], [], [], []
         with torch.no_grad():
             for part in self._held_out:
                 output, embedding, _ = self._run(part, hidden, augment=False)
                 hidden = output.hidden.masked_fill(part.done[-1, :, None], 0.0)
                 means.append(output.mean)
+                wanted.append(in_view(part.label, output.view))
                 if self.pose is not None:
                     turns.append(
                         angle_between(
@@ -264,8 +269,7 @@ class Dagger:
                         )
                     )
                 errors.append((output.distance[..., -1] - part.frames["distance"]).abs())
-        label = torch.cat([part.label for part in self._held_out])
-        figures = imitation_figures("validation", torch.cat(means), label)
+        figures = imitation_figures("validation", torch.cat(means), torch.cat(wanted))
         figures["validation/distance_error"] = torch.cat(errors).mean()
         if turns:
             figures["validation/rotation_error"] = torch.cat(turns).mean()
@@ -305,7 +309,10 @@ class Dagger:
         output, embedding, matches = self._run(rollout, rollout.hidden, augment=True)
         found = {
             "imitation": imitation_loss(
-                output, rollout.label, self.cfg.imitation, bounded=self.cfg.clip_labels
+                output,
+                in_view(rollout.label, output.view),
+                self.cfg.imitation,
+                bounded=self.cfg.clip_labels,
             ),
             "distance": distance_loss(output.distance, rollout.frames["distance"]),
         }
@@ -389,6 +396,13 @@ class Dagger:
     def _label(self, observation: torch.Tensor) -> torch.Tensor:
         label = self.teacher.act(observation)
         return label.clamp(-1.0, 1.0) if self.cfg.clip_labels else label
+
+    def _true_view(self, observation: torch.Tensor) -> torch.Tensor:
+        """The view that each state calls for [N]: the one in which the teacher acts itself."""
+        state = self.student.state
+        if state is None or state.views is None:
+            return torch.zeros(len(observation), dtype=torch.long, device=self.device)
+        return state.views.choose(observation)
 
     def _look(self, sites: tuple[Sites, ...]) -> tuple[torch.Tensor, Matches | None]:
         """Embeddings and matches; what follows the encoder is small, and stays in single precision."""

@@ -47,6 +47,18 @@ def imitation_loss(
     return (0.5 * scaled.square() + output.log_std + 0.5 * math.log(2.0 * math.pi)).sum(dim=-1).mean()
 
 
+def in_view(label: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
+    """The labels [.., D] that belong to the views [..] which were taken.
+
+    Args:
+        label: One label of a state [.., D], or one in each view of the teacher [.., F, D].
+        view: Views [..].
+    """
+    if label.ndim == view.ndim + 1:
+        return label
+    return label.take_along_dim(view[..., None, None], dim=-2).squeeze(-2)
+
+
 def distance_loss(predicted: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
     """Squared error of predictions [T, N, H] of the rotation distance [T, N], in rad^2; the mean over all."""
     return (predicted - true[..., None]).square().mean()

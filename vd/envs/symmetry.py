@@ -1,5 +1,6 @@
 """The views of :mod:`vd.kernels.symmetry` for a hand and an observation: their tables, and their launches."""
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,6 +22,38 @@ SECTOR = np.array([1.0, 0.0, 0.0])
 """Views turn the axis of the wanted rotation near to this direction, world frame; any would do."""
 
 
+@dataclass(frozen=True)
+class ViewTables:
+    """What the F views of a hand are made of."""
+
+    source: np.ndarray
+    """Values of the world frame that make each value of a view, int [F, O, T]."""
+    factor: np.ndarray
+    """Their factors [F, O, T]."""
+    joints: np.ndarray
+    """Joint of the view that is each joint of the world, int [F, D]."""
+    sector: np.ndarray
+    """The direction near which a view has the axis of the wanted rotation, as it is in the world [F, 3]."""
+
+
+def view_tables(env: "ReorientEnv") -> ViewTables:
+    """The views of an environment's hand and observation.
+
+    Raises:
+        ValueError: The fingers are not spaced evenly about the vertical.
+    """
+    fingers, tips = env.num_fingers, _tips(env)
+    maps = [_observation_map(tips, step, sees_shape=env.sees_shape) for step in range(fingers)]
+    source = np.stack([np.argsort(-np.abs(m), axis=1, kind="stable")[:, :TERMS] for m in maps])
+    turns = [_turn(step, fingers) for step in range(fingers)]
+    return ViewTables(
+        source=source,
+        factor=np.take_along_axis(np.stack(maps), source, axis=2),
+        joints=np.stack([_joint_source(_finger_source(tips, -step)) for step in range(fingers)]),
+        sector=np.stack([turn.inv().apply(SECTOR) for turn in turns]),
+    )
+
+
 class Views:
     """The view of each world of ``env``, and what the policy sees and does in it.
 
@@ -36,17 +69,11 @@ class Views:
             ValueError: The fingers are not spaced evenly about the vertical.
         """
         self._env = env
-        device, worlds, fingers = env.device, env.num_worlds, env.num_fingers
-        tips = _tips(env)
-        maps = [_observation_map(tips, step, sees_shape=env.sees_shape) for step in range(fingers)]
-        source = np.stack([np.argsort(-np.abs(m), axis=1, kind="stable")[:, :TERMS] for m in maps])
-        factor = np.take_along_axis(np.stack(maps), source, axis=2)
-        joints = np.stack([_joint_source(_finger_source(tips, -step)) for step in range(fingers)])
-        turns = [_turn(step, fingers) for step in range(fingers)]
-        self._source = wp.array(source, dtype=wp.int32, device=device)
-        self._factor = wp.array(factor, dtype=float, device=device)
-        self._joints = wp.array(joints, dtype=wp.int32, device=device)
-        self._sector = wp.array([turn.inv().apply(SECTOR) for turn in turns], dtype=wp.vec3, device=device)
+        device, worlds, tables = env.device, env.num_worlds, view_tables(env)
+        self._source = wp.array(tables.source, dtype=wp.int32, device=device)
+        self._factor = wp.array(tables.factor, dtype=float, device=device)
+        self._joints = wp.array(tables.joints, dtype=wp.int32, device=device)
+        self._sector = wp.array(tables.sector, dtype=wp.vec3, device=device)
         self._action = wp.zeros((worlds, env.num_actions), dtype=float, device=device)
         self.view = wp.zeros(worlds, dtype=wp.int32, device=device)
         self.observation = wp.zeros((worlds, env.num_observations), dtype=float, device=device)
@@ -104,9 +131,15 @@ class WorldOrder:
 
 
 def _tips(env: "ReorientEnv") -> np.ndarray:
-    """Fingertip poses of a world, the angles of all fingers the same, with the simulation's signs [F, 7]."""
+    """Fingertip poses of a hand with all angles zero, with the simulation's signs [F, 7]."""
+    joints = env.sim.joint_q.numpy()
+    straight = joints.copy()
+    straight[:, : env.num_actions] = 0.0
+    env.sim.joint_q.assign(straight)
     env.sim.forward_kinematics()
     bodies = env.sim.body_q.numpy()[0]
+    env.sim.joint_q.assign(joints)
+    env.sim.forward_kinematics()
     pairs = zip(bodies[env.tip_body.numpy()], env.tip_offset.numpy(), strict=True)
     tips: list[Any] = [wp.transform_multiply(wp.transform(*body), wp.transform(*tip)) for body, tip in pairs]
     return np.array([[tip[i] for i in range(7)] for tip in tips])

@@ -110,11 +110,13 @@ class StateCfg:
     """Their activation."""
     inside: int = 256
     """Width of the layer that reads the estimate."""
+    views: int = 0
+    """Views in which the teacher sees its goals, one for each finger; 0: it sees the world as it is."""
 
     def validate(self) -> None:
         """Raise ``ValueError`` for sizes that make no network, naming the field."""
-        if self.values < 0 or min((self.inside, *self.hidden)) < 1:
-            raise ValueError("state: values must not be negative and every other size be positive")
+        if min(self.values, self.views) < 0 or min((self.inside, *self.hidden)) < 1:
+            raise ValueError("state: values and views must not be negative and every other size be positive")
 
 
 @dataclass(frozen=True)

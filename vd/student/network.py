@@ -40,6 +40,8 @@ class StudentOutput:
     """Predicted angle to the goal by each distance head [rad], in the order of the configuration [.., H]."""
     state: torch.Tensor
     """Estimate of the teacher's observation, normalised [.., O]; O is 0 without such a head."""
+    view: torch.Tensor
+    """View in which the teacher's layers acted on it [..]; 0 if they have none."""
     seen: torch.Tensor
     """What that is read from: features of the memory, the embedding, the senses [.., W]."""
     hidden: torch.Tensor
@@ -264,9 +266,9 @@ class Student(nn.Module):
             low, high = (math.log(bound) for bound in self.cfg.std_range)
             log_std = low + (high - low) * torch.sigmoid(log_std)
         mean, seen = self.mean(features), torch.cat([features, embedding, senses], dim=-1)
-        state = seen[..., :0]
+        state, view = seen[..., :0], torch.zeros(mean.shape[:-1], dtype=torch.long, device=mean.device)
         if self.state is not None:
-            state, action = self.state(seen)
+            state, action, view = self.state(seen)
             mean = mean + action
         # Autocast may have computed in half precision; losses and the next step should not have to.
         precision = self.mean.weight.dtype
@@ -275,6 +277,7 @@ class Student(nn.Module):
             log_std.to(precision),
             torch.cat(distance, dim=-1).to(precision),
             state.to(precision),
+            view,
             seen.to(precision),
             hidden.to(precision),
         )
@@ -289,6 +292,7 @@ class Student(nn.Module):
             output.log_std[0],
             output.distance[0],
             output.state[0],
+            output.view[0],
             output.seen[0],
             output.hidden,
         )

@@ -2,8 +2,11 @@
 
 A teacher's actions turn sharply with its state, and labels alone teach a new network to turn so only after a
 great many of them. Its layers do already, and they bear an estimate that is off
-(docs/results/student.md): what is left to learn is to see. O values of the observation, D actions.
+(docs/student.md): what is left to learn is to see. A teacher that sees its goals in views is shown the
+estimate in the view that the estimate calls for. O values of the observation, D actions.
 """
+
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
@@ -11,6 +14,10 @@ from torch import nn
 from vd.kernels.observations import JOINTS_PER_FINGER, teacher_observation_slices
 from vd.policy import MeanAction, PolicySpec, perceptron
 from vd.student.cfg import StateCfg
+from vd.student.views import ViewMaps
+
+if TYPE_CHECKING:
+    from vd.envs.symmetry import ViewTables
 
 UNSEEN = ("object_orientation", "goal_orientation")
 """Orientations in the axes of the object's file, which no cloud shows; the teacher hardly uses them."""
@@ -19,16 +26,24 @@ RIDGE = 1e-4
 """Variance of noise that the first estimate is made to bear, in features of about one."""
 
 
-def state_cfg(teacher: PolicySpec) -> StateCfg:
-    """The head that estimates what a teacher observes, with layers like the teacher's."""
-    return StateCfg(values=teacher.num_observations, hidden=teacher.hidden, activation=teacher.activation)
+def state_cfg(teacher: PolicySpec, *, views: int = 0) -> StateCfg:
+    """The head that estimates what a teacher observes, with layers like the teacher's.
+
+    Args:
+        teacher: The teacher.
+        views: Views in which it sees its goals; 0: it sees the world as it is.
+    """
+    return StateCfg(
+        values=teacher.num_observations, hidden=teacher.hidden, activation=teacher.activation, views=views
+    )
 
 
 class StateHead(nn.Module):
     """From features to an estimate of the teacher's observation, and to what the teacher does there.
 
-    Values are normalised as the teacher's: zero is the mean of its training, which the values that cannot be
-    seen are left at. The teacher's layers are not trained; they are random until :meth:`adopt`.
+    The estimate is of the observation in the world frame, normalised: zero is its mean in the teacher's
+    training. Values that cannot be seen are at the mean for the teacher, whatever the estimate says of them.
+    The teacher's layers are not trained; they are random until :meth:`adopt`.
 
     Args:
         cfg: Sizes.
@@ -39,6 +54,9 @@ class StateHead(nn.Module):
     offset: torch.Tensor
     scale: torch.Tensor
     fitted: torch.Tensor
+    view_offset: torch.Tensor
+    view_scale: torch.Tensor
+    known: torch.Tensor
 
     def __init__(self, cfg: StateCfg, width: int, num_actions: int) -> None:
         super().__init__()
@@ -50,36 +68,73 @@ class StateHead(nn.Module):
         self.register_buffer("offset", torch.zeros(cfg.values))
         self.register_buffer("scale", torch.ones(cfg.values))
         self.register_buffer("fitted", torch.tensor(False))
+        self.views = ViewMaps(cfg.views, cfg.values, num_actions) if cfg.views else None
+        if self.views is not None:
+            self.register_buffer("view_offset", torch.zeros(cfg.values))
+            self.register_buffer("view_scale", torch.ones(cfg.values))
         columns = teacher_observation_slices(num_actions // JOINTS_PER_FINGER)
         self._turn = columns["relative_orientation"]
-        self._unseen = [columns[name] for name in UNSEEN]
+        known = torch.ones(cfg.values)
+        for name in UNSEEN:
+            known[columns[name]] = 0.0
+        self.register_buffer("known", known, persistent=False)
 
-    def adopt(self, teacher: MeanAction) -> None:
-        """Take over the layers of a teacher and the scales of its observation.
+    def adopt(self, teacher: MeanAction, tables: "ViewTables | None" = None) -> bool:
+        """Take over the layers of a teacher, the scales of its observation, and its views.
+
+        Args:
+            teacher: The teacher.
+            tables: The views of its hand, if it sees its goals in them.
+
+        Returns:
+            Whether it is another one than before; the estimate then is to be fitted anew.
 
         Raises:
             RuntimeError: Its layers are of other sizes.
         """
+        before = [weight.clone() for weight in self.teacher.parameters()]
         weights = teacher.layers.state_dict()
         # A state-dependent std is the second half of the teacher's outputs.
         for name, value in self.teacher[-1].state_dict(prefix=f"{len(self.teacher) - 1}.").items():
             weights[name] = weights[name][: len(value)]
         self.teacher.load_state_dict(weights)
-        self.offset.copy_(teacher.offset[0])
-        self.scale.copy_(teacher.scale[0])
+        offset, scale = teacher.offset[0], teacher.scale[0]
+        if self.views is not None and tables is not None:
+            self.views.adopt(tables)
+            self.view_offset.copy_(offset)
+            self.view_scale.copy_(scale)
+            offset, scale = self.views.world_moments(offset, scale)
+        self.offset.copy_(offset)
+        self.scale.copy_(scale)
+        if all(torch.equal(old, new) for old, new in zip(before, self.teacher.parameters(), strict=True)):
+            return False
+        self.fitted.fill_(False)
+        return True
 
     def target(self, observation: torch.Tensor) -> torch.Tensor:
-        """What the estimate of an observation [.., O] should be, normalised.
+        """What the estimate of an observation in the world frame [.., O] should be, normalised.
 
         Of a rotation's two quaternions the one of less than half a turn; of what cannot be seen, the mean.
         """
         wanted = observation.clone()
         turn = wanted[..., self._turn]
         wanted[..., self._turn] = torch.where(turn[..., 3:] < 0.0, -turn, turn)
-        wanted = (wanted - self.offset) / self.scale
-        for columns in self._unseen:
-            wanted[..., columns] = 0.0
-        return wanted
+        return self.known * (wanted - self.offset) / self.scale
+
+    def act(self, estimate: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the teacher does at an estimate [.., O].
+
+        Returns:
+            Its mean action, in the world's order [.., D], and the view it takes [..], 0 where it has none.
+        """
+        if self.views is None:
+            return self.teacher(self.known * estimate), estimate.new_zeros(
+                estimate.shape[:-1], dtype=torch.long
+            )
+        world = self.offset + self.scale * estimate
+        view = self.views.choose(world)
+        seen = (self.views.take(world, view) - self.view_offset) / self.view_scale
+        return self.views.world_action(self.teacher(self.known * seen), view), view
 
     def fit(self, features: torch.Tensor, observation: torch.Tensor) -> None:
         """Begin with the estimate that is best in least squares: gradients would take long to what is exact.
@@ -100,7 +155,7 @@ class StateHead(nn.Module):
             self.estimate.bias.copy_(mean - middle @ slope)
             self.fitted.fill_(True)
 
-    def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Estimated observation, normalised [.., O], and the teacher's mean action there [.., D]."""
+    def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Estimated observation, normalised [.., O], and what :meth:`act` says of it."""
         estimate = self.estimate(torch.cat([features, self.inside(features)], dim=-1))
-        return estimate, self.teacher(estimate)
+        return estimate, *self.act(estimate)

@@ -1,0 +1,103 @@
+"""The views of a teacher that sees its goals in them, for those who act without a simulator.
+
+The simulator keeps a view as long as a goal (:mod:`vd.envs.symmetry`). Here it is chosen anew in every step,
+from the rotation as it is known: a teacher acts as well so (docs/student.md), and nothing has to be
+remembered. F views, O values of the observation, D actions. World frame: z up; quaternions xyzw.
+"""
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import nn
+
+from vd.kernels.observations import teacher_observation_slices
+from vd.policy import TrainedPolicy
+
+if TYPE_CHECKING:
+    from vd.envs.symmetry import ViewTables
+
+TERMS = 4
+"""Most values that a value of a view is made of, those of a quaternion."""
+
+
+class ViewMaps(nn.Module):
+    """From observations in the world frame to views, and from actions in views to the world's joints.
+
+    They map nothing to nothing until :meth:`adopt`.
+
+    Args:
+        views: F, as many as the hand has fingers.
+        values: O.
+        num_actions: D.
+    """
+
+    source: torch.Tensor
+    factor: torch.Tensor
+    joints: torch.Tensor
+    sector: torch.Tensor
+
+    def __init__(self, views: int, values: int, num_actions: int) -> None:
+        super().__init__()
+        self.register_buffer("source", torch.zeros((views, values, TERMS), dtype=torch.long))
+        self.register_buffer("factor", torch.zeros((views, values, TERMS)))
+        self.register_buffer("joints", torch.zeros((views, num_actions), dtype=torch.long))
+        self.register_buffer("sector", torch.zeros((views, 3)))
+        self._turn = teacher_observation_slices(views)["relative_orientation"]
+
+    def __len__(self) -> int:
+        return len(self.sector)
+
+    def adopt(self, tables: "ViewTables") -> None:
+        """Take over the tables of a hand."""
+        for name in ("source", "factor", "joints", "sector"):
+            buffer = getattr(self, name)
+            buffer.copy_(torch.as_tensor(getattr(tables, name), dtype=buffer.dtype))
+
+    def choose(self, observation: torch.Tensor) -> torch.Tensor:
+        """Views [..] of observations [.., O]: the axis of the wanted rotation is in their sector."""
+        turn = observation[..., self._turn]
+        # Observed is the object from the goal; wanted is the other way, by less than half a turn.
+        axis = torch.where(turn[..., 3:] < 0.0, turn[..., :3], -turn[..., :3])
+        return (axis @ self.sector.T).argmax(dim=-1)
+
+    def take(self, observation: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
+        """Observations [.., O] as views [..] show them."""
+        values = observation.gather(-1, self.source[view].flatten(-2)).unflatten(-1, (-1, TERMS))
+        return (self.factor[view] * values).sum(dim=-1)
+
+    def world_action(self, action: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
+        """Actions [.., D] of views [..] with the joints in the world's order."""
+        return action.gather(-1, self.joints[view])
+
+    def world_moments(self, mean: torch.Tensor, std: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and standard deviation of values in the world frame [O], from those in a view [O].
+
+        Every view is taken to be as likely as the others, and its values to be uncorrelated.
+        """
+        views, values, _ = self.source.shape
+        maps = mean.new_zeros((views, values, values)).scatter_add(2, self.source, self.factor)
+        means = torch.einsum("kvw,v->kw", maps, mean)  # maps are orthogonal
+        variance = torch.einsum("kvw,v->kw", maps.square(), std.square()) + means.square()
+        centre = means.mean(dim=0)
+        return centre, (variance.mean(dim=0) - centre.square()).clamp(min=0.0).sqrt()
+
+
+class EveryView:
+    """A teacher of views, in each of them: for a state it has as many actions as there are views.
+
+    Args:
+        policy: The teacher.
+        maps: Its views.
+    """
+
+    def __init__(self, policy: TrainedPolicy, maps: ViewMaps) -> None:
+        self.num_actions = policy.num_actions
+        self._policy, self._maps = policy, maps
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """Mean actions [N, F, D], in the world's order, for observations in the world frame [N, O]."""
+        count, views = len(observation), len(self._maps)
+        view = torch.arange(views, device=observation.device).expand(count, views)
+        seen = self._maps.take(observation[:, None].expand(-1, views, -1), view)
+        action = self._policy.act(seen.flatten(0, 1)).unflatten(0, (count, views))
+        return self._maps.world_action(action, view)
