@@ -246,6 +246,22 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     assert read_student(path)["iter"] == 2
 
 
+@pytest.mark.slow
+def test_a_teacher_of_views_is_imitated_in_those_that_the_student_chooses(tmp_path):
+    small = ["--preset", "cpu-demo", "--num-worlds", "3", "--dagger.rollout-steps", "3", "--no-tensorboard"]
+    small += ["--dagger.validation-worlds", "1", "--task.at-rest", "False", "--objects", "cube"]
+    folder = tmp_path / "stage1"
+    flags = ["student", *small, "--teacher", "dclaw3-table", "--run-dir", str(folder), "--max-steps", "9"]
+    assert main(flags) == 0
+    saved, teacher = load_student(folder / "student.pt"), open_teacher("dclaw3-table", "cpu")
+    head = saved.network.state
+    assert teacher is not None and head is not None and head.views is not None and head.fitted
+    assert len(head.views) == 3 and torch.equal(head.view_offset, teacher.network.offset[0])
+    assert saved.task["observation"] == {"shape": "full", "view": "world"}
+    (row,) = read_progress(folder / "progress.jsonl")
+    assert row["loss/state"] > 0.0
+
+
 PROCESS = """
 import json, os, sys
 from pathlib import Path

@@ -209,11 +209,11 @@ def state_head(cfg: StudentTrainCfg, teacher: "TrainedPolicy") -> "StateCfg":
 def begin_from(path: Path, student: "Student", device: str) -> list[str]:
     """Take over the weights of another student, as far as they fit.
 
-    The layers that act on an estimate of what the teacher observes may be of other sizes; of a pre-trained
-    encoder, all that belongs to a hand may.
+    Of one that acts, only the layers for what its teacher observes may be of other sizes. Of a pre-trained
+    one the encoder is what counts: all else may be of another hand, or another network.
 
     Returns:
-        Parts of the network that begin anew.
+        Parts of the network that begin anew, wholly or in part.
 
     Raises:
         ValueError: It is of another network, or has learned to move another hand.
@@ -222,20 +222,23 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
 
     state = read_student(path, device)
     spec = saved_spec(state, path)
-    if spec.num_actions != student.num_actions and spec.stage != PRETRAINING:
+    acts = spec.stage != PRETRAINING
+    if acts and spec.num_actions != student.num_actions:
         raise ValueError(
             f"{path} moves {spec.num_actions} joints, the teacher {student.num_actions}; "
             "give a student of the same hand, or one of stage 0"
         )
-    if to_dict(replace(spec.network, state=student.cfg.state)) != to_dict(student.cfg):
-        raise ValueError(f"{path} is of another network than --network says; leave those flags out")
+    other = to_dict(replace(spec.network, state=student.cfg.state)) != to_dict(student.cfg)
     own, theirs = student.state_dict(), state["student_state_dict"]
     if spec.network.state != student.cfg.state:
         # Actions were read from the memory alone, or added to those of another teacher.
         theirs = {name: value for name, value in theirs.items() if not name.startswith(("state.", "mean."))}
-    fits = {name: value for name, value in theirs.items() if own[name].shape == value.shape}
+    fits = {key: value for key, value in theirs.items() if key in own and own[key].shape == value.shape}
+    anew = sorted({name.split(".")[0] for name in own.keys() - fits.keys()})
+    if other and (acts or "encoder" in anew):
+        raise ValueError(f"{path} is of another network than --network says; leave those flags out")
     student.load_state_dict(fits, strict=False)
-    return sorted({name.split(".")[0] for name in own.keys() - fits.keys()})
+    return anew
 
 
 def _pretrainer(cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", world_size: int) -> Any:
