@@ -360,6 +360,30 @@ def test_a_student_comes_back_from_its_file(tmp_path):
     assert "optimizer" not in torch.load(tmp_path / "student.pt", weights_only=True)
 
 
+def test_a_student_is_written_small_and_used_as_before(tmp_path, capsys):
+    runner = make_student_runner(tmp_path)
+    runner.learn(1)
+    whole, small = tmp_path / "student.pt", tmp_path / "small.pt"
+    assert main(["export", str(whole), str(small)]) == 0
+    before, after = load_student(whole), load_student(small)
+    assert after.spec == before.spec and after.env_steps == before.env_steps
+    for name, value in before.network.state_dict().items():
+        found = after.network.state_dict()[name]
+        assert found.dtype == value.dtype
+        if value.ndim == 3:  # convolutions
+            step = value.abs().amax(dim=(0, 1)) / 127
+            assert ((found - value).abs() <= 0.501 * step).all() and not torch.equal(found, value)
+        elif value.ndim == 2:
+            torch.testing.assert_close(found, value.half().float(), rtol=0.0, atol=0.0)
+        else:
+            assert torch.equal(found, value)
+    again = tmp_path / "again.pt"
+    assert main(["export", str(small), str(again)]) == 0
+    np.testing.assert_array_equal(weights(load_student(again).network), weights(after.network))
+    assert main(["export", "--resumable", str(whole), str(again)]) == 1
+    assert "--init" in capsys.readouterr().err
+
+
 def test_ctrl_c_saves_within_a_rollout(tmp_path):
     dagger = make_dagger(rollout_steps=50)
     step, calls = dagger.env.step, []

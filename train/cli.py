@@ -59,10 +59,14 @@ SHORT_FORMS = ("hand", "hand-layer", "objects", "num-worlds", "seed")
 
 @dataclass
 class ExportCfg:
-    """Write the policy of a checkpoint without its training state, as ONNX, or a small checkpoint."""
+    """Write the policy of a checkpoint without its training state, as ONNX, or a small checkpoint.
+
+    A student is written in a third of its space: 8 bits for convolutions, half precision for other matrices.
+    It is used as before, --init included.
+    """
 
     checkpoint: Annotated[Path, tyro.conf.Positional]
-    """Checkpoint of vd-train teacher, or its policy.pt."""
+    """Checkpoint of vd-train teacher, or its policy.pt; or a student."""
     output: Annotated[Path, tyro.conf.Positional] = Path("policy.pt")
     """File to write. A name that ends in .onnx gets the network from observation to mean action, checked
     against onnxruntime where that is installed."""
@@ -283,8 +287,15 @@ def _export(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(ExportCfg, args=arguments, prog="vd-train export")
 
     from vd.policy import policy_export
+    from vd.student.saved import is_student, read_student, student_export
     from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
 
+    if is_student(cfg.checkpoint):
+        if cfg.resumable or cfg.output.suffix == ".onnx":
+            raise ValueError(f"{cfg.checkpoint} is a student: leave --resumable out, go on with --init")
+        save_checkpoint(cfg.output, student_export(read_student(cfg.checkpoint), small=True))
+        print(cfg.output)
+        return 0
     if cfg.output.suffix == ".onnx":
         return _export_onnx(cfg)
     state = load_checkpoint(cfg.checkpoint)

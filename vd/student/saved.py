@@ -9,6 +9,7 @@ import torch
 from vd.config import from_dict
 from vd.student.cfg import StudentCfg
 from vd.student.network import Student
+from vd.student.packed import pack, unpack
 from vd.student.stopping import StoppingRule
 
 STUDENT_FORMAT = "visual-dexterity student 1"
@@ -60,13 +61,15 @@ def is_student(path: Path) -> bool:
     return isinstance(state, dict) and "student_state_dict" in state
 
 
-def student_export(state: dict[str, Any]) -> dict[str, Any]:
-    """The part of a checkpoint that :func:`load_student` needs."""
-    kept = ("spec", "task", "depth", "iter", "env_steps")
+def student_export(state: dict[str, Any], *, small: bool = False) -> dict[str, Any]:
+    """The part of a checkpoint that :func:`load_student` needs, its weights packed if it is to be small."""
+    kept, weights = ("spec", "task", "depth", "iter", "env_steps"), state["student_state_dict"]
     return {
         "format": STUDENT_FORMAT,
         **{key: state[key] for key in kept},
-        "student_state_dict": {key: v.detach().cpu() for key, v in state["student_state_dict"].items()},
+        "student_state_dict": pack(weights)
+        if small
+        else {key: v.detach().cpu() for key, v in weights.items()},
     }
 
 
@@ -89,7 +92,7 @@ def read_student(path: Path, device: str = "cpu") -> dict[str, Any]:
         raise ValueError(f"{path} is damaged or no student ({reason}); copy it again") from error
     if not isinstance(state, dict) or not {"spec", "student_state_dict", "task", "depth"} <= state.keys():
         raise ValueError(f"{path} holds no student; give a file that vd-train student wrote")
-    return state
+    return state | {"student_state_dict": unpack(state["student_state_dict"])}
 
 
 def saved_spec(state: dict[str, Any], path: Path) -> StudentSpec:
