@@ -12,6 +12,7 @@ from vd.envs.cfg import (
     ObservationCfg,
     RandomisationCfg,
     ReorientCfg,
+    RewardCfg,
     StartCfg,
     SuccessCfg,
 )
@@ -24,6 +25,7 @@ from vd.kernels.shapes import (
     shape_observation_size,
     shape_observation_slices,
 )
+from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 from vd.sim.replay import replay
 from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE
@@ -65,6 +67,29 @@ def test_shapes_and_ranges(device):
     assert env.reward_terms.numpy().shape == (WORLDS, len(env.reward_term_names))
     quats = seen[..., teacher_observation_slices(3)["object_orientation"]]
     assert np.linalg.norm(quats, axis=-1) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_table_costs_while_the_object_touches_it():
+    """Equation 7: c6 in every step of contact, none while the object falls or is held."""
+    env = make(reward=RewardCfg(table_contact=-3.0), success=SuccessCfg(no_table_contact=True))
+    column = env.reward_term_names.index("table_contact")
+    seen, heights = [], []
+    for _ in range(24):
+        env.step(env.action)
+        seen.append(env.reward_terms.numpy()[:, column].copy())
+        heights.append(env.object_pose_end.numpy()[:, 2].copy())
+    seen, heights = np.array(seen), np.array(heights)
+    falling = heights > heights[-1] + 0.02
+    assert falling[0].all() and not falling[-1].any()
+    assert (seen[falling] == 0.0).all() and (seen[-1] == -3.0).all()
+    terms = env.reward_terms.numpy()
+    assert env.reward.numpy() == pytest.approx(terms.sum(axis=1), rel=1e-5)
+
+    env.sim.place_table(present=False)
+    env.reset()
+    env.step(env.action)
+    assert (env.reward_terms.numpy()[:, column] == 0.0).all()
+    assert RewardCfg().table_contact == PAPER.reward.table_contact == -1.0
 
 
 def test_a_success_gives_a_new_goal_without_a_reset():

@@ -2,12 +2,14 @@
 
 import dataclasses
 import json
+import types
 import typing
 from pathlib import Path
 
 import pytest
 
 from vd.config import from_dict, to_dict
+from vd.envs.cfg import CurriculumCfg, SuccessCfg
 from vd.paper import PAPER
 from vd.train.cli import main, parse_teacher, resolve_device
 from vd.train.config import minibatches, validate
@@ -50,6 +52,37 @@ def test_our_presets_bound_a_state_dependent_std():
         policy = PRESETS[name]().policy
         assert policy.distribution == "state-dependent"
         assert 0.0 < policy.std_range[0] < policy.initial_std < policy.std_range[1] <= 1.0
+
+
+def test_several_gpus_train_by_the_recipe_of_one():
+    one, several = PRESETS["gpu"](), PRESETS["multi-gpu"]()
+    assert dataclasses.replace(several, preset=one.preset, run=one.run) == one
+
+
+def test_the_recipe_loosens_stillness_that_an_evaluation_asks_for_in_full():
+    """Fingers that explore cannot be still: training asks for less, and no policy is judged by that."""
+    from vd.evaluate.agents import task_for
+
+    trained = PRESETS["gpu"]().env
+    policy = types.SimpleNamespace(task=to_dict(trained))
+    success = PAPER.success
+    for name in ("joint_speed_rad_s", "object_speed_m_s", "object_spin_rad_s", "action_norm"):
+        loose = getattr(trained.success, name)
+        assert loose == 0.0 or loose > getattr(success, name)
+    judged = task_for(
+        policy,
+        hand=None,
+        objects=("cube",),
+        num_worlds=1,
+        seed=0,
+        stop_tolerance_rad=success.rotation_rad,
+        max_goal_angle_rad=None,
+        episode_s=PAPER.scene.episode_s,
+        randomised=False,
+        success_ends_episode=True,
+    )
+    assert judged.success == SuccessCfg() and judged.curriculum == CurriculumCfg()
+    assert judged.max_episode_steps == 120
 
 
 def _flags(cls: type, prefix: str = "--") -> list[str]:
