@@ -4,7 +4,7 @@ Units are SI and radians, quaternions are xyzw. Frames: the base frame is that o
 pose is a row ``(x, y, z, qx, qy, qz, qw)``.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,20 +16,16 @@ class HandError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class CameraModel:
-    """A pinhole camera fixed to the base.
+class Intrinsics:
+    """A pinhole camera without a place.
 
     Attributes:
-        width: Image width [px].
-        height: Image height [px].
+        width: Columns of the image.
+        height: Rows of the image.
         fx: Horizontal focal length [px].
         fy: Vertical focal length [px].
-        cx: Principal point, from the left edge of the image [px].
+        cx: Principal point, from the left edge of the image [px]; the first pixel's centre is at 0.5.
         cy: Principal point, from the top edge of the image [px].
-        near: Nearest depth [m].
-        far: Farthest depth [m].
-        position: Origin of the optical frame in the base frame [3] [m].
-        quaternion: Optical frame (x right, y down, z forward) in the base frame, xyzw [4].
     """
 
     width: int
@@ -38,15 +34,32 @@ class CameraModel:
     fy: float
     cx: float
     cy: float
-    near: float
-    far: float
-    position: np.ndarray
-    quaternion: np.ndarray
 
     @property
     def matrix(self) -> np.ndarray:
         """The intrinsic matrix [3, 3] [px]."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def seen_from(self, camera: "CameraModel") -> "CameraModel":
+        """The camera with these intrinsics, at the place and with the range of another."""
+        return replace(camera, **{f.name: getattr(self, f.name) for f in fields(Intrinsics)})
+
+
+@dataclass(frozen=True, eq=False)
+class CameraModel(Intrinsics):
+    """A pinhole camera fixed to the base.
+
+    Attributes:
+        near: Nearest depth [m].
+        far: Farthest depth [m].
+        position: Origin of the optical frame in the base frame [3] [m].
+        quaternion: Optical frame (x right, y down, z forward) in the base frame, xyzw [4].
+    """
+
+    near: float
+    far: float
+    position: np.ndarray
+    quaternion: np.ndarray
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixel (u, v) and depth [m] of points [.., 3] [m] of the base frame, as [.., 3].

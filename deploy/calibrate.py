@@ -17,10 +17,10 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandModel, compose, invert
+from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert
 from vd.deploy.calibration_poses import plan
 from vd.deploy.calibration_twin import CalibrationTwin
-from vd.deploy.camera import GrayFrame, Intrinsics, StaleCamera
+from vd.deploy.camera import GrayFrame, StaleCamera
 from vd.deploy.check import ready
 from vd.deploy.connect import Connection, HandOptions, connect, read_hand_and_joints
 from vd.deploy.hand_eye import HandEye, Views, solve

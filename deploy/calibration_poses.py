@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandModel, compose, invert
-from vd.deploy.camera import CameraError, Intrinsics
+from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert
+from vd.deploy.camera import CameraError
 from vd.deploy.hand_eye import project, square
 from vd.deploy.motion import reset_pose
 from vd.sensors.depth_cloud import BASE_IN_WORLD

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandModel, compose, invert
+from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert
 from vd.deploy.calibration_poses import seat
-from vd.deploy.camera import GrayFrame, Intrinsics
+from vd.deploy.camera import GrayFrame
 from vd.deploy.camera_twin import CameraTwin
 from vd.deploy.markers import draw
 from vd.deploy.realsense import RealSenseCfg, RealSenseInfrared

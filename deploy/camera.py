@@ -5,12 +5,12 @@ y down, z forward) [m]; 0 means no value, as RealSense cameras report it.
 """
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
 
-from vd.assets_usd.hand_data import CameraModel
+from vd.assets_usd.hand_data import Intrinsics
 
 MAX_AGE_S = 0.25
 """Age from which an image is stale [s]: three control periods. The latency of a D415 is below 0.1 s."""
@@ -22,35 +22,6 @@ class CameraError(RuntimeError):
 
 class StaleCamera(CameraError):  # noqa: N818 - it names the state, as the reports of the loop do
     """No image that is new enough to act upon."""
-
-
-@dataclass(frozen=True)
-class Intrinsics:
-    """A pinhole camera without a place."""
-
-    width: int
-    """Columns of the image."""
-    height: int
-    """Rows of the image."""
-    fx: float
-    """Horizontal focal length [px]."""
-    fy: float
-    """Vertical focal length [px]."""
-    cx: float
-    """Principal point, from the left edge of the image [px]; the first pixel's centre is at 0.5."""
-    cy: float
-    """Principal point, from the top edge of the image [px]."""
-
-    @staticmethod
-    def of(camera: CameraModel) -> "Intrinsics":
-        """Those of a camera that has a place."""
-        return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-
-    def seen_from(self, camera: CameraModel) -> CameraModel:
-        """The camera with these intrinsics, at the place and with the range of another."""
-        return replace(
-            camera, width=self.width, height=self.height, fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy
-        )
 
 
 @dataclass(frozen=True)

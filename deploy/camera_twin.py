@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.deploy.camera import Intrinsics
+from vd.assets_usd.hand_data import Intrinsics
 from vd.deploy.realsense import sdk
 
 DEPTH_UNIT_M = 0.001

@@ -7,7 +7,7 @@ dual quaternions solve for rotation and translation at once (Daniilidis, 1999). 
 the corners in the images refine X and every M together; their curvature and the scatter from view to view
 give the intervals.
 
-Poses are [7], position [m] and quaternion xyzw; pixels as in :class:`vd.deploy.camera.Intrinsics`.
+Poses are [7], position [m] and quaternion xyzw; pixels as in :class:`vd.assets_usd.hand_data.Intrinsics`.
 """
 
 from collections.abc import Sequence
@@ -18,8 +18,7 @@ from scipy import stats
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import compose, invert
-from vd.deploy.camera import Intrinsics
+from vd.assets_usd.hand_data import Intrinsics, compose, invert
 
 CONFIDENCE = 0.95
 LEAST_VIEWS = 6

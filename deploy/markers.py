@@ -1,7 +1,8 @@
 """ArUco markers: printed, found in images, and drawn into images as a camera would see them.
 
-A marker's own frame has x right and y up on the print, z out of it, its origin in the middle. Pixels as in
-:class:`vd.deploy.camera.Intrinsics`: the first pixel's centre is at (0.5, 0.5), not at 0 as OpenCV has it.
+A marker's own frame has x right and y up on the print, z out of it, its origin in the middle. Pixels are
+those of :class:`vd.assets_usd.hand_data.Intrinsics`: the first one's centre is at (0.5, 0.5), not at 0 as
+OpenCV has it.
 """
 
 from pathlib import Path
@@ -10,7 +11,8 @@ from types import ModuleType
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vd.deploy.camera import CameraError, Intrinsics
+from vd.assets_usd.hand_data import Intrinsics
+from vd.deploy.camera import CameraError
 from vd.deploy.hand_eye import project, square
 from vd.files import atomic_path
 
@@ -80,8 +82,8 @@ class MarkerFinder:
 
         A small square that is seen nearly straight on looks alike from two sides (Collins and Bartoli, 2014).
         """
-        cv, lens = self._cv, self.lens
-        matrix = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
+        cv = self._cv
+        matrix = self.lens.matrix
         _, turns, places, errors = cv.solvePnPGeneric(
             square(self.side_m), np.asarray(corners, dtype=float), matrix, None, flags=cv.SOLVEPNP_IPPE_SQUARE
         )

@@ -15,12 +15,12 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vd.assets_usd.hand_data import Intrinsics
 from vd.deploy.camera import (
     MAX_AGE_S,
     CameraError,
     DepthFrame,
     GrayFrame,
-    Intrinsics,
     StaleCamera,
     check_fresh,
 )

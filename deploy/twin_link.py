@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from vd.assets_usd.hand_data import CameraModel
-from vd.deploy.camera import DepthFrame, Intrinsics, StaleCamera
+from vd.assets_usd.hand_data import CameraModel, Intrinsics
+from vd.deploy.camera import DepthFrame, StaleCamera
 from vd.deploy.child import TwinError
 from vd.deploy.twin_side import Arrays, receive
 
@@ -151,7 +151,7 @@ class TwinCamera:
     @property
     def intrinsics(self) -> Intrinsics:
         """Of its images."""
-        return Intrinsics.of(self._camera)
+        return self._camera
 
     def read(self, timeout_s: float) -> DepthFrame:
         """An image of the present.

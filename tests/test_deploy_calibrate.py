@@ -11,12 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.camera_layer import read_camera, write_camera_layer
-from vd.assets_usd.hand_data import HandError, compose, invert
+from vd.assets_usd.hand_data import HandError, Intrinsics, compose, invert
 from vd.assets_usd.hands import load_hand
 from vd.deploy.calibrate import CalibrateCfg, Shot, calibrate, misplaced, object_place, save_views
 from vd.deploy.calibration_poses import plan, seat
 from vd.deploy.calibration_twin import SLIP, CalibrationTwin
-from vd.deploy.camera import Intrinsics
 from vd.deploy.hand_eye import HandEyeError, Views, dual_quaternions, project, refine, solve, square
 from vd.deploy.markers import MarkerFinder, draw
 from vd.deploy.realsense import RealSenseCfg

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from simulated_clock import SimulatedClock
 
+from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
-from vd.deploy.camera import DepthFrame, Intrinsics, StaleCamera
+from vd.deploy.camera import DepthFrame, StaleCamera
 from vd.deploy.check_camera import camera_findings
 
 PLACE = load_hand("dclaw3").camera
@@ -18,7 +19,7 @@ class Camera:
     """Images of a wall, ``fps`` a second, each ``age_s`` old when it comes."""
 
     clock: SimulatedClock = field(default_factory=SimulatedClock)
-    intrinsics: Intrinsics = field(default_factory=lambda: Intrinsics.of(PLACE))
+    intrinsics: Intrinsics = PLACE
     fps: float = 30.0
     age_s: float = 0.03
     images: int = 1000
@@ -71,7 +72,7 @@ def test_a_camera_that_looks_elsewhere_is_named():
     turned = replace(PLACE, quaternion=PLACE.quaternion[[3, 2, 1, 0]] * [1, -1, 1, -1])
     found = look(Camera(), turned)
     assert "lens" in wrong(found) and "not in view" in found["lens"][1]
-    found = look(Camera(intrinsics=replace(Intrinsics.of(PLACE), width=640)))
+    found = look(Camera(intrinsics=replace(PLACE, width=640)))
     assert wrong(found) == ["lens"] and "640 x 180, not 320 x 180" in found["lens"][1]
 
 
