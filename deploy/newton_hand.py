@@ -1,6 +1,7 @@
 """The hand in Newton as the plant behind the twin's motors, on the CPU, over a table with an object or none.
 
-One world, stepped at the simulator's physics rate in as many steps as the time that passed holds.
+One world, stepped at the simulator's physics rate. Steps do not end when somebody asks: a goal that arrives
+within a step counts for the rest of it, and the joints are told where they have got to since the last one.
 """
 
 from collections.abc import Sequence
@@ -22,8 +23,8 @@ from vd.sim.cfg import SimCfg
 from vd.sim.scene import SHAPE_TABLE, Scene, add_table, build_hand, build_scene, new_builder
 from vd.sim.simulator import AWAY_M, make_solver
 
-SHORTEST_COMMAND_S = 0.005
-"""Commands do not come more often, or some of those that are delayed are lost."""
+SHORTEST_COMMAND_S = 0.0025
+"""Commands do not come more often, or some of those that are delayed are lost: two for each goal."""
 LONGEST_S = 0.1
 """Time that is simulated at once at most: after a longer pause the hand is where it was."""
 ROOM = 4
@@ -67,9 +68,11 @@ class NewtonHand:
         self._state, self._next = self._model.state(), self._model.state()
         self._control = self._model.control()
         self._axes = hand.num_joints
-        self._target = np.tile(PAPER.scene.reset_joint_rad, hand.num_fingers).astype(np.float32)
+        self._target = np.tile(PAPER.scene.reset_joint_rad, hand.num_fingers)
+        self._held = np.full(self._axes, np.nan, dtype=np.float32)
         self._limits = wp.zeros(self._axes, dtype=float, device="cpu")
-        self._rest = 0.0
+        self._pair_s, self._rest = 2.0 * cfg.physics_dt, 0.0
+        self._pulled = np.zeros(self._axes)
         self._stiffness, self._damping = np.zeros(self._axes), np.zeros(self._axes)
         self._gains: tuple[tuple[float, float], ...] = ()
         self._write(self._state.joint_q, self._target)
@@ -89,6 +92,7 @@ class NewtonHand:
         self._graph = self._capture()
         if self._servo is not None:
             self._servo.reset(wp.ones(1, dtype=wp.int32, device="cpu"))
+        self._hold(self._target)
 
     @property
     def joint_q(self) -> np.ndarray:
@@ -164,32 +168,48 @@ class NewtonHand:
             self._servo.measure()
 
     def advance(self, seconds: float, drives: Sequence[Drive]) -> None:
-        """Go on by ``seconds``, to the pair of physics steps before."""
+        """Go on by ``seconds``; what is less than a pair of physics steps is kept for the next time."""
         self._set_gains(drives)
         goals = np.array([np.nan if drive.goal_rad is None else drive.goal_rad for drive in drives])
-        target = np.where(np.isnan(goals), self._target, self.joints.to_joint(goals)).astype(np.float32)
-        if not np.array_equal(target, self._target):
-            self._target = target
-            if self._servo is None:
-                self._write(self._control.joint_target_q, target)
-            else:
-                self._sent.assign(target[None])
-                self._servo.send(self._sent)
+        self._target = np.where(np.isnan(goals), self._target, self.joints.to_joint(goals))
         self._limits.assign(np.minimum([drive.velocity_limit for drive in drives], self.hand.velocity_limit))
-        self._rest = min(self._rest + seconds, LONGEST_S)
-        while self._rest >= 2.0 * self.cfg.physics_dt:
-            self._rest -= 2.0 * self.cfg.physics_dt
+        seconds = min(seconds, LONGEST_S)
+        while self._rest + seconds >= self._pair_s:
+            share = self._pair_s - self._rest
+            self._hold((self._pulled + share * self._target) / self._pair_s)
             wp.capture_launch(self._graph)
+            seconds -= share
+            self._rest, self._pulled = 0.0, np.zeros(self._axes)
+        self._rest += seconds
+        self._pulled = self._pulled + seconds * self._target
+
+    def _hold(self, target: np.ndarray) -> None:
+        """Give the joints the goals of the next steps [rad] [D]."""
+        target = target.astype(np.float32)
+        if np.array_equal(target, self._held):
+            return
+        self._held = target
+        if self._servo is None:
+            self._write(self._control.joint_target_q, target)
+        else:
+            self._sent.assign(target[None])
+            self._servo.send(self._sent)
 
     def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions [rad], velocities [rad/s] and torques [N m] of the motors, each of shape [D]."""
+        """Positions [rad], velocities [rad/s] and torques [N m] of the motors, each of shape [D].
+
+        Without an object positions are those of now, else of the last step, as is what the object and the
+        camera tell.
+        """
         q, qd = self.joint_q[: self._axes].astype(float), self.joint_qd[: self._axes].astype(float)
-        reference = self._target if self._servo is None else self._servo.reference.numpy()[0]
+        reference = self._held if self._servo is None else self._servo.reference.numpy()[0]
         torque = self._stiffness * (reference - q) - self._damping * qd
         torque = np.clip(torque, -self.hand.effort, self.hand.effort)
         if self._servo is not None:  # late, or with an offset
             q = self._servo.measured_q.numpy()[0].astype(float)
             qd = self._servo.measured_qd.numpy()[0].astype(float)
+        if self.scene is None:
+            q = q + self._rest * qd
         sign = self.joints.sign
         return self.joints.to_motor(q), sign * qd, sign * torque
 
