@@ -43,7 +43,7 @@ def plot_curves(progress: Path | Sequence[Path], output: Path) -> None:
         (axes[0, 1], "mean_reward", "mean reward per control step", 1.0),
         (axes[1, 0], "task/rotation_error", "mean rotation error [rad]", 1.0),
         (axes[1, 1], "action_std", "mean std of the actions", 1.0),
-        (axes[0, 3], "task/difficulty", "difficulty; dashed: tightness (1 and 1: the configured task)", 1.0),
+        (axes[0, 3], "task/difficulty", "difficulty; dashed: tightness (1: as configured)", 1.0),
         (axes[1, 2], "drop_rate", "episodes that end in a fall [%]", 100.0),
         (axes[1, 3], "steps_per_s", "control steps per second, learning included", 1.0),
     ]
