@@ -18,6 +18,7 @@ from vd.sensors.depth_cloud import CameraCloud
 from vd.sim.scene import hand_mount
 from vd.student.cfg import StudentCfg
 from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
+from vd.student.object_sense import ObjectSense
 from vd.student.sites import Sites
 from vd.vision import voxels
 
@@ -88,6 +89,19 @@ class StudentSight:
         self._goal = zeros(1, dtype=wp.quat)
         self._points = zeros((1, self._clouds.item.start + seen), dtype=wp.vec3)
         self._voxelise = Voxeliser(network.voxel_m)
+        self._sense: ObjectSense | None = None
+        if "object" in network.senses:
+            self._sense = ObjectSense(
+                hand,
+                [item],
+                link_body=np.arange(links),
+                world_object=np.zeros(1, dtype=int),
+                world_scale=np.ones(1),
+                camera=camera,
+                voxel_m=network.voxel_m,
+                device="cpu",
+            )
+        self._fresh = torch.ones(1, dtype=torch.bool)
 
     @property
     def ends(self) -> tuple[int, int]:
@@ -132,6 +146,32 @@ class StudentSight:
             augment=False,
             complete=self._camera is None,
         )
+
+    def begin(self) -> None:
+        """An episode begins: where the object was is of no meaning."""
+        self._fresh.fill_(True)
+
+    def frame(
+        self, sensed: Sensed, points: torch.Tensor, sites: tuple[Sites, ...]
+    ) -> dict[str, torch.Tensor]:
+        """What the student senses, by name: itself as of :func:`frame`, and the object where it looks for it.
+
+        Args:
+            sensed: What is known.
+            points: Its cloud, from :meth:`points`.
+            sites: The cloud's voxels.
+        """
+        known = frame(sensed)
+        if self._sense is not None:
+            known["object"] = self._sense(
+                sites,
+                wp.to_torch(self._body_q),
+                wp.to_torch(self._goal),
+                fresh=self._fresh,
+                points=points[:, self._clouds.item.start :] if self._camera is not None else None,
+            )
+            self._fresh.fill_(False)
+        return known
 
 
 def frame(sensed: Sensed) -> dict[str, torch.Tensor]:

@@ -11,7 +11,7 @@ from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict
 from vd.deploy.mirror import Mirror, TeacherSight
-from vd.deploy.observation import Sensed, StudentSight, frame
+from vd.deploy.observation import Sensed, StudentSight
 from vd.evaluate.statistics import rotation_angle
 from vd.evaluate.student import PRETRAINED, RENDERED
 from vd.sensors.cfg import DepthCameraCfg
@@ -74,14 +74,16 @@ class StudentPilot:
         self.sight = self._make_sight(camera=camera)
 
     def begin(self) -> None:
-        """A new goal: the memory starts empty, as in training."""
+        """A new goal: the memory starts empty, as in training, and the object is looked for anew."""
         self._hidden = self._network.initial_hidden(1)
+        self.sight.begin()
 
     def decide(self, sensed: Sensed) -> Decision:
         """Mean action and predicted distance."""
         with torch.inference_mode():
-            sites = self.sight.sites(self.sight.points(sensed))
-            senses = self._network.senses(frame(sensed))
+            points = self.sight.points(sensed)
+            sites = self.sight.sites(points)
+            senses = self._network.senses(self.sight.frame(sensed, points, sites))
             output = self._network.act(sites[0], senses, self._hidden, *sites[1:])
         self._hidden = output.hidden
         return Decision(output.mean[0].numpy().copy(), float(output.distance[0, -1]))

@@ -16,6 +16,7 @@ from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import EncoderCfg, NoiseCfg, StudentCfg
 from vd.student.match import Matches
 from vd.student.network import Student
+from vd.student.quaternions import relative_rotation, rotation_distance
 from vd.student.saved import StudentSpec
 from vd.train.checkpoint import list_checkpoints
 from vd.train.config import RunCfg
@@ -29,7 +30,6 @@ from vd.train.student.pretrain import (
 )
 from vd.train.student.rotations import angle_between, multiply, random_rotations, two_columns
 from vd.train.student.runner import StudentRunner
-from vd.vision import relative_rotation, rotation_distance
 
 NETWORK = StudentCfg(
     encoder=EncoderCfg(channels=(8, 16), blocks=0, embedding=30), voxel_m=0.015, memory=8, head_hidden=8

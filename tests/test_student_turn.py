@@ -12,9 +12,9 @@ from vd.student.cfg import EncoderCfg, StudentCfg, TurnCfg
 from vd.student.clouds import Voxeliser
 from vd.student.match import PointMatch, orthogonal
 from vd.student.network import Student
+from vd.student.quaternions import relative_rotation
 from vd.student.turn import ShapeVectors, TurnEncoder, item_and_goal, padded
 from vd.train.student.rotations import angle_between, random_rotations, two_columns
-from vd.vision import relative_rotation
 
 SIZES = TurnCfg(vectors=4, rounds=2, hidden=8, pairs=3)
 GOAL_POINTS, HAND_POINTS, ITEM_POINTS = 60, 40, 60

@@ -20,26 +20,15 @@ from vd.sensors.surfaces import scene_surfaces
 from vd.sim.scene import hand_mount
 from vd.student.cfg import NoiseCfg, StudentCfg
 from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
+from vd.student.object_sense import ObjectSense
+from vd.student.quaternions import rotation_distance
 from vd.student.sites import Sites
 
 Frame = dict[str, torch.Tensor]
 """Tensors of N worlds: ``body_q`` [N, B, 7], ``goal_quat`` [N, 4], ``action`` [N, D] (smoothed, of the step
 before), ``position`` [rad] and ``velocity`` [rad/s] of the joints as their encoders report them [N, D],
-``distance`` [N] (true angle to the goal [rad]) and, with a camera, ``points`` [N, K, 3] (base frame
-[m])."""
-
-
-def rotation_distance(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """Angle between orientations, quaternions xyzw [..., 4], in [0, pi] [rad]."""
-    vector = torch.linalg.vector_norm(relative_rotation(first, second)[..., :3], dim=-1)
-    return 2.0 * torch.asin(vector.clamp(max=1.0))
-
-
-def relative_rotation(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """``first * conj(second)``, quaternions xyzw [..., 4]."""
-    a, aw, b, bw = first[..., :3], first[..., 3:], -second[..., :3], second[..., 3:]
-    vector = aw * b + bw * a + torch.linalg.cross(a, b)
-    return torch.cat([vector, aw * bw - (a * b).sum(dim=-1, keepdim=True)], dim=-1)
+``distance`` [N] (true angle to the goal [rad]), if the student senses it ``object`` [N, V]
+(:class:`vd.student.object_sense.ObjectSense`) and, with a camera, ``points`` [N, K, 3] (base frame [m])."""
 
 
 def voxels(
@@ -127,8 +116,8 @@ class StudentView:
             network.voxel_m, noise=noise, clouds=max(batch, env.num_worlds), seed=seed, device=env.device
         )
         self.camera: DepthCamera | None = None
-        if rendered:
-            model = scene.hand.camera
+        model = scene.hand.camera if rendered else None
+        if model is not None:
             if camera is not None:
                 turn = np.asarray(camera[3:], dtype=float)
                 if not np.linalg.norm(turn) > 0.0:
@@ -144,6 +133,18 @@ class StudentView:
                 camera_body=int(scene.link_body[0]),
                 frame_s=env.cfg.sim.control_dt,
                 seed=seed,
+            )
+        self._sense: ObjectSense | None = None
+        if "object" in network.senses:
+            self._sense = ObjectSense(
+                env.hand,
+                env.objects,
+                link_body=scene.link_body,
+                world_object=scene.world_object,
+                world_scale=scene.world_scale,
+                camera=model,
+                voxel_m=network.voxel_m,
+                device=env.device,
             )
         # Encoders that read late or wrong show the hand where they say it is, as they do on the robot.
         self._kinematics: HandKinematics | None = None
@@ -178,6 +179,14 @@ class StudentView:
             # Without a pixel in the crop the cloud is one false point at the origin: it counts for nothing.
             unseen = wp.to_torch(self.camera.count) == 0
             frame["points"] = points.masked_fill_(unseen[:, None, None], torch.nan)
+        if self._sense is not None:
+            frame["object"] = self._sense(
+                self.sites(frame, augment=False),
+                body_q,
+                frame["goal_quat"],
+                fresh=self._steps == 0,
+                points=frame.get("points"),
+            )
         return frame
 
     def points(self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None) -> torch.Tensor:
@@ -237,4 +246,6 @@ class StudentView:
         arrays = {"noise": self._voxelise.rng}
         if self.camera is not None:
             arrays |= self.camera.stateful()
+        if self._sense is not None:
+            arrays |= self._sense.stateful()
         return arrays

@@ -9,8 +9,8 @@ from torch import nn
 from vd.paper import PAPER
 from vd.student.match import Matches
 from vd.student.network import StudentOutput
+from vd.student.quaternions import relative_rotation
 from vd.train.student.rotations import matrices, two_columns
-from vd.vision import relative_rotation
 
 POSE_SCALE_M = 0.05
 """Positions of objects are predicted in units of this, about their spread."""

@@ -22,13 +22,14 @@ from vd.sim.scene import hand_mount
 from vd.student.cfg import NoiseCfg, StudentCfg
 from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
 from vd.student.network import Student
+from vd.student.quaternions import relative_rotation, rotation_distance
 from vd.student.sites import Sites
 from vd.train.ending import TrainingDivergedError
 from vd.train.student.config import PretrainCfg
 from vd.train.student.losses import match_loss
 from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer, scheduled
 from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
-from vd.vision import relative_rotation, rotation_distance, voxels
+from vd.vision import voxels
 
 OBJECT_RANGE_M = ((-0.06, 0.06), (-0.06, 0.06), (0.02, 0.16))
 """Where objects are in random scenes, world frame: from the table to the palm, as wide as the claw opens."""
@@ -208,6 +209,8 @@ class PretrainHeads(nn.Module):
         self._split = cfg.embedding == "split"
         part = width // EMBEDDING_PARTS if self._split else width
         own = "before" in student.distance and cfg.distance == "scalar" and not self._split
+        # Where the object is found, its head only corrects the angle that was found.
+        own = own and "object" not in student.cfg.senses
         sizes = {
             "category": (part, objects, cfg.category_weight),
             "joints": (width - 2 * part if self._split else width, student.num_actions, cfg.joint_weight),

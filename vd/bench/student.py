@@ -28,6 +28,7 @@ from vd.sim.scene import hand_mount
 from vd.student.cfg import PRESETS, NoiseCfg
 from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
 from vd.student.network import Student
+from vd.student.object_sense import ObjectSense
 from vd.student.sites import Sites
 
 WARM_UP = 5
@@ -122,15 +123,19 @@ class ControlStep:
         self.kinematics = HandKinematics(scene.hand, link_body=scene.link_body, base=base, device="cpu")
         self.body_q = wp.zeros((1, scene.bodies_per_world), dtype=wp.transform, device="cpu")
         self.goal = wp.array([[0.0, 0.0, 0.0, 1.0]], dtype=wp.quat, device="cpu")
-        self.clouds = SceneClouds(
-            scene.hand,
-            scene.objects,
-            link_body=scene.link_body,
-            object_body=scene.object_body,
-            world_object=scene.world_object,
-            world_scale=scene.world_scale,
-            device="cpu",
-        )
+        worlds: dict[str, Any] = {
+            "link_body": scene.link_body,
+            "world_object": scene.world_object,
+            "world_scale": scene.world_scale,
+            "device": "cpu",
+        }
+        self.clouds = SceneClouds(scene.hand, scene.objects, object_body=scene.object_body, **worlds)
+        self.sense: ObjectSense | None = None
+        if "object" in net.cfg.senses:
+            self.sense = ObjectSense(
+                scene.hand, scene.objects, camera=scene.hand.camera, voxel_m=net.cfg.voxel_m, **worlds
+            )
+        self.fresh = torch.ones(1, dtype=torch.bool)
         size = self.clouds.item.start + self.camera.cloud.points.shape[1]
         self.points = wp.empty((1, size), dtype=wp.vec3, device="cpu")
         self.voxelise = Voxeliser(net.cfg.voxel_m)
@@ -154,6 +159,22 @@ class ControlStep:
         marked = "marks" in self.net.cfg.encoder.inputs
         self.sites = self.voxelise(self.points, ends=self.clouds.ends if marked else ())
 
+    def find(self) -> None:
+        """The object among the voxels, followed from step to step."""
+        if self.sense is None:
+            return
+        assert self.sites is not None
+        found = self.sense(
+            (self.sites.fresh(),),
+            wp.to_torch(self.body_q),
+            wp.to_torch(self.goal),
+            fresh=self.fresh,
+            points=wp.to_torch(self.points)[:, self.clouds.item.start :],
+        )
+        self.fresh.fill_(False)
+        first = self.net.cfg.senses.index("object") * self.net.num_actions
+        self.senses[:, first : first + found.shape[1]] = found
+
     def act(self) -> np.ndarray:
         """Voxels, previous action and memory to the next action [D]."""
         assert self.sites is not None
@@ -168,6 +189,7 @@ class ControlStep:
         self.camera_points()
         self.model_points()
         self.voxels()
+        self.find()
         return self.act()
 
 
@@ -221,6 +243,7 @@ def measure_latency(
                 "camera points": step.camera_points,
                 "hand and goal points": step.model_points,
                 "voxels": step.voxels,
+                "object": step.find,
                 "maps and network": step.act,
             },
             calls,

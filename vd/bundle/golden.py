@@ -26,7 +26,7 @@ TOLERANCE = 5e-3
 """Largest difference of an output from the golden one. Actions are of size 1; processors, GPUs and other
 versions of torch differ by 1e-6 to 1e-3."""
 
-SENSES = {"action": "previous_action", "position": "joint_q", "velocity": "joint_qd"}
+SENSES = {"action": "previous_action", "position": "joint_q", "velocity": "joint_qd", "object": "object"}
 """Golden input behind each sense of a student."""
 
 Golden = dict[str, torch.Tensor]
@@ -49,11 +49,13 @@ def student_golden(student: "SavedStudent", hand: HandModel) -> Golden:
 
     Inputs: ``joint_q`` [T, D] [rad]; ``object_pose`` [T, 7] in the base frame; ``goal_quat`` [4] in the world
     frame; ``points`` [T, P, 3] [m], base frame, the cloud that these give with a cube, moved away from the
-    borders of voxels; ``previous_action`` [T, D]; ``joint_qd`` [T, D] [rad/s]. Outputs: ``action`` [T, D]
+    borders of voxels; ``previous_action`` [T, D]; ``joint_qd`` [T, D] [rad/s]; if it senses its object
+    ``object`` [T, V]. Outputs: ``action`` [T, D]
     and ``distance`` [T, H] [rad].
     """
     from vd.assets_usd.objects.model import load_set
     from vd.sim.scene import hand_mount
+    from vd.student.object_sense import object_values
 
     rng = np.random.default_rng(0)
     cube = load_set(["cube"])[0].surface_points
@@ -79,6 +81,8 @@ def student_golden(student: "SavedStudent", hand: HandModel) -> Golden:
         "previous_action": rng.uniform(-1.0, 1.0, (STEPS, len(rest))),
         "joint_qd": rng.normal(size=(STEPS, len(rest))),
     }
+    if "object" in student.spec.network.senses:
+        values["object"] = rng.normal(size=(STEPS, object_values(len(rest))))
     golden = {name: torch.tensor(value, dtype=torch.float32) for name, value in values.items()}
     return {**golden, **student_outputs(student, golden)}
 
@@ -98,7 +102,11 @@ def student_outputs(student: "SavedStudent", golden: Mapping[str, torch.Tensor])
     actions, distances = [], []
     with torch.no_grad():
         for step, points in enumerate(clouds):
-            frame = {name: golden[source][step : step + 1].to(device) for name, source in SENSES.items()}
+            frame = {
+                name: golden[source][step : step + 1].to(device)
+                for name, source in SENSES.items()
+                if source in golden
+            }
             cloud = points[None].contiguous().to(device)
             sites = voxels(cloud, ends, voxelise, network=cfg, augment=False)
             output = network.act(sites[0], network.senses(frame), hidden, *sites[1:])

@@ -7,7 +7,7 @@ from vd.paper import PAPER
 
 DistancePlace = Literal["before", "after"]
 VoxelInput = Literal["constant", "position", "marks"]
-Sense = Literal["action", "position", "velocity"]
+Sense = Literal["action", "position", "velocity", "object"]
 
 STD_RANGE = (0.02, 1.0)
 """Standard deviation of the student's actions, as of the teachers trained here: always some exploration."""
@@ -132,8 +132,9 @@ class StudentCfg:
     turn: TurnCfg = field(default_factory=TurnCfg)
     """How the object is turned from the goal, read from the two directly."""
     senses: tuple[Sense, ...] = ("action", "position", "velocity")
-    """What it knows of itself besides clouds: the previous action (all that the paper has), positions and
-    velocities of the joints, as the encoders report them."""
+    """What it knows besides clouds: the previous action (all that the paper has), positions and velocities of
+    the joints, as the encoders report them, and the object as it is found by its known shape
+    (:mod:`vd.student.object_sense`)."""
     state: StateCfg = field(default_factory=StateCfg)
     """What the teacher would observe, estimated, and the teacher's layers that act by it. Its sizes are the
     teacher's; training fills them in (``--dagger.state-weight``)."""
@@ -160,6 +161,8 @@ class StudentCfg:
         self.state.validate()
         if self.turn.vectors and "marks" not in self.encoder.inputs:
             raise ValueError("student.turn needs voxels that are marked: add marks to encoder.inputs")
+        if "object" in self.senses and "marks" not in self.encoder.inputs:
+            raise ValueError("an object is found among voxels that are marked: add marks to encoder.inputs")
         if "action" not in self.senses or len(set(self.senses)) != len(self.senses):
             raise ValueError(f"student.senses = {self.senses} must hold action, and nothing twice")
         if not self.voxel_m > 0.0:
@@ -172,9 +175,9 @@ class StudentCfg:
             raise ValueError(f"student.std_range = {self.std_range} must be (low, high), both positive")
 
 
-LEAN = StudentCfg(turn=TurnCfg(vectors=32))
-"""A last stage of half the width, distance heads before and after the GRU, bounded standard deviation, and
-the rotation from the goal pooled apart."""
+LEAN = StudentCfg(turn=TurnCfg(vectors=32), senses=("action", "position", "velocity", "object"))
+"""A last stage of half the width, distance heads before and after the GRU, bounded standard deviation, the
+rotation from the goal pooled apart, and the object found by its known shape."""
 
 PAPER_NETWORK = replace(
     LEAN,

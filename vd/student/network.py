@@ -13,6 +13,7 @@ from torch import nn
 from vd.paper import PAPER
 from vd.student.cfg import EncoderCfg, StudentCfg
 from vd.student.match import Matches
+from vd.student.object_sense import ANGLE, object_values
 from vd.student.sites import Sites
 from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool
 from vd.student.state import StateHead
@@ -156,7 +157,12 @@ class Student(nn.Module):
         cfg.validate()
         self.cfg = cfg
         self.num_actions = num_actions
-        self.num_senses = len(cfg.senses) * num_actions
+        widths = [object_values(num_actions) if name == "object" else num_actions for name in cfg.senses]
+        self.num_senses = sum(widths)
+        self._angle: int | None = None
+        """Column of the senses in which the angle to the goal is."""
+        if "object" in cfg.senses:
+            self._angle = sum(widths[: cfg.senses.index("object")]) + ANGLE
         width = cfg.encoder.embedding
         self.encoder = VoxelEncoder(cfg.encoder, cfg.voxel_m)
         self.goal_encoder = VoxelEncoder(cfg.encoder, cfg.voxel_m) if cfg.goal == "separate" else None
@@ -192,13 +198,19 @@ class Student(nn.Module):
                 for place in cfg.distance
             }
         )
+        if self._angle is not None:
+            # The angle that was found stands, until there is something to add.
+            for layers in self.distance.values():
+                nn.init.zeros_(layers[-1].weight)
+                nn.init.zeros_(layers[-1].bias)
 
     def senses(self, frame: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """What the student knows of itself [.., S].
 
         Args:
             frame: ``action`` [.., D], the (smoothed) action before the step, and as far as the configuration
-                names them ``position`` [rad] and ``velocity`` [rad/s] of the joints [.., D].
+                names them ``position`` [rad] and ``velocity`` [rad/s] of the joints [.., D], and ``object``
+                [.., V].
         """
         parts = [
             frame[name] * VELOCITY_SCALE if name == "velocity" else frame[name] for name in self.cfg.senses
@@ -261,6 +273,8 @@ class Student(nn.Module):
         features = self.head(remembered)
         places = {"before": embedding, "after": remembered}
         distance = [head(places[place]) for place, head in self.distance.items()]
+        if self._angle is not None:
+            distance = [value + senses[..., self._angle, None] for value in distance]
         log_std = self.log_std(features)
         if self.cfg.std_range is not None:
             low, high = (math.log(bound) for bound in self.cfg.std_range)

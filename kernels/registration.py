@@ -1,0 +1,416 @@
+"""Where a known shape is, from points seen of it: poses are fitted, many at once, and the best kept.
+
+A shape is a grid of distances to its surface samples, so that a point costs one look-up whatever the shape
+is. Each pose is improved by steps of Gauss and Newton on the distances of the seen points, of which far ones
+count less. How badly it fits is the mean square of two lengths, both cut off at ``far``: how far the seen
+points are from the shape, and how far the shape stands out before what a camera saw behind it.
+
+Frames: *base* is that of the points and poses, *object* that of the samples. Metres, quaternions xyzw.
+N worlds, P seen points at most, O shapes of S samples, grids of E^3 distances; M rows, each of one world,
+with C poses each.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+LEVER_M = wp.constant(0.03)
+"""Turns weigh against shifts as at this distance from the centre, about the size of an object."""
+DAMPING = wp.constant(0.01)
+"""Curvature added to each direction, of one: what the points do not fix stays where it is."""
+LARGEST_TURN = wp.constant(0.5)
+"""Largest turn of one step [rad]."""
+SMALL = wp.constant(1.0e-7)
+"""Lengths and angles below this have no direction."""
+NEVER = wp.constant(1.0e9)
+"""Misfit of a pose that is not to be taken."""
+
+
+@wp.struct
+class Shapes:
+    """Shapes that can be looked for, and which one each world holds.
+
+    samples: Surface samples in the object frame, unscaled [O, S] [m].
+    distance: Distance to the nearest sample [O, E, E, E] [m], on grids about the origin.
+    half: Half the side of each grid [O] [m].
+    world_shape: Shape of each world [N].
+    world_scale: Factor on its size [N].
+    """
+
+    samples: wp.array2d[wp.vec3]
+    distance: wp.array4d[float]
+    half: wp.array[float]
+    world_shape: wp.array[int]
+    world_scale: wp.array[float]
+
+
+@wp.struct
+class Eye:
+    """A camera and what it can tell.
+
+    focal: Focal lengths [pixel].
+    centre: Principal point, from the top left corner of the image [pixel].
+    pose: Optical frame in the base frame.
+    cell: Side of a cell of the background [pixel].
+    margin: What is nearer than the background by less than this may be seen [m].
+    """
+
+    focal: wp.vec2
+    centre: wp.vec2
+    pose: wp.transform
+    cell: float
+    margin: float
+
+
+@wp.kernel
+def shape_distance_kernel(
+    # Model:
+    samples: wp.array2d[wp.vec3],
+    half: wp.array[float],
+    # Out:
+    distance_out: wp.array4d[float],
+):
+    """Distance from each point of a grid to the nearest sample. Launch: [O, E, E, E].
+
+    Args:
+        samples: Surface samples in the object frame [m], shape [O, S].
+        half: Half the side of each grid [m], shape [O].
+        distance_out: Distances [m], shape [O, E, E, E].
+    """
+    shape, i, j, k = wp.tid()
+    side = 2.0 * half[shape] / float(distance_out.shape[1] - 1)
+    corner = wp.vec3(half[shape], half[shape], half[shape])
+    place = side * wp.vec3(float(i), float(j), float(k)) - corner
+    nearest = wp.length_sq(samples[shape, 0] - place)
+    for sample in range(1, samples.shape[1]):
+        nearest = wp.min(nearest, wp.length_sq(samples[shape, sample] - place))
+    distance_out[shape, i, j, k] = wp.sqrt(nearest)
+
+
+@wp.func
+def surface_distance(shapes: Shapes, shape: int, place: wp.vec3):
+    """Distance of a point of the object frame (unscaled) from the surface, and its gradient.
+
+    Between grid points it is interpolated; outside of the grid it grows by the distance from the grid.
+    """
+    last = shapes.distance.shape[1] - 1
+    half = shapes.half[shape]
+    per_metre = float(last) / (2.0 * half)
+    grid = (place + wp.vec3(half, half, half)) * per_metre
+    top = float(last) - 1.0e-3
+    inside = wp.vec3(wp.clamp(grid[0], 0.0, top), wp.clamp(grid[1], 0.0, top), wp.clamp(grid[2], 0.0, top))
+    i = int(inside[0])
+    j = int(inside[1])
+    k = int(inside[2])
+    u = inside[0] - float(i)
+    v = inside[1] - float(j)
+    w = inside[2] - float(k)
+    d000 = shapes.distance[shape, i, j, k]
+    d001 = shapes.distance[shape, i, j, k + 1]
+    d010 = shapes.distance[shape, i, j + 1, k]
+    d011 = shapes.distance[shape, i, j + 1, k + 1]
+    d100 = shapes.distance[shape, i + 1, j, k]
+    d101 = shapes.distance[shape, i + 1, j, k + 1]
+    d110 = shapes.distance[shape, i + 1, j + 1, k]
+    d111 = shapes.distance[shape, i + 1, j + 1, k + 1]
+    low = wp.lerp(wp.lerp(d000, d001, w), wp.lerp(d010, d011, w), v)
+    high = wp.lerp(wp.lerp(d100, d101, w), wp.lerp(d110, d111, w), v)
+    along_x = high - low
+    along_y = wp.lerp(wp.lerp(d010 - d000, d011 - d001, w), wp.lerp(d110 - d100, d111 - d101, w), u)
+    along_z = wp.lerp(wp.lerp(d001 - d000, d011 - d010, v), wp.lerp(d101 - d100, d111 - d110, v), u)
+    distance = wp.lerp(low, high, u)
+    gradient = per_metre * wp.vec3(along_x, along_y, along_z)
+    outside = (grid - inside) / per_metre
+    beyond = wp.length(outside)
+    if beyond > 2.0e-3 / per_metre:
+        distance += beyond
+        gradient = outside / beyond
+    return distance, gradient
+
+
+@wp.func
+def cell_of(eye: Eye, seen: wp.vec3):
+    """Row and column of the cell that shows a point of the optical frame."""
+    column = wp.floor((eye.focal[0] * seen[0] / seen[2] + eye.centre[0]) / eye.cell)
+    row = wp.floor((eye.focal[1] * seen[1] / seen[2] + eye.centre[1]) / eye.cell)
+    return int(row), int(column)
+
+
+@wp.kernel
+def background_kernel(
+    # Model:
+    eye: Eye,
+    # In:
+    points_in: wp.array2d[wp.vec3],
+    # In/Out:
+    background: wp.array3d[float],
+):
+    """Farthest depth that was seen in each cell of the image. Launch: [N, K].
+
+    Args:
+        eye: The camera.
+        points_in: What it saw, base frame [m], NaN for none, shape [N, K].
+        background: Depth [m], shape [N, Y, X]; to be zero before, and zero where nothing was seen.
+    """
+    world, k = wp.tid()
+    place = wp.transform_point(wp.transform_inverse(eye.pose), points_in[world, k])
+    if place[2] > 0.0:  # not so of NaN
+        row, column = cell_of(eye, place)
+        if row >= 0 and row < background.shape[1] and column >= 0 and column < background.shape[2]:
+            wp.atomic_max(background, world, row, column, place[2])
+
+
+@wp.func
+def standing_out(eye: Eye, place: wp.vec3, world: int, background: wp.array3d[float], far: float) -> float:
+    """How far a point of the base frame lies before what was seen behind it [m], at most ``far``.
+
+    Where nothing was seen, not even the hand, there is nothing for a long way. Beyond the image all may be.
+    """
+    seen = wp.transform_point(wp.transform_inverse(eye.pose), place)
+    row, column = cell_of(eye, seen)
+    if row < 0 or row >= background.shape[1] or column < 0 or column >= background.shape[2]:
+        return 0.0
+    behind = background[world, row, column]
+    if behind == 0.0:
+        return far
+    return wp.clamp(behind - eye.margin - seen[2], 0.0, far)
+
+
+@wp.kernel
+def start_poses_kernel(
+    # Model:
+    shapes: Shapes,
+    eye: Eye,
+    rendered: int,
+    every: int,
+    # In:
+    world_in: wp.array[int],
+    first_in: wp.array[int],
+    rotation_in: wp.array[wp.quat],
+    seen_in: wp.array2d[wp.vec3],
+    count_in: wp.array[int],
+    # Out:
+    pose_out: wp.array2d[wp.transform],
+):
+    """Place the shape in given rotations, what would be seen of it where points are. Launch: [M, C].
+
+    The mean of the samples that lie nearer to the camera than their mean, of all without a camera, comes to
+    the mean of the seen points.
+
+    Args:
+        shapes: The shapes.
+        eye: The camera.
+        rendered: 1 where a camera saw the points, 0 where they are of all sides.
+        every: Look at every so many-th sample.
+        world_in: World of each row, shape [M].
+        first_in: Which rotation is the first of each row, counted on and around, shape [M].
+        rotation_in: Rotations, shape [H].
+        seen_in: Points seen of the object, base frame [m], shape [N, P].
+        count_in: How many there are, shape [N].
+        pose_out: Object frame in the base frame, shape [M, C].
+    """
+    row, c = wp.tid()
+    world = world_in[row]
+    shape = shapes.world_shape[world]
+    turn = rotation_in[(first_in[row] + c) % rotation_in.shape[0]]
+    middle = wp.vec3()
+    for i in range(count_in[world]):
+        middle += seen_in[world, i]
+    middle = middle / wp.max(float(count_in[world]), 1.0)
+    whole = wp.vec3()
+    for i in range(0, shapes.samples.shape[1], every):
+        whole += shapes.samples[shape, i]
+    samples = (shapes.samples.shape[1] + every - 1) // every
+    whole = whole / float(samples)
+    part = whole
+    if rendered != 0:
+        ray = wp.quat_rotate_inv(turn, middle - wp.transform_get_translation(eye.pose))
+        total = wp.vec3()
+        near = wp.float32(0.0)
+        for i in range(0, shapes.samples.shape[1], every):
+            sample = shapes.samples[shape, i]
+            if wp.dot(sample - whole, ray) <= 0.0:
+                total += sample
+                near += 1.0
+        part = total / wp.max(near, 1.0)
+    place = middle - wp.quat_rotate(turn, shapes.world_scale[world] * part)
+    pose_out[row, c] = wp.transform(place, turn)
+
+
+@wp.func
+def improved(
+    shapes: Shapes,
+    world: int,
+    pose: wp.transform,
+    far: float,
+    every: int,
+    seen: wp.array2d[wp.vec3],
+    count: wp.array[int],
+) -> wp.transform:
+    """A pose after one step of Gauss and Newton on the distances of the seen points from the shape."""
+    shape = shapes.world_shape[world]
+    scale = shapes.world_scale[world]
+    place = wp.transform_get_translation(pose)
+    turn = wp.transform_get_rotation(pose)
+    # Curvature of shifts, of turns, and between them; slopes of both.
+    shifts = wp.mat33()
+    turns = wp.mat33()
+    mixed = wp.mat33()
+    shift_slope = wp.vec3()
+    turn_slope = wp.vec3()
+    used = wp.float32(0.0)
+    for i in range(0, count[world], every):
+        arm = seen[world, i] - place
+        distance, gradient = surface_distance(shapes, shape, wp.quat_rotate_inv(turn, arm) / scale)
+        distance = scale * distance
+        normal = wp.quat_rotate(turn, gradient)
+        moment = wp.cross(arm, normal) / LEVER_M
+        weight = far * far / (far * far + distance * distance)
+        shifts += weight * wp.outer(normal, normal)
+        turns += weight * wp.outer(moment, moment)
+        mixed += weight * wp.outer(normal, moment)
+        shift_slope += weight * distance * normal
+        turn_slope += weight * distance * moment
+        used += 1.0
+    if used == 0.0:
+        return pose
+    damping = DAMPING * used * wp.identity(n=3, dtype=float)
+    solved = wp.inverse(shifts + damping)
+    # The shift that is best for each turn put in (Schur's complement).
+    left = turns + damping - wp.transpose(mixed) * solved * mixed
+    angle_axis = wp.inverse(left) * (turn_slope - wp.transpose(mixed) * solved * shift_slope)
+    shift = solved * (shift_slope - mixed * angle_axis)
+    angle_axis = angle_axis / LEVER_M
+    angle = wp.length(angle_axis)
+    if angle > SMALL:
+        step = wp.quat_from_axis_angle(angle_axis / angle, wp.min(angle, LARGEST_TURN))
+        turn = wp.normalize(step * turn)
+    return wp.transform(place + shift, turn)
+
+
+@wp.kernel
+def fit_poses_kernel(
+    # Model:
+    shapes: Shapes,
+    eye: Eye,
+    far: float,
+    steps: int,
+    every: int,
+    every_sample: int,
+    # In:
+    world_in: wp.array[int],
+    seen_in: wp.array2d[wp.vec3],
+    count_in: wp.array[int],
+    background_in: wp.array3d[float],
+    # In/Out:
+    pose: wp.array2d[wp.transform],
+    # Out:
+    misfit_out: wp.array2d[float],
+):
+    """Improve poses, and say how badly they fit. Launch: [M, C].
+
+    Args:
+        shapes: The shapes.
+        eye: The camera.
+        far: Length at which distances are cut off [m]; from about there on points count less.
+        steps: Steps of each pose.
+        every: Look at every so many-th seen point.
+        every_sample: Look at every so many-th sample for what stands out.
+        world_in: World of each row, shape [M].
+        seen_in: Points seen of the object, base frame [m], shape [N, P].
+        count_in: How many there are, shape [N].
+        background_in: From ``background_kernel``, shape [N, Y, X]; [N, 0, 0] without a camera.
+        pose: Object frame in the base frame, shape [M, C].
+        misfit_out: Mean squares of both lengths, together [m^2], shape [M, C].
+    """
+    row, c = wp.tid()
+    world = world_in[row]
+    best = pose[row, c]
+    for _ in range(steps):
+        best = improved(shapes, world, best, far, every, seen_in, count_in)
+    pose[row, c] = best
+
+    shape = shapes.world_shape[world]
+    scale = shapes.world_scale[world]
+    to_object = wp.transform_inverse(best)
+    off = wp.float32(0.0)
+    points = wp.float32(0.0)
+    for i in range(0, count_in[world], every):
+        place = wp.transform_point(to_object, seen_in[world, i]) / scale
+        distance, _gradient = surface_distance(shapes, shape, place)
+        distance = wp.min(scale * distance, far)
+        off += distance * distance
+        points += 1.0
+    out = wp.float32(0.0)
+    samples = wp.float32(0.0)
+    if background_in.shape[1] > 0:
+        for i in range(0, shapes.samples.shape[1], every_sample):
+            place = wp.transform_point(best, scale * shapes.samples[shape, i])
+            length = standing_out(eye, place, world, background_in, far)
+            out += length * length
+            samples += 1.0
+    misfit_out[row, c] = off / wp.max(points, 1.0) + out / wp.max(samples, 1.0)
+
+
+@wp.kernel
+def keep_poses_kernel(
+    # Model:
+    apart: float,
+    stay: float,
+    share: float,
+    known: int,
+    # In:
+    world_in: wp.array[int],
+    found_in: wp.array2d[wp.transform],
+    misfit_in: wp.array2d[float],
+    # In/Out:
+    pose: wp.array2d[wp.transform],
+    misfit: wp.array2d[float],
+    # Out:
+    cost_out: wp.array2d[float],
+):
+    """Keep the best poses of each world that are not nearly the same. Launch: [M].
+
+    The first of the found poses may be those kept before, improved: their misfits are averaged over time.
+    The very first stays so unless another is better by a good deal: of a shape that looks the same from
+    several sides any is as good, but not another one in each step. The kept poses are in the order of their
+    misfits.
+
+    Args:
+        apart: Least angle between two kept poses [rad].
+        stay: Factor on the misfit of the first pose when it is compared.
+        share: Share of the latest misfit in the average over time.
+        known: How many of the found poses were kept before, 0 or K.
+        world_in: World of each row, shape [M].
+        found_in: Found poses, shape [M, C].
+        misfit_in: Their misfits now, shape [M, C].
+        pose: Kept poses, shape [N, K].
+        misfit: Their misfits, averaged over time; NEVER where none is left, shape [N, K].
+        cost_out: Scratch, shape [M, C].
+    """
+    row = wp.tid()
+    world = world_in[row]
+    for c in range(found_in.shape[1]):
+        cost = misfit_in[row, c]
+        if c < known:
+            cost = misfit[world, c] + share * (cost - misfit[world, c])
+            if misfit[world, c] >= NEVER:
+                cost = NEVER
+        cost_out[row, c] = cost
+    for k in range(pose.shape[1]):
+        best = wp.int32(0)
+        least = 2.0 * NEVER
+        for c in range(found_in.shape[1]):
+            cost = cost_out[row, c]
+            if c == 0 and known > 0:
+                cost = stay * cost
+            if cost < least:
+                best = c
+                least = cost
+        misfit[world, k] = wp.min(cost_out[row, best], NEVER)
+        pose[world, k] = found_in[row, best]
+        turn = wp.transform_get_rotation(found_in[row, best])
+        for c in range(found_in.shape[1]):
+            cosine = wp.abs(wp.dot(turn, wp.transform_get_rotation(found_in[row, c])))
+            if c == best or 2.0 * wp.acos(wp.min(cosine, 1.0)) < apart:
+                cost_out[row, c] = NEVER

@@ -1,0 +1,303 @@
+import numpy as np
+import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
+from kernel_oracle import EXAMPLES, device_array, pose_matrix, unwritten
+from scipy.spatial.transform import Rotation
+
+from vd.kernels.registration import (
+    DAMPING,
+    LARGEST_TURN,
+    LEVER_M,
+    NEVER,
+    Eye,
+    Shapes,
+    background_kernel,
+    fit_poses_kernel,
+    keep_poses_kernel,
+    shape_distance_kernel,
+    start_poses_kernel,
+)
+
+GRID, SAMPLES, SEEN = 5, 9, 7
+FAR, CELL, MARGIN = 0.02, 8.0, 0.004
+CELLS = (6, 9)
+seeds = st.integers(0, 2**31 - 1)
+"""Scenes come from generators: numbers that hypothesis likes lie on borders, where rounding decides."""
+
+
+class Scene:
+    """Random shapes, points and poses of some worlds, as NumPy arrays."""
+
+    def __init__(self, seed: int):
+        rng = self.rng = np.random.default_rng(seed)
+        self.worlds, self.shapes, self.poses = rng.integers(1, 4), rng.integers(1, 3), rng.integers(1, 5)
+        self.samples = rng.uniform(-0.05, 0.05, (self.shapes, SAMPLES, 3))
+        self.half = rng.uniform(0.05, 0.08, self.shapes)
+        self.world_shape = rng.integers(0, self.shapes, self.worlds)
+        self.world_scale = rng.uniform(0.8, 1.2, self.worlds)
+        axis = np.linspace(-1.0, 1.0, GRID)
+        grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+        places = self.half[:, None, None, None, None] * grid
+        apart = places[..., None, :] - self.samples[:, None, None, None]
+        self.distance = np.linalg.norm(apart, axis=-1).min(axis=-1)
+        self.seen = rng.uniform(-0.1, 0.1, (self.worlds, SEEN, 3))
+        self.count = rng.integers(0, SEEN + 1, self.worlds)
+        self.row_world = rng.permutation(self.worlds)[: rng.integers(1, self.worlds + 1)]
+        self.pose = self.random_poses(len(self.row_world), self.poses)
+        self.eye = np.concatenate([[0.0, 0.0, -0.6], Rotation.random(rng=rng).as_quat() * 0.02])
+        self.eye[6] += 1.0
+        self.eye[3:] /= np.linalg.norm(self.eye[3:])
+        self.background = rng.uniform(0.55, 0.65, (self.worlds, *CELLS)) * (
+            rng.random((self.worlds, *CELLS)) < 0.7
+        )
+
+    def random_poses(self, *shape: int) -> np.ndarray:
+        """Poses of that shape."""
+        turns = Rotation.random(int(np.prod(shape)), rng=self.rng).as_quat().reshape(*shape, 4)
+        return np.concatenate([self.rng.uniform(-0.03, 0.03, (*shape, 3)), turns], axis=-1)
+
+    def model(self, device: str) -> Shapes:
+        """The shapes as the kernels take them."""
+        shapes = Shapes()
+        shapes.samples = device_array(self.samples, wp.vec3, device)
+        shapes.distance = device_array(self.distance, float, device)
+        shapes.half = device_array(self.half, float, device)
+        shapes.world_shape = device_array(self.world_shape, int, device)
+        shapes.world_scale = device_array(self.world_scale, float, device)
+        return shapes
+
+    def camera(self) -> Eye:
+        """The camera likewise."""
+        eye = Eye()
+        eye.focal, eye.centre = wp.vec2(250.0, 250.0), wp.vec2(36.0, 24.0)
+        eye.pose = wp.transform(*self.eye.tolist())
+        eye.cell, eye.margin = CELL, MARGIN
+        return eye
+
+    def inputs(self, device: str) -> list[wp.array]:
+        """World of each row, seen points, and how many."""
+        return [
+            device_array(self.row_world, int, device),
+            device_array(self.seen, wp.vec3, device),
+            device_array(self.count, int, device),
+        ]
+
+    def surface_distance(self, shape: int, place: np.ndarray) -> tuple[float, np.ndarray]:
+        """Interpolated distance and its gradient, from the eight corners' weights."""
+        half = self.half[shape]
+        spacing = 2.0 * half / (GRID - 1)
+        inside = np.clip((place + half) / spacing, 0.0, GRID - 1 - 1e-3)
+        beyond = place - (inside * spacing - half)
+        low = np.floor(inside).astype(int)
+        share = inside - low
+        value, gradient = 0.0, np.zeros(3)
+        for corner in np.ndindex(2, 2, 2):
+            factors = np.where(corner, share, 1.0 - share)
+            at = self.distance[(shape, *(low + corner))]
+            value += at * factors.prod()
+            for axis in range(3):
+                slope = (1.0 if corner[axis] else -1.0) / spacing
+                gradient[axis] += at * slope * np.delete(factors, axis).prod()
+        far = np.linalg.norm(beyond)
+        if far > 2e-3 * spacing:
+            return value + far, beyond / far
+        return value, gradient
+
+    def pixel(self, place: np.ndarray) -> tuple[int, int, float]:
+        """Row and column of the cell that shows a point, and its depth."""
+        x, y, z = Rotation.from_quat(self.eye[3:]).inv().apply(place - self.eye[:3])
+        return int(np.floor((250.0 * y / z + 24.0) / CELL)), int(np.floor((250.0 * x / z + 36.0) / CELL)), z
+
+    def improved(self, world: int, pose: np.ndarray, every: int) -> np.ndarray:
+        """One step by the whole system of six equations."""
+        shape, scale = self.world_shape[world], self.world_scale[world]
+        turn = Rotation.from_quat(pose[3:])
+        rows, rest, weights = [], [], []
+        for point in self.seen[world, : self.count[world] : every]:
+            arm = point - pose[:3]
+            distance, gradient = self.surface_distance(shape, turn.inv().apply(arm) / scale)
+            normal = turn.apply(gradient)
+            rows.append(np.concatenate([normal, np.cross(arm, normal) / LEVER_M]))
+            rest.append(scale * distance)
+            weights.append(FAR**2 / (FAR**2 + rest[-1] ** 2))
+        if not rows:
+            return pose
+        jacobian, weight = np.array(rows), np.array(weights)
+        curvature = (weight[:, None] * jacobian).T @ jacobian + DAMPING * len(rows) * np.eye(6)
+        step = np.linalg.solve(curvature, (weight[:, None] * jacobian).T @ np.array(rest))
+        vector = step[3:] / LEVER_M
+        vector *= min(1.0, LARGEST_TURN / max(np.linalg.norm(vector), 1e-12))
+        return np.concatenate([pose[:3] + step[:3], (Rotation.from_rotvec(vector) * turn).as_quat()])
+
+    def misfit(self, world: int, pose: np.ndarray, every: int, every_sample: int, *, rendered: bool) -> float:
+        """Mean squares of distances and of what stands out."""
+        shape, scale = self.world_shape[world], self.world_scale[world]
+        turn = Rotation.from_quat(pose[3:])
+        points = self.seen[world, : self.count[world] : every]
+        places = [turn.inv().apply(point - pose[:3]) / scale for point in points]
+        off = [min(scale * self.surface_distance(shape, place)[0], FAR) ** 2 for place in places]
+        total = float(np.mean(off)) if off else 0.0
+        if rendered:
+            out = []
+            for sample in self.samples[shape, ::every_sample]:
+                row, column, depth = self.pixel(turn.apply(scale * sample) + pose[:3])
+                behind = None
+                if 0 <= row < CELLS[0] and 0 <= column < CELLS[1]:
+                    behind = self.background[world, row, column]
+                length = 0.0 if behind is None else FAR
+                if behind:
+                    length = np.clip(behind - MARGIN - depth, 0.0, FAR)
+                out.append(length**2)
+            total += float(np.mean(out))
+        return total
+
+
+@given(seed=seeds)
+@EXAMPLES
+def test_distances_are_those_to_the_nearest_sample(device, seed):
+    scene = Scene(seed)
+    out = unwritten(scene.distance.shape, float, device)
+    inputs = [device_array(scene.samples, wp.vec3, device), device_array(scene.half, float, device)]
+    wp.launch(shape_distance_kernel, dim=out.shape, inputs=inputs, outputs=[out], device=device)
+    np.testing.assert_allclose(out.numpy(), scene.distance, atol=1e-6)
+
+
+@given(seed=seeds)
+@EXAMPLES
+def test_the_background_is_the_farthest_of_each_cell(device, seed):
+    scene = Scene(seed)
+    points = scene.rng.uniform(-0.15, 0.15, (scene.worlds, 40, 3))
+    points[:, ::5] = np.nan
+    points[:, 3] = [0.0, 0.0, -2.0]  # behind the camera
+    expected = np.zeros((scene.worlds, *CELLS))
+    for world, cloud in enumerate(points):
+        for point in cloud[np.isfinite(cloud[:, 0])]:
+            row, column, depth = scene.pixel(point)
+            if depth > 0.0 and 0 <= row < CELLS[0] and 0 <= column < CELLS[1]:
+                expected[world, row, column] = max(expected[world, row, column], depth)
+    background = wp.zeros((scene.worlds, *CELLS), dtype=float, device=device)
+    cloud = device_array(points, wp.vec3, device)
+    inputs = [scene.camera(), cloud]
+    wp.launch(background_kernel, dim=cloud.shape, inputs=inputs, outputs=[background], device=device)
+    np.testing.assert_allclose(background.numpy(), expected, atol=1e-6)
+
+
+@given(seed=seeds, rendered=st.booleans(), every=st.integers(1, 3))
+@EXAMPLES
+def test_a_start_puts_the_near_side_where_the_points_are(device, seed, rendered, every):
+    scene = Scene(seed)
+    rotations = Rotation.random(6, rng=scene.rng)
+    first = scene.rng.integers(0, 6, len(scene.row_world))
+    row_world, seen, count = scene.inputs(device)
+    out = unwritten((len(scene.row_world), 4), wp.transform, device)
+    inputs = [scene.model(device), scene.camera(), int(rendered), every, row_world]
+    inputs += [device_array(first, int, device), device_array(rotations.as_quat(), wp.quat, device)]
+    wp.launch(start_poses_kernel, dim=out.shape, inputs=[*inputs, seen, count], outputs=[out], device=device)
+    for row, world in enumerate(scene.row_world):
+        points = scene.seen[world, : scene.count[world]]
+        middle = points.mean(axis=0) if len(points) else np.zeros(3)
+        samples = scene.samples[scene.world_shape[world], ::every]
+        for c in range(4):
+            turn = rotations[(first[row] + c) % 6]
+            near = samples
+            if rendered:
+                depth = turn.apply(samples) @ (middle - scene.eye[:3])
+                near = samples[depth <= depth.mean()]
+            place = middle - scene.world_scale[world] * turn.apply(near.mean(axis=0))
+            np.testing.assert_allclose(out.numpy()[row, c, :3], place, atol=1e-5)
+            np.testing.assert_allclose(out.numpy()[row, c, 3:], turn.as_quat(), atol=1e-6)
+
+
+@given(
+    seed=seeds,
+    rendered=st.booleans(),
+    steps=st.integers(0, 1),
+    every=st.integers(1, 2),
+    every_sample=st.integers(1, 3),
+)
+@EXAMPLES
+def test_a_step_solves_the_normal_equations(device, seed, rendered, steps, every, every_sample):
+    scene = Scene(seed)
+    row_world, seen, count = scene.inputs(device)
+    background = scene.background if rendered else np.zeros((scene.worlds, 0, 0))
+    pose = device_array(scene.pose, wp.transform, device)
+    misfit = unwritten(pose.shape, float, device)
+    wp.launch(
+        fit_poses_kernel,
+        dim=pose.shape,
+        inputs=[
+            scene.model(device),
+            scene.camera(),
+            FAR,
+            steps,
+            every,
+            every_sample,
+            row_world,
+            seen,
+            count,
+            device_array(background, float, device),
+        ],
+        outputs=[pose, misfit],
+        device=device,
+    )
+    found = pose.numpy().astype(float)
+    for row, world in enumerate(scene.row_world):
+        for c in range(scene.poses):
+            expected = scene.pose[row, c]
+            for _ in range(steps):
+                expected = scene.improved(world, expected, every)
+            matrices = pose_matrix(np.stack([found[row, c], expected]))
+            np.testing.assert_allclose(matrices[0], matrices[1], atol=2e-3)
+            # At the kernel's own pose: rounding of a step must not choose another cell.
+            wanted = scene.misfit(world, found[row, c], every, every_sample, rendered=rendered)
+            np.testing.assert_allclose(misfit.numpy()[row, c], wanted, atol=2e-6)
+
+
+@given(seed=seeds, known=st.booleans())
+@EXAMPLES
+def test_the_best_poses_that_differ_are_kept(device, seed, known):
+    scene = Scene(seed)
+    apart, stay, share, kept = 0.8, 0.7, 0.25, 3
+    rows, candidates = len(scene.row_world), 8
+    found = scene.random_poses(rows, candidates)
+    found[:, 5] = found[:, 1]  # one twice
+    misfit = scene.rng.uniform(0.1, 1.0, (rows, candidates))
+    pose, average = scene.random_poses(scene.worlds, kept), scene.rng.uniform(0.1, 1.0, (scene.worlds, kept))
+    average[:, 2] = NEVER
+    expected_pose, expected = pose.copy(), average.copy()
+    for row, world in enumerate(scene.row_world):
+        cost = misfit[row].copy()
+        if known:
+            cost[:kept] = average[world] + share * (cost[:kept] - average[world])
+            cost[2] = NEVER
+        left = list(range(candidates))
+        turns = Rotation.from_quat(found[row, :, 3:])
+        for k in range(kept):
+            if not left:
+                expected[world, k:] = NEVER
+                expected_pose[world, k:] = np.nan
+                break
+            best = min(left, key=lambda c, cost=cost: cost[c] * (stay if known and c == 0 else 1.0))
+            expected_pose[world, k], expected[world, k] = found[row, best], cost[best]
+            angle = (turns * turns[best].inv()).magnitude()
+            left = [c for c in left if c != best and angle[c] >= apart and cost[c] < NEVER]
+    arrays = [device_array(pose, wp.transform, device), device_array(average, float, device)]
+    wp.launch(
+        keep_poses_kernel,
+        dim=rows,
+        inputs=[
+            apart,
+            stay,
+            share,
+            kept if known else 0,
+            device_array(scene.row_world, int, device),
+            device_array(found, wp.transform, device),
+            device_array(misfit, float, device),
+        ],
+        outputs=[*arrays, unwritten(misfit.shape, float, device)],
+        device=device,
+    )
+    np.testing.assert_allclose(arrays[1].numpy(), np.minimum(expected, NEVER), rtol=1e-5)
+    there = np.isfinite(expected_pose)
+    np.testing.assert_allclose(arrays[0].numpy()[there], expected_pose[there], atol=1e-6)

@@ -1,0 +1,223 @@
+"""Objects are found by their shapes and followed; students sense of them what their teachers observe."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.model import ObjectModel, load_set
+from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
+from vd.envs.reorient import ReorientEnv
+from vd.kernels.shapes import shape_observation_size
+from vd.student.cfg import LEAN, EncoderCfg
+from vd.student.network import Student
+from vd.student.object_sense import ANGLE, STATE_VALUES
+from vd.student.registration import KEPT, POINTS, ROTATIONS, Registration, even_rotations
+from vd.vision import StudentView
+
+SPACING_RAD = 0.3
+"""Farthest that a rotation may be from the nearest one tried at the first look."""
+CLOSE_RAD = 0.15
+"""A rotation that was found, from points a few millimetres off."""
+
+
+@pytest.fixture(scope="module")
+def corner() -> ObjectModel:
+    """Three bars of different lengths along the axes, which look the same from nowhere."""
+    rng = np.random.default_rng(0)
+    bars = []
+    for axis, (length, share) in enumerate(((0.09, 220), (0.06, 160), (0.035, 120))):
+        points = rng.uniform(-0.008, 0.008, (share, 3))
+        points[:, axis] = rng.uniform(0.0, length, share)
+        bars.append(points)
+    points = np.concatenate(bars)
+    return replace(load_set(["cube"])[0], surface_points=np.float32(points - points.mean(axis=0)))
+
+
+def seen_of(item: ObjectModel, pose: np.ndarray, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Noisy points of poses [N, 7], as many as are looked at."""
+    rng = np.random.default_rng(seed)
+    chosen = rng.permutation(len(item.surface_points))[:POINTS]
+    clouds = [Rotation.from_quat(p[3:]).apply(item.surface_points[chosen]) + p[:3] for p in pose]
+    points = np.stack(clouds) + rng.normal(scale=0.002, size=(len(pose), len(chosen), 3))
+    return torch.tensor(points, dtype=torch.float32), torch.full((len(pose),), len(chosen), dtype=torch.int32)
+
+
+def poses(count: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    turns = Rotation.random(count, rng=rng).as_quat()
+    return np.concatenate([np.array([0.0, 0.0, 0.15]) + rng.uniform(-0.05, 0.05, (count, 3)), turns], axis=1)
+
+
+def errors(found: torch.Tensor, pose: np.ndarray) -> np.ndarray:
+    return (Rotation.from_quat(found.numpy()[:, 3:]) * Rotation.from_quat(pose[:, 3:]).inv()).magnitude()
+
+
+def registration(item: ObjectModel, worlds: int, device: str = "cpu", camera=None) -> Registration:
+    return Registration(
+        [item],
+        world_object=np.zeros(worlds, dtype=int),
+        world_scale=np.ones(worlds),
+        camera=camera,
+        device=device,
+    )
+
+
+def test_rotations_lie_evenly():
+    tried = Rotation.from_quat(even_rotations(ROTATIONS))
+    np.testing.assert_allclose(np.linalg.norm(even_rotations(ROTATIONS), axis=1), 1.0, atol=1e-12)
+    for turn in Rotation.random(200, rng=np.random.default_rng(0)):
+        assert (tried * turn.inv()).magnitude().min() < SPACING_RAD
+
+
+def test_a_shape_is_found_and_followed(device, corner):
+    """Eight worlds, each turned a little from look to look; the second look is of four of them anew."""
+    found, place = registration(corner, 8, device), torch.device(wp.device_to_torch(device))
+    pose, turn = poses(8), Rotation.from_rotvec([0.0, 0.1, 0.05])
+    fresh = torch.ones(8, dtype=torch.bool, device=place)
+    for look in range(4):
+        seen, count = seen_of(corner, pose, seed=look)
+        found.look(seen.to(place), count.to(place), fresh=fresh)
+        assert errors(found.pose[:, 0].cpu(), pose).max() < CLOSE_RAD
+        np.testing.assert_allclose(found.pose[:, 0, :3].cpu(), pose[:, :3], atol=5e-3)
+        assert (found.misfit[:, 0] <= found.misfit.amin(dim=1) / 0.8 + 1e-9).all()
+        pose[:, 3:] = (turn * Rotation.from_quat(pose[:, 3:])).as_quat()
+        pose[:, :3] += 0.002
+        fresh = torch.arange(8, device=place) % 2 == 0 if look == 0 else torch.zeros_like(fresh)
+    assert found.looks.tolist() == [3, 4] * 4
+
+
+def test_a_world_is_found_whatever_the_others_are(corner):
+    """And twice the same, to the bit."""
+    pose = poses(3)
+    seen, count = seen_of(corner, pose)
+    fresh = torch.ones(3, dtype=torch.bool)
+    results = []
+    for worlds in (slice(0, 3), slice(0, 3), slice(1, 2)):
+        found = registration(corner, len(pose[worlds]))
+        for first in (fresh, ~fresh):
+            found.look(seen[worlds], count[worlds], fresh=first[worlds])
+        results.append(found.pose)
+    assert torch.equal(results[0], results[1])
+    assert torch.equal(results[0][1:2], results[2])
+
+
+def test_what_is_not_seen_stays_where_it_was(corner):
+    pose = poses(2)
+    seen, count = seen_of(corner, pose)
+    found, nothing = registration(corner, 2), torch.tensor([0, POINTS], dtype=torch.int32)
+    found.look(seen, nothing, fresh=torch.ones(2, dtype=torch.bool))
+    assert found.looks.tolist() == [0, 1]
+    found.look(seen, count, fresh=torch.zeros(2, dtype=torch.bool))
+    assert errors(found.pose[:, 0], pose).max() < CLOSE_RAD
+    before = found.pose.clone()
+    found.look(seen + 0.1, torch.zeros_like(count), fresh=torch.zeros(2, dtype=torch.bool))
+    assert torch.equal(found.pose, before)
+    assert found.pose.shape == (2, KEPT, 7)
+
+
+def test_points_of_a_camera_are_needed_with_one_only(corner):
+    seen, count = seen_of(corner, poses(1))
+    fresh = torch.ones(1, dtype=torch.bool)
+    with pytest.raises(ValueError, match="camera"):
+        registration(corner, 1).look(seen, count, fresh=fresh, points=seen)
+    with pytest.raises(ValueError, match="camera"):
+        registration(corner, 1, camera=load_hand("dclaw3").camera).look(seen, count, fresh=fresh)
+
+
+def test_the_free_space_of_a_camera_tells_a_bar_from_its_mirror_image():
+    """A flat board with one leg, seen from behind: only free space says on which end the leg is."""
+    rng = np.random.default_rng(1)
+    camera = load_hand("dclaw3").camera
+    board = rng.uniform(-1.0, 1.0, (400, 3)) * [0.05, 0.02, 0.002]
+    leg = rng.uniform(-1.0, 1.0, (100, 3)) * [0.004, 0.004, 0.02] + [0.045, 0.0, 0.022]
+    item = replace(load_set(["cube"])[0], surface_points=np.float32(np.concatenate([board, leg])))
+    # The board faces the camera with its back; the leg points away, and is hidden.
+    facing = Rotation.from_quat(camera.quaternion)
+    pose = np.concatenate([camera.position + facing.apply([0.0, 0.0, 0.55]), facing.as_quat()])
+    # A wall right behind the board: no leg could stick out towards the camera, so it would be seen.
+    back = facing.apply(board) + pose[:3]
+    seen = torch.tensor(back[None, :POINTS], dtype=torch.float32)
+    count = torch.tensor([POINTS], dtype=torch.int32)
+    points = torch.tensor(back[None], dtype=torch.float32)
+    found = registration(item, 1, camera=camera)
+    found.look(seen, count, fresh=torch.ones(1, dtype=torch.bool), points=points)
+    away = facing.inv().apply(Rotation.from_quat(found.pose[0, 0, 3:].numpy()).apply([0.0, 0.0, 1.0]))
+    assert away[2] > 0.9
+
+
+@pytest.mark.parametrize("rendered", [False, True], ids=["complete", "camera"])
+def test_a_student_senses_what_the_teacher_observes(corner, rendered):
+    """The sense of a known pose is the environment's own; a found one is near it."""
+    task = ReorientCfg(
+        hand="dclaw3",
+        num_worlds=3,
+        objects=("cube",),
+        seed=1,
+        observation=ObservationCfg(shape="full"),
+        randomisation=RandomisationCfg(enabled=False),
+    )
+    env = ReorientEnv(task, "cpu")
+    view = StudentView(env, LEAN, rendered=rendered)
+    frame = view.frame()
+    sense = view._sense
+    assert sense is not None
+    values = frame["object"]
+    found = sense.registration
+    assert values.shape == (3, Student(LEAN, env.num_actions).num_senses - 3 * env.num_actions)
+    assert torch.isfinite(values).all()
+    # A cube looks the same from 24 sides: the angle to the goal is that of one of them.
+    true = wp.to_torch(env.sim.body_q)[:, env.scene.object_body]
+    base = Rotation.from_quat(wp.to_torch(env.sim.body_q)[:, 0, 3:].numpy())
+    turn = base * Rotation.from_quat(found.pose[:, 0, 3:].numpy())
+    group = Rotation.create_group("O")
+    for world in range(3):
+        own = Rotation.from_quat(true[world, 3:].numpy())
+        assert (own.inv() * turn[world] * group).magnitude().min() < CLOSE_RAD
+        goal = Rotation.from_quat(frame["goal_quat"][world].numpy())
+        assert (turn[world] * goal.inv()).magnitude() == pytest.approx(float(values[world, ANGLE]), abs=1e-3)
+    np.testing.assert_allclose(0.1 * values[:, 5:8], true[:, :3], atol=6e-3)
+    assert not values[:, 8:14].any()  # a first look knows no motion
+    exact = sense._shape(true, frame["body_q"], frame["goal_quat"])
+    observed = wp.to_torch(env.world_observation)[:, -shape_observation_size(env.num_fingers) :]
+    torch.testing.assert_close(exact, observed, atol=1e-5, rtol=0.0)
+    assert (values[:, STATE_VALUES:] - observed).abs().mean() < 0.5
+
+
+def test_motion_is_that_between_two_looks():
+    task = ReorientCfg(num_worlds=1, objects=("cube",), seed=1, randomisation=RandomisationCfg(enabled=False))
+    env = ReorientEnv(task, "cpu")
+    view = StudentView(env, LEAN, rendered=False)
+    view.frame()
+    steps, body_q = wp.to_torch(env.step_count), wp.to_torch(env.sim.body_q)
+    steps.fill_(1)
+    item = env.scene.object_body
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.1])
+    body_q[:, item, 3:] = torch.tensor((turn * Rotation.from_quat(body_q[:, item, 3:].numpy())).as_quat())
+    body_q[:, item, :3] += torch.tensor([0.01, 0.0, 0.0])
+    values = view.frame()["object"][0]
+    np.testing.assert_allclose(values[8:11], [12.0 * 0.01 / 0.1, 0.0, 0.0], atol=0.4)
+    np.testing.assert_allclose(values[11:14], [0.0, 0.0, 0.2 * 12.0 * 0.1], atol=0.1)
+
+
+def test_a_view_goes_on_from_its_state():
+    task = ReorientCfg(num_worlds=2, objects=("cube",), seed=1, randomisation=RandomisationCfg(enabled=False))
+    env = ReorientEnv(task, "cpu")
+    one, two = (StudentView(env, LEAN, rendered=True) for _ in range(2))
+    one.frame()
+    wp.to_torch(env.step_count).fill_(1)
+    two.load_state_dict(one.state_dict())
+    assert torch.equal(one.frame()["object"], two.frame()["object"])
+
+
+def test_the_angle_that_was_found_stands_at_first():
+    student = Student(LEAN, 9).eval()
+    senses = torch.randn(2, 3, student.num_senses)
+    output = student(torch.randn(2, 3, LEAN.encoder.embedding), senses, student.initial_hidden(3))
+    torch.testing.assert_close(output.distance, senses[..., 27 + ANGLE, None].expand(2, 3, 2))
+    with pytest.raises(ValueError, match="marks"):
+        replace(LEAN, turn=replace(LEAN.turn, vectors=0), encoder=EncoderCfg(inputs=("constant",))).validate()

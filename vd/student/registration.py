@@ -1,0 +1,236 @@
+"""Where the object is, from the points seen of it and its known shape, followed over time.
+
+What a network has to learn of each shape anew is computed: many rotations are tried at the first look, the
+best are improved, and a few that fit well are kept and followed, so that a turn of the object tells apart
+what one look does not. A few other rotations are tried in each step, in case none of those kept is right.
+
+N worlds, P seen points at most, K kept poses. Base frame; metres, quaternions xyzw.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from vd.assets_usd.hand_data import CameraModel
+from vd.assets_usd.objects.model import ObjectModel
+from vd.kernels.registration import (
+    Eye,
+    Shapes,
+    background_kernel,
+    fit_poses_kernel,
+    keep_poses_kernel,
+    shape_distance_kernel,
+    start_poses_kernel,
+)
+
+POINTS = 256
+"""Points seen of the object that are looked at, at most."""
+GRID = 32
+"""Grid points along a side of a shape's distances: some 5 mm apart, as the samples are."""
+BEYOND_M = 0.02
+"""How far that grid reaches beyond the shape [m]."""
+FAR_M = 0.012
+"""Length at which distances are cut off [m]: what is farther is no point of the object."""
+CELL_PX = 4.0
+"""Side of a cell of the background [pixel]: with 6000 points of an image few cells on a surface are empty."""
+MARGIN_M = 0.004
+"""Depth within which the shape may stand out [m]: the size of a cell, seen aslant."""
+ROTATIONS = 2048
+"""Rotations tried at the first look, about 0.25 rad apart."""
+FIRST_STEPS, FIRST_EVERY = 3, 4
+"""Steps of each of these, and every so many-th point they look at."""
+CHOSEN, CHOSEN_STEPS = 64, 8
+"""How many of them are improved further, and steps of these."""
+KEPT = 6
+"""Poses that are followed."""
+OTHERS = 10
+"""Other rotations that are tried in each step."""
+STRIDE = 370
+"""How far along the spiral of rotations those of the next step are: all come in turn."""
+STEPS = 5
+"""Steps of each pose in a later look."""
+EVERY_SAMPLE = 2
+"""Every so many-th surface sample is looked at for what stands out."""
+APART_RAD = 0.3
+"""Least angle between two kept poses."""
+STAY = 0.8
+"""Another pose must fit better by a fifth to be believed."""
+SHARE = 0.1
+"""Share of the latest misfit in the average: some ten looks count."""
+
+
+def even_rotations(count: int) -> np.ndarray:
+    """Rotations that lie evenly, quaternions xyzw [count, 4] (super-Fibonacci spiral, Alexa 2022)."""
+    # Its two constants: the root of 2, and the positive root of x^4 = x + 4.
+    first, second = np.sqrt(2.0), 1.533751168755204288118041
+    along = np.arange(count) + 0.5
+    share, turn = along / count, 2.0 * np.pi * along
+    inner, outer = np.sqrt(share), np.sqrt(1.0 - share)
+    return np.stack(
+        [
+            inner * np.sin(turn / first),
+            inner * np.cos(turn / first),
+            outer * np.sin(turn / second),
+            outer * np.cos(turn / second),
+        ],
+        axis=1,
+    )
+
+
+class Registration:
+    """Finds and follows the object of each world.
+
+    Attributes:
+        pose: Kept poses of the object in the base frame, the one that is believed first, [N, K, 7].
+        misfit: Their misfits, averaged over time [m^2], [N, K].
+        looks: How often each world's object was seen since it was begun anew, [N] int32.
+    """
+
+    def __init__(
+        self,
+        objects: Sequence[ObjectModel],
+        *,
+        world_object: np.ndarray,
+        world_scale: np.ndarray,
+        camera: CameraModel | None,
+        device: str,
+    ):
+        """Measure the shapes.
+
+        Args:
+            objects: What may be looked for.
+            world_object: Object of each world, shape [N].
+            world_scale: Size factor of each world's object, shape [N].
+            camera: What sees it, posed in the base frame; None where points are of all sides.
+            device: Warp device.
+        """
+        self.device, worlds = device, len(world_object)
+        place = torch.device(wp.device_to_torch(device))
+
+        def array(values: Any, dtype: Any) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        samples = np.stack([item.surface_points for item in objects])
+        self._shapes = shapes = Shapes()
+        shapes.samples = array(samples, wp.vec3)
+        shapes.half = array(np.abs(samples).max(axis=(1, 2)) + BEYOND_M, float)
+        shapes.distance = wp.empty((len(objects), GRID, GRID, GRID), dtype=float, device=device)
+        shapes.world_shape, shapes.world_scale = array(world_object, wp.int32), array(world_scale, float)
+        self._launch(
+            shape_distance_kernel, shapes.distance.shape, [shapes.samples, shapes.half], [shapes.distance]
+        )
+        self._eye, self._rendered, cells = Eye(), camera is not None, (0, 0)
+        if camera is not None:
+            self._eye.focal, self._eye.centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
+            self._eye.pose = wp.transform(*camera.position.tolist(), *camera.quaternion.tolist())
+            self._eye.cell, self._eye.margin = CELL_PX, MARGIN_M
+            cells = (math.ceil(camera.height / CELL_PX), math.ceil(camera.width / CELL_PX))
+        self._background = wp.zeros((worlds, *cells), dtype=float, device=device)
+        self._rotations = array(even_rotations(ROTATIONS), wp.quat)
+        self.pose = torch.zeros((worlds, KEPT, 7), device=place)
+        self.pose[..., 6] = 1.0
+        self.misfit = torch.zeros((worlds, KEPT), device=place)
+        self.looks = torch.zeros(worlds, dtype=torch.int32, device=place)
+
+    def look(
+        self,
+        seen: torch.Tensor,
+        count: torch.Tensor,
+        *,
+        fresh: torch.Tensor,
+        points: torch.Tensor | None = None,
+    ) -> None:
+        """Look once in every world; where nothing is seen of the object all stays as it is.
+
+        Args:
+            seen: Points seen of the object [m], [N, P, 3].
+            count: How many there are, [N] int32.
+            fresh: Where nothing is known from before, bool [N].
+            points: All that the camera saw [m], NaN for none, [N, K, 3].
+
+        Raises:
+            ValueError: There is a camera but no points, or the other way round.
+        """
+        if (points is not None) != self._rendered:
+            raise ValueError("all points of a camera are needed, and only of one")
+        inputs = [wp.from_torch(seen.contiguous(), dtype=wp.vec3), wp.from_torch(count)]
+        if points is not None:
+            self._background.zero_()
+            cloud = wp.from_torch(points.contiguous(), dtype=wp.vec3)
+            self._launch(background_kernel, cloud.shape, [self._eye, cloud], [self._background])
+        self.looks.masked_fill_(fresh, 0)
+        for worlds in ((self.looks == 0) & (count > 0), (self.looks > 0) & (count > 0)):
+            rows = worlds.nonzero().flatten()
+            if len(rows):
+                self._find(rows, inputs)
+        self.looks += (count > 0).int()
+
+    def _find(self, worlds: torch.Tensor, inputs: list[wp.array]) -> None:
+        """Find the objects of some worlds, which were all found before or all were not."""
+        known = bool(self.looks[worlds[0]])
+        looks, rows = self.looks[worlds], wp.from_torch(worlds.int())
+        if known:
+            others = self._start(rows, (looks * STRIDE) % ROTATIONS, OTHERS, inputs)
+            found = torch.cat([self.pose[worlds], others], dim=1)
+            misfit = self._fit(found, rows, STEPS, 1, inputs)
+        else:
+            tried = self._start(rows, looks, ROTATIONS, inputs)
+            misfit = self._fit(tried, rows, FIRST_STEPS, FIRST_EVERY, inputs)
+            best = misfit.topk(CHOSEN, dim=1, largest=False).indices
+            found = tried.gather(1, best[..., None].expand(-1, -1, tried.shape[-1]))
+            misfit = self._fit(found, rows, CHOSEN_STEPS, 1, inputs)
+        kept = [wp.from_torch(self.pose, dtype=wp.transform), wp.from_torch(self.misfit)]
+        scratch = wp.empty(misfit.shape, dtype=float, device=self.device)
+        self._launch(
+            keep_poses_kernel,
+            len(worlds),
+            [
+                APART_RAD,
+                STAY,
+                SHARE,
+                KEPT if known else 0,
+                rows,
+                wp.from_torch(found, dtype=wp.transform),
+                wp.from_torch(misfit),
+            ],
+            [*kept, scratch],
+        )
+
+    def _start(
+        self, worlds: wp.array, first: torch.Tensor, count: int, inputs: list[wp.array]
+    ) -> torch.Tensor:
+        """Poses in so many rotations, from the given ones on [M, count, 7]."""
+        pose = wp.empty((len(worlds), count), dtype=wp.transform, device=self.device)
+        model = [self._shapes, self._eye, int(self._rendered), EVERY_SAMPLE, worlds, wp.from_torch(first)]
+        self._launch(start_poses_kernel, pose.shape, [*model, self._rotations, *inputs], [pose])
+        return wp.to_torch(pose)
+
+    def _fit(
+        self, pose: torch.Tensor, worlds: wp.array, steps: int, every: int, inputs: list[wp.array]
+    ) -> torch.Tensor:
+        """Improve poses [M, C, 7] in place; their misfits [M, C]."""
+        misfit = torch.empty(pose.shape[:2], device=pose.device)
+        self._launch(
+            fit_poses_kernel,
+            misfit.shape,
+            [
+                self._shapes,
+                self._eye,
+                FAR_M,
+                steps,
+                every,
+                EVERY_SAMPLE,
+                worlds,
+                *inputs,
+                self._background,
+            ],
+            [wp.from_torch(pose, dtype=wp.transform), wp.from_torch(misfit)],
+        )
+        return misfit
+
+    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
