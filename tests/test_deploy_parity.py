@@ -16,11 +16,14 @@ from vd.evaluate.agents import open_teacher, task_for
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import PRESETS
 from vd.student.network import Student
+from vd.student.object_sense import ANGLE
 from vd.vision import StudentView
 
 POINT_M = 2e-6
 """Points of the two clouds lie this close: rounding of poses that were computed in another order."""
 SENSE = 1e-6
+FOUND_RAD = 1e-3
+"""So do the angles to the goal at which the object is found, in most steps."""
 
 
 def state_of(env: ReorientEnv) -> Sensed:
@@ -65,6 +68,7 @@ def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered):
     hidden = there = student.initial_hidden(1)
     rng = np.random.default_rng(0)
     apart, borders, steps = 0, 0, 0
+    found: list[float] = []
     for _ in range(env.max_episode_steps):
         seen = view.frame()
         sensed = state_of(env)
@@ -78,13 +82,15 @@ def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered):
         ours, theirs = sight.sites(points), view.sites(seen, augment=False)
         apart += len(keys(ours[0]) ^ keys(theirs[0]))
         borders += near_border(expected[0].numpy(), network.voxel_m)
-        senses, wanted = student.senses(frame(sensed)), student.senses(seen)
-        assert (senses - wanted).abs().max() < SENSE
+        known = sight.frame(sensed, points, ours)
+        assert all((known[name] - seen[name]).abs().max() < SENSE for name in frame(sensed))
+        found.append(float((known["object"] - seen["object"])[:, : 1 + ANGLE].abs().max()))
+        senses, wanted = student.senses(known), student.senses(seen)
         with torch.inference_mode():
             one = student.act(ours[0], senses, hidden, *ours[1:])
             other = student.act(theirs[0], wanted, there, *theirs[1:])
         hidden, there = one.hidden, other.hidden
-        if keys(ours[0]) == keys(theirs[0]):
+        if keys(ours[0]) == keys(theirs[0]) and max(found) < SENSE:
             np.testing.assert_allclose(one.mean, other.mean, atol=2e-2)
         action = rng.uniform(-1.0, 1.0, env.num_actions).astype(np.float32)
         actions.put(sensed.smoothed)
@@ -94,6 +100,8 @@ def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered):
         steps += 1
     assert steps == env.max_episode_steps
     assert apart <= 2 * borders, f"{apart} voxels differ, {borders} points lie on borders"
+    # Rounding may decide between two sides of a cube that fit alike.
+    assert np.median(found) < FOUND_RAD, f"angles to the goal differ by {np.median(found):.3g} rad"
 
 
 @pytest.mark.slow
