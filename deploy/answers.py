@@ -35,7 +35,7 @@ class HandState:
     """
 
     time_s: float
-    """When it was read [s]: the middle of the exchange."""
+    """When it was asked for [s]."""
     position: np.ndarray
     """Angles [rad]."""
     velocity: np.ndarray

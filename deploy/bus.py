@@ -386,13 +386,15 @@ class MotorBus:
             if result != self._sdk.COMM_SUCCESS:
                 raise BusError(f"states were not asked for: {self._words(result)}")
             # One time for all: the SDK counts no time for the answers' bytes.
+            heard = self.clock.now()
             answers = [self._answer(id) for id in ids]
             took = self.clock.now() - asked
             if took > CLOCK_TOLERANCE_S:
                 # This process did not run: whose time is not known is nothing to compare later ones with.
                 raise BusError(f"the state took {took:.3f} s")
-            # Motors measure when they are asked or when they answer: in the middle, half of it off at most.
-            return self._states.accept(asked + 0.5 * took, answers)
+            # Motors measure when they have heard it, or not before they answer. A later time than theirs
+            # would look like a delay of the goals, which has a name; an earlier one does not.
+            return self._states.accept(heard, answers)
 
     def _answer(self, id: int) -> Answer:
         """This motor's next answer."""

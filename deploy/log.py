@@ -18,6 +18,7 @@ from vd.assets_usd.hand_spec import HANDS
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.control_table import RAD_PER_COUNT
 from vd.files import write_json
+from vd.gap.recording import COMMAND_TIME
 from vd.gap.recording import FORMAT as RECORDING_FORMAT
 from vd.hand_log import (
     EVENTS_FILE,
@@ -81,6 +82,7 @@ class LogWriter:
         }
         self._columns = [
             "t",
+            COMMAND_TIME,
             *(f"{channel}.{joint}" for channel in JOINT_CHANNELS for joint in hand.joint_names),
             *STEP_COLUMNS,
             *(TRUTH_COLUMNS if truth else ()),
@@ -101,6 +103,7 @@ class LogWriter:
     def step(
         self,
         time_s: float,
+        sent_s: float,
         joints: Mapping[str, np.ndarray],
         values: Sequence[float],
         truth: Sequence[float] = (),
@@ -109,12 +112,14 @@ class LogWriter:
 
         Args:
             time_s: When the state was read, by the monotonic clock [s].
+            sent_s: When the goals were sent, by the same clock [s].
             joints: Each of JOINT_CHANNELS [D].
             values: In the order of STEP_COLUMNS.
             truth: In the order of TRUTH_COLUMNS, if they are logged.
         """
         row = [
             self.since(time_s),
+            self.since(sent_s),
             *(v for channel in JOINT_CHANNELS for v in joints[channel]),
             *values,
             *truth,

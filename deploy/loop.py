@@ -225,7 +225,7 @@ class ControlLoop:
         }
         distance = np.nan if moment.distance is None else moment.distance
         values = [moment.number, moment.acting, distance, *vars(times).values(), missed]
-        self._log.step(state.time_s, joints, values, truth)
+        self._log.step(state.time_s, self._pacer.due_s + times.sent_s, joints, values, truth)
         self.times.append(times)
         if len(self.times) % STATUS_STEPS == 0:
             self._status(status_line(moment, times, missed, truth))

@@ -176,6 +176,20 @@ def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
     return tuple(name for f in chosen for name in hand.joint_names[3 * f : 3 * f + JOINTS_PER_FINGER])
 
 
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One sample."""
+
+    state: HandState
+    """What was measured."""
+    goal: np.ndarray
+    """Angles of the joints that were sent before [rad] [D]."""
+    sent_s: float
+    """When [s]."""
+    on: np.ndarray
+    """Whether each joint's torque is on [D]."""
+
+
 class Recorder:
     """Plays motions on an armed hand and keeps what it answers.
 
@@ -193,7 +207,7 @@ class Recorder:
     def play(self, safe: SafeHand, motion: Motion) -> "Trajectory":
         """Go to where the motion starts, play it, and give what was measured.
 
-        A sample is a state, and the goal that was sent right before it was read.
+        A sample is a state, and the goal that was sent right before it was read, each with its time.
 
         Raises:
             StoppedError: The hand was stopped.
@@ -203,7 +217,7 @@ class Recorder:
         move(safe, excitation.command[0], SPEED_RAD_S)
         gain = int(float(excitation.conditions["p_gain"]))
         self._set_gain(gain)
-        rows: list[tuple[HandState, np.ndarray, np.ndarray]] = []
+        rows: list[Row] = []
         pacer, last = Pacer(self._rate, self._connection.bus.clock), -np.inf
         pacer.wait()
         begin = pacer.due_s
@@ -214,9 +228,10 @@ class Recorder:
                 on = excitation.enabled[at]
                 safe.switch(on)
             goal = safe.command(excitation.command[at])
+            sent_s = self._connection.bus.clock.now()
             state = safe.read()
             if state.time_s > last:  # else the last one again
-                rows.append((state, goal, on))
+                rows.append(Row(state, goal, sent_s, on))
                 last = state.time_s
             safe.beat()
             pacer.wait()
@@ -232,12 +247,10 @@ class Recorder:
             if bus.read(id, "position_p_gain") != gain:
                 bus.write(id, "position_p_gain", gain)
 
-    def _trajectory(
-        self, motion: Motion, rows: Sequence[tuple[HandState, np.ndarray, np.ndarray]]
-    ) -> "Trajectory":
+    def _trajectory(self, motion: Motion, rows: Sequence["Row"]) -> "Trajectory":
         from vd.gap.recording import Trajectory
 
-        states = [state for state, _, _ in rows]
+        states = [row.state for row in rows]
 
         def column(values: Sequence[np.ndarray]) -> np.ndarray:
             return np.array(values)[:, self._columns]
@@ -250,9 +263,10 @@ class Recorder:
             joints=excitation.joints,
             conditions=excitation.conditions,
             time=np.array([state.time_s for state in states]) - states[0].time_s,
-            command=column([goal for _, goal, _ in rows]),
+            command_time=np.array([row.sent_s for row in rows]) - states[0].time_s,
+            command=column([row.goal for row in rows]),
             position=column([state.position for state in states]),
-            enabled=column([on for _, _, on in rows]),
+            enabled=column([row.on for row in rows]),
             # A motor that does not tell its duty cycle says zero.
             **{name: values for name, values in measured.items() if name != "pwm" or values.any()},
         )

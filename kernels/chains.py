@@ -76,12 +76,16 @@ class Samples:
 
     step: Time stamp in whole steps [S]. A trajectory need not begin at 0: a piece of a longer one.
     fraction: And the rest, in [0, 1] [S].
+    sent_step: When the command was sent, in whole steps [S].
+    sent_fraction: And the rest, in [0, 1] [S].
     command: Commanded positions [S, n] [rad].
     power: Factor on the controller's gains, 0 with the torque off [S, n].
     """
 
     step: wp.array[int]
     fraction: wp.array[float]
+    sent_step: wp.array[int]
+    sent_fraction: wp.array[float]
     command: wp.array2d[float]
     power: wp.array2d[float]
 
@@ -181,7 +185,7 @@ def arrival(
         if wp.randf(rng) < drop:
             kept = 0
         delay += sigma * wp.abs(wp.randn(rng))
-    step, fraction = split_steps(samples.step[write], samples.fraction[write], CENTRED + delay / dt)
+    step, fraction = split_steps(samples.sent_step[write], samples.sent_fraction[write], CENTRED + delay / dt)
     return step, fraction, kept
 
 

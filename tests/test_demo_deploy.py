@@ -25,7 +25,8 @@ def made_up_flights(folder: Path, _seed: int, *, minutes: float, hands=demo_depl
         for step in range(100):
             joints = dict.fromkeys(JOINT_CHANNELS, np.zeros(hand.num_joints))
             sent = 0.005 + 0.0001 * step
-            log.step(log.started_s + step / 12, joints, [0.0, 1.0, 0.5, 0.0, 0.002, sent, 0.004, 1.0])
+            now = log.started_s + step / 12
+            log.step(now, now + sent, joints, [0.0, 1.0, 0.5, 0.0, 0.002, sent, 0.004, 1.0])
         log.event("stop", goal=0, outcome="stopped", distance=0.2)
         log.finish("all goals pursued")
         demo_deploy.deploy_video(folder, name).write_bytes(b"no film")

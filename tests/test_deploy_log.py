@@ -13,6 +13,7 @@ from vd.gap.recording import read_recording
 from vd.hand_log import JOINT_CHANNELS, STEP_COLUMNS, STEPS_FILE, TRUTH_COLUMNS, LogError, is_log, read_log
 
 STEPS = 30
+SENT_S = 0.02
 GOALS = [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]]
 
 
@@ -26,7 +27,8 @@ def folder(tmp_path):
         joints = {channel: wave + 0.01 * i for i, channel in enumerate(JOINT_CHANNELS)}
         values = [float(step >= 10), 1.0, 0.5, 0.001, 0.002, 0.02, 0.02, 0.0]
         assert len(values) == len(STEP_COLUMNS)
-        log.step(log.started_s + step / 12, joints, values, [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step])
+        now = log.started_s + step / 12
+        log.step(now, now + SENT_S, joints, values, [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step])
         if step == 9:
             log.event("stop", goal=0, outcome="stopped", distance=0.2)
     log.event("stop", goal=1, outcome="time limit", distance=0.7)
@@ -54,6 +56,18 @@ def test_the_log_is_a_recording(folder):
     trajectory = recording.trajectories[0]
     np.testing.assert_allclose(trajectory.position, read_log(folder).channel("position"), atol=1e-9)
     assert recording.model == "dclaw3" and trajectory.current is not None
+    np.testing.assert_allclose(trajectory.sent - trajectory.time, SENT_S, atol=1e-6)
+
+
+def test_a_state_that_was_told_again_is_one_sample(folder):
+    """Over a short gap of the bus the loop acts on the state before."""
+    header, *rows = (folder / STEPS_FILE).read_text().splitlines()
+    again = rows[11].split(",")
+    again[:1], again[2:] = rows[10].split(",")[:1], rows[10].split(",")[2:]
+    rows[11] = ",".join(again)
+    (folder / STEPS_FILE).write_text("\n".join([header, *rows]) + "\n")
+    assert len(read_log(folder).columns["t"]) == STEPS
+    assert len(read_recording(folder).trajectories[0].time) == STEPS - 1
 
 
 def test_a_log_cut_short_is_read_to_its_last_whole_row(folder):
@@ -75,7 +89,8 @@ def test_the_loop_does_not_wait_for_the_disk(tmp_path, monkeypatch):
     monkeypatch.setattr("vd.deploy.log.os.write", lambda *a: busy.wait(60.0) and write(*a))
     joints = dict.fromkeys(JOINT_CHANNELS, np.zeros(9))
     for step in range(3):
-        log.step(log.started_s + step, joints, [0.0] * len(STEP_COLUMNS))  # nothing is written yet
+        now = log.started_s + step
+        log.step(now, now, joints, [0.0] * len(STEP_COLUMNS))  # nothing is written yet
     assert len((tmp_path / "log" / STEPS_FILE).read_text().splitlines()) <= 1
     busy.set()
     log.finish("done")

@@ -49,7 +49,8 @@ class Run:
                 here = number * steps + step
                 turns.append((Rotation.from_rotvec(angle[step] * axis) * goal).as_quat())
                 values = dict.fromkeys(STEP_COLUMNS, 0.0) | {"goal": number, "distance": angle[step] + 0.02}
-                log.step(log.started_s + self.t[here], joints, list(values.values()))
+                now = log.started_s + self.t[here]
+                log.step(now, now, joints, list(values.values()))
             end = self.t[(number + 1) * steps - 1]
             monkeypatch.setattr("vd.deploy.log.time.monotonic", lambda end=end: log.started_s + end)
             outcome = "time limit" if number == FIFTH_ENDS_BY_TIME else "stopped"

@@ -40,7 +40,8 @@ def write(folder, *, truth=True, spoil=0.0):
         turn = 0.1 * step
         pose = [0.0, 0.0, 0.05, 0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2), turn]
         values = [float(step >= 12), 1.0, 0.5, 0.001, 0.004, 0.02, 0.01, 0.0]
-        log.step(log.started_s + step / 12, joints, values, pose if truth else [])
+        now = log.started_s + step / 12
+        log.step(now, now + 0.02, joints, values, pose if truth else [])
         if step == 11:
             log._append(log._events, json.dumps({"t": 11.5 / 12, "event": "stop", "goal": 0} | STOPPED))
     log._append(log._events, json.dumps({"t": 3.0, "event": "stop", "goal": 1} | LOST))

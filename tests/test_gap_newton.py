@@ -89,6 +89,16 @@ def test_newton_agrees_with_the_rollouts_under_every_kind_of_effect():
     assert np.allclose(squared, expected, rtol=1e-3, atol=1e-6)
 
 
+def test_commands_act_from_when_they_were_sent():
+    """Sent 7 ms after the rows' stamps they act as those that are late by as much do."""
+    recording = motions("sine_0.50hz", ("f0_j1",), 0.5)
+    (motion,) = recording.trajectories
+    sent = replace(recording, trajectories=(replace(motion, command_time=motion.time + 0.007),))
+    got = simulate_hand(sent, HAND, rows())
+    np.testing.assert_allclose(got, simulate_hand(recording, HAND, rows(COMMAND_DELAY=0.007)), atol=1e-5)
+    assert np.abs(got - simulate_hand(recording, HAND, rows())).max() > 1e-3
+
+
 def test_load_friction_follows_what_the_drive_gives_not_what_its_controller_wants():
     """Steps so large that the drive is at its limit, which the solver keeps."""
     recording = motions("step_large", ("f0_j2",), 3.0)

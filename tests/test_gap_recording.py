@@ -89,6 +89,18 @@ def test_what_is_written_is_read(tmp_path):
     assert again.subset([0, 0]).trajectories == again.trajectories * 2
 
 
+def test_commands_may_be_sent_at_other_times_than_the_stamps(tmp_path):
+    sent = np.arange(SAMPLES) / 100.0 - 0.0003
+    folder = write_recording(example(command_time=sent), tmp_path / "r")
+    (read,) = read_recording(folder).trajectories
+    np.testing.assert_allclose(read.sent, sent, atol=1e-6)
+    np.testing.assert_array_equal(read.piece(50, 90).sent, read.sent[50:90])
+    edit_table(folder, set_cells("t", lambda t: f"{5.0 + t:.6f}"))
+    np.testing.assert_allclose(read_recording(folder).trajectories[0].sent, sent - 5.0, atol=1e-6)
+    edit_table(folder, set_cells("t_command", "0.1", [7]))
+    refused(folder, "a.csv", "row 9", "'t_command'", "before")
+
+
 def test_time_starts_at_zero_and_need_not_be_regular(folder):
     edit_table(folder, set_cells("t", lambda t: f"{5.0 + t + 1e-3 * np.sin(50 * t):.6f}"))
     time = read_recording(folder).trajectories[0].time

@@ -124,6 +124,23 @@ def test_excited_joints_are_marked():
     assert marks == [False, True]
 
 
+@pytest.mark.parametrize(("sent_s", "delay_s", "same_as"), [(0.007, 0.0, 0.007), (-0.003, 0.003, 0.0)])
+def test_commands_act_from_when_they_were_sent(hand, device, sent_s, delay_s, same_as):
+    """Sent after the rows' stamps they act as delayed ones; sent before them and late, as at the stamps."""
+    plain = recording("dclaw3", hand.joint_names[:3], trajectory("a", 0.2 * wave(joints=3)))
+    (motion,) = plain.trajectories
+    sent = replace(plain, trajectories=(replace(motion, command_time=motion.time + sent_s),))
+    (chain,) = chains(plain, hand)
+
+    def positions(data, delay):
+        row = chain.start_row.copy()
+        row[:, servo.COMMAND_DELAY] = delay
+        return Rollouts(chain, data, device=device).predict(row[None])[0]
+
+    np.testing.assert_allclose(positions(sent, delay_s), positions(plain, same_as), atol=1e-5)
+    assert np.abs(positions(sent, delay_s) - positions(plain, delay_s)).max() > 1e-3
+
+
 def test_a_rollout_starts_where_it_was_measured():
     position = np.full((100, 1), 0.25)
     data = recording("servo", ("j",), trajectory("a", np.full((100, 1), 0.2), position=position))

@@ -75,6 +75,7 @@ def roll(
     samples = Samples()
     samples.step = device_array(np.floor(steps), int, device)
     samples.fraction = device_array(steps - np.floor(steps), float, device)
+    samples.sent_step, samples.sent_fraction = samples.step, samples.fraction
     samples.command = device_array(command.reshape(-1, n), float, device)
     power = np.ones_like(command) if power is None else power
     samples.power = device_array(power.reshape(-1, n), float, device)

@@ -121,6 +121,7 @@ class HandReplay:
             ]
         )
         stamps = np.concatenate([t.time for t in trajectories]) / self.dt
+        sent = np.concatenate([t.sent for t in trajectories]) / self.dt
         command = np.concatenate([t.command for t in trajectories])
         position = np.concatenate([t.position for t in trajectories])
         names = list(recording.joints)
@@ -143,6 +144,8 @@ class HandReplay:
         self._samples = Samples()
         self._samples.step = array(np.floor(stamps), int)
         self._samples.fraction = array(stamps - np.floor(stamps))
+        self._samples.sent_step = array(np.floor(sent), int)
+        self._samples.sent_fraction = array(sent - np.floor(sent))
         self._samples.command, self._samples.power = array(command), array(power)
         self._tracks = Tracks()
         self._tracks.column = array(column, int)

@@ -1,7 +1,8 @@
 """Recordings of real machines: the format ``vd-recording/1``, read with every check and written.
 
 A recording is a folder with ``recording.json`` and one CSV file per trajectory. SI units, radians,
-seconds. A command holds from its time stamp on; stamps increase but need not be regular.
+seconds. A command holds from its row's time stamp on, or from when it was sent where the row says that;
+stamps increase but need not be regular.
 """
 
 import csv
@@ -34,6 +35,8 @@ MIN_DISTINCT = 50
 """Distinct positions from which the smallest step between two of them tells the unit."""
 DEGREES_RATIO = 20.0
 """A smallest step above this many encoder counts is in another unit (degrees are 57 times radians)."""
+COMMAND_TIME = "t_command"
+"""Optional column: when the commands of a row were sent [s], if not at the row's time stamp."""
 CSV_DIGITS = 6
 
 
@@ -58,6 +61,7 @@ class Trajectory:
         pwm: Duty cycles [T, J] in [-1, 1], or None.
         voltage: Supply voltages [T, J] [V], or None.
         temperature: Motor temperatures [T, J] [deg C], or None.
+        command_time: When the commands were sent [T] [s], in the time of ``time``; None: at the time stamps.
         enabled: Whether the servo's torque is on [T, J] bool; all true where not recorded.
     """
 
@@ -74,10 +78,16 @@ class Trajectory:
     pwm: np.ndarray | None = None
     voltage: np.ndarray | None = None
     temperature: np.ndarray | None = None
+    command_time: np.ndarray | None = None
+
+    @property
+    def sent(self) -> np.ndarray:
+        """When the commands were sent [T] [s]."""
+        return self.time if self.command_time is None else self.command_time
 
     def piece(self, first: int, end: int) -> "Trajectory":
         """Samples ``first`` to ``end`` (not included), with the times that they have in the whole."""
-        arrays = {name: getattr(self, name) for name in ("time", *CHANNELS)}
+        arrays = {name: getattr(self, name) for name in ("time", "command_time", *CHANNELS)}
         return replace(self, **{name: a[first:end] for name, a in arrays.items() if a is not None})
 
 
@@ -271,6 +281,7 @@ def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...
     table = file.parent / name
     columns = _read_csv(table, joints)
     time = columns.pop("t")
+    sent = columns.pop(COMMAND_TIME, None)
     channels: dict[str, Any] = {}
     for channel in CHANNELS:
         found = [columns.get(f"{channel}.{joint}") for joint in joints]
@@ -284,6 +295,7 @@ def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...
         joints=excited,
         conditions=conditions,
         time=time - time[0],
+        command_time=None if sent is None else sent - time[0],
         enabled=np.nan_to_num(enabled, nan=1.0) > 0.5,
         **channels,
     )
@@ -316,8 +328,17 @@ def _read_csv(file: Path, joints: tuple[str, ...]) -> dict[str, np.ndarray]:
                 f"{file}: row {i + 2} has {len(row)} cells, the header {len(names)}; correct the row"
             )
     columns = {name: _numbers(file, name, [row[index] for row in body]) for name, index in kept.items()}
+    if COMMAND_TIME in columns:
+        columns = _told_once(columns)
     _check_values(file, columns)
     return columns
+
+
+def _told_once(columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns without rows that tell the state before once more, as a log does over a gap of the bus."""
+    same = [np.diff(v) == 0.0 for name, v in columns.items() if name == "t" or name.startswith("position.")]
+    new = np.concatenate([[True], ~np.all(same, axis=0)])
+    return {name: values[new] for name, values in columns.items()}
 
 
 def _check_columns(file: Path, names: list[str], joints: tuple[str, ...]) -> dict[str, int]:
@@ -335,7 +356,7 @@ def _check_columns(file: Path, names: list[str], joints: tuple[str, ...]) -> dic
     for name in required:
         if name not in names:
             raise RecordingError(f"{file}: row 1 has no column {name!r}; add it")
-    wanted = {"t", *(f"{channel}.{joint}" for channel in CHANNELS for joint in joints)}
+    wanted = {"t", COMMAND_TIME, *(f"{channel}.{joint}" for channel in CHANNELS for joint in joints)}
     return {name: index for index, name in enumerate(names) if name in wanted}
 
 
@@ -364,6 +385,12 @@ def _check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
         raise RecordingError(
             f"{file}: row {i + 2}, column 't': time {how} ({time[i - 1]:g} s, then {time[i]:g} s); "
             "sort the rows and keep one per stamp"
+        )
+    back = np.flatnonzero(np.diff(columns.get(COMMAND_TIME, time)) < 0.0)
+    if len(back):
+        raise RecordingError(
+            f"{file}: row {int(back[0]) + 3}, column {COMMAND_TIME!r}: sent before the commands of the row "
+            "before; commands go out in the order of the rows: correct it"
         )
     for name, values in columns.items():
         channel = name.partition(".")[0]
@@ -429,6 +456,8 @@ def _check_units(recording: Recording) -> None:
 def _write_csv(file: Path, trajectory: Trajectory, joints: tuple[str, ...]) -> None:
     """The CSV of one trajectory; telemetry that is NaN throughout is left out."""
     columns = {"t": trajectory.time}
+    if trajectory.command_time is not None:
+        columns[COMMAND_TIME] = trajectory.command_time
     for channel in CHANNELS:
         values = getattr(trajectory, channel)
         if values is None or (channel == "enabled" and values.all()):

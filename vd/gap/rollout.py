@@ -50,7 +50,7 @@ class Rollouts:
     """Predictions of a recording's trajectories for one chain. S samples in all, n joints.
 
     A gain set on purpose acts on the stiffness (``p_gain`` over the chain's reference), as does the
-    servo's torque being off; both travel with the command. Before the first stamp the first command holds.
+    servo's torque being off; both travel with the command. Before the first command is sent it holds.
 
     Attributes:
         chain: The chain.
@@ -129,17 +129,25 @@ class Rollouts:
         trajectories, columns = self.recording.trajectories, self.chain.columns
         command = np.concatenate([t.command[:, columns] for t in trajectories])
         power = np.concatenate([t.enabled[:, columns] * self._gain(t.conditions) for t in trajectories])
-        steps = self.time / self.dt
+        samples = Samples()
+        samples.step, samples.fraction = self._steps_of(self.time)
+        sent = np.concatenate([t.sent for t in trajectories])
+        samples.sent_step, samples.sent_fraction = self._steps_of(sent)
+        samples.command = wp.array(command, dtype=float, device=self.device)
+        samples.power = wp.array(power, dtype=float, device=self.device)
+        return samples
+
+    def _steps_of(self, time: np.ndarray) -> tuple[wp.array, wp.array]:
+        """Times [s] as whole steps and a fraction in [0, 1)."""
+        steps = time / self.dt
         whole = np.floor(steps)
         # In single precision a fraction just under 1 is 1: the next step, which must then be counted.
         fraction = (steps - whole).astype(np.float32)
         whole, fraction = whole + (fraction >= 1.0), np.where(fraction < 1.0, fraction, 0.0)
-        samples = Samples()
-        samples.step = wp.array(whole, dtype=int, device=self.device)
-        samples.fraction = wp.array(fraction, dtype=float, device=self.device)
-        samples.command = wp.array(command, dtype=float, device=self.device)
-        samples.power = wp.array(power, dtype=float, device=self.device)
-        return samples
+        return (
+            wp.array(whole, dtype=int, device=self.device),
+            wp.array(fraction, dtype=float, device=self.device),
+        )
 
     def _gain(self, conditions: dict[str, float | str]) -> float:
         reference = self.chain.reference_p_gain

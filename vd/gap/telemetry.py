@@ -98,7 +98,7 @@ def _follows(
     for t in trajectories:
         if t.pwm is None or not np.isfinite(t.pwm[:, column]).all():
             continue
-        sent = np.maximum(np.searchsorted(t.time, t.time - command_delay, side="right") - 1, 0)
+        sent = np.maximum(np.searchsorted(t.sent, t.time - command_delay, side="right") - 1, 0)
         position = np.interp(t.time + read_delay, t.time, t.position[:, column])
         gain = float(t.conditions.get("p_gain", reference_gain)) / reference_gain if reference_gain else 1.0
         used = t.enabled[:, column] & (np.abs(t.pwm[:, column]) < SATURATED)

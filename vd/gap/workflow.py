@@ -239,7 +239,7 @@ def fingerprint(recording: Recording, hand: HandModel | None, options: Options) 
         digest.update(repr(sorted(trajectory.conditions.items())).encode())
         for array in (trajectory.time, trajectory.command, trajectory.position, trajectory.enabled):
             digest.update(np.ascontiguousarray(array).tobytes())
-        for channel in (trajectory.pwm, trajectory.voltage, trajectory.current):
+        for channel in (trajectory.pwm, trajectory.voltage, trajectory.current, trajectory.command_time):
             digest.update(b"-" if channel is None else np.ascontiguousarray(channel).tobytes())
     if hand is not None:
         for chain in chains(recording, hand):
