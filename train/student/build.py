@@ -233,6 +233,9 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
     if spec.network.state != student.cfg.state:
         # Actions were read from the memory alone, or added to those of another teacher.
         theirs = {name: value for name, value in theirs.items() if not name.startswith(("state.", "mean."))}
+    if ("object" in spec.network.senses) != ("object" in student.cfg.senses):
+        # Heads for the whole distance, or for what is to be added to the angle that was found.
+        theirs = {name: value for name, value in theirs.items() if not name.startswith("distance.")}
     fits = {key: value for key, value in theirs.items() if key in own and own[key].shape == value.shape}
     anew = sorted({name.split(".")[0] for name in own.keys() - fits.keys()})
     if other and (acts or "encoder" in anew):
