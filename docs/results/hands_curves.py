@@ -1,6 +1,6 @@
 """Draw hands-curves.png: what both hands' teachers reach on held-out shapes as training goes on.
 
-The numbers are those of runs.md and teacher.md (full success test, 13 held-out objects, 100 episodes each):
+The numbers are those of runs.md and first-runs.md (full success test, 13 x 100 held-out episodes):
 million control steps, GPU hours of an H200 so far, per cent within 0.4 rad, and its 95 % interval.
 
 Run from the repository's root: python docs/results/hands_curves.py
