@@ -208,6 +208,16 @@ A servo that does not change with time, and is commanded rather than steered by 
 its whole motion in time either way. By convention the shift is one of the command.
 """
 
+ON_A_PENDULUM: dict[str, tuple[str, ...]] = {"encoder_bias": ("gravity_load",)}
+"""The same on a pendulum, whose load hangs from the joint: whether its zero is not where the arm hangs, or a
+further load hangs off the arm, positions and commands are the same."""
+
+
+def equivalent(model: str) -> dict[str, tuple[str, ...]]:
+    """Effects that stand for others on recordings of a model."""
+    return {**EQUIVALENT, **ON_A_PENDULUM} if model == "pendulum" else EQUIVALENT
+
+
 TOGETHER: dict[str, tuple[str, ...]] = {
     "asymmetric_friction": ("coulomb_friction", "dead_zone", "encoder_bias", "gravity_load"),
 }

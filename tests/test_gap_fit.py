@@ -9,13 +9,13 @@ import pytest
 
 import vd.gap.fit
 import vd.kernels.actuators as servo
-from vd.gap.chain import chains
+from vd.gap.chain import candidates, chains
 from vd.gap.coordinates import coordinate
 from vd.gap.descent import Descent, LeastSquares
 from vd.gap.design import design
 from vd.gap.explanation import intervals
 from vd.gap.find import findings, phases
-from vd.gap.fit import JointProblem, candidates
+from vd.gap.fit import JointProblem
 from vd.gap.holding import Holding
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Rollouts
@@ -125,7 +125,7 @@ def test_effect_is_recovered_with_the_baseline(effect: str, column: int, value: 
 
 
 def test_the_error_of_the_first_reading_is_forgiven_where_friction_holds_a_joint() -> None:
-    """Of a joint that is to hold and is predicted to; not of one that moves, nor where it is commanded."""
+    """Of a joint that is to hold and is predicted to; of one that is shaken, as far as it is free to move."""
     recording = recorded({})
     held = replace(recording.trajectories[0], command=np.zeros_like(recording.trajectories[0].command))
     recording = replace(recording, trajectories=(held, *recording.trajectories[1:]))
@@ -136,10 +136,13 @@ def test_the_error_of_the_first_reading_is_forgiven_where_friction_holds_a_joint
     residual = np.full((2, 2 * count), 0.5 * COUNT)
     residual[0, 0] += COUNT
     before = residual.copy()
-    holding.forgive(residual, predicted, [0, 1])
+    holding.forgive(residual, predicted, [0, 1], np.zeros(2))
     assert residual[0, :count].mean() == pytest.approx(0.0, abs=1e-12)
     assert np.ptp(residual[0, :count]) == pytest.approx(COUNT), "noise stays"
     assert np.array_equal(residual[1], before[1]) and np.array_equal(residual[:, count:], before[:, count:])
+    holding.forgive(residual, predicted, [0, 1], np.full(2, 0.2 * COUNT))
+    assert residual[1, :count] == pytest.approx(0.3 * COUNT), "no more than the play"
+    assert np.array_equal(residual[:, count:], before[:, count:]), "not where it is commanded"
 
 
 def test_refits_near_the_floor_keep_the_slopes_of_the_whole_fit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -352,7 +352,7 @@ def test_far_from_the_floor_the_search_begins_anew_where_first_effects_tied() ->
     selection.search, selection.better = search, better  # type: ignore[method-assign, assignment]
     with pytest.raises(FoundError) as found:
         selection.explain(baseline)
-    assert beginnings == [(), ("load_friction",)]
+    assert beginnings == [(), (), ("load_friction",)], "from the best starts, from all, with the tied one"
     assert found.value.args[0].effects == ("load_friction", "torque_limit")
 
 

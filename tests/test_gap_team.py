@@ -12,10 +12,11 @@ from vd.gap.assemble import curves
 from vd.gap.chain import chains
 from vd.gap.crowd import Crowd
 from vd.gap.design import design
+from vd.gap.joints import parallel
 from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.statistics import noise_floor
 from vd.gap.team import Bench, Call, JointSpec, Team
-from vd.gap.workflow import _parallel, baseline_of
+from vd.gap.workflow import baseline_of
 
 EFFECTS = ("coulomb_friction", "backlash", "load_friction")
 
@@ -90,6 +91,6 @@ def test_whoever_stops_does_not_wait_for_the_other_joints() -> None:
         ended.append(released.wait(60.0))
 
     with pytest.raises(KeyboardInterrupt):
-        _parallel(work, [0, 1])
+        parallel(work, [0, 1])
     assert not ended
     released.set()

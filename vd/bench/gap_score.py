@@ -12,7 +12,7 @@ from vd.gap.hidden_plant import CABLE, COGGING, WARMING
 from vd.gap.hide import Hiding
 from vd.gap.recording import BARE_MODELS
 from vd.gap.sizes import sized_effect
-from vd.kernels.effects import EFFECTS, EQUIVALENT, TOGETHER
+from vd.kernels.effects import EFFECTS, TOGETHER, equivalent
 
 KINDS = ("single", "none", "pair", "outside")
 MASS_SPREAD = 0.2
@@ -27,8 +27,6 @@ NEIGHBOURS: Mapping[str, tuple[str, ...]] = {
 """Effects of the table that are of the kind of one outside, so that naming them is no error: a cable pulls
 with the position, as only gravity does in the table; friction that falls as the joint warms is friction, of
 one form or another; torque ripple is like nothing in it."""
-STANDS_FOR: Mapping[str, str] = {other: name for name, others in EQUIVALENT.items() for other in others}
-"""Effects of which positions alone cannot show that they are not another, which is named for both."""
 SUMS: Mapping[frozenset[str], str] = {
     frozenset({"coulomb_friction", "stribeck_friction"}): "stribeck_friction",
     frozenset({"coulomb_friction", "asymmetric_friction"}): "asymmetric_friction",
@@ -89,7 +87,8 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
     sets = [list(group) for group in report["ambiguous"]]
     right = set(case.effects) | (set(MASS_EFFECTS) if case.change == "mass" else set())
     # The name that stands for a hidden effect is right if the report says that it does.
-    right |= {STANDS_FOR[n] for n in case.effects if n in STANDS_FOR and any(n in group for group in sets)}
+    stands = {other: name for name, others in equivalent(case.model).items() for other in others}
+    right |= {stands[n] for n in case.effects if n in stands and any(n in group for group in sets)}
     # So is one that is the same as the hidden ones together, if the report says that.
     stood_for = {
         n
@@ -111,7 +110,7 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
         "by_convention": [
             n
             for n in case.effects
-            if n not in named and (STANDS_FOR.get(n) in {*named} & right or n in stood_for | summed)
+            if n not in named and (stands.get(n) in {*named} & right or n in stood_for | summed)
         ],
         "missed": [n for n in case.effects if n not in named and not any(n in group for group in sets)],
         "false": [n for n in named if n not in tolerated],

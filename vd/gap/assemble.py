@@ -32,7 +32,7 @@ from vd.gap.result import (
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import interval, resamples, rmse
 from vd.gap.team import Bench, JointSpec
-from vd.kernels.effects import EFFECTS, EQUIVALENT, TOGETHER
+from vd.kernels.effects import EFFECTS, TOGETHER, equivalent
 
 CLOSE = 0.1
 """Values of one effect on two joints within this share of each other are one value."""
@@ -117,7 +117,7 @@ def assemble(
         ambiguous=_sets(joints),
         identified=_fit(joints, predictions, predictions.identified, "final"),
         held_out=_held_out(recording, list(errors.values()), rng),
-        next_experiment=_next(joints),
+        next_experiment=_next(joints, recording.model),
         seconds=seconds,
         recording=_source(recording, joints),
         provisional=_pool(joints, named=False),
@@ -360,9 +360,10 @@ def _open_sets(joint: Analysed) -> tuple[tuple[str, ...], ...]:
     return tuple((one.name, *one.tied) for one in accepted if one.tied and not one.named)
 
 
-def _next(joints: Sequence[Analysed]) -> str:
+def _next(joints: Sequence[Analysed], model: str) -> str:
     named = {a.name for j in joints for a in j.explanation.accepted if a.named}
-    closed = {n: {*EQUIVALENT.get(n, ()), *(TOGETHER.get(n, ()) if n in named else ())} for n in EFFECTS}
+    same = equivalent(model)
+    closed = {n: {*same.get(n, ()), *(TOGETHER.get(n, ()) if n in named else ())} for n in EFFECTS}
     sets = [group for group in _sets(joints) if set(group[1:]) - closed[group[0]]]
     if sets:
         listed = " and ".join(name.replace("_", " ") for name in sets[0][:2])

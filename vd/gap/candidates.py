@@ -9,7 +9,7 @@ import numpy as np
 from vd.gap.coordinates import Scales, best_two, sizes, smaller, torque_power
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import AT_FLOOR, EXPLAINED, RANDOM, SHARP
-from vd.kernels.effects import EFFECTS, EQUIVALENT
+from vd.kernels.effects import EFFECTS, equivalent
 
 SHORT_LIST = 10
 """Candidates of a round that are fitted, after the linear screening of all."""
@@ -64,6 +64,7 @@ class CandidateFits:
         nominal: Nominal values of the baseline's parameters, by key.
         promised: Share of the squared error that each candidate of the last round could remove at best.
         veiled: Whether the samples are seen through what chance does to them.
+        fine: Whether rollouts have the step at which estimates are finished.
     """
 
     floor: float
@@ -78,9 +79,14 @@ class CandidateFits:
     nominal: Mapping[str, float] = field(default_factory=dict)
     promised: dict[str, float] = field(default_factory=dict)
     veiled: bool = False
+    fine: bool = False
 
     def fit_candidates(
-        self, present: JointFit, skip: Sequence[str] = (), vetoed: Sequence[str] = ()
+        self,
+        present: JointFit,
+        skip: Sequence[str] = (),
+        vetoed: Sequence[str] = (),
+        known: JointFit | None = None,
     ) -> dict[str, JointFit]:
         """Fits with each promising further effect, the finalists to convergence, by name.
 
@@ -88,8 +94,12 @@ class CandidateFits:
             present: Model to which they are added.
             skip: Effects to leave out.
             vetoed: Effects to try in spite of a veto.
+            known: A fit with one that is left out; where it explains everything, what stays far from it is
+                not fitted to the end.
         """
         out = {*present.effects, *(set(self.vetoes) - set(vetoed)), *skip, RANDOM}
+        white = 0.0 if self.veiled else EXPLAINED * self.floor
+        least = known.rmse if known is not None and known.rmse < white else np.inf
         names = [name for name in self.candidates if name not in out]
         starts = {name: sizes(name, self.others, self.scales) for name in names}
         flat = [(name, start) for name in names for start in starts[name]]
@@ -120,7 +130,7 @@ class CandidateFits:
 
         screened = screen(ranked[:FIRST])
         rest = ranked[FIRST:]
-        if not self.veiled and min(fit.rmse for fit in screened) < EXPLAINED * self.floor:
+        if min(least, *(fit.rmse for fit in screened)) < white:
             # What explains everything has only those to fear that promised nearly as much.
             enough = ALIKE * promise[order[ranked[0]][0]]
             rest = [name for name in rest if promise[order[name][0]] > enough]
@@ -131,9 +141,9 @@ class CandidateFits:
         def go_on(chosen: Sequence[JointFit], iterations: int) -> list[JointFit]:
             return self.run([self.call(present, f.effects[-1], [f.values], iterations) for f in chosen])
 
-        if len(finalists) > 1:
+        if len(finalists) > 1 or np.isfinite(least):
             finalists = sorted(go_on(finalists, HALF_ITERATIONS), key=lambda fit: fit.rmse)
-        near = [fit for fit in finalists if fit.rmse < HOPELESS * finalists[0].rmse]
+        near = [fit for fit in finalists if fit.rmse < HOPELESS * min(finalists[0].rmse, least)]
         last = [*go_on(near, FULL_ITERATIONS), *finalists[len(near) :]]
         fits = {fit.effects[-1]: fit for fit in (*last, *screened[len(finalists) :])}
         # Nothing added can do worse than nothing: such a fit began too large, and no descent led back.
@@ -276,19 +286,19 @@ class CandidateFits:
         return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0]
 
 
-def alike(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def alike(names: Sequence[str], model: str) -> dict[str, tuple[str, ...]]:
     """The candidates that stand for others of the candidates, and for which."""
     return {
         name: inside
-        for name, others in EQUIVALENT.items()
+        for name, others in equivalent(model).items()
         if name in names and (inside := tuple(other for other in others if other in names))
     }
 
 
-def stood_for(equivalent: Mapping[str, Sequence[str]]) -> dict[str, str]:
+def stood_for(same: Mapping[str, Sequence[str]]) -> dict[str, str]:
     """Candidates that another stands for, with the reason why they are not tried."""
     return {
         other: f"leaves the same positions as {name}, which stands for both"
-        for name, others in equivalent.items()
+        for name, others in same.items()
         for other in others
     }

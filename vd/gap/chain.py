@@ -4,6 +4,7 @@ A bare servo and a pendulum are one joint with its own inertia; a finger is a ch
 down as in the simulator.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import HandModel
 from vd.gap.recording import Recording
 from vd.kernels import actuators as servo
-from vd.kernels.effects import BASELINE, neutral_row
+from vd.kernels.effects import BASELINE, EFFECTS, neutral_row
 
 GRAVITY_M_S2 = 9.81
 """Acceleration of gravity, the simulator's."""
@@ -237,3 +238,20 @@ def _finger(
         reference_p_gain=p_gain,
         reference_load=None,
     )
+
+
+def others_in(chain: Chain, joint: int) -> list[int]:
+    """Slots of the other joints of a chain, whose motion can drive a joint."""
+    return [int(slot) for j, slot in enumerate(chain.slot) if j != joint]
+
+
+def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
+    """Effects that a joint of a chain can have besides its baseline."""
+    excluded = set()
+    if "tau_g_nm" in chain.baseline_free:
+        excluded.add("gravity_load")
+    if "inertia" in chain.baseline_free:
+        excluded.add("payload_inertia")
+    if len(chain.joints) == 1:
+        excluded.add("joint_coupling")
+    return [name for name in EFFECTS if name in effects and name not in excluded]

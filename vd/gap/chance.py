@@ -110,6 +110,7 @@ def behind(search: "Selection", veil: Veil) -> "Selection":
         run=run,
         candidates=[name for name in search.candidates if name != RANDOM],
         restarts=0,
+        like=((), {}),
         veiled=True,
         report=lambda line: search.report(f"beside {RANDOM}: {line}"),
         without={},

@@ -2,19 +2,76 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from vd.gap.explanation import NAMED, Explanation, estimates, intervals
+from vd.gap.candidates import FULL_ITERATIONS
+from vd.gap.coordinates import sizes
+from vd.gap.explanation import NAMED, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import MIN_GAIN, RANDOM, SMALL_EXCESS_FLOORS
+from vd.gap.judge import EXCESS_FLOORS, MIN_GAIN, RANDOM, SMALL_EXCESS_FLOORS
 from vd.gap.verdict import explains
+
+if TYPE_CHECKING:
+    from vd.gap.select import Selection
 
 OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}
 """What all joints of a machine have or have not: its bus, its supply, gravity."""
+
+SHOWN_TAIL = 0.4
+"""Share of the resamples that may see no gain from an effect that another joint has for sure: one motion of a
+dozen can be all that shows it, and a third of the resamples leave that out."""
 
 Polish = Callable[[JointFit], JointFit]
 """Fits a model to the end."""
 Fit = Callable[[tuple[str, ...], Sequence[Mapping[str, float]]], JointFit]
 """Fits the model with these effects to the end, from these starts."""
+
+
+def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanation | None:
+    """The explanation of a joint by what another of its finger certainly lacks, without a search of its own.
+
+    The joints of a finger are built alike, and what leaves noise can only be equalled. None where it leaves
+    more than that, where a further effect promises to do better, or where one of its effects is not needed.
+
+    Args:
+        search: Of the joint; :attr:`~vd.gap.select.Selection.like` is what the other lacks.
+        baseline: The plain model.
+        loose: What of the baseline the motions leave open.
+    """
+    effects, values = search.like
+    if not effects or {*effects} & {*search.vetoes}:
+        return None
+    starts = [{**baseline.values, **values}, {**search.nominal, **values}]
+    fit = search.run([search.call(baseline, effects, starts, FULL_ITERATIONS)])[0]
+    if search.too_coarse(fit):
+        search = search.finer()
+        baseline, fit = search.run(
+            [search.plain(baseline), search.call(baseline, effects, [fit.values], FULL_ITERATIONS)]
+        )
+    if fit.at_bound or not search.noise_only(fit):
+        return None
+    others = [name for name in search.candidates if name not in {*effects, *search.vetoes, RANDOM}]
+    added = [start for name in others for start in sizes(name, search.others, search.scales)]
+    promise = search.run([("promise", {"fit": fit, "starts": added, "scales": search.scales})])[0]
+    if promise.max(initial=0.0) > EXCESS_FLOORS**2:
+        return None
+    for name in effects:
+        without = search.refit(fit, [other for other in effects if other != name])
+        if not search.better(without, fit, SHOWN_TAIL)[0]:
+            return None
+        search.without[name] = without.held_out_rmse
+    gain, ci = search.gain(baseline, fit)
+    names = " and ".join(effects)
+    before, after = 1e3 * baseline.held_out_rmse, 1e3 * fit.held_out_rmse
+    search.report(f"+ {names}, as on another joint: {before:.2f} -> {after:.2f} mrad held out")
+    reason = "as on another joint: leaves noise, and no other effect promises more"
+    trials = [Trial(1, name, fit, gain, ci, "named", reason) for name in effects]
+    control = search.run([("placebo", {"before": baseline, "after": fit})])[0]
+    text = f"{names} with its times reversed and its trajectories exchanged: must be rejected"
+    trials.append(Trial(1, effects[-1], fit, control, (control, control), reason=text, placebo=True))
+    rivals = {name: [fit] for name in effects}
+    refined = search.refined(fit)
+    return search.explained(search.conclude(baseline, fit, rivals, trials, loose, refined))
 
 
 def share(

@@ -7,6 +7,7 @@ import numpy as np
 
 from vd.gap.fit import RIDGE
 from vd.gap.joint_fit import JointFit
+from vd.gap.judge import RANDOM
 from vd.gap.result import Verdict
 from vd.gap.statistics import covariance, half_width
 from vd.kernels.effects import EFFECTS
@@ -96,3 +97,12 @@ def polished(explanation: Explanation, fit: JointFit, floor: float) -> Explanati
     spread = intervals(fit, floor)
     accepted = tuple(replace(a, estimates=estimates(fit, a.name, spread)) for a in explanation.accepted)
     return replace(explanation, final=fit, accepted=accepted)
+
+
+def lacking(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
+    """The effects that a joint is certain to lack, and their values by key; none where it is not."""
+    effects = explanation.final.effects
+    certain = explanation.verdict == "effects" and all(one.named for one in explanation.accepted)
+    if not certain or RANDOM in effects:
+        return (), {}
+    return effects, {key: value for key, value in explanation.final.values.items() if "." in key}

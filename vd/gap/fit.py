@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 import vd.kernels.actuators as servo
-from vd.gap.chain import Chain
+from vd.gap.chain import others_in
 from vd.gap.coordinates import BASELINE_PARAMETERS, Coordinate, Scales, coordinate, keys, sizes
 from vd.gap.descent import FIRST_DAMPING, LOG_TRUST, Descent, LeastSquares
 from vd.gap.holding import Holding
@@ -19,7 +19,6 @@ from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
 from vd.gap.veil import Veil
 from vd.kernels.chains import MAX_JOINTS
-from vd.kernels.effects import EFFECTS
 
 RIDGE = 0.01
 """Pull towards the start, as information in units of the noise floor: holds directions that the data
@@ -87,6 +86,12 @@ class JointProblem:
         self.count = np.array([len(self._measured[int(t)]) for t in self.trajectories], float)
         self._growth: dict[int, np.ndarray] = {}
 
+    def finer(self) -> "JointProblem":
+        """The same data simulated with the step at which estimates are finished; slopes as before."""
+        fine = copy.copy(self)
+        fine.coarse, fine.rollouts = self.rollouts, self.rollouts.at(self.rollouts.dt / FINER[-1])
+        return fine
+
     def through(self, veil: Veil) -> "JointProblem":
         """The same data seen through what chance does to them."""
         seen = copy.copy(self)
@@ -114,7 +119,8 @@ class JointProblem:
         predicted = simulation.predict(rows, chosen, joint=self.joint, keep=keep)
         self.simulated += len(rows) * len(chosen) if keep is None else int(keep.sum())
         residual = measured - predicted
-        self._holding.forgive(residual, predicted, chosen)
+        free = rows[:, self.joint, [servo.BACKLASH_WIDTH, servo.DEAD_ZONE_WIDTH]].max(axis=1)
+        self._holding.forgive(residual, predicted, chosen, free)
         if self._growth:
             residual /= np.concatenate([self._growth[t] for t in chosen])
         if keep is not None:
@@ -317,12 +323,12 @@ class JointProblem:
         residuals is measured. Slopes are those of the problem's own time step: they need not be finer.
         Held-out errors are those of ``fit``, to be compared with other models'.
         """
-        rollouts, x, error = self.rollouts, fit.x, np.zeros(len(fit.x))
-        result = fit
+        x, error, result = fit.x, np.zeros(len(fit.x)), fit
+        given = self.rollouts, self.coarse
+        self.coarse = self.coarse or self.rollouts
         try:
-            self.coarse = rollouts
             for divisor in FINER:
-                self.rollouts = rollouts.at(rollouts.dt / divisor)
+                self.rollouts = self.coarse.at(self.coarse.dt / divisor)
                 result = self.fit(
                     fit.rows,
                     fit.effects,
@@ -334,7 +340,7 @@ class JointProblem:
                 x, error = result.x, np.abs(result.x - x)
             residual = self.residuals(result.rows[None])[0]
         finally:
-            self.rollouts, self.coarse = rollouts, None
+            self.rollouts, self.coarse = given
         structure = None if self._growth else self._structure(residual)  # chance has a memory
         return replace(
             result,
@@ -421,6 +427,7 @@ class JointProblem:
             scales: Sizes of the joint's motion.
         """
         residual = self.residuals(fit.rows[None])
+        plain = residual if self.coarse is None else self.residuals(fit.rows[None], rollouts=self.coarse)
         jacobian = self.jacobian(fit)
         basis = np.linalg.svd(jacobian, full_matrices=False)[2]
         left = residual[0] - basis.T @ (basis @ residual[0])
@@ -430,7 +437,7 @@ class JointProblem:
                 if "." not in key and key not in self.baseline:
                     continue  # not free in this chain
                 rows[i, self.joint, coordinate(key, scales).column] = value
-        change = residual - self.residuals(rows)
+        change = plain - self.residuals(rows, rollouts=self.coarse)
         change -= (change @ basis.T) @ basis
         along = change @ left
         power = np.einsum("cn,cn->c", change, change)
@@ -480,20 +487,3 @@ class JointProblem:
                 break
         best = np.asarray(strategy.result.xbest)
         return self.rows(base, coordinates, best[None])[0]
-
-
-def others_in(chain: Chain, joint: int) -> list[int]:
-    """Slots of the other joints of a chain, whose motion can drive a joint."""
-    return [int(slot) for j, slot in enumerate(chain.slot) if j != joint]
-
-
-def candidates(chain: Chain, effects: Sequence[str]) -> list[str]:
-    """Effects that a joint of a chain can have besides its baseline."""
-    excluded = set()
-    if "tau_g_nm" in chain.baseline_free:
-        excluded.add("gravity_load")
-    if "inertia" in chain.baseline_free:
-        excluded.add("payload_inertia")
-    if len(chain.joints) == 1:
-        excluded.add("joint_coupling")
-    return [name for name in EFFECTS if name in effects and name not in excluded]

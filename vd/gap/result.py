@@ -17,7 +17,7 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import atomic_path, write_json
-from vd.kernels.effects import BASELINE, EFFECTS, EQUIVALENT, TOGETHER, Parameter
+from vd.kernels.effects import BASELINE, EFFECTS, TOGETHER, Parameter, equivalent
 
 FORMAT = "vd-gap-report/1"
 LAYER = "identified.usda"
@@ -305,14 +305,15 @@ class Report:
     def open_sets(self) -> tuple[tuple[str, ...], ...]:
         """The sets in ``ambiguous`` that another recording can split.
 
-        The others hold a named effect and those for which it stands: one other (:data:`EQUIVALENT`), or
+        The others hold a named effect and those for which it stands: one other (:func:`equivalent`), or
         several together (:data:`TOGETHER`).
         """
         named = {effect.name for effect in self.effects}
+        same = equivalent(self.recording.model)
 
         def closed(group: tuple[str, ...]) -> bool:
             both = set(TOGETHER.get(group[0], ())) if group[0] in named else set()
-            return set(group[1:]) <= {*EQUIVALENT.get(group[0], ()), *both}
+            return set(group[1:]) <= {*same.get(group[0], ()), *both}
 
         return tuple(group for group in self.ambiguous if not closed(group))
 

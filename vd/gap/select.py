@@ -6,14 +6,17 @@ A step of the search is tentative; :mod:`vd.gap.verdict` has the last word.
 import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 import vd.kernels.actuators as servo
-from vd.gap.candidates import BETTER, FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIONS, CandidateFits
+from vd.gap.candidates import BETTER, FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIONS, Call, CandidateFits
 from vd.gap.chance import try_random
+from vd.gap.consensus import as_another
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import Accepted, Explanation, Trial
+from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import EXPLAINED, NESTED, RANDOM, REPEATABLE
 from vd.gap.telemetry import BEHIND_SENSOR
@@ -32,6 +35,13 @@ WIDE = 15.0
 promise is no guide to where an effect that rings or brakes can be found."""
 LOOKS = 2
 """Rounds in which they are: each costs as much as several others."""
+RESTARTS = 2
+"""Searches from another first effect, where the first search leaves a gap."""
+COARSE = 0.9
+"""Share of an error that a finer time step leaves, at which the search is made with that."""
+LARGE = 4.0
+"""Gap, in noise floors, that two wrong effects together do not imitate: only a search that fails has to look
+that wide."""
 NEAR = 4.0
 """A final error between ``NO_GAP`` and this, in noise floors, is worth a search from another first effect."""
 SEARCH_TAIL = 0.4
@@ -51,12 +61,14 @@ class Selection(CandidateFits, Verdicts):
         report: Called with a line of progress.
         rest: Where the joint rests before it moves [rad].
         looks: Rounds in which every start may be tried (:meth:`look_wider`).
+        like: What another joint of the finger certainly lacks: effects, and values by key.
     """
 
-    restarts: int = 2
+    restarts: int = RESTARTS
     report: Callable[[str], None] = lambda line: None
     rest: float = 0.0
     looks: int = LOOKS
+    like: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
 
     def explain(self, baseline: JointFit) -> Explanation:
         """Select effects, starting from the fitted baseline."""
@@ -71,8 +83,15 @@ class Selection(CandidateFits, Verdicts):
             if loose:
                 return Explanation(baseline, baseline, "under_excited", loose)
             return Explanation(baseline, baseline, "no_gap", "the plain model is within the noise floor")
+        known = as_another(self, baseline, loose)
+        if known is not None:
+            return known
         trials = self.contradicted(baseline)
-        present, rivals, rows = self.search(baseline, baseline)
+        present, rivals, rows = self.first(baseline)
+        if self.too_coarse(present):
+            self.report(f"{' and '.join(present.effects)}: the time step shows, so again with a finer one")
+            fine = self.finer()
+            return fine.explain(fine.run([fine.plain(baseline)])[0])
         trials += rows
         alone = [t for t in rows if t.round == 1 and len(t.fit.effects) == 1]
         first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
@@ -139,6 +158,17 @@ class Selection(CandidateFits, Verdicts):
         ]
         return replace(explanation, reason="; ".join([explanation.reason, *notes]))
 
+    def first(self, baseline: JointFit) -> tuple[JointFit, dict[str, list[JointFit]], list[Trial]]:
+        """The first search; it looks wide at once where a gap is small."""
+        if not self.veiled and baseline.held_out_rmse > LARGE * self.floor:
+            looks, self.looks = self.looks, 0
+            found = self.search(baseline, baseline)
+            if self.finished(found[0]) or self.noise_only(found[0]) or self.too_coarse(found[0]):
+                return found
+            self.looks = looks
+            self.report("not explained: every candidate is tried from every start")
+        return self.search(baseline, baseline)
+
     def search(
         self, baseline: JointFit, start: JointFit
     ) -> tuple[JointFit, dict[str, list[JointFit]], list[Trial]]:
@@ -153,7 +183,7 @@ class Selection(CandidateFits, Verdicts):
             rivals.update(added)
             grown = longer is not present
             present = longer
-            if not grown and present is not start:
+            if (not grown and present is not start) or self.too_coarse(present):
                 break
             if len(present.effects) > 1:
                 revised, rivals = self.revise(present)
@@ -262,9 +292,30 @@ class Selection(CandidateFits, Verdicts):
             self.report(f"+ {name}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
             rivals[name] = list(fits.values())
             present = best
-            if self.finished(present) or len(present.effects) >= MAX_EFFECTS:
+            if self.finished(present) or self.too_coarse(present) or len(present.effects) >= MAX_EFFECTS:
                 break
         return present, rivals, trials
+
+    def too_coarse(self, present: JointFit) -> bool:
+        """Whether it is the time step of the search that keeps a model from leaving no more than noise."""
+        if self.fine or self.veiled or not present.effects or self.no_gap(present) or self.white(present):
+            return False
+        if present.rmse > WIDE * self.floor:
+            return False
+        return self.refined(present).rmse < COARSE * present.rmse
+
+    def finer(self) -> "Selection":
+        """The same search with the step at which estimates are finished."""
+
+        def run(calls: list[Call]) -> list[Any]:
+            every = [
+                (name, options if name in CALLS else {**options, "finer": True}) for name, options in calls
+            ]
+            return self.run(every)
+
+        return replace(
+            self, run=run, fine=True, restarts=RESTARTS, looks=LOOKS, without={}, apart={}, promised={}
+        )
 
     def finished(self, present: JointFit) -> bool:
         """Whether a model leaves nothing to explain: noise, of no more than its size."""
@@ -421,7 +472,8 @@ class Selection(CandidateFits, Verdicts):
         self.without[name] = without.held_out_rmse
         # Beside Coulomb friction, a friction that contains it is no other cause.
         contains = [c for c, simpler in NESTED.items() if set(simpler) & set(without.effects)]
-        fits = self.fit_candidates(without, skip=(name, *contains), vetoed=tuple(BEHIND_SENSOR))
+        skip, tried = (name, *contains), tuple(BEHIND_SENSOR)
+        fits = self.fit_candidates(without, skip=skip, vetoed=tried, known=present)
         for simpler in {*NESTED.get(name, ())} & {*self.candidates} - {
             *self.vetoes,
             *contains,

@@ -106,10 +106,10 @@ class Bench:
         return self._problems[key]
 
     def call(self, spec: JointSpec, call: Call) -> Answer:
-        """Run a method of the problem, seen through the ``veil`` among its arguments."""
+        """Run a method of the problem, seen through the ``veil`` among its arguments, or at a finer step."""
         name, options = call[0], dict(call[1])
-        veil = options.pop("veil", None)
-        problem = self.problem(spec)
+        veil, finer = options.pop("veil", None), options.pop("finer", False)
+        problem = self.problem(spec).finer() if finer else self.problem(spec)
         # Calls side by side count, and change the time step.
         problem = copy.copy(problem) if veil is None else problem.through(veil)
         problem.simulated, begin = 0, time.perf_counter()

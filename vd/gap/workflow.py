@@ -9,10 +9,8 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,41 +20,32 @@ from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
 from vd.gap.answers import FOLDER, Answers
 from vd.gap.assemble import Analysed, assemble, curves
-from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
 from vd.gap.chain import Chain, chains
-from vd.gap.consensus import agree, share
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.crowd import Crowd
 from vd.gap.design import design, pieces
-from vd.gap.explanation import Explanation, polished
+from vd.gap.explanation import Explanation
 from vd.gap.find import findings
-from vd.gap.fit import candidates, others_in
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import NO_GAP, RANDOM
-from vd.gap.masses import Masses, fit_masses
+from vd.gap.joints import POLISH_ITERATIONS, REFITS, Joint, Progress, explain_joints, parallel
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S
-from vd.gap.select import Selection
-from vd.gap.statistics import noise_floor, resamples
+from vd.gap.statistics import noise_floor
 from vd.gap.team import Bench, JointSpec, Team
-from vd.gap.telemetry import vetoes
 from vd.kernels.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"
-VERSION = 4
+VERSION = 5
 """Of the method; a result of another version is not resumed."""
 CMA_GENERATIONS = 20
 BASELINE_ITERATIONS = 15
-POLISH_ITERATIONS = 5
 LONG_STEP_S = 1.0 / 240.0
 """Time step [s] for recordings so long that the usual step would take minutes a joint."""
 LONG_S = 600.0
 """Total motion [s] above which a recording counts as long."""
 SPEED_STARTS = (1.05, 3.0)
 """Starts of the velocity limit, in largest speeds seen: one that binds, one that does not."""
-
-Progress = Callable[[str], None]
 
 
 def _silent(_: str) -> None:
@@ -93,16 +82,6 @@ class Options:
         if self.workers is not None:
             return self.workers
         return len(os.sched_getaffinity(0)) if self.device == "cpu" else 1
-
-
-@dataclass(frozen=True, eq=False)
-class Joint:
-    """A joint under analysis: its data and its baseline."""
-
-    name: str
-    spec: JointSpec
-    scales: Scales
-    fit: JointFit
 
 
 def find(
@@ -197,7 +176,9 @@ def explain(
     answers = Answers(out / FOLDER, key)
     with _team(recording, hand, chosen, answers) as team:
         joints = _resume(team, _specs(recording, team.bench.chains), known["joints"])
-        explained = _explain_all(team, joints, recording, chosen, progress)
+        explained = explain_joints(
+            team, joints, recording, effects=chosen.effects, seed=chosen.seed, progress=progress
+        )
         analysed = [
             Analysed(j.name, j.spec, replace_baseline(e, j.fit), j.scales)
             for j, e in zip(joints, explained, strict=True)
@@ -320,7 +301,7 @@ def _identify(team: Team, specs: Sequence[JointSpec], options: Options, progress
         progress(f"find: {name}: baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}")
         return Joint(name, spec, _scales(team, spec, fit), fit)
 
-    joints = _parallel(first, specs)
+    joints = parallel(first, specs)
     if all(len(chain.joints) == 1 for chain in team.bench.chains):
         return joints
     return _together(team, joints)
@@ -338,7 +319,7 @@ def _together(team: Team, joints: Sequence[Joint]) -> list[Joint]:
         fit = team.run(joint.spec, [("fit", {**call, "iterations": POLISH_ITERATIONS})])[0]
         return replace(joint, fit=fit, scales=_scales(team, joint.spec, fit))
 
-    return _parallel(again, joints)
+    return parallel(again, joints)
 
 
 def _scales(team: Team, spec: JointSpec, fit: JointFit) -> Scales:
@@ -358,120 +339,9 @@ def _resume(team: Team, specs: Sequence[JointSpec], known: dict[str, Any]) -> li
         call = {"base": rows, "effects": (), "starts": [{}], "scales": scales, "iterations": 1}
         return Joint(name, spec, scales, team.run(spec, [("fit", {**call, "refits": REFITS})])[0])
 
-    return _parallel(one, specs)
-
-
-REFITS = 3
-"""Steps of Levenberg-Marquardt of each refit without a fold."""
-
-
-def _explain_all(
-    team: Team, joints: Sequence[Joint], recording: Recording, options: Options, progress: Progress
-) -> list[Explanation]:
-    """Select the effects of every joint."""
-    masses = _masses(team, joints)
-
-    def one(joint: Joint) -> Explanation:
-        chain = team.bench.chains[joint.spec.chain]
-        if joint.spec.chain in masses:
-            text = masses[joint.spec.chain].text
-            progress(f"explain: {joint.name}: no_gap: {text}")
-            return Explanation(joint.fit, joint.fit, "no_gap", text)
-        rng = np.random.default_rng([options.seed, joint.spec.chain, joint.spec.joint])
-        names = candidates(chain, options.effects)
-        told = vetoes(recording, chain, joint.spec, joint.fit.rows)
-        same = {name: others for name, others in alike(names).items() if not {name, *others} & set(told)}
-        selection = Selection(
-            run=lambda calls: team.run(joint.spec, calls),
-            joint=joint.spec.joint,
-            others=others_in(chain, joint.spec.joint),
-            candidates=names,
-            equivalent=same,
-            seed=options.seed,
-            nominal={
-                key: float(chain.start_row[joint.spec.joint, BASELINE_PARAMETERS[key].column])
-                for key in joint.spec.baseline
-            },
-            floor=joint.spec.floor,
-            scales=joint.scales,
-            weights=resamples(len(joint.spec.trajectories), rng),
-            refits=REFITS,
-            vetoes={**stood_for(same), **told},
-            report=lambda line: progress(f"explain: {joint.name}: {line}"),
-            rest=_rest(recording, int(chain.columns[joint.spec.joint]), joint.spec.trajectories),
-        )
-        result = selection.explain(joint.fit)
-        progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
-        return result
-
-    floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))
-
-    def fitted(joint: Joint, effects: tuple[str, ...], starts: Sequence[Mapping[str, float]]) -> JointFit:
-        call = {"base": joint.fit.rows, "effects": effects, "starts": list(starts), "scales": joint.scales}
-        call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
-        whole = team.run(joint.spec, [("fit", call)])[0]
-        return team.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales})])[0]
-
-    def finished(joint: Joint, fit: JointFit) -> JointFit:
-        return fitted(joint, fit.effects, [fit.values])
-
-    ends = [partial(finished, joint) for joint in joints]
-    shared = share(_parallel(one, joints), floors, fingers, ends)
-    agreed = agree(shared, floors, fingers, [partial(fitted, joint) for joint in joints])
-    return _consistent(team, joints, agreed)
-
-
-def _masses(team: Team, joints: Sequence[Joint]) -> dict[int, Masses]:
-    """By chain, the masses of links that explain a gap on all joints that have one."""
-    result = {}
-    for index, chain in enumerate(team.bench.chains):
-        own = [joint for joint in joints if joint.spec.chain == index]
-        floors = np.array([NO_GAP * joint.spec.floor for joint in own])
-        if not chain.bodies or all(j.fit.held_out_rmse < floor for j, floor in zip(own, floors, strict=True)):
-            continue
-        masses = fit_masses([team.bench.problem(joint.spec) for joint in own], [joint.fit for joint in own])
-        if (masses.errors < floors).all():
-            result[index] = masses
-    return result
-
-
-def _rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:
-    """Where a joint begins most of its motions [rad]."""
-    return float(np.median([recording.trajectories[i].position[0, column] for i in trajectories]))
-
-
-def _consistent(
-    team: Team, joints: Sequence[Joint], explanations: Sequence[Explanation]
-) -> list[Explanation]:
-    """Final models with the other joints of their chain as these are in the end, not without effects.
-
-    Joints that drive or load each other are else fitted to motions that the others do not make.
-    """
-
-    def again(index: int) -> Explanation:
-        joint, own = joints[index], explanations[index]
-        rows, changed = own.final.rows.copy(), False
-        for other, found in zip(joints, explanations, strict=True):
-            if other is not joint and other.spec.chain == joint.spec.chain and found.final.effects:
-                rows[other.spec.joint], changed = found.final.rows[other.spec.joint], True
-        if not changed or not own.final.effects or RANDOM in own.final.effects:
-            return own
-        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales}
-        return polished(own, team.run(joint.spec, [("refine", call)])[0], joint.spec.floor)
-
-    return _parallel(again, range(len(joints)))
+    return parallel(one, specs)
 
 
 def replace_baseline(explanation: Explanation, baseline: JointFit) -> Explanation:
     """The explanation with the joint's baseline."""
     return replace(explanation, baseline=baseline)
-
-
-def _parallel(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
-    """Results in order; threads, since the work waits for processes."""
-    pool = ThreadPoolExecutor(max(len(items), 1))
-    try:
-        return list(pool.map(work, items))
-    finally:
-        # Nobody waits for the others after a failure or Ctrl-C: they end with the team's processes.
-        pool.shutdown(wait=False, cancel_futures=True)

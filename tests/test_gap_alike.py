@@ -1,0 +1,145 @@
+"""What is alike: the joints of a finger, and causes that no recording tells apart."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_gap_fit import TRUE, problem_of, recorded
+from test_gap_judge import FLOOR, made_up
+
+import vd.kernels.actuators as servo
+from vd.gap.chain import candidates
+from vd.gap.coordinates import Scales
+from vd.gap.explanation import Explanation, lacking
+from vd.gap.fit import JointProblem
+from vd.gap.hide import Hiding, simulate_hidden
+from vd.gap.joint_fit import JointFit
+from vd.gap.rollout import Rollouts
+from vd.gap.select import Selection
+from vd.gap.statistics import resamples
+from vd.gap.words import verdict_sentence
+from vd.gap.workflow import explain
+
+FRICTION = 0.08
+CHOSEN = ("coulomb_friction", "command_delay", "torque_saturation", "gravity_load", "thermal_drift")
+
+
+class Servo:
+    """A servo with Coulomb friction, its plain model, and how often its search asks for fits."""
+
+    def __init__(self) -> None:
+        self.problem: JointProblem = problem_of(recorded({servo.COULOMB_TORQUE: FRICTION}))
+        base = self.problem.rollouts.chain.start_row.copy()
+        for column, value in TRUE.items():
+            base[0, column] = value
+        self.scales = self.problem.scales(base[0], self.problem.floor)
+        self.baseline: JointFit = self.problem.fit(base, (), [{}], self.scales)
+        self.fits = 0
+
+    def explain(self, like: tuple[tuple[str, ...], dict[str, float]]) -> Explanation:
+        """What a search finds that knows what another joint lacks."""
+        self.fits = 0
+
+        def run(calls: list) -> list:
+            self.fits += sum(name == "fit" for name, _ in calls)
+            return [getattr(self.problem, name)(**options) for name, options in calls]
+
+        return Selection(
+            floor=self.problem.floor,
+            weights=resamples(len(self.problem.trajectories), np.random.default_rng(0)),
+            run=run,
+            joint=0,
+            others=(),
+            candidates=candidates(self.problem.rollouts.chain, CHOSEN),
+            scales=self.scales,
+            refits=3,
+            like=like,
+        ).explain(self.baseline)
+
+
+def test_a_joint_lacks_what_another_of_its_finger_lacks_where_that_leaves_noise() -> None:
+    joint = Servo()
+    found = joint.explain(((), {}))
+    alone = joint.fits
+    effects, values = lacking(found)
+    assert effects == ("coulomb_friction",)
+    again = joint.explain((effects, {key: 1.3 * value for key, value in values.items()}))
+    assert joint.fits == 2 < alone, "with the effect, and without"
+    assert again.verdict == "effects" and [one.name for one in again.accepted] == ["coulomb_friction"]
+    assert again.final.values["coulomb_friction.tau_c_nm"] == pytest.approx(FRICTION, rel=0.1)
+    rows = {(row.name, row.decision, row.placebo) for row in again.trials}
+    assert rows == {("coulomb_friction", "named", False), ("coulomb_friction", "rejected", True)}
+
+
+@pytest.mark.parametrize(
+    ("effects", "values"),
+    [
+        (("command_delay",), {"command_delay.delay_s": 0.02}),
+        (
+            ("coulomb_friction", "thermal_drift"),
+            {"coulomb_friction.tau_c_nm": FRICTION, "thermal_drift.rate_per_s": 0.02},
+        ),
+    ],
+    ids=["another cause", "one too many"],
+)
+def test_a_joint_that_lacks_something_else_is_searched_by_itself(
+    effects: tuple[str, ...], values: dict[str, float]
+) -> None:
+    found = Servo().explain((effects, values))
+    assert found.verdict == "effects" and [one.name for one in found.accepted] == ["coulomb_friction"]
+
+
+def test_on_a_pendulum_a_load_off_the_arm_and_an_offset_of_the_encoder_are_one(tmp_path: Path) -> None:
+    load = {"gravity_load": {"tau_g_nm": 0.07, "phase_rad": 0.4}}
+    (hidden,) = simulate_hidden([Hiding("pendulum", load, seed=5)])
+    chosen = ("encoder_bias", "gravity_load", "coulomb_friction", "command_delay")
+    report = explain(hidden.recording, None, tmp_path, effects=chosen, workers=1)
+    assert [effect.name for effect in report.effects] == ["encoder_bias"]
+    assert report.ambiguous == (("encoder_bias", "gravity_load"),)
+    assert report.open_sets == () and report.next_experiment == ""
+    assert "stands for gravity load too" in verdict_sentence(report)
+
+
+def test_a_finer_problem_is_simulated_with_the_step_of_finished_estimates() -> None:
+    problem = problem_of(recorded({servo.TORQUE_LIMIT: 0.8}))
+    row = problem.rollouts.chain.start_row.copy()
+    row[0, servo.TORQUE_LIMIT] = 0.8
+    exact = Rollouts(problem.rollouts.chain, problem.rollouts.recording, dt=problem.rollouts.dt / 4)
+    left = problem.rollouts.measured[:, 0] - exact.predict(row[None], joint=0)[0]
+    assert problem.finer().residuals(row[None])[0] == pytest.approx(left)
+    assert problem.residuals(row[None])[0] != pytest.approx(left)
+    scales = problem.scales(row[0], problem.floor)
+    fit = problem.fit(row, ("torque_limit",), [{}], scales)
+    one, other = (each.refine(fit, scales) for each in (problem, problem.finer()))
+    assert one.x == pytest.approx(other.x), "refined as before"
+
+
+@pytest.mark.parametrize(("refined", "again"), [(0.8, True), (0.95, False)])
+def test_a_search_that_its_time_step_holds_up_is_made_with_a_finer_one(refined: float, again: bool) -> None:
+    baseline, found = made_up((), 0.1), made_up(("acceleration_limit",), 1.5 * FLOOR)
+    asked = []
+
+    class EndError(Exception):
+        pass
+
+    def run(calls: list) -> list:
+        asked.extend((name, bool(options.get("finer"))) for name, options in calls)
+        if calls[0][0] == "refine":
+            return [made_up(found.effects, refined * 1.5 * FLOOR)]
+        raise EndError
+
+    selection = Selection(
+        floor=FLOOR,
+        weights=resamples(10, np.random.default_rng(0)),
+        run=run,
+        joint=0,
+        others=(),
+        candidates=(),
+        scales=Scales(3.0, 0.5, 2.0, 6.0, 70.0, 1e-3, 1e-3, 12.0),
+        restarts=0,
+    )
+    selection.first = lambda _: (found, {"acceleration_limit": [found]}, [])  # type: ignore[method-assign]
+    assert selection.too_coarse(found) == again
+    with pytest.raises(EndError):
+        selection.explain(baseline)
+    assert asked[-1] == (("fit", True) if again else ("again", False))

@@ -1,0 +1,218 @@
+"""Explain the joints of a recording, those of a finger in turn, each knowing what the others have."""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
+from vd.gap.chain import candidates, others_in
+from vd.gap.consensus import agree, share
+from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
+from vd.gap.explanation import Explanation, lacking, polished
+from vd.gap.joint_fit import JointFit
+from vd.gap.judge import NO_GAP, RANDOM
+from vd.gap.masses import Masses, fit_masses
+from vd.gap.recording import Recording
+from vd.gap.select import LOOKS, RESTARTS, Selection
+from vd.gap.statistics import resamples
+from vd.gap.team import JointSpec, Team
+from vd.gap.telemetry import vetoes
+from vd.kernels.effects import EFFECTS
+
+POLISH_ITERATIONS = 5
+"""Steps of a fit that has to follow small changes of the other joints."""
+REFITS = 3
+"""Steps of Levenberg-Marquardt of each refit without a fold."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint under analysis: its data and its baseline."""
+
+    name: str
+    spec: JointSpec
+    scales: Scales
+    fit: JointFit
+
+
+Explained = list[tuple[Joint, Explanation]]
+"""Joints, and what they lack."""
+
+
+def explain_joints(
+    team: Team,
+    joints: Sequence[Joint],
+    recording: Recording,
+    *,
+    effects: Sequence[str],
+    seed: int,
+    progress: Progress,
+) -> list[Explanation]:
+    """What every joint lacks.
+
+    Args:
+        team: Who fits.
+        joints: The joints with their plain models.
+        recording: The recording.
+        effects: Effects to consider.
+        seed: Of everything random.
+        progress: Called with lines of progress.
+    """
+    masses = _masses(team, joints)
+
+    def plain(joint: Joint, explained: Explained) -> JointFit:
+        """The plain model, fitted again beside joints of which more is known than theirs."""
+        rows = _beside(joint, explained)
+        if np.array_equal(rows, joint.fit.rows):
+            return joint.fit
+        call = {"base": rows, "effects": (), "starts": [{}], "scales": joint.scales}
+        call |= {"iterations": POLISH_ITERATIONS, "refits": REFITS}
+        return team.run(joint.spec, [("fit", call)])[0]
+
+    def one(joint: Joint, explained: Explained) -> Explanation:
+        chain = team.bench.chains[joint.spec.chain]
+        if joint.spec.chain in masses:
+            text = masses[joint.spec.chain].text
+            progress(f"explain: {joint.name}: no_gap: {text}")
+            return Explanation(joint.fit, joint.fit, "no_gap", text)
+        # What is none of the table on one joint is none on the others: what is plain to see is enough there.
+        unknown = any(found.verdict == "unknown" for _, found in explained)
+        rng = np.random.default_rng([seed, joint.spec.chain, joint.spec.joint])
+        names = [n for n in candidates(chain, effects) if n != RANDOM or not unknown]
+        told = vetoes(recording, chain, joint.spec, joint.fit.rows)
+        pairs = alike(effects, recording.model).items()
+        same = {name: others for name, others in pairs if not {name, *others} & set(told)}
+        selection = Selection(
+            run=lambda calls: team.run(joint.spec, calls),
+            joint=joint.spec.joint,
+            others=others_in(chain, joint.spec.joint),
+            candidates=names,
+            equivalent=same,
+            seed=seed,
+            nominal={
+                key: float(chain.start_row[joint.spec.joint, BASELINE_PARAMETERS[key].column])
+                for key in joint.spec.baseline
+            },
+            floor=joint.spec.floor,
+            scales=joint.scales,
+            weights=resamples(len(joint.spec.trajectories), rng),
+            refits=REFITS,
+            restarts=0 if unknown else RESTARTS,
+            looks=0 if unknown else LOOKS,
+            vetoes={**stood_for(same), **told},
+            report=lambda line: progress(f"explain: {joint.name}: {line}"),
+            rest=_rest(recording, int(chain.columns[joint.spec.joint]), joint.spec.trajectories),
+            like=next((like for _, found in explained if (like := lacking(found))[0]), ((), {})),
+        )
+        result = selection.explain(plain(joint, explained))
+        progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
+        return result
+
+    floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))
+    alone = _in_turn(joints, one)
+    known = list(zip(joints, alone, strict=True))
+
+    def fitted(joint: Joint, effects: tuple[str, ...], starts: Sequence[Mapping[str, float]]) -> JointFit:
+        rows = _beside(joint, known)
+        call = {"base": rows, "effects": effects, "starts": list(starts), "scales": joint.scales}
+        call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
+        whole = team.run(joint.spec, [("fit", call)])[0]
+        return team.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales})])[0]
+
+    def finished(joint: Joint, fit: JointFit) -> JointFit:
+        return fitted(joint, fit.effects, [fit.values])
+
+    ends = [partial(finished, joint) for joint in joints]
+    shared = share(alone, floors, fingers, ends)
+    agreed = agree(shared, floors, fingers, [partial(fitted, joint) for joint in joints])
+    return _consistent(team, joints, agreed)
+
+
+def _in_turn(
+    joints: Sequence[Joint], explain: Callable[[Joint, Explained], Explanation]
+) -> list[Explanation]:
+    """Explanations of all joints: of each finger from its tip on, as a joint's motion shakes those before it.
+
+    Args:
+        joints: The joints.
+        explain: Explains a joint, knowing those of its finger that are explained already.
+    """
+
+    def finger(chain: int) -> Explained:
+        found: Explained = []
+        own = [joint for joint in joints if joint.spec.chain == chain]
+        for joint in sorted(own, key=lambda each: -each.spec.joint):
+            found.append((joint, explain(joint, found)))
+        return found
+
+    explained = parallel(finger, sorted({joint.spec.chain for joint in joints}))
+    by_name = {joint.name: found for each in explained for joint, found in each}
+    return [by_name[joint.name] for joint in joints]
+
+
+def _beside(joint: Joint, explained: Explained) -> np.ndarray:
+    """Rows of a joint's chain with its plain model, the others as they were found to be, chance aside."""
+    rows = joint.fit.rows.copy()
+    for other, found in explained:
+        if other is not joint and other.spec.chain == joint.spec.chain and found.final.effects:
+            rows[other.spec.joint] = found.final.rows[other.spec.joint]
+            for parameter in EFFECTS[RANDOM].parameters:
+                rows[other.spec.joint, parameter.column] = parameter.neutral
+    return rows
+
+
+def _masses(team: Team, joints: Sequence[Joint]) -> dict[int, Masses]:
+    """By chain, the masses of links that explain a gap on all joints that have one."""
+    result = {}
+    for index, chain in enumerate(team.bench.chains):
+        own = [joint for joint in joints if joint.spec.chain == index]
+        floors = np.array([NO_GAP * joint.spec.floor for joint in own])
+        if not chain.bodies or all(j.fit.held_out_rmse < floor for j, floor in zip(own, floors, strict=True)):
+            continue
+        masses = fit_masses([team.bench.problem(joint.spec) for joint in own], [joint.fit for joint in own])
+        if (masses.errors < floors).all():
+            result[index] = masses
+    return result
+
+
+def _rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:
+    """Where a joint begins most of its motions [rad]."""
+    return float(np.median([recording.trajectories[i].position[0, column] for i in trajectories]))
+
+
+def _consistent(
+    team: Team, joints: Sequence[Joint], explanations: Sequence[Explanation]
+) -> list[Explanation]:
+    """Final models with the other joints of their chain as these are in the end, not without effects.
+
+    Joints that drive or load each other are else fitted to motions that the others do not make.
+    """
+    known = list(zip(joints, explanations, strict=True))
+
+    def again(index: int) -> Explanation:
+        joint, own = known[index]
+        rows = _beside(joint, known)
+        changed = not np.array_equal(rows, joint.fit.rows)
+        if not changed or not own.final.effects or RANDOM in own.final.effects:
+            return own
+        rows[joint.spec.joint] = own.final.rows[joint.spec.joint]
+        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales}
+        return polished(own, team.run(joint.spec, [("refine", call)])[0], joint.spec.floor)
+
+    return parallel(again, range(len(joints)))
+
+
+def parallel(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """Results in order; threads, since the work waits for processes."""
+    pool = ThreadPoolExecutor(max(len(items), 1))
+    try:
+        return list(pool.map(work, items))
+    finally:
+        # Nobody waits for the others after a failure or Ctrl-C: they end with the team's processes.
+        pool.shutdown(wait=False, cancel_futures=True)
