@@ -78,6 +78,14 @@ def test_at_a_true_estimate_the_head_acts_as_the_teacher_in_the_simulators_view(
     assert (policy.act(world) - action)[view > 0].abs().max() > 0.1
 
 
+def test_asking_for_the_maps_moves_nothing(env):
+    before = env.sim.joint_q.numpy().copy(), env.sim.body_q.numpy().copy()
+    assert np.abs(before[0][:, : env.num_actions]).min(axis=1).max() > 0.0, "fingers are bent"
+    view_tables(env)
+    np.testing.assert_array_equal(env.sim.joint_q.numpy(), before[0])
+    np.testing.assert_allclose(env.sim.body_q.numpy(), before[1], atol=1e-6)
+
+
 def test_maps_are_those_of_the_simulator(env):
     maps = ViewMaps(env.num_fingers, env.num_observations, env.num_actions)
     maps.adopt(view_tables(env))

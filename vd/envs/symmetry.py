@@ -132,12 +132,12 @@ class WorldOrder:
 
 def _tips(env: "ReorientEnv") -> np.ndarray:
     """Fingertip poses of a hand with all angles zero, with the simulation's signs [F, 7]."""
-    joints = env.sim.joint_q.numpy()
+    joints = env.sim.joint_q.numpy().copy()
     straight = joints.copy()
     straight[:, : env.num_actions] = 0.0
     env.sim.joint_q.assign(straight)
     env.sim.forward_kinematics()
-    bodies = env.sim.body_q.numpy()[0]
+    bodies = env.sim.body_q.numpy()[0].copy()
     env.sim.joint_q.assign(joints)
     env.sim.forward_kinematics()
     pairs = zip(bodies[env.tip_body.numpy()], env.tip_offset.numpy(), strict=True)
