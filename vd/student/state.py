@@ -6,7 +6,7 @@ great many of them. Its layers do already, and they bear an estimate that is off
 estimate in the view that the estimate calls for. O values of the observation, D actions.
 """
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import nn
@@ -15,9 +15,6 @@ from vd.kernels.observations import JOINTS_PER_FINGER, teacher_observation_slice
 from vd.policy import MeanAction, PolicySpec, perceptron
 from vd.student.cfg import StateCfg
 from vd.student.views import ViewMaps
-
-if TYPE_CHECKING:
-    from vd.envs.symmetry import ViewTables
 
 UNSEEN = ("object_orientation", "goal_orientation")
 """Orientations in the axes of the object's file, which no cloud shows; the teacher hardly uses them."""
@@ -79,12 +76,12 @@ class StateHead(nn.Module):
             known[columns[name]] = 0.0
         self.register_buffer("known", known, persistent=False)
 
-    def adopt(self, teacher: MeanAction, tables: "ViewTables | None" = None) -> bool:
+    def adopt(self, teacher: MeanAction, tables: Any = None) -> bool:
         """Take over the layers of a teacher, the scales of its observation, and its views.
 
         Args:
             teacher: The teacher.
-            tables: The views of its hand, if it sees its goals in them.
+            tables: The views of its hand (``vd.envs.symmetry.ViewTables``), if it sees its goals in them.
 
         Returns:
             Whether it is another one than before; the estimate then is to be fitted anew.

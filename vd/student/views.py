@@ -5,16 +5,13 @@ from the rotation as it is known: a teacher acts as well so (docs/student.md), a
 remembered. F views, O values of the observation, D actions. World frame: z up; quaternions xyzw.
 """
 
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import nn
 
 from vd.kernels.observations import teacher_observation_slices
 from vd.policy import TrainedPolicy
-
-if TYPE_CHECKING:
-    from vd.envs.symmetry import ViewTables
 
 TERMS = 4
 """Most values that a value of a view is made of, those of a quaternion."""
@@ -47,8 +44,8 @@ class ViewMaps(nn.Module):
     def __len__(self) -> int:
         return len(self.sector)
 
-    def adopt(self, tables: "ViewTables") -> None:
-        """Take over the tables of a hand."""
+    def adopt(self, tables: Any) -> None:
+        """Take over the tables of a hand, a ``vd.envs.symmetry.ViewTables``: envs stand above this layer."""
         for name in ("source", "factor", "joints", "sector"):
             buffer = getattr(self, name)
             buffer.copy_(torch.as_tensor(getattr(tables, name), dtype=buffer.dtype))
