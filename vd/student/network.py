@@ -180,7 +180,9 @@ class Student(nn.Module):
         self.mean = nn.Linear(cfg.head_hidden, num_actions)
         self.state: StateHead | None = None
         if cfg.state.values:
-            self.state = StateHead(cfg.state, cfg.head_hidden + width + self.num_senses, num_actions)
+            before = cfg.head_hidden + width
+            found = None if self._angle is None else before + self._angle - ANGLE
+            self.state = StateHead(cfg.state, before + self.num_senses, num_actions, found=found)
             # What the teacher does at the estimate stands, until there is something to add.
             nn.init.zeros_(self.mean.weight)
             nn.init.zeros_(self.mean.bias)

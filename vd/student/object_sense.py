@@ -13,7 +13,11 @@ import warp as wp
 
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.kernels.observations import JOINTS_PER_FINGER
+from vd.kernels.observations import (
+    JOINTS_PER_FINGER,
+    teacher_observation_size,
+    teacher_observation_slices,
+)
 from vd.kernels.shapes import (
     ORIENTATIONS,
     extent_directions,
@@ -44,6 +48,26 @@ TINY_M2 = 1e-9
 def object_values(num_actions: int) -> int:
     """Values of the sense for a hand of so many joints."""
     return STATE_VALUES + shape_observation_size(num_actions // JOINTS_PER_FINGER)
+
+
+def observed(num_actions: int, columns: int) -> tuple[list[int], list[int], list[float]]:
+    """What of a teacher's observation, of so many columns, the sense tells.
+
+    Returns:
+        Columns of the observation, in the world frame, the columns of the sense that tell them, and the
+        factors from these to those.
+    """
+    fingers = num_actions // JOINTS_PER_FINGER
+    parts, first = teacher_observation_slices(fingers), teacher_observation_size(fingers)
+    told = [
+        (range(parts["relative_orientation"].start, parts["relative_orientation"].stop), 1, 1.0),
+        (range(parts["object_position"].start, parts["object_position"].stop), 5, PLACE_M),
+        (range(parts["object_velocity"].start, parts["object_velocity"].stop), 8, PLACE_M),
+        (range(parts["object_spin"].start, parts["object_spin"].stop), 11, 1.0),
+        (range(first, columns), STATE_VALUES, 1.0),
+    ]
+    rows = [(column, source + i, factor) for part, source, factor in told for i, column in enumerate(part)]
+    return [row[0] for row in rows], [row[1] for row in rows], [row[2] for row in rows]
 
 
 class ObjectSense:

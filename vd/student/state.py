@@ -14,6 +14,7 @@ from torch import nn
 from vd.kernels.observations import JOINTS_PER_FINGER, teacher_observation_slices
 from vd.policy import MeanAction, PolicySpec, perceptron
 from vd.student.cfg import StateCfg
+from vd.student.object_sense import observed
 from vd.student.views import ViewMaps
 
 UNSEEN = ("object_orientation", "goal_orientation")
@@ -46,6 +47,8 @@ class StateHead(nn.Module):
         cfg: Sizes.
         width: Width of the features.
         num_actions: D.
+        found: Column of the features at which the sense of the object begins, if there is one: what it tells
+            of the observation stands, and the estimate is added to it.
     """
 
     offset: torch.Tensor
@@ -54,8 +57,11 @@ class StateHead(nn.Module):
     view_offset: torch.Tensor
     view_scale: torch.Tensor
     known: torch.Tensor
+    factor: torch.Tensor
+    source: torch.Tensor
+    told: torch.Tensor
 
-    def __init__(self, cfg: StateCfg, width: int, num_actions: int) -> None:
+    def __init__(self, cfg: StateCfg, width: int, num_actions: int, *, found: int | None = None) -> None:
         super().__init__()
         self.inside = nn.Sequential(nn.Linear(width, cfg.inside), nn.GELU())
         self.estimate = nn.Linear(width + cfg.inside, cfg.values)
@@ -75,6 +81,15 @@ class StateHead(nn.Module):
         for name in UNSEEN:
             known[columns[name]] = 0.0
         self.register_buffer("known", known, persistent=False)
+        self._finds = found is not None
+        if found is not None:
+            told, source, factor = observed(num_actions, cfg.values)
+            for name, values in (
+                ("factor", torch.tensor(factor)),
+                ("source", torch.tensor([found + column for column in source])),
+                ("told", torch.tensor(told)),
+            ):
+                self.register_buffer(name, values, persistent=False)
 
     def adopt(self, teacher: MeanAction, tables: Any = None) -> bool:
         """Take over the layers of a teacher, the scales of its observation, and its views.
@@ -150,9 +165,17 @@ class StateHead(nn.Module):
             slope = torch.linalg.solve(products, spread.T @ (target - mean))
             self.estimate.weight.copy_(slope.T)
             self.estimate.bias.copy_(mean - middle @ slope)
+            if self._finds:
+                # Least squares would make less of it for the few that are found on the wrong side.
+                self.estimate.weight[self.told] = 0.0
+                self.estimate.bias[self.told] = 0.0
             self.fitted.fill_(True)
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Estimated observation, normalised [.., O], and what :meth:`act` says of it."""
         estimate = self.estimate(torch.cat([features, self.inside(features)], dim=-1))
+        if self._finds:
+            values = self.factor * features[..., self.source]
+            normal = (values - self.offset[self.told]) / self.scale[self.told]
+            estimate = estimate.index_add(-1, self.told, normal)
         return estimate, *self.act(estimate)
