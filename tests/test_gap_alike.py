@@ -1,5 +1,6 @@
 """What is alike: the joints of a finger, and causes that no recording tells apart."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from vd.gap.explanation import Explanation, lacking
 from vd.gap.fit import JointProblem
 from vd.gap.hide import Hiding, simulate_hidden
 from vd.gap.joint_fit import JointFit
+from vd.gap.joints import Joint, _beside, _in_turn
 from vd.gap.rollout import Rollouts
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
+from vd.gap.team import JointSpec
 from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain
 
@@ -143,3 +146,26 @@ def test_a_search_that_its_time_step_holds_up_is_made_with_a_finer_one(refined: 
     with pytest.raises(EndError):
         selection.explain(baseline)
     assert asked[-1] == (("fit", True) if again else ("again", False))
+
+
+def test_a_finger_is_explained_from_its_tip_on_each_joint_beside_those_before() -> None:
+    """What the others were found to have is in the rows of a joint's chain, chance aside."""
+
+    def made(name: str, chain: int, joint: int) -> Joint:
+        fit = replace(made_up((), 0.01), rows=np.full((3, servo.PARAMETER_COLUMNS), 0.5))
+        return Joint(name, JointSpec(chain, joint, (0,), (0,), FLOOR, ()), Scales(*[1.0] * 8), fit)
+
+    def explained(joint: Joint, known: list) -> Explanation:
+        seen[joint.name] = [other.name for other, _ in known]
+        rows = joint.fit.rows + joint.spec.joint + 1.0
+        final = replace(made_up(("backlash", "command_jitter"), FLOOR), rows=rows)
+        return Explanation(joint.fit, final, "effects", joint.name)
+
+    seen: dict[str, list[str]] = {}
+    joints = [made("a1", 0, 0), made("b1", 1, 0), made("a2", 0, 1), made("a3", 0, 2)]
+    found = _in_turn(joints, explained)
+    assert [each.reason for each in found] == ["a1", "b1", "a2", "a3"]
+    assert seen == {"a3": [], "a2": ["a3"], "a1": ["a3", "a2"], "b1": []}
+    rows = _beside(joints[2], list(zip(joints, found, strict=True)))
+    chance = [servo.JITTER_SIGMA, servo.JITTER_DROP]
+    assert rows[:, servo.KP].tolist() == [1.5, 0.5, 3.5] and not rows[[0, 2]][:, chance].any()
