@@ -19,9 +19,12 @@ from vd.evaluate.comparison import Comparison
 from vd.evaluate.scanned import MISSING, NOISE_M, ScannedGoalView, scan
 from vd.evaluate.student import StudentActor
 from vd.evaluate.trace import NEVER_RAD, record
+from vd.kernels.shapes import SHAPE_UNIT_M
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
+from vd.student.cfg import LEAN
 from vd.student.network import Student
+from vd.student.object_sense import STATE_VALUES
 from vd.student.saved import SavedStudent, StudentSpec, student_export
 from vd.student.stopping import StoppingRule
 from vd.train.checkpoint import save_checkpoint
@@ -153,6 +156,14 @@ def test_only_the_goal_is_scanned(env, rendered):
     assert not torch.allclose(clouds[0][:, :goal], clouds[1][:, :goal], atol=NOISE_M)
     assert reach[1] < reach[0] + 5 * NOISE_M, "the goal is where it belongs"
     np.testing.assert_array_equal(scanned.points(chosen, rows).numpy(), clouds[1].numpy())
+
+
+def test_an_object_is_looked_for_by_its_scan(env):
+    """What a student finds of the extents at the goal are those of the scanned shape, not of the true one."""
+    env.reset()
+    sensed = [view(env, LEAN, rendered=False) for view in (StudentView, ScannedGoalView)]
+    shapes = [view.frame()["object"][:, STATE_VALUES:] for view in sensed]
+    assert (shapes[0] - shapes[1]).abs().mean() > NOISE_M / SHAPE_UNIT_M / 2.0
 
 
 def test_without_a_table_objects_fall_and_it_comes_back(env):

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.reorient import ReorientEnv
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
@@ -81,6 +82,7 @@ class StudentView:
         rendered: bool,
         depth: DepthCameraCfg | None = None,
         camera: Sequence[float] | None = None,
+        known: Sequence[ObjectModel] | None = None,
         noise: NoiseCfg | None = None,
         batch: int = 0,
         seed: int = 0,
@@ -94,6 +96,8 @@ class StudentView:
             depth: Its settings.
             camera: Pose of its optical frame in the hand's base frame, position [m] and quaternion xyzw; the
                 hand's camera by default.
+            known: The objects as the student knows them, if it looks for them by their shapes; as they are by
+                default.
             noise: Noise of training; None where there will be none.
             batch: Clouds of a training batch at most.
             seed: Of noise and camera.
@@ -138,7 +142,7 @@ class StudentView:
         if "object" in network.senses:
             self._sense = ObjectSense(
                 env.hand,
-                env.objects,
+                env.objects if known is None else known,
                 link_body=scene.link_body,
                 world_object=scene.world_object,
                 world_scale=scene.world_scale,

@@ -45,12 +45,13 @@ class ScannedGoalView(StudentView):
 
     def __init__(self, env: Any, network: StudentCfg, *, seed: int = 0, **settings: Any):
         """Scan the objects; arguments are those of :class:`vd.vision.StudentView`."""
-        super().__init__(env, network, seed=seed, **settings)
         rng = np.random.default_rng(seed)
+        scanned = [replace(item, surface_points=scan(item.surface_points, rng)) for item in env.objects]
+        super().__init__(env, network, seed=seed, known=scanned, **settings)
         scene = env.scene
         self._scanned = SceneClouds(
             env.hand,
-            [replace(item, surface_points=scan(item.surface_points, rng)) for item in env.objects],
+            scanned,
             link_body=scene.link_body,
             object_body=scene.object_body,
             world_object=scene.world_object,
