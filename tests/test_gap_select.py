@@ -325,6 +325,34 @@ def test_a_fit_that_is_worse_than_without_begins_anew_nearly_off() -> None:
     assert begun[-1] == [pytest.approx(0.1 * begun[0][0])]
 
 
+@pytest.mark.parametrize(("promised", "found"), [(0.9, 0.0015), (0.1, 0.004)])
+def test_a_speed_limit_above_all_speeds_is_brought_to_them_where_that_promises_more(
+    promised: float, found: float
+) -> None:
+    """There it has no slope: the descent from where it binds leaves less."""
+
+    def fast(effects, rmse, speed):
+        fit = made_up(effects, rmse)
+        names, values = ("kp", "velocity_limit"), np.array([3.0, speed])
+        coordinates = tuple(Coordinate(name, i, False, 1.0, -99.0, 99.0) for i, name in enumerate(names))
+        return replace(fit, coordinates=coordinates, x=values)
+
+    def run(calls: list) -> list:
+        return [
+            np.array([promised]) if name == "promise" else fast(call["effects"], 0.0015, 6.5)
+            for name, call in calls
+            if name == "promise" or call["starts"] == [{"kp": 3.0, "velocity_limit": 6.0}]
+        ]
+
+    selection, _ = searching([])
+    selection.run, selection.scales = run, Scales(1.0, 1.0, 2.0, 6.0, 10.0, 1e-3, 0.01, 6.0)
+    near, far = fast(("coulomb_friction",), 0.004, 12.0), fast(("backlash",), 0.05, 12.0)
+    fits = selection.slowed(made_up((), 0.1), [near, far])
+    assert [fit.rmse for fit in fits] == pytest.approx([found, 0.05])
+    bound = fast(("coulomb_friction",), 0.004, 5.9)
+    assert selection.slowed(made_up((), 0.1), [bound]) == [bound]
+
+
 def test_far_from_the_floor_the_search_begins_anew_where_first_effects_tied() -> None:
     baseline, first = made_up((), 0.10), made_up(("torque_saturation",), 0.08)
     beginnings = []

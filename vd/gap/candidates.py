@@ -31,6 +31,8 @@ SEARCHES = 3
 ASTRAY = 2.0
 """Factor from the nominal model beyond which a fit starts from that as well."""
 SEED_STEP = 1000
+SLOWER = 0.3
+"""Share of the squared error that a binding speed limit has to promise for fits to start from one."""
 BETTER = 0.98
 """Share of the error from which another search for the same model has found a better one."""
 
@@ -145,6 +147,7 @@ class CandidateFits:
             finalists = sorted(go_on(finalists, HALF_ITERATIONS), key=lambda fit: fit.rmse)
         near = [fit for fit in finalists if fit.rmse < HOPELESS * min(finalists[0].rmse, least)]
         last = [*go_on(near, FULL_ITERATIONS), *finalists[len(near) :]]
+        last = self.slowed(present, last)
         fits = {fit.effects[-1]: fit for fit in (*last, *screened[len(finalists) :])}
         # Nothing added can do worse than nothing: such a fit began too large, and no descent led back.
         astray = [name for name, fit in fits.items() if fit.rmse > present.rmse]
@@ -158,6 +161,23 @@ class CandidateFits:
             if found.rmse < fits[name].rmse:
                 fits[name] = found
         return fits
+
+    def slowed(self, present: JointFit, fits: list[JointFit]) -> list[JointFit]:
+        """The fits, or better ones whose speed limit binds where that promises to explain what is left.
+
+        Without the effect the baseline may have put it above all speeds, where it has no slope to descend.
+        """
+        best = min(fits, key=lambda fit: fit.rmse)
+        start = {"velocity_limit": self.scales.speed}
+        if best.rmse < AT_FLOOR * self.floor or best.values.get("velocity_limit", 0.0) <= self.scales.speed:
+            return fits
+        call = {"fit": best, "starts": [start], "scales": self.scales}
+        if self.run([("promise", call)])[0][0] < SLOWER:
+            return fits
+        near = [fit for fit in fits if fit.rmse < HOPELESS * best.rmse]
+        calls = [self.call(present, f.effects[-1], [{**f.values, **start}], FULL_ITERATIONS) for f in near]
+        found = dict(zip([fit.effects for fit in near], self.run(calls), strict=True))
+        return [min(fit, found.get(fit.effects, fit), key=lambda one: one.rmse) for fit in fits]
 
     def look_beside(self, fit: JointFit, whole: float) -> JointFit:
         """The fit, or a better one beside it where nearly all of the error is gone.
