@@ -61,6 +61,7 @@ class Selection(CandidateFits, Verdicts):
         report: Called with a line of progress.
         rest: Where the joint rests before it moves [rad].
         looks: Rounds in which every start may be tried (:meth:`look_wider`).
+        wide: Whether more is tried than the best starts and one effect after the other.
         like: What another joint of the finger certainly lacks: effects, and values by key.
     """
 
@@ -68,6 +69,7 @@ class Selection(CandidateFits, Verdicts):
     report: Callable[[str], None] = lambda line: None
     rest: float = 0.0
     looks: int = LOOKS
+    wide: bool = True
     like: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
 
     def explain(self, baseline: JointFit) -> Explanation:
@@ -161,11 +163,11 @@ class Selection(CandidateFits, Verdicts):
     def first(self, baseline: JointFit) -> tuple[JointFit, dict[str, list[JointFit]], list[Trial]]:
         """The first search; it looks wide at once where a gap is small."""
         if not self.veiled and baseline.held_out_rmse > LARGE * self.floor:
-            looks, self.looks = self.looks, 0
+            self.wide = False
             found = self.search(baseline, baseline)
+            self.wide = True
             if self.finished(found[0]) or self.noise_only(found[0]) or self.too_coarse(found[0]):
                 return found
-            self.looks = looks
             self.report("not explained: every candidate is tried from every start")
         return self.search(baseline, baseline)
 
@@ -242,7 +244,7 @@ class Selection(CandidateFits, Verdicts):
             if not fits:
                 break
             best = self.winner(list(fits.values()))
-            if self.looks > 0 and EXPLAINED * self.floor < best.rmse < WIDE * self.floor:
+            if self.wide and self.looks > 0 and EXPLAINED * self.floor < best.rmse < WIDE * self.floor:
                 self.looks -= 1
                 fits = self.look_wider(present, fits)
                 best = self.winner(list(fits.values()))
@@ -267,7 +269,7 @@ class Selection(CandidateFits, Verdicts):
             both = fits.get(FRICTION_AND_LOAD)
             # What explains everything needs no two in its place, unless it is what two do together; nor do
             # two explain what both as one are far from.
-            open_ = best is both or best.rmse > EXPLAINED * self.floor
+            open_ = best is both or (self.wide and best.rmse > EXPLAINED * self.floor)
             if both is not None and open_ and both.rmse < HOPELESS * best.rmse and room >= 2:
                 apart = self.take_apart(present, both)
                 pair = self.winner(apart) if apart else best
