@@ -10,11 +10,14 @@ import vd.kernels.actuators as servo
 from vd.assets_usd.hands import load_hand
 from vd.gap.chain import Chain, chains
 from vd.gap.design import design
+from vd.gap.explanation import Accepted, Explanation
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
+from vd.gap.joints import Joint, _beside_masses
 from vd.gap.masses import RANGE, Masses, fit_masses
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Rollouts
+from vd.gap.team import Bench, JointSpec, Team
 from vd.gap.workflow import baseline_of
 
 JOINTS = ("f0_j1", "f0_j2", "f0_j3")
@@ -88,6 +91,38 @@ def test_masses_of_links_explain_what_no_stiffness_does() -> None:
 def test_friction_is_no_mass() -> None:
     _, masses = fitted(*recorded((1.0, 1.0, 1.0), friction=0.02))
     assert masses.errors.max() > 2.0 * NOISE
+
+
+@pytest.mark.parametrize(("core", "explained"), [("coulomb_friction", True), ("command_filter", False)])
+def test_beside_an_effect_other_masses_are_no_second_one(core: str, explained: bool) -> None:
+    """Only what all joints lack is kept where masses are the rest; nothing changes where they are not."""
+    recording, chain = recorded((0.86, 1.14, 0.9), friction=0.03)
+    both = ("coulomb_friction", "command_filter")
+    with Team(Bench(recording, [chain], DT, "cpu"), workers=1) as team:
+        joints, found = [], []
+        for index, name in enumerate(JOINTS):
+            trajectories, folds = design(recording, chain, index)
+            spec = JointSpec(0, index, trajectories, folds, NOISE, baseline_of(chain))
+            problem = team.bench.problem(spec)
+            scales = problem.scales(chain.start_row[index], NOISE)
+            plain = problem.fit(chain.start_row, (), [{}], scales, iterations=8)
+            joints.append(Joint(name, spec, scales, plain))
+            effects = both if index else (core,)
+            start = {"coulomb_friction.tau_c_nm": 0.03, "command_filter.tau_s": 1e-3}
+            final = problem.fit(
+                plain.rows, effects, [{k: start[k] for k in start if k.split(".")[0] in effects}], scales
+            )
+            accepted = tuple(Accepted(effect, 1.0, {}, (), (), False) for effect in effects)
+            found.append(Explanation(plain, final, "unknown", "structure is left", accepted))
+        told = _beside_masses(team, joints, found)
+    if not explained:
+        assert told == found
+        return
+    assert [each.verdict for each in told] == ["effects"] * 3
+    for each in told:
+        assert [one.name for one in each.accepted] == ["coulomb_friction"]
+        assert each.accepted[0].estimates["tau_c_nm"][0] == pytest.approx(0.03, rel=0.05)
+        assert "with the masses of its links" in each.reason
 
 
 def test_masses_stay_in_the_range_that_policies_are_trained_on() -> None:

@@ -8,7 +8,7 @@ from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import NAMED, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXCESS_FLOORS, MIN_GAIN, RANDOM, SMALL_EXCESS_FLOORS
+from vd.gap.judge import CONTAINED_FLOORS, MIN_GAIN, RANDOM, SMALL_EXCESS_FLOORS
 from vd.gap.verdict import explains
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
     others = [name for name in search.candidates if name not in {*effects, *search.vetoes, RANDOM}]
     added = [start for name in others for start in sizes(name, search.others, search.scales)]
     promise = search.run([("promise", {"fit": fit, "starts": added, "scales": search.scales})])[0]
-    if promise.max(initial=0.0) > EXCESS_FLOORS**2:
+    if promise.max(initial=0.0) > CONTAINED_FLOORS**2:
         return None
     for name in effects:
         without = search.refit(fit, [other for other in effects if other != name])

@@ -21,6 +21,7 @@ from vd.gap.select import LOOKS, RESTARTS, Selection
 from vd.gap.statistics import resamples
 from vd.gap.team import JointSpec, Team
 from vd.gap.telemetry import vetoes
+from vd.gap.verdict import explains
 from vd.kernels.effects import EFFECTS
 
 POLISH_ITERATIONS = 5
@@ -78,7 +79,7 @@ def explain_joints(
     def one(joint: Joint, explained: Explained) -> Explanation:
         chain = team.bench.chains[joint.spec.chain]
         if joint.spec.chain in masses:
-            text = masses[joint.spec.chain].text
+            text = f"the plain model is within the noise floor {masses[joint.spec.chain].text}"
             progress(f"explain: {joint.name}: no_gap: {text}")
             return Explanation(joint.fit, joint.fit, "no_gap", text)
         # What is none of the table on one joint is none on the others: what is plain to see is enough there.
@@ -131,7 +132,7 @@ def explain_joints(
     ends = [partial(finished, joint) for joint in joints]
     shared = share(alone, floors, fingers, ends)
     agreed = agree(shared, floors, fingers, [partial(fitted, joint) for joint in joints])
-    return _consistent(team, joints, agreed)
+    return _consistent(team, joints, _beside_masses(team, joints, agreed))
 
 
 def _in_turn(
@@ -178,6 +179,52 @@ def _masses(team: Team, joints: Sequence[Joint]) -> dict[int, Masses]:
         masses = fit_masses([team.bench.problem(joint.spec) for joint in own], [joint.fit for joint in own])
         if (masses.errors < floors).all():
             result[index] = masses
+    return result
+
+
+def _beside_masses(
+    team: Team, joints: Sequence[Joint], explanations: Sequence[Explanation]
+) -> list[Explanation]:
+    """Only what all joints of a finger lack, where other masses of its links are the rest.
+
+    What slightly heavier links leave beside an effect is imitated by a second effect, another on each joint.
+    """
+    result = list(explanations)
+    for index, chain in enumerate(team.bench.chains):
+        own = [i for i, joint in enumerate(joints) if joint.spec.chain == index]
+        gaps = [i for i in own if explanations[i].verdict != "no_gap"]
+        effects = [explanations[i].final.effects for i in gaps]
+        core = tuple(name for name in (effects or [()])[0] if all(name in each for each in effects))
+        more = any(len(each) > len(core) for each in effects)
+        settled = not more and all(explanations[i].verdict == "effects" for i in gaps)
+        if not chain.bodies or not core or RANDOM in core or settled:
+            continue
+        rows = joints[own[0]].fit.rows.copy()
+        for i in own:
+            rows[joints[i].spec.joint] = joints[i].fit.rows[joints[i].spec.joint]
+        for i in gaps:
+            row = explanations[i].final.rows[joints[i].spec.joint].copy()
+            for name in {*explanations[i].final.effects} - {*core}:
+                for parameter in EFFECTS[name].parameters:
+                    row[parameter.column] = parameter.neutral
+            rows[joints[i].spec.joint] = row
+
+        def fitted(i: int, rows: np.ndarray = rows, core: tuple[str, ...] = core) -> JointFit:
+            call = {"base": rows, "effects": core, "starts": [{}], "scales": joints[i].scales}
+            call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
+            return team.run(joints[i].spec, [("fit", call)])[0]
+
+        fits = dict(zip(gaps, parallel(fitted, gaps), strict=True))
+        problems = [team.bench.problem(joints[i].spec) for i in own]
+        masses = fit_masses(problems, [fits.get(i, joints[i].fit) for i in own])
+        kept = {i: tuple(a for a in explanations[i].accepted if a.name in core) for i in gaps}
+        named = all(a.named for accepted in kept.values() for a in accepted)
+        if not named or (masses.errors >= [NO_GAP * joints[i].spec.floor for i in own]).any():
+            continue
+        for i, fit in fits.items():
+            reason = f"{explains(core)}, {masses.text}"
+            plain = replace(explanations[i], accepted=kept[i], verdict="effects", reason=reason)
+            result[i] = polished(plain, fit, joints[i].spec.floor)
     return result
 
 

@@ -39,9 +39,9 @@ class Masses:
 
     @property
     def text(self) -> str:
-        """The factors in words."""
+        """By how much they are off, in words."""
         percent = ", ".join(f"{100.0 * (factor - 1.0):+.0f}" for factor in self.factors)
-        return f"the plain model is within the noise floor with the masses of its links {percent} % off"
+        return f"with the masses of its links {percent} % off"
 
 
 def fit_masses(problems: Sequence[JointProblem], fits: Sequence[JointFit]) -> Masses:
