@@ -42,8 +42,8 @@ hand a straight finger that bends through its range would press on its neighbour
 WIDE = SafetyCfg(step_rad=4.0)
 """Steps go through most of a joint's range at once, which a policy must not."""
 TWIN_ARGS = "--physics-hz 3840"
-"""A twin tells of a state up to two of its steps old: at the rate of training 17 ms, which vd-gap would find,
-and at 960 Hz as much noise again as its encoders have."""
+"""Steps of the twin so short that its integrator is as exact as vd-gap's: at 960 Hz it is off by 0.3 mrad
+(median of a moving hand; up to 0.9), two thirds of what the encoders round."""
 STATE_CHANNELS = ("velocity", "current", "pwm", "voltage", "temperature")
 
 

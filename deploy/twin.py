@@ -151,7 +151,7 @@ class TwinCommand:
     hand_layer: Path | None = None
     """Identified servo model over it (identified.usda), whose effects act."""
     physics_hz: float = PAPER.scene.physics_hz
-    """Rate of its simulation; the motors are at most two steps behind."""
+    """Rate of its simulation."""
     calibration: Path | None = None
     """Calibration file of that hand's motors; IDs 10, 11, 12, 20, ... by default."""
     object: str | None = None

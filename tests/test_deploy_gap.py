@@ -60,5 +60,4 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     report = json.loads((out / "report.json").read_text())
     found = {effect["name"]: effect for effect in report["effects"] if "f0_j1" in effect["joints"]}
     assert set(found) == {"command_delay"}
-    # The goal is heard 0.5 ms before its state is asked for; the twin's steps are 0.3 ms.
     assert found["command_delay"]["parameters"]["delay_s"]["value"] == pytest.approx(DELAY_S, abs=0.001)
