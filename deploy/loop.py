@@ -61,6 +61,18 @@ class StepTimes:
 
 
 @dataclass(frozen=True)
+class Present:
+    """What is read in one control step."""
+
+    sensed: Sensed
+    """What the policy is told."""
+    state: HandState
+    """As measured."""
+    known: TwinState | None
+    """The truth: a twin's only."""
+
+
+@dataclass(frozen=True)
 class Moment:
     """What was known and done in one control step; D joints."""
 
@@ -128,6 +140,10 @@ class ControlLoop:
             StaleCamera: There is no new image.
         """
         outcomes = []
+        self._pilot.begin()
+        for goal in goals[:1]:
+            # Before the first deadline: an object that is not yet followed takes longer to find.
+            self._pilot.decide(self._sense(np.asarray(goal, dtype=float)).sensed)
         for number, goal in enumerate(goals):
             outcome, distance = self._pursue(number, np.asarray(goal, dtype=float))
             outcomes.append(outcome)
@@ -140,7 +156,7 @@ class ControlLoop:
 
     def _pursue(self, number: int, goal: np.ndarray) -> tuple[str, float | None]:
         """Act until one goal is reached or given up: outcome, and the distance that was known then [rad]."""
-        self._pilot.begin()
+        self._pilot.new_goal()
         self._actions.reset()
         self._log.event("goal", goal=number)
         distance: float | None = None
@@ -156,28 +172,13 @@ class ControlLoop:
         """One control step; what ends the pursuit, if anything, and the distance [rad]."""
         late, busy = self._pacer.wait(), time.process_time()
         due = self._pacer.due_s
-        depth = None
-        if self._camera is not None:
-            image = self._camera.read(CAMERA_SHARE * self._pacer.period_s)
-            self._safe.image_at(image.time_s)
-            depth = image.depth_m
-        known = self._truth.state() if self._truth is not None else None
-        state = self._safe.read()
+        now = self._sense(goal)
+        state, known, depth = now.state, now.known, now.sensed.depth
         smoothed, outcome = self._actions.smoothed, ""
         distance: float | None = None
         action = np.zeros_like(smoothed)
         if acting:
-            decision = self._pilot.decide(
-                Sensed(
-                    joint_q=state.position,
-                    joint_qd=state.velocity,
-                    smoothed=smoothed,
-                    goal_quat=goal,
-                    depth=depth,
-                    object_pose=None if known is None else known.object_pose,
-                    object_velocity=None if known is None else known.object_velocity,
-                )
-            )
+            decision = self._pilot.decide(now.sensed)
             distance = None if np.isnan(decision.distance) else decision.distance
             outcome = self._outcome(decision.distance, smoothed, known, first=first)
             if not outcome:
@@ -193,6 +194,31 @@ class ControlLoop:
         moment = Moment(number, goal, acting, state, known, smoothed, action, sent, distance)
         self._note(moment, times)
         return outcome, distance
+
+    def _sense(self, goal: np.ndarray) -> Present:
+        """Read the camera, then the joints.
+
+        Raises:
+            SafeStop: The hand was stopped.
+            StaleCamera: There is no new image.
+        """
+        depth = None
+        if self._camera is not None:
+            image = self._camera.read(CAMERA_SHARE * self._pacer.period_s)
+            self._safe.image_at(image.time_s)
+            depth = image.depth_m
+        known = self._truth.state() if self._truth is not None else None
+        state = self._safe.read()
+        sensed = Sensed(
+            joint_q=state.position,
+            joint_qd=state.velocity,
+            smoothed=self._actions.smoothed,
+            goal_quat=goal,
+            depth=depth,
+            object_pose=None if known is None else known.object_pose,
+            object_velocity=None if known is None else known.object_velocity,
+        )
+        return Present(sensed, state, known)
 
     def _outcome(self, distance: float, smoothed: np.ndarray, known: TwinState | None, *, first: bool) -> str:
         """``stopped``, ``lost``, or nothing."""

@@ -36,6 +36,9 @@ class Pilot(Protocol):
     """When it has arrived."""
 
     def begin(self) -> None:
+        """A flight begins: nothing is known from before."""
+
+    def new_goal(self) -> None:
         """A new goal: memory starts empty, as in training."""
 
     def decide(self, sensed: Sensed) -> Decision:
@@ -74,9 +77,13 @@ class StudentPilot:
         self.sight = self._make_sight(camera=camera)
 
     def begin(self) -> None:
-        """A new goal: the memory starts empty, as in training, and the object is looked for anew."""
-        self._hidden = self._network.initial_hidden(1)
+        """A flight begins: the object is looked for anew, which takes several times as long as a step."""
+        self.new_goal()
         self.sight.begin()
+
+    def new_goal(self) -> None:
+        """A new goal: the memory starts empty, as in training; the object is followed on."""
+        self._hidden = self._network.initial_hidden(1)
 
     def decide(self, sensed: Sensed) -> Decision:
         """Mean action and predicted distance."""
@@ -104,6 +111,9 @@ class TeacherPilot:
     def begin(self) -> None:
         """A teacher remembers nothing."""
 
+    def new_goal(self) -> None:
+        """A teacher remembers nothing."""
+
     def decide(self, sensed: Sensed) -> Decision:
         """Mean action and true distance."""
         assert sensed.object_pose is not None
@@ -122,6 +132,9 @@ class StillPilot:
         self.rule, self._action = StoppingRule(), np.zeros(num_actions)
 
     def begin(self) -> None:
+        """Nothing to forget."""
+
+    def new_goal(self) -> None:
         """Nothing to forget."""
 
     def decide(self, sensed: Sensed) -> Decision:

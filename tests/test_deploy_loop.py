@@ -1,5 +1,6 @@
 """The control loop: its clock, how goals end, what is logged, and the whole of it on a twin."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -63,15 +64,25 @@ class Countdown:
     start: float = 1.0
     rule: StoppingRule = field(default_factory=lambda: StoppingRule(0.35, 2.0))
     seen: list = field(default_factory=list)
+    """What it decided on, goals begun."""
     begun: int = 0
+    look: Callable[[], None] = lambda: None
+    """What it does at its first look."""
 
     def begin(self) -> None:
+        """Nothing is known."""
+        self.distance, self.begun, self.seen = self.start, 0, []
+
+    def new_goal(self) -> None:
         """From the start again."""
         self.distance, self.begun = self.start, self.begun + 1
 
     def decide(self, sensed) -> Decision:
         """A tenth nearer."""
-        self.seen.append(sensed)
+        if self.begun:
+            self.seen.append(sensed)
+        else:
+            self.look()
         self.distance -= 0.1
         return Decision(np.full(9, 0.1), self.distance)
 
@@ -156,6 +167,15 @@ def test_missed_deadlines_are_counted_and_told(parts):
     loop.run([GOAL])
     assert hand.missed == [False, False, True, False, False, False] and pacer.missed == 1
     assert loop.times[2].sent_s == pytest.approx(0.1) and loop.times[3].late_s == pytest.approx(0.1 - 1 / HZ)
+
+
+def test_the_first_look_has_no_deadline(parts):
+    hand, pilot, actions, pacer, log = parts
+    looks = []
+    pilot.look = lambda: (looks.append(hand.clock.now()), hand.clock.sleep(3.0 / HZ))
+    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(hold_s=0.0))
+    assert loop.run([GOAL, GOAL]) == ["stopped", "stopped"]
+    assert len(looks) == 1 and pacer.missed == 0 and loop.times[0].late_s == 0.0
 
 
 def test_there_is_nothing_to_stop_before_the_first_action(parts):
