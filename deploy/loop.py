@@ -141,9 +141,8 @@ class ControlLoop:
         """
         outcomes = []
         self._pilot.begin()
-        for goal in goals[:1]:
-            # Before the first deadline: an object that is not yet followed takes longer to find.
-            self._pilot.decide(self._sense(np.asarray(goal, dtype=float)).sensed)
+        if len(goals):
+            self._look(np.asarray(goals[0], dtype=float))
         for number, goal in enumerate(goals):
             outcome, distance = self._pursue(number, np.asarray(goal, dtype=float))
             outcomes.append(outcome)
@@ -153,6 +152,12 @@ class ControlLoop:
             for _ in range(round(self._cfg.hold_s / self._pacer.period_s)):
                 self._step(number, goal, acting=False)
         return outcomes
+
+    def _look(self, goal: np.ndarray) -> None:
+        """See the object before the first deadline: to find it takes longer than to follow it."""
+        self._safe.beat(missed=False)
+        self._pilot.decide(self._sense(goal).sensed)
+        self._safe.beat(missed=False)
 
     def _pursue(self, number: int, goal: np.ndarray) -> tuple[str, float | None]:
         """Act until one goal is reached or given up: outcome, and the distance that was known then [rad]."""

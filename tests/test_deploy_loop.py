@@ -165,7 +165,8 @@ def test_missed_deadlines_are_counted_and_told(parts):
     pilot.start = 9.0
     loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=0.5, hold_s=0.0))
     loop.run([GOAL])
-    assert hand.missed == [False, False, True, False, False, False] and pacer.missed == 1
+    look = [False, False]
+    assert hand.missed == [*look, False, False, True, False, False, False] and pacer.missed == 1
     assert loop.times[2].sent_s == pytest.approx(0.1) and loop.times[3].late_s == pytest.approx(0.1 - 1 / HZ)
 
 
