@@ -163,15 +163,14 @@ class Registration:
             cloud = wp.from_torch(points.contiguous(), dtype=wp.vec3)
             self._launch(background_kernel, cloud.shape, [self._eye, cloud], [self._background])
         self.looks.masked_fill_(fresh, 0)
-        for worlds in ((self.looks == 0) & (count > 0), (self.looks > 0) & (count > 0)):
-            rows = worlds.nonzero().flatten()
+        for known in (False, True):
+            rows = (((self.looks > 0) == known) & (count > 0)).nonzero().flatten()
             if len(rows):
-                self._find(rows, inputs)
+                self._find(rows, inputs, known=known)
         self.looks += (count > 0).int()
 
-    def _find(self, worlds: torch.Tensor, inputs: list[wp.array]) -> None:
+    def _find(self, worlds: torch.Tensor, inputs: list[wp.array], *, known: bool) -> None:
         """Find the objects of some worlds, which were all found before or all were not."""
-        known = bool(self.looks[worlds[0]])
         looks, rows = self.looks[worlds], wp.from_torch(worlds.int())
         if known:
             others = self._start(rows, (looks * STRIDE) % ROTATIONS, OTHERS, inputs)
