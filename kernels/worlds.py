@@ -124,6 +124,38 @@ def write_object_force_kernel(
 
 
 @wp.kernel
+def place_table_kernel(
+    # Model:
+    geom_kind: wp.array2d[wp.int32],
+    kind_table: int,
+    # In:
+    step_count: wp.array[wp.int32],
+    last_step: wp.array[wp.int32],
+    height: float,
+    away: float,
+    # In/Out:
+    geom_pos: wp.array2d[wp.vec3],
+):
+    """Put each world's table where it belongs, or away once its time in the episode is over. Launch: [N, G].
+
+    Args:
+        geom_kind: Kind of each geom, shape [N, G].
+        kind_table: Kind of the table.
+        step_count: Control steps since the world's reset, shape [N].
+        last_step: Control steps for which the table of each world stays, shape [N].
+        height: Height of its top [m].
+        away: Height of its top where it is out of reach [m].
+        geom_pos: Positions of the geoms [m], shape [N, G]; only the heights of tables are written.
+    """
+    world, geom = wp.tid()
+    if geom_kind[world, geom] != kind_table:
+        return
+    position = geom_pos[world, geom]
+    position[2] = wp.where(step_count[world] < last_step[world], height, away)
+    geom_pos[world, geom] = position
+
+
+@wp.kernel
 def record_step_kernel(
     # In:
     joint_q: wp.array2d[float],

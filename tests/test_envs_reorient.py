@@ -15,8 +15,10 @@ from vd.envs.cfg import (
     RewardCfg,
     StartCfg,
     SuccessCfg,
+    TableCfg,
 )
 from vd.envs.reorient import ReorientEnv
+from vd.envs.table import ALWAYS, table_steps
 from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
 from vd.kernels.shapes import (
     EXTENT_CENTRE_M,
@@ -90,6 +92,34 @@ def test_the_table_costs_while_the_object_touches_it():
     env.step(env.action)
     assert (env.reward_terms.numpy()[:, column] == 0.0).all()
     assert RewardCfg().table_contact == PAPER.reward.table_contact == -1.0
+
+
+def test_tables_leave_their_share_of_worlds_in_time():
+    """In a world that loses its table after 1.5 s the object, at rest until then, falls."""
+    env = make(table=TableCfg(away_share=0.5, away_s=(1.5, 1.5)), num_worlds=4, episode_s=2.5)
+    lost = table_steps(env.cfg) < ALWAYS
+    assert lost.sum() == 2
+    heights, fell, gone = [], np.zeros(4, dtype=int), round(1.5 * env.cfg.sim.control_hz)
+    for _ in range(env.max_episode_steps):
+        env.step(env.action)
+        heights.append(env.object_pose_end.numpy()[:, 2].copy())
+        fell += env.fell.numpy()
+        if len(heights) == gone:
+            assert not fell.any()
+    assert (fell[lost] > 0).all() and not fell[~lost].any()
+    before, after = heights[gone - 1], heights[gone + 1]
+    assert (after[lost] < before[lost] - 0.02).all() and np.allclose(after[~lost], before[~lost], atol=2e-3)
+
+
+def test_times_of_tables_lie_between_their_bounds():
+    cfg = ReorientCfg(num_worlds=1000, table=TableCfg(away_share=0.3, away_s=(1.0, 3.0)))
+    steps = table_steps(cfg)
+    away = steps < ALWAYS
+    assert away.sum() == 300 and steps[away].min() == 12 and steps[away].max() == 36
+    with pytest.raises(ValueError, match=r"table\.away_s"):
+        ReorientCfg(table=TableCfg(away_share=0.3, away_s=(3.0, 1.0))).validate()
+    with pytest.raises(ValueError, match=r"table\.away_share"):
+        ReorientCfg(table=TableCfg(away_share=3.0)).validate()
 
 
 def test_a_success_gives_a_new_goal_without_a_reset():

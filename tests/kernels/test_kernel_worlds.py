@@ -12,6 +12,7 @@ from vd.kernels.guard import collect_overflow_kernel, guard_kernel, put_back_ker
 from vd.kernels.worlds import (
     copy_columns_kernel,
     count_goals_kernel,
+    place_table_kernel,
     record_step_kernel,
     redraw_mask_kernel,
     world_mask_kernel,
@@ -283,3 +284,30 @@ def test_the_first_columns_are_copied(device):
         device=device,
     )
     np.testing.assert_array_equal(narrow.numpy(), wide[:, :4])
+
+
+@EXAMPLES
+@given(seed=st.integers(0, 2**31), worlds=st.integers(1, 5))
+def test_tables_are_away_from_their_last_step_on(device, seed, worlds):
+    random = np.random.default_rng(seed)
+    kind, count = random.integers(0, 4, (worlds, 6)), random.integers(0, 5, worlds)
+    last, position = random.integers(0, 5, worlds), random.normal(size=(worlds, 6, 3)).astype(np.float32)
+    expected = position.copy()
+    for w, g in np.argwhere(kind == 3):
+        expected[w, g, 2] = 0.25 if count[w] < last[w] else -7.0
+    out = device_array(position, wp.vec3, device)
+    wp.launch(
+        place_table_kernel,
+        dim=(worlds, 6),
+        inputs=[
+            device_array(kind, int, device),
+            3,
+            device_array(count, int, device),
+            device_array(last, int, device),
+            0.25,
+            -7.0,
+        ],
+        outputs=[out],
+        device=device,
+    )
+    assert np.array_equal(out.numpy(), expected)

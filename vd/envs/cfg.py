@@ -106,6 +106,25 @@ class StartCfg:
 
 
 @dataclass(frozen=True)
+class TableCfg:
+    """Ours: worlds in which the table is taken away in an episode, as in-air tests do; none by default."""
+
+    away_share: float = 0.0
+    """Share of the worlds whose episodes lose the table; the same worlds throughout."""
+    away_s: tuple[float, float] = (PAPER.scene.air_table_s, PAPER.scene.air_table_s)
+    """Times in the episode at which it goes, uniform over these worlds [s]."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        if not 0.0 <= self.away_share <= 1.0:
+            raise ValueError(f"table.away_share is {self.away_share:g}; it has to lie within 0 and 1")
+        if not 0.0 < self.away_s[0] <= self.away_s[1]:
+            raise ValueError(
+                f"table.away_s is {self.away_s[0]:g} {self.away_s[1]:g}; it has to rise, and be positive"
+            )
+
+
+@dataclass(frozen=True)
 class TighteningCfg:
     """Ours: ask for little stillness at first, later for that of ``success``. Off by default.
 
@@ -273,6 +292,7 @@ class ReorientCfg:
     success: SuccessCfg = field(default_factory=SuccessCfg)
     start: StartCfg = field(default_factory=StartCfg)
     goal: GoalCfg = field(default_factory=GoalCfg)
+    table: TableCfg = field(default_factory=TableCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
 
@@ -286,6 +306,7 @@ class ReorientCfg:
         self.sim.validate()
         self.randomisation.validate()
         self.curriculum.validate()
+        self.table.validate()
         if self.start.at_rest and (self.start.poses < 1 or self.start.settle_s <= 0.0):
             raise ValueError(
                 f"start.at_rest needs start.poses >= 1 (now {self.start.poses}) and start.settle_s > 0 "

@@ -23,6 +23,7 @@ from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
 from vd.envs.state import load_state, save_state
 from vd.envs.symmetry import Views
+from vd.envs.table import table_array
 from vd.kernels.actions import apply_action_kernel, joint_effort_kernel
 from vd.kernels.guard import void_step_kernel
 from vd.kernels.observations import fingertip_kernel, teacher_observation_kernel, teacher_observation_size
@@ -155,6 +156,7 @@ class ReorientEnv:
         """Observation in the world frame, shape [N, O]."""
         self.acts_in_view = True
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
+        self._table_steps = table_array(cfg, self.device)
         self._shapes = ShapeObserver(self) if self.sees_shape else None
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
         self.randomiser = Randomiser(self)
@@ -252,6 +254,8 @@ class ReorientEnv:
         sim = self.sim
         self._apply_action()
         self.randomiser.disturb()
+        if self._table_steps is not None:
+            sim.place_tables(self.step_count, self._table_steps)
         sim.step()
         if self.cfg.failures_per_million > 0.0:
             sim.put_back(self.step_count, self.max_episode_steps - 1)

@@ -10,6 +10,7 @@ from newton.solvers import SolverMuJoCo
 from vd.kernels.actions import limit_joint_velocity_kernel
 from vd.kernels.contacts import pair_force_kernel
 from vd.kernels.guard import collect_overflow_kernel, guard_kernel, put_back_kernel
+from vd.kernels.worlds import place_table_kernel
 from vd.paper import PAPER
 from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
@@ -256,16 +257,28 @@ class Simulator:
         )
 
     def place_table(self, *, present: bool) -> None:
-        """Put the table where it belongs, or out of reach of everything, in all worlds.
+        """Put the table where it belongs, or out of reach of everything, in all worlds."""
+        n = self.num_worlds
+        counts = wp.zeros(n, dtype=wp.int32, device=self.device)
+        self.place_tables(counts, wp.full(n, int(present), dtype=wp.int32, device=self.device))
+
+    def place_tables(self, step_count: wp.array, last_step: wp.array) -> None:
+        """Put each world's table where it belongs until its last step, then out of reach of everything.
 
         The solver computes where fixed shapes are once, when it is built, so this is written into its data,
-        where a captured step finds it.
+        where a captured step finds it. Device work only.
+
+        Args:
+            step_count: Control steps since the world's reset, shape [N].
+            last_step: Control steps for which each table stays, shape [N].
         """
-        table = self._geom_kind.numpy() == SHAPE_TABLE
-        height = PAPER.scene.table_top_m if present else AWAY_M
-        places = self.solver.mjw_data.geom_xpos.numpy()
-        places[..., 2] = np.where(table, height, places[..., 2])
-        self.solver.mjw_data.geom_xpos.assign(places)
+        wp.launch(
+            place_table_kernel,
+            dim=self._geom_kind.shape,
+            inputs=[self._geom_kind, SHAPE_TABLE, step_count, last_step, PAPER.scene.table_top_m, AWAY_M],
+            outputs=[self.solver.mjw_data.geom_xpos],
+            device=self.device,
+        )
 
     def forward_kinematics(self) -> None:
         """Refresh ``body_q`` and ``body_qd`` of all worlds from the joint state (after a reset)."""
