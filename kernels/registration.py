@@ -202,7 +202,7 @@ def start_poses_kernel(
         eye: The camera.
         rendered: 1 where a camera saw the points, 0 where they are of all sides.
         every: Look at every so many-th sample.
-        world_in: World of each row, shape [M].
+        world_in: World of each row, shape [M]; a row of -1 is left out.
         first_in: Which rotation is the first of each row, counted on and around, shape [M].
         rotation_in: Rotations, shape [H].
         seen_in: Points seen of the object, base frame [m], shape [N, P].
@@ -211,6 +211,8 @@ def start_poses_kernel(
     """
     row, c = wp.tid()
     world = world_in[row]
+    if world < 0:
+        return
     shape = shapes.world_shape[world]
     turn = rotation_in[(first_in[row] + c) % rotation_in.shape[0]]
     middle = wp.vec3()
@@ -316,7 +318,7 @@ def fit_poses_kernel(
         steps: Steps of each pose.
         every: Look at every so many-th seen point.
         every_sample: Look at every so many-th sample for what stands out.
-        world_in: World of each row, shape [M].
+        world_in: World of each row, shape [M]; a row of -1 is left out.
         seen_in: Points seen of the object, base frame [m], shape [N, P].
         count_in: How many there are, shape [N].
         background_in: From ``background_kernel``, shape [N, Y, X]; [N, 0, 0] without a camera.
@@ -325,6 +327,8 @@ def fit_poses_kernel(
     """
     row, c = wp.tid()
     world = world_in[row]
+    if world < 0:
+        return
     best = pose[row, c]
     for _ in range(steps):
         best = improved(shapes, world, best, far, every, seen_in, count_in)
@@ -362,12 +366,10 @@ def keep_poses_kernel(
     # In:
     world_in: wp.array[int],
     found_in: wp.array2d[wp.transform],
-    misfit_in: wp.array2d[float],
     # In/Out:
+    cost: wp.array2d[float],
     pose: wp.array2d[wp.transform],
     misfit: wp.array2d[float],
-    # Out:
-    cost_out: wp.array2d[float],
 ):
     """Keep the best poses of each world that are not nearly the same. Launch: [M].
 
@@ -381,36 +383,35 @@ def keep_poses_kernel(
         stay: Factor on the misfit of the first pose when it is compared.
         share: Share of the latest misfit in the average over time.
         known: How many of the found poses were kept before, 0 or K.
-        world_in: World of each row, shape [M].
+        world_in: World of each row, shape [M]; a row of -1 is left out.
         found_in: Found poses, shape [M, C].
-        misfit_in: Their misfits now, shape [M, C].
+        cost: Their misfits now, shape [M, C]; of no meaning after.
         pose: Kept poses, shape [N, K].
         misfit: Their misfits, averaged over time; NEVER where none is left, shape [N, K].
-        cost_out: Scratch, shape [M, C].
     """
     row = wp.tid()
     world = world_in[row]
-    for c in range(found_in.shape[1]):
-        cost = misfit_in[row, c]
-        if c < known:
-            cost = misfit[world, c] + share * (cost - misfit[world, c])
-            if misfit[world, c] >= NEVER:
-                cost = NEVER
-        cost_out[row, c] = cost
+    if world < 0:
+        return
+    for c in range(known):
+        if misfit[world, c] >= NEVER:
+            cost[row, c] = NEVER
+        else:
+            cost[row, c] = misfit[world, c] + share * (cost[row, c] - misfit[world, c])
     for k in range(pose.shape[1]):
         best = wp.int32(0)
         least = 2.0 * NEVER
         for c in range(found_in.shape[1]):
-            cost = cost_out[row, c]
+            weighed = cost[row, c]
             if c == 0 and known > 0:
-                cost = stay * cost
-            if cost < least:
+                weighed = stay * weighed
+            if weighed < least:
                 best = c
-                least = cost
-        misfit[world, k] = wp.min(cost_out[row, best], NEVER)
+                least = weighed
+        misfit[world, k] = wp.min(cost[row, best], NEVER)
         pose[world, k] = found_in[row, best]
         turn = wp.transform_get_rotation(found_in[row, best])
         for c in range(found_in.shape[1]):
             cosine = wp.abs(wp.dot(turn, wp.transform_get_rotation(found_in[row, c])))
             if c == best or 2.0 * wp.acos(wp.min(cosine, 1.0)) < apart:
-                cost_out[row, c] = NEVER
+                cost[row, c] = NEVER

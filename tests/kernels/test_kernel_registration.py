@@ -293,11 +293,39 @@ def test_the_best_poses_that_differ_are_kept(device, seed, known):
             kept if known else 0,
             device_array(scene.row_world, int, device),
             device_array(found, wp.transform, device),
-            device_array(misfit, float, device),
         ],
-        outputs=[*arrays, unwritten(misfit.shape, float, device)],
+        outputs=[device_array(misfit, float, device), *arrays],
         device=device,
     )
     np.testing.assert_allclose(arrays[1].numpy(), np.minimum(expected, NEVER), rtol=1e-5)
     there = np.isfinite(expected_pose)
     np.testing.assert_allclose(arrays[0].numpy()[there], expected_pose[there], atol=1e-6)
+
+
+def test_rows_of_no_world_are_left_out(device):
+    """They are neither placed nor improved nor kept, in a launch that is of all rows."""
+    scene = Scene(0)
+    before, rows = scene.pose.copy(), scene.pose.shape[:2]
+    scene.row_world = np.full(len(scene.row_world), -1)
+    row_world, seen, count = scene.inputs(device)
+    started, misfit = unwritten(rows, wp.transform, device), unwritten(rows, float, device)
+    pose, background = (
+        device_array(before, wp.transform, device),
+        device_array(scene.background, float, device),
+    )
+    shapes, eye, first = scene.model(device), scene.camera(), wp.zeros(rows[0], dtype=int, device=device)
+    rotation = device_array(np.eye(4)[3:], wp.quat, device)
+    starting = [shapes, eye, 1, 1, row_world, first, rotation, seen, count]
+    wp.launch(start_poses_kernel, dim=rows, inputs=starting, outputs=[started], device=device)
+    fitting = [shapes, eye, FAR, 1, 1, 1, row_world, seen, count, background]
+    wp.launch(fit_poses_kernel, dim=rows, inputs=fitting, outputs=[pose, misfit], device=device)
+    kept, average = (
+        unwritten((scene.worlds, 2), wp.transform, device),
+        wp.zeros((scene.worlds, 2), dtype=float, device=device),
+    )
+    keeping = [0.3, 0.8, 0.1, 0, row_world, pose]
+    outputs = [misfit, kept, average]
+    wp.launch(keep_poses_kernel, dim=rows[0], inputs=keeping, outputs=outputs, device=device)
+    for array in (started, misfit, kept):
+        assert np.isnan(array.numpy()).all()
+    np.testing.assert_array_equal(pose.numpy(), np.float32(before))

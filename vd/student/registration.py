@@ -135,6 +135,11 @@ class Registration:
         self.pose[..., 6] = 1.0
         self.misfit = torch.zeros((worlds, KEPT), device=place)
         self.looks = torch.zeros(worlds, dtype=torch.int32, device=place)
+        self._kept = [wp.from_torch(self.pose, dtype=wp.transform), wp.from_torch(self.misfit)]
+        self._worlds = torch.arange(worlds, dtype=torch.int32, device=place)
+        # What a later look fits: poses kept before, and others.
+        self._found = wp.empty((worlds, KEPT + OTHERS), dtype=wp.transform, device=device)
+        self._cost = wp.empty(self._found.shape, dtype=float, device=device)
 
     def look(
         self,
@@ -163,73 +168,58 @@ class Registration:
             cloud = wp.from_torch(points.contiguous(), dtype=wp.vec3)
             self._launch(background_kernel, cloud.shape, [self._eye, cloud], [self._background])
         self.looks.masked_fill_(fresh, 0)
-        for known in (False, True):
-            rows = (((self.looks > 0) == known) & (count > 0)).nonzero().flatten()
-            if len(rows):
-                self._find(rows, inputs, known=known)
-        self.looks += (count > 0).int()
+        seen_now, known = count > 0, self.looks > 0
+        self._follow(wp.from_torch(torch.where(known & seen_now, self._worlds, -1)), inputs)
+        first = (~known & seen_now).nonzero().flatten()  # waits for the device
+        if len(first):
+            self._find(wp.from_torch(self._worlds[first]), inputs)
+        self.looks += seen_now.int()
 
-    def _find(self, worlds: torch.Tensor, inputs: list[wp.array], *, known: bool) -> None:
-        """Find the objects of some worlds, which were all found before or all were not."""
-        looks, rows = self.looks[worlds], wp.from_torch(worlds.int())
-        if known:
-            others = self._start(rows, (looks * STRIDE) % ROTATIONS, OTHERS, inputs)
-            found = torch.cat([self.pose[worlds], others], dim=1)
-            misfit = self._fit(found, rows, STEPS, 1, inputs)
-        else:
-            tried = self._start(rows, looks, ROTATIONS, inputs)
-            misfit = self._fit(tried, rows, FIRST_STEPS, FIRST_EVERY, inputs)
-            best = misfit.topk(CHOSEN, dim=1, largest=False).indices
-            found = tried.gather(1, best[..., None].expand(-1, -1, tried.shape[-1]))
-            misfit = self._fit(found, rows, CHOSEN_STEPS, 1, inputs)
-        kept = [wp.from_torch(self.pose, dtype=wp.transform), wp.from_torch(self.misfit)]
-        scratch = wp.empty(misfit.shape, dtype=float, device=self.device)
-        self._launch(
-            keep_poses_kernel,
-            len(worlds),
-            [
-                APART_RAD,
-                STAY,
-                SHARE,
-                KEPT if known else 0,
-                rows,
-                wp.from_torch(found, dtype=wp.transform),
-                wp.from_torch(misfit),
-            ],
-            [*kept, scratch],
+    def _find(self, worlds: wp.array, inputs: list[wp.array]) -> None:
+        """Find the objects of some worlds, of which nothing is known."""
+        first = wp.zeros(len(worlds), dtype=int, device=self.device)
+        tried = wp.empty((len(worlds), ROTATIONS), dtype=wp.transform, device=self.device)
+        cost = wp.empty(tried.shape, dtype=float, device=self.device)
+        self._start(tried, worlds, first, inputs)
+        self._fit(tried, cost, worlds, FIRST_STEPS, FIRST_EVERY, inputs)
+        best = wp.to_torch(cost).topk(CHOSEN, dim=1, largest=False).indices
+        poses = wp.to_torch(tried)
+        chosen = wp.from_torch(
+            poses.gather(1, best[..., None].expand(-1, -1, poses.shape[-1])), dtype=wp.transform
         )
+        cost = wp.empty(chosen.shape, dtype=float, device=self.device)
+        self._fit(chosen, cost, worlds, CHOSEN_STEPS, 1, inputs)
+        self._keep(0, worlds, chosen, cost)
 
-    def _start(
-        self, worlds: wp.array, first: torch.Tensor, count: int, inputs: list[wp.array]
-    ) -> torch.Tensor:
-        """Poses in so many rotations, from the given ones on [M, count, 7]."""
-        pose = wp.empty((len(worlds), count), dtype=wp.transform, device=self.device)
-        model = [self._shapes, self._eye, int(self._rendered), EVERY_SAMPLE, worlds, wp.from_torch(first)]
+    def _follow(self, worlds: wp.array, inputs: list[wp.array]) -> None:
+        """Go on from the kept poses, and try a few others; a row for each world, -1 where it is left out."""
+        wp.copy(self._found[:, :KEPT], self._kept[0])
+        first = wp.from_torch((self.looks * STRIDE) % ROTATIONS)
+        self._start(self._found[:, KEPT:], worlds, first, inputs)
+        self._fit(self._found, self._cost, worlds, STEPS, 1, inputs)
+        self._keep(KEPT, worlds, self._found, self._cost)
+
+    def _start(self, pose: wp.array, worlds: wp.array, first: wp.array, inputs: list[wp.array]) -> None:
+        """Write poses [M, C] in so many rotations, from the given ones on."""
+        model = [self._shapes, self._eye, int(self._rendered), EVERY_SAMPLE, worlds, first]
         self._launch(start_poses_kernel, pose.shape, [*model, self._rotations, *inputs], [pose])
-        return wp.to_torch(pose)
 
     def _fit(
-        self, pose: torch.Tensor, worlds: wp.array, steps: int, every: int, inputs: list[wp.array]
-    ) -> torch.Tensor:
-        """Improve poses [M, C, 7] in place; their misfits [M, C]."""
-        misfit = torch.empty(pose.shape[:2], device=pose.device)
+        self, pose: wp.array, cost: wp.array, worlds: wp.array, steps: int, every: int, inputs: list[wp.array]
+    ) -> None:
+        """Improve poses [M, C], and write their misfits."""
+        sizes = [FAR_M, steps, every, EVERY_SAMPLE]
         self._launch(
             fit_poses_kernel,
-            misfit.shape,
-            [
-                self._shapes,
-                self._eye,
-                FAR_M,
-                steps,
-                every,
-                EVERY_SAMPLE,
-                worlds,
-                *inputs,
-                self._background,
-            ],
-            [wp.from_torch(pose, dtype=wp.transform), wp.from_torch(misfit)],
+            pose.shape,
+            [self._shapes, self._eye, *sizes, worlds, *inputs, self._background],
+            [pose, cost],
         )
-        return misfit
+
+    def _keep(self, known: int, worlds: wp.array, found: wp.array, cost: wp.array) -> None:
+        """Keep the best of poses [M, C], the first of which were kept before."""
+        inputs = [APART_RAD, STAY, SHARE, known, worlds, found]
+        self._launch(keep_poses_kernel, len(worlds), inputs, [cost, *self._kept])
 
     def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
