@@ -4,6 +4,7 @@ A contract that scripts rely on: effect and parameter names are those of USD att
 command lines. Physics: :mod:`vd.kernels.actuators`.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import vd.kernels.actuators as servo
@@ -212,10 +213,25 @@ ON_A_PENDULUM: dict[str, tuple[str, ...]] = {"encoder_bias": ("gravity_load",)}
 """The same on a pendulum, whose load hangs from the joint: whether its zero is not where the arm hangs, or a
 further load hangs off the arm, positions and commands are the same."""
 
+BESIDE: dict[str, dict[str, tuple[str, ...]]] = {
+    "stribeck_friction": {"encoder_bias": ("asymmetric_friction",)}
+}
+"""Effects that stand for others beside a certain one: Stribeck friction and friction with a direction are
+Stribeck friction, higher by the mean of both sides, and an offset that pulls by half their difference."""
 
-def equivalent(model: str) -> dict[str, tuple[str, ...]]:
-    """Effects that stand for others on recordings of a model."""
-    return {**EQUIVALENT, **ON_A_PENDULUM} if model == "pendulum" else EQUIVALENT
+
+def equivalent(model: str, beside: Iterable[str] = ()) -> dict[str, tuple[str, ...]]:
+    """Effects that stand for others.
+
+    Args:
+        model: Model of the recording.
+        beside: Effects that are there as well.
+    """
+    result = {**EQUIVALENT, **ON_A_PENDULUM} if model == "pendulum" else {**EQUIVALENT}
+    for other in beside:
+        for name, same in BESIDE.get(other, {}).items():
+            result[name] = (*result.get(name, ()), *same)
+    return result
 
 
 TOGETHER: dict[str, tuple[str, ...]] = {

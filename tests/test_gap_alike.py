@@ -10,8 +10,8 @@ from test_gap_judge import FLOOR, made_up
 
 import vd.kernels.actuators as servo
 from vd.gap.chain import candidates
-from vd.gap.coordinates import Scales
-from vd.gap.explanation import Explanation, lacking
+from vd.gap.coordinates import Coordinate, Scales
+from vd.gap.explanation import Explanation, Trial, lacking
 from vd.gap.fit import JointProblem
 from vd.gap.hide import Hiding, simulate_hidden
 from vd.gap.joint_fit import JointFit
@@ -41,6 +41,10 @@ class Servo:
 
     def explain(self, like: tuple[tuple[str, ...], dict[str, float]]) -> Explanation:
         """What a search finds that knows what another joint lacks."""
+        return self.selection(like).explain(self.baseline)
+
+    def selection(self, like: tuple[tuple[str, ...], dict[str, float]]) -> Selection:
+        """The search."""
         self.fits = 0
 
         def run(calls: list) -> list:
@@ -57,7 +61,7 @@ class Servo:
             scales=self.scales,
             refits=3,
             like=like,
-        ).explain(self.baseline)
+        )
 
 
 def test_a_joint_lacks_what_another_of_its_finger_lacks_where_that_leaves_noise() -> None:
@@ -103,6 +107,54 @@ def test_on_a_pendulum_a_load_off_the_arm_and_an_offset_of_the_encoder_are_one(t
     assert "stands for gravity load too" in verdict_sentence(report)
 
 
+STRIBECK = {servo.STRIBECK_STATIC: 0.13, servo.STRIBECK_SLIDING: 0.07, servo.STRIBECK_SPEED: 0.4}
+PULL_NM = 0.02
+"""Of an offset: half the difference of both sides of the friction that moves the joint alike."""
+
+
+def test_beside_stribeck_friction_an_offset_moves_a_joint_as_friction_with_a_direction_does() -> None:
+    problem = problem_of(recorded({}))
+    plain = problem.rollouts.chain.start_row.copy()
+    plain[0, list(TRUE)] = list(TRUE.values())
+    offset, sides = plain.copy(), plain.copy()
+    offset[0, list(STRIBECK)] = list(STRIBECK.values())
+    sides[:] = offset
+    offset[0, servo.ENCODER_BIAS] = PULL_NM / TRUE[servo.KP]
+    sides[0, [servo.STRIBECK_STATIC, servo.STRIBECK_SLIDING]] -= PULL_NM
+    sides[0, servo.FRICTION_MINUS] = 2.0 * PULL_NM
+    paths = problem.rollouts.predict(np.stack([offset, sides, plain]))
+    assert np.abs(paths[0] - paths[1]).max() < 1e-6
+    assert np.abs(paths[0] - paths[2]).max() > 1e-2
+
+
+@pytest.mark.parametrize("hidden", [{servo.ENCODER_BIAS: 0.008}, {servo.FRICTION_PLUS: 0.05}])
+def test_beside_stribeck_friction_an_offset_stands_for_friction_with_a_direction(
+    hidden: dict[int, float], tmp_path: Path
+) -> None:
+    chosen = ("stribeck_friction", "asymmetric_friction", "coulomb_friction", "encoder_bias", "command_delay")
+    report = explain(recorded({**STRIBECK, **hidden}), None, tmp_path, effects=chosen, workers=1)
+    assert {effect.name for effect in report.effects} == {"stribeck_friction", "encoder_bias"}
+    assert report.ambiguous == (("encoder_bias", "asymmetric_friction"),)
+    assert report.open_sets == () and report.next_experiment == ""
+    assert "Encoder bias stands for asymmetric friction too" in verdict_sentence(report)
+
+
+def test_an_offset_that_pulls_more_than_friction_holds_is_no_friction() -> None:
+    keys = ("encoder_bias.bias_rad", "stribeck_friction.tau_c_nm")
+    rows = np.zeros((1, servo.PARAMETER_COLUMNS))
+    rows[0, servo.KP] = 3.0
+    search = Servo().selection(((), {}))
+    for sliding, same in ((0.03, ("asymmetric_friction",)), (0.02, ())):
+        fit = replace(
+            made_up(("stribeck_friction", "encoder_bias"), FLOOR),
+            coordinates=tuple(Coordinate(key, 0, False, 1.0, -9.0, 9.0) for key in keys),
+            x=np.array([-0.008, sliding]),
+            rows=rows,
+        )
+        assert search.same_beside(fit, "encoder_bias") == same
+        assert search.same_beside(fit, "stribeck_friction") == ()
+
+
 def test_a_finer_problem_is_simulated_with_the_step_of_finished_estimates() -> None:
     problem = problem_of(recorded({servo.TORQUE_LIMIT: 0.8}))
     row = problem.rollouts.chain.start_row.copy()
@@ -117,8 +169,11 @@ def test_a_finer_problem_is_simulated_with_the_step_of_finished_estimates() -> N
     assert one.x == pytest.approx(other.x), "refined as before"
 
 
+@pytest.mark.parametrize("restarts", [0, 1], ids=["first search", "another"])
 @pytest.mark.parametrize(("refined", "again"), [(0.8, True), (0.95, False)])
-def test_a_search_that_its_time_step_holds_up_is_made_with_a_finer_one(refined: float, again: bool) -> None:
+def test_a_search_that_its_time_step_holds_up_is_made_with_a_finer_one(
+    refined: float, again: bool, restarts: int
+) -> None:
     baseline, found = made_up((), 0.1), made_up(("acceleration_limit",), 1.5 * FLOOR)
     asked = []
 
@@ -139,9 +194,14 @@ def test_a_search_that_its_time_step_holds_up_is_made_with_a_finer_one(refined: 
         others=(),
         candidates=(),
         scales=Scales(3.0, 0.5, 2.0, 6.0, 70.0, 1e-3, 1e-3, 12.0),
-        restarts=0,
+        restarts=restarts,
     )
-    selection.first = lambda _: (found, {"acceleration_limit": [found]}, [])  # type: ignore[method-assign]
+    result = found, {"acceleration_limit": [found]}, []
+    far = made_up(("torque_limit",), 20.0 * FLOOR)
+    rows = [Trial(1, "acceleration_limit", made_up(found.effects, 0.05), 0.5, (0.4, 0.6), "tied")]
+    first = result if not restarts else (far, {"torque_limit": [far]}, rows)
+    selection.first = lambda _: first  # type: ignore[method-assign]
+    selection.search = lambda *_: result  # type: ignore[method-assign]
     assert selection.too_coarse(found) == again
     with pytest.raises(EndError):
         selection.explain(baseline)

@@ -87,7 +87,7 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
     sets = [list(group) for group in report["ambiguous"]]
     right = set(case.effects) | (set(MASS_EFFECTS) if case.change == "mass" else set())
     # The name that stands for a hidden effect is right if the report says that it does.
-    stands = {other: name for name, others in equivalent(case.model).items() for other in others}
+    stands = {o: name for name, others in equivalent(case.model, named).items() for o in others}
     right |= {stands[n] for n in case.effects if n in stands and any(n in group for group in sets)}
     # So is one that is the same as the hidden ones together, if the report says that.
     stood_for = {

@@ -362,7 +362,7 @@ def _open_sets(joint: Analysed) -> tuple[tuple[str, ...], ...]:
 
 def _next(joints: Sequence[Analysed], model: str) -> str:
     named = {a.name for j in joints for a in j.explanation.accepted if a.named}
-    same = equivalent(model)
+    same = equivalent(model, named)
     closed = {n: {*same.get(n, ()), *(TOGETHER.get(n, ()) if n in named else ())} for n in EFFECTS}
     sets = [group for group in _sets(joints) if set(group[1:]) - closed[group[0]]]
     if sets:

@@ -309,7 +309,7 @@ class Report:
         several together (:data:`TOGETHER`).
         """
         named = {effect.name for effect in self.effects}
-        same = equivalent(self.recording.model)
+        same = equivalent(self.recording.model, named)
 
         def closed(group: tuple[str, ...]) -> bool:
             both = set(TOGETHER.get(group[0], ())) if group[0] in named else set()

@@ -3,31 +3,25 @@
 A step of the search is tentative; :mod:`vd.gap.verdict` has the last word.
 """
 
-import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-import vd.kernels.actuators as servo
-from vd.gap.candidates import BETTER, FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIONS, Call, CandidateFits
+from vd.gap.candidates import BETTER, HOPELESS, Call
 from vd.gap.chance import try_random
 from vd.gap.consensus import as_another
-from vd.gap.coordinates import sizes
 from vd.gap.explanation import Accepted, Explanation, Trial
+from vd.gap.frictions import EXACTLY, Frictions
 from vd.gap.jitter import CALLS
-from vd.gap.joint_fit import JointFit
+from vd.gap.joint_fit import ONE_SIDED, JointFit
 from vd.gap.judge import EXPLAINED, NESTED, RANDOM, REPEATABLE
 from vd.gap.telemetry import BEHIND_SENSOR
-from vd.gap.verdict import Verdicts, cancelled
+from vd.gap.verdict import cancelled
 
 MIN_TRAJECTORIES = 3
 MAX_EFFECTS = 3
-FRICTION_AND_LOAD = "asymmetric_friction"
-"""The effect that is also what two others do together (:meth:`Selection.take_apart`)."""
-EXACTLY = {"coulomb_friction", "encoder_bias"}
-"""The two of them that move a joint exactly as it does: what one fits better, the integrator has done."""
 MAX_ROUNDS = 6
 """Rounds in all, with those after a revision."""
 WIDE = 15.0
@@ -53,21 +47,17 @@ earned is not lost to the luck of another local fit."""
 
 
 @dataclass(kw_only=True)
-class Selection(CandidateFits, Verdicts):
+class Selection(Frictions):
     """Forward selection for one joint.
 
     Attributes:
         restarts: Searches from another first effect, where the first search leaves a gap.
-        report: Called with a line of progress.
-        rest: Where the joint rests before it moves [rad].
         looks: Rounds in which every start may be tried (:meth:`look_wider`).
         wide: Whether more is tried than the best starts and one effect after the other.
         like: What another joint of the finger certainly lacks: effects, and values by key.
     """
 
     restarts: int = RESTARTS
-    report: Callable[[str], None] = lambda line: None
-    rest: float = 0.0
     looks: int = LOOKS
     wide: bool = True
     like: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
@@ -90,16 +80,13 @@ class Selection(CandidateFits, Verdicts):
             return known
         trials = self.contradicted(baseline)
         present, rivals, rows = self.first(baseline)
-        if self.too_coarse(present):
-            self.report(f"{' and '.join(present.effects)}: the time step shows, so again with a finer one")
-            fine = self.finer()
-            return fine.explain(fine.run([fine.plain(baseline)])[0])
         trials += rows
         alone = [t for t in rows if t.round == 1 and len(t.fit.effects) == 1]
         first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
         tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
         for name in sorted(first, key=lambda n: first[n].rmse):
-            if present.effects and (self.no_gap(present) or self.noise_only(present)):
+            ended = self.no_gap(present) or self.noise_only(present) or self.too_coarse(present)
+            if present.effects and ended:
                 break
             # Far from the floor another path would change little, unless its beginning was as good.
             far = present.effects and present.held_out_rmse >= NEAR * self.floor
@@ -112,6 +99,10 @@ class Selection(CandidateFits, Verdicts):
                 self.report(f"from {name}: {1e3 * other.held_out_rmse:.2f} mrad held out is better")
                 present, rivals = other, fits
                 trials += [replace(row, round=row.round + MAX_ROUNDS) for row in rows]
+        if self.too_coarse(present):
+            self.report(f"{' and '.join(present.effects)}: the time step shows, so again with a finer one")
+            fine = self.finer()
+            return fine.explain(fine.run([fine.plain(baseline)])[0])
         if present.effects:
             earned, why = self.better(baseline, present)
             if not earned:
@@ -129,7 +120,7 @@ class Selection(CandidateFits, Verdicts):
                 present, rivals = chance, {}
                 if RANDOM not in present.effects:
                     present, rivals = self.revise(present)
-        together = self.put_together(present)
+        together = self.as_an_offset(self.put_together(present))
         if together is not present:
             present = together
             rivals = {name: self.rivals(present, name) for name in present.effects}
@@ -266,7 +257,7 @@ class Selection(CandidateFits, Verdicts):
             if not accepted:
                 break
             room = MAX_EFFECTS - len(present.effects)
-            both = fits.get(FRICTION_AND_LOAD)
+            both = fits.get(ONE_SIDED)
             # What explains everything needs no two in its place, unless it is what two do together; nor do
             # two explain what both as one are far from.
             open_ = best is both or (self.wide and best.rmse > EXPLAINED * self.floor)
@@ -274,7 +265,7 @@ class Selection(CandidateFits, Verdicts):
                 apart = self.take_apart(present, both)
                 pair = self.winner(apart) if apart else best
                 if apart and best is both:
-                    self.apart[FRICTION_AND_LOAD] = pair
+                    self.apart[ONE_SIDED] = pair
                 better = int(np.argmin(self.scores([best, pair]))) == 1
                 same = best is both and {*pair.effects[-2:]} == EXACTLY
                 if better and not self.tied(pair, best, same)[0]:  # in a tie one effect is simpler than two
@@ -338,78 +329,6 @@ class Selection(CandidateFits, Verdicts):
         if float(np.quantile(self.weights @ (before.sse - after.sse), 0.025)) <= 0.0:
             return False
         return bool(self.lack_of_fit(self.refined(before))) and not self.lack_of_fit(self.refined(after))
-
-    def take_apart(self, present: JointFit, asymmetric: JointFit) -> list[JointFit]:
-        """Fits with asymmetric friction taken apart: dry friction or a dead zone, and a load or an offset.
-
-        Friction that differs between the directions is the same as friction that does not and a constant
-        torque. Each alone can make motions worse, so that one after the other they would not be found.
-        """
-        plus, minus = (asymmetric.values[f"{FRICTION_AND_LOAD}.tau_{side}_nm"] for side in ("plus", "minus"))
-        load = 0.5 * (minus - plus)
-        level = 0.5 * (plus + minus)
-        dry = {
-            "coulomb_friction": {"coulomb_friction.tau_c_nm": level},
-            "dead_zone": {"dead_zone.width_rad": 2.0 * level / self.scales.kp},
-        }
-        base = {k: v for k, v in asymmetric.values.items() if not k.startswith(FRICTION_AND_LOAD)}
-        starts = {
-            "gravity_load": {
-                "gravity_load.tau_g_nm": abs(load),
-                "gravity_load.phase_rad": -0.5 * np.pi * np.sign(load),
-            },
-            "encoder_bias": {"encoder_bias.bias_rad": load / self.scales.kp},
-        }
-        usable = {*self.candidates} - {*present.effects, *self.vetoes}
-        calls = []
-        for friction, name in itertools.product(dry, starts):
-            if not {friction, name} <= usable:
-                continue
-            others = sizes(name, self.others, self.scales)
-            given = [{**base, **dry[friction], **start} for start in (starts[name], *others)]
-            calls.append(self.call(present, (friction, name), given, SCREEN_ITERATIONS))
-        screened = self.run(calls)
-        least = min((fit.rmse for fit in screened), default=0.0)
-        near = [fit for fit in screened if fit.rmse < HOPELESS * least]
-        return self.run([self.call(present, f.effects[-2:], [f.values], FULL_ITERATIONS) for f in near])
-
-    def put_together(self, present: JointFit) -> JointFit:
-        """The model with asymmetric friction in the place of dry friction and an offset, if that is as good.
-
-        One cause is simpler than two that are the same as it.
-        """
-        usable = {*self.candidates} - {*present.effects, *self.vetoes}
-        parts = [
-            {friction, offset}
-            for friction in ("coulomb_friction", "dead_zone")
-            for offset in ("encoder_bias", "gravity_load")
-            if {friction, offset} <= {*present.effects}
-        ]
-        if not parts or FRICTION_AND_LOAD not in usable or RANDOM in present.effects:
-            return present
-        kept = [name for name in present.effects if name not in parts[0]]
-        without = self.refit(present, kept)
-        given = [self.both_ways(present), *sizes(FRICTION_AND_LOAD, self.others, self.scales)]
-        starts = self.starts(without, given)
-        fit = self.run([self.call(without, FRICTION_AND_LOAD, starts, FULL_ITERATIONS)])[0]
-        if fit.at_bound or not self.tied(present, fit, parts[0] == EXACTLY)[0]:
-            return present
-        self.report(f"~ {' and '.join(sorted(parts[0]))} are {FRICTION_AND_LOAD}")
-        self.apart[FRICTION_AND_LOAD] = present
-        return fit
-
-    def both_ways(self, present: JointFit) -> dict[str, float]:
-        """The asymmetric friction that dry friction or a dead zone and an offset of a model are together."""
-        values, kp = present.values, float(present.rows[self.joint, servo.KP])
-        level = values.get("coulomb_friction.tau_c_nm", 0.5 * kp * values.get("dead_zone.width_rad", 0.0))
-        load = kp * values.get("encoder_bias.bias_rad", 0.0)
-        if "gravity_load" in present.effects:
-            angle = self.rest + values["gravity_load.phase_rad"]
-            load -= values["gravity_load.tau_g_nm"] * float(np.sin(angle))
-        return {
-            f"{FRICTION_AND_LOAD}.tau_plus_nm": max(level - load, 0.0),
-            f"{FRICTION_AND_LOAD}.tau_minus_nm": max(level + load, 0.0),
-        }
 
     def judge(
         self,

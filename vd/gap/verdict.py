@@ -7,7 +7,7 @@ import numpy as np
 
 import vd.kernels.actuators as servo
 from vd.gap.explanation import NAMED, Accepted, Explanation, Trial, estimates, intervals
-from vd.gap.joint_fit import JointFit
+from vd.gap.joint_fit import ONE_SIDED, JointFit
 from vd.gap.judge import (
     AT_FLOOR,
     FORMS,
@@ -20,6 +20,7 @@ from vd.gap.judge import (
     SHARP,
     Judge,
 )
+from vd.kernels.effects import BESIDE
 
 UNEXPLAINED = 1.5
 """A baseline beyond this factor of the noise floor has a gap, whether or not an effect explains it."""
@@ -46,10 +47,12 @@ class Verdicts(Judge):
     Attributes:
         equivalent: Effects that one stands for, since the recording cannot tell them apart.
         apart: Fits with several effects in the place of one that they are together, by its name.
+        joint: Index of the joint in its chain.
     """
 
     equivalent: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     apart: dict[str, JointFit] = field(default_factory=dict)
+    joint: int = 0
 
     def undetermined(self, fit: JointFit) -> str:
         """Which parameter of the baseline the motions leave open, in words; empty if none."""
@@ -197,7 +200,8 @@ class Verdicts(Judge):
         """Confidence and set of one effect of the final model, with the values ``told``."""
         own = next((fit for fit in rivals if fit.effects and fit.effects[-1] == name), None)
         mine = final if own is None or any(fit is final for fit in rivals) else own
-        others = [fit for fit in rivals if fit is not mine and fit.effects[-1] != name]
+        means = (*self.equivalent.get(name, ()), *self.same_beside(final, name))
+        others = [fit for fit in rivals if fit is not mine and fit.effects[-1] not in (name, *means)]
         white = self.white(mine)
         choice = np.argmin(self.scores([mine, *others], self.weights, fitted=white), axis=0)
         simple = {i + 1 for i, fit in enumerate(others) if name in NESTED.get(fit.effects[-1], ())}
@@ -221,7 +225,7 @@ class Verdicts(Judge):
         if share < NAMED and not tied:
             rival = int(np.argmax(np.bincount(choice, minlength=len(others) + 1)[1:]))
             tied.append(others[rival].effects[-1])
-        split, means = self.apart.get(name), tuple(self.equivalent.get(name, ()))
+        split = self.apart.get(name)
         if split is not None and {*split.effects} > {*final.effects} - {name}:
             same, _ = self.tied(mine, split, loose=True)
             means += tuple(other for other in split.effects if same and other not in final.effects)
@@ -234,6 +238,16 @@ class Verdicts(Judge):
             tied=tuple(tied),
             at_bound=any(key.startswith(f"{name}.") for key in final.at_bound),
         )
+
+    def same_beside(self, final: JointFit, name: str) -> tuple[str, ...]:
+        """Effects that move the joint as one does beside the others of a model (:data:`BESIDE`)."""
+        same = [other for one in final.effects for other in BESIDE.get(one, {}).get(name, ())]
+        if ONE_SIDED in same:
+            # A side of friction cannot push: it is at most what is dry in all.
+            level = final.values.get("stribeck_friction.tau_c_nm", 0.0)
+            pull = abs(final.values["encoder_bias.bias_rad"]) * float(final.rows[self.joint, servo.KP])
+            same = [other for other in same if other != ONE_SIDED or pull <= level]
+        return tuple(same)
 
 
 def explains(names: Sequence[str]) -> str:
