@@ -11,6 +11,7 @@ from test_gap_judge import FLOOR, made_up
 
 import vd.kernels.actuators as servo
 from vd.gap import chance
+from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.chain import chains
 from vd.gap.chance import with_random
 from vd.gap.coordinates import Coordinate, Scales
@@ -302,6 +303,12 @@ def test_the_simpler_of_two_stands_for_the_other_only_if_it_is_earned(named: str
     assert longer.effects[1] == named and trials[0].round == 1
 
 
+def friction(torque: float, error: float) -> JointFit:
+    """A made-up fit with Coulomb friction of a given torque."""
+    key = Coordinate("coulomb_friction.tau_c_nm", servo.COULOMB_TORQUE, False, 1.0, 0.0, 10.0)
+    return replace(made_up(("coulomb_friction",), error), coordinates=(key,), x=np.array([torque]))
+
+
 def test_a_fit_that_is_worse_than_without_begins_anew_nearly_off() -> None:
     present = made_up((), 0.010)
     begun = []
@@ -312,9 +319,9 @@ def test_a_fit_that_is_worse_than_without_begins_anew_nearly_off() -> None:
             if name == "promise":
                 answers.append(np.linspace(0.9, 0.1, len(call["starts"])))
                 continue
-            starts = [s.get("coulomb_friction.tau_c_nm", 1.0) for s in call["starts"]]
+            starts = [s["coulomb_friction.tau_c_nm"] for s in call["starts"]]
             begun.append(starts)
-            answers.append(made_up(call["effects"], 0.02 if starts[0] > 0.01 else 0.006))
+            answers.append(friction(starts[0], 0.02 if starts[0] > 0.01 else 0.006))
         return answers
 
     selection, _ = searching([])
@@ -322,7 +329,59 @@ def test_a_fit_that_is_worse_than_without_begins_anew_nearly_off() -> None:
     selection.scales = Scales(1.0, 1.0, 2.0, 3.0, 10.0, 1e-3, 0.01, 6.0)
     fits = selection.fit_candidates(present)
     assert fits["coulomb_friction"].rmse == pytest.approx(0.006)
-    assert begun[-1] == [pytest.approx(0.1 * begun[0][0])]
+    assert begun[-2] == begun[-1] == [pytest.approx(0.1 * begun[0][0])], "and is fitted to the end from there"
+
+
+def test_what_does_nothing_is_not_fitted_to_the_end() -> None:
+    """Half way one effect has removed a third of the error and another nothing; noise is far below both."""
+    present, ended = made_up((), 0.010), []
+
+    def run(calls: list) -> list:
+        answers = []
+        for name, call in calls:
+            if name == "promise":
+                answers.append(np.linspace(0.9, 0.1, len(call["starts"])))
+                continue
+            effect = call["effects"][-1]
+            if call["iterations"] == FULL_ITERATIONS:
+                ended.append(effect)
+            answers.append(made_up(call["effects"], 0.007 if effect == "backlash" else 0.00995))
+        return answers
+
+    selection, _ = searching([])
+    selection.run, selection.candidates = run, ("backlash", "dead_zone")
+    selection.scales = Scales(1.0, 1.0, 2.0, 3.0, 10.0, 1e-3, 0.01, 6.0)
+    fits = selection.fit_candidates(present)
+    assert ended == ["backlash"] and set(fits) == {"backlash", "dead_zone"}
+    ended.clear()
+    selection.candidates = ("dead_zone",)
+    selection.fit_candidates(present)
+    assert ended == ["dead_zone"], "the best of a round is"
+
+
+def test_what_was_tried_in_the_place_of_the_last_effect_is_not_tried_again() -> None:
+    """An effect was chosen from those of a round; what stands in its place was fitted there."""
+    asked: list[str] = []
+    before, present = made_up(("backlash",), 0.010), made_up(("backlash", "coulomb_friction"), 0.004)
+    other = made_up(("backlash", "command_delay"), 0.006)
+
+    selection, _ = searching([])
+    selection.refit = lambda fit, effects: made_up(tuple(effects), 0.010)  # type: ignore[method-assign]
+
+    def fit_candidates(without: JointFit, **_: object) -> dict[str, JointFit]:
+        asked.extend(without.effects)
+        return {}
+
+    selection.fit_candidates = fit_candidates  # type: ignore[method-assign, assignment]
+    selection.added = {frozenset({"backlash"}): (before, other, present)}
+    assert selection.rivals(present, "coulomb_friction") == [present, other]
+    assert asked == []
+    selection.rivals(present, "backlash")
+    assert asked == ["coulomb_friction"], "but in the place of the one before it all are tried"
+    asked.clear()
+    selection.refit = lambda fit, effects: made_up(tuple(effects), 0.008)  # type: ignore[method-assign]
+    selection.rivals(present, "coulomb_friction")
+    assert asked == ["backlash"], "and all are tried beside a better fit than the round began with"
 
 
 @pytest.mark.parametrize(("promised", "found"), [(0.9, 0.0015), (0.1, 0.004)])

@@ -9,6 +9,7 @@ import numpy as np
 from vd.gap.coordinates import Scales, best_two, sizes, smaller, torque_power
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import AT_FLOOR, EXPLAINED, RANDOM, SHARP
+from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.effects import EFFECTS, equivalent
 
 SHORT_LIST = 10
@@ -23,6 +24,9 @@ BEHIND = 3.0
 """Finalists have at most this many times the error of the best after screening."""
 HOPELESS = 1.5
 """The same factor half way: those beyond it are not fitted to the end."""
+IDLE = 0.99
+"""Share of the error before it that a further effect leaves at least half way if it does nothing: where more
+than noise is left such a fit is not finished either."""
 SCREEN_ITERATIONS = 6
 HALF_ITERATIONS = 4
 FULL_ITERATIONS = 12
@@ -65,6 +69,8 @@ class CandidateFits:
         vetoes: Effects that telemetry contradicts, with the reason.
         nominal: Nominal values of the baseline's parameters, by key.
         promised: Share of the squared error that each candidate of the last round could remove at best.
+        added: The last fits with one more effect, by the effects of the model to which it was added: that
+            model first.
         veiled: Whether the samples are seen through what chance does to them.
         fine: Whether rollouts have the step at which estimates are finished.
     """
@@ -80,6 +86,7 @@ class CandidateFits:
     vetoes: Mapping[str, str] = field(default_factory=dict)
     nominal: Mapping[str, float] = field(default_factory=dict)
     promised: dict[str, float] = field(default_factory=dict)
+    added: dict[frozenset[str], tuple[JointFit, ...]] = field(default_factory=dict)
     veiled: bool = False
     fine: bool = False
 
@@ -145,7 +152,10 @@ class CandidateFits:
 
         if len(finalists) > 1 or np.isfinite(least):
             finalists = sorted(go_on(finalists, HALF_ITERATIONS), key=lambda fit: fit.rmse)
-        near = [fit for fit in finalists if fit.rmse < HOPELESS * min(finalists[0].rmse, least)]
+        # The fit of what does nothing is not finished, but that of the best is.
+        most = max(finalists[0].rmse, white, IDLE * present.rmse)
+        most = min(most, HOPELESS * min(finalists[0].rmse, least))
+        near = [fit for fit in finalists if fit.rmse <= most]
         last = [*go_on(near, FULL_ITERATIONS), *finalists[len(near) :]]
         last = self.slowed(present, last)
         fits = {fit.effects[-1]: fit for fit in (*last, *screened[len(finalists) :])}
@@ -154,13 +164,25 @@ class CandidateFits:
         small = {name: smaller(flat[order[name][0]][1]) for name in astray}
         again = [name for name in astray if small[name] is not None]
         calls = [
-            self.call(present, name, [{**present.values, **(small[name] or {})}], FULL_ITERATIONS)
+            self.call(present, name, [{**present.values, **(small[name] or {})}], SCREEN_ITERATIONS)
             for name in again
         ]
-        for name, found in zip(again, self.run(calls), strict=True):
-            if found.rmse < fits[name].rmse:
-                fits[name] = found
+        found = [fit for fit in self.run(calls) if fit.rmse < fits[fit.effects[-1]].rmse]
+        fits |= {fit.effects[-1]: fit for fit in found}
+        near = [fit for fit in found if fit.rmse <= most]
+        fits |= {fit.effects[-1]: fit for fit in go_on(near, FULL_ITERATIONS)}
         return fits
+
+    def tried_beside(
+        self, without: JointFit, present: JointFit, skip: Sequence[str]
+    ) -> dict[str, JointFit] | None:
+        """The fits with other effects in the place of a model's last, if it was chosen from among them."""
+        before, *fits = self.added.get(frozenset(without.effects), (None,))
+        if before is None or not any(fit is present for fit in fits) or without.rmse < BETTER * before.rmse:
+            return None
+        if {*BEHIND_SENSOR} & {*self.vetoes}:
+            return None  # these are tried here, and were not there
+        return {fit.effects[-1]: fit for fit in fits if fit.effects[-1] not in skip}
 
     def slowed(self, present: JointFit, fits: list[JointFit]) -> list[JointFit]:
         """The fits, or better ones whose speed limit binds where that promises to explain what is left.

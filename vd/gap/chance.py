@@ -116,4 +116,5 @@ def behind(search: "Selection", veil: Veil) -> "Selection":
         without={},
         apart={},
         promised={},
+        added={},
     )

@@ -82,8 +82,10 @@ def explain_joints(
             text = f"the plain model is within the noise floor {masses[joint.spec.chain].text}"
             progress(f"explain: {joint.name}: no_gap: {text}")
             return Explanation(joint.fit, joint.fit, "no_gap", text)
-        # What is none of the table on one joint is none on the others: what is plain to see is enough there.
+        # What is none of the table on one joint is none on the others, and what is chance on one is chance on
+        # all: what is plain to see is enough there.
         unknown = any(found.verdict == "unknown" for _, found in explained)
+        hidden = unknown or any(RANDOM in found.final.effects for _, found in explained)
         rng = np.random.default_rng([seed, joint.spec.chain, joint.spec.joint])
         names = [n for n in candidates(chain, effects) if n != RANDOM or not unknown]
         told = vetoes(recording, chain, joint.spec, joint.fit.rows)
@@ -104,8 +106,8 @@ def explain_joints(
             scales=joint.scales,
             weights=resamples(len(joint.spec.trajectories), rng),
             refits=REFITS,
-            restarts=0 if unknown else RESTARTS,
-            looks=0 if unknown else LOOKS,
+            restarts=0 if hidden else RESTARTS,
+            looks=0 if hidden else LOOKS,
             vetoes={**stood_for(same), **told},
             report=lambda line: progress(f"explain: {joint.name}: {line}"),
             rest=_rest(recording, int(chain.columns[joint.spec.joint]), joint.spec.trajectories),

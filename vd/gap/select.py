@@ -284,6 +284,7 @@ class Selection(Frictions):
             name, before, after = best.effects[-1], present.held_out_rmse, best.held_out_rmse
             self.report(f"+ {name}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
             rivals[name] = list(fits.values())
+            self.added[frozenset(present.effects)] = (present, *fits.values())
             present = best
             if self.finished(present) or self.too_coarse(present) or len(present.effects) >= MAX_EFFECTS:
                 break
@@ -307,7 +308,7 @@ class Selection(Frictions):
             return self.run(every)
 
         return replace(
-            self, run=run, fine=True, restarts=RESTARTS, looks=LOOKS, without={}, apart={}, promised={}
+            self, run=run, fine=True, restarts=RESTARTS, looks=LOOKS, without={}, apart={}, added={}
         )
 
     def finished(self, present: JointFit) -> bool:
@@ -394,7 +395,9 @@ class Selection(Frictions):
         # Beside Coulomb friction, a friction that contains it is no other cause.
         contains = [c for c, simpler in NESTED.items() if set(simpler) & set(without.effects)]
         skip, tried = (name, *contains), tuple(BEHIND_SENSOR)
-        fits = self.fit_candidates(without, skip=skip, vetoed=tried, known=present)
+        fits = self.tried_beside(without, present, skip)
+        if fits is None:
+            fits = self.fit_candidates(without, skip=skip, vetoed=tried, known=present)
         for simpler in {*NESTED.get(name, ())} & {*self.candidates} - {
             *self.vetoes,
             *contains,
@@ -404,4 +407,5 @@ class Selection(Frictions):
             inside = self.from_richer(present, name, simpler)
             if simpler not in fits or inside.rmse < fits[simpler].rmse:
                 fits[simpler] = inside
+        self.added[frozenset(without.effects)] = (without, present, *fits.values())
         return [present, *fits.values()]
