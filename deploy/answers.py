@@ -50,6 +50,8 @@ class HandState:
     """Temperatures of the motors [deg C]."""
     alert: np.ndarray
     """Whether a motor reports a hardware error."""
+    tick: np.ndarray
+    """Their own clocks [ms], which start again at 32768."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,6 @@ class StateCheck:
         self._ids, self._model, self._items = tuple(ids), model, table(model)
         self.fastest = np.full(len(self._ids), np.inf)
         self._last: HandState | None = None
-        self._ticks = np.zeros(len(self._ids), dtype=int)
 
     def forget(self) -> None:
         """The next state follows none: motors were configured, or restarted."""
@@ -127,7 +128,6 @@ class StateCheck:
             start = item.address - STATE_ADDRESS
             return np.array([item.from_bytes(data[start : start + item.size]) for data in columns])
 
-        ticks = column("realtime_tick")
         state = HandState(
             time_s=time_s,
             position=np.array([to_angle(int(count)) for count in column("present_position")]),
@@ -137,16 +137,17 @@ class StateCheck:
             voltage=0.1 * column("present_input_voltage"),
             temperature=column("present_temperature").astype(float),
             alert=np.array([bool(answer.error & ALERT) for answer in answers]),
+            tick=column("realtime_tick"),
         )
         if self._last is not None:
-            self._compare(self._last, state, ticks)
-        self._last, self._ticks = state, ticks
+            self._compare(self._last, state)
+        self._last = state
         return state
 
-    def _compare(self, last: HandState, state: HandState, ticks: np.ndarray) -> None:
+    def _compare(self, last: HandState, state: HandState) -> None:
         """Refuse a state that cannot follow the last one."""
         elapsed = state.time_s - last.time_s
-        gone = (ticks - self._ticks) % TICK_MODULUS / 1000.0
+        gone = (state.tick - last.tick) % TICK_MODULUS / 1000.0
         span = TICK_MODULUS / 1000.0
         difference = (gone - elapsed + 0.5 * span) % span - 0.5 * span
         for id, late in zip(self._ids, difference, strict=True):

@@ -151,7 +151,10 @@ def look(flight: Flight, source: DepthSource, hand: HandModel, layer: Path | Non
 def warm_up(
     pilot: Pilot, hand: HandModel, goal: np.ndarray, camera: DepthSource | None, link: TwinLink | None
 ) -> None:
-    """Let the policy decide a few times on what is seen now, and forget it."""
+    """Let the policy decide a few times on what is seen now, and forget it.
+
+    The object may not be between the fingers yet: for the flight it is looked for anew.
+    """
     pose = reset_pose(hand.num_fingers)
     known = None if link is None else link.state()
     sensed = Sensed(

@@ -73,9 +73,9 @@ class MotorLine:
         """When the next late packet arrives [s]; infinite without one."""
         return min((at for at, _ in self._held), default=float("inf"))
 
-    def go_on(self, heard: bytes = b"") -> None:
-        """Go on to the present, at which bytes arrive at the motors, or none."""
-        now = self._clock.now()
+    def go_on(self, heard: bytes = b"", *, at: float | None = None) -> None:
+        """Go on to the present, or the moment ``at`` [s], in which bytes arrive at the motors, or none."""
+        now = max(self._clock.now() if at is None else at, self._then)
         seconds, self._then = now - self._then, now
         if seconds > 0.0:
             self.plant.advance(seconds, [motor.drive for motor in self.motors])

@@ -61,18 +61,6 @@ class StepTimes:
 
 
 @dataclass(frozen=True)
-class Present:
-    """What is read in one control step."""
-
-    sensed: Sensed
-    """What the policy is told."""
-    state: HandState
-    """As measured."""
-    known: TwinState | None
-    """The truth: a twin's only."""
-
-
-@dataclass(frozen=True)
 class Moment:
     """What was known and done in one control step; D joints."""
 
@@ -84,8 +72,8 @@ class Moment:
     """Whether the policy acts; else the hand holds still."""
     state: HandState
     """As measured."""
-    known: TwinState | None
-    """The truth: a twin's only."""
+    object_pose: np.ndarray | None
+    """The object's true pose [7]: a twin's only."""
     smoothed: np.ndarray
     """Moving average of the actions before [D]."""
     action: np.ndarray
@@ -156,7 +144,8 @@ class ControlLoop:
     def _look(self, goal: np.ndarray) -> None:
         """See the object before the first deadline: to find it takes longer than to follow it."""
         self._safe.beat(missed=False)
-        self._pilot.decide(self._sense(goal).sensed)
+        sensed, _ = self._sense(goal)
+        self._pilot.decide(sensed)
         self._safe.beat(missed=False)
 
     def _pursue(self, number: int, goal: np.ndarray) -> tuple[str, float | None]:
@@ -177,15 +166,14 @@ class ControlLoop:
         """One control step; what ends the pursuit, if anything, and the distance [rad]."""
         late, busy = self._pacer.wait(), time.process_time()
         due = self._pacer.due_s
-        now = self._sense(goal)
-        state, known, depth = now.state, now.known, now.sensed.depth
+        sensed, state = self._sense(goal)
         smoothed, outcome = self._actions.smoothed, ""
         distance: float | None = None
         action = np.zeros_like(smoothed)
         if acting:
-            decision = self._pilot.decide(now.sensed)
+            decision = self._pilot.decide(sensed)
             distance = None if np.isnan(decision.distance) else decision.distance
-            outcome = self._outcome(decision.distance, smoothed, known, first=first)
+            outcome = self._outcome(decision.distance, sensed, first=first)
             if not outcome:
                 action = decision.action
                 self._target = self._actions.goal(action, state.position)
@@ -193,15 +181,15 @@ class ControlLoop:
         end = self._pacer.clock.now() - due
         missed = self._pacer.end()
         self._safe.beat(missed=missed)
-        if depth is not None and self._cfg.images:
-            self._log.image(len(self.times), depth)
+        if sensed.depth is not None and self._cfg.images:
+            self._log.image(len(self.times), sensed.depth)
         times = StepTimes(late, state.time_s - due, end, time.process_time() - busy)
-        moment = Moment(number, goal, acting, state, known, smoothed, action, sent, distance)
+        moment = Moment(number, goal, acting, state, sensed.object_pose, smoothed, action, sent, distance)
         self._note(moment, times)
         return outcome, distance
 
-    def _sense(self, goal: np.ndarray) -> Present:
-        """Read the camera, then the joints.
+    def _sense(self, goal: np.ndarray) -> tuple[Sensed, HandState]:
+        """Read the camera, then the joints: what the policy is told, and all that was measured.
 
         Raises:
             SafeStop: The hand was stopped.
@@ -223,16 +211,16 @@ class ControlLoop:
             object_pose=None if known is None else known.object_pose,
             object_velocity=None if known is None else known.object_velocity,
         )
-        return Present(sensed, state, known)
+        return sensed, state
 
-    def _outcome(self, distance: float, smoothed: np.ndarray, known: TwinState | None, *, first: bool) -> str:
+    def _outcome(self, distance: float, sensed: Sensed, *, first: bool) -> str:
         """``stopped``, ``lost``, or nothing."""
         rule = self._pilot.rule
-        near = distance < rule.distance_rad and float(np.linalg.norm(smoothed)) < rule.action_norm
+        near = distance < rule.distance_rad and float(np.linalg.norm(sensed.smoothed)) < rule.action_norm
         if near and not first:  # before the first action there is nothing to stop
             return "stopped"
-        if known is not None:
-            away = np.linalg.norm(known.object_pose[:3] - np.array(PAPER.scene.goal_position_m))
+        if sensed.object_pose is not None:
+            away = np.linalg.norm(sensed.object_pose[:3] - np.array(PAPER.scene.goal_position_m))
             if away > self._cfg.fall_m:
                 return "lost"
         return ""
@@ -240,8 +228,8 @@ class ControlLoop:
     def _note(self, moment: Moment, times: StepTimes) -> None:
         """Log the step, keep its times, and refresh the status line."""
         truth: list[float] = []
-        if moment.known is not None:
-            pose = moment.known.object_pose.astype(float)
+        if moment.object_pose is not None:
+            pose = moment.object_pose.astype(float)
             error = symmetric_error(pose[None, 3:], moment.goal[None], self._symmetry)
             truth = [*(float(value) for value in pose), float(error[0])]
         state, missed = moment.state, self._pacer.missed

@@ -22,6 +22,10 @@ OVERLOAD_SHARE, OVERLOAD_S = 0.9, 1.0
 published."""
 AMBIENT_C, HEATING_C_PER_S, COOLING_S = 30.0, 0.5, 120.0
 """Case temperature: rise at full torque, and time constant of cooling."""
+TICK_S = 1e-3
+"""What its clock counts."""
+PHASE_S = 0.618e-3
+"""Between the clocks of two motors whose IDs follow each other: none start at the same moment."""
 GOALS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
 
 
@@ -52,7 +56,8 @@ class Motor:
             if item.address >= EEPROM_END and item.writable:
                 self.put(name, item.initial)
         self.put("hardware_error_status", 0)
-        self._clock = self._tick = self._strained = self._silence = 0.0
+        self._clock = self.id * PHASE_S % TICK_S
+        self._strained = self._silence = 0.0
         self.registered: tuple[int, bytes] | None = None
 
     def reboot(self) -> None:
@@ -158,7 +163,7 @@ class Motor:
             torque: Torque of the motor [N m].
         """
         self._clock += seconds
-        self.put("realtime_tick", int(self._clock * 1000.0) % TICK_MODULUS)
+        self.put("realtime_tick", int(self._clock / TICK_S) % TICK_MODULUS)
         counts = to_counts(position)
         speed = round(velocity / RAD_S_PER_COUNT)
         self.put("present_position", counts)

@@ -21,6 +21,7 @@ from vd.deploy.connect import Connection, HandOptions, connect
 from vd.deploy.control_table import RAD_PER_COUNT
 from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import move
+from vd.deploy.motor_time import measured_at
 from vd.deploy.safety import SafeHand
 from vd.deploy.timely import Priority, real_time, undisturbed
 
@@ -255,6 +256,10 @@ class Recorder:
         def column(values: Sequence[np.ndarray]) -> np.ndarray:
             return np.array(values)[:, self._columns]
 
+        asked_s, sent_s = np.array([state.time_s for state in states]), np.array([row.sent_s for row in rows])
+        # A goal goes out right before its state is asked for: what keeps one on the way keeps both.
+        measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
+        sent_s = np.maximum.accumulate(sent_s + np.maximum(measured_s - asked_s, 0.0))
         measured = {name: column([getattr(state, name) for state in states]) for name in STATE_CHANNELS}
         excitation = motion.excitation
         return Trajectory(
@@ -262,8 +267,8 @@ class Recorder:
             excitation=excitation.name,
             joints=excitation.joints,
             conditions=excitation.conditions,
-            time=np.array([state.time_s for state in states]) - states[0].time_s,
-            command_time=np.array([row.sent_s for row in rows]) - states[0].time_s,
+            time=measured_s - measured_s[0],
+            command_time=sent_s - measured_s[0],
             command=column([row.goal for row in rows]),
             position=column([state.position for state in states]),
             enabled=column([row.on for row in rows]),

@@ -1,15 +1,16 @@
 """Compare what a policy saw on a hand with what the simulator shows in the same state, step by step.
 
 Every step of a log is put into a simulated world. Its observation, by the code of the training, is compared
-with the one that the loop makes of the same joints: points, voxels, senses and joint goals, and where images
-of a twin were kept (--images) the depth image too. With --follow it runs beside the loop.
+with the one that the loop makes of the same joints: points, voxels, senses and joint goals, the object as the
+student finds it, and where images of a twin were kept (--images) the depth image too: the object is then
+looked for in both images. With --follow it runs beside the loop.
 """
 
 import json
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +18,8 @@ import numpy as np
 import tyro
 
 if TYPE_CHECKING:
+    import torch
+
     from vd.deploy.observation import Sensed
     from vd.hand_log import HandLog
 
@@ -25,12 +28,17 @@ POINT_M = 2e-6
 SENSE = 1e-6
 """So do senses; and joint goals within the digits of a log."""
 GOAL_RAD = 2e-5
+FOUND_RAD = 0.05
+"""Angles to the goal at which the object is found differ by no more in most steps: an image shows the moment
+before the reading, and rounding may decide between sides of an object that fit alike."""
 PIXEL_M = 0.005
 """Difference from which a pixel shows something else [m]."""
 PIXEL_SHARE = 0.05
 """Share of such pixels that motion explains, between the image and the reading of the state."""
 FOLLOW_S = 0.5
 """How often a log is looked at that is still being written."""
+OBJECT = "object"
+"""Name of the sense by which a student finds its object."""
 SILENT_S = 30.0
 """Time without a new step after which a log is taken to be finished."""
 BEGIN_S = 300.0
@@ -73,6 +81,9 @@ class Difference:
     """Largest difference of the joint goals [rad]; 0 where the policy did not act."""
     pixels: float | None
     """Share of the image's pixels that show something else; None without an image."""
+    found_rad: float | None = None
+    """Difference of the angles to the goal at which the object is found [rad]; None where it is not looked
+    for, or by a camera whose image was not kept."""
 
     @property
     def ok(self) -> bool:
@@ -96,11 +107,13 @@ class Shadow:
 
     def __init__(self, log: "HandLog", policy: str | None = None):
         from vd.assets_usd.hands import load_hand
+        from vd.config import from_dict
         from vd.deploy.action import ActionFilter
         from vd.deploy.flight import STILL, mirror_task
         from vd.deploy.goals import one_object
         from vd.deploy.mirror import Mirror
         from vd.deploy.observation import StudentSight
+        from vd.deploy.pilot import student_camera
         from vd.evaluate.agents import is_saved_student, open_policy
         from vd.sensors.cfg import DepthCameraCfg
         from vd.student.cfg import LEAN
@@ -115,37 +128,57 @@ class Shadow:
         task = mirror_task(loaded, hand_name, item_name)
         self._mirror = Mirror(task)
         self._actions = ActionFilter(hand, task)
-        self._sight = StudentSight(hand, item, self._network)
-        self._view = StudentView(self._mirror.env, self._network, rendered=False)
-        place = None if student is None else student.spec.camera
-        self._camera = StudentView(
-            self._mirror.env, self._network, rendered=True, depth=DepthCameraCfg(points=0), camera=place
-        ).camera
+        # The object is looked for in what the student sees: its camera's images, or complete clouds.
+        blind = replace(self._network, senses=tuple(n for n in self._network.senses if n != OBJECT))
+        whole, rendered, depth, place = self._network, blind, DepthCameraCfg(points=0), None
+        self._image_sight: StudentSight | None = None
+        camera = None if student is None else student_camera(student, hand)
+        if student is not None and camera is not None:
+            whole, rendered, place = blind, self._network, student.spec.camera
+            depth = from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
+            self._image_sight = StudentSight(hand, item, rendered, camera=camera, depth=depth)
+        self._sight = StudentSight(hand, item, whole)
+        self._view = StudentView(self._mirror.env, whole, rendered=False)
+        self._image_view = StudentView(self._mirror.env, rendered, rendered=True, depth=depth, camera=place)
+        self._compared = 0
 
     def compare(self, log: "HandLog", step: int) -> Difference:
         """One step of the log, on both sides."""
         import torch
-
-        from vd.deploy.observation import frame
+        import warp as wp
 
         sensed = _sensed(log, step)
         self._mirror.take(sensed)
+        # The simulator looks for the object anew where an episode begins.
+        wp.to_torch(self._mirror.env.step_count).fill_(self._compared)
+        self._compared += 1
         seen = self._view.frame()
         points, expected = self._sight.points(sensed), self._view.points(seen)
-        senses = frame(sensed)
         ours, theirs = self._sight.sites(points), self._view.sites(seen, augment=False)
+        known = self._sight.frame(sensed, points, ours)
         with torch.inference_mode():
             apart = (points - expected).norm(dim=-1)
         image = log.image(step)
+        pixels, found_rad = None, _found_apart(known, seen)
+        if image is not None:
+            shown = self._image_view.frame()
+            pixels = self._pixels(image)
+            if self._image_sight is not None:
+                sensed = replace(sensed, depth=image)
+                points = self._image_sight.points(sensed)
+                found_rad = _found_apart(
+                    self._image_sight.frame(sensed, points, self._image_sight.sites(points)), shown
+                )
         acted = log.columns["acting"][step] > 0.5 and np.abs(log.channel("action")[step]).max() > 0.0
         return Difference(
             points_m=float(apart.max()),
             voxels=sum(len(sites) for sites in theirs),
             voxels_apart=sum(len(_keys(a) ^ _keys(b)) for a, b in zip(ours, theirs, strict=True)),
             borders=_near_borders(expected[0].numpy(), self._network.voxel_m),
-            sense=max(float((senses[name] - seen[name]).abs().max()) for name in senses),
+            sense=max(float((known[name] - seen[name]).abs().max()) for name in known if name != OBJECT),
             goal_rad=self._goal_difference(log, step) if acted else 0.0,
-            pixels=None if image is None else self._pixels(image),
+            pixels=pixels,
+            found_rad=found_rad,
         )
 
     def _goal_difference(self, log: "HandLog", step: int) -> float:
@@ -155,10 +188,10 @@ class Shadow:
         return float(np.abs(goal - log.channel("command")[step]).max())
 
     def _pixels(self, image: np.ndarray) -> float:
-        """Share of pixels of an image that differ from the simulated one."""
-        assert self._camera is not None
-        self._camera.capture()
-        return float((np.abs(self._camera.depth.numpy()[0] - image) > PIXEL_M).mean())
+        """Share of pixels of an image that differ from the simulated one, which was rendered before."""
+        camera = self._image_view.camera
+        assert camera is not None
+        return float((np.abs(camera.depth.numpy()[0] - image) > PIXEL_M).mean())
 
 
 def shadow(cfg: ShadowCfg) -> int:
@@ -212,8 +245,10 @@ def differences(cfg: ShadowCfg) -> Iterator[Difference]:
 def summary(found: list[Difference]) -> dict[str, Any]:
     """The worst of all steps."""
     pixels = [one.pixels for one in found if one.pixels is not None]
+    turns = [one.found_rad for one in found if one.found_rad is not None]
+    turned = float(np.median(turns)) if turns else 0.0
     result: dict[str, Any] = {
-        "ok": all(one.ok for one in found),
+        "ok": all(one.ok for one in found) and turned <= FOUND_RAD,
         "steps": len(found),
         "steps apart": sum(not one.ok for one in found),
         "points, largest [m]": float(f"{max(one.points_m for one in found):.2g}"),
@@ -225,6 +260,8 @@ def summary(found: list[Difference]) -> dict[str, Any]:
     }
     if pixels:
         result["pixels apart, largest share"] = float(f"{max(pixels):.3g}")
+    if turns:
+        result["object's angle, median [rad]"] = float(f"{turned:.2g}")
     return result
 
 
@@ -241,6 +278,13 @@ def _sensed(log: "HandLog", step: int) -> "Sensed":
         object_pose=np.array(UNKNOWN_POSE if pose is None else pose[step], dtype=np.float32),
         object_velocity=np.zeros(6, dtype=np.float32),
     )
+
+
+def _found_apart(known: dict[str, "torch.Tensor"], seen: dict[str, "torch.Tensor"]) -> float | None:
+    """Difference of the angles to the goal at which the object is found [rad], if it is looked for."""
+    from vd.student.object_sense import ANGLE
+
+    return abs(float(known[OBJECT][0, ANGLE] - seen[OBJECT][0, ANGLE])) if OBJECT in known else None
 
 
 def _keys(sites: Any) -> set[tuple[int, ...]]:

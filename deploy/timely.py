@@ -3,12 +3,16 @@
 import contextlib
 import gc
 import os
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
 
 Priority = Literal["auto", "on", "off"]
 """Real-time priority: where it is permitted, always, or never."""
+
+TURN_S = 1e-4
+"""Longest turn of a thread of this process while another one waits: less than what a packet takes."""
 
 
 @contextlib.contextmanager
@@ -55,12 +59,19 @@ def real_time(wanted: Priority, *, level: int = 0) -> Iterator[bool]:
 
 @contextlib.contextmanager
 def undisturbed() -> Iterator[None]:
-    """Without the garbage collector, which pauses for a second where there is much; a run makes little."""
+    """Without the garbage collector, and without long turns of other threads.
+
+    The collector pauses for a second where there is much; a run makes little. A thread that waits for the
+    interpreter, as after every packet, waits for whoever has it: 5 ms by default.
+    """
+    turn_s = sys.getswitchinterval()
+    sys.setswitchinterval(TURN_S)
     gc.collect()
     gc.freeze()
     gc.disable()
     try:
         yield
     finally:
+        sys.setswitchinterval(turn_s)
         gc.enable()
         gc.unfreeze()

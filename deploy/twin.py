@@ -2,11 +2,15 @@
 
 ``python -m vd.deploy.twin`` owns such a port and prints its path. The motors are those of
 :mod:`vd.deploy.line`, which answer byte by byte; behind them stands any :class:`vd.deploy.plant.Plant`.
+Motors hear what arrives when it arrives, however long the plant takes: they have processors of their own.
 """
 
+import contextlib
 import os
 import pty
 import select
+import socket
+import struct
 import sys
 import termios
 import threading
@@ -33,6 +37,10 @@ if TYPE_CHECKING:
 
 IDLE_S = 0.005
 """Longest wait for bytes: the plant goes on in steps of this size at most."""
+STAMP = struct.Struct("d")
+"""Time before bytes that arrived."""
+LONGEST = 4096
+"""Bytes that are taken at once."""
 
 
 class Twin(MotorLine):
@@ -57,6 +65,7 @@ class Twin(MotorLine):
         self._side = side
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
+        self._mouth, self._ear = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._near, self._far = pty.openpty()
         tty.setraw(self._far)
         os.set_blocking(self._near, False)
@@ -78,6 +87,8 @@ class Twin(MotorLine):
             self._thread.join()
         for end in (self._near, self._far):
             os.close(end)
+        self._mouth.close()
+        self._ear.close()
         if self._side is not None:
             self._side.close()
 
@@ -87,20 +98,35 @@ class Twin(MotorLine):
 
     def serve(self) -> None:
         """Answer until it has to end."""
-        while not self._end.is_set():
-            beside = {} if self._side is None else {one.fileno(): one for one in self._side.sockets}
-            wait_s = max(0.0, min(IDLE_S, self.due_s - self._clock.now()))
-            ready, _, _ = select.select([self._near, *beside], [], [], wait_s)
-            self.go_on(self._read() if self._near in ready else b"")
-            for one in ready:
-                if one in beside and self._side is not None:
-                    self._side.serve(beside[one])
-
-    def _read(self) -> bytes:
+        listener = threading.Thread(target=self._listen, name="listener", daemon=True)
+        listener.start()
         try:
-            return os.read(self._near, 4096)
-        except (BlockingIOError, OSError):
-            return b""
+            while not self._end.is_set():
+                self._serve_once()
+        finally:
+            self.end()
+            listener.join()
+
+    def _serve_once(self) -> None:
+        beside = {} if self._side is None else {one.fileno(): one for one in self._side.sockets}
+        wait_s = max(0.0, min(IDLE_S, self.due_s - self._clock.now()))
+        ready, _, _ = select.select([self._ear.fileno(), *beside], [], [], wait_s)
+        if self._ear.fileno() in ready:
+            heard = self._ear.recv(STAMP.size + LONGEST)
+            self.go_on(heard[STAMP.size :], at=STAMP.unpack_from(heard)[0])
+        else:
+            self.go_on()
+        for one in ready:
+            if one in beside and self._side is not None:
+                self._side.serve(beside[one])
+
+    def _listen(self) -> None:
+        """Pass on what arrives, with the time at which it did: meanwhile the plant may be in a step."""
+        while not self._end.is_set():
+            if select.select([self._near], [], [], IDLE_S)[0]:
+                at = self._clock.now()
+                with contextlib.suppress(BlockingIOError, OSError):
+                    self._mouth.send(STAMP.pack(at) + os.read(self._near, LONGEST))
 
     def _write(self, data: bytes) -> None:
         try:

@@ -409,3 +409,22 @@ def test_the_plant_can_be_another_one():
         time.sleep(0.1)
         assert plant.goals[0] == pytest.approx(0.7, abs=0.001)
         assert bus.read_state().position[0] == pytest.approx(0.0)
+
+
+def test_motors_hear_what_arrives_when_it_arrives_however_long_the_plant_takes():
+    """A state is that of the moment of its packet, not of the end of the step in which the plant was."""
+
+    class Slow(FirstOrderPlant):
+        def advance(self, seconds, drives):
+            time.sleep(0.008)
+            self.position += 6.0 * seconds
+
+    plant = Slow(1, position=np.array([-2.5]))
+    with Twin([Motor(MODELS[MODEL], 1)], plant) as twin, MotorBus(twin.path, [1], MODEL, retries=20) as bus:
+        states = []
+        for wait_s in np.random.default_rng(0).uniform(0.0, 0.02, 30):
+            time.sleep(wait_s)
+            states.append(bus.read_state())
+    late = np.array([state.position[0] / 6.0 - state.time_s for state in states])
+    low, high = np.percentile(late, [20, 80])  # a busy machine lets some packets wait
+    assert high - low < 0.002

@@ -44,7 +44,7 @@ class Hand:
         """As :class:`SafeHand`."""
         zero = np.zeros(9)
         now, here = self.clock.now(), self.position.copy()
-        return HandState(now, here, zero, zero, zero, zero + 12.0, zero + 30.0, zero > 0.0)
+        return HandState(now, here, zero, zero, zero, zero + 12.0, zero + 30.0, zero > 0.0, zero)
 
     def command(self, target: np.ndarray) -> np.ndarray:
         """As :class:`SafeHand`."""

@@ -12,7 +12,7 @@ from vd.deploy import cli
 from vd.deploy.action import ActionFilter
 from vd.deploy.log import LogWriter
 from vd.deploy.mirror import Mirror
-from vd.deploy.shadow import Difference, ShadowCfg, differences
+from vd.deploy.shadow import Difference, ShadowCfg, differences, summary
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.hand_log import JOINT_CHANNELS, LogError, read_log
 from vd.play.cli import main as play
@@ -59,6 +59,7 @@ def test_a_sound_log_is_what_the_simulator_shows(tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result["ok"] and result["steps"] == 4 and result["voxels of a cloud"] > 1000
     assert result["voxels apart"] <= 2 * result["points on borders of voxels"]
+    assert result["object's angle, median [rad]"] < 1e-3
 
 
 def test_goals_of_another_rule_are_told(tmp_path, capsys):
@@ -109,6 +110,13 @@ def test_what_differs_is_not_rounding():
         assert not replace(same, **{name: value}).ok
 
 
+def test_an_object_found_elsewhere_is_told():
+    same = Difference(1e-7, 4000, 1, 10, 0.0, 0.0, None, 1e-5)
+    assert summary([same] * 3)["ok"]
+    assert not summary([same, replace(same, found_rad=0.2), replace(same, found_rad=0.3)])["ok"]
+    assert "object's angle, median [rad]" not in summary([replace(same, found_rad=None)])
+
+
 def test_an_image_of_something_else_is_told(tmp_path):
     """The image that the simulator itself renders is the same, one of a moment later is not."""
     folder = write(tmp_path / "log")
@@ -127,6 +135,10 @@ def test_an_image_of_something_else_is_told(tmp_path):
     first, second, *_ = differences(ShadowCfg(folder, every=6))
     assert first.ok and first.pixels == 0.0
     assert not second.ok and second.pixels > 0.05
+    # A student with a camera looks for its object in the images, and nowhere else.
+    first, _, third, *_ = differences(ShadowCfg(folder, policy="dclaw3-student", every=6))
+    assert first.found_rad is not None and first.found_rad < 1e-3
+    assert third.found_rad is None
 
 
 def test_a_log_is_shown(tmp_path, capsys):
