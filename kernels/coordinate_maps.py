@@ -137,31 +137,38 @@ def neighbour_kernel(
 def beside_kernel(
     # In:
     key_in: wp.array[wp.int64],
+    asked_in: wp.array[wp.bool],
+    other_in: wp.array[wp.bool],
     slot_key_in: wp.array[wp.int64],
     slot_row_in: wp.array[int],
     # Out:
-    beside_out: wp.array[int],
+    beside_out: wp.array[wp.bool],
 ):
-    """Tell of each voxel whether any of the 3x3x3 about it is in a hash table: 1 or 0. Launch: [M].
+    """Tell of some voxels whether any of the 3x3x3 about each is one of others. Launch: [M].
 
     Args:
         key_in: Keys of voxels, shape [M].
-        slot_key_in: Hash table of other voxels.
+        asked_in: Which are asked about, shape [M].
+        other_in: Which are the others, shape [M].
+        slot_key_in: Hash table of the keys.
         slot_row_in: Rows of its slots.
-        beside_out: Shape [M].
+        beside_out: False where not asked, shape [M].
     """
     row = wp.tid()
-    key = key_in[row]
-    cell = key_coordinates(key & _MORTON_MASK)
     found = wp.int32(0)
-    k = wp.int32(0)
-    while k < _KERNEL and found == 0:
-        x, y, z = cell[0] + k // 9 - 1, cell[1] + (k // 3) % 3 - 1, cell[2] + k % 3 - 1
-        other = cell_key(key >> _KEY_SHIFT, x, y, z, 0)
-        if other != _NONE and find_row(other, slot_key_in, slot_row_in) >= 0:
-            found = wp.int32(1)
-        k += 1
-    beside_out[row] = found
+    if asked_in[row]:
+        key = key_in[row]
+        cell = key_coordinates(key & _MORTON_MASK)
+        k = wp.int32(0)
+        while k < _KERNEL and found == 0:
+            x, y, z = cell[0] + k // 9 - 1, cell[1] + (k // 3) % 3 - 1, cell[2] + k % 3 - 1
+            other = cell_key(key >> _KEY_SHIFT, x, y, z, 0)
+            if other != _NONE:
+                place = find_row(other, slot_key_in, slot_row_in)
+                if place >= 0 and other_in[place]:
+                    found = wp.int32(1)
+            k += 1
+    beside_out[row] = found == 1
 
 
 @wp.kernel
@@ -315,18 +322,19 @@ def neighbour_table(keys: wp.array, level: int) -> wp.array:
     return table
 
 
-def beside(keys: wp.array, others: wp.array) -> wp.array:
-    """1 where a voxel is one of ``others`` or touches one, by a corner at least, else 0, shape [M], int32.
+def beside(keys: wp.array, asked: wp.array, others: wp.array) -> wp.array:
+    """Which of the voxels asked about are among others or touch one, by a corner at least, bool [M].
 
     Args:
-        keys: Keys of voxels [M].
-        others: Keys of other voxels, each once.
+        keys: Keys of voxels, each once [M].
+        asked: Which are asked about, bool [M].
+        others: Which are the others, bool [M].
     """
-    touches = wp.empty(keys.shape[0], dtype=int, device=keys.device)
+    touches = wp.empty(keys.shape[0], dtype=wp.bool, device=keys.device)
     wp.launch(
         beside_kernel,
         dim=keys.shape[0],
-        inputs=[keys, *hash_table(others)],
+        inputs=[keys, asked, others, *hash_table(keys)],
         outputs=[touches],
         device=keys.device,
     )

@@ -13,7 +13,7 @@ from vd.student.clouds import Voxeliser
 from vd.student.match import PointMatch, orthogonal
 from vd.student.network import Student
 from vd.student.quaternions import relative_rotation
-from vd.student.turn import ShapeVectors, TurnEncoder, item_and_goal, padded
+from vd.student.turn import ShapeVectors, TurnEncoder
 from vd.train.student.rotations import angle_between, random_rotations, two_columns
 
 SIZES = TurnCfg(vectors=4, rounds=2, hidden=8, pairs=3)
@@ -77,24 +77,24 @@ def test_absent_points_count_for_nothing():
     )
 
 
-def test_padded_rows_hold_the_voxels_of_their_cloud(device):
+def test_places_are_those_of_the_voxels_of_each_cloud(device):
     clouds = np.concatenate([scene(shape(seed=i), shape(seed=i)) for i in range(3)])
     sites = voxels(clouds, device)
-    item, goal = item_and_goal(sites)
+    item, goal = sites.item, sites.goal
     assert not (item & goal).any()
-    points, present = padded(sites, goal, GOAL_POINTS)
+    points, present = sites.places(goal, GOAL_POINTS)
     for i in range(3):
         own = np.unique(np.floor(clouds[i, :GOAL_POINTS] / 0.005), axis=0) + 0.5
         found = points[i][present[i, :, 0] > 0].cpu().numpy()
         assert np.array_equal(own, np.unique(found, axis=0))
     most, whole = 7, [points[i][present[i, :, 0] > 0] for i in range(3)]
-    points, present = padded(sites, goal, most)
+    points, present = sites.places(goal, most)
     assert points.shape == (3, most, 3) and present.all()
     for all_of_them, some in zip(whole, points, strict=True):
         rows = [(all_of_them == point).all(dim=1).nonzero().item() for point in some]
         steps = np.diff([*rows, len(all_of_them)])
         assert rows[0] == 0 and max(steps) - min(steps) <= 1  # as far apart as can be
-    points, present = padded(sites, torch.zeros_like(goal), most)
+    points, present = sites.places(torch.zeros_like(goal), most)
     assert points.shape == (3, 1, 3) and not present.any()
 
 
@@ -102,16 +102,13 @@ def test_the_object_has_no_voxel_that_touches_the_hand(device):
     points = scene(shape(), shape())
     seen = points[0, ENDS[0] : ENDS[1]] + np.float32(0.005)  # the camera's points of the hand, beside its own
     sites = voxels(np.concatenate([points, seen[None]], axis=1), device)
-    item, _ = item_and_goal(sites)
-    own = np.floor(points[0] / 0.005)
+    item, own = sites.item, np.floor(points[0] / 0.005)
     found = sites.coordinates[item][:, 1:].cpu().numpy()
     assert set(map(tuple, found)) == set(map(tuple, own[ENDS[1] :].astype(int)))
     assert len(sites) > len(np.unique(own, axis=0))  # some of what the camera sees is not marked
-    sites.complete = True  # then all without a mark is the object's
-    whole, _ = item_and_goal(sites)
-    assert torch.equal(whole, (sites.marks == 0).all(dim=1)) and whole.sum() > item.sum()
-    none = torch.zeros_like(item)
-    assert not sites.touching(none, item).any() and not sites.touching(item, none).any()
+    whole = sites.fresh()
+    whole.complete = True  # then all without a mark is the object's
+    assert torch.equal(whole.item, (sites.marks == 0).all(dim=1)) and whole.item.sum() > item.sum()
 
 
 def test_embedding_sees_shapes_but_not_places_nor_the_hand(device):
@@ -137,7 +134,7 @@ def test_every_pair_of_frames_tells_the_rotation(device):
     net.pairs.weight.data *= 10.0  # long vectors have length 1 in the frames
     now, aim = (
         net._frames(net._shape(sites, which, whole=bool(whole)))[0]
-        for whole, which in enumerate(item_and_goal(sites))
+        for whole, which in enumerate((sites.item, sites.goal))
     )
     expected = torch.from_numpy(turn).float().to(now.device).expand(1, SIZES.pairs, 3, 3)
     torch.testing.assert_close(now @ aim.mT, expected, rtol=0.0, atol=0.05)

@@ -129,17 +129,17 @@ def test_windows_hold_the_sites_of_each_cell(device, cells, level):
 
 
 @EXAMPLES
-@given(cells=grids(), parity=st.integers(2, 3))
-def test_voxels_beside_others_are_those_with_one_of_them_about(device, cells, parity):
+@given(cells=grids(), kinds=st.integers(3, 4))
+def test_voxels_beside_others_are_those_with_one_of_them_about(device, cells, kinds):
     keys, rows = sites(cells, device, 0)
-    some, others = (
-        [row for row in range(len(rows)) if (rows[row, 1:].sum() % parity == 0) is which]
-        for which in (True, False)
-    )
-    there = {tuple(rows[row]) for row in others}
-    parts = (wp.array(keys.numpy()[part], dtype=wp.int64, device=device) for part in (some, others))
-    expected = [any(moved(rows[row], offset) in there for offset in OFFSETS) for row in some]
-    assert beside(*parts).numpy().astype(bool).tolist() == expected
+    kind = rows[:, 1:].sum(axis=1) % kinds  # asked about, both, one of the others, neither
+    asked, others = kind <= 1, (kind == 1) | (kind == 2)
+    there = {tuple(row) for row in rows[others]}
+    expected = [
+        bool(a) and any(moved(row, o) in there for o in OFFSETS) for row, a in zip(rows, asked, strict=True)
+    ]
+    parts = (wp.array(part, dtype=wp.bool, device=device) for part in (asked, others))
+    assert beside(keys, *parts).numpy().tolist() == expected
 
 
 def test_hash_table_holds_every_key_once(device):
@@ -162,6 +162,5 @@ def test_no_sites_give_empty_maps(device):
         strided_table(keys, coarse, 0).shape == strided_table(keys, coarse, 0, reverse=True).shape == (0, 27)
     )
     assert window_table(keys, place, 0).shape == (0, 8)
-    assert beside(keys, keys).shape == (0,)
-    some = sites(np.zeros((1, 1, 3), dtype=int), device, 0)[0]
-    assert beside(some, keys).numpy().tolist() == [0] and beside(some, some).numpy().tolist() == [1]
+    nothing = wp.empty(0, dtype=wp.bool, device=device)
+    assert beside(keys, nothing, nothing).shape == (0,)

@@ -209,6 +209,4 @@ class Voxeliser:
         if ends not in self._ends:
             self._ends[ends] = wp.array(ends, dtype=wp.int32, device=self.device)
         keys, marks = voxelise_marked(points, self.voxel_m, self._ends[ends], draw)
-        sites = Sites(keys, clouds)
-        sites.marks = wp.to_torch(marks)
-        return sites
+        return Sites(keys, clouds, marks=wp.to_torch(marks))

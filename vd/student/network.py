@@ -17,7 +17,7 @@ from vd.student.object_sense import ANGLE, object_values
 from vd.student.sites import Sites
 from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool
 from vd.student.state import StateHead
-from vd.student.turn import TurnEncoder, marks
+from vd.student.turn import TurnEncoder
 
 POSITION_SCALE_M = 0.1
 """Positions of voxels are given in units of this: about the size of the scene."""
@@ -67,7 +67,7 @@ def voxel_features(sites: Sites, cfg: EncoderCfg, voxel_m: float) -> torch.Tenso
         elif name == "position":
             parts.append(voxel_m / POSITION_SCALE_M * (sites.coordinates[:, 1:] + 0.5))
         else:
-            parts.append(marks(sites))
+            parts.append(sites.marks)
     return torch.cat(parts, dim=1)
 
 

@@ -30,7 +30,6 @@ from vd.paper import PAPER
 from vd.student.quaternions import product, relative_rotation, rotated, rotation_distance
 from vd.student.registration import FAR_M, POINTS, Registration
 from vd.student.sites import Sites
-from vd.student.turn import item_and_goal, padded
 
 ANGLE = 0
 """Column of the angle to the goal [rad]."""
@@ -146,8 +145,7 @@ class ObjectSense:
             [FAR_M], the misfit as a share of that of the next pose, and the shape's values as the teacher
             observes them (:mod:`vd.kernels.shapes`): [N, V].
         """
-        item, _ = item_and_goal(*sites)
-        voxels, present = padded(sites[0], item, POINTS)
+        voxels, present = sites[0].places(sites[0].item, POINTS)
         count = present.sum(dim=(1, 2)).int()
         found = self.registration
         found.look(self._voxel_m * voxels, count, fresh=fresh, points=points)

@@ -16,6 +16,9 @@ from vd.kernels.coordinate_maps import (
 )
 from vd.kernels.voxels import cloud_offsets, coordinates
 
+GOAL, HAND = 0, 1
+"""Columns of the marks of voxels."""
+
 
 class Sites:
     """M occupied cells of B clouds on one level of a grid; the cells of level l are 2^l voxels wide.
@@ -28,31 +31,39 @@ class Sites:
         keys: Sorted keys of the cells (:mod:`vd.kernels.voxels`), shape [M].
         clouds: B.
         level: l.
-        marks: What the cells hold, columns of 0 and 1, shape [M, C], where that was asked for.
         complete: Whether all that bears no mark is of the object; a camera sees the hand too.
     """
 
-    marks: torch.Tensor | None = None
     complete: bool = False
 
-    def __init__(self, keys: wp.array, clouds: int, level: int = 0, *, sizes: Sequence[int] = ()):
+    def __init__(
+        self,
+        keys: wp.array,
+        clouds: int,
+        level: int = 0,
+        *,
+        marks: torch.Tensor | None = None,
+        sizes: Sequence[int] = (),
+    ):
         """Take the cells.
 
         Args:
             keys: Sorted keys of the cells, each once, shape [M].
             clouds: B.
             level: l.
+            marks: Whether the cells hold points of the goal, and of the hand's own model, columns of 0 and 1,
+                shape [M, 2], where that was asked for.
             sizes: Numbers of cells of the coarser levels, as far as they are known.
         """
         self.keys = keys
         self.clouds = clouds
         self.level = level
-        self._sizes = sizes
+        self._marks, self._sizes = marks, sizes
 
     def fresh(self) -> "Sites":
         """The same cells without maps, as they come from the voxeliser."""
-        same = Sites(self.keys, self.clouds, self.level)
-        same.marks, same.complete = self.marks, self.complete
+        same = Sites(self.keys, self.clouds, self.level, marks=self._marks)
+        same.complete = self.complete
         return same
 
     def __len__(self) -> int:
@@ -73,21 +84,64 @@ class Sites:
         """Rows (cloud, x, y, z): each cell covers voxels from 2^l (x, y, z) on, shape [M, 4], int32."""
         return wp.to_torch(coordinates(self.keys, self.level))
 
-    def touching(self, chosen: torch.Tensor, others: torch.Tensor) -> torch.Tensor:
-        """Those of the chosen cells that touch, by a corner at least, or are one of the others; level 0.
+    @property
+    def marks(self) -> torch.Tensor:
+        """Whether voxels hold points of the goal, and of the hand's own model, shape [M, 2].
+
+        Raises:
+            ValueError: The voxeliser was not asked for them.
+        """
+        if self._marks is None:
+            raise ValueError("the network reads marks of voxels; give the voxeliser the ends of the groups")
+        return self._marks
+
+    @cached_property
+    def goal(self) -> torch.Tensor:
+        """Which voxels are the goal's, bool [M]."""
+        return self.marks[:, GOAL] > 0
+
+    @cached_property
+    def item(self) -> torch.Tensor:
+        """Which voxels are the object's, bool [M].
+
+        A voxel is the object's that holds no point of the goal, nor of the hand's own model. Of a camera's
+        points those of the hand that lie between that model's samples are left out too, with all that
+        touches it, by a corner at least.
+        """
+        hand = self.marks[:, HAND] > 0
+        free = ~(self.goal | hand)
+        if self.complete:
+            return free
+        touches = beside(self.keys, wp.from_torch(free), wp.from_torch(hand))
+        return free & ~wp.to_torch(touches)
+
+    def places(self, chosen: torch.Tensor, most: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """Coordinates of some voxels, a row for each cloud; waits for the device.
 
         Args:
-            chosen: Which cells are asked about, bool [M].
-            others: Which they may touch, bool [M].
+            chosen: Which, bool [M].
+            most: Voxels of a cloud at most. Of more, every so many-th one is taken in the order of their
+                keys, in which neighbours follow each other.
 
         Returns:
-            Bool [M].
+            Coordinates of their centres [voxels], zeros where a cloud has fewer, shape [B, P, 3], and 1 where
+            there is one, shape [B, P, 1].
         """
-        keys = wp.to_torch(self.keys)
-        some, rest = (wp.from_torch(keys[which]) for which in (chosen, others))
-        touches = torch.zeros_like(chosen)
-        touches[chosen] = wp.to_torch(beside(some, rest)).bool()
-        return touches
+        rows = self.coordinates[chosen]
+        cloud = rows[:, 0].long()
+        first = torch.searchsorted(cloud, torch.arange(self.clouds + 1, device=self.device))
+        counts, rank = first.diff(), torch.arange(len(cloud), device=self.device) - first[cloud]
+        # Voxels that are left out would share a place with the one before them.
+        share = counts.clamp(min=most)[cloud]
+        place = rank * most // share
+        taken = (rank == 0) | ((rank - 1) * most // share < place)
+        size = min(most, max(1, int(counts.max())))
+        # The last row takes what is left out.
+        filled = torch.zeros((self.clouds * size + 1, 4), device=self.device)
+        values = torch.nn.functional.pad(rows[:, 1:] + 0.5, (0, 1), value=1.0)
+        filled[torch.where(taken, cloud * size + place, self.clouds * size)] = values
+        points, present = filled[:-1].view(self.clouds, size, 4).split((3, 1), dim=-1)
+        return points, present
 
     @cached_property
     def _coarser(self) -> tuple["Sites", wp.array]:

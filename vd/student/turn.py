@@ -26,56 +26,6 @@ FAR, WHOSE = 3, 2
 goal, which no side of is hidden; the column of the last."""
 SMALL = 1e-2
 """Vectors are scaled to length 1, those that are not much longer than this less: noise stays small."""
-GOAL, HAND = 0, 1
-"""Columns of the marks of voxels."""
-
-
-def marks(sites: Sites) -> torch.Tensor:
-    """Marks of voxels [M, 2]: whether they hold points of the goal, and of the hand's own model."""
-    if sites.marks is None:
-        raise ValueError("the network reads marks of voxels; give the voxeliser the ends of the groups")
-    return sites.marks
-
-
-def item_and_goal(sites: Sites, goal: Sites | None = None) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which voxels are the object's, and which the goal's (of ``goal``, where that is given), bool [M].
-
-    A voxel is the object's that holds no point of the goal, nor of the hand's own model. Of a camera's points
-    those of the hand that lie between that model's samples are left out too, with all that touches it.
-    """
-    wanted = marks(sites if goal is None else goal)[:, GOAL] > 0
-    free = (marks(sites) == 0).all(dim=1)
-    if sites.complete:
-        return free, wanted
-    return free & ~sites.touching(free, marks(sites)[:, HAND] > 0), wanted
-
-
-def padded(sites: Sites, chosen: torch.Tensor, most: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Coordinates of some voxels, a row for each cloud.
-
-    Args:
-        sites: Voxels of B clouds.
-        chosen: Which, bool [M].
-        most: Voxels of a cloud at most. Of more, every so many-th one is taken in the order of their keys,
-            in which neighbours follow each other.
-
-    Returns:
-        Coordinates of their centres [voxels], zeros where a cloud has fewer, shape [B, P, 3], and 1 where
-        there is one, shape [B, P, 1].
-    """
-    rows = sites.coordinates[chosen]
-    cloud = rows[:, 0].long()
-    counts = torch.bincount(cloud, minlength=sites.clouds)
-    rank = torch.arange(len(cloud), device=cloud.device) - (counts.cumsum(0) - counts)[cloud]
-    # Voxels that are left out would share a place with the one before them.
-    share = counts.clamp(min=most)[cloud]
-    place = rank * most // share
-    first = (rank == 0) | ((rank - 1) * most // share < place)
-    points = torch.zeros((sites.clouds, min(most, max(1, int(counts.max()))), 3), device=cloud.device)
-    present = torch.zeros_like(points[..., :1])
-    points[cloud[first], place[first]] = rows[first, 1:] + 0.5
-    present[cloud[first], place[first]] = 1.0
-    return points, present
 
 
 def unit(values: torch.Tensor) -> torch.Tensor:
@@ -181,10 +131,10 @@ class TurnEncoder(nn.Module):
         Returns:
             Embeddings, and the points that found each other.
         """
-        item, wanted = item_and_goal(sites, goal)
+        whole = sites if goal is None else goal
         with torch.autocast(sites.device.type, enabled=False):
-            one = self._shape(sites, item, whole=False)
-            other = self._shape(sites if goal is None else goal, wanted, whole=True)
+            one = self._shape(sites, sites.item, whole=False)
+            other = self._shape(whole, whole.goal, whole=True)
             (now, length, spread), (aim, aim_length, aim_spread) = self._frames(one), self._frames(other)
             turns = now @ aim.transpose(-1, -2)
             lengths = torch.cat([length, aim_length], dim=1).clamp(min=SMALL).log()
@@ -203,7 +153,7 @@ class TurnEncoder(nn.Module):
 
     def _shape(self, sites: Sites, chosen: torch.Tensor, *, whole: bool) -> Shape:
         """The shape of some voxels of each cloud."""
-        points, present = padded(sites, chosen, self.points)
+        points, present = sites.places(chosen, self.points)
         dtype = self.out.weight.dtype
         return self.shape(self.scale * points.to(dtype), present.to(dtype), whole=whole)
 
