@@ -218,4 +218,4 @@ def test_the_angle_that_was_found_stands_at_first():
     output = student(torch.randn(2, 3, LEAN.encoder.embedding), senses, student.initial_hidden(3))
     torch.testing.assert_close(output.distance, senses[..., 27 + ANGLE, None].expand(2, 3, 2))
     with pytest.raises(ValueError, match="marks"):
-        replace(LEAN, turn=replace(LEAN.turn, vectors=0), encoder=EncoderCfg(inputs=("constant",))).validate()
+        replace(LEAN, encoder=EncoderCfg(inputs=("constant",))).validate()

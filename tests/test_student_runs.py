@@ -18,7 +18,7 @@ from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_teacher
 from vd.sensors.cfg import DepthCameraCfg
-from vd.student.cfg import NoiseCfg, StudentCfg
+from vd.student.cfg import LEAN, NoiseCfg, StudentCfg
 from vd.student.saved import load_student, read_student
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main
@@ -170,7 +170,10 @@ def test_stage_2_does_not_begin_from_nothing_unless_told_to(tmp_path, stage, cap
     encoder = stage(0)
     with pytest.raises(ValueError, match="of stage 0"):
         check_start(parse_student([*flags[1:], "--init", str(encoder)]))
-    check_start(parse_student([*flags[1:], "--init", str(encoder), "--from-scratch"]))
+    cfg = parse_student([*flags[1:], "--init", str(encoder), "--from-scratch"])
+    check_start(cfg)
+    # of which the encoder is taken, and what follows it is this stage's own
+    assert cfg.network == replace(LEAN, encoder=TINY.encoder, voxel_m=TINY.voxel_m)
 
 
 def test_stage_2_begins_from_stage_1_beside_it_with_its_network(tmp_path, stage):

@@ -12,7 +12,7 @@ import tyro
 from vd.config import from_dict
 from vd.paper import PAPER
 from vd.train.student.build import CONFIG_NAME, build_student, default_init
-from vd.train.student.config import PRESETS, Stage, StudentTrainCfg
+from vd.train.student.config import PRESETS, PRETRAINING, Stage, StudentTrainCfg
 
 HELP = """Train the student: imitate the teacher from point clouds.
 
@@ -158,7 +158,10 @@ def calibrate_command(arguments: list[str], _started: float) -> int:
 
 
 def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
-    """``base`` with the student to begin from, its network, and for stage 2 its camera."""
+    """``base`` with the student to begin from, its network, and for stage 2 its camera.
+
+    A pre-trained one has an encoder to give, whatever else it needed to be trained.
+    """
     from vd.train.cli import value_of
 
     given, run_dir = value_of(arguments, "--init"), value_of(arguments, "--run-dir")
@@ -172,8 +175,12 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
     spec = saved_spec(read_student(path), path)
     camera = None if spec.camera is None or base.stage != 2 else spec.camera
     assert camera is None or len(camera) == 7
+    network = spec.network
+    if spec.stage == PRETRAINING:
+        sees = {name: getattr(network, name) for name in ("encoder", "voxel_m", "goal")}
+        network = replace(base.network, **sees)
     return replace(
-        base, init=path, network=spec.network, camera=camera, teacher=base.teacher or spec.teacher or None
+        base, init=path, network=network, camera=camera, teacher=base.teacher or spec.teacher or None
     )
 
 

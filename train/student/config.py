@@ -9,7 +9,7 @@ import tyro
 
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
-from vd.student.cfg import LEAN, PAPER_NETWORK, EncoderCfg, NoiseCfg, StudentCfg
+from vd.student.cfg import LEAN, PAPER_NETWORK, EncoderCfg, NoiseCfg, StudentCfg, TurnCfg
 from vd.train.config import RunCfg
 
 Stage = Literal[0, 1, 2]
@@ -216,7 +216,9 @@ def gpu(stage: Stage) -> StudentTrainCfg:
     The numbers of the released code do not learn in hours: docs/results/student.md.
     """
     start = paper(stage)
-    dagger = SHORT_ROLLOUTS
+    dagger, network = SHORT_ROLLOUTS, LEAN
+    if stage == PRETRAINING:  # nothing else could see the rotation that it is to predict
+        network = replace(LEAN, turn=TurnCfg(vectors=32))
     if stage == RENDERED:  # it begins from a student that acts already
         dagger = replace(dagger, learning_rate=5e-4, teacher_share=dagger.teacher_share_last)
     return replace(
@@ -242,7 +244,7 @@ def gpu(stage: Stage) -> StudentTrainCfg:
             near_share=0.5,
             precision="bf16",
         ),
-        network=LEAN,
+        network=network,
     )
 
 

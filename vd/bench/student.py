@@ -165,7 +165,7 @@ class ControlStep:
             return
         assert self.sites is not None
         found = self.sense(
-            (self.sites.fresh(),),
+            (self.sites,),
             wp.to_torch(self.body_q),
             wp.to_torch(self.goal),
             fresh=self.fresh,
@@ -178,8 +178,7 @@ class ControlStep:
     def act(self) -> np.ndarray:
         """Voxels, previous action and memory to the next action [D]."""
         assert self.sites is not None
-        # Fresh maps each time: those of this cloud would else be kept.
-        output = self.net.act(self.sites.fresh(), self.senses, self.hidden)
+        output = self.net.act(self.sites, self.senses, self.hidden)
         action, self.hidden = output.mean.clamp(-1.0, 1.0), output.hidden
         self.senses[:, : self.net.num_actions] = action
         return action.numpy()[0]
