@@ -1,14 +1,19 @@
 """Links of other mass: found from the motions of all joints of a finger, within bounds, and no finding."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from test_gap_judge import made_up
 
 import vd.kernels.actuators as servo
 from vd.assets_usd.hands import load_hand
+from vd.gap import joints
 from vd.gap.chain import Chain, chains
+from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.design import design
 from vd.gap.explanation import Accepted, Explanation
 from vd.gap.fit import JointProblem
@@ -50,14 +55,22 @@ def blank() -> Recording:
     return Recording(Path("made up"), "dclaw3", JOINTS, {}, 1e-5, tuple(parts))
 
 
-def recorded(factors: tuple[float, float, float], friction: float = 0.0) -> tuple[Recording, Chain]:
-    """What a finger with links of other mass would have answered, and the chain of the model."""
+def recorded(
+    factors: tuple[float, float, float], lacks: dict[int, float] | None = None
+) -> tuple[Recording, Chain]:
+    """What a finger with links of other mass would have answered, and the chain of the model.
+
+    Args:
+        factors: Masses as shares of the model's.
+        lacks: What its joints have besides, by column of a parameter row.
+    """
     recording = blank()
     (chain,) = chains(recording, load_hand("dclaw3"))
     scale = np.array(factors)
     true = replace(chain, mass=chain.mass * scale, inertia=chain.inertia * scale[:, None, None])
     rows = chain.start_row.copy()
-    rows[:, servo.COULOMB_TORQUE] = friction
+    for column, value in (lacks or {}).items():
+        rows[:, column] = value
     rollouts = Rollouts(true, recording, dt=DT)
     path = rollouts.predict(rows[None])[0]
     path = path + np.random.default_rng(0).normal(0.0, NOISE, path.shape)
@@ -89,32 +102,46 @@ def test_masses_of_links_explain_what_no_stiffness_does() -> None:
 
 
 def test_friction_is_no_mass() -> None:
-    _, masses = fitted(*recorded((1.0, 1.0, 1.0), friction=0.02))
+    _, masses = fitted(*recorded((1.0, 1.0, 1.0), {servo.COULOMB_TORQUE: 0.02}))
     assert masses.errors.max() > 2.0 * NOISE
 
 
-@pytest.mark.parametrize(("core", "explained"), [("coulomb_friction", True), ("command_filter", False)])
-def test_beside_an_effect_other_masses_are_no_second_one(core: str, explained: bool) -> None:
-    """Only what all joints lack is kept where masses are the rest; nothing changes where they are not."""
-    recording, chain = recorded((0.86, 1.14, 0.9), friction=0.03)
-    both = ("coulomb_friction", "command_filter")
+def beside_masses(
+    recording: Recording, chain: Chain, effects: Sequence[tuple[str, ...]], start: dict[str, float]
+) -> tuple[list[Explanation], list[Explanation]]:
+    """Fits with effects on each joint that are no answer, and what they are beside other masses."""
     with Team(Bench(recording, [chain], DT, "cpu"), workers=1) as team:
-        joints, found = [], []
-        for index, name in enumerate(JOINTS):
+        every, found = [], []
+        for index, (name, own) in enumerate(zip(JOINTS, effects, strict=True)):
             trajectories, folds = design(recording, chain, index)
             spec = JointSpec(0, index, trajectories, folds, NOISE, baseline_of(chain))
             problem = team.bench.problem(spec)
             scales = problem.scales(chain.start_row[index], NOISE)
             plain = problem.fit(chain.start_row, (), [{}], scales, iterations=8)
-            joints.append(Joint(name, spec, scales, plain))
-            effects = both if index else (core,)
-            start = {"coulomb_friction.tau_c_nm": 0.03, "command_filter.tau_s": 1e-3}
-            final = problem.fit(
-                plain.rows, effects, [{k: start[k] for k in start if k.split(".")[0] in effects}], scales
-            )
-            accepted = tuple(Accepted(effect, 1.0, {}, (), (), False) for effect in effects)
+            every.append(Joint(name, spec, scales, plain))
+            given = {key: value for key, value in start.items() if key.split(".")[0] in own}
+            final = problem.fit(plain.rows, own, [given], scales)
+            accepted = tuple(Accepted(effect, 1.0, {}, (), (), False) for effect in own)
             found.append(Explanation(plain, final, "unknown", "structure is left", accepted))
-        told = _beside_masses(team, joints, found)
+        return found, _beside_masses(team, every, found)
+
+
+@pytest.mark.parametrize(
+    ("first", "others", "explained"),
+    [
+        (("coulomb_friction",), ("coulomb_friction", "command_filter"), True),
+        (("command_filter",), ("coulomb_friction", "command_filter"), True),
+        (("command_filter",), ("command_filter",), False),
+    ],
+    ids=["all have it", "most have it", "none has it"],
+)
+def test_beside_an_effect_other_masses_are_no_second_one(
+    first: tuple[str, ...], others: tuple[str, ...], explained: bool
+) -> None:
+    """Only what all joints lack is kept where masses are the rest; nothing changes where they are not."""
+    recording, chain = recorded((0.86, 1.14, 0.9), {servo.COULOMB_TORQUE: 0.03})
+    start = {"coulomb_friction.tau_c_nm": 0.03, "command_filter.tau_s": 1e-3}
+    found, told = beside_masses(recording, chain, [first, others, others], start)
     if not explained:
         assert told == found
         return
@@ -123,6 +150,41 @@ def test_beside_an_effect_other_masses_are_no_second_one(core: str, explained: b
         assert [one.name for one in each.accepted] == ["coulomb_friction"]
         assert each.accepted[0].estimates["tau_c_nm"][0] == pytest.approx(0.03, rel=0.05)
         assert "with the masses of its links" in each.reason
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(1.0, "unknown"), (-1.0, "effects")])
+def test_beside_other_masses_a_spring_is_no_load_with_an_offset(
+    share: float, verdict: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The table has no spring: a load and an offset that cancel at rest are not named in its place."""
+    monkeypatch.setattr(joints, "fit_masses", lambda *_: Masses(np.ones(3), np.full(3, NOISE)))
+    monkeypatch.setattr(joints, "_cores", lambda _: [("gravity_load", "encoder_bias")])
+    recording = blank()
+    (chain,) = chains(recording, load_hand("dclaw3"))
+    load, phase = 0.05, -1.3
+    offset = share * load * np.sin(phase) / float(chain.start_row[0, servo.KP])
+    values = {
+        "gravity_load.tau_g_nm": load,
+        "gravity_load.phase_rad": phase,
+        "encoder_bias.bias_rad": offset,
+    }
+    fit = replace(
+        made_up(("gravity_load", "encoder_bias"), NOISE),
+        coordinates=tuple(Coordinate(key, 0, False, 1.0, -9.0, 9.0) for key in ("kp", "kd", *values)),
+        x=np.array([1.0, 1.0, *values.values()]),
+        rows=chain.start_row,
+    )
+    bench = SimpleNamespace(chains=[chain], recording=recording, problem=lambda _: None)
+    team = SimpleNamespace(bench=bench, run=lambda *_: [fit])
+    accepted = tuple(Accepted(effect, 1.0, {}, (), (), False) for effect in fit.effects)
+    scales = Scales(1.0, 1.0, 2.0, 3.0, 10.0, 1e-3, 0.01, 6.0)
+    own, found = [], []
+    for index, name in enumerate(JOINTS):
+        spec = JointSpec(0, index, *design(recording, chain, index), NOISE, ())
+        own.append(Joint(name, spec, scales, replace(fit, effects=())))
+        found.append(Explanation(own[-1].fit, fit, "unknown", "structure is left", accepted))
+    told = _beside_masses(team, own, found)  # type: ignore[arg-type]
+    assert [each.verdict for each in told] == [verdict] * 3
 
 
 def test_masses_stay_in_the_range_that_policies_are_trained_on() -> None:

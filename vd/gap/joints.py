@@ -12,16 +12,16 @@ from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
 from vd.gap.chain import candidates, others_in
 from vd.gap.consensus import agree, share
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.explanation import Explanation, lacking, polished
+from vd.gap.explanation import NAMED, Accepted, Explanation, lacking, polished
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import NO_GAP, RANDOM
+from vd.gap.judge import EXCESS_FLOORS, NESTED, NO_GAP, RANDOM
 from vd.gap.masses import Masses, fit_masses
 from vd.gap.recording import Recording
 from vd.gap.select import LOOKS, RESTARTS, Selection
 from vd.gap.statistics import resamples
 from vd.gap.team import JointSpec, Team
 from vd.gap.telemetry import vetoes
-from vd.gap.verdict import explains
+from vd.gap.verdict import cancelled, explains
 from vd.kernels.effects import EFFECTS
 
 POLISH_ITERATIONS = 5
@@ -189,45 +189,102 @@ def _beside_masses(
 ) -> list[Explanation]:
     """Only what all joints of a finger lack, where other masses of its links are the rest.
 
-    What slightly heavier links leave beside an effect is imitated by a second effect, another on each joint.
+    What slightly heavier links leave beside an effect is imitated by a second effect, another on each joint,
+    or has something else imitate the effect better.
     """
     result = list(explanations)
     for index, chain in enumerate(team.bench.chains):
         own = [i for i, joint in enumerate(joints) if joint.spec.chain == index]
-        gaps = [i for i in own if explanations[i].verdict != "no_gap"]
-        effects = [explanations[i].final.effects for i in gaps]
-        core = tuple(name for name in (effects or [()])[0] if all(name in each for each in effects))
-        more = any(len(each) > len(core) for each in effects)
-        settled = not more and all(explanations[i].verdict == "effects" for i in gaps)
-        if not chain.bodies or not core or RANDOM in core or settled:
+        known = [(joints[i], explanations[i]) for i in own]
+        models = {frozenset(found.final.effects) for _, found in known if found.verdict != "no_gap"}
+        certain = all(found.verdict in ("effects", "no_gap") for _, found in known)
+        if not chain.bodies or not models or (certain and len(models) == 1):
             continue
-        rows = joints[own[0]].fit.rows.copy()
-        for i in own:
-            rows[joints[i].spec.joint] = joints[i].fit.rows[joints[i].spec.joint]
-        for i in gaps:
-            row = explanations[i].final.rows[joints[i].spec.joint].copy()
-            for name in {*explanations[i].final.effects} - {*core}:
-                for parameter in EFFECTS[name].parameters:
-                    row[parameter.column] = parameter.neutral
-            rows[joints[i].spec.joint] = row
-
-        def fitted(i: int, rows: np.ndarray = rows, core: tuple[str, ...] = core) -> JointFit:
-            call = {"base": rows, "effects": core, "starts": [{}], "scales": joints[i].scales}
-            call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
-            return team.run(joints[i].spec, [("fit", call)])[0]
-
-        fits = dict(zip(gaps, parallel(fitted, gaps), strict=True))
-        problems = [team.bench.problem(joints[i].spec) for i in own]
-        masses = fit_masses(problems, [fits.get(i, joints[i].fit) for i in own])
-        kept = {i: tuple(a for a in explanations[i].accepted if a.name in core) for i in gaps}
-        named = all(a.named for accepted in kept.values() for a in accepted)
-        if not named or (masses.errors >= [NO_GAP * joints[i].spec.floor for i in own]).any():
-            continue
-        for i, fit in fits.items():
-            reason = f"{explains(core)}, {masses.text}"
-            plain = replace(explanations[i], accepted=kept[i], verdict="effects", reason=reason)
-            result[i] = polished(plain, fit, joints[i].spec.floor)
+        told = [found for core in _cores(known) if (found := _all_with(team, known, core))]
+        fewest = min((found.effects for found in told), default=0)
+        best = sorted((found for found in told if found.effects == fewest), key=lambda found: found.left)
+        if best and (len(best) == 1 or best[1].left - best[0].left > EXCESS_FLOORS**2):
+            for i, explanation in zip(own, best[0].explanations, strict=True):
+                result[i] = explanation
     return result
+
+
+def _cores(known: Explained) -> list[tuple[str, ...]]:
+    """What all joints with a gap may lack: what all were found to, or one effect that most can have."""
+    gaps = [found for _, found in known if found.verdict != "no_gap"]
+    common = tuple(name for name in gaps[0].final.effects if all(name in e.final.effects for e in gaps))
+    can = []
+    for found in gaps:
+        names = {*found.final.effects, *(name for one in found.accepted for name in one.tied)}
+        can.append({*names, *(inside for name in names for inside in NESTED.get(name, ()))})
+    most = [n for n in sorted(set().union(*can)) if sum(n in names for names in can) > len(gaps) // 2]
+    cores = dict.fromkeys([common, *((name,) for name in most)])
+    return [core for core in cores if core and RANDOM not in core]
+
+
+@dataclass(frozen=True)
+class _Finger:
+    """A finger's joints with the same effects and links of other mass.
+
+    Attributes:
+        effects: How many effects.
+        left: Sum of the joints' squared errors, in squared noise floors.
+        explanations: Of the joints.
+    """
+
+    effects: int
+    left: float
+    explanations: list[Explanation]
+
+
+def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | None:
+    """The joints of a finger with these effects alone, if links of other mass then leave noise on all."""
+    models = [
+        (found.final.values, {one.name: one for one in found.accepted if not (one.at_bound or one.doubt)})
+        for _, found in known
+    ]
+    named = {name: next((m for m in models if name in m[1]), None) for name in core}
+    start: dict[str, float] = {}
+    accepted: list[Accepted] = []
+    for name, model in named.items():
+        if model is None:
+            return None
+        start |= {key: value for key, value in model[0].items() if key.startswith(f"{name}.")}
+        one = model[1][name]
+        accepted.append(replace(one, tied=(), confidence=max(one.confidence, NAMED)))
+    rows = known[0][0].fit.rows.copy()
+    for joint, found in known:
+        row = (found.final if {*core} <= {*found.final.effects} else joint.fit).rows[joint.spec.joint].copy()
+        for name in {*found.final.effects} - {*core}:
+            for parameter in EFFECTS[name].parameters:
+                row[parameter.column] = parameter.neutral
+        rows[joint.spec.joint] = row
+
+    def fitted(one: tuple[Joint, Explanation]) -> JointFit:
+        joint, found = one
+        if found.verdict == "no_gap":
+            return joint.fit
+        starts = [{}] if {*core} <= {*found.final.effects} else [start]
+        call = {"base": rows, "effects": core, "starts": starts, "scales": joint.scales}
+        call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
+        return team.run(joint.spec, [("fit", call)])[0]
+
+    fits = parallel(fitted, known)
+    masses = fit_masses([team.bench.problem(joint.spec) for joint, _ in known], fits)
+    floors = np.array([joint.spec.floor for joint, _ in known])
+    if (masses.errors >= NO_GAP * floors).any():
+        return None
+    reason, explanations = f"{explains(core)}, {masses.text}", []
+    for (joint, found), fit in zip(known, fits, strict=True):
+        column = int(team.bench.chains[joint.spec.chain].columns[joint.spec.joint])
+        rest = _rest(team.bench.recording, column, joint.spec.trajectories)
+        if cancelled(fit, joint.spec.joint, rest):
+            return None  # a spring, and no load and offset
+        if found.verdict != "no_gap":
+            plain = replace(found, accepted=tuple(accepted), verdict="effects", reason=reason)
+            found = polished(plain, fit, joint.spec.floor)
+        explanations.append(found)
+    return _Finger(len(core), float(np.sum((masses.errors / floors) ** 2)), explanations)
 
 
 def _rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:
