@@ -1,9 +1,10 @@
-"""An effect hidden in the twin is named by vd-gap from a recording, exactly: on a simulated clock."""
+"""What vd-gap makes of a recording of the twin and of the log of a flight, exactly: on a simulated clock."""
 
 import contextlib
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
@@ -12,11 +13,25 @@ from simulated_hand import simulated_bus
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy import record
+from vd.deploy.action import ActionFilter
+from vd.deploy.clock import Pacer
 from vd.deploy.connect import Connection
 from vd.deploy.joints import uncalibrated
+from vd.deploy.log import LogWriter
+from vd.deploy.loop import ControlLoop, LoopCfg
+from vd.deploy.motion import move
 from vd.deploy.newton_hand import NewtonHand
+from vd.deploy.pilot import Decision
+from vd.deploy.safety import SafeHand
+from vd.envs.cfg import ReorientCfg
 from vd.gap import cli as gap
+from vd.gap.chain import chains
+from vd.gap.recording import read_recording
+from vd.gap.rollout import Rollouts
+from vd.gap.workflow import explain
+from vd.kernels.actuators import COMMAND_DELAY
 from vd.sim.cfg import SimCfg
+from vd.student.stopping import StoppingRule
 
 DELAY_S = 0.04
 LAYER = """#usda 1.0
@@ -31,6 +46,8 @@ over "dclaw4"
     }
 }
 """
+THINKING_S = 0.03
+"""Time that a policy takes to decide."""
 KINDS = ("step_medium", "step_large", "sine_0.50hz", "sine_1.00hz")
 
 
@@ -61,3 +78,65 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     found = {effect["name"]: effect for effect in report["effects"] if "f0_j1" in effect["joints"]}
     assert set(found) == {"command_delay"}
     assert found["command_delay"]["parameters"]["delay_s"]["value"] == pytest.approx(DELAY_S, abs=0.001)
+
+
+class Waving:
+    """A policy that moves all joints of dclaw3 back and forth, each in its own time."""
+
+    def __init__(self, clock):
+        self.rule, self._clock, self._step = StoppingRule(), clock, 0
+
+    def begin(self):
+        """Nothing to forget."""
+
+    new_goal = begin
+
+    def decide(self, sensed):
+        """After a while."""
+        self._clock.sleep(THINKING_S)
+        self._step += 1
+        return Decision(0.8 * np.sin(0.4 * self._step + np.arange(9.0)), float("nan"))
+
+
+def fly(folder, plant_hand, goal_s):
+    """The log of a flight without an object."""
+    hand = load_hand("dclaw3")
+    joints = uncalibrated(hand)
+    plant = NewtonHand(plant_hand, joints, SimCfg(physics_hz=960.0))
+    with simulated_bus(hand, joints, plant) as (_, bus):
+        run = {"goals": [[0.0, 0.0, 0.0, 1.0]]}
+        with SafeHand(bus, joints, hand) as safe:
+            safe.arm()
+            move(safe, np.tile([0.0, 0.3, -0.5], 3), 0.5)
+            log = LogWriter(folder, hand, run, servo={}, clock=bus.clock)
+            pacer, actions = Pacer(12.0, bus.clock), ActionFilter(hand, ReorientCfg())
+            loop = ControlLoop(safe, Waving(bus.clock), actions, pacer, log, LoopCfg(goal_s, 0.0))
+            loop.run([np.array([0.0, 0.0, 0.0, 1.0])])
+        log.finish("done")
+    return folder
+
+
+def test_a_flight_tells_when_its_goals_were_sent(tmp_path):
+    """The true model follows them; with the times of the states it would be early."""
+    hand = load_hand("dclaw3")
+    flight = read_recording(fly(tmp_path / "log", hand, 4.0))
+    (motion,) = flight.trajectories
+    stamped = replace(flight, trajectories=(replace(motion, command_time=None),))
+
+    def error(recording):
+        chain = chains(recording, hand)[0]
+        rollouts = Rollouts(chain, recording)
+        return np.median(np.abs(rollouts.predict(chain.start_row[None])[0] - rollouts.measured))
+
+    assert error(flight) < 0.001 < 0.01 < error(stamped)
+
+
+@pytest.mark.slow
+def test_a_flight_alone_is_given_no_name(tmp_path):
+    """Not even that of an effect which it has: one motion leaves none to hold out."""
+    hand = load_hand("dclaw3")
+    servo = hand.servo.copy()
+    servo[:, COMMAND_DELAY] = 0.06
+    folder = fly(tmp_path / "log", replace(hand, servo=servo), 6.0)
+    report = explain(folder, hand, tmp_path / "gap", effects=("command_delay", "backlash"))
+    assert report.verdict == "under_excited" and not report.effects
