@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.coordinates import Scales, best_two, sizes, smaller, torque_power
+from vd.gap.coordinates import Scales, beside, best_two, sizes, smaller, torque_power
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import AT_FLOOR, EXPLAINED, RANDOM, SHARP
 from vd.gap.telemetry import BEHIND_SENSOR
@@ -110,7 +110,10 @@ class CandidateFits:
         white = 0.0 if self.veiled else EXPLAINED * self.floor
         least = known.rmse if known is not None and known.rmse < white else np.inf
         names = [name for name in self.candidates if name not in out]
-        starts = {name: sizes(name, self.others, self.scales) for name in names}
+        starts = {
+            name: [*sizes(name, self.others, self.scales), *beside(name, present.values, self.scales)]
+            for name in names
+        }
         flat = [(name, start) for name in names for start in starts[name]]
         if not flat:
             return {}
@@ -316,6 +319,27 @@ class CandidateFits:
         kept = tuple(effect for effect in present.effects if effect != name)
         call = {"base": rows, "effects": (*kept, simpler), "starts": [start], "scales": self.scales}
         return self.run([("fit", {**call, "iterations": FULL_ITERATIONS, "refits": self.refits})])[0]
+
+    def from_present(
+        self, present: JointFit, without: JointFit, fits: Mapping[str, JointFit]
+    ) -> dict[str, JointFit]:
+        """The fits with others in the place of an effect that are better from where the present model is.
+
+        In a sharp valley, as beside a profile that cannot follow, they end where they entered it.
+
+        Args:
+            present: The model.
+            without: The model without the effect.
+            fits: With others in its place, by name.
+        """
+        near = {name: fit for name, fit in fits.items() if present.rmse < fit.rmse < BEHIND * present.rmse}
+        kept = {key: present.values[key] for key in without.values}
+        calls = []
+        for name, fit in near.items():
+            own = {key: value for key, value in fit.values.items() if key.startswith(f"{name}.")}
+            calls.append(self.call(without, name, [{**kept, **own}], FULL_ITERATIONS))
+        found = dict(zip(near, self.run(calls), strict=True))
+        return {name: fit for name, fit in found.items() if fit.rmse < near[name].rmse}
 
     def refit(self, present: JointFit, effects: Sequence[str]) -> JointFit:
         """The fit with only some of a model's effects."""

@@ -29,6 +29,8 @@ LIGHT = 0.1
 """An inertia that does none of it, in fitted ones."""
 FREE_SPEED = 3.0
 """A speed limit that does not bind, in largest speeds."""
+STEEPER = 2.0
+"""Torque at rest of a line beside a limit, in that of one which stands for both."""
 FLATTEST = 1e-3
 """Scale of angles at least [rad], if the residual is smaller."""
 
@@ -203,7 +205,7 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
                 "c_nms_rad": 0.1 * f * scales.kp * period,
                 "j_kgm2": g * scales.inertia,
             }
-            for f, g in ((0.3, 0.3), (1.0, 0.3), (1.0, 1.0), (3.0, 0.3), (3.0, 2.0))
+            for f, g in ((0.3, 0.3), (0.3, 0.6), (1.0, 0.3), (1.0, 1.0), (3.0, 0.3), (3.0, 2.0))
         ],
         "joint_coupling": [
             {f"from_{slot + 1}": f if slot == other else 0.0 for slot in others}
@@ -225,6 +227,23 @@ def sizes(effect: str, others: Sequence[int], scales: Scales) -> list[dict[str, 
     if effect in SMOOTHING:
         starts += [{**start, "inertia": LIGHT * scales.inertia} for start in starts]
     return starts
+
+
+def beside(effect: str, present: Mapping[str, float], scales: Scales) -> list[dict[str, float]]:
+    """Starting values of an effect and of one that it has to leave room beside, by key.
+
+    Args:
+        effect: Name of the effect.
+        present: Values of the model to which it is added.
+        scales: Sizes of the joint's motion.
+    """
+    line = "torque_speed_limit.tau_stall_nm"
+    if effect != "torque_limit" or line not in present:
+        return []
+    # The line has bent to where both are; with the limit there, it rises to what the speeds ask of it.
+    room = {line: STEEPER * present[line], "torque_speed_limit.omega_0_rad_s": scales.speed}
+    limit = {"torque_limit.tau_max_nm": present[line]}
+    return [{**limit, **room, "velocity_limit": FREE_SPEED * scales.speed}]
 
 
 def smaller(start: Mapping[str, float]) -> dict[str, float] | None:

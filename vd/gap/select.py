@@ -16,7 +16,7 @@ from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.frictions import EXACTLY, Frictions
 from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import ONE_SIDED, JointFit
-from vd.gap.judge import EXPLAINED, NESTED, RANDOM, REPEATABLE
+from vd.gap.judge import EXPLAINED, NESTED, RANDOM, REPEATABLE, SHARP
 from vd.gap.telemetry import BEHIND_SENSOR
 from vd.gap.verdict import cancelled
 
@@ -407,5 +407,7 @@ class Selection(Frictions):
             inside = self.from_richer(present, name, simpler)
             if simpler not in fits or inside.rmse < fits[simpler].rmse:
                 fits[simpler] = inside
+        if len(present.effects) > 1 and present.rmse < SHARP * self.whole:
+            fits |= self.from_present(present, without, fits)
         self.added[frozenset(without.effects)] = (without, present, *fits.values())
         return [present, *fits.values()]
