@@ -210,8 +210,8 @@ its whole motion in time either way. By convention the shift is one of the comma
 """
 
 ON_A_PENDULUM: dict[str, tuple[str, ...]] = {"encoder_bias": ("gravity_load",)}
-"""The same on a pendulum, whose load hangs from the joint: whether its zero is not where the arm hangs, or a
-further load hangs off the arm, positions and commands are the same."""
+"""Nearly the same on a pendulum, whose own load is part of the plain model: whether its zero is not where the
+arm hangs, or a further load hangs off the arm, moves it alike but for how the load changes with the angle."""
 
 BESIDE: dict[str, dict[str, tuple[str, ...]]] = {
     "stribeck_friction": {"encoder_bias": ("asymmetric_friction",)}
