@@ -125,6 +125,32 @@ class TableCfg:
 
 
 @dataclass(frozen=True)
+class RetryCfg:
+    """Ours: a hand that is still, but far from its goal, opens and tries again. Off by default.
+
+    A policy without memory that has come to rest has nothing that would move it again. Needs a table: in the
+    air an open hand drops its object.
+    """
+
+    enabled: bool = False
+    """Whether hands try again."""
+    beyond_rad: float = PAPER.success.rotation_rad
+    """Distance from the goal above which a hand that is still is stuck [rad]."""
+    joint_speed_rad_s: float = 0.3
+    """Norm of the joint velocities up to which a hand is still [rad/s]."""
+    still_s: float = 0.5
+    """How long it has to be so [s]."""
+    open_s: float = 0.67
+    """How long it then opens [s]."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        for name in ("beyond_rad", "joint_speed_rad_s", "still_s", "open_s"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"retry.{name} is {getattr(self, name):g}; it has to be positive")
+
+
+@dataclass(frozen=True)
 class TighteningCfg:
     """Ours: ask for little stillness at first, later for that of ``success``. Off by default.
 
@@ -293,6 +319,7 @@ class ReorientCfg:
     start: StartCfg = field(default_factory=StartCfg)
     goal: GoalCfg = field(default_factory=GoalCfg)
     table: TableCfg = field(default_factory=TableCfg)
+    retry: RetryCfg = field(default_factory=RetryCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
 
@@ -307,6 +334,7 @@ class ReorientCfg:
         self.randomisation.validate()
         self.curriculum.validate()
         self.table.validate()
+        self.retry.validate()
         if self.start.at_rest and (self.start.poses < 1 or self.start.settle_s <= 0.0):
             raise ValueError(
                 f"start.at_rest needs start.poses >= 1 (now {self.start.poses}) and start.settle_s > 0 "

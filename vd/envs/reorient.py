@@ -18,10 +18,11 @@ from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.parameters import TaskParameters
 from vd.envs.randomise import Randomiser
+from vd.envs.retries import Retries
 from vd.envs.servo import needs_servo, servo_ranges
 from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
-from vd.envs.state import load_state, save_state
+from vd.envs.state import load_state, save_failed_step, save_state
 from vd.envs.symmetry import Views
 from vd.envs.table import table_array
 from vd.kernels.actions import apply_action_kernel, joint_effort_kernel
@@ -33,7 +34,6 @@ from vd.kernels.rng import init_rng_kernel
 from vd.kernels.shapes import shape_observation_size
 from vd.kernels.worlds import copy_columns_kernel, count_goals_kernel, record_step_kernel, world_mask_kernel
 from vd.paper import PAPER
-from vd.sim.replay import save_dump
 from vd.sim.scene import build_scene
 from vd.sim.simulator import SimulationError, Simulator
 
@@ -157,6 +157,8 @@ class ReorientEnv:
         self.acts_in_view = True
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
         self._table_steps = table_array(cfg, self.device)
+        self.retries = Retries(self) if cfg.retry.enabled else None
+        """What opens hands that are stuck, or None: they stay as they are."""
         self._shapes = ShapeObserver(self) if self.sees_shape else None
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
         self.randomiser = Randomiser(self)
@@ -231,6 +233,8 @@ class ReorientEnv:
         action = self.action
         if self.views is not None and self.acts_in_view:
             action = self.views.world_action(action)
+        if self.retries is not None:
+            action = self.retries.world_action(action)
         wp.launch(
             apply_action_kernel,
             dim=self.num_worlds,
@@ -445,19 +449,9 @@ class ReorientEnv:
         try:
             self.sim.check(tolerated)
         except SimulationError as error:
-            dumps = self.sim.dumps()
-            if not dumps:
+            path = save_failed_step(self)
+            if path is None:
                 raise
-            cfg, dump = self.cfg, dumps[0]
-            path = save_dump(
-                self.dump_dir / f"dump_{dump.object_name}_{dump.world}.json",
-                dump,
-                hand=cfg.hand,
-                fingertip=cfg.fingertip,
-                hand_layer=cfg.hand_layer,
-                objects=cfg.objects,
-                sim=cfg.sim,
-            )
             raise SimulationError(f"{error} (dump: {path})") from error
 
     def failed_steps(self) -> int:

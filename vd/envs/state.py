@@ -1,11 +1,13 @@
 """Saving an environment in the middle of its episodes, and going on from there."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from vd.envs.cfg import CurriculumCfg
 from vd.envs.curriculum import Stage, first_stage
+from vd.sim.replay import save_dump
 
 if TYPE_CHECKING:
     from vd.envs.reorient import ReorientEnv
@@ -43,8 +45,8 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
     here = _arrays(env)
     if state["arrays"].keys() != here.keys():
         raise ValueError(
-            "the saved environment has other servos, views or contacts; resume with hand_layer, "
-            "observation.view, randomisation.effects and randomisation.restitution of the checkpoint, "
+            "the saved environment has other servos, views, contacts or retries; resume with hand_layer, "
+            "observation.view, retry, randomisation.effects and randomisation.restitution of the checkpoint, "
             "or from one without worlds (vd-train export --resumable)"
         )
     for name, array in here.items():
@@ -57,9 +59,28 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
             )
         array.assign(saved)
     env.steps = int(state["steps"])
+    if env.retries is not None:
+        env.retries.forget()
     env.set_stage(saved_stage(state, env.cfg.curriculum))
     env.randomiser.push()
     env.sim.forward_kinematics()
+
+
+def save_failed_step(env: "ReorientEnv") -> Path | None:
+    """Save the first control step that failed for ``vd-bench replay``; returns its file, None if none did."""
+    dumps = env.sim.dumps()
+    if not dumps:
+        return None
+    cfg, dump = env.cfg, dumps[0]
+    return save_dump(
+        env.dump_dir / f"dump_{dump.object_name}_{dump.world}.json",
+        dump,
+        hand=cfg.hand,
+        fingertip=cfg.fingertip,
+        hand_layer=cfg.hand_layer,
+        objects=cfg.objects,
+        sim=cfg.sim,
+    )
 
 
 def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
@@ -78,6 +99,7 @@ def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
         "observation": env.observation,
         "rng": env.rng,
         **({} if env.views is None else {"view": env.views.view}),
+        **({} if env.retries is None else env.retries.stateful()),
         **env.randomiser.stateful(),
         **({} if sim.servo is None else sim.servo.stateful()),
         **({} if sim.restitution is None else sim.restitution.stateful()),

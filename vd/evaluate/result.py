@@ -93,6 +93,8 @@ class Protocol:
     """Coefficient of the table if it is not the nominal one."""
     scanned_goals: bool = False
     """Students get their goals from scans, with the errors of these."""
+    retry: bool = False
+    """Hands that are still far from the goal open and try again."""
 
     @property
     def hand_name(self) -> str:

@@ -68,6 +68,8 @@ class PlayCfg:
     """Start at rest on the table; the default is as trained, and a drop for --agent zero and random."""
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
+    retry: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Where a hand is still, but far from the goal, open it and let the policy try again."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float = PAPER.scene.episode_s
@@ -259,6 +261,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         success_ends_episode=False,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
+        retry=cfg.retry,
     )
     check_bundle(cfg.agent_name, task)
     env = ReorientEnv(task, device)
