@@ -50,8 +50,9 @@ demo: $(STAMP)
 	$(BIN)/python -m vd.train.demo $(if $(MESHES),--meshes "$(MESHES)") $(DEMO_ARGS)
 
 # A file's tests stay in one process: its fixtures build simulators, which is what takes the time.
+# Files keep the order of tests/conftest.py, which puts slow ones first.
 test: $(STAMP)
-	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist loadfile $(TEST_ARGS)
+	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

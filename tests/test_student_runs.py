@@ -217,12 +217,13 @@ def test_another_network_or_no_teacher_is_explained(tmp_path, stage, capsys):
 def test_stages_on_the_command_line(tmp_path, capsys):
     """Stage 1 by imitation of an installed teacher, stage 2 from it, resumed; then its stopping rule."""
     small = ["--preset", "cpu-demo", "--num-worlds", "2", "--dagger.rollout-steps", "3", "--no-tensorboard"]
-    small += ["--dagger.validation-worlds", "1", "--network.turn.vectors", "4"]
+    small += ["--dagger.validation-worlds", "1"]
     small += ["--task.at-rest", "False"]  # the search for poses at rest takes long
-    assert main(["student", *small, "--run-dir", str(tmp_path / "stage1"), "--max-steps", "6"]) == 0
+    first = ["student", *small, "--network.turn.vectors", "4", "--run-dir", str(tmp_path / "stage1")]
+    assert main([*first, "--max-steps", "6"]) == 0
     (row,) = read_progress(tmp_path / "stage1" / "progress.jsonl")
     assert all(row[f"loss/{name}"] > 0.0 for name in ("imitation", "distance", "pose", "state", "match"))
-    second = ["student", *small[:-2], "--stage", "2", "--run-dir", str(tmp_path / "stage2")]
+    second = ["student", *small, "--stage", "2", "--run-dir", str(tmp_path / "stage2")]
     assert main([*second, "--max-steps", "6"]) == 0
     assert "begins with the weights of" in capsys.readouterr().out
     resume = ["student", "--run-dir", str(tmp_path / "stage2"), "--resume", "--max-steps", "12"]

@@ -121,8 +121,10 @@ def test_an_estimate_is_normalised_in_the_world_as_the_teachers_views_would_have
                 maps[view, row, column] += factor
         np.testing.assert_allclose(maps[view] @ maps[view].T, np.eye(values), atol=1e-6)
     view = torch.randint(env.num_fingers, (count,), generator=random)
-    back = torch.from_numpy(maps).float().transpose(1, 2)[view]
-    world = ((back @ seen[..., None])[..., 0] - head.offset) / head.scale
+    back = torch.empty_like(seen)
+    for one, turn in enumerate(torch.from_numpy(maps).float()):  # back is its inverse, the transpose
+        back[view == one] = seen[view == one] @ turn
+    world = (back - head.offset) / head.scale
     assert world.mean(dim=0).abs().max() < 0.03
     assert (world.std(dim=0) - 1.0).abs().max() < 0.03
 
