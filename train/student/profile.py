@@ -8,6 +8,7 @@ from unittest.mock import patch
 
 import torch
 
+from vd.train.student import dagger as loop
 from vd.train.student.dagger import Dagger
 
 
@@ -66,19 +67,23 @@ def profile_iteration(dagger: Dagger, *, warm_up: int = 1) -> dict[str, float]:
         (env, "step", "simulation"),
         (dagger, "_label", "teacher"),
         (view, "frame", "frames, depth images"),
+        (view, "_sense", "finding the object"),
         (view, "sites", "clouds"),
         (view, "_voxelise", "voxels"),
+        (loop, "taken", "gathering of sequences"),
         (dagger, "_look", "maps, encoder"),
+        (dagger.student.turn, "forward", "learned rotation"),
         (dagger, "_run", "memory, heads"),
         (dagger.optimizer, "step", "optimiser"),
         (torch.Tensor, "backward", "backward"),
+        (loop, "descend", "norm of the gradient"),
         (dagger, "collect", "acting"),
         (dagger, "update", "learning"),
         (dagger, "validate", "validation"),
     ]
     with ExitStack() as stack:
         for owner, name, part in parts:
-            if hasattr(owner, name):
+            if getattr(owner, name, None) is not None:
                 stack.enter_context(patch.object(owner, name, times.timed(part, getattr(owner, name))))
         dagger.iterate(lambda: False)
     return dict(sorted(times.seconds.items(), key=lambda item: -item[1]))
