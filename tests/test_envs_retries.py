@@ -9,7 +9,7 @@ from vd.envs.cfg import GoalCfg, RandomisationCfg, ReorientCfg, RetryCfg
 from vd.envs.reorient import ReorientEnv
 from vd.paper import PAPER
 
-BENT, SECOND = 8, 12
+BENT, SECOND = 6, 12
 """Control steps in which the fingers bend, and of a second."""
 OPEN = np.tile(PAPER.scene.reset_joint_rad, 3)
 
@@ -69,8 +69,8 @@ def test_without_retries_a_hand_that_is_told_nothing_stays(stuck):
 
 
 def test_a_hand_that_is_stuck_far_from_the_goal_opens(stuck):
-    held = stuck[True][: BENT + 3]
-    assert np.allclose(held, stuck[False][: BENT + 3]), "nothing opens before it was still for half a second"
+    waits = SECOND - 1
+    assert np.allclose(stuck[True][:waits], stuck[False][:waits]), "nothing opens within the first second"
     assert (stuck[True].min(axis=0) < 0.1).all()
 
 
@@ -100,5 +100,5 @@ def test_a_saved_environment_goes_on_opening():
 
 
 def test_settings_that_cannot_work_are_refused():
-    with pytest.raises(ValueError, match=r"retry\.still_s"):
-        ReorientCfg(retry=RetryCfg(enabled=True, still_s=0.0), goal=GoalCfg()).validate()
+    with pytest.raises(ValueError, match=r"retry\.patience_s"):
+        ReorientCfg(retry=RetryCfg(enabled=True, patience_s=0.0), goal=GoalCfg()).validate()

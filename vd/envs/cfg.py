@@ -126,26 +126,26 @@ class TableCfg:
 
 @dataclass(frozen=True)
 class RetryCfg:
-    """Ours: a hand that is still, but far from its goal, opens and tries again. Off by default.
+    """Ours: a hand that brings its object no nearer to the goal opens and tries again. Off by default.
 
-    A policy without memory that has come to rest has nothing that would move it again. Needs a table: in the
-    air an open hand drops its object.
+    A policy without memory that has come to rest, or goes round in circles, has nothing that would end it.
+    Needs a table: in the air an open hand drops its object.
     """
 
     enabled: bool = False
     """Whether hands try again."""
     beyond_rad: float = PAPER.success.rotation_rad
-    """Distance from the goal above which a hand that is still is stuck [rad]."""
-    joint_speed_rad_s: float = 0.3
-    """Norm of the joint velocities up to which a hand is still [rad/s]."""
-    still_s: float = 0.5
-    """How long it has to be so [s]."""
+    """Distance from the goal above which a hand can be stuck [rad]."""
+    progress_rad: float = 0.1
+    """By how much the least distance since the hand began has to fall to count as progress [rad]."""
+    patience_s: float = 1.0
+    """Time without progress after which the hand opens [s]."""
     open_s: float = 0.67
-    """How long it then opens [s]."""
+    """Time for which it opens [s]."""
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        for name in ("beyond_rad", "joint_speed_rad_s", "still_s", "open_s"):
+        for name in ("beyond_rad", "progress_rad", "patience_s", "open_s"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"retry.{name} is {getattr(self, name):g}; it has to be positive")
 

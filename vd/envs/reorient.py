@@ -234,7 +234,7 @@ class ReorientEnv:
         if self.views is not None and self.acts_in_view:
             action = self.views.world_action(action)
         if self.retries is not None:
-            action = self.retries.world_action(action)
+            action = self.retries.world_action(action, self._new_goal)
         wp.launch(
             apply_action_kernel,
             dim=self.num_worlds,

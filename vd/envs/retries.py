@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import warp as wp
 
-from vd.kernels.retries import RetryParams, retry_kernel
+from vd.kernels.retries import ANY_DISTANCE, RetryParams, retry_kernel
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -24,8 +24,8 @@ def retry_params(cfg: Any, control_dt: float, step_rad: float, device: str) -> w
         device: Warp device.
     """
     params = RetryParams()
-    params.beyond, params.joint_speed = cfg.beyond_rad, cfg.joint_speed_rad_s
-    params.still_steps, params.open_steps = (max(1, round(s / control_dt)) for s in (cfg.still_s, cfg.open_s))
+    params.beyond, params.progress = cfg.beyond_rad, cfg.progress_rad
+    params.patience, params.open_steps = (max(1, round(s / control_dt)) for s in (cfg.patience_s, cfg.open_s))
     params.step_rad = step_rad
     return wp.array([params], dtype=RetryParams, device=device)
 
@@ -46,12 +46,18 @@ class Retries:
         open_q = np.tile(PAPER.scene.reset_joint_rad, env.num_fingers)
         self._open_q = wp.array(open_q, dtype=float, device=env.device)
         self.predicted = wp.full(n, NO_PREDICTION, dtype=float, device=env.device)
-        self._still = wp.zeros(n, dtype=wp.int32, device=env.device)
+        self._least = wp.full(n, ANY_DISTANCE, dtype=float, device=env.device)
+        self._waited = wp.zeros(n, dtype=wp.int32, device=env.device)
         self._opening = wp.zeros(n, dtype=wp.int32, device=env.device)
         self._action = wp.zeros((n, d), dtype=float, device=env.device)
 
-    def world_action(self, action: wp.array) -> wp.array:
-        """Actions to apply, shape [N, D], for those of the policy, joints in the world's order."""
+    def world_action(self, action: wp.array, new_goal: wp.array) -> wp.array:
+        """Actions to apply, shape [N, D].
+
+        Args:
+            action: Those of the policy, joints in the world's order, shape [N, D].
+            new_goal: 1 where the goal is new, shape [N].
+        """
         env = self._env
         wp.launch(
             retry_kernel,
@@ -61,11 +67,12 @@ class Retries:
                 self._params,
                 action,
                 env.measured_q,
-                env.measured_qd,
                 env.previous_error,
                 self.predicted,
                 env.step_count,
-                self._still,
+                new_goal,
+                self._least,
+                self._waited,
                 self._opening,
             ],
             outputs=[self._action],
@@ -83,4 +90,8 @@ class Retries:
 
     def stateful(self) -> dict[str, wp.array]:
         """What a saved environment has to keep."""
-        return {"retry_still": self._still, "retry_opening": self._opening}
+        return {
+            "retry_least": self._least,
+            "retry_waited": self._waited,
+            "retry_opening": self._opening,
+        }

@@ -93,7 +93,7 @@ class EvalCfg:
     table_friction: float | None = None
     """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
     retry: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Where a hand is still, but far from the goal, open it and try again; not for --in-air."""
+    """Open a hand that brings its object no nearer to the goal, and try again; not for --in-air."""
     scanned_goals: tyro.conf.FlagCreatePairsOff[bool] = False
     """Students get goals with the errors of a scan: 4 mm of noise, a fifth of the points missing."""
     sees: Literal["auto", "complete", "rendered"] = "auto"

@@ -94,7 +94,7 @@ class Protocol:
     scanned_goals: bool = False
     """Students get their goals from scans, with the errors of these."""
     retry: bool = False
-    """Hands that are still far from the goal open and try again."""
+    """Hands that bring their object no nearer to the goal open and try again."""
 
     @property
     def hand_name(self) -> str:

@@ -69,7 +69,7 @@ class PlayCfg:
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
     retry: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Where a hand is still, but far from the goal, open it and let the policy try again."""
+    """Open a hand that brings its object no nearer to the goal, and let the policy try again."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float = PAPER.scene.episode_s
