@@ -1,6 +1,12 @@
-"""Calls one after the other, and in threads that simulate together: the same results."""
+"""Calls one after the other, in processes, and in threads that simulate together."""
 
+import os
+import signal
+import subprocess
+import sys
 import threading
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -31,18 +37,25 @@ def answers(team: Team, spec: JointSpec) -> list[Any]:
     return team.run(spec, calls)
 
 
-def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
-    recording = recorded({servo.COULOMB_TORQUE: 0.06})
+def problem(extra: dict[int, float], crowd: Crowd | None = None) -> tuple[Bench, JointSpec]:
+    """A made-up recording of a servo, and what makes the problem of its joint."""
+    recording = recorded(extra)
     (chain,) = chains(recording)
     trajectories, folds = design(recording, chain, 0)
     spec = JointSpec(0, 0, trajectories, folds, noise_floor(recording, 0), baseline_of(chain))
-    with Team(Bench(recording, [chain], STEP_S, "cpu"), workers=1) as team:
+    return Bench(recording, [chain], STEP_S, "cpu", crowd), spec
+
+
+def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
+    hidden = {servo.COULOMB_TORQUE: 0.06}
+    bench, spec = problem(hidden)
+    with Team(bench, workers=1) as team:
         alone, simulated = answers(team, spec), team.simulated
         again = answers(team, spec)
         assert team.simulated == simulated, "a call that was made before is not made again"
         assert all(one is other for one, other in zip(alone, again, strict=True))
     crowd = Crowd()
-    with Team(Bench(recording, [chain], STEP_S, "cpu", crowd), workers=1) as team:
+    with Team(problem(hidden, crowd)[0], workers=1) as team:
         together = answers(team, spec)
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one.x, other.x)
@@ -54,16 +67,63 @@ def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
     assert crowd.launches <= 2 + 3 * 3 + (2 * 3 - 1) + 1
 
 
+PARENT = """
+import time
+import multiprocessing
+from test_gap_team import problem
+from vd.gap.team import Team
+
+if __name__ == "__main__":
+    bench, spec = problem({})
+    with Team(bench, workers=2) as team:
+        row = bench.chains[0].start_row[0]
+        team.run(spec, [("scales", {"row": row, "residual": left}) for left in (0.01, 0.02)])
+        print(*(child.pid for child in multiprocessing.active_children()), flush=True)
+        time.sleep(60.0)
+"""
+ENDING_S = 20.0
+"""Time for orphans to end."""
+
+
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_whom_they_work_for(ending: signal.Signals, tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT)
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    with subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path}
+    ) as parent:
+        assert parent.stdout is not None
+        lines = iter(parent.stdout)
+        workers = [int(pid) for pid in next(line for line in lines if line[:1].isdigit()).split()]
+        assert len(workers) == 2 and all(map(runs, workers))
+        parent.send_signal(ending)
+        parent.wait()
+        end = time.monotonic() + ENDING_S
+        while any(map(runs, workers)) and time.monotonic() < end:
+            time.sleep(0.1)
+        left = [pid for pid in workers if runs(pid)]
+        for pid in left:
+            os.kill(pid, signal.SIGKILL)
+        assert not left
+
+
+def runs(pid: int) -> bool:
+    """Whether a process runs, and is not merely waiting for somebody to ask how it ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
-    recording = recorded({servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2})
-    (chain,) = chains(recording)
-    trajectories, folds = design(recording, chain, 0)
-    spec = JointSpec(0, 0, trajectories, folds, noise_floor(recording, 0), baseline_of(chain))
+    bench, spec = problem({servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2})
+    recording, (chain,) = bench.recording, bench.chains
     rows = chain.start_row.copy()
     for column, value in {**TRUE, servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2}.items():
         rows[0, column] = value
     exact = Rollouts(chain, recording, dt=STEP_S / 32).predict(rows[None])[0]
-    drawn = curves(recording, Bench(recording, [chain], STEP_S, "cpu"), [("j", spec, rows)])
+    drawn = curves(recording, bench, [("j", spec, rows)])
     searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
     assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)
 

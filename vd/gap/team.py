@@ -2,12 +2,14 @@
 
 import copy
 import multiprocessing
+import os
 import threading
 import time
 from collections.abc import Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import connection
 from typing import Any
 
 import warp as wp
@@ -124,8 +126,17 @@ _bench: Bench | None = None
 
 def _start(bench: Bench) -> None:
     global _bench
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     wp.config.log_level = wp.LOG_WARNING
     _bench = bench
+
+
+def _end_with_parent() -> None:
+    """End this process once its parent has ended: one that is killed has no time to tell its workers."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
 
 
 def _work(spec: JointSpec, call: Call) -> Answer:
