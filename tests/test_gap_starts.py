@@ -43,6 +43,30 @@ def test_a_load_behind_a_spring_is_found_where_it_is_as_heavy_as_the_motor() -> 
     assert fit.values["elastic_transmission.k_nm_rad"] == pytest.approx(0.5, rel=0.05)
 
 
+@pytest.mark.parametrize(("share", "inertia"), [(0.22, 7e-4), (0.42, 7e-4), (0.27, 2e-3)])
+def test_a_load_that_rings_far_below_the_drive_is_found(share: float, inertia: float) -> None:
+    """It is hardly damped; the starts that tell its frequency are the ones that promise to explain it."""
+    frequency = share * np.sqrt(TRUE[servo.KP] / TRUE[servo.INERTIA])
+    stiffness = inertia * frequency**2
+    spring = {
+        servo.ELASTIC_STIFFNESS: stiffness,
+        servo.ELASTIC_DAMPING: 0.06 * inertia * frequency,
+        servo.ELASTIC_INERTIA: inertia,
+    }
+    selection, baseline = search(spring, "elastic_transmission")
+    (fit,) = selection.fit_candidates(baseline).values()
+    assert baseline.rmse > 3.0 * selection.floor > 2.5 * fit.rmse
+    assert fit.values["elastic_transmission.k_nm_rad"] == pytest.approx(stiffness, rel=0.05)
+
+
+def test_starts_that_differ_in_what_is_not_fitted_are_one() -> None:
+    selection, baseline = search({}, "command_filter")
+    free = len(selection.sized(baseline, "command_filter"))
+    held = replace(baseline, coordinates=baseline.coordinates[:2], x=baseline.x[:2])
+    assert "inertia" in baseline.values and "inertia" not in held.values
+    assert len(selection.sized(held, "command_filter")) == free / 2
+
+
 def test_a_limit_is_found_beside_the_line_that_stood_for_both() -> None:
     both = {servo.TORQUE_LIMIT: 1.2, servo.STALL_TORQUE: 2.5, servo.NO_LOAD_SPEED: 5.0}
     selection, baseline = search(both, "torque_limit", "torque_speed_limit")

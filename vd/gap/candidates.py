@@ -111,8 +111,7 @@ class CandidateFits:
         least = known.rmse if known is not None and known.rmse < white else np.inf
         names = [name for name in self.candidates if name not in out]
         starts = {
-            name: [*sizes(name, self.others, self.scales), *beside(name, present.values, self.scales)]
-            for name in names
+            name: [*self.sized(present, name), *beside(name, present.values, self.scales)] for name in names
         }
         flat = [(name, start) for name in names for start in starts[name]]
         if not flat:
@@ -176,6 +175,11 @@ class CandidateFits:
         fits |= {fit.effects[-1]: fit for fit in go_on(near, FULL_ITERATIONS)}
         return fits
 
+    def sized(self, present: JointFit, name: str) -> list[dict[str, float]]:
+        """Starting values of an effect added to a model: none that differ only in what that does not fit."""
+        starts = sizes(name, self.others, self.scales)
+        return [start for start in starts if all("." in key or key in present.values for key in start)]
+
     def tried_beside(
         self, without: JointFit, present: JointFit, skip: Sequence[str]
     ) -> dict[str, JointFit] | None:
@@ -227,9 +231,7 @@ class CandidateFits:
         out = {*present.effects, *self.vetoes, RANDOM}
         names = [name for name in self.candidates if name not in out]
         calls = [
-            self.call(
-                present, name, self.starts(present, sizes(name, self.others, self.scales)), SCREEN_ITERATIONS
-            )
+            self.call(present, name, self.starts(present, self.sized(present, name)), SCREEN_ITERATIONS)
             for name in names
         ]
         least = min(fit.rmse for fit in fits.values())
