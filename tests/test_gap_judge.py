@@ -116,15 +116,19 @@ def test_a_fuller_form_that_is_a_little_better_makes_a_set(judge: Verdicts) -> N
     assert judge.accept(friction, "coulomb_friction", [friction, fuller], {}, friction).tied == ()
 
 
+def load_and_offset(torque: float, phase: float, bias: float, error: float = FLOOR) -> JointFit:
+    """A made-up fit with a load and an encoder's offset."""
+    plain = made_up(("gravity_load", "encoder_bias"), error)
+    keys = ("gravity_load.tau_g_nm", "gravity_load.phase_rad", "encoder_bias.bias_rad")
+    some = tuple(Coordinate(key, 0, False, 1.0, -9.0, 9.0) for key in keys)
+    rows = plain.rows.copy()
+    rows[0, servo.KP] = 3.0
+    x = np.array([0.0, 0.0, torque, phase, bias])
+    return replace(plain, coordinates=(*plain.coordinates[:2], *some), x=x, rows=rows)
+
+
 def test_a_load_and_an_offset_that_cancel_at_rest_are_a_spring() -> None:
-    def fit(torque: float, phase: float, bias: float) -> JointFit:
-        plain = made_up(("gravity_load", "encoder_bias"), FLOOR)
-        keys = ("gravity_load.tau_g_nm", "gravity_load.phase_rad", "encoder_bias.bias_rad")
-        some = tuple(Coordinate(key, 0, False, 1.0, -9.0, 9.0) for key in keys)
-        rows = plain.rows.copy()
-        rows[0, servo.KP] = 3.0
-        x = np.array([0.0, 0.0, torque, phase, bias])
-        return replace(plain, coordinates=(*plain.coordinates[:2], *some), x=x, rows=rows)
+    fit = load_and_offset
 
     assert "spring" in cancelled(fit(0.015, -1.15, -0.00457), 0, 0.0)
     assert cancelled(fit(0.015, -1.15, 0.00457), 0, 0.0) == "", "together they hold it off"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from test_gap_fit import TRUE, blank, recorded
-from test_gap_judge import FLOOR, made_up
+from test_gap_judge import FLOOR, load_and_offset, made_up
 
 import vd.kernels.actuators as servo
 from vd.gap import chance
@@ -441,6 +441,33 @@ def test_far_from_the_floor_the_search_begins_anew_where_first_effects_tied() ->
         selection.explain(baseline)
     assert beginnings == [(), (), ("load_friction",)], "from the best starts, from all, with the tied one"
     assert found.value.args[0].effects == ("load_friction", "torque_limit")
+
+
+@pytest.mark.parametrize(
+    ("bias", "error", "searches"), [(-0.00457, 2.0, 1), (0.00457, 2.0, 3), (-0.00457, 5.0, 2)]
+)
+def test_a_spring_is_not_looked_for_among_all_others(bias: float, error: float, searches: int) -> None:
+    """A load and an offset that cancel at rest are no answer, and no other search finds one."""
+    baseline, found = made_up((), 10.0 * FLOOR), load_and_offset(0.015, -1.15, bias, error * FLOOR)
+    beginnings = []
+
+    def search(_: JointFit, start: JointFit) -> tuple:
+        beginnings.append(start.effects)
+        first = made_up(("coulomb_friction",), 6.0 * FLOOR)
+        return found, {}, [Trial(1, "coulomb_friction", first, 0.2, (0.1, 0.3), "rejected")]
+
+    class EndedError(Exception):
+        pass
+
+    def better(*_: JointFit) -> tuple[bool, str]:
+        raise EndedError
+
+    selection, _ = searching([])
+    selection.run = lambda calls: [found for _ in calls]
+    selection.search, selection.better = search, better  # type: ignore[method-assign, assignment]
+    with pytest.raises(EndedError):
+        selection.explain(baseline)
+    assert len(beginnings) == searches
 
 
 def test_a_search_that_comes_back_to_where_it_began_ends() -> None:

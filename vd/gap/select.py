@@ -85,8 +85,7 @@ class Selection(Frictions):
         first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
         tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
         for name in sorted(first, key=lambda n: first[n].rmse):
-            ended = self.no_gap(present) or self.noise_only(present) or self.too_coarse(present)
-            if present.effects and ended:
+            if present.effects and (self.no_gap(present) or self.ended(present)):
                 break
             # Far from the floor another path would change little, unless its beginning was as good.
             far = present.effects and present.held_out_rmse >= NEAR * self.floor
@@ -113,7 +112,8 @@ class Selection(Frictions):
         if present.effects and (behind or stale or set(rivals) != set(present.effects)):
             rivals = {name: self.rivals(present, name) for name in present.effects}
         beside: tuple[Accepted, ...] = ()
-        if not self.no_gap(present) and not self.white(present):  # what is fitted well leaves none to chance
+        # What is fitted well leaves none to chance, nor does a spring.
+        if not self.no_gap(present) and not self.white(present) and not self.a_spring(present):
             chance, beside, rows = try_random(self, baseline, present)
             trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
             if chance is not present:
@@ -157,7 +157,7 @@ class Selection(Frictions):
             self.wide = False
             found = self.search(baseline, baseline)
             self.wide = True
-            if self.finished(found[0]) or self.noise_only(found[0]) or self.too_coarse(found[0]):
+            if self.finished(found[0]) or self.ended(found[0]):
                 return found
             self.report("not explained: every candidate is tried from every start")
         return self.search(baseline, baseline)
@@ -314,6 +314,14 @@ class Selection(Frictions):
     def finished(self, present: JointFit) -> bool:
         """Whether a model leaves nothing to explain: noise, of no more than its size."""
         return self.no_gap(present) and not self.lack_of_fit(self.refined(present))
+
+    def ended(self, present: JointFit) -> bool:
+        """Whether no other search would change what a model says."""
+        return self.noise_only(present) or self.too_coarse(present) or self.a_spring(present)
+
+    def a_spring(self, present: JointFit) -> bool:
+        """Whether a model is near enough to stand for a cause that the table has not: it is no answer."""
+        return present.rmse < NEAR * self.floor and bool(cancelled(present, self.joint, self.rest))
 
     def noise_only(self, present: JointFit) -> bool:
         """Whether a model leaves noise on what it was fitted to: no other search finds a better one."""
