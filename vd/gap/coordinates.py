@@ -29,11 +29,11 @@ LIGHT = 0.1
 """An inertia that does none of it, in fitted ones."""
 FREE_SPEED = 3.0
 """A speed limit that does not bind, in largest speeds."""
-SLOW_RESONANCES = tuple(0.2 * 1.25**i for i in range(8))
+SLOW_RESONANCES = tuple(0.2 * 1.2**i for i in range(10))
 """Frequencies of a second mass on its spring, in that of the drive with the joint. The valley of one that is
 hardly damped is some 15 % wide to either side, and from farther off a descent damps it until it is gone."""
-RINGING_MASS, RINGING_DAMPING = 0.5, 0.1
-"""Its inertia, in the joint's, and its damping ratio at these starts."""
+RINGING_MASS, RINGING_DAMPING = 0.5, 0.04
+"""Its inertia, in the joint's, and its damping ratio at these starts; from 0.1 a descent can end at more."""
 STEEPER = 2.0
 """Torque at rest of a line beside a limit, in that of one which stands for both."""
 FLATTEST = 1e-3
