@@ -28,9 +28,9 @@ POINT_M = 2e-6
 SENSE = 1e-6
 """So do senses; and joint goals within the digits of a log."""
 GOAL_RAD = 2e-5
-FOUND_RAD = 0.05
-"""Angles to the goal at which the object is found differ by no more in most steps: an image shows the moment
-before the reading, and rounding may decide between sides of an object that fit alike."""
+FOUND_RAD = 0.15
+"""The object is found turned by no more in most steps, a symmetric one up to its symmetry: twice what the
+errors of a camera made of it."""
 PIXEL_M = 0.005
 """Difference from which a pixel shows something else [m]."""
 PIXEL_SHARE = 0.05
@@ -80,9 +80,9 @@ class Difference:
     goal_rad: float
     """Largest difference of the joint goals [rad]; 0 where the policy did not act."""
     pixels: float | None
-    """Share of the image's pixels that show something else; None without an image."""
+    """Share of the pixels with depth in both images that show something else; None without an image."""
     found_rad: float | None = None
-    """Difference of the angles to the goal at which the object is found [rad]; None where it is not looked
+    """Angle between the object's orientations as found, up to its symmetry [rad]; None where it is not looked
     for, or by a camera whose image was not kept."""
 
     @property
@@ -140,6 +140,7 @@ class Shadow:
         self._sight = StudentSight(hand, item, whole)
         self._view = StudentView(self._mirror.env, whole, rendered=False)
         self._image_view = StudentView(self._mirror.env, rendered, rendered=True, depth=depth, camera=place)
+        self._symmetry = item.symmetry
         self._compared = 0
 
     def compare(self, log: "HandLog", step: int) -> Difference:
@@ -159,16 +160,15 @@ class Shadow:
         with torch.inference_mode():
             apart = (points - expected).norm(dim=-1)
         image = log.image(step)
-        pixels, found_rad = None, _found_apart(known, seen)
+        pixels, found_rad = None, self._found_apart(known, seen, sensed.goal_quat)
         if image is not None:
             shown = self._image_view.frame()
             pixels = self._pixels(image)
-            if self._image_sight is not None:
+            if (sight := self._image_sight) is not None:
                 sensed = replace(sensed, depth=image)
-                points = self._image_sight.points(sensed)
-                found_rad = _found_apart(
-                    self._image_sight.frame(sensed, points, self._image_sight.sites(points)), shown
-                )
+                cloud = sight.points(sensed)
+                looked = sight.frame(sensed, cloud, sight.sites(cloud))
+                found_rad = self._found_apart(looked, shown, sensed.goal_quat)
         acted = log.columns["acting"][step] > 0.5 and np.abs(log.channel("action")[step]).max() > 0.0
         return Difference(
             points_m=float(apart.max()),
@@ -187,11 +187,25 @@ class Shadow:
         goal = self._actions.goal(log.channel("action")[step], log.channel("position")[step])
         return float(np.abs(goal - log.channel("command")[step]).max())
 
+    def _found_apart(
+        self, known: dict[str, "torch.Tensor"], seen: dict[str, "torch.Tensor"], goal: np.ndarray
+    ) -> float | None:
+        """Angle between two findings of the object [rad]; None if it is not looked for."""
+        from vd.evaluate.statistics import quat_multiply, symmetric_error
+        from vd.student.object_sense import ROTATION
+
+        if OBJECT not in known:
+            return None
+        ours, theirs = (quat_multiply(one[OBJECT][0, ROTATION].numpy(), goal) for one in (known, seen))
+        return float(symmetric_error(ours, theirs, self._symmetry))
+
     def _pixels(self, image: np.ndarray) -> float:
         """Share of pixels of an image that differ from the simulated one, which was rendered before."""
         camera = self._image_view.camera
         assert camera is not None
-        return float((np.abs(camera.depth.numpy()[0] - image) > PIXEL_M).mean())
+        shown = camera.depth.numpy()[0]
+        both = (shown > 0.0) & (image > 0.0)  # a camera misses some of what is there
+        return float((np.abs(shown - image) > PIXEL_M)[both].mean()) if both.any() else 1.0
 
 
 def shadow(cfg: ShadowCfg) -> int:
@@ -261,7 +275,7 @@ def summary(found: list[Difference]) -> dict[str, Any]:
     if pixels:
         result["pixels apart, largest share"] = float(f"{max(pixels):.3g}")
     if turns:
-        result["object's angle, median [rad]"] = float(f"{turned:.2g}")
+        result["object turned, median [rad]"] = float(f"{turned:.2g}")
     return result
 
 
@@ -278,13 +292,6 @@ def _sensed(log: "HandLog", step: int) -> "Sensed":
         object_pose=np.array(UNKNOWN_POSE if pose is None else pose[step], dtype=np.float32),
         object_velocity=np.zeros(6, dtype=np.float32),
     )
-
-
-def _found_apart(known: dict[str, "torch.Tensor"], seen: dict[str, "torch.Tensor"]) -> float | None:
-    """Difference of the angles to the goal at which the object is found [rad], if it is looked for."""
-    from vd.student.object_sense import ANGLE
-
-    return abs(float(known[OBJECT][0, ANGLE] - seen[OBJECT][0, ANGLE])) if OBJECT in known else None
 
 
 def _keys(sites: Any) -> set[tuple[int, ...]]:

@@ -59,7 +59,7 @@ def test_a_sound_log_is_what_the_simulator_shows(tmp_path, capsys):
     result = json.loads(capsys.readouterr().out)
     assert result["ok"] and result["steps"] == 4 and result["voxels of a cloud"] > 1000
     assert result["voxels apart"] <= 2 * result["points on borders of voxels"]
-    assert result["object's angle, median [rad]"] < 1e-3
+    assert result["object turned, median [rad]"] < 1e-3
 
 
 def test_goals_of_another_rule_are_told(tmp_path, capsys):
@@ -114,7 +114,7 @@ def test_an_object_found_elsewhere_is_told():
     same = Difference(1e-7, 4000, 1, 10, 0.0, 0.0, None, 1e-5)
     assert summary([same] * 3)["ok"]
     assert not summary([same, replace(same, found_rad=0.2), replace(same, found_rad=0.3)])["ok"]
-    assert "object's angle, median [rad]" not in summary([replace(same, found_rad=None)])
+    assert "object turned, median [rad]" not in summary([replace(same, found_rad=None)])
 
 
 def test_an_image_of_something_else_is_told(tmp_path):

@@ -33,6 +33,8 @@ from vd.student.sites import Sites
 
 ANGLE = 0
 """Column of the angle to the goal [rad]."""
+ROTATION = slice(1, 5)
+"""Columns of the rotation from the goal, q_object conj(q_goal)."""
 PLACE_M = 0.1
 """Unit of positions [m]."""
 LEAP_RAD = 0.5
