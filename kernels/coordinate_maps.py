@@ -302,8 +302,12 @@ def coarsen(keys: wp.array, count: int | None = None) -> tuple[wp.array, wp.arra
     return unique_keys(keys, keys.shape[0], limit=2**63 - 1, shift=3, kept=count)
 
 
-def hash_table(keys: wp.array) -> tuple[wp.array, wp.array]:
-    """A hash table from keys, each given once, to rows: key (-1 where empty) and row of each slot."""
+HashTable = tuple[wp.array, wp.array]
+"""Key (-1 where empty) and row of each slot."""
+
+
+def hash_table(keys: wp.array) -> HashTable:
+    """A hash table from keys, each given once, to rows."""
     slots = 1 << max(1, SLOTS_PER_SITE * keys.shape[0] - 1).bit_length()
     slot_key = wp.full(slots, -1, dtype=wp.int64, device=keys.device)
     slot_row = wp.empty(slots, dtype=int, device=keys.device)
@@ -313,41 +317,51 @@ def hash_table(keys: wp.array) -> tuple[wp.array, wp.array]:
     return slot_key, slot_row
 
 
-def neighbour_table(keys: wp.array, level: int) -> wp.array:
-    """Map of a submanifold 3x3x3 convolution over sites of a level, shape [M, 27]."""
+def neighbour_table(keys: wp.array, level: int, slots: HashTable | None = None) -> wp.array:
+    """Map of a submanifold 3x3x3 convolution over sites of a level, shape [M, 27].
+
+    Args:
+        keys: Keys of the sites [M].
+        level: Level of the sites.
+        slots: Hash table of the keys, if there is one already.
+    """
     count = keys.shape[0]
     table = wp.full((count, KERNEL), count, dtype=int, device=keys.device)
-    slots = hash_table(keys)
+    slots = slots or hash_table(keys)
     wp.launch(neighbour_kernel, dim=count, inputs=[keys, level, *slots], outputs=[table], device=keys.device)
     return table
 
 
-def beside(keys: wp.array, asked: wp.array, others: wp.array) -> wp.array:
+def beside(keys: wp.array, asked: wp.array, others: wp.array, slots: HashTable | None = None) -> wp.array:
     """Which of the voxels asked about are among others or touch one, by a corner at least, bool [M].
 
     Args:
         keys: Keys of voxels, each once [M].
         asked: Which are asked about, bool [M].
         others: Which are the others, bool [M].
+        slots: Hash table of the keys, if there is one already.
     """
     touches = wp.empty(keys.shape[0], dtype=wp.bool, device=keys.device)
     wp.launch(
         beside_kernel,
         dim=keys.shape[0],
-        inputs=[keys, asked, others, *hash_table(keys)],
+        inputs=[keys, asked, others, *(slots or hash_table(keys))],
         outputs=[touches],
         device=keys.device,
     )
     return touches
 
 
-def strided_table(fine: wp.array, coarse: wp.array, level: int, *, reverse: bool = False) -> wp.array:
+def strided_table(
+    fine: wp.array, coarse: wp.array, level: int, slots: HashTable | None = None, *, reverse: bool = False
+) -> wp.array:
     """Map of a 3x3x3 convolution of stride 2.
 
     Args:
         fine: Keys of the input sites [F].
         coarse: Keys of the output sites [M], from :func:`coarsen`.
         level: Level of the input sites.
+        slots: Hash table of the output sites' keys, if there is one already.
         reverse: Give the output sites that read each input site, not the input sites that each output reads.
 
     Returns:
@@ -358,7 +372,7 @@ def strided_table(fine: wp.array, coarse: wp.array, level: int, *, reverse: bool
     wp.launch(
         strided_kernel,
         dim=fine.shape[0],
-        inputs=[fine, level, *hash_table(coarse), int(reverse)],
+        inputs=[fine, level, *(slots or hash_table(coarse)), int(reverse)],
         outputs=[table],
         device=fine.device,
     )

@@ -24,6 +24,9 @@ POINT_M = 2e-6
 SENSE = 1e-6
 FOUND_RAD = 1e-3
 """So do the angles to the goal at which the object is found, in most steps."""
+COMPARED = 0.5
+"""Least share of steps in which actions are compared: until rounding first decides about a voxel or a pose.
+Where it was counted it never did, in all 192 steps."""
 
 
 def state_of(env: ReorientEnv) -> Sensed:
@@ -71,7 +74,7 @@ def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered, 
     student = Student(network, env.num_actions).eval()
     hidden = there = student.initial_hidden(1)
     rng = np.random.default_rng(0)
-    apart, borders, steps = 0, 0, 0
+    apart, borders, steps, compared = 0, 0, 0, 0
     found: list[float] = []
     for _ in range(env.max_episode_steps):
         seen = view.frame()
@@ -96,6 +99,7 @@ def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered, 
         hidden, there = one.hidden, other.hidden
         if keys(ours[0]) == keys(theirs[0]) and max(found) < SENSE:
             np.testing.assert_allclose(one.mean, other.mean, atol=2e-2)
+            compared += 1
         action = rng.uniform(-1.0, 1.0, env.num_actions).astype(np.float32)
         actions.put(sensed.smoothed)
         target = actions.goal(action, sensed.joint_q)
@@ -106,6 +110,7 @@ def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered, 
     assert apart <= 2 * borders, f"{apart} voxels differ, {borders} points lie on borders"
     # Rounding may decide between two sides of a cube that fit alike.
     assert np.median(found) < FOUND_RAD, f"angles to the goal differ by {np.median(found):.3g} rad"
+    assert compared >= COMPARED * steps, f"actions could be compared in {compared} of {steps} steps"
 
 
 @pytest.mark.slow

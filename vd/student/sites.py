@@ -7,8 +7,10 @@ import torch
 import warp as wp
 
 from vd.kernels.coordinate_maps import (
+    HashTable,
     beside,
     coarsen,
+    hash_table,
     level_counts,
     neighbour_table,
     strided_table,
@@ -112,7 +114,7 @@ class Sites:
         free = ~(self.goal | hand)
         if self.complete:
             return free
-        touches = beside(self.keys, wp.from_torch(free), wp.from_torch(hand))
+        touches = beside(self.keys, wp.from_torch(free), wp.from_torch(hand), self._slots)
         return free & ~wp.to_torch(touches)
 
     def places(self, chosen: torch.Tensor, most: int) -> tuple[torch.Tensor, torch.Tensor]:
@@ -144,6 +146,10 @@ class Sites:
         return points, present
 
     @cached_property
+    def _slots(self) -> HashTable:
+        return hash_table(self.keys)
+
+    @cached_property
     def _coarser(self) -> tuple["Sites", wp.array]:
         size, *sizes = self._sizes or level_counts(self.keys)
         keys, place = coarsen(self.keys, size)
@@ -157,7 +163,7 @@ class Sites:
     @cached_property
     def neighbours(self) -> torch.Tensor:
         """Rows that a submanifold 3x3x3 kernel reads for each cell, M for none, shape [M, 27], int32."""
-        return wp.to_torch(neighbour_table(self.keys, self.level))
+        return wp.to_torch(neighbour_table(self.keys, self.level, self._slots))
 
     @cached_property
     def strided(self) -> torch.Tensor:
@@ -165,12 +171,16 @@ class Sites:
 
         Shape [coarser M, 27], int32.
         """
-        return wp.to_torch(strided_table(self.keys, self.coarser.keys, self.level))
+        return wp.to_torch(strided_table(*self._strides))
 
     @cached_property
     def strided_back(self) -> torch.Tensor:
         """Coarser rows that read each cell so, by the same offsets, coarser M for none, [M, 27], int32."""
-        return wp.to_torch(strided_table(self.keys, self.coarser.keys, self.level, reverse=True))
+        return wp.to_torch(strided_table(*self._strides, reverse=True))
+
+    @property
+    def _strides(self) -> tuple[wp.array, wp.array, int, HashTable]:
+        return self.keys, self.coarser.keys, self.level, self.coarser._slots
 
     @cached_property
     def windows(self) -> torch.Tensor:
