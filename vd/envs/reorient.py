@@ -157,7 +157,7 @@ class ReorientEnv:
         self.acts_in_view = True
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
         self._table_steps = table_array(cfg, self.device)
-        self.retries = Retries(self) if cfg.retry.enabled else None
+        self.retries = Retries(cfg, f, n, self.device) if cfg.retry.enabled else None
         """What opens hands that are stuck, or None: they stay as they are."""
         self._shapes = ShapeObserver(self) if self.sees_shape else None
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
@@ -234,7 +234,9 @@ class ReorientEnv:
         if self.views is not None and self.acts_in_view:
             action = self.views.world_action(action)
         if self.retries is not None:
-            action = self.retries.world_action(action, self._new_goal)
+            action = self.retries.world_action(
+                action, self.measured_q, self.previous_error, self.step_count, self._new_goal
+            )
         wp.launch(
             apply_action_kernel,
             dim=self.num_worlds,
