@@ -9,6 +9,7 @@ from test_gap_fit import TRUE, problem_of, recorded
 from test_gap_judge import FLOOR, made_up
 
 import vd.kernels.actuators as servo
+from vd.gap import judge
 from vd.gap.chain import candidates
 from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.explanation import Explanation, Trial, lacking
@@ -30,8 +31,8 @@ CHOSEN = ("coulomb_friction", "command_delay", "torque_saturation", "gravity_loa
 class Servo:
     """A servo with Coulomb friction, its plain model, and how often its search asks for fits."""
 
-    def __init__(self) -> None:
-        self.problem: JointProblem = problem_of(recorded({servo.COULOMB_TORQUE: FRICTION}))
+    def __init__(self, friction: float = FRICTION) -> None:
+        self.problem: JointProblem = problem_of(recorded({servo.COULOMB_TORQUE: friction}))
         base = self.problem.rollouts.chain.start_row.copy()
         for column, value in TRUE.items():
             base[0, column] = value
@@ -94,6 +95,19 @@ def test_a_joint_that_lacks_something_else_is_searched_by_itself(
 ) -> None:
     found = Servo().explain((effects, values))
     assert found.verdict == "effects" and [one.name for one in found.accepted] == ["coulomb_friction"]
+
+
+def test_what_another_joint_lacks_is_not_named_where_it_is_too_small_to_show(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It leaves noise, and gains less on the plain model than an effect must: nothing else is tried."""
+    monkeypatch.setattr(judge, "MIN_GAIN_FLOORS", 0.9)
+    joint = Servo(0.0026)
+    floors = joint.baseline.held_out_rmse / joint.problem.floor
+    assert 1.15 < floors < 1.3, "the plain model is not enough"
+    found = joint.explain((("coulomb_friction",), {"coulomb_friction.tau_c_nm": FRICTION}))
+    assert found.verdict == "no_gap" and "below the noise floor" in found.reason
+    assert joint.fits == 2
 
 
 def test_on_a_pendulum_a_load_off_the_arm_and_an_offset_of_the_encoder_are_one(tmp_path: Path) -> None:

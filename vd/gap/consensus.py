@@ -9,7 +9,7 @@ from vd.gap.coordinates import sizes
 from vd.gap.explanation import NAMED, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import CONTAINED_FLOORS, MIN_GAIN, RANDOM, SMALL_EXCESS_FLOORS
-from vd.gap.verdict import explains
+from vd.gap.verdict import UNEXPLAINED, explains
 
 if TYPE_CHECKING:
     from vd.gap.select import Selection
@@ -31,7 +31,7 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
     """The explanation of a joint by what another of its finger certainly lacks, without a search of its own.
 
     The joints of a finger are built alike, and what leaves noise can only be equalled. None where it leaves
-    more than that, where a further effect promises to do better, or where one of its effects is not needed.
+    more than that, or where a further effect promises to do better. What is not needed here is not named.
 
     Args:
         search: Of the joint; :attr:`~vd.gap.select.Selection.like` is what the other lacks.
@@ -55,12 +55,20 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
     promise = search.run([("promise", {"fit": fit, "starts": added, "scales": search.scales})])[0]
     if promise.max(initial=0.0) > CONTAINED_FLOORS**2:
         return None
-    for name in effects:
-        without = search.refit(fit, [other for other in effects if other != name])
-        if not search.better(without, fit, SHOWN_TAIL)[0]:
-            return None
-        search.without[name] = without.held_out_rmse
     gain, ci = search.gain(baseline, fit)
+    for name in effects:
+        rest = tuple(other for other in effects if other != name)
+        without = search.refit(fit, rest)
+        needed, why = search.better(without, fit, SHOWN_TAIL)
+        if not needed and rest:
+            return as_another(replace(search, like=(rest, values)), baseline, loose)
+        if not needed and baseline.held_out_rmse > UNEXPLAINED * search.floor:
+            return None
+        if not needed:
+            return search.conclude(
+                baseline, baseline, {}, [Trial(1, name, fit, gain, ci, "rejected", why)], loose
+            )
+        search.without[name] = without.held_out_rmse
     names = " and ".join(effects)
     before, after = 1e3 * baseline.held_out_rmse, 1e3 * fit.held_out_rmse
     search.report(f"+ {names}, as on another joint: {before:.2f} -> {after:.2f} mrad held out")
