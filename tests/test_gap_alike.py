@@ -12,7 +12,7 @@ import vd.kernels.actuators as servo
 from vd.gap import judge
 from vd.gap.chain import candidates
 from vd.gap.coordinates import Coordinate, Scales
-from vd.gap.explanation import Explanation, Trial, lacking
+from vd.gap.explanation import Accepted, Explanation, Trial, lacking
 from vd.gap.fit import JointProblem
 from vd.gap.hide import Hiding, simulate_hidden
 from vd.gap.joint_fit import JointFit
@@ -167,6 +167,34 @@ def test_an_offset_that_pulls_more_than_friction_holds_is_no_friction() -> None:
         )
         assert search.same_beside(fit, "encoder_bias") == same
         assert search.same_beside(fit, "stribeck_friction") == ()
+
+
+@pytest.mark.parametrize(("line", "again"), [(0.98, True), (0.9999, False)])
+def test_a_set_is_judged_beside_the_best_member_of_another(line: float, again: bool) -> None:
+    """What a limit leaves where a line is would else decide whether friction or a dead zone is beside it."""
+    selection = Servo().selection(((), {}))
+    floor = selection.floor
+    final = made_up(("coulomb_friction", "torque_limit"), floor)
+    better = made_up(("coulomb_friction", "torque_speed_limit"), line * floor)
+    dead = made_up(("torque_limit", "dead_zone"), 1.002 * floor)
+    selection.weights = resamples(len(final.sse), np.random.default_rng(0))
+    sets = [
+        Accepted(name, 0.8, {}, (), (other,), False)
+        for name, other in (("coulomb_friction", "dead_zone"), ("torque_limit", "torque_speed_limit"))
+    ]
+    fits = {"coulomb_friction": [final, dead], "torque_limit": [final, better]}
+    result = Explanation(final, final, "ambiguous", "", tuple(sets), (), fits)
+    asked: list[tuple[tuple[str, ...], str]] = []
+
+    def rivals(present: JointFit, name: str) -> list[JointFit]:
+        asked.append((present.effects, name))
+        return [present]
+
+    selection.rivals = rivals  # type: ignore[method-assign, assignment]
+    found = selection.beside_better(result, final)
+    assert asked == ([(("torque_speed_limit", "coulomb_friction"), "coulomb_friction")] if again else [])
+    assert {*found} == ({"coulomb_friction"} if again else set())
+    assert not selection.beside_better(replace(result, verdict="effects"), final), "a name stands"
 
 
 def test_a_finer_problem_is_simulated_with_the_step_of_finished_estimates() -> None:

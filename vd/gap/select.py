@@ -134,7 +134,33 @@ class Selection(Frictions):
             present = self.refit(again, again.effects)
             rivals = {k: [present if fit is found else fit for fit in fits] for k, fits in rivals.items()}
         refined = self.refined(present)
-        return self.explained(self.conclude(baseline, present, rivals, evidence, loose, refined, again))
+        result = self.conclude(baseline, present, rivals, evidence, loose, refined, again)
+        better = self.beside_better(result, present)
+        if better:
+            result = self.conclude(baseline, present, {**rivals, **better}, evidence, loose, refined, again)
+        return self.explained(result)
+
+    def beside_better(self, result: Explanation, final: JointFit) -> dict[str, list[JointFit]]:
+        """Fits with others in the place of an effect, where all are sets, beside better members of others.
+
+        What the final model lacks there is as large as what tells the members of a set apart.
+        """
+        if result.verdict != "ambiguous" or not self.white(final):
+            return {}
+        found = {}
+        for one in result.accepted:
+            beside = [
+                fit
+                for other in result.accepted
+                for fit in result.rivals.get(other.name, ())
+                if other is not one and fit.effects[-1] in other.tied and one.name in fit.effects
+                if fit.rmse < final.rmse and not self.tied(fit, final)[0]
+            ]
+            if beside:
+                best = min(beside, key=lambda fit: fit.rmse)
+                order = (*(name for name in best.effects if name != one.name), one.name)
+                found[one.name] = self.rivals(replace(best, effects=order), one.name)
+        return found
 
     def explained(self, explanation: Explanation) -> Explanation:
         """The explanation with what its names do not say.
