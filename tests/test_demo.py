@@ -71,14 +71,19 @@ def made_up_students(folder: Path, _seed: int, *, minutes: float) -> None:
         (path.parent / PROGRESS_FILE).write_text("\n".join(lines) + "\n")
 
 
+@pytest.fixture(scope="module")
+def assets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that the first demo fills."""
+    return tmp_path_factory.mktemp("assets")
+
+
 @pytest.fixture
-def small(monkeypatch, tmp_path) -> demo.DemoCfg:
+def small(monkeypatch, tmp_path, assets) -> demo.DemoCfg:
     """Settings under which every stage is short, with assets of its own."""
-    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "assets"))
+    monkeypatch.setenv("VD_ASSETS", str(assets))
     preset = PRESETS["cpu-demo"]()
-    monkeypatch.setitem(
-        PRESETS, "cpu-demo", lambda: replace(preset, env=replace(preset.env, episode_s=EPISODE_S))
-    )
+    env = replace(preset.env, episode_s=EPISODE_S, start=replace(preset.env.start, poses=1))
+    monkeypatch.setitem(PRESETS, "cpu-demo", lambda: replace(preset, env=env))
     monkeypatch.setitem(demo.EPISODES_RANGE, "cpu", (4, 4))
     monkeypatch.setitem(demo.PAPER_EPISODES, "cpu", 4)
     monkeypatch.setitem(demo.MESH_EPISODES, "cpu", 4)

@@ -75,6 +75,7 @@ def test_the_likelihood_finds_the_jitter_beside_an_effect() -> None:
     assert both.rmse < 0.8 * alone.rmse
 
 
+@pytest.mark.slow
 def test_an_effect_is_named_beside_chance(tmp_path: Path) -> None:
     effects = ("command_jitter", "encoder_bias", "dead_zone")
     report = explain(hidden(encoder_bias=BIAS).recording, None, tmp_path, workers=1, effects=effects)
@@ -83,6 +84,7 @@ def test_an_effect_is_named_beside_chance(tmp_path: Path) -> None:
     assert bias.value == pytest.approx(BIAS["bias_rad"], rel=0.2) and bias.ci95[0] < bias.value < bias.ci95[1]
 
 
+@pytest.mark.slow
 def test_nothing_is_named_beside_chance_alone(tmp_path: Path) -> None:
     effects = ("command_jitter", "command_filter")
     report = explain(hidden().recording, None, tmp_path, workers=1, effects=effects)

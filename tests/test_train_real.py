@@ -28,6 +28,7 @@ def _train(run_dir: Path, iterations: int, resume: str | None = None) -> Teacher
     task = replace(
         cfg.env,
         num_worlds=8,
+        start=replace(cfg.env.start, poses=2),
         randomisation=replace(cfg.env.randomisation, enabled=True),
         curriculum=replace(cfg.env.curriculum, enabled=True, raise_at=0.0, lower_at=0.0),
     )
