@@ -1,9 +1,9 @@
 """Where a known shape is, from points seen of it: poses are fitted, many at once, and the best kept.
 
-A shape is a grid of distances to its surface samples, so that a point costs one look-up whatever the shape
-is. Each pose is improved by steps of Gauss and Newton on the distances of the seen points, of which far ones
-count less. How badly it fits is the mean square of two lengths, both cut off at ``far``: how far the seen
-points are from the shape, and how far the shape stands out before what a camera saw behind it.
+A shape is a grid of distances to its surface, so that a point costs one look-up whatever the shape is. Each
+pose is improved by steps of Gauss and Newton on the distances of the seen points, of which far ones count
+less. How badly it fits is the mean square of two lengths, both cut off at ``far``: how far the seen points
+are from the shape, and how far the shape stands out before what a camera saw.
 
 Frames: *base* is that of the points and poses, *object* that of the samples. Metres, quaternions xyzw.
 N worlds, P seen points at most, O shapes of S samples, grids of E^3 distances; M rows, each of one world,
@@ -22,6 +22,8 @@ LARGEST_TURN = wp.constant(0.5)
 """Largest turn of one step [rad]."""
 SMALL = wp.constant(1.0e-7)
 """Lengths and angles below this have no direction."""
+ANYWHERE = wp.constant(1.0)
+"""Farthest that the surface is looked for [m]."""
 NEVER = wp.constant(1.0e9)
 """Misfit of a pose that is not to be taken."""
 
@@ -31,7 +33,7 @@ class Shapes:
     """Shapes that can be looked for, and which one each world holds.
 
     samples: Surface samples in the object frame, unscaled [O, S] [m].
-    distance: Distance to the nearest sample [O, E, E, E] [m], on grids about the origin.
+    distance: Distance to the surface [O, E, E, E] [m], on grids about the origin; negative inside.
     half: Half the side of each grid [O] [m].
     world_shape: Shape of each world [N].
     world_scale: Factor on its size [N].
@@ -51,8 +53,8 @@ class Eye:
     focal: Focal lengths [pixel].
     centre: Principal point, from the top left corner of the image [pixel].
     pose: Optical frame in the base frame.
-    cell: Side of a cell of the background [pixel].
-    margin: What is nearer than the background by less than this may be seen [m].
+    cell: Side of a cell of the image [pixel].
+    margin: What is nearer than all that was seen in its cell by less than this may be there [m].
     """
 
     focal: wp.vec2
@@ -63,33 +65,66 @@ class Eye:
 
 
 @wp.kernel
-def shape_distance_kernel(
+def off_mesh_kernel(
     # Model:
     samples: wp.array2d[wp.vec3],
-    half: wp.array[float],
+    mesh: wp.array[wp.uint64],
     # Out:
-    distance_out: wp.array4d[float],
+    distance_out: wp.array2d[float],
 ):
-    """Distance from each point of a grid to the nearest sample. Launch: [O, E, E, E].
+    """Distance of each sample from the mesh of its shape. Launch: [O, S].
 
     Args:
         samples: Surface samples in the object frame [m], shape [O, S].
+        mesh: Mesh of each shape, shape [O].
+        distance_out: Distances [m], shape [O, S].
+    """
+    shape, sample = wp.tid()
+    place = samples[shape, sample]
+    found = wp.mesh_query_point_no_sign(mesh[shape], place, ANYWHERE)
+    distance_out[shape, sample] = wp.length(
+        wp.mesh_eval_position(mesh[shape], found.face, found.u, found.v) - place
+    )
+
+
+@wp.kernel
+def shape_distance_kernel(
+    # Model:
+    samples: wp.array2d[wp.vec3],
+    mesh: wp.array[wp.uint64],
+    half: wp.array[float],
+    # In:
+    meshed_in: wp.array[int],
+    # Out:
+    distance_out: wp.array4d[float],
+):
+    """Distance from each point of a grid to the surface. Launch: [O, E, E, E].
+
+    Args:
+        samples: Surface samples in the object frame [m], shape [O, S].
+        mesh: Mesh of each shape, with winding numbers, shape [O].
         half: Half the side of each grid [m], shape [O].
-        distance_out: Distances [m], shape [O, E, E, E].
+        meshed_in: 1 where the surface is the mesh, 0 where it is the samples, shape [O].
+        distance_out: Distances [m], negative inside of a mesh, shape [O, E, E, E].
     """
     shape, i, j, k = wp.tid()
     side = 2.0 * half[shape] / float(distance_out.shape[1] - 1)
     corner = wp.vec3(half[shape], half[shape], half[shape])
     place = side * wp.vec3(float(i), float(j), float(k)) - corner
-    nearest = wp.length_sq(samples[shape, 0] - place)
+    if meshed_in[shape] != 0:
+        found = wp.mesh_query_point_sign_winding_number(mesh[shape], place, ANYWHERE)
+        nearest = wp.mesh_eval_position(mesh[shape], found.face, found.u, found.v)
+        distance_out[shape, i, j, k] = found.sign * wp.length(nearest - place)
+        return
+    least = wp.length_sq(samples[shape, 0] - place)
     for sample in range(1, samples.shape[1]):
-        nearest = wp.min(nearest, wp.length_sq(samples[shape, sample] - place))
-    distance_out[shape, i, j, k] = wp.sqrt(nearest)
+        least = wp.min(least, wp.length_sq(samples[shape, sample] - place))
+    distance_out[shape, i, j, k] = wp.sqrt(least)
 
 
 @wp.func
 def surface_distance(shapes: Shapes, shape: int, place: wp.vec3):
-    """Distance of a point of the object frame (unscaled) from the surface, and its gradient.
+    """Distance of a point of the object frame (unscaled) from the surface, as in the grid, and its gradient.
 
     Between grid points it is interpolated; outside of the grid it grows by the distance from the grid.
     """
@@ -137,43 +172,43 @@ def cell_of(eye: Eye, seen: wp.vec3):
 
 
 @wp.kernel
-def background_kernel(
+def nearness_kernel(
     # Model:
     eye: Eye,
     # In:
     points_in: wp.array2d[wp.vec3],
     # In/Out:
-    background: wp.array3d[float],
+    nearness: wp.array3d[float],
 ):
-    """Farthest depth that was seen in each cell of the image. Launch: [N, K].
+    """How near the nearest is that was seen in each cell of the image. Launch: [N, K].
 
     Args:
         eye: The camera.
         points_in: What it saw, base frame [m], NaN for none, shape [N, K].
-        background: Depth [m], shape [N, Y, X]; to be zero before, and zero where nothing was seen.
+        nearness: One over depth [1/m], shape [N, Y, X]; to be zero before, and zero where nothing was seen.
     """
     world, k = wp.tid()
     place = wp.transform_point(wp.transform_inverse(eye.pose), points_in[world, k])
     if place[2] > 0.0:  # not so of NaN
         row, column = cell_of(eye, place)
-        if row >= 0 and row < background.shape[1] and column >= 0 and column < background.shape[2]:
-            wp.atomic_max(background, world, row, column, place[2])
+        if row >= 0 and row < nearness.shape[1] and column >= 0 and column < nearness.shape[2]:
+            wp.atomic_max(nearness, world, row, column, 1.0 / place[2])
 
 
 @wp.func
-def standing_out(eye: Eye, place: wp.vec3, world: int, background: wp.array3d[float], far: float) -> float:
-    """How far a point of the base frame lies before what was seen behind it [m], at most ``far``.
+def standing_out(eye: Eye, place: wp.vec3, world: int, nearness: wp.array3d[float], far: float) -> float:
+    """How far a point of the base frame lies before all that was seen in its cell [m], at most ``far``.
 
     Where nothing was seen, not even the hand, there is nothing for a long way. Beyond the image all may be.
     """
     seen = wp.transform_point(wp.transform_inverse(eye.pose), place)
     row, column = cell_of(eye, seen)
-    if row < 0 or row >= background.shape[1] or column < 0 or column >= background.shape[2]:
+    if row < 0 or row >= nearness.shape[1] or column < 0 or column >= nearness.shape[2]:
         return 0.0
-    behind = background[world, row, column]
-    if behind == 0.0:
+    near = nearness[world, row, column]
+    if near == 0.0:
         return far
-    return wp.clamp(behind - eye.margin - seen[2], 0.0, far)
+    return wp.clamp(1.0 / near - eye.margin - seen[2], 0.0, far)
 
 
 @wp.kernel
@@ -303,7 +338,7 @@ def fit_poses_kernel(
     world_in: wp.array[int],
     seen_in: wp.array2d[wp.vec3],
     count_in: wp.array[int],
-    background_in: wp.array3d[float],
+    nearness_in: wp.array3d[float],
     # In/Out:
     pose: wp.array2d[wp.transform],
     # Out:
@@ -321,7 +356,7 @@ def fit_poses_kernel(
         world_in: World of each row, shape [M]; a row of -1 is left out.
         seen_in: Points seen of the object, base frame [m], shape [N, P].
         count_in: How many there are, shape [N].
-        background_in: From ``background_kernel``, shape [N, Y, X]; [N, 0, 0] without a camera.
+        nearness_in: From ``nearness_kernel``, shape [N, Y, X]; [N, 0, 0] without a camera.
         pose: Object frame in the base frame, shape [M, C].
         misfit_out: Mean squares of both lengths, together [m^2], shape [M, C].
     """
@@ -342,15 +377,15 @@ def fit_poses_kernel(
     for i in range(0, count_in[world], every):
         place = wp.transform_point(to_object, seen_in[world, i]) / scale
         distance, _gradient = surface_distance(shapes, shape, place)
-        distance = wp.min(scale * distance, far)
+        distance = wp.min(wp.abs(scale * distance), far)
         off += distance * distance
         points += 1.0
     out = wp.float32(0.0)
     samples = wp.float32(0.0)
-    if background_in.shape[1] > 0:
+    if nearness_in.shape[1] > 0:
         for i in range(0, shapes.samples.shape[1], every_sample):
             place = wp.transform_point(best, scale * shapes.samples[shape, i])
-            length = standing_out(eye, place, world, background_in, far)
+            length = standing_out(eye, place, world, nearness_in, far)
             out += length * length
             samples += 1.0
     misfit_out[row, c] = off / wp.max(points, 1.0) + out / wp.max(samples, 1.0)

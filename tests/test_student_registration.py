@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
@@ -72,6 +73,22 @@ def test_rotations_lie_evenly():
     np.testing.assert_allclose(np.linalg.norm(even_rotations(ROTATIONS), axis=1), 1.0, atol=1e-12)
     for turn in Rotation.random(200, rng=np.random.default_rng(0)):
         assert (tried * turn.inv()).magnitude().min() < SPACING_RAD
+
+
+def test_distances_are_those_of_the_mesh_where_the_samples_lie_on_it(device):
+    """Of the cube as authored, and of one whose samples are noisy as those of a scan are."""
+    cube, rng = load_set(["cube"])[0], np.random.default_rng(0)
+    scan = replace(cube, surface_points=cube.surface_points + rng.normal(scale=0.004, size=(500, 3)))
+    for item in (cube, scan):
+        shapes = registration(item, 1, device)._shapes
+        half, grid = float(shapes.half.numpy()[0]), shapes.distance.numpy()[0]
+        place = np.stack(np.meshgrid(*3 * [np.linspace(-half, half, len(grid))], indexing="ij"), axis=-1)
+        if item is cube:
+            beyond = np.abs(place) - cube.longest_side / 2
+            wanted = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(axis=-1), 0.0)
+        else:
+            wanted = cKDTree(scan.surface_points).query(place)[0]
+        np.testing.assert_allclose(grid, wanted, atol=1e-5)
 
 
 def test_a_shape_is_found_and_followed(device, corner):

@@ -20,9 +20,10 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.kernels.registration import (
     Eye,
     Shapes,
-    background_kernel,
     fit_poses_kernel,
     keep_poses_kernel,
+    nearness_kernel,
+    off_mesh_kernel,
     shape_distance_kernel,
     start_poses_kernel,
 )
@@ -30,15 +31,17 @@ from vd.kernels.registration import (
 POINTS = 256
 """Points seen of the object that are looked at, at most."""
 GRID = 32
-"""Grid points along a side of a shape's distances: some 5 mm apart, as the samples are."""
+"""Grid points along a side of a shape's distances: some 5 mm apart."""
 BEYOND_M = 0.02
 """How far that grid reaches beyond the shape [m]."""
+ON_MESH_M = 1e-3
+"""A mesh is a shape's surface if the samples are no farther from it than this; that of a scan is its hull."""
 FAR_M = 0.012
 """Length at which distances are cut off [m]: what is farther is no point of the object."""
 CELL_PX = 4.0
-"""Side of a cell of the background [pixel]: with 6000 points of an image few cells on a surface are empty."""
-MARGIN_M = 0.004
-"""Depth within which the shape may stand out [m]: the size of a cell, seen aslant."""
+"""Side of a cell of the image [pixel]: with 6000 points of an image few cells on a surface are empty."""
+MARGIN_M = 0.002
+"""Depth within which the shape may stand out [m]: half a cell, seen aslant."""
 ROTATIONS = 2048
 """Rotations tried at the first look, about 0.25 rad apart."""
 FIRST_STEPS, FIRST_EVERY = 3, 4
@@ -120,8 +123,23 @@ class Registration:
         shapes.half = array(np.abs(samples).max(axis=(1, 2)) + BEYOND_M, float)
         shapes.distance = wp.empty((len(objects), GRID, GRID, GRID), dtype=float, device=device)
         shapes.world_shape, shapes.world_scale = array(world_object, wp.int32), array(world_scale, float)
+        meshes = [
+            wp.Mesh(
+                array(item.vertices, wp.vec3),
+                array(item.faces.ravel(), wp.int32),
+                support_winding_number=True,
+            )
+            for item in objects
+        ]
+        mesh = array([mesh.id for mesh in meshes], wp.uint64)
+        off = wp.empty(samples.shape[:2], dtype=float, device=device)
+        self._launch(off_mesh_kernel, off.shape, [shapes.samples, mesh], [off])
+        meshed = array(off.numpy().max(axis=1) < ON_MESH_M, wp.int32)
         self._launch(
-            shape_distance_kernel, shapes.distance.shape, [shapes.samples, shapes.half], [shapes.distance]
+            shape_distance_kernel,
+            shapes.distance.shape,
+            [shapes.samples, mesh, shapes.half, meshed],
+            [shapes.distance],
         )
         self._eye, self._rendered, cells = Eye(), camera is not None, (0, 0)
         if camera is not None:
@@ -129,7 +147,7 @@ class Registration:
             self._eye.pose = wp.transform(*camera.position.tolist(), *camera.quaternion.tolist())
             self._eye.cell, self._eye.margin = CELL_PX, MARGIN_M
             cells = (math.ceil(camera.height / CELL_PX), math.ceil(camera.width / CELL_PX))
-        self._background = wp.zeros((worlds, *cells), dtype=float, device=device)
+        self._nearness = wp.zeros((worlds, *cells), dtype=float, device=device)
         self._rotations = array(even_rotations(ROTATIONS), wp.quat)
         self.pose = torch.zeros((worlds, KEPT, 7), device=place)
         self.pose[..., 6] = 1.0
@@ -164,9 +182,9 @@ class Registration:
             raise ValueError("all points of a camera are needed, and only of one")
         inputs = [wp.from_torch(seen.contiguous(), dtype=wp.vec3), wp.from_torch(count)]
         if points is not None:
-            self._background.zero_()
+            self._nearness.zero_()
             cloud = wp.from_torch(points.contiguous(), dtype=wp.vec3)
-            self._launch(background_kernel, cloud.shape, [self._eye, cloud], [self._background])
+            self._launch(nearness_kernel, cloud.shape, [self._eye, cloud], [self._nearness])
         self.looks.masked_fill_(fresh, 0)
         seen_now, known = count > 0, self.looks > 0
         self._follow(wp.from_torch(torch.where(known & seen_now, self._worlds, -1)), inputs)
@@ -212,7 +230,7 @@ class Registration:
         self._launch(
             fit_poses_kernel,
             pose.shape,
-            [self._shapes, self._eye, *sizes, worlds, *inputs, self._background],
+            [self._shapes, self._eye, *sizes, worlds, *inputs, self._nearness],
             [pose, cost],
         )
 
