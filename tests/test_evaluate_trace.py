@@ -65,8 +65,8 @@ def test_what_happened_is_written_down():
     trace = traced()
     assert trace.predicted is None and trace.steps[0, 0] == 12 and not trace.fell.any()
     passed = np.abs(0.85 - STEP_RAD * np.arange(13))
-    np.testing.assert_allclose(trace.distance[0, 0], passed, atol=1e-5)
-    np.testing.assert_allclose(trace.error, trace.distance, atol=1e-9)
+    np.testing.assert_allclose(trace.exact[0, 0], passed, atol=1e-5)
+    np.testing.assert_allclose(trace.error, trace.exact, atol=1e-9)
     assert np.isnan(trace.action_norm[0, 0, 12]) and np.isfinite(trace.action_norm[0, 0, :12]).all()
 
 
@@ -104,19 +104,25 @@ def test_nothing_stops_before_the_first_action_or_after_a_fall():
     assert episode.steps == 1 and episode.stopped
     fallen = traced(fall_at={0: 3})
     assert fallen.fell[0, 0] and fallen.steps[0, 0] == 3
-    assert np.isnan(fallen.distance[0, 0, 4:]).all(), "the next episode is not this one's"
+    assert np.isnan(fallen.exact[0, 0, 4:]).all(), "the next episode is not this one's"
     (lost,) = fallen.episodes(StoppingRule(0.3, 2.0), by_prediction=False)
     assert lost.fell and lost.steps == 3 and lost.scored_error_rad == pytest.approx(np.pi)
     (saved,) = fallen.episodes(StoppingRule(0.8, 2.0), by_prediction=False)
     assert saved.stopped and not saved.fell and saved.steps == 1
 
 
-def test_errors_are_up_to_symmetry_and_stops_are_not():
+def test_errors_and_stops_are_up_to_symmetry():
     square = FakeObject("b", Rotation.from_rotvec(np.outer(np.arange(4), [0.0, 0.0, np.pi / 2])).as_quat())
     trace = traced(np.pi / 2 + 0.3, objects=(FakeObject("a"), square), episodes=2)
     assert trace.error.shape == (2, 2, 13)
     np.testing.assert_allclose(trace.error[1, 0, :4], [0.3, 0.2, 0.1, 0.0], atol=1e-5)
-    np.testing.assert_allclose(trace.distance[1, 0], trace.distance[0, 0], atol=1e-9)
+    np.testing.assert_allclose(trace.exact[1, 0], trace.exact[0, 0], atol=1e-9)
+    stopped = trace.ends(StoppingRule(0.4, 2.0), by_prediction=False)[1]
+    assert stopped.tolist() == [[False, False], [True, True]]
+    rule = StoppingRule(0.4, 2.0)
+    square_only = trace.of([1]), protocol("zero", 2), [square]
+    rows, _ = judge(*square_only, kind="zero", sees="nothing", group="b", rule=rule)
+    assert rows[0].outcomes["success"].value == 1.0 and rows[0].exact.value == 0.0
 
 
 def test_the_table_goes_and_comes_back():

@@ -15,6 +15,7 @@ import warp as wp
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.envs.reorient import ReorientEnv
+from vd.kernels.observations import teacher_observation_slices
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sensors.surfaces import scene_surfaces
@@ -22,14 +23,16 @@ from vd.sim.scene import hand_mount
 from vd.student.cfg import NoiseCfg, StudentCfg
 from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
 from vd.student.object_sense import ObjectSense
-from vd.student.quaternions import rotation_distance
+from vd.student.quaternions import relative_rotation, rotation_distance
 from vd.student.sites import Sites
+from vd.student.symmetry import nearest_goal, symmetries_of_worlds
 
 Frame = dict[str, torch.Tensor]
 """Tensors of N worlds: ``body_q`` [N, B, 7], ``goal_quat`` [N, 4], ``action`` [N, D] (smoothed, of the step
 before), ``position`` [rad] and ``velocity`` [rad/s] of the joints as their encoders report them [N, D],
-``distance`` [N] (true angle to the goal [rad]), if the student senses it ``object`` [N, V]
-(:class:`vd.student.object_sense.ObjectSense`) and, with a camera, ``points`` [N, K, 3] (base frame [m])."""
+``distance`` [N] (true angle to the goal [rad], or to what looks like it, if that is nearer), if the student
+senses it ``object`` [N, V] (:class:`vd.student.object_sense.ObjectSense`) and, with a camera, ``points``
+[N, K, 3] (base frame [m])."""
 
 
 def voxels(
@@ -138,6 +141,7 @@ class StudentView:
                 frame_s=env.cfg.sim.control_dt,
                 seed=seed,
             )
+        self._symmetry = symmetries_of_worlds(env.objects, scene.world_object, env.device)
         self._sense: ObjectSense | None = None
         if "object" in network.senses:
             self._sense = ObjectSense(
@@ -173,7 +177,7 @@ class StudentView:
             "action": self._smoothed.clone(),
             "position": wp.to_torch(self.env.measured_q)[:, : self._joints].clone(),
             "velocity": wp.to_torch(self.env.measured_qd)[:, : self._joints].clone(),
-            "distance": rotation_distance(self._body_q[:, self._object, 3:], self._goal),
+            "distance": rotation_distance(*self._towards()),
         }
         if self.camera is not None:
             # A late image must not show what was before a reset.
@@ -192,6 +196,15 @@ class StudentView:
                 points=frame.get("points"),
             )
         return frame
+
+    def observation(self, observed: torch.Tensor) -> torch.Tensor:
+        """A teacher's observation [N, O], world frame: of all that looks like the goal the nearest is it."""
+        orientation, goal = self._towards()
+        columns = teacher_observation_slices(self.env.num_fingers)
+        changed = observed.clone()
+        changed[:, columns["goal_orientation"]] = goal
+        changed[:, columns["relative_orientation"]] = relative_rotation(orientation, goal)
+        return changed
 
     def points(self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None) -> torch.Tensor:
         """Clouds of frames: goal, hand, and the object or what the camera sees [R, P, 3]; base frame [m].
@@ -245,6 +258,11 @@ class StudentView:
         """Restore what :meth:`state_dict` gave."""
         for name, array in self._stateful().items():
             array.assign(state[name])
+
+    def _towards(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """True orientation of each world's object, and the nearest that looks like its goal [N, 4]."""
+        orientation = self._body_q[:, self._object, 3:]
+        return orientation, nearest_goal(orientation, self._goal, self._symmetry)
 
     def _stateful(self) -> dict[str, wp.array]:
         arrays = {"noise": self._voxelise.rng}

@@ -16,6 +16,7 @@ from vd.evaluate.trace import NEVER_RAD, Trace, record
 from vd.paper import PAPER
 from vd.student.saved import load_student, read_student, saved_spec
 from vd.student.stopping import Calibration, calibrate
+from vd.student.symmetry import with_symmetries
 from vd.train.checkpoint import save_checkpoint
 
 
@@ -31,9 +32,9 @@ def calibrate_trace(trace: Trace, *, tolerance_rad: float = PAPER.success.rotati
     """
     if trace.predicted is None:
         raise ValueError("only a student predicts distances; there is no rule to choose for another policy")
-    after = np.arange(trace.distance.shape[-1])
+    after = np.arange(trace.error.shape[-1])
     running = (after > 0) & (after < trace.steps[..., None])
-    values = trace.predicted, trace.action_norm, trace.distance, running
+    values = trace.predicted, trace.action_norm, trace.error, running
     return calibrate(*(value.reshape(-1, len(after)).T for value in values), tolerance_rad=tolerance_rad)
 
 
@@ -76,6 +77,7 @@ def calibrate_student(
         randomisation=replace(trained.randomisation, enabled=randomise),
     )
     env = ReorientEnv(task, device)
+    env.objects = with_symmetries(env.objects, device)
     trace = record(env, StudentActor(env, saved, seed=seed), each)
     env.check()
     env.close()

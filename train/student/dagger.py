@@ -50,6 +50,10 @@ class View(Protocol):
         """Tensors [N, ...] of the present state, among them the student's senses and ``distance`` [N]."""
         ...
 
+    def observation(self, observed: torch.Tensor) -> torch.Tensor:
+        """What the teacher would observe if of all that looks like its goal the nearest were its goal."""
+        ...
+
     def sites(
         self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None, *, augment: bool
     ) -> tuple[Sites, ...]:
@@ -207,9 +211,9 @@ class Dagger:
                 if stopping():
                     self._means.clear()
                     return None
-                frame, observed = self.view.frame(), observation[OBSERVATION_GROUP]
+                frame, observed = self.view.frame(), self.view.observation(observation[OBSERVATION_GROUP])
                 if self.student.state is not None:
-                    frame["observation"] = observed.clone()
+                    frame["observation"] = observed
                 for name, value in frame.items():
                     if step == 0:
                         # A tenth of a millimetre is lost of camera points, and half of the memory won.

@@ -61,6 +61,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
     from vd.evaluate.comparison import Comparison, judge
     from vd.evaluate.comparison_page import write_comparison
     from vd.evaluate.result import Protocol
+    from vd.student.symmetry import with_symmetries
 
     device = resolve_device(cfg.device)
     groups = parse_groups(cfg.object_sets)
@@ -81,6 +82,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             if env is not None:
                 env.close()
             env = ReorientEnv(wanted, device)
+            env.objects = with_symmetries(env.objects, device)
             task, start = wanted, env.state_dict()
         env.load_state_dict(start)
         actor, kind, sees, rule = _actor(cfg, name, policy, env, device)

@@ -17,7 +17,7 @@ from vd.evaluate.trace import Trace
 from vd.files import write_json
 from vd.student.stopping import StoppingRule
 
-COMPARISON_FORMAT = "visual-dexterity comparison 2"
+COMPARISON_FORMAT = "visual-dexterity comparison 3"
 OUTCOMES = ("success", "orientation error", "time-out", "object falls")
 """Classes of episodes: stopped within the tolerance, stopped outside of it, never stopped, lost."""
 BOUNDS_RAD = (0.1, 0.4)
@@ -45,6 +45,8 @@ class Row:
     """Bounds of the distance and of the action's norm."""
     outcomes: dict[str, Interval]
     """Share of episodes in each class."""
+    exact: Interval
+    """Share of episodes stopped within the tolerance of the very goal, not of what looks like it."""
     stops_within: dict[str, Interval]
     """By bound [rad] (as text): share of episodes that stop within it if the distance has to be below this
     bound rather than the rule's."""
@@ -148,7 +150,7 @@ def judge(
     ways: list[tuple[StoppedBy, StoppingRule]] = [("true distance", true_rule)]
     if trace.predicted is not None:
         ways.insert(0, ("prediction", rule))
-    rows = []
+    rows, unit = [], choose_unit(len(objects), resample)
     for stopped_by, bounds in ways:
         by_prediction = stopped_by == "prediction"
         episodes = trace.episodes(bounds, by_prediction=by_prediction)
@@ -168,9 +170,8 @@ def judge(
                 stopped_by=stopped_by,
                 rule=bounds,
                 outcomes=outcome_shares(result, resample=resample),
-                stops_within=_stops_within(
-                    trace, rule.action_norm, by_prediction, choose_unit(len(objects), resample)
-                ),
+                exact=_exact(trace, bounds, protocol.stop_tolerance_rad, by_prediction, unit),
+                stops_within=_stops_within(trace, rule.action_norm, by_prediction, unit),
                 result=result,
             )
         )
@@ -192,6 +193,15 @@ def outcome_shares(
     return dict(zip(OUTCOMES, rate_intervals(classes, unit), strict=True))
 
 
+def _exact(
+    trace: Trace, rule: StoppingRule, tolerance_rad: float, by_prediction: bool, unit: Unit
+) -> Interval:
+    """Share of episodes that a rule stops within the tolerance of the very goal."""
+    steps, stopped = trace.ends(rule, by_prediction=by_prediction)
+    error = np.take_along_axis(trace.exact, steps[..., None], axis=-1)[..., 0]
+    return rate_intervals((stopped & (error <= tolerance_rad))[None], unit)[0]
+
+
 def _stops_within(trace: Trace, action_norm: float, by_prediction: bool, unit: Unit) -> dict[str, Interval]:
     """Share of episodes that stop within each of BOUNDS_RAD with the bound in place of the rule's."""
     within = []
@@ -206,7 +216,7 @@ def _prediction(trace: Trace, policy: str, group: str) -> Prediction | None:
     if trace.predicted is None:
         return None
     there = np.isfinite(trace.predicted)
-    true, predicted = trace.distance[there], trace.predicted[there]
+    true, predicted = trace.error[there], trace.predicted[there]
     bounds = []
     for bound in BOUNDS_RAD:
         near, said = true <= bound, predicted <= bound

@@ -16,6 +16,8 @@ from vd.paper import PAPER
 
 COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Of policies, in their order (Okabe and Ito)."""
+EXACT = "very goal"
+"""Heading of the share that was stopped near the goal itself, not near what looks like it."""
 OUTCOME_COLOURS = dict(zip(OUTCOMES, (GREEN, "#E69F00", GREY, ORANGE), strict=True))
 PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.9
 """Of one panel of a figure [inch]."""
@@ -29,6 +31,7 @@ _HEADER = (
     "stopped by",
     "episodes",
     *OUTCOMES,
+    EXACT,
     *(f"<= {tolerance:g} rad" for tolerance in TOLERANCES_RAD if tolerance <= NEAR_RAD),
     "median error [rad]",
     "time to stop [s]",
@@ -236,6 +239,7 @@ def _cells(row: Row, short: dict[str, str]) -> tuple[str, ...]:
         row.stopped_by,
         str(overall.episodes),
         *(percent(row.outcomes[name]) for name in OUTCOMES),
+        percent(row.exact),
         *(percent(rate) for rate in shown),
         number(overall.median_error_rad),
         number(overall.time_to_success_s),
@@ -303,6 +307,7 @@ _METHOD = (
     "by each rule at the first step at which it holds: what decides to stop does not change what happened "
     "before. A rule is a bound on the distance, predicted by a student or true, and one on the norm of the "
     "smoothed action; unlike the evaluation of a single teacher it does not ask for stillness. "
-    "Errors are measured at the stop, up to the object's symmetry; rules know no symmetry. Intervals are "
+    "Errors, and distances to stop by, are up to the symmetry of the shape; of the very goal: the share that "
+    "was stopped near the goal itself, not near what looks like it. Intervals are "
     "95 %, as on the page of a single policy."
 )

@@ -29,9 +29,9 @@ class Trace:
         start_quat: Orientation of the object at the reset [K, M, 4].
         goal_quat: Wanted orientation [K, M, 4].
         error: Orientation error after t steps, up to the object's symmetry, NaN after the end [K, M, T + 1].
-        distance: The same without symmetry [K, M, T + 1].
+        exact: The same without symmetry [K, M, T + 1].
         action_norm: Norm of the smoothed action that led there, NaN after the end [K, M, T + 1].
-        predicted: What a student predicts of ``distance`` there; None for other policies [K, M, T + 1].
+        predicted: What a student predicts of ``error`` there; None for other policies [K, M, T + 1].
         steps: Steps to the fall or the time limit [K, M].
         fell: Whether the object was lost [K, M].
     """
@@ -39,7 +39,7 @@ class Trace:
     start_quat: np.ndarray
     goal_quat: np.ndarray
     error: np.ndarray
-    distance: np.ndarray
+    exact: np.ndarray
     action_norm: np.ndarray
     predicted: np.ndarray | None
     steps: np.ndarray
@@ -61,7 +61,7 @@ class Trace:
         Returns:
             Steps to the stop, fall or time limit, and whether the rule stopped it, shape [K, M] each.
         """
-        distance = self.predicted if by_prediction else self.distance
+        distance = self.predicted if by_prediction else self.error
         if distance is None:
             raise ValueError("only a student predicts distances; stop by the true distance")
         with np.errstate(invalid="ignore"):  # NaN stops nothing
@@ -103,6 +103,8 @@ def record(
 ) -> Trace:
     """Run a policy and write down what happens.
 
+    Errors are up to the symmetry that ``env.objects`` declare.
+
     Args:
         env: An environment that no state ends (``success.rotation_rad`` of NEVER_RAD), as it was built.
         policy: What acts; one with ``predicted`` is a student, and is told where it need not act any more.
@@ -113,6 +115,7 @@ def record(
         on_step: Called after every control step.
     """
     world_object = np.asarray(env.world_object)
+    symmetry = [item.symmetry for item in env.objects]
     shape = (len(env.objects), episodes)
     length = env.max_episode_steps + 1
     predicts = hasattr(policy, "predicted")
@@ -120,7 +123,7 @@ def record(
         start_quat=np.empty((*shape, 4)),
         goal_quat=np.empty((*shape, 4)),
         error=np.full((*shape, length), np.nan),
-        distance=np.full((*shape, length), np.nan),
+        exact=np.full((*shape, length), np.nan),
         action_norm=np.full((*shape, length), np.nan),
         predicted=np.full((*shape, length), np.nan) if predicts else None,
         steps=np.full(shape, env.max_episode_steps),
@@ -143,7 +146,7 @@ def record(
             env.reset(
                 object_quat=starts[chosen].astype(np.float32), goal_quat=goals[chosen].astype(np.float32)
             )
-        _record_round(env, policy, numbers, trace, table_steps, on_step)
+        _record_round(env, policy, numbers, trace, symmetry, table_steps, on_step)
     if table_steps is not None:
         env.sim.place_table(present=True)
     return trace
@@ -154,6 +157,7 @@ def _record_round(
     policy: Any,
     numbers: np.ndarray,
     trace: Trace,
+    symmetry: Sequence[np.ndarray],
     table_steps: int | None,
     on_step: Callable[[], object],
 ) -> None:
@@ -163,7 +167,7 @@ def _record_round(
     goal = unit_quats(env.goal_quat.numpy())[worlds]
     quat = unit_quats(env.object_pose()[:, 3:7])[worlds]
     trace.start_quat[place], trace.goal_quat[place] = quat, goal
-    _write_errors(env, trace, place, 0, quat, goal)
+    _write_errors(trace, symmetry, place, 0, quat, goal)
     alive = np.ones(len(worlds), dtype=bool)
     smoothed = wp.to_torch(env.smoothed)
     for step in range(env.max_episode_steps):
@@ -178,7 +182,7 @@ def _record_round(
             trace.predicted[(*living, step)] = policy.predicted.cpu().numpy()[worlds][alive]
         env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
         quat = unit_quats(env.object_pose_end.numpy()[:, 3:7])[worlds]
-        _write_errors(env, trace, living, step + 1, quat[alive], goal[alive])
+        _write_errors(trace, symmetry, living, step + 1, quat[alive], goal[alive])
         fell = (env.fell.numpy()[worlds] != 0) & alive
         trace.fell[place[0][fell], place[1][fell]] = True
         trace.steps[place[0][fell], place[1][fell]] = step + 1
@@ -196,18 +200,18 @@ def _mask(worlds: np.ndarray, count: int, device: torch.device) -> torch.Tensor:
 
 
 def _write_errors(
-    env: Any,
     trace: Trace,
+    symmetry: Sequence[np.ndarray],
     place: tuple[np.ndarray, np.ndarray],
     step: int,
     quat: np.ndarray,
     goal: np.ndarray,
 ) -> None:
-    """Write error and distance of some episodes after ``step`` steps."""
-    trace.distance[(*place, step)] = rotation_angle(quat, goal)
+    """Write the errors of some episodes after ``step`` steps."""
+    trace.exact[(*place, step)] = rotation_angle(quat, goal)
     for k in np.unique(place[0]):
         rows = place[0] == k
-        error = symmetric_error(quat[rows], goal[rows], env.objects[k].symmetry)
+        error = symmetric_error(quat[rows], goal[rows], symmetry[k])
         trace.error[k, place[1][rows], step] = error
 
 

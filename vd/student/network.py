@@ -198,6 +198,7 @@ class Student(nn.Module):
                     nn.Linear(cfg.distance_hidden, 1),
                 )
                 for place in cfg.distance
+                if place != "found"
             }
         )
         if self._angle is not None:
@@ -274,9 +275,11 @@ class Student(nn.Module):
         remembered, hidden = self._remember(self.merge_action(inputs), hidden, done)
         features = self.head(remembered)
         places = {"before": embedding, "after": remembered}
-        distance = [head(places[place]) for place, head in self.distance.items()]
-        if self._angle is not None:
-            distance = [value + senses[..., self._angle, None] for value in distance]
+        angle = embedding.new_zeros(()) if self._angle is None else senses[..., self._angle, None]
+        distance = [
+            angle if place == "found" else angle + self.distance[place](places[place])
+            for place in self.cfg.distance
+        ]
         log_std = self.log_std(features)
         if self.cfg.std_range is not None:
             low, high = (math.log(bound) for bound in self.cfg.std_range)

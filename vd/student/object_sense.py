@@ -1,7 +1,8 @@
 """What a student knows of its object once that is found: pose, motion, and the surface.
 
 The object is found among the voxels that the network reads (:mod:`vd.student.registration`). N worlds, G
-fingers. World frame unless said otherwise: z up; quaternions xyzw.
+fingers. World frame unless said otherwise: z up; quaternions xyzw. Of the orientations that look like the
+wanted one (:mod:`vd.student.symmetry`) the nearest is the goal: which of them it is, nobody can see.
 """
 
 from collections.abc import Sequence
@@ -30,6 +31,7 @@ from vd.paper import PAPER
 from vd.student.quaternions import product, relative_rotation, rotated, rotation_distance
 from vd.student.registration import FAR_M, POINTS, Registration
 from vd.student.sites import Sites
+from vd.student.symmetry import nearest_goal, symmetries_of_worlds
 
 ANGLE = 0
 """Column of the angle to the goal [rad]."""
@@ -103,6 +105,7 @@ class ObjectSense:
             device: Warp device.
         """
         self.device = device
+        self._symmetry = symmetries_of_worlds(objects, world_object, device)
         self._voxel_m, self._fingers, self._base = voxel_m, hand.num_fingers, int(link_body[0])
         self.registration = Registration(
             objects, world_object=world_object, world_scale=world_scale, camera=camera, device=device
@@ -160,6 +163,7 @@ class ObjectSense:
         spin = 2.0 * rotated(turn, step[:, :3] * step[:, 3:].sign())  # of a small angle
         self._before.copy_(pose)
         orientation, position = product(turn, pose[:, 3:]), base[:, :3] + rotated(turn, pose[:, :3])
+        goal_quat = nearest_goal(orientation, goal_quat, self._symmetry)
         rotation = relative_rotation(orientation, goal_quat)
         rotation = torch.where(rotation[:, 3:] < 0.0, -rotation, rotation)
         rate, moves = PAPER.scene.control_hz, known[:, None].float()

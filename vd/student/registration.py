@@ -193,13 +193,38 @@ class Registration:
             self._find(wp.from_torch(self._worlds[first]), inputs)
         self.looks += seen_now.int()
 
+    def tried(
+        self, seen: torch.Tensor, count: torch.Tensor, *, steps: int, every: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """All rotations that a first look tries, improved, where there is no camera; nothing is kept.
+
+        Args:
+            seen: Points of the object from all sides [m], [N, P, 3].
+            count: How many there are, [N] int32.
+            steps: Steps of each.
+            every: Look at every so many-th point.
+
+        Returns:
+            Poses [N, H, 7] and their misfits [m^2], [N, H].
+        """
+        inputs = [wp.from_torch(seen.contiguous(), dtype=wp.vec3), wp.from_torch(count)]
+        poses, cost = self._tried(wp.from_torch(self._worlds), steps, every, inputs)
+        return wp.to_torch(poses), wp.to_torch(cost)
+
+    def _tried(
+        self, worlds: wp.array, steps: int, every: int, inputs: list[wp.array]
+    ) -> tuple[wp.array, wp.array]:
+        """Poses in all rotations [M, H], improved, and their misfits."""
+        first = wp.zeros(len(worlds), dtype=int, device=self.device)
+        poses = wp.empty((len(worlds), ROTATIONS), dtype=wp.transform, device=self.device)
+        cost = wp.empty(poses.shape, dtype=float, device=self.device)
+        self._start(poses, worlds, first, inputs)
+        self._fit(poses, cost, worlds, steps, every, inputs)
+        return poses, cost
+
     def _find(self, worlds: wp.array, inputs: list[wp.array]) -> None:
         """Find the objects of some worlds, of which nothing is known."""
-        first = wp.zeros(len(worlds), dtype=int, device=self.device)
-        tried = wp.empty((len(worlds), ROTATIONS), dtype=wp.transform, device=self.device)
-        cost = wp.empty(tried.shape, dtype=float, device=self.device)
-        self._start(tried, worlds, first, inputs)
-        self._fit(tried, cost, worlds, FIRST_STEPS, FIRST_EVERY, inputs)
+        tried, cost = self._tried(worlds, FIRST_STEPS, FIRST_EVERY, inputs)
         best = wp.to_torch(cost).topk(CHOSEN, dim=1, largest=False).indices
         poses = wp.to_torch(tried)
         chosen = wp.from_torch(
