@@ -141,10 +141,7 @@ def test_places_and_marks_are_read_where_asked_for(device):
 
 
 def test_senses_are_what_the_configuration_names(device):
-    net = student(
-        dataclasses.replace(SMALL, senses=("action", "position", "velocity"), distance=("before", "after")),
-        device,
-    )
+    net = student(dataclasses.replace(SMALL, senses=("action", "position", "velocity")), device)
     frame = {name: torch.full((3, ACTIONS), value) for name, value in (("action", 1.0), ("position", 2.0))}
     frame["velocity"] = torch.full((3, ACTIONS), 15.0)
     assert net.senses(frame).unique(dim=1).tolist() == [[1.0, 2.0, 3.0]] * 3

@@ -5,7 +5,7 @@ from typing import Literal
 
 from vd.paper import PAPER
 
-DistancePlace = Literal["before", "after", "found"]
+DistancePlace = Literal["before", "after"]
 VoxelInput = Literal["constant", "position", "marks"]
 Sense = Literal["action", "position", "velocity", "object"]
 
@@ -148,10 +148,9 @@ class StudentCfg:
     distance_hidden: int = PAPER.student.distance_hidden
     """Width of the hidden layer of a distance head."""
     distance: tuple[DistancePlace, ...] = ("before", "after")
-    """Where heads predict the rotation distance: before the GRU, from this cloud alone, or after it;
-    ``found`` is the angle of the sense ``object`` as it is.
+    """Where heads predict the rotation distance: before the GRU, from this cloud alone, or after it.
 
-    The last one is the one to stop by.
+    The last one is the one to stop by, unless the sense of the object finds the angle itself.
     """
     std_range: tuple[float, float] | None = STD_RANGE
     """Open interval of the standard deviation of actions; None for no bounds."""
@@ -170,21 +169,16 @@ class StudentCfg:
         if not self.voxel_m > 0.0:
             raise ValueError(f"student.voxel_m = {self.voxel_m} must be positive")
         if len(set(self.distance)) != len(self.distance) or not self.distance:
-            raise ValueError(
-                f"student.distance = {self.distance} must name before, after or found, each once"
-            )
-        if "found" in self.distance and "object" not in self.senses:
-            raise ValueError("the angle of an object is found by the sense of it: add object to senses")
+            raise ValueError(f"student.distance = {self.distance} must name one or both of before, after")
         if min(self.action_hidden, self.memory, self.head_hidden, self.distance_hidden) < 1:
             raise ValueError("student: every width must be positive")
         if self.std_range is not None and not 0.0 < self.std_range[0] < self.std_range[1]:
             raise ValueError(f"student.std_range = {self.std_range} must be (low, high), both positive")
 
 
-LEAN = StudentCfg(senses=("action", "position", "velocity", "object"), distance=("before", "after", "found"))
+LEAN = StudentCfg(senses=("action", "position", "velocity", "object"))
 """A last stage of half the width, distance heads before and after the GRU, bounded standard deviation, and
-the object found by its known shape: its rotation from the goal need not be pooled, and it stops by the angle
-of the object as it is found."""
+the object found by its known shape, so that its rotation from the goal need not be pooled."""
 
 PAPER_NETWORK = replace(
     LEAN,

@@ -38,7 +38,8 @@ class StudentOutput:
     log_std: torch.Tensor
     """Logarithm of their standard deviation [.., D]."""
     distance: torch.Tensor
-    """Predicted angle to the goal by each distance head [rad], in the order of the configuration [.., H]."""
+    """Predicted angle to the goal by each distance head [rad], in the order of the configuration, and the one
+    that was found, where the object is looked for: the last one is the one to stop by [.., H]."""
     state: torch.Tensor
     """Estimate of the teacher's observation, normalised [.., O]; O is 0 without such a head."""
     view: torch.Tensor
@@ -198,7 +199,6 @@ class Student(nn.Module):
                     nn.Linear(cfg.distance_hidden, 1),
                 )
                 for place in cfg.distance
-                if place != "found"
             }
         )
         if self._angle is not None:
@@ -275,11 +275,10 @@ class Student(nn.Module):
         remembered, hidden = self._remember(self.merge_action(inputs), hidden, done)
         features = self.head(remembered)
         places = {"before": embedding, "after": remembered}
-        angle = embedding.new_zeros(()) if self._angle is None else senses[..., self._angle, None]
-        distance = [
-            angle if place == "found" else angle + self.distance[place](places[place])
-            for place in self.cfg.distance
-        ]
+        distance = [head(places[place]) for place, head in self.distance.items()]
+        if self._angle is not None:
+            angle = senses[..., self._angle, None]
+            distance = [*(angle + value for value in distance), angle]
         log_std = self.log_std(features)
         if self.cfg.std_range is not None:
             low, high = (math.log(bound) for bound in self.cfg.std_range)
