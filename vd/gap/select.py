@@ -210,7 +210,7 @@ class Selection(Frictions):
                 present = revised
                 if settled:
                     break
-            if not grown or self.finished(present):
+            if not grown or self.finished(present) or self.a_spring(present):
                 break
             if len(present.effects) >= MAX_EFFECTS:
                 break
@@ -312,7 +312,9 @@ class Selection(Frictions):
             rivals[name] = list(fits.values())
             self.added[frozenset(present.effects)] = (present, *fits.values())
             present = best
-            if self.finished(present) or self.too_coarse(present) or len(present.effects) >= MAX_EFFECTS:
+            if self.finished(present) or self.too_coarse(present) or self.a_spring(present):
+                break
+            if len(present.effects) >= MAX_EFFECTS:
                 break
         return present, rivals, trials
 
