@@ -80,6 +80,16 @@ def test_convolution_equals_a_dense_one_masked_to_the_sites(device, stride, monk
     torch.testing.assert_close(result, at_sites(dense, outputs, EXTENT // stride), atol=1e-5, rtol=1e-5)
 
 
+def test_layers_give_the_same_where_nothing_is_learned(device):
+    sites = random_sites(device)
+    values = features_of(sites, 5)
+    for layer in (SparseConv3d(5, 7), SparseConv3d(5, 7, stride=2), SparseMaxPool3d()):
+        layer = layer.to(sites.device)
+        expected = layer(values, sites)
+        with torch.inference_mode():
+            assert torch.equal(layer(values, sites), expected)
+
+
 def test_only_one_coarser_level_waits_for_the_device(device, monkeypatch):
     sites, waits, read = random_sites(device), [], wp.array.numpy
     monkeypatch.setattr(wp.array, "numpy", lambda array: waits.append(array.shape) or read(array))

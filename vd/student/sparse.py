@@ -183,10 +183,11 @@ class SparseConv3d(nn.Module):
         """Convolve ``features`` [M, C_in]; rows of the result are of ``sites``, or of ``sites.coarser``."""
         if torch.is_autocast_enabled(features.device.type):
             features = features.to(torch.get_autocast_dtype(features.device.type))
-        if self.stride == 2:
-            back = sites.strided_back if features.requires_grad else None
-            return _Convolution.apply(features, self.weight, sites.strided, back)
-        return _Convolution.apply(features, self.weight, sites.neighbours)
+        table = sites.strided if self.stride == 2 else sites.neighbours
+        if not torch.is_grad_enabled():  # autograd's bookkeeping is a twentieth of a cloud's time on a CPU
+            return gather_multiply(features, table, self.weight.to(features.dtype))
+        back = sites.strided_back if self.stride == 2 and features.requires_grad else None
+        return _Convolution.apply(features, self.weight, table, back)
 
     def extra_repr(self) -> str:
         """Sizes, for ``print``."""
@@ -198,7 +199,9 @@ class SparseMaxPool3d(nn.Module):
 
     def forward(self, features: torch.Tensor, sites: Sites) -> torch.Tensor:
         """Pool ``features`` [M, C] to [coarser M, C]."""
-        return _WindowMaximum.apply(features, sites.windows)
+        if torch.is_grad_enabled() or fused_for(features):
+            return _WindowMaximum.apply(features, sites.windows)
+        return gather_rows(features, sites.windows, -math.inf).amax(dim=1)  # nobody asks which row it was
 
 
 def global_pool(features: torch.Tensor, sites: Sites) -> torch.Tensor:
