@@ -108,6 +108,25 @@ def _sdk() -> Any:
     return dynamixel_sdk
 
 
+class _Kept:
+    """A port that keeps the packet that the SDK makes."""
+
+    def __init__(self) -> None:
+        self.is_using, self.packet, self.answer_bytes = False, b"", 0
+
+    def clearPort(self) -> None:  # noqa: N802 (the SDK's name)
+        """Nothing has come."""
+
+    def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
+        """Keep it."""
+        self.packet = bytes(packet)
+        return len(packet)
+
+    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
+        """Keep how long the answer is."""
+        self.answer_bytes = packet_length
+
+
 class MotorBus:
     """Motors of one model on one serial port.
 
@@ -145,6 +164,7 @@ class MotorBus:
         self._lock = threading.RLock()
         self._packets = self._sdk.PacketHandler(2.0)
         self._states = StateCheck(self.ids, self.model)
+        self._goals = b""
         self._settings: dict[int, MotorSettings] = {}
         self.rejected = 0
         """States that were not accepted."""
@@ -326,11 +346,13 @@ class MotorBus:
         found = {id: self.read(id, "hardware_error_status") for id in self.ids}
         return {id: describe_hardware_error(bits) for id, bits in found.items() if bits}
 
-    def write_goals(self, goals: np.ndarray) -> None:
+    def write_goals(self, goals: np.ndarray, *, with_state: bool = False) -> None:
         """Send all goals in one packet.
 
         Args:
             goals: Angles [rad], shape [D]; clipped to the limits that were configured.
+            with_state: Send them in one piece with the question of the next :meth:`read_state`, so that both
+                arrive at the same moment; others that are sent before take their place.
 
         Raises:
             ValueError: A goal that is no number; nothing is sent.
@@ -344,16 +366,18 @@ class MotorBus:
             if id in self._settings:
                 goal = np.clip(goal, self._settings[id].lower_rad, self._settings[id].upper_rad)
             counts.append(to_counts(float(goal)))
-        self._write_all("goal_position", counts)
+        self._write_all("goal_position", counts, later=with_state)
 
-    def _write_all(self, name: str, values: Sequence[int]) -> None:
-        """Write one item of every motor in one packet."""
+    def _write_all(self, name: str, values: Sequence[int], *, later: bool = False) -> None:
+        """Write one item of every motor in one packet, now or with the question for their state."""
         item = self._items[name]
         rows = [
             byte for id, value in zip(self.ids, values, strict=True) for byte in (id, *item.to_bytes(value))
         ]
         with self._line():
-            result = self._packets.syncWriteTxOnly(self._port, item.address, item.size, rows, len(rows))
+            port = _Kept() if later else self._port
+            result = self._packets.syncWriteTxOnly(port, item.address, item.size, rows, len(rows))
+            self._goals = port.packet if later else b""
         if result != self._sdk.COMM_SUCCESS:
             raise BusError(f"{name} was not sent: {self._words(result)}")
 
@@ -380,11 +404,13 @@ class MotorBus:
         ids = list(self.ids)
         with self._line():
             asked = self.clock.now()
-            result = self._packets.syncReadTx(
-                self._port, STATE_ADDRESS, STATE_BYTES, ids, len(ids), fast_option=False
-            )
-            if result != self._sdk.COMM_SUCCESS:
-                raise BusError(f"states were not asked for: {self._words(result)}")
+            question = _Kept()
+            self._packets.syncReadTx(question, STATE_ADDRESS, STATE_BYTES, ids, len(ids), fast_option=False)
+            packets, self._goals = self._goals + question.packet, b""
+            self._port.clearPort()
+            if self._port.writePort(packets) != len(packets):
+                raise BusError("states were not asked for: the port did not take the packet")
+            self._port.setPacketTimeout(question.answer_bytes)
             # One time for all: the SDK counts no time for the answers' bytes.
             heard = self.clock.now()
             answers = [self._answer(id) for id in ids]

@@ -45,6 +45,8 @@ WIDE = SafetyCfg(step_rad=4.0)
 TWIN_ARGS = "--physics-hz 3840"
 """Steps of the twin so short that its integrator is as exact as vd-gap's: at 960 Hz it is off by 0.3 mrad
 (median of a moving hand; up to 0.9), two thirds of what the encoders round."""
+AGAIN_S = 0.01
+"""A state that was asked for so long after its goal was sent was asked for again."""
 STATE_CHANNELS = ("velocity", "current", "pwm", "voltage", "temperature")
 
 
@@ -184,7 +186,7 @@ class Row:
     state: HandState
     """What was measured."""
     goal: np.ndarray
-    """Angles of the joints that were sent before [rad] [D]."""
+    """Angles of the joints that were sent with the question for it [rad] [D]."""
     sent_s: float
     """When [s]."""
     on: np.ndarray
@@ -208,7 +210,7 @@ class Recorder:
     def play(self, safe: SafeHand, motion: Motion) -> "Trajectory":
         """Go to where the motion starts, play it, and give what was measured.
 
-        A sample is a state, and the goal that was sent right before it was read, each with its time.
+        A sample is a goal and the state at the moment at which it arrived.
 
         Raises:
             StoppedError: The hand was stopped.
@@ -228,7 +230,7 @@ class Recorder:
             if not np.array_equal(on, excitation.enabled[at]):
                 on = excitation.enabled[at]
                 safe.switch(on)
-            goal = safe.command(excitation.command[at])
+            goal = safe.command(excitation.command[at], with_state=True)
             sent_s = self._connection.bus.clock.now()
             state = safe.read()
             if state.time_s > last:  # else the last one again
@@ -257,9 +259,9 @@ class Recorder:
             return np.array(values)[:, self._columns]
 
         asked_s, sent_s = np.array([state.time_s for state in states]), np.array([row.sent_s for row in rows])
-        # A goal goes out right before its state is asked for: what keeps one on the way keeps both.
         measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
-        sent_s = np.maximum.accumulate(sent_s + np.maximum(measured_s - asked_s, 0.0))
+        # A goal arrives with the question for its state, unless that was asked again.
+        sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
         measured = {name: column([getattr(state, name) for state in states]) for name in STATE_CHANNELS}
         excitation = motion.excitation
         return Trajectory(

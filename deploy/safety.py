@@ -161,11 +161,12 @@ class SafeHand:
         self._check()
         return state
 
-    def command(self, target: np.ndarray) -> np.ndarray:
+    def command(self, target: np.ndarray, *, with_state: bool = False) -> np.ndarray:
         """Send goals within the limits.
 
         Args:
             target: Wanted angles of the joints [rad], shape [D].
+            with_state: Send them with the question of the next :meth:`read`.
 
         Returns:
             The goals that were sent [rad], shape [D].
@@ -184,7 +185,7 @@ class SafeHand:
         with self._stopping:  # never after the hold
             self._check()
             try:
-                self.bus.write_goals(self.joints.to_motor(goal))
+                self.bus.write_goals(self.joints.to_motor(goal), with_state=with_state)
             except BusError as error:
                 raise self._stop(f"lost the bus: {error}", lost=True) from error
         return goal

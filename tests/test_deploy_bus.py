@@ -428,3 +428,22 @@ def test_motors_hear_what_arrives_when_it_arrives_however_long_the_plant_takes()
     late = np.array([state.position[0] / 6.0 - state.time_s for state in states])
     low, high = np.percentile(late, [20, 80])  # a busy machine lets some packets wait
     assert high - low < 0.002
+
+
+def test_goals_arrive_with_the_question_for_the_state_unless_others_are_sent_before(bus, twin):
+    ready(bus)
+    goals = np.array([0.3, -0.3, 0.2])
+
+    def told() -> np.ndarray:
+        return np.array([to_angle(motor.get("goal_position")) for motor in twin.motors])
+
+    first = told()
+    bus.write_goals(goals, with_state=True)
+    time.sleep(0.05)
+    np.testing.assert_array_equal(told(), first)
+    bus.read_state()
+    np.testing.assert_allclose(told(), goals, atol=0.001)
+    bus.write_goals(goals + 0.1, with_state=True)
+    bus.write_goals(np.zeros(3))  # as a stop of the hand does
+    bus.read_state()
+    np.testing.assert_allclose(told(), 0.0, atol=0.001)
