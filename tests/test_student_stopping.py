@@ -95,7 +95,7 @@ def test_a_recorded_trace_gives_the_same_rule():
         quats,
         quats,
         error=traced(true),
-        distance=traced(true),
+        exact=traced(true),
         action_norm=traced(norm),
         predicted=traced(predicted),
         steps=steps.reshape(2, 30),
