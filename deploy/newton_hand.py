@@ -25,8 +25,9 @@ from vd.sim.simulator import AWAY_M, make_solver
 
 SHORTEST_COMMAND_S = 0.0025
 """Commands do not come more often, or some of those that are delayed are lost: two for each goal."""
-LONGEST_S = 0.1
-"""Time that is simulated at once at most: after a longer pause the hand is where it was."""
+LONGEST_S = 0.3
+"""Time that is simulated at once at most, longer than a gap at which the hand is stopped: after a longer one
+it is where it was."""
 ROOM = 4
 """Times as many contacts as a world of many has on average, for there is no other world to take them from."""
 
