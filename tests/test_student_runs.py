@@ -17,6 +17,7 @@ from student_dummy import TINY, make_student_runner
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_teacher
+from vd.evaluate.statistics import symmetric_error
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import LEAN, NoiseCfg, StudentCfg
 from vd.student.saved import load_student, read_student
@@ -76,11 +77,17 @@ def test_recorded_frames_show_what_was_seen(env, rendered, network):
 
 
 def test_a_frame_holds_the_true_distance_and_the_action_before_it(env):
+    """The distance is to the nearest goal that looks the same: of a cube there are 24."""
     env.reset()
     view = StudentView(env, NETWORK, rendered=False)
     assert not view.frame()["action"].any()
     frames, _ = steps(env, view, 3)
-    np.testing.assert_allclose(view.frame()["distance"], env.rotation_error.numpy(), atol=1e-4)
+    turn = wp.to_torch(env.sim.body_q)[:, env.scene.object_body, 3:].numpy()
+    error = [
+        symmetric_error(turn[world], env.goal_quat.numpy()[world], env.objects[index].symmetry)
+        for world, index in enumerate(env.world_object)
+    ]
+    np.testing.assert_allclose(view.frame()["distance"], error, atol=1e-3)
     assert torch.equal(view.frame()["action"], wp.to_torch(env.smoothed))
     assert not torch.equal(frames[1]["action"], frames[2]["action"])
 
