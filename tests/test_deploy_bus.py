@@ -416,18 +416,18 @@ def test_motors_hear_what_arrives_when_it_arrives_however_long_the_plant_takes()
 
     class Slow(FirstOrderPlant):
         def advance(self, seconds, drives):
-            time.sleep(0.008)
+            time.sleep(0.016)
             self.position += 6.0 * seconds
 
     plant = Slow(1, position=np.array([-2.5]))
     with Twin([Motor(MODELS[MODEL], 1)], plant) as twin, MotorBus(twin.path, [1], MODEL, retries=20) as bus:
         states = []
-        for wait_s in np.random.default_rng(0).uniform(0.0, 0.02, 30):
+        for wait_s in np.random.default_rng(0).uniform(0.0, 0.04, 30):
             time.sleep(wait_s)
             states.append(bus.read_state())
     late = np.array([state.position[0] / 6.0 - state.time_s for state in states])
     low, high = np.percentile(late, [20, 80])  # a busy machine lets some packets wait
-    assert high - low < 0.002
+    assert high - low < 0.006
 
 
 def test_goals_arrive_with_the_question_for_the_state_unless_others_are_sent_before(bus, twin):
