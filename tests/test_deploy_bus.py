@@ -1,6 +1,7 @@
 """dynamixel-sdk, unchanged, against the twin over its pseudo-terminal."""
 
 import itertools
+import os
 import random
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from vd.deploy.bus import MotorBus, MotorSettings  # noqa: E402
 from vd.deploy.control_table import MODELS, HardwareError, table, to_angle, to_counts  # noqa: E402
 from vd.deploy.line import Faults, MotorLine  # noqa: E402
 from vd.deploy.motor import Motor  # noqa: E402
-from vd.deploy.packets import ALERT, Failure  # noqa: E402
+from vd.deploy.packets import ALERT, Failure, Instruction, Packet, PacketReader, encode  # noqa: E402
 from vd.deploy.plant import FirstOrderPlant  # noqa: E402
 from vd.deploy.twin import Twin, spoil  # noqa: E402
 
@@ -415,19 +416,38 @@ def test_motors_hear_what_arrives_when_it_arrives_however_long_the_plant_takes()
     """A state is that of the moment of its packet, not of the end of the step in which the plant was."""
 
     class Slow(FirstOrderPlant):
-        def advance(self, seconds, drives):
-            time.sleep(0.016)
-            self.position += 6.0 * seconds
+        rate, slow = 2.0, threading.Event()
+        busy = threading.Event()
 
-    plant = Slow(1, position=np.array([-2.5]))
-    with Twin([Motor(MODELS[MODEL], 1)], plant) as twin, MotorBus(twin.path, [1], MODEL, retries=20) as bus:
-        states = []
-        for wait_s in np.random.default_rng(0).uniform(0.0, 0.04, 30):
-            time.sleep(wait_s)
-            states.append(bus.read_state())
-    late = np.array([state.position[0] / 6.0 - state.time_s for state in states])
-    low, high = np.percentile(late, [20, 80])  # a busy machine lets some packets wait
-    assert high - low < 0.006
+        def advance(self, seconds, drives):
+            self.position += self.rate * seconds
+            if self.slow.is_set():
+                self.slow.clear()
+                self.busy.set()
+                time.sleep(0.4)
+
+    plant = Slow(1, position=np.array([-3.0]))
+    item = table(MODELS[MODEL])["present_position"]
+    where = item.address.to_bytes(2, "little") + item.size.to_bytes(2, "little")
+    question = encode(Packet(1, Instruction.READ, where))
+    with Twin([Motor(MODELS[MODEL], 1)], plant) as twin:
+        line = os.open(twin.path, os.O_RDWR | os.O_NOCTTY)
+
+        def started() -> float:
+            """When it was at zero, by what it answers to a packet of now."""
+            now = time.monotonic()
+            os.write(line, question)
+            answers: list[Packet] = []
+            reader = PacketReader()
+            while not answers:
+                answers = reader.feed(os.read(line, 100))
+            return now - to_angle(item.from_bytes(answers[0].parameters[1:])) / plant.rate
+
+        calm = started()
+        plant.slow.set()
+        assert plant.busy.wait(5.0)
+        assert started() == pytest.approx(calm, abs=0.15)
+        os.close(line)
 
 
 def test_goals_arrive_with_the_question_for_the_state_unless_others_are_sent_before(bus, twin):
