@@ -152,12 +152,18 @@ def test_beside_an_effect_other_masses_are_no_second_one(
         assert "with the masses of its links" in each.reason
 
 
-@pytest.mark.parametrize(("share", "verdict"), [(1.0, "unknown"), (-1.0, "effects")])
+@pytest.mark.parametrize(
+    ("share", "off", "verdict"), [(1.0, 0.1, "unknown"), (-1.0, 0.1, "effects"), (-1.0, 0.02, "unknown")]
+)
 def test_beside_other_masses_a_spring_is_no_load_with_an_offset(
-    share: float, verdict: str, monkeypatch: pytest.MonkeyPatch
+    share: float, off: float, verdict: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The table has no spring: a load and an offset that cancel at rest are not named in its place."""
-    monkeypatch.setattr(joints, "fit_masses", lambda *_: Masses(np.ones(3), np.full(3, NOISE)))
+    """The table has no spring: a load and an offset that cancel at rest are not named in its place.
+
+    Nor is anything else where the masses are not others: it is not they that are the rest.
+    """
+    masses = Masses(np.array([1.0, 1.0 - off, 1.0]), np.full(3, NOISE))
+    monkeypatch.setattr(joints, "fit_masses", lambda *_: masses)
     monkeypatch.setattr(joints, "_cores", lambda _: [("gravity_load", "encoder_bias")])
     recording = blank()
     (chain,) = chains(recording, load_hand("dclaw3"))

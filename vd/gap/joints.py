@@ -272,7 +272,7 @@ def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | 
     fits = parallel(fitted, known)
     masses = fit_masses([team.bench.problem(joint.spec) for joint, _ in known], fits)
     floors = np.array([joint.spec.floor for joint, _ in known])
-    if (masses.errors >= NO_GAP * floors).any():
+    if not masses.other or (masses.errors >= NO_GAP * floors).any():
         return None
     reason, explanations = f"{explains(core)}, {masses.text}", []
     for (joint, found), fit in zip(known, fits, strict=True):

@@ -20,6 +20,8 @@ from vd.paper import PAPER
 
 RANGE = PAPER.randomisation.link_mass_scale
 """Masses that are no finding, as a share of the model's: policies are trained on all of them."""
+LEAST_OFF = 0.05
+"""Share by which a mass is other than the model's at least: what less does is not what a finger lacks."""
 ITERATIONS = 8
 RIDGE = 0.01
 """Pull of the logarithms towards the start, as information in units of the noise floor."""
@@ -36,6 +38,11 @@ class Masses:
 
     factors: np.ndarray
     errors: np.ndarray
+
+    @property
+    def other(self) -> bool:
+        """Whether a mass is another than the model's."""
+        return bool(np.abs(self.factors - 1.0).max() > LEAST_OFF)
 
     @property
     def text(self) -> str:
