@@ -163,8 +163,8 @@ def test_sequence_equals_single_steps_with_the_memory_cleared_at_ends(device):
     embedding, previous = sequence(net, 7, 3)
     done = torch.zeros(7, 3, device=embedding.device)
     done[2, 0] = done[2, 1] = done[3, 0] = done[6, 2] = 1.0
-    whole = net(embedding, previous, net.initial_hidden(3), done)
-    hidden = net.initial_hidden(3)
+    hidden = torch.randn_like(net.initial_hidden(3))
+    whole = net(embedding, previous, hidden, done)
     for t in range(7):
         step = net(embedding[t : t + 1], previous[t : t + 1], hidden)
         for one, all_steps in ((step.mean, whole.mean), (step.distance, whole.distance)):

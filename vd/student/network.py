@@ -319,14 +319,20 @@ class Student(nn.Module):
         self, inputs: torch.Tensor, hidden: torch.Tensor, done: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """The GRU over [T, N, E], its memory cleared where worlds ended."""
-        steps = inputs.shape[0]
-        # Runs of steps between which no world ends go through the GRU in one call.
-        ends = [] if done is None else done.bool().any(dim=1).nonzero().flatten().tolist()
-        outputs, start, state = [], 0, hidden[None]
-        for end in sorted({*(end + 1 for end in ends), steps}):
-            output, state = self.memory(inputs[start:end], state)
-            outputs.append(output)
-            if done is not None:
-                state = state.masked_fill(done[end - 1].bool().view(1, -1, 1), 0.0)
-            start = end
-        return torch.cat(outputs), state[0]
+        if done is None:
+            outputs, state = self.memory(inputs, hidden[None])
+            return outputs, state[0]
+        # A world's steps are cut into runs at its ends, and all runs go through the GRU side by side.
+        ended = done.bool()
+        steps, worlds = ended.shape
+        begins = torch.cat([torch.ones_like(ended[:1]), ended[:-1]])
+        run = begins.T.flatten().cumsum(0).view(worlds, steps).T - 1
+        step = torch.arange(steps, device=inputs.device)[:, None]
+        since = step - torch.where(begins, step, 0).cummax(dim=0).values
+        runs = int(run[-1, -1]) + 1  # waits for the device
+        place = (since * runs + run).flatten()
+        beside = inputs.new_zeros((steps * runs, inputs.shape[-1])).index_copy(0, place, inputs.flatten(0, 1))
+        first = hidden.new_zeros((runs, hidden.shape[-1])).index_copy(0, run[0], hidden)
+        outputs, _ = self.memory(beside.view(steps, runs, -1), first[None])
+        remembered = outputs.flatten(0, 1).index_select(0, place).view(steps, worlds, -1)
+        return remembered, remembered[-1].masked_fill(ended[-1, :, None], 0.0)
