@@ -64,9 +64,8 @@ class RunCfg(HandOptions):
     """Time for each goal [s]; then the next one is pursued."""
     hold_s: float = 1.0
     """How long the hand holds still between goals [s]."""
-    retry: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Open the hand where it brings its object no nearer to the goal, and let the policy try again; needs a
-    table under it."""
+    nudge: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
     air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Take the twin's table away after 2 s, as the paper's test in the air does."""
     realistic: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -101,8 +100,6 @@ class RunCfg(HandOptions):
             raise ValueError("--goal-s has to be positive, and --hold-s must not be negative")
         if (self.air or self.realistic or self.sdk) and not self.twin:
             raise ValueError("--air, --realistic and --sdk are for --twin")
-        if self.air and self.retry:
-            raise ValueError("--retry opens the hand, which drops the object with --air; give one of them")
         if self.twin and Path(self.object).suffix.lower() in SCAN_SUFFIXES:
             raise ValueError(f"--object {self.object}: a twin cannot hold a scan; vd-assets import it first")
         if self.policy is None and not self.twin:
@@ -155,7 +152,7 @@ def _fly(
     from vd.deploy.flight import look, make_goals, warm_up
     from vd.deploy.log import LogWriter
     from vd.deploy.loop import ControlLoop, LoopCfg, summary
-    from vd.deploy.retrying import RetryingPilot
+    from vd.deploy.nudging import NudgedPilot
 
     hand = connection.hand
     goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
@@ -169,7 +166,7 @@ def _fly(
             view = look(flight, camera, hand, cfg.camera_layer)
             fps = flight.task.sim.control_hz if cfg.twin else cfg.camera.fps
             seen = camera_findings(camera, view, fps=fps)
-        pilot = RetryingPilot(flight.pilot, hand, flight.task) if cfg.retry else flight.pilot
+        pilot = NudgedPilot(flight.pilot, hand, flight.task) if cfg.nudge else flight.pilot
         warm_up(pilot, hand, goals[0], camera, link)
         stack.enter_context(undisturbed())
         stack.enter_context(real_time(cfg.realtime))
@@ -187,7 +184,7 @@ def _fly(
                 "goals": [[float(value) for value in goal] for goal in goals],
                 "control_hz": flight.task.sim.control_hz,
                 "stopping": vars(pilot.rule),
-                "retry": vars(flight.task.retry) if cfg.retry else None,
+                "nudge": vars(flight.task.nudge) if cfg.nudge else None,
                 "action": vars(flight.task.action),
             },
             servo={"model": cfg.motor, "p_gain": P_GAIN, "d_gain": D_GAIN},

@@ -125,29 +125,30 @@ class TableCfg:
 
 
 @dataclass(frozen=True)
-class RetryCfg:
-    """Ours: a hand that brings its object no nearer to the goal opens and tries again. Off by default.
+class NudgeCfg:
+    """Ours: hands whose object stands still far from its goal are moved at random. Off by default.
 
-    A policy without memory that has come to rest, or goes round in circles, has nothing that would end it.
-    Needs a table: in the air an open hand drops its object.
+    A policy without memory that has come to rest has nothing that would move it again.
     """
 
     enabled: bool = False
-    """Whether hands try again."""
+    """Whether hands are nudged."""
     beyond_rad: float = PAPER.success.rotation_rad
-    """Distance from the goal above which a hand can be stuck [rad]."""
-    progress_rad: float = 0.1
-    """By how much the least distance since the hand began has to fall to count as progress [rad]."""
-    patience_s: float = 1.0
-    """Time without progress after which the hand opens [s]."""
-    open_s: float = 0.67
-    """Time for which it opens [s]."""
+    """Distance from the goal above which an object that stands still is stuck [rad]."""
+    still_rad_s: float = 0.3
+    """Rate of the distance up to which it stands still [rad/s]."""
+    still_s: float = 0.5
+    """How long it has to [s]."""
+    nudge_s: float = 0.25
+    """How long the hand is then moved [s]."""
+    action_std: float = 0.5
+    """Standard deviation of the action that moves it, one draw for each nudge and joint."""
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        for name in ("beyond_rad", "progress_rad", "patience_s", "open_s"):
+        for name in ("beyond_rad", "still_rad_s", "still_s", "nudge_s", "action_std"):
             if not getattr(self, name) > 0.0:
-                raise ValueError(f"retry.{name} is {getattr(self, name):g}; it has to be positive")
+                raise ValueError(f"nudge.{name} is {getattr(self, name):g}; it has to be positive")
 
 
 @dataclass(frozen=True)
@@ -319,7 +320,7 @@ class ReorientCfg:
     start: StartCfg = field(default_factory=StartCfg)
     goal: GoalCfg = field(default_factory=GoalCfg)
     table: TableCfg = field(default_factory=TableCfg)
-    retry: RetryCfg = field(default_factory=RetryCfg)
+    nudge: NudgeCfg = field(default_factory=NudgeCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
 
@@ -334,7 +335,7 @@ class ReorientCfg:
         self.randomisation.validate()
         self.curriculum.validate()
         self.table.validate()
-        self.retry.validate()
+        self.nudge.validate()
         if self.start.at_rest and (self.start.poses < 1 or self.start.settle_s <= 0.0):
             raise ValueError(
                 f"start.at_rest needs start.poses >= 1 (now {self.start.poses}) and start.settle_s > 0 "

@@ -16,9 +16,9 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
+from vd.envs.nudges import Nudges
 from vd.envs.parameters import TaskParameters
 from vd.envs.randomise import Randomiser
-from vd.envs.retries import Retries
 from vd.envs.servo import needs_servo, servo_ranges
 from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
@@ -157,8 +157,8 @@ class ReorientEnv:
         self.acts_in_view = True
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
         self._table_steps = table_array(cfg, self.device)
-        self.retries = Retries(cfg, f, n, self.device) if cfg.retry.enabled else None
-        """What opens hands that are stuck, or None: they stay as they are."""
+        self.nudges = Nudges(cfg, d, n, self.device) if cfg.nudge.enabled else None
+        """What moves hands that are stuck, or None: they stay as they are."""
         self._shapes = ShapeObserver(self) if self.sees_shape else None
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
         self.randomiser = Randomiser(self)
@@ -233,10 +233,8 @@ class ReorientEnv:
         action = self.action
         if self.views is not None and self.acts_in_view:
             action = self.views.world_action(action)
-        if self.retries is not None:
-            action = self.retries.world_action(
-                action, self.measured_q, self.previous_error, self.step_count, self._new_goal
-            )
+        if self.nudges is not None:
+            action = self.nudges.action(action, self.previous_error, self.step_count, self._new_goal)
         wp.launch(
             apply_action_kernel,
             dim=self.num_worlds,

@@ -45,8 +45,8 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
     here = _arrays(env)
     if state["arrays"].keys() != here.keys():
         raise ValueError(
-            "the saved environment has other servos, views, contacts or retries; resume with hand_layer, "
-            "observation.view, retry, randomisation.effects and randomisation.restitution of the checkpoint, "
+            "the saved environment has other servos, views, contacts or nudges; resume with hand_layer, "
+            "observation.view, nudge, randomisation.effects and randomisation.restitution of the checkpoint, "
             "or from one without worlds (vd-train export --resumable)"
         )
     for name, array in here.items():
@@ -59,8 +59,8 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
             )
         array.assign(saved)
     env.steps = int(state["steps"])
-    if env.retries is not None:
-        env.retries.forget()
+    if env.nudges is not None:
+        env.nudges.forget()
     env.set_stage(saved_stage(state, env.cfg.curriculum))
     env.randomiser.push()
     env.sim.forward_kinematics()
@@ -99,7 +99,7 @@ def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
         "observation": env.observation,
         "rng": env.rng,
         **({} if env.views is None else {"view": env.views.view}),
-        **({} if env.retries is None else env.retries.stateful()),
+        **({} if env.nudges is None else env.nudges.stateful()),
         **env.randomiser.stateful(),
         **({} if sim.servo is None else sim.servo.stateful()),
         **({} if sim.restitution is None else sim.restitution.stateful()),

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 from vd.bundle import is_bundle
 from vd.config import from_dict
-from vd.envs.cfg import CurriculumCfg, ObservationCfg, ReorientCfg, RetryCfg, SuccessCfg, TableCfg
+from vd.envs.cfg import CurriculumCfg, NudgeCfg, ObservationCfg, ReorientCfg, SuccessCfg, TableCfg
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -177,7 +177,7 @@ def task_for(
     success_ends_episode: bool,
     at_rest: bool | None = None,
     hand_layer: str | None = None,
-    retry: bool = False,
+    nudge: bool = False,
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
 
@@ -199,7 +199,7 @@ def task_for(
         at_rest: Start at rest on the table rather than from a drop; None: as trained.
         hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is, None: as
             trained.
-        retry: Whether hands that are stuck open and try again.
+        nudge: Whether hands that are stuck are nudged.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     if is_saved_student(policy):
@@ -221,6 +221,6 @@ def task_for(
         else replace(base.goal, max_angle_rad=max_goal_angle_rad),
         curriculum=CurriculumCfg(),
         table=TableCfg(),
-        retry=RetryCfg(enabled=retry),
+        nudge=NudgeCfg(enabled=nudge),
         randomisation=replace(base.randomisation, enabled=randomised),
     )

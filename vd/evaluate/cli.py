@@ -29,7 +29,7 @@ OF_THE_SUITE = (
     "stop_tolerance",
     "episode_s",
     "in_air",
-    "retry",
+    "nudge",
     "table_friction",
     "scanned_goals",
     "sees",
@@ -92,8 +92,8 @@ class EvalCfg:
     """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
     table_friction: float | None = None
     """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
-    retry: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Open a hand that brings its object no nearer to the goal, and try again; not for --in-air."""
+    nudge: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
     scanned_goals: tyro.conf.FlagCreatePairsOff[bool] = False
     """Students get goals with the errors of a scan: 4 mm of noise, a fifth of the points missing."""
     sees: Literal["auto", "complete", "rendered"] = "auto"
@@ -159,8 +159,6 @@ class EvalCfg:
             raise ValueError("--table-friction and --randomise exclude each other; give one of them")
         if self.table_friction is not None and self.table_friction < 0.0:
             raise ValueError(f"--table-friction is {self.table_friction}; it must not be negative")
-        if self.in_air and self.retry:
-            raise ValueError("--retry opens the hand, which drops the object --in-air; give one of them")
         self._validate_suite()
         start_at_rest(self.at_rest, self.no_at_rest)
         if self.num_worlds is not None and self.num_worlds < 1:
@@ -289,7 +287,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        retry=cfg.retry,
+        nudge=cfg.nudge,
     )
     check_bundle(name, task)
     print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
@@ -330,7 +328,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         randomised=cfg.randomise,
         at_rest=task.start.at_rest,
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
-        retry=cfg.retry,
+        nudge=cfg.nudge,
     )
     result = summarise(
         protocol,

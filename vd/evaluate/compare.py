@@ -104,7 +104,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             in_air=cfg.in_air,
             table_friction=cfg.table_friction,
             scanned_goals=cfg.scanned_goals,
-            retry=cfg.retry,
+            nudge=cfg.nudge,
         )
         index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
@@ -145,7 +145,7 @@ def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        retry=cfg.retry,
+        nudge=cfg.nudge,
     )
     if cfg.table_friction is not None:
         task = replace(task, table_friction=cfg.table_friction)

@@ -289,8 +289,8 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
     ]
     if protocol.table_friction is not None:
         rows.append(("friction of the table", f"{protocol.table_friction:g}"))
-    if protocol.retry:
-        rows.append(("hands that come no nearer to the goal", "open and try again"))
+    if protocol.nudge:
+        rows.append(("hands whose object stands still far from the goal", "are nudged"))
     if protocol.scanned_goals:
         rows.append(("goals of students", "from scans"))
     by_group = {row.group: row.result.protocol.objects for row in comparison.rows}

@@ -118,7 +118,7 @@ def task_line(result: EvalResult) -> str:
     return (
         f"starts {starts_text(protocol)}; goals {goals_text(protocol)}; stop within "
         f"{protocol.stop_tolerance_rad:g} rad and still; randomisation {randomisation}"
-        + ("; stuck hands open and try again" if protocol.retry else "")
+        + ("; stuck hands are nudged" if protocol.nudge else "")
     )
 
 

@@ -93,8 +93,8 @@ class Protocol:
     """Coefficient of the table if it is not the nominal one."""
     scanned_goals: bool = False
     """Students get their goals from scans, with the errors of these."""
-    retry: bool = False
-    """Hands that bring their object no nearer to the goal open and try again."""
+    nudge: bool = False
+    """Hands whose object stands still far from the goal are nudged."""
 
     @property
     def hand_name(self) -> str:

@@ -68,8 +68,8 @@ class PlayCfg:
     """Start at rest on the table; the default is as trained, and a drop for --agent zero and random."""
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
-    retry: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Open a hand that brings its object no nearer to the goal, and let the policy try again."""
+    nudge: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float = PAPER.scene.episode_s
@@ -261,7 +261,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         success_ends_episode=False,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        retry=cfg.retry,
+        nudge=cfg.nudge,
     )
     check_bundle(cfg.agent_name, task)
     env = ReorientEnv(task, device)

@@ -1,4 +1,4 @@
-"""A pilot that opens the hand where it brings its object no nearer to the goal, and tries again."""
+"""A pilot that is moved at random for a moment where its object stands still far from the goal."""
 
 import numpy as np
 import warp as wp
@@ -7,23 +7,22 @@ from vd.assets_usd.hand_data import HandModel
 from vd.deploy.observation import Sensed
 from vd.deploy.pilot import Decision, Pilot
 from vd.envs.cfg import ReorientCfg
-from vd.envs.retries import Retries
+from vd.envs.nudges import Nudges
 
 
-class RetryingPilot:
-    """A policy, and the kernel that acts in its place where it is stuck (``kernels/retries.py``).
+class NudgedPilot:
+    """A policy, and the kernel that acts in its place where it is stuck (``kernels/nudges.py``).
 
     Args:
         pilot: The policy.
         hand: The hand.
-        task: The task it was trained in; its settings of retries count.
+        task: The task it was trained in; its settings of nudges count.
     """
 
     def __init__(self, pilot: Pilot, hand: HandModel, task: ReorientCfg):
         self.rule, self.pilot = pilot.rule, pilot
-        self._retries = Retries(task, hand.num_fingers, 1, "cpu")
-        shape = (1, hand.num_joints)
-        self._action, self._q = (wp.zeros(shape, dtype=float, device="cpu") for _ in range(2))
+        self._nudges = Nudges(task, hand.num_joints, 1, "cpu")
+        self._action = wp.zeros((1, hand.num_joints), dtype=float, device="cpu")
         self._distance = wp.zeros(1, dtype=float, device="cpu")
         self._steps, self._new_goal = (wp.zeros(1, dtype=wp.int32, device="cpu") for _ in range(2))
 
@@ -33,20 +32,17 @@ class RetryingPilot:
         self._steps.zero_()
 
     def new_goal(self) -> None:
-        """A new goal: what was tried for the last one says nothing of it."""
+        """A new goal: how long the last one was missed says nothing of it."""
         self.pilot.new_goal()
         self._new_goal.fill_(1)
 
     def decide(self, sensed: Sensed) -> Decision:
-        """The policy's action, or one towards the open hand; the policy's distance."""
+        """The policy's action, or a random one where it is stuck; the policy's distance."""
         decision = self.pilot.decide(sensed)
         self._action.assign(decision.action.astype(np.float32)[None])
-        self._q.assign(sensed.joint_q.astype(np.float32)[None])
         known = not np.isnan(decision.distance)  # who knows no distance is never stuck
         self._distance.fill_(decision.distance if known else 0.0)
-        action = self._retries.world_action(
-            self._action, self._q, self._distance, self._steps, self._new_goal
-        )
+        action = self._nudges.action(self._action, self._distance, self._steps, self._new_goal)
         self._steps.fill_(1)
         self._new_goal.zero_()
         return Decision(action.numpy()[0].copy(), decision.distance)
