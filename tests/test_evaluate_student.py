@@ -132,6 +132,7 @@ def test_a_scan_is_noisy_and_misses_one_side():
     ball *= 0.05 / np.linalg.norm(ball, axis=1, keepdims=True)
     scanned = scan(ball, rng)
     assert scanned.shape == ball.shape
+    assert scan(ball.astype(np.float32), rng).dtype == np.float32, "of the kind that the search for it takes"
     off = np.linalg.norm(scanned, axis=1) - 0.05  # across the surface only one axis of the noise shows
     assert off.std() == pytest.approx(NOISE_M, rel=0.1)
     side = -scanned.mean(axis=0) / np.linalg.norm(scanned.mean(axis=0))

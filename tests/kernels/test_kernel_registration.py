@@ -1,4 +1,5 @@
 import numpy as np
+import trimesh
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,9 +13,10 @@ from vd.kernels.registration import (
     NEVER,
     Eye,
     Shapes,
-    background_kernel,
     fit_poses_kernel,
     keep_poses_kernel,
+    nearness_kernel,
+    off_mesh_kernel,
     shape_distance_kernel,
     start_poses_kernel,
 )
@@ -40,7 +42,8 @@ class Scene:
         grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
         places = self.half[:, None, None, None, None] * grid
         apart = places[..., None, :] - self.samples[:, None, None, None]
-        self.distance = np.linalg.norm(apart, axis=-1).min(axis=-1)
+        self.from_samples = np.linalg.norm(apart, axis=-1).min(axis=-1)
+        self.places, self.distance = places, self.from_samples - 0.02  # negative inside, as of a mesh
         self.seen = rng.uniform(-0.1, 0.1, (self.worlds, SEEN, 3))
         self.count = rng.integers(0, SEEN + 1, self.worlds)
         self.row_world = rng.permutation(self.worlds)[: rng.integers(1, self.worlds + 1)]
@@ -48,9 +51,8 @@ class Scene:
         self.eye = np.concatenate([[0.0, 0.0, -0.6], Rotation.random(rng=rng).as_quat() * 0.02])
         self.eye[6] += 1.0
         self.eye[3:] /= np.linalg.norm(self.eye[3:])
-        self.background = rng.uniform(0.55, 0.65, (self.worlds, *CELLS)) * (
-            rng.random((self.worlds, *CELLS)) < 0.7
-        )
+        depth, shown = rng.uniform(0.55, 0.65, (self.worlds, *CELLS)), rng.random((self.worlds, *CELLS)) < 0.7
+        self.nearness = shown / depth
 
     def random_poses(self, *shape: int) -> np.ndarray:
         """Poses of that shape."""
@@ -136,36 +138,59 @@ class Scene:
         turn = Rotation.from_quat(pose[3:])
         points = self.seen[world, : self.count[world] : every]
         places = [turn.inv().apply(point - pose[:3]) / scale for point in points]
-        off = [min(scale * self.surface_distance(shape, place)[0], FAR) ** 2 for place in places]
+        off = [min(abs(scale * self.surface_distance(shape, place)[0]), FAR) ** 2 for place in places]
         total = float(np.mean(off)) if off else 0.0
         if rendered:
             out = []
             for sample in self.samples[shape, ::every_sample]:
                 row, column, depth = self.pixel(turn.apply(scale * sample) + pose[:3])
-                behind = None
+                length = 0.0
                 if 0 <= row < CELLS[0] and 0 <= column < CELLS[1]:
-                    behind = self.background[world, row, column]
-                length = 0.0 if behind is None else FAR
-                if behind:
-                    length = np.clip(behind - MARGIN - depth, 0.0, FAR)
+                    near = self.nearness[world, row, column]
+                    length = np.clip(1.0 / near - MARGIN - depth, 0.0, FAR) if near else FAR
                 out.append(length**2)
             total += float(np.mean(out))
         return total
 
 
+def box_distance(extent: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Signed distance from the surface of a box about the origin, of half these sides."""
+    beyond = np.abs(place) - extent
+    return np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(axis=-1), 0.0)
+
+
 @given(seed=seeds)
 @EXAMPLES
-def test_distances_are_those_to_the_nearest_sample(device, seed):
+def test_distances_are_those_to_the_mesh_or_to_the_nearest_sample(device, seed):
     scene = Scene(seed)
+    extents, meshed = scene.rng.uniform(0.01, 0.06, (scene.shapes, 3)), scene.rng.integers(0, 2, scene.shapes)
+    boxes = [trimesh.creation.box(2.0 * extent) for extent in extents]
+    meshes = [
+        wp.Mesh(
+            device_array(box.vertices, wp.vec3, device),
+            device_array(box.faces.ravel(), wp.int32, device),
+            support_winding_number=True,
+        )
+        for box in boxes
+    ]
+    samples = device_array(scene.samples, wp.vec3, device)
+    mesh = device_array([each.id for each in meshes], wp.uint64, device)
+    off = unwritten(samples.shape, float, device)
+    wp.launch(off_mesh_kernel, dim=off.shape, inputs=[samples, mesh], outputs=[off], device=device)
     out = unwritten(scene.distance.shape, float, device)
-    inputs = [device_array(scene.samples, wp.vec3, device), device_array(scene.half, float, device)]
+    inputs = [samples, mesh, device_array(scene.half, float, device), device_array(meshed, int, device)]
     wp.launch(shape_distance_kernel, dim=out.shape, inputs=inputs, outputs=[out], device=device)
-    np.testing.assert_allclose(out.numpy(), scene.distance, atol=1e-6)
+    for shape, extent in enumerate(extents):
+        wanted = np.abs(box_distance(extent, scene.samples[shape]))
+        np.testing.assert_allclose(off.numpy()[shape], wanted, atol=1e-6)
+        signed = box_distance(extent, scene.places[shape])
+        expected = signed if meshed[shape] else scene.from_samples[shape]
+        np.testing.assert_allclose(out.numpy()[shape], expected, atol=1e-6)
 
 
 @given(seed=seeds)
 @EXAMPLES
-def test_the_background_is_the_farthest_of_each_cell(device, seed):
+def test_the_nearest_of_each_cell_is_kept(device, seed):
     scene = Scene(seed)
     points = scene.rng.uniform(-0.15, 0.15, (scene.worlds, 40, 3))
     points[:, ::5] = np.nan
@@ -175,12 +200,12 @@ def test_the_background_is_the_farthest_of_each_cell(device, seed):
         for point in cloud[np.isfinite(cloud[:, 0])]:
             row, column, depth = scene.pixel(point)
             if depth > 0.0 and 0 <= row < CELLS[0] and 0 <= column < CELLS[1]:
-                expected[world, row, column] = max(expected[world, row, column], depth)
-    background = wp.zeros((scene.worlds, *CELLS), dtype=float, device=device)
+                expected[world, row, column] = max(expected[world, row, column], 1.0 / depth)
+    nearness = wp.zeros((scene.worlds, *CELLS), dtype=float, device=device)
     cloud = device_array(points, wp.vec3, device)
     inputs = [scene.camera(), cloud]
-    wp.launch(background_kernel, dim=cloud.shape, inputs=inputs, outputs=[background], device=device)
-    np.testing.assert_allclose(background.numpy(), expected, atol=1e-6)
+    wp.launch(nearness_kernel, dim=cloud.shape, inputs=inputs, outputs=[nearness], device=device)
+    np.testing.assert_allclose(nearness.numpy(), expected, rtol=1e-5)
 
 
 @given(seed=seeds, rendered=st.booleans(), every=st.integers(1, 3))
@@ -220,7 +245,7 @@ def test_a_start_puts_the_near_side_where_the_points_are(device, seed, rendered,
 def test_a_step_solves_the_normal_equations(device, seed, rendered, steps, every, every_sample):
     scene = Scene(seed)
     row_world, seen, count = scene.inputs(device)
-    background = scene.background if rendered else np.zeros((scene.worlds, 0, 0))
+    nearness = scene.nearness if rendered else np.zeros((scene.worlds, 0, 0))
     pose = device_array(scene.pose, wp.transform, device)
     misfit = unwritten(pose.shape, float, device)
     wp.launch(
@@ -236,7 +261,7 @@ def test_a_step_solves_the_normal_equations(device, seed, rendered, steps, every
             row_world,
             seen,
             count,
-            device_array(background, float, device),
+            device_array(nearness, float, device),
         ],
         outputs=[pose, misfit],
         device=device,
@@ -309,15 +334,15 @@ def test_rows_of_no_world_are_left_out(device):
     scene.row_world = np.full(len(scene.row_world), -1)
     row_world, seen, count = scene.inputs(device)
     started, misfit = unwritten(rows, wp.transform, device), unwritten(rows, float, device)
-    pose, background = (
+    pose, nearness = (
         device_array(before, wp.transform, device),
-        device_array(scene.background, float, device),
+        device_array(scene.nearness, float, device),
     )
     shapes, eye, first = scene.model(device), scene.camera(), wp.zeros(rows[0], dtype=int, device=device)
     rotation = device_array(np.eye(4)[3:], wp.quat, device)
     starting = [shapes, eye, 1, 1, row_world, first, rotation, seen, count]
     wp.launch(start_poses_kernel, dim=rows, inputs=starting, outputs=[started], device=device)
-    fitting = [shapes, eye, FAR, 1, 1, 1, row_world, seen, count, background]
+    fitting = [shapes, eye, FAR, 1, 1, 1, row_world, seen, count, nearness]
     wp.launch(fit_poses_kernel, dim=rows, inputs=fitting, outputs=[pose, misfit], device=device)
     kept, average = (
         unwritten((scene.worlds, 2), wp.transform, device),

@@ -37,7 +37,8 @@ def scan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     side = rng.normal(size=3)
     seen = np.argsort(points @ side)[: round(len(points) * (1.0 - MISSING))]
     again = rng.choice(seen, len(points) - len(seen))
-    return points[np.concatenate([seen, again])] + rng.normal(scale=NOISE_M, size=points.shape)
+    noise = rng.normal(scale=NOISE_M, size=points.shape).astype(points.dtype)
+    return points[np.concatenate([seen, again])] + noise
 
 
 class ScannedGoalView(StudentView):
