@@ -8,7 +8,7 @@ from test_gap_fit import TRUE, problem_of, recorded
 from test_gap_judge import FLOOR, made_up
 
 import vd.kernels.actuators as servo
-from vd.gap.coordinates import Coordinate, Scales
+from vd.gap.coordinates import Coordinate, Scales, beside
 from vd.gap.joint_fit import JointFit
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
@@ -76,6 +76,18 @@ def test_a_limit_is_found_beside_the_line_that_stood_for_both() -> None:
     assert fit.values["torque_speed_limit.omega_0_rad_s"] == pytest.approx(5.0, rel=0.05)
 
 
+@pytest.mark.parametrize("level", ["torque_limit.tau_max_nm", "torque_saturation.tau_s_nm"])
+def test_a_line_beside_another_loss_begins_steeper_and_ends_at_the_largest_speed(level: str) -> None:
+    name = level.partition(".")[0]
+    (start,) = beside("torque_speed_limit", {"kp": 3.0, level: 0.5}, SCALES)
+    line = {"torque_speed_limit.tau_stall_nm": 1.0, "torque_speed_limit.omega_0_rad_s": SCALES.speed}
+    assert {key: start[key] for key in line} == line
+    assert start["velocity_limit"] > SCALES.speed, "that stood for the end of the line"
+    (other,) = beside(name, {"torque_speed_limit.tau_stall_nm": 0.5}, SCALES)
+    assert other == {**start, level: 0.5}
+    assert not beside("supply_sag", {level: 0.5}, SCALES) and not beside(name, {level: 0.5}, SCALES)
+
+
 def test_in_a_sharp_valley_others_begin_where_the_model_is() -> None:
     keys = ("kp", "acceleration_limit.a_max_rad_s2", "dead_zone.width_rad")
 
@@ -116,3 +128,26 @@ def test_in_a_sharp_valley_others_begin_where_the_model_is() -> None:
         assert [f.rmse / FLOOR for f in found.values()] == ([pytest.approx(1.01)] if left < 2.5 else [])
     start = {"kp": 3.0, "acceleration_limit.a_max_rad_s2": 66.0, "coulomb_friction.tau_c_nm": 0.03}
     assert asked == [start, start], "only what is near begins anew, at the model's place and its own size"
+
+
+def test_a_narrow_valley_is_followed_while_it_leads_down() -> None:
+    down = [0.9, 1.0, 1.0, 0.8, 0.8, 1.0, 0.9, 1.0, 1.0, 1.0, 0.5]
+    asked: list[str] = []
+
+    def run(calls: list) -> list[JointFit]:
+        ((name, call),) = calls
+        asked.append(name)
+        return [made_up(("torque_limit",), call["fit"].rmse * down[len(asked) - 1])]
+
+    selection, _ = search({}, "torque_limit")
+    selection.run, floor = run, selection.floor
+    begun = made_up(("torque_limit",), 5.0 * floor)
+
+    def refit(found: JointFit, _: tuple[str, ...]) -> JointFit:
+        return found
+
+    selection.refit = refit  # type: ignore[method-assign, assignment]
+    found = selection.look_beside(begun, 100.0 * floor)
+    assert found.rmse / floor == pytest.approx(5.0 * 0.9 * 0.8 * 0.8 * 0.9)
+    assert len(asked) == 10, "three in a row that lead nowhere are the end"
+    assert selection.look_beside(begun, 40.0 * floor) is begun, "a valley that is not narrow"

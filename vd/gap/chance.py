@@ -45,6 +45,7 @@ def try_random(
         return present, (), []
     random, beside, rows, left = with_random(search, baseline, present)
     rest = search.refit(random, [name for name in random.effects if name != RANDOM])
+    rest = search.look_beside(rest, search.whole)
     if rest.effects and search.white(rest) and not search.better(rest, random)[0]:
         # No chance is needed: it has only smoothed the way to where the search before did not come.
         search.report(f"+ {' and '.join(rest.effects)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")

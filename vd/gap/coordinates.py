@@ -34,8 +34,10 @@ SLOW_RESONANCES = tuple(0.2 * 1.2**i for i in range(10))
 hardly damped is some 15 % wide to either side, and from farther off a descent damps it until it is gone."""
 RINGING_MASS, RINGING_DAMPING = 0.5, 0.04
 """Its inertia, in the joint's, and its damping ratio at these starts; from 0.1 a descent can end at more."""
+LEVELS = {"torque_limit": "torque_limit.tau_max_nm", "torque_saturation": "torque_saturation.tau_s_nm"}
+"""Losses of torque beside which a line that falls with the speed can act, and the torque of each."""
 STEEPER = 2.0
-"""Torque at rest of a line beside a limit, in that of one which stands for both."""
+"""Torque at rest of the line beside one of them, in that of what stands for both."""
 FLATTEST = 1e-3
 """Scale of angles at least [rad], if the residual is smaller."""
 
@@ -255,12 +257,17 @@ def beside(effect: str, present: Mapping[str, float], scales: Scales) -> list[di
         scales: Sizes of the joint's motion.
     """
     line = "torque_speed_limit.tau_stall_nm"
-    if effect != "torque_limit" or line not in present:
-        return []
-    # The line has bent to where both are; with the limit there, it rises to what the speeds ask of it.
-    room = {line: STEEPER * present[line], "torque_speed_limit.omega_0_rad_s": scales.speed}
-    limit = {"torque_limit.tau_max_nm": present[line]}
-    return [{**limit, **room, "velocity_limit": FREE_SPEED * scales.speed}]
+
+    def room(torque: float) -> dict[str, float]:
+        # One that stands for both has bent to where they are; the line of two rises to what the speeds ask.
+        end = {"torque_speed_limit.omega_0_rad_s": scales.speed, "velocity_limit": FREE_SPEED * scales.speed}
+        return {line: STEEPER * torque, **end}
+
+    if effect in LEVELS and line in present:
+        return [{LEVELS[effect]: present[line], **room(present[line])}]
+    if effect == "torque_speed_limit":
+        return [room(present[level]) for level in LEVELS.values() if level in present]
+    return []
 
 
 def smaller(start: Mapping[str, float]) -> dict[str, float] | None:
