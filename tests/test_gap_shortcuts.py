@@ -1,8 +1,10 @@
 """What a search need not try: it knows the answer, or that there is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from test_gap_judge import FLOOR, load_and_offset, made_up
+from test_gap_judge import COUNT, FLOOR, load_and_offset, made_up
 from test_gap_select import searching
 
 from vd.gap.candidates import FULL_ITERATIONS
@@ -61,6 +63,34 @@ def test_what_was_tried_in_the_place_of_the_last_effect_is_not_tried_again() -> 
     selection.refit = lambda fit, effects: made_up(tuple(effects), 0.008)  # type: ignore[method-assign]
     selection.rivals(present, "coulomb_friction")
     assert asked == ["backlash"], "and all are tried beside a better fit than the round began with"
+
+
+@pytest.mark.parametrize(("structure", "searches"), [(0.0, 1), (0.5, 3)])
+def test_a_model_that_leaves_structure_is_not_the_end(structure: float, searches: int) -> None:
+    """It is within the noise floor, but one effect can stand for two there: another beginning is tried."""
+    baseline, beginnings = made_up((), 10.0 * FLOOR), []
+    found = replace(
+        made_up(("elastic_transmission",), 1.05 * FLOOR),
+        structure=np.stack([structure * FLOOR**2 * COUNT, COUNT]),
+    )
+
+    def search(_: JointFit, start: JointFit) -> tuple:
+        beginnings.append(start.effects)
+        first = made_up(("command_filter",), 6.0 * FLOOR)
+        return found, {}, [Trial(1, "command_filter", first, 0.2, (0.1, 0.3), "rejected")]
+
+    class EndedError(Exception):
+        pass
+
+    def better(*_: JointFit) -> tuple[bool, str]:
+        raise EndedError
+
+    selection, _ = searching([])
+    selection.run = lambda calls: [found for _ in calls]
+    selection.search, selection.better = search, better  # type: ignore[method-assign, assignment]
+    with pytest.raises(EndedError):
+        selection.explain(baseline)
+    assert len(beginnings) == searches
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ class Selection(Frictions):
         first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
         tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
         for name in sorted(first, key=lambda n: first[n].rmse):
-            if present.effects and (self.no_gap(present) or self.ended(present)):
+            if present.effects and (self.finished(present) or self.ended(present)):
                 break
             # Far from the floor another path would change little, unless its beginning was as good.
             far = present.effects and present.held_out_rmse >= NEAR * self.floor
