@@ -64,10 +64,12 @@ class Pacer:
     Args:
         hz: Steps a second.
         clock: Time.
+        latest: Share of a period by which a step may begin late; one that would begin later is left out, or
+            it would be late too, and the next.
     """
 
-    def __init__(self, hz: float, clock: Clock = MONOTONIC):
-        self.period_s, self.clock = 1.0 / hz, clock
+    def __init__(self, hz: float, clock: Clock = MONOTONIC, *, latest: float = 1.0):
+        self.period_s, self.clock, self._latest = 1.0 / hz, clock, latest
         self.due_s = -math.inf
         """When the present step was due [s]; before the first one long ago."""
         self.missed = 0
@@ -83,6 +85,8 @@ class Pacer:
         behind = int((now - self.due_s) // self.period_s)
         if behind > 0:
             self.due_s += behind * self.period_s
+        if now - self.due_s > self._latest * self.period_s:
+            self.due_s += self.period_s
         while (left := self.due_s - self.clock.now()) > 0.0:
             self.clock.sleep(left)
         return self.clock.now() - self.due_s

@@ -40,6 +40,8 @@ HOME_RAD_S = 0.5
 """Speed of the way to the start [rad/s]."""
 SETTLE_S = 1.5
 """Time that an object of a twin has to come to rest between the fingers [s]."""
+LATEST = 0.25
+"""Share of a control period by which a step may begin late: a student takes more than half of one."""
 STATUS_S = 5.0
 """Seconds between status lines where there is no terminal to rewrite one on."""
 
@@ -190,7 +192,7 @@ def _fly(
             servo={"model": cfg.motor, "p_gain": P_GAIN, "d_gain": D_GAIN},
             truth=link is not None,
         )
-        pacer = Pacer(flight.task.sim.control_hz)
+        pacer = Pacer(flight.task.sim.control_hz, latest=LATEST)
         reason, outcomes = "aborted", list[str]()
         status = StatusLine()
         loop: ControlLoop | None = None

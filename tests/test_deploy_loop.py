@@ -159,6 +159,19 @@ def test_a_goal_that_is_not_reached_ends_by_its_time_and_a_lost_object_the_run(p
     assert lost.run([GOAL, GOAL]) == ["lost"]
 
 
+def test_one_long_step_makes_no_other_late():
+    """Of steps that take two thirds of a period, one of 130 ms would make the two after it late."""
+    for latest, missed in ((1.0, [False, True, True, False]), (0.25, [False, True, False, False])):
+        clock = SimulatedClock()
+        pacer = Pacer(HZ, clock, latest=latest)
+        found = []
+        for work_s in (0.055, 0.13, 0.055, 0.055):
+            pacer.wait()
+            clock.sleep(work_s)
+            found.append(pacer.end())
+        assert found == missed
+
+
 def test_missed_deadlines_are_counted_and_told(parts):
     hand, pilot, actions, pacer, log = parts
     hand.work = [0.01, 0.01, 0.1, 0.01]
