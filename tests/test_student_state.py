@@ -92,6 +92,16 @@ def test_the_first_estimate_is_the_best_linear_one():
     assert abs(float(error[:, 0].mean())) < 1e-3 and error[:, 0].std() * policy.scale[0, 0] < 1.05
 
 
+def test_of_few_states_the_first_estimate_learns_no_chance_by_heart():
+    """Features that say nothing, hardly more states than features: other states are to be near the mean."""
+    made = head()
+    made.fit(torch.randn(2 * WIDTH, WIDTH), torch.randn(2 * WIDTH, SPEC.num_observations))
+    features, observation = torch.randn(2000, WIDTH), torch.randn(2000, SPEC.num_observations)
+    target = made.target(observation)
+    error = (made(features)[0] - target).detach().square().mean()
+    assert error < 1.25 * target.var(dim=0).mean()
+
+
 def test_a_student_with_the_head_is_saved_whole_and_leaves_the_teachers_layers_alone():
     cfg = from_dict(StudentCfg, to_dict(StudentCfg(memory=8, head_hidden=8, state=state_cfg(SPEC))))
     student = Student(cfg, ACTIONS)

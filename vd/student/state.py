@@ -20,8 +20,10 @@ from vd.student.views import ViewMaps
 UNSEEN = ("object_orientation", "goal_orientation")
 """Orientations in the axes of the object's file, which no cloud shows; the teacher hardly uses them."""
 
-RIDGE = 1e-4
-"""Variance of noise that the first estimate is made to bear, in features of about one."""
+RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
+"""What may be added to the variance of each input in the first least squares; few states ask for much."""
+LEFT_OUT = 4
+"""One in so many of the states, the last ones, decides which."""
 
 
 def state_cfg(teacher: PolicySpec, *, views: int = 0) -> StateCfg:
@@ -151,20 +153,21 @@ class StateHead(nn.Module):
     def fit(self, features: torch.Tensor, observation: torch.Tensor) -> None:
         """Begin with the estimate that is best in least squares: gradients would take long to what is exact.
 
+        How much it is held back (ridge) is decided by the last states, which are to be of other worlds.
+
         Args:
             features: Features of some states [R, width].
             observation: The teacher's observation of them [R, O].
         """
         with torch.no_grad():
             inputs = torch.cat([features, self.inside(features)], dim=-1).double()
-            middle = inputs.mean(dim=0)
             target = self.target(observation).double()
-            mean, spread = target.mean(dim=0), inputs - middle
-            products = spread.T @ spread
-            products.diagonal().add_(RIDGE * len(inputs))
-            slope = torch.linalg.solve(products, spread.T @ (target - mean))
+            known = len(inputs) - len(inputs) // LEFT_OUT
+            part, rest = (inputs[:known], target[:known]), (inputs[known:], target[known:])
+            ridge = min(RIDGES, key=lambda value: _left(_least_squares(*part, value), *rest))
+            slope, bias = _least_squares(inputs, target, ridge)
             self.estimate.weight.copy_(slope.T)
-            self.estimate.bias.copy_(mean - middle @ slope)
+            self.estimate.bias.copy_(bias)
             if self._finds:
                 # Least squares would make less of it for the few that are found on the wrong side.
                 self.estimate.weight[self.told] = 0.0
@@ -179,3 +182,21 @@ class StateHead(nn.Module):
             normal = (values - self.offset[self.told]) / self.scale[self.told]
             estimate = estimate.index_add(-1, self.told, normal)
         return estimate, *self.act(estimate)
+
+
+def _least_squares(
+    inputs: torch.Tensor, target: torch.Tensor, ridge: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Slope [I, O] and bias [O] of what is nearest to targets [R, O] of inputs [R, I]."""
+    middle, mean = inputs.mean(dim=0), target.mean(dim=0)
+    spread = inputs - middle
+    products = spread.T @ spread
+    products.diagonal().add_(ridge * len(inputs))
+    slope = torch.linalg.solve(products, spread.T @ (target - mean))
+    return slope, mean - middle @ slope
+
+
+def _left(line: tuple[torch.Tensor, torch.Tensor], inputs: torch.Tensor, target: torch.Tensor) -> float:
+    """Sum of the squares that a slope and bias leave of other states."""
+    slope, bias = line
+    return float((target - inputs @ slope - bias).square().sum())
