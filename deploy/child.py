@@ -7,8 +7,11 @@ import tempfile
 import time
 from collections.abc import Sequence
 
-START_S = 300.0
-"""Longest start: on a machine that has not compiled the simulator's kernels, that takes minutes."""
+START_S = 1200.0
+"""Longest start: on a machine that has not compiled the simulator's kernels, and has other work."""
+USUAL_S = 30.0
+"""Longest start on one that has; then it is said what takes so long."""
+SLOW = "... it compiles the simulator's kernels, once for this machine: that takes minutes"
 END_S = 5.0
 """Time that a twin has to end."""
 
@@ -40,10 +43,14 @@ class TwinChild:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._words,
-            text=True,
+            bufsize=0,
             start_new_session=True,
         )
-        self.path = self._first_line()
+        try:
+            self.path = self._first_line()
+        except BaseException:
+            TwinChild.close(self)
+            raise
 
     def close(self) -> None:
         """End it."""
@@ -58,16 +65,27 @@ class TwinChild:
         self._words.close()
 
     def _first_line(self) -> str:
-        """The device that it prints when it serves; libraries may have said something before."""
+        """The device that it prints when it serves; libraries may have said something before.
+
+        Raises:
+            TwinError: It ended before, or takes too long.
+        """
         assert self._process.stdout is not None
-        end = time.monotonic() + START_S
-        while select.select([self._process.stdout], [], [], max(0.0, end - time.monotonic()))[0]:
-            line = self._process.stdout.readline()
-            if line.startswith("/"):
-                return line.strip()
-            if not line:
-                break
-        self._words.seek(0)
-        words = self._words.read().strip().splitlines()
-        TwinChild.close(self)
-        raise TwinError(f"the twin did not start: {words[-1] if words else 'no answer'}")
+        waited, begin = 0.0, time.monotonic()
+        while waited < START_S:
+            left = (USUAL_S if waited < USUAL_S else START_S) - waited
+            if select.select([self._process.stdout], [], [], left)[0]:
+                line = self._process.stdout.readline().decode()
+                if line.startswith("/"):
+                    return line.strip()
+                if not line:
+                    self._words.seek(0)
+                    words = self._words.read().strip().splitlines()
+                    raise TwinError(f"the twin did not start: {words[-1] if words else 'no answer'}")
+            before, waited = waited, time.monotonic() - begin
+            if before < USUAL_S <= waited:
+                print(SLOW, file=sys.stderr, flush=True)
+        raise TwinError(
+            f"the twin did not start within {START_S:g} s; what it has compiled is kept, so try again, "
+            "or with fewer other programs"
+        )

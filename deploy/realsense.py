@@ -33,6 +33,7 @@ HOLE_MODES: dict[HoleFilling, int] = {"left": 0, "farthest": 1, "nearest": 2}
 CLOCK_WINDOW = 300
 """Frames from which the offset between two clocks is found: ten seconds, in which crystals part by 0.2 ms."""
 MILLISECOND = 1e-3
+INSTALL = "pip install 'visual-dexterity[hardware]'"
 
 
 @dataclass(frozen=True)
@@ -121,9 +122,9 @@ def sdk() -> ModuleType:
     try:
         import pyrealsense2
     except ImportError as error:
-        raise CameraError(
-            f"the RealSense SDK cannot be imported ({error}); pip install 'visual-dexterity[hardware]'"
-        ) from error
+        # Its wheel takes one library from the system.
+        remedy = "apt install libusb-1.0-0" if "libusb" in str(error) else INSTALL
+        raise CameraError(f"the RealSense SDK cannot be imported ({error}); {remedy}") from error
     return pyrealsense2
 
 

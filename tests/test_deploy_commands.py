@@ -15,7 +15,7 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 from simulated_hand import simulated_bus
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy import check, cli, home, record
+from vd.deploy import check, child, cli, home, record
 from vd.deploy.connect import MOTOR, Connection, HandOptions, connect
 from vd.deploy.control_table import MODELS
 from vd.deploy.faults import BEFORE, MOVING, try_fault, try_preflight
@@ -234,3 +234,12 @@ def test_a_twin_that_cannot_start_says_why():
     command = [sys.executable, "-m", "vd.deploy.cli", "scan", "--twin", "--twin-args=--seed no"]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     assert run.returncode == 1 and "the twin did not start" in run.stderr
+
+
+def test_a_twin_that_takes_long_says_why_and_is_not_waited_for_forever(monkeypatch, capsys):
+    """The first start compiles for minutes: 300 s were too few on a busy machine, and nothing was said."""
+    monkeypatch.setattr(child, "USUAL_S", 0.01)
+    monkeypatch.setattr(child, "START_S", 0.02)
+    with pytest.raises(child.TwinError, match="what it has compiled is kept"):
+        child.TwinChild(["--ids", "10"])
+    assert "compiles the simulator's kernels" in capsys.readouterr().err
