@@ -8,6 +8,7 @@ import json
 
 import numpy as np
 import pytest
+from camera_sdk import camera_sdk
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.camera_layer import read_camera, write_camera_layer
@@ -175,7 +176,7 @@ def test_drawn_markers_are_found_where_they_are(camera, lens, noise):
 @pytest.fixture(scope="module")
 def kept(hand, lens, poses, tmp_path_factory):
     """A folder of drawn pictures by a camera that is not where the hand's file has it, and where it is."""
-    pytest.importorskip("pyrealsense2", reason="the RealSense SDK is not installed (extra: hardware)")
+    camera_sdk()
     twin = CalibrationTwin(
         hand, lambda: current[0], (0, 1, 2), RealSenseCfg(width=1280, height=720), side_m=SIDE_M
     )

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from camera_sdk import camera_sdk
 from simulated_clock import SimulatedClock
 from student_dummy import TINY
 
@@ -233,7 +234,7 @@ def test_a_teacher_flies_a_twin(hand, tmp_path, capsys, patient):
 def test_a_student_sees_a_twin_through_the_cameras_sdk(tmp_path, capsys, patient):
     """Random weights that never stop; the simulator shows what the student saw, images included."""
     pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
-    pytest.importorskip("pyrealsense2", reason="needs the extra `hardware`")
+    camera_sdk()
     spec = StudentSpec(TINY, 9, 2, "none", None, StoppingRule(-100.0, 1.0))
     network = Student(TINY, 9).eval().requires_grad_(False)
     task, depth = to_dict(ReorientCfg(hand="dclaw3")), to_dict(DepthCameraCfg())

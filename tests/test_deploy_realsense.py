@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from camera_sdk import camera_sdk
 from scipy.spatial import cKDTree
 
 from vd.assets_usd.hand_data import Intrinsics
@@ -33,7 +34,7 @@ from vd.sensors.depth_camera import DepthCamera
 from vd.sensors.depth_cloud import CameraCloud
 from vd.sensors.surfaces import scene_surfaces
 
-rs = pytest.importorskip("pyrealsense2", reason="the RealSense SDK is not installed (extra: hardware)")
+rs = camera_sdk()
 
 LENS = Intrinsics(640, 360, 455.0, 456.0, 323.5, 177.0)
 NORMAL, DISTANCE = np.array([0.3, -0.2, 1.0]), 0.7
