@@ -181,10 +181,10 @@ def test_a_folder_with_a_run_is_not_overwritten(tmp_path, capsys):
 def test_init_keeps_the_flags_and_names_a_missing_file(tmp_path, capsys):
     start = ["--preset", "gpu", "--init", str(tmp_path / "no.pt"), "--env.observation.shape", "full"]
     cfg = parse_teacher([*start, "--run-dir", str(tmp_path / "run"), "--resume", "auto"])
-    assert cfg.init == tmp_path / "no.pt" and cfg.env.observation.shape == "full"
+    assert cfg.init == str(tmp_path / "no.pt") and cfg.env.observation.shape == "full"
     assert cfg.ppo == PRESETS["gpu"]().ppo and from_dict(TeacherCfg, to_dict(cfg)) == cfg
     assert main(["teacher", *start, "--run-dir", str(tmp_path / "run")]) == 1
-    assert "--init: no file" in capsys.readouterr().err
+    assert "--init: no policy at" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

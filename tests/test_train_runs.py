@@ -443,8 +443,8 @@ def test_a_new_run_can_begin_from_anothers_checkpoint(tmp_path):
     assert second._best is None and not second._window.full, "another run's rates would decide which is best"
     second.learn(1)
     assert [row["iteration"] for row in _rows(tmp_path / "second")] == [4]
-    with pytest.raises(ValueError, match="is a policy; --init needs a checkpoint"):
-        second.begin_from(str(tmp_path / "first" / "policy.pt"))
+    with pytest.raises(ValueError, match="is a policy, which nothing can resume; --init"):
+        second.load(str(tmp_path / "first" / "policy.pt"))
 
 
 def test_a_new_run_has_its_own_learning_rates_and_a_resumed_one_those_it_had(tmp_path):

@@ -67,13 +67,16 @@ def save_checkpoint(path: Path, state: dict[str, Any]) -> None:
             os.fsync(file.fileno())  # a rename alone may survive a power cut without the data
 
 
-def load_checkpoint(path: Path, device: str = "cpu", *, network: str = "actor") -> dict[str, Any]:
+def load_checkpoint(
+    path: Path, device: str = "cpu", *, network: str = "actor", flag: str = "--resume"
+) -> dict[str, Any]:
     """Read a checkpoint without executing anything in it.
 
     Args:
         path: The file.
         device: Torch device of its tensors.
         network: What it has to hold the weights of: ``actor`` (teacher) or ``student``.
+        flag: What asked for it, for messages.
 
     Raises:
         ValueError: The file is damaged or not a checkpoint.
@@ -85,11 +88,11 @@ def load_checkpoint(path: Path, device: str = "cpu", *, network: str = "actor") 
     except Exception as error:
         reason = str(error).splitlines()[0]
         raise ValueError(
-            f"{path} is damaged or no checkpoint ({reason}); give --resume another file of its folder"
+            f"{path} is damaged or no checkpoint ({reason}); give {flag} another file of its folder"
         ) from error
     if not isinstance(state, dict) or f"{network}_state_dict" not in state:
         raise ValueError(
-            f"{path} holds no {network}; give --resume a file that vd-train wrote in {CHECKPOINT_FOLDER}/"
+            f"{path} holds no {network}; give {flag} a file that vd-train wrote in {CHECKPOINT_FOLDER}/"
         )
     return _restored(state)
 

@@ -12,6 +12,7 @@ import tyro
 
 from vd.config import from_dict, to_dict
 from vd.files import write_json
+from vd.train.begin import find_start, settings_of
 from vd.train.presets import PRESETS, TeacherCfg, smoke
 
 if TYPE_CHECKING:
@@ -60,6 +61,8 @@ SHORT_FORMS = ("hand", "hand-layer", "objects", "num-worlds", "seed")
 @dataclass
 class ExportCfg:
     """Write the policy of a checkpoint without its training state, as ONNX, or a small checkpoint.
+
+    A policy keeps its critic, so that --init can go on from it.
 
     A student is written in a third of its space: 8 bits for convolutions, half precision for other matrices.
     It is used as before, --init included.
@@ -140,17 +143,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def parse_teacher(arguments: Sequence[str]) -> TeacherCfg:
     """The configuration that command-line flags ask for.
 
-    The first pass finds where to start from (``--preset``, ``--smoke``, or the run's own configuration
-    with ``--resume``), the second reads every flag with those values as defaults.
+    The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins from, or the
+    run's own configuration with ``--resume``), the second reads every flag with those values as defaults.
 
     Raises:
         FileNotFoundError: ``--resume`` names a run without a configuration.
-        ValueError: The run's configuration is not one of this version.
+        ValueError: The run's configuration is not one of this version, or ``--init`` is no teacher.
     """
     arguments = normalise(arguments, SHORT_FORMS, "env")
-    preset = value_of(arguments, "--preset") or "paper"
-    # The second pass refuses an unknown name.
-    start = smoke() if "--smoke" in arguments else PRESETS.get(preset, PRESETS["paper"])()
+    preset, init = value_of(arguments, "--preset"), value_of(arguments, "--init")
+    if "--smoke" in arguments:
+        start = smoke()
+    elif preset is None and init is not None:
+        start = settings_of(init, PRESETS["gpu"]())
+    else:  # the second pass refuses an unknown name
+        start = PRESETS.get(preset or "paper", PRESETS["paper"])()
     base = _saved_config(arguments, start) if "--resume" in arguments else start
     return tyro.cli(
         TeacherCfg, args=arguments, default=base, prog="vd-train teacher", description=TEACHER_HELP
@@ -166,6 +173,7 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
 
     Raises:
         FileExistsError: The run folder holds another run and ``resume`` is not set.
+        FileNotFoundError: There is nothing to resume or to begin from.
     """
     from vd.train.checkpoint import find_checkpoint, list_checkpoints
 
@@ -174,8 +182,9 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     present = list_checkpoints(cfg.run.run_dir)
     resume = cfg.resume if cfg.resume != AUTO else "latest" if present else None
     checkpoint = find_checkpoint(cfg.run.run_dir, resume) if resume else None
-    if checkpoint is None and cfg.init is not None and not cfg.init.is_file():
-        raise FileNotFoundError(f"--init: no file {cfg.init}; give a checkpoint of vd-train teacher")
+    init = find_start(cfg.init) if checkpoint is None and cfg.init is not None else None
+    if cfg.init is None and cfg.init_stage is not None:
+        raise ValueError("--init-stage says where a run with --init begins; leave it out, or give --init")
     if checkpoint is None and present:
         raise FileExistsError(
             f"{cfg.run.run_dir} holds a run; add --resume to go on with it, or choose another --run-dir"
@@ -209,8 +218,8 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     runner = TeacherRunner(env, cfg.ppo, cfg.policy, cfg.run, task=task, device=device, deadline=deadline)
     if checkpoint is not None:
         runner.load(str(checkpoint))
-    elif cfg.init is not None:
-        runner.begin_from(str(cfg.init))
+    elif init is not None:
+        runner.begin_from(str(init), cfg.init_stage)
     return runner
 
 
@@ -254,6 +263,10 @@ def _teacher(arguments: list[str], started: float) -> int:
             print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
         if runner.new_inputs:
             print(f"{runner.new_inputs} observed values are new to the networks and start without effect")
+        if runner.critic_warmup:
+            print(f"the critic learns alone for {runner.critic_warmup} iterations, the actor stays as it is")
+        for difference in runner.unlike:
+            print(f"the policy was trained with other observations or actions: {difference}")
     whole = finished(runner.learn, runner.env.close, distributed=runner.is_distributed)
     runner.shutdown()
     if not whole:

@@ -45,6 +45,9 @@ class PpoCfg:
     """Joint gradient norm of actor and critic is clipped to this."""
     optimizer: Literal["adam", "adamw"] = "adam"
     """Optimiser: the paper says Adam, its code uses AdamW."""
+    critic_warmup_iterations: int | None = None
+    """Iterations at the begin of a run in which the critic learns alone; the actor acts and stays as it is.
+    None: as many as what --init begins from needs, 50 without a critic, 3 without an optimiser, else 0."""
 
 
 @dataclass
@@ -121,6 +124,10 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
     for flag, value in positive.items():
         if not value > 0:
             raise ValueError(f"{flag} is {value}; it has to be positive")
+    if ppo.critic_warmup_iterations is not None and ppo.critic_warmup_iterations < 0:
+        raise ValueError(
+            f"--ppo.critic-warmup-iterations is {ppo.critic_warmup_iterations}; it has to be zero or positive"
+        )
     if ppo.bound_coefficient < 0.0:
         raise ValueError(f"--ppo.bound-coefficient is {ppo.bound_coefficient}; it has to be zero or positive")
     for flag, share in {"--ppo.gamma": ppo.gamma, "--ppo.gae-lambda": ppo.gae_lambda}.items():

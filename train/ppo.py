@@ -52,6 +52,12 @@ class TeacherPPO(PPO):
         critic_learning_rate: The critic's rate; ``learning_rate`` is the actor's.
         bound_coef: Weight of the squared excess of mean actions beyond :data:`ACTION_BOUND`.
         **kwargs: rsl-rl's PPO arguments.
+
+    Attributes:
+        actor_learns: Whether updates change the actor. A critic that knows nothing yet gives random
+            advantages, which would unlearn an actor that has learned; so it learns alone first. The actor's
+            gradients go through Adam meanwhile, at a rate of zero: its first step then has moments to go by,
+            where one without would move every weight by the whole rate, whatever its gradient.
     """
 
     optimizer: Any
@@ -71,6 +77,7 @@ class TeacherPPO(PPO):
         if self.actor.is_recurrent or self.critic.is_recurrent or self.rnd or self.symmetry:
             raise ValueError("TeacherPPO trains feed-forward networks, without RND and symmetry")
         self.bound_coef = bound_coef
+        self.actor_learns = True
         self.optimizer = type(self.optimizer)(
             [
                 {"params": list(self.actor.parameters()), "lr": self.learning_rate},
@@ -97,11 +104,15 @@ class TeacherPPO(PPO):
             ``clip_fraction``, ``grad_norm`` (before clipping), ``beyond_bound`` (share of mean
             actions), and ``explained_variance`` of the returns by the values of the rollout.
         """
+        group = self.optimizer.param_groups[ACTOR_GROUP]
+        group["lr"] = self.learning_rate if self.actor_learns else 0.0
         steps = torch.stack([self._minibatch_step(batch) for batch in self._minibatches()])
-        if self.schedule == "adaptive":
-            self._adapt_learning_rate(steps[-self.num_mini_batches :, STATISTICS.index("kl")].mean())
+        group["lr"] = self.learning_rate
         flat = self.storage.observations.flatten(0, 1)
-        self.actor.update_normalization(flat)
+        if self.actor_learns:
+            if self.schedule == "adaptive":
+                self._adapt_learning_rate(steps[-self.num_mini_batches :, STATISTICS.index("kl")].mean())
+            self.actor.update_normalization(flat)
         self.critic.update_normalization(flat)
         returns, values = self.storage.returns, self.storage.values
         explained = 1.0 - (returns - values).var() / returns.var().clamp_min(1e-8)

@@ -36,9 +36,14 @@ class TeacherCfg:
     resume: str | None = None
     """Go on from a checkpoint of --run-dir: latest (a bare --resume), best, a file, or auto: the latest, and
     a new run where there is none."""
-    init: Path | None = None
-    """Begin a new run with the networks, optimiser and curriculum of another run's checkpoint, at this run's
-    learning rates. It may have observed less: what is new (--env.observation.shape) starts without effect."""
+    init: str | None = None
+    """Begin a new run with networks, curriculum and counters of another: the name of an installed policy
+    (dclaw3-table), a policy, a checkpoint or a run's folder. Of a policy without a critic or an optimiser the
+    critic learns alone first (--ppo.critic-warmup-iterations). Without --preset its task and its networks are
+    this run's defaults. It may have observed less: what is new starts without effect."""
+    init_stage: tuple[float, float] | None = None
+    """Difficulty and tightness of the curriculum at which a run with --init begins. None: those of what it
+    begins from; 1 and 1 for a policy that does not say, which is the task as configured."""
     smoke: bool = False
     """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from vd.config import to_dict
 from vd.envs.curriculum import blend
 from vd.policy import PolicySpec, policy_export
+from vd.train.begin import at_stage, check_fit, completed, unlike, warmup_iterations
 from vd.train.checkpoint import (
     BEST_NAME,
     CHECKPOINT_FOLDER,
@@ -62,6 +63,8 @@ class TeacherRunner(OnPolicyRunner):
         env_steps: Control steps completed, over all worlds and processes.
         new_episodes: Why the checkpoint that was loaded could not restore the worlds; empty if it did.
         new_inputs: Observed values that the networks of that checkpoint did not read.
+        critic_warmup: Iterations left in which the critic learns alone (``PpoCfg.critic_warmup_iterations``).
+        unlike: What observations and actions mean otherwise than to the policy that the run began from.
     """
 
     alg: TeacherPPO
@@ -96,6 +99,8 @@ class TeacherRunner(OnPolicyRunner):
         self._stagger_due = True
         self.new_episodes = ""
         self.new_inputs = 0
+        self.critic_warmup = ppo.critic_warmup_iterations or 0
+        self.unlike: list[str] = []
 
     @property
     def num_observations(self) -> int:
@@ -197,7 +202,9 @@ class TeacherRunner(OnPolicyRunner):
             self._check_rollout(observation)
             self.alg.compute_returns(observation)
         collected = time.perf_counter()
+        self.alg.actor_learns = self.critic_warmup == 0
         losses = self.alg.update()
+        self.critic_warmup = max(0, self.critic_warmup - 1)
         self._check_update(losses)
         end = time.perf_counter()
 
@@ -214,6 +221,7 @@ class TeacherRunner(OnPolicyRunner):
             "learn_s": round(end - collected, 4),
             **self._window.add(means),
             "action_std": action_std,
+            "critic_warmup": self.critic_warmup,
             "actor_learning_rate": self.alg.learning_rate,
             "critic_learning_rate": self.alg.critic_learning_rate,
             **means,
@@ -258,37 +266,49 @@ class TeacherRunner(OnPolicyRunner):
             map_location: Device to read to.
 
         Raises:
-            ValueError: The file is damaged, or of another network.
-        """
-        state = load_checkpoint(Path(path), map_location or self.device)
-        return self._restore(state, path, load_cfg, strict)
-
-    def begin_from(self, path: str) -> None:
-        """Begin with networks, optimiser, curriculum and counters of another run's checkpoint.
-
-        Worlds, random states, learning rates and the choice of the best checkpoint are this run's own.
-
-        Args:
-            path: The checkpoint.
-
-        Raises:
             ValueError: The file is damaged, a policy only, or of another network.
         """
-        state = load_checkpoint(Path(path), self.device)
+        state = load_checkpoint(Path(path), map_location or self.device)
         if "optimizer_state_dict" not in state:
-            raise ValueError(f"{path} is a policy; --init needs a checkpoint, which has an optimiser too")
-        self._restore(without_worlds(state), path, None, True)
+            raise ValueError(f"{path} is a policy, which nothing can resume; --init begins a new run from it")
+        return self._restore(state, path, load_cfg, strict)
+
+    def begin_from(self, path: str, stage: tuple[float, float] | None = None) -> None:
+        """Begin with networks, optimiser, curriculum and counters of another run's checkpoint or policy.
+
+        Worlds, random states, learning rates and the choice of the best checkpoint are this run's own, and so
+        are a critic and an optimiser that the file lacks; then the critic learns alone first.
+
+        Args:
+            path: Checkpoint or exported policy.
+            stage: Difficulty and tightness to begin at, rather than those of the file.
+
+        Raises:
+            ValueError: The file is damaged, of another hand or of another network.
+        """
+        state = load_checkpoint(Path(path), self.device, flag="--init")
+        check_fit(state, self._spec(), self.task, path)
+        self.unlike = unlike(state["task"], self.task)
+        warmup = warmup_iterations(state, self.ppo.critic_warmup_iterations)
+        self.new_inputs = new_inputs(state, self.num_observations)
+        if self.new_inputs:
+            state = widen(state, self.new_inputs, self.alg.actor, self.alg.critic)
+        state = without_worlds(completed(state, self.alg.save() | {"window": self._window.state_dict()}))
+        if stage is not None:
+            state = at_stage(state, stage)
+        self._restore(state, path, None, True)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.new_episodes = "it is of another run"
+        self.critic_warmup = warmup
         self._best = None
         self._window = GoalWindow(self._window_length)
 
     def _restore(self, state: dict[str, Any], path: str, load_cfg: dict | None, strict: bool) -> dict:
         """Take over a checkpoint that was read; see :meth:`load`."""
         try:
-            self.new_inputs = new_inputs(state, self.num_observations)
-            if self.new_inputs:
-                state = widen(state, self.new_inputs, self.alg.actor, self.alg.critic)
+            if extra := new_inputs(state, self.num_observations):
+                self.new_inputs = extra
+                state = widen(state, extra, self.alg.actor, self.alg.critic)
             everything = self.alg.load(state, load_cfg, strict)
         except (RuntimeError, ValueError, KeyError) as error:
             raise ValueError(
@@ -299,6 +319,7 @@ class TeacherRunner(OnPolicyRunner):
             self.current_learning_iteration = state["iter"]
             self.env_steps = state["env_steps"]
             self._elapsed_s = state["elapsed_s"]
+            self.critic_warmup = state.get("critic_warmup", 0)
             self._best = tuple(state["best"]) if state["best"] is not None else None
             self._window.load_state_dict(state["window"])
             self._load_worlds(state["ranks"])
@@ -332,14 +353,6 @@ class TeacherRunner(OnPolicyRunner):
         if self.is_distributed:
             ranks = [None] * self.gpu_world_size
             torch.distributed.all_gather_object(ranks, mine)
-        spec = PolicySpec(
-            num_observations=self.num_observations,
-            num_actions=self.env.num_actions,
-            hidden=self.policy_cfg.hidden,
-            activation=self.policy_cfg.activation,
-            distribution=self.policy_cfg.distribution,
-            normalise_observations=self.policy_cfg.normalise_observations,
-        )
         return self.alg.save() | {
             "iter": self.current_learning_iteration,
             "infos": infos,
@@ -348,9 +361,22 @@ class TeacherRunner(OnPolicyRunner):
             "best": list(self._best) if self._best is not None else None,
             "window": self._window.state_dict(),
             "ranks": ranks,
-            "policy": to_dict(spec),
+            "critic_warmup": self.critic_warmup,
+            "policy": to_dict(self._spec()),
+            "learner": {"ppo": to_dict(self.ppo), "policy": to_dict(self.policy_cfg)},
             "task": self.task,
         }
+
+    def _spec(self) -> PolicySpec:
+        """Shape of the actor."""
+        return PolicySpec(
+            num_observations=self.num_observations,
+            num_actions=self.env.num_actions,
+            hidden=self.policy_cfg.hidden,
+            activation=self.policy_cfg.activation,
+            distribution=self.policy_cfg.distribution,
+            normalise_observations=self.policy_cfg.normalise_observations,
+        )
 
     def _save_periodic(self) -> None:
         """Write the checkpoint of this iteration, and the best if it is one.

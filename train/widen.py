@@ -36,7 +36,8 @@ def widen(state: dict[str, Any], extra: int, actor: nn.Module, critic: nn.Module
     counts steps from the begin of the run.
 
     Args:
-        state: The checkpoint, as :func:`vd.train.checkpoint.load_checkpoint` reads it; not changed.
+        state: The checkpoint, as :func:`vd.train.checkpoint.load_checkpoint` reads it; not changed. Critic
+            and optimiser may be missing, as in an exported policy.
         extra: New inputs.
         actor: The actor it is for; says the order of the optimiser's parameters.
         critic: The critic it is for.
@@ -46,9 +47,12 @@ def widen(state: dict[str, Any], extra: int, actor: nn.Module, critic: nn.Module
         for network, module in (("actor", actor), ("critic", critic))
         for name, _ in module.named_parameters()
     ]
-    moments = dict(state["optimizer_state_dict"]["state"])
+    optimiser = state.get("optimizer_state_dict", {"state": {}})
+    moments = dict(optimiser["state"])
     widened = dict(state)
     for network in ("actor", "critic"):
+        if f"{network}_state_dict" not in state:
+            continue
         weights = dict(state[f"{network}_state_dict"])
         weights[FIRST_WEIGHT] = _behind(weights[FIRST_WEIGHT], extra, 0.0)
         for name, fill in _FILLS.items():
@@ -61,7 +65,8 @@ def widen(state: dict[str, Any], extra: int, actor: nn.Module, critic: nn.Module
             second = moment[SECOND_MOMENT]
             filled = torch.cat((second, second.mean(dim=1, keepdim=True).expand(-1, extra)), dim=1)
             moments[index] = moment | {MOMENT: _behind(moment[MOMENT], extra, 0.0), SECOND_MOMENT: filled}
-    widened["optimizer_state_dict"] = state["optimizer_state_dict"] | {"state": moments}
+    if "optimizer_state_dict" in state:
+        widened["optimizer_state_dict"] = optimiser | {"state": moments}
     before = int(state["policy"]["num_observations"])
     widened["policy"] = state["policy"] | {"num_observations": before + extra}
     return widened

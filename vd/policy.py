@@ -14,6 +14,8 @@ from vd.config import from_dict
 
 POLICY_FORMAT = "visual-dexterity policy 1"
 _ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "gelu": nn.GELU}
+_STAGE = ("difficulty", "tightness", "tightening")
+"""What says how far the curriculum has come, in the state of an environment."""
 _NORMALISER_EPSILON = 1e-2
 """Added to the running std by the normaliser that trained the actor (rsl-rl's EmpiricalNormalization)."""
 
@@ -206,15 +208,25 @@ def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
 
 
 def policy_export(state: dict[str, Any]) -> dict[str, Any]:
-    """The part of a checkpoint that :func:`load_policy` needs: weights, network, task; no optimiser."""
-    return {
-        "format": POLICY_FORMAT,
-        "policy": state["policy"],
-        "task": state["task"],
-        "iter": state["iter"],
-        "env_steps": state["env_steps"],
-        "actor_state_dict": {key: value.detach().cpu() for key, value in state["actor_state_dict"].items()},
+    """The part of a checkpoint that others need: networks, task, how it was trained; no optimiser.
+
+    :func:`load_policy` reads the actor. The rest is for a run that begins from it (``vd-train teacher
+    --init``): the critic, unless it is still warming up and so worth nothing, the stage of the curriculum and
+    the settings of the learner.
+
+    Args:
+        state: A checkpoint, or what this function gave.
+    """
+    exported = {"format": POLICY_FORMAT} | {
+        key: state[key] for key in ("policy", "task", "iter", "env_steps")
     }
+    for key in ("actor_state_dict", "critic_state_dict"):
+        if key == "actor_state_dict" or (key in state and not state.get("critic_warmup", 0)):
+            exported[key] = {name: value.detach().cpu() for name, value in state[key].items()}
+    if "ranks" in state:
+        environment = state["ranks"][0]["env"]
+        exported["stage"] = {key: environment[key] for key in _STAGE if key in environment}
+    return exported | {key: state[key] for key in ("stage", "learner") if key in state}
 
 
 def perceptron(spec: PolicySpec) -> nn.Sequential:

@@ -1,0 +1,249 @@
+"""Beginning a run from an exported policy: what is taken over, what the critic learns, what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
+
+from vd.config import to_dict
+from vd.envs.cfg import CurriculumCfg, TighteningCfg
+from vd.evaluate.agents import SHIPPED_POLICIES, trained_task
+from vd.policy import load_policy, policy_export
+from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start, unlike
+from vd.train.checkpoint import BEST_NAME, find_checkpoint, load_checkpoint, save_checkpoint
+from vd.train.cli import main, parse_teacher
+from vd.train.metrics import read_progress
+from vd.train.presets import PRESETS
+
+NORMALISING = replace(SMALL_POLICY, normalise_observations=True)
+LEARNED = replace(SMALL_PPO, minibatch_size=128)
+
+
+def _export(folder: Path, *, critic: bool = True, learner: bool = True) -> Path:
+    """A policy of a short run on the dummy, as ``vd-train export`` writes it, or wrote it once."""
+    runner = make_runner(folder, policy=NORMALISING, ppo=LEARNED)
+    runner.learn(3)
+    state = policy_export(load_checkpoint(find_checkpoint(folder, "latest")))
+    dropped = (() if critic else ("critic_state_dict",)) + (() if learner else ("learner", "stage"))
+    path = folder / "exported.pt"
+    save_checkpoint(path, {key: value for key, value in state.items() if key not in dropped})
+    return path
+
+
+def _begun(folder: Path, policy: Path, *, warmup: int | None = None, **options):
+    ppo = replace(LEARNED, critic_warmup_iterations=warmup, **options)
+    runner = make_runner(folder, env=DummyEnv(num_worlds=16, seed=7), seed=7, policy=NORMALISING, ppo=ppo)
+    runner.begin_from(str(policy))
+    return runner
+
+
+def _state(module: torch.nn.Module) -> dict[str, torch.Tensor]:
+    return {name: tensor.clone() for name, tensor in module.state_dict().items()}
+
+
+def _same(one: dict[str, torch.Tensor], two: dict[str, torch.Tensor]) -> list[str]:
+    return [name for name in one if torch.equal(one[name], two[name])]
+
+
+@pytest.mark.parametrize(("critic", "warmup"), [(False, CRITIC_WARMUP), (True, MOMENTS_WARMUP)])
+def test_a_run_begun_from_a_policy_acts_as_it_and_says_how_long_the_critic_learns_alone(
+    tmp_path, critic, warmup
+):
+    path = _export(tmp_path / "first", critic=critic)
+    runner = _begun(tmp_path / "second", path)
+    assert runner.critic_warmup == warmup and runner.new_inputs == 0
+    assert runner.current_learning_iteration == 3 and runner.env_steps == 3 * 128
+    observation = runner.env.get_observations()
+    with torch.no_grad():
+        assert torch.allclose(
+            runner.alg.actor(observation), load_policy(path).act(observation["policy"]), atol=1e-6
+        )
+    actor, learned = _state(runner.alg.actor), load_checkpoint(path)["actor_state_dict"]
+    assert _same(actor, learned) == list(actor), "its normaliser and its std belong to it"
+    assert runner.env.env.stage.difficulty == pytest.approx(0.03)
+    assert not runner.alg.optimizer.state_dict()["state"], "moments would be another network's"
+    values = _state(runner.alg.critic)
+    if critic:
+        assert _same(values, load_checkpoint(path)["critic_state_dict"]) == list(values)
+    else:
+        normaliser = [name for name in values if name.startswith("obs_normalizer")]
+        assert normaliser and set(_same(values, actor)) >= set(normaliser), "both read the same observations"
+
+
+@pytest.mark.parametrize("schedule", ["fixed", "adaptive"])
+@pytest.mark.parametrize("optimizer", ["adam", "adamw"])
+def test_only_the_critic_learns_while_it_warms_up(tmp_path, schedule, optimizer):
+    path = _export(tmp_path / "first", critic=False)
+    runner = _begun(tmp_path / "second", path, warmup=2, schedule=schedule, optimizer=optimizer)
+    actor, critic, rate = _state(runner.alg.actor), _state(runner.alg.critic), runner.alg.learning_rate
+    runner.learn(2)
+    assert _same(actor, _state(runner.alg.actor)) == list(actor)
+    assert not _same(critic, _state(runner.alg.critic))
+    assert runner.alg.learning_rate == rate == runner.alg.optimizer.param_groups[0]["lr"]
+    moments = runner.alg.optimizer.state_dict()["state"]
+    assert all(moment["exp_avg_sq"].abs().max() > 0.0 for moment in moments.values()), "the actor's too"
+    runner.learn(1)
+    assert runner.critic_warmup == 0
+    assert _same(actor, _state(runner.alg.actor)) == [], "afterwards both learn"
+    assert [row["critic_warmup"] for row in read_progress(tmp_path / "second" / "progress.jsonl")] == [
+        1,
+        0,
+        0,
+    ]
+
+
+def test_the_warmed_up_critic_explains_what_the_actor_gets(tmp_path):
+    # Sure actions: what the actor gets depends on what it sees, and hardly on chance.
+    sure = replace(NORMALISING, initial_std=0.05)
+    make_runner(tmp_path / "first", policy=sure).learn(1)
+    state = load_checkpoint(tmp_path / "first" / "policy.pt")
+    del state["critic_state_dict"]
+    save_checkpoint(tmp_path / "first" / "policy.pt", state)
+    ppo = replace(LEARNED, critic_warmup_iterations=20)
+    runner = make_runner(tmp_path / "second", env=DummyEnv(num_worlds=64, seed=7), policy=sure, ppo=ppo)
+    runner.begin_from(str(tmp_path / "first" / "policy.pt"))
+    runner.learn(20)
+    explained = [r["loss/explained_variance"] for r in read_progress(tmp_path / "second" / "progress.jsonl")]
+    assert explained[0] < 0.2
+    assert min(explained[-3:]) > 0.5
+
+
+def test_a_run_that_stops_while_the_critic_warms_up_goes_on_with_it(tmp_path):
+    path = _export(tmp_path / "first", critic=False)
+    whole = _begun(tmp_path / "whole", path, warmup=4)
+    whole.learn(6)
+    part = _begun(tmp_path / "part", path, warmup=4)
+    part.learn(2)
+    checkpoint = find_checkpoint(tmp_path / "part", "latest")
+    assert "critic_state_dict" not in load_checkpoint(tmp_path / "part" / "policy.pt"), (
+        "it is worth nothing yet"
+    )
+    resumed = make_runner(tmp_path / "part", seed=99, policy=NORMALISING, ppo=LEARNED)
+    resumed.load(str(checkpoint))
+    assert resumed.critic_warmup == 2
+    resumed.learn(4)
+    assert _same(_state(whole.alg.actor), _state(resumed.alg.actor)) == list(_state(whole.alg.actor))
+    again = make_runner(tmp_path / "again", policy=NORMALISING, ppo=LEARNED)
+    again.begin_from(str(checkpoint))
+    assert again.critic_warmup == 2, "another run that begins from it has what is left to do"
+    assert "critic_state_dict" in policy_export(load_checkpoint(find_checkpoint(tmp_path / "part", "latest")))
+
+
+def test_a_whole_checkpoint_needs_no_warm_up_unless_asked(tmp_path):
+    make_runner(tmp_path, policy=NORMALISING).learn(1)
+    best = find_checkpoint(tmp_path, "best")
+    assert _begun(tmp_path / "second", best).critic_warmup == 0
+    assert _begun(tmp_path / "third", best, warmup=5).critic_warmup == 5
+    asked = replace(SMALL_PPO, critic_warmup_iterations=2)
+    assert make_runner(tmp_path / "new", ppo=asked).critic_warmup == 2
+    with pytest.raises(ValueError, match=r"--ppo\.critic-warmup-iterations is -1"):
+        make_runner(tmp_path / "bad", ppo=replace(SMALL_PPO, critic_warmup_iterations=-1))
+
+
+@pytest.mark.parametrize(
+    ("tightened", "asked", "wanted"),
+    [(True, None, (1.0, 1.0)), (False, None, (1.0, 0.0)), (True, (0.5, 0.0), (0.5, 0.0))],
+)
+def test_a_policy_that_does_not_say_how_far_it_came_has_come_to_the_end(tmp_path, tightened, asked, wanted):
+    """The installed policies of old have no stage; whether stillness tightened stands in their task."""
+    path = _export(tmp_path / "first", learner=False)
+    state = load_checkpoint(path)
+    state["task"]["curriculum"] = to_dict(CurriculumCfg(tightening=TighteningCfg(enabled=tightened)))
+    save_checkpoint(path, state)
+    env = DummyEnv(num_worlds=16)
+    env.cfg = replace(env.cfg, curriculum=CurriculumCfg(enabled=True, tightening=TighteningCfg(enabled=True)))
+    runner = make_runner(tmp_path / "second", env=env, policy=NORMALISING)
+    runner.begin_from(str(path), asked)
+    assert (env.stage.difficulty, env.stage.tightness) == wanted
+    with pytest.raises(ValueError, match=r"--init-stage is 1\.5 0"):
+        runner.begin_from(str(path), (1.5, 0.0))
+
+
+def test_what_does_not_fit_is_named_with_the_flag_that_would(tmp_path):
+    path = _export(tmp_path / "first")
+    for policy, message in (
+        (replace(NORMALISING, hidden=(8,)), r"have --policy\.hidden 16 16.*give --policy\.hidden 16 16"),
+        (replace(NORMALISING, distribution="gaussian"), r"give --policy\.distribution state-dependent"),
+        (SMALL_POLICY, r"give --policy\.normalise-observations, or leave --preset out"),
+    ):
+        runner = make_runner(tmp_path / "other", policy=policy)
+        with pytest.raises(ValueError, match=message):
+            runner.begin_from(str(path))
+
+    class Larger(DummyEnv):
+        num_actions = 3
+
+        def _observe(self) -> None: ...
+
+    runner = make_runner(tmp_path / "hand", env=Larger(num_worlds=4), policy=NORMALISING)
+    with pytest.raises(ValueError, match="moves 2 joints of dummy, and this run's hand, dummy, has 3"):
+        runner.begin_from(str(path))
+    state = load_checkpoint(path)
+    state["policy"]["num_observations"] = 9
+    save_checkpoint(path, state)
+    runner = make_runner(tmp_path / "less", policy=NORMALISING)
+    with pytest.raises(ValueError, match=r"reads 9 values and this run observes 5.*--hand dummy"):
+        runner.begin_from(str(path))
+
+
+def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys):
+    assert find_start("dclaw3-table") == SHIPPED_POLICIES["dclaw3-table"]
+    make_runner(tmp_path).learn(1)
+    assert find_start(str(tmp_path)) == tmp_path / "checkpoints" / BEST_NAME, "it has the optimiser"
+    assert find_start(str(tmp_path / "policy.pt")) == tmp_path / "policy.pt"
+    with pytest.raises(FileNotFoundError, match=r"--init: no policy at .*installed policy: dclaw3"):
+        find_start(str(tmp_path / "none"))
+    assert main(["teacher", "--init", "dclaw3-student", "--run-dir", str(tmp_path / "run")]) == 1
+    assert "holds no actor; give --init" in capsys.readouterr().err
+    assert main(["teacher", "--init-stage", "1", "0", "--run-dir", str(tmp_path / "run")]) == 1
+    assert "--init-stage says where a run with --init begins" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", ["dclaw3-table", "dclaw4-table", "dclaw4-cube"])
+def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
+    cfg = parse_teacher(["--init", name, "--objects", "cube", "--num-worlds", "8"])
+    state = load_checkpoint(SHIPPED_POLICIES[name])
+    assert cfg.env.objects == ("cube",) and cfg.env.num_worlds == 8
+    trained = trained_task(load_policy(SHIPPED_POLICIES[name]))
+    assert replace(cfg.env, objects=trained.objects, num_worlds=trained.num_worlds) == trained
+    for field in ("hidden", "activation", "distribution", "normalise_observations"):
+        wanted = state["policy"][field]
+        assert getattr(cfg.policy, field) == (tuple(wanted) if isinstance(wanted, list) else wanted)
+    assert parse_teacher(["--init", name, "--preset", "cube"]).env == PRESETS["cube"]().env
+
+
+def test_without_a_preset_the_learner_is_the_policys_if_it_says(tmp_path):
+    path = _export(tmp_path / "first")
+    state = load_checkpoint(path)
+    state["task"] = to_dict(PRESETS["cube"]().env)
+    save_checkpoint(path, state)
+    cfg = parse_teacher(["--init", str(path)])
+    assert cfg.ppo == LEARNED and cfg.policy == NORMALISING and cfg.env == PRESETS["cube"]().env
+    state["task"]["wind"] = 3.0
+    save_checkpoint(path, state)
+    with pytest.raises(ValueError, match=r"task has no field wind.*add --preset"):
+        parse_teacher(["--init", str(path)])
+
+
+def test_what_observations_and_actions_mean_is_compared():
+    before, now = to_dict(PRESETS["gpu"]().env), to_dict(PRESETS["paper"]().env)
+    now["action"]["ema_alpha"] = 0.5
+    assert unlike(before, before) == []
+    found = unlike(before, now)
+    assert (
+        "env.observation.view goal, here world" in found and "env.observation.shape full, here none" in found
+    )
+    assert "env.action.ema_alpha 0.8, here 0.5" in found and len(found) == 3, "rewards are the run's own"
+
+
+def test_policies_keep_their_critic_when_they_are_exported_and_are_small(tmp_path):
+    make_runner(tmp_path).learn(1)
+    shipped = load_checkpoint(tmp_path / "policy.pt")
+    assert main(["export", str(tmp_path / "policy.pt"), str(tmp_path / "again.pt")]) == 0
+    again = load_checkpoint(tmp_path / "again.pt")
+    assert again.keys() == shipped.keys() >= {"actor_state_dict", "critic_state_dict", "stage", "learner"}
+    assert "optimizer_state_dict" not in again and "ranks" not in again
+    assert _same(again["critic_state_dict"], shipped["critic_state_dict"]) == list(again["critic_state_dict"])
