@@ -19,6 +19,7 @@ REWARD_TERMS = (
     "table_contact",
     "fingertip_height",
     "progress",
+    "lift",
 )
 """Columns of the reward terms."""
 
@@ -45,6 +46,8 @@ class RewardParams:
     fingertip_height: c7, on each fingertip above height_limit (eq. 8).
     height_limit: World z above which a fingertip is too high [m].
     progress: Coefficient on the decrease of the rotation error since the last step [1/rad]; not in the paper.
+    lift: Coefficient on the object's clearance over ``lift_height``, at most 1; not in the paper.
+    lift_height: Clearance of the object's lowest point from which more is worth nothing [m].
     scale: Factor on the sum of all terms.
     """
 
@@ -61,6 +64,8 @@ class RewardParams:
     fingertip_height: float
     height_limit: float
     progress: float
+    lift: float
+    lift_height: float
     scale: float
 
 
@@ -110,6 +115,7 @@ def reward_kernel(
     goal_quat_in: wp.array[wp.quat],
     smoothed_in: wp.array2d[float],
     table_force_in: wp.array[float],
+    clearance_in: wp.array[float],
     # In/Out:
     previous_error: wp.array[float],
     # Out:
@@ -123,7 +129,8 @@ def reward_kernel(
 
     reward = scale * (c1 [success] + c2 / (error + epsilon) + c3 sum_i norm(tip_i - object)^2
     + c4 sum_j abs(qd_j tau_j) + c5 [fell] + c6 [table force > limit]
-    + c7 sum_i [tip_i.z > height_limit] + progress (previous_error - error)).
+    + c7 sum_i [tip_i.z > height_limit] + progress (previous_error - error)
+    + lift clamp(clearance / lift_height, 0, 1)).
     Success: the rotation error and all speeds are at most their thresholds. Fall: the object's distance
     from fall_center is at least fall_distance. ``previous_error`` becomes the present error; the reset
     kernel starts it anew with each goal.
@@ -138,9 +145,10 @@ def reward_kernel(
         goal_quat_in: Wanted orientation of the object, shape [N].
         smoothed_in: Smoothed action, shape [N, D].
         table_force_in: Magnitude of the object's force on the table [N], shape [N].
+        clearance_in: Height of the object's lowest point above the table's top [m], shape [N].
         previous_error: Rotation error of the last step [rad], shape [N].
         reward_out: Reward, shape [N].
-        terms_out: Terms with their coefficients, without scale, columns REWARD_TERMS, shape [N, 8].
+        terms_out: Terms with their coefficients, without scale, columns REWARD_TERMS, shape [N, 9].
         rotation_error_out: Angle between object and goal [rad], shape [N].
         success_out: 1 where the goal is reached, shape [N].
         fell_out: 1 where the object is lost, shape [N].
@@ -200,6 +208,7 @@ def reward_kernel(
     table_term = wp.where(touches, weights.table_contact, 0.0)
     height_term = weights.fingertip_height * high_tips
     progress_term = weights.progress * (previous_error[world] - error)
+    lift_term = weights.lift * wp.clamp(clearance_in[world] / weights.lift_height, 0.0, 1.0)
 
     terms_out[world, 0] = success_term
     terms_out[world, 1] = rotation_term
@@ -209,8 +218,9 @@ def reward_kernel(
     terms_out[world, 5] = table_term
     terms_out[world, 6] = height_term
     terms_out[world, 7] = progress_term
+    terms_out[world, 8] = lift_term
     total = success_term + rotation_term + fingertip_term + energy_term
-    total += fall_term + table_term + height_term + progress_term
+    total += fall_term + table_term + height_term + progress_term + lift_term
     reward_out[world] = weights.scale * total
     rotation_error_out[world] = error
     success_out[world] = wp.where(success, 1, 0)

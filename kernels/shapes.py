@@ -98,6 +98,18 @@ def surface_kernel(
     write_vec3(world, first_column + 3 * finger, value, observation_out)
 
 
+@wp.func
+def extent(
+    points: wp.array2d[wp.vec3], shape: int, scale: float, orientation: wp.quat, direction: wp.vec3
+) -> float:
+    """How far a shape, scaled and turned, extends from its origin along ``direction`` [m]."""
+    local = wp.quat_rotate_inv(orientation, direction)
+    farthest = wp.dot(points[shape, 0], local)
+    for i in range(1, points.shape[1]):
+        farthest = wp.max(farthest, wp.dot(points[shape, i], local))
+    return scale * farthest
+
+
 @wp.kernel
 def extent_kernel(
     # Model:
@@ -135,9 +147,37 @@ def extent_kernel(
     orientation = read_quat(world, object_column + 3, joint_q_in)
     if goal != 0:
         orientation = goal_quat_in[world]
-    direction = wp.quat_rotate_inv(orientation, directions[index])
-    extent = wp.dot(points[shape, 0], direction)
-    for i in range(1, points.shape[1]):
-        extent = wp.max(extent, wp.dot(points[shape, i], direction))
-    value = (world_scale[world] * extent - wp.static(EXTENT_CENTRE_M)) / wp.static(SHAPE_UNIT_M)
+    reach = extent(points, shape, world_scale[world], orientation, directions[index])
+    value = (reach - wp.static(EXTENT_CENTRE_M)) / wp.static(SHAPE_UNIT_M)
     observation_out[world, first_column + goal * directions.shape[0] + index] = value
+
+
+@wp.kernel
+def clearance_kernel(
+    # Model:
+    points: wp.array2d[wp.vec3],
+    world_object: wp.array[int],
+    world_scale: wp.array[float],
+    object_column: int,
+    table_top: float,
+    # In:
+    joint_q_in: wp.array2d[float],
+    # Out:
+    clearance_out: wp.array[float],
+):
+    """Height of the object's lowest point above the table's top, whether it is there or not. Launch: [N].
+
+    Args:
+        points: Surface points of each object, object frame [m], shape [K, P].
+        world_object: Object of each world, shape [N].
+        world_scale: Factor on the object's size in each world, shape [N].
+        object_column: Column of the object's position in ``joint_q_in``; its quaternion follows.
+        table_top: Height of the table's top, world frame [m].
+        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
+        clearance_out: Height [m], negative below the top, shape [N].
+    """
+    world = wp.tid()
+    orientation = read_quat(world, object_column + 3, joint_q_in)
+    down = wp.vec3(0.0, 0.0, -1.0)
+    depth = extent(points, world_object[world], world_scale[world], orientation, down)
+    clearance_out[world] = joint_q_in[world, object_column + 2] - depth - table_top

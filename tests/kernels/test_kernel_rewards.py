@@ -38,6 +38,8 @@ REWARD = {
     "fingertip_height": PAPER.reward.fingertip_height,
     "height_limit": PAPER.reward.fingertip_height_m,
     "progress": 0.0,
+    "lift": 0.0,
+    "lift_height": 0.02,
     "scale": 1.0,
 }
 SUCCESS = {
@@ -65,6 +67,7 @@ def rest(fingers=3, worlds=1):
         "goal": np.tile([0.0, 0.0, 0.0, 1.0], (worlds, 1)),
         "smoothed": np.zeros((worlds, joints)),
         "table_force": np.zeros(worlds),
+        "clearance": np.zeros(worlds),
         "previous_error": np.zeros(worlds),
     }
 
@@ -93,6 +96,7 @@ def evaluate(device, state, reward=None, success=None):
             device_array(state["goal"], wp.quat, device),
             device_array(state["smoothed"], float, device),
             device_array(state["table_force"], float, device),
+            device_array(state["clearance"], float, device),
             previous,
         ],
         outputs=list(out.values()),
@@ -143,6 +147,7 @@ def oracle(state, reward, success):
             reward["table_contact"] * (contact_margin > 0),
             reward["fingertip_height"] * (height_margin > 0).sum(axis=1),
             reward["progress"] * (s["previous_error"] - error),
+            reward["lift"] * np.interp(s["clearance"], [0.0, reward["lift_height"]], [0.0, 1.0]),
         ],
         axis=1,
     )
@@ -169,6 +174,7 @@ def states(draw: st.DrawFn) -> dict[str, np.ndarray]:
         "goal": draw(goals(orientation)),
         "smoothed": draw(floats((worlds, joints), -0.5, 0.5)),
         "table_force": draw(floats((worlds,), 0.0, 1.0)),
+        "clearance": draw(floats((worlds,), -0.1, 0.1)),
         "previous_error": draw(floats((worlds,), 0.0, 3.0)),
     }
 
@@ -179,13 +185,17 @@ def states(draw: st.DrawFn) -> dict[str, np.ndarray]:
     form=st.sampled_from([FINGERTIP_SQUARED_SUM, FINGERTIP_MEAN]),
     clip=st.sampled_from([0.0, PAPER.reward.energy_clip_w_code]),
     progress=st.sampled_from([0.0, 20.0]),
+    lift=st.sampled_from([(0.0, 0.02), (3.0, 0.02), (3.0, 0.2)]),
     scale=st.sampled_from([1.0, 0.01]),
     in_air=st.integers(0, 1),
     tolerance=st.sampled_from([0.4, 0.1, 2.0]),
     disabled=st.sets(st.sampled_from([*STILLNESS, "fall_distance"])),
 )
-def test_terms_match_the_equations(device, state, form, clip, progress, scale, in_air, tolerance, disabled):
+def test_terms_match_the_equations(
+    device, state, form, clip, progress, lift, scale, in_air, tolerance, disabled
+):
     reward = {**REWARD, "fingertip_form": form, "energy_clip": clip, "progress": progress, "scale": scale}
+    reward |= {"lift": lift[0], "lift_height": lift[1]}
     success = {**SUCCESS, "no_table_contact": in_air, "rotation": tolerance, **dict.fromkeys(disabled, 0.0)}
     out = evaluate(device, state, reward, success)
     terms, error, reached, fell, decided = oracle(state, reward, success)
@@ -193,7 +203,7 @@ def test_terms_match_the_equations(device, state, form, clip, progress, scale, i
     np.testing.assert_array_equal(out["previous_error"], out["error"])
     np.testing.assert_array_equal(out["success"][decided], reached[decided])
     np.testing.assert_array_equal(out["fell"][decided], fell[decided])
-    tolerances = np.array([0, 3e-3, 1e-5, 1e-3, 0, 0, 0, 20 * 2e-3])
+    tolerances = np.array([0, 3e-3, 1e-5, 1e-3, 0, 0, 0, 20 * 2e-3, 1e-5])
     assert np.all(np.abs(out["terms"] - terms)[decided] <= tolerances + 1e-5 * np.abs(terms)[decided])
     np.testing.assert_allclose(out["reward"], scale * out["terms"].sum(axis=1), rtol=1e-5, atol=1e-3)
 
@@ -205,9 +215,9 @@ def test_all_coefficients_of_table_s1(device):
     state["tips"][0] = [[0.2, 0.0, 0.18], [0.2, 0.3, 0.08], [0.2, 0.0, 0.08]]
     state["qd"][0, 0], state["effort"][0, 0] = 0.125, -2.0
     state["table_force"][0] = 1.0
-    state["previous_error"][0] = 0.5
-    out = evaluate(device, state, {"progress": 20.0})
-    expected = [800.0, 2.5, -(0.01 + 0.09), -20 * 0.25, -100.0, -1.0, -2.0, 10.0]
+    state["previous_error"][0], state["clearance"][0] = 0.5, 0.005
+    out = evaluate(device, state, {"progress": 20.0, "lift": 4.0})
+    expected = [800.0, 2.5, -(0.01 + 0.09), -20 * 0.25, -100.0, -1.0, -2.0, 10.0, 1.0]
     np.testing.assert_allclose(out["terms"][0], expected, rtol=1e-5)
     assert out["reward"][0] == pytest.approx(sum(expected), rel=1e-5)
     assert (out["success"][0], out["fell"][0]) == (1, 1)
@@ -287,3 +297,10 @@ def test_height_counts_each_finger_strictly_above(device):
     state = rest(fingers=4)
     state["tips"][0, :, 2] = [0.25, 0.2500001, 1.0, 0.0]
     assert evaluate(device, state, {"height_limit": 0.25})["terms"][0, 6] == -4.0
+
+
+def test_lift_grows_to_its_height_and_is_nothing_below_the_table(device):
+    state = rest(worlds=5)
+    state["clearance"] = np.array([-0.04, 0.0, 0.015, 0.03, 0.5])
+    out = evaluate(device, state, {"lift": 6.0, "lift_height": 0.03})
+    np.testing.assert_allclose(out["terms"][:, 8], [0.0, 0.0, 3.0, 6.0, 6.0], rtol=1e-6)

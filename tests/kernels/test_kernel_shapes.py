@@ -20,6 +20,7 @@ from vd.kernels.shapes import (
     EXTENT_CENTRE_M,
     ORIENTATIONS,
     SHAPE_UNIT_M,
+    clearance_kernel,
     extent_directions,
     extent_kernel,
     shape_observation_size,
@@ -157,3 +158,28 @@ def test_nothing_else_is_written(device, scene):
     out = observe(device, scene, first=2)
     assert np.isnan(out[:, :2]).all() and np.isnan(out[:, -1]).all()
     assert np.isfinite(out[:, 2:-1]).all()
+
+
+@EXAMPLES
+@given(scene=scenes(), table_top=st.sampled_from([0.0, -0.3]))
+def test_clearance_is_the_lowest_point_above_the_table(device, scene, table_top):
+    worlds, joints = len(scene["q"]), 3 * len(scene["tip_body"])
+    out = unwritten(worlds, float, device)
+    wp.launch(
+        clearance_kernel,
+        dim=worlds,
+        inputs=[
+            device_array(scene["points"], wp.vec3, device),
+            device_array(scene["object"], int, device),
+            device_array(scene["scale"], float, device),
+            joints,
+            table_top,
+            device_array(scene["q"], float, device),
+        ],
+        outputs=[out],
+        device=device,
+    )
+    for world, q in enumerate(np.asarray(scene["q"], np.float64)):
+        cloud = scene["scale"][world] * np.asarray(scene["points"][scene["object"][world]], np.float64)
+        heights = q[joints + 2] + Rotation.from_quat(q[joints + 3 :]).apply(cloud)[:, 2]
+        assert out.numpy()[world] == pytest.approx(heights.min() - table_top, abs=1e-5)

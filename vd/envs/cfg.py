@@ -44,8 +44,17 @@ class RewardCfg:
     """c7: for each fingertip above fingertip_height_m."""
     progress: float = 0.0
     """Ours: per radian by which the error fell since the last step."""
+    lift: float = 0.0
+    """Ours: times the height of the object's lowest point above the table (there or not), 1 at lift_m."""
+    lift_m: float = 0.02
+    """Ours: height from which more is worth nothing [m]; as far as a finger can give way without a fall."""
     scale: float = 1.0
     """Ours: factor on the sum; changes no optimum, keeps value targets near 1."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        if not self.lift_m > 0.0:
+            raise ValueError(f"reward.lift_m is {self.lift_m:g}; it has to be positive (lift 0 is off)")
 
 
 @dataclass(frozen=True)
@@ -332,6 +341,7 @@ class ReorientCfg:
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         self.sim.validate()
+        self.reward.validate()
         self.randomisation.validate()
         self.curriculum.validate()
         self.table.validate()

@@ -104,6 +104,8 @@ class TaskParameters:
             fingertip_height=reward.fingertip_height,
             height_limit=PAPER.reward.fingertip_height_m,
             progress=reward.progress,
+            lift=reward.lift,
+            lift_height=reward.lift_m,
             scale=reward.scale,
         )
         self._write(

@@ -132,6 +132,8 @@ class ReorientEnv:
         """Fingertip positions [m], shape [N, F]."""
         self.effort = zeros(n, d)
         """Joint torques [N m], shape [N, D]."""
+        self.clearance = zeros(n)
+        """Height of the object's lowest point above the table [m], shape [N]; 0 unless it is rewarded."""
         self.rng = zeros(n, dtype=wp.uint32)
         """Random stream of each world, shape [N]."""
 
@@ -159,7 +161,7 @@ class ReorientEnv:
         self._table_steps = table_array(cfg, self.device)
         self.nudges = Nudges(cfg, d, n, self.device) if cfg.nudge.enabled else None
         """What moves hands that are stuck, or None: they stay as they are."""
-        self._shapes = ShapeObserver(self) if self.sees_shape else None
+        self._shapes = ShapeObserver(self)
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
         self.randomiser = Randomiser(self)
 
@@ -265,6 +267,8 @@ class ReorientEnv:
             sim.put_back(self.step_count, self.max_episode_steps - 1)
         self._fingertips()
         self._motor_torque()
+        if self.cfg.reward.lift != 0.0:
+            self._shapes.measure_clearance()
         wp.launch(
             reward_kernel,
             dim=n,
@@ -278,6 +282,7 @@ class ReorientEnv:
                 self.goal_quat,
                 self.smoothed,
                 sim.table_force,
+                self.clearance,
                 self.previous_error,
             ],
             outputs=[self.reward, self.reward_terms, self.rotation_error, self.success, self.fell],
@@ -428,7 +433,7 @@ class ReorientEnv:
             outputs=[self.world_observation],
             device=self.device,
         )
-        if self._shapes is not None:
+        if self.sees_shape:
             self._shapes.launch()
         if self.views is not None:
             self.views.observe()

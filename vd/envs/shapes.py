@@ -1,4 +1,4 @@
-"""The shape of each world's object as the teacher sees it: its points on the device, and their launches."""
+"""The shape of each world's object: its points on the device, what a teacher sees of it, how high it is."""
 
 from typing import TYPE_CHECKING
 
@@ -8,18 +8,23 @@ import warp as wp
 from vd.kernels.observations import teacher_observation_size
 from vd.kernels.shapes import (
     ORIENTATIONS,
+    clearance_kernel,
     extent_directions,
     extent_kernel,
     shape_observation_slices,
     surface_kernel,
 )
+from vd.paper import PAPER
 
 if TYPE_CHECKING:
     from vd.envs.reorient import ReorientEnv
 
 
 class ShapeObserver:
-    """Writes the columns of ``vd.kernels.shapes`` behind the state in the observation of ``env``."""
+    """Writes the columns of ``vd.kernels.shapes`` behind the state in the observation of ``env``.
+
+    Also how high the objects are, for the reward.
+    """
 
     def __init__(self, env: "ReorientEnv"):
         """Put surface points and scales of the objects on the device."""
@@ -33,6 +38,24 @@ class ShapeObserver:
         first, slices = teacher_observation_size(env.num_fingers), shape_observation_slices(env.num_fingers)
         self._surface_column = first + slices["surface"].start
         self._extent_column = first + slices["extent"].start
+
+    def measure_clearance(self) -> None:
+        """Write the heights of the objects' lowest points into ``env.clearance``."""
+        env = self._env
+        wp.launch(
+            clearance_kernel,
+            dim=env.num_worlds,
+            inputs=[
+                self._points,
+                self._object,
+                self._scale,
+                env.num_actions,
+                PAPER.scene.table_top_m,
+                env.sim.joint_q,
+            ],
+            outputs=[env.clearance],
+            device=env.device,
+        )
 
     def launch(self) -> None:
         """Write the values of the present state and goal."""
