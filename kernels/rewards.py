@@ -81,7 +81,6 @@ class SuccessParams:
     object_speed: Largest speed of the object [m/s].
     object_spin: Largest angular speed of the object [rad/s].
     action_norm: Largest norm of the smoothed action.
-    no_table_contact: 1 if the object must not touch the table.
     fall_distance: Distance of the object from fall_center at which it is lost [m].
     fall_center: Centre of the space in which the object is held, world frame [m].
     """
@@ -91,7 +90,6 @@ class SuccessParams:
     object_speed: float
     object_spin: float
     action_norm: float
-    no_table_contact: int
     fall_distance: float
     fall_center: wp.vec3
 
@@ -116,6 +114,7 @@ def reward_kernel(
     smoothed_in: wp.array2d[float],
     table_force_in: wp.array[float],
     clearance_in: wp.array[float],
+    must_lift_in: wp.array[int],
     # In/Out:
     previous_error: wp.array[float],
     # Out:
@@ -131,7 +130,8 @@ def reward_kernel(
     + c4 sum_j abs(qd_j tau_j) + c5 [fell] + c6 [table force > limit]
     + c7 sum_i [tip_i.z > height_limit] + progress (previous_error - error)
     + lift clamp(clearance / lift_height, 0, 1)).
-    Success: the rotation error and all speeds are at most their thresholds. Fall: the object's distance
+    Success: the rotation error and all speeds are at most their thresholds, without contact with the table
+    where that is asked for. Fall: the object's distance
     from fall_center is at least fall_distance. ``previous_error`` becomes the present error; the reset
     kernel starts it anew with each goal.
 
@@ -146,6 +146,7 @@ def reward_kernel(
         smoothed_in: Smoothed action, shape [N, D].
         table_force_in: Magnitude of the object's force on the table [N], shape [N].
         clearance_in: Height of the object's lowest point above the table's top [m], shape [N].
+        must_lift_in: 1 where the object must not touch the table for success, shape [N].
         previous_error: Rotation error of the last step [rad], shape [N].
         reward_out: Reward, shape [N].
         terms_out: Terms with their coefficients, without scale, columns REWARD_TERMS, shape [N, 9].
@@ -196,7 +197,7 @@ def reward_kernel(
         and within(wp.length(velocity), limits.object_speed)
         and within(wp.length(spin), limits.object_spin)
         and within(action_norm, limits.action_norm)
-        and not (limits.no_table_contact != 0 and touches)
+        and not (must_lift_in[world] != 0 and touches)
     )
     fell = limits.fall_distance > 0.0 and wp.length(position - limits.fall_center) >= limits.fall_distance
 

@@ -18,7 +18,7 @@ from vd.envs.cfg import (
     TableCfg,
 )
 from vd.envs.reorient import ReorientEnv
-from vd.envs.table import ALWAYS, table_steps
+from vd.envs.table import ALWAYS, must_lift, table_steps
 from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
 from vd.kernels.shapes import (
     EXTENT_CENTRE_M,
@@ -135,6 +135,29 @@ def test_times_of_tables_lie_between_their_bounds():
         ReorientCfg(table=TableCfg(away_share=0.3, away_s=(3.0, 1.0))).validate()
     with pytest.raises(ValueError, match=r"table\.away_share"):
         ReorientCfg(table=TableCfg(away_share=3.0)).validate()
+
+
+def test_worlds_that_must_lift_are_those_that_lose_their_table_first():
+    cfg = ReorientCfg(num_worlds=1000, table=TableCfg(away_share=0.3, lift_share=0.5))
+    away, lift = table_steps(cfg) < ALWAYS, must_lift(cfg) == 1
+    assert away.sum() == 300 and lift.sum() == 500 and lift[away].all()
+    assert not must_lift(dataclasses.replace(cfg, table=TableCfg(away_share=0.3))).any()
+    assert must_lift(dataclasses.replace(cfg, success=SuccessCfg(no_table_contact=True))).all()
+    with pytest.raises(ValueError, match=r"table\.lift_share"):
+        ReorientCfg(table=TableCfg(lift_share=-0.1)).validate()
+
+
+def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
+    """Objects at rest on the table, each at its goal: half of the worlds must lift theirs."""
+    loose = SuccessCfg(rotation_rad=4.0, joint_speed_rad_s=0.0, action_norm=0.0)
+    env = make(table=TableCfg(lift_share=0.5), success=loose, num_worlds=8)
+    lift = must_lift(env.cfg) == 1
+    reached = np.zeros(8, dtype=int)
+    for _ in range(24):
+        env.step(env.action)
+        still = env.sim.table_force.numpy() > PAPER.reward.table_contact_force_n
+        reached += env.success.numpy() * still
+    assert (reached[~lift] > 0).all() and not reached[lift].any()
 
 
 def test_a_success_gives_a_new_goal_without_a_reset():

@@ -48,7 +48,6 @@ SUCCESS = {
     "object_speed": PAPER.success.object_speed_m_s,
     "object_spin": PAPER.success.object_spin_rad_s,
     "action_norm": PAPER.success.action_norm,
-    "no_table_contact": 0,
     "fall_distance": PAPER.success.fall_m,
     "fall_center": wp.vec3(*PAPER.scene.goal_position_m),
 }
@@ -68,6 +67,7 @@ def rest(fingers=3, worlds=1):
         "smoothed": np.zeros((worlds, joints)),
         "table_force": np.zeros(worlds),
         "clearance": np.zeros(worlds),
+        "must_lift": np.zeros(worlds, np.int32),
         "previous_error": np.zeros(worlds),
     }
 
@@ -97,6 +97,7 @@ def evaluate(device, state, reward=None, success=None):
             device_array(state["smoothed"], float, device),
             device_array(state["table_force"], float, device),
             device_array(state["clearance"], float, device),
+            device_array(state["must_lift"], int, device),
             previous,
         ],
         outputs=list(out.values()),
@@ -134,8 +135,7 @@ def oracle(state, reward, success):
     for name in STILLNESS:
         if success[name] > 0:
             reached &= margins[name] >= 0
-    if success["no_table_contact"]:
-        reached &= contact_margin <= 0
+    reached &= (contact_margin <= 0) | (s["must_lift"] == 0)
     fell = (success["fall_distance"] > 0) & (fall_distance >= success["fall_distance"])
     terms = np.stack(
         [
@@ -175,6 +175,7 @@ def states(draw: st.DrawFn) -> dict[str, np.ndarray]:
         "smoothed": draw(floats((worlds, joints), -0.5, 0.5)),
         "table_force": draw(floats((worlds,), 0.0, 1.0)),
         "clearance": draw(floats((worlds,), -0.1, 0.1)),
+        "must_lift": np.array(draw(st.lists(st.integers(0, 1), min_size=worlds, max_size=worlds))),
         "previous_error": draw(floats((worlds,), 0.0, 3.0)),
     }
 
@@ -187,16 +188,13 @@ def states(draw: st.DrawFn) -> dict[str, np.ndarray]:
     progress=st.sampled_from([0.0, 20.0]),
     lift=st.sampled_from([(0.0, 0.02), (3.0, 0.02), (3.0, 0.2)]),
     scale=st.sampled_from([1.0, 0.01]),
-    in_air=st.integers(0, 1),
     tolerance=st.sampled_from([0.4, 0.1, 2.0]),
     disabled=st.sets(st.sampled_from([*STILLNESS, "fall_distance"])),
 )
-def test_terms_match_the_equations(
-    device, state, form, clip, progress, lift, scale, in_air, tolerance, disabled
-):
+def test_terms_match_the_equations(device, state, form, clip, progress, lift, scale, tolerance, disabled):
     reward = {**REWARD, "fingertip_form": form, "energy_clip": clip, "progress": progress, "scale": scale}
     reward |= {"lift": lift[0], "lift_height": lift[1]}
-    success = {**SUCCESS, "no_table_contact": in_air, "rotation": tolerance, **dict.fromkeys(disabled, 0.0)}
+    success = {**SUCCESS, "rotation": tolerance, **dict.fromkeys(disabled, 0.0)}
     out = evaluate(device, state, reward, success)
     terms, error, reached, fell, decided = oracle(state, reward, success)
     np.testing.assert_allclose(out["error"], error, atol=2e-3)
@@ -272,14 +270,13 @@ def test_success_includes_its_rotation_threshold(device, offset, succeeds):
     assert evaluate(device, state, success={"rotation": threshold})["success"][0] == succeeds
 
 
-def test_contact_at_its_threshold_is_none_and_above_it_spoils_success_in_air(device):
-    state = rest(worlds=3)
-    state["table_force"] = np.array([0.0, 0.25, 0.26])
-    on_table = evaluate(device, state, {"table_contact_force": 0.25})
-    in_air = evaluate(device, state, {"table_contact_force": 0.25}, {"no_table_contact": 1})
-    np.testing.assert_array_equal(on_table["terms"][:, 5], [0, 0, -1])
-    np.testing.assert_array_equal(on_table["success"], [1, 1, 1])
-    np.testing.assert_array_equal(in_air["success"], [1, 1, 0])
+def test_contact_at_its_threshold_is_none_and_above_it_spoils_success_where_lifting_is_asked(device):
+    state = rest(worlds=6)
+    state["table_force"] = np.tile([0.0, 0.25, 0.26], 2)
+    state["must_lift"] = np.repeat([0, 1], 3)
+    out = evaluate(device, state, {"table_contact_force": 0.25})
+    np.testing.assert_array_equal(out["terms"][:, 5], [0, 0, -1, 0, 0, -1])
+    np.testing.assert_array_equal(out["success"], [1, 1, 1, 1, 1, 0])
 
 
 def test_fall_is_at_its_distance_and_can_be_switched_off(device):

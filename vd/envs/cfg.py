@@ -116,17 +116,21 @@ class StartCfg:
 
 @dataclass(frozen=True)
 class TableCfg:
-    """Ours: worlds in which the table is taken away in an episode, as in-air tests do; none by default."""
+    """Ours: worlds whose table is taken away, as in in-air tests, or does not help; none by default."""
 
     away_share: float = 0.0
     """Share of the worlds whose episodes lose the table; the same worlds throughout."""
     away_s: tuple[float, float] = (PAPER.scene.air_table_s, PAPER.scene.air_table_s)
     """Times in the episode at which it goes, uniform over these worlds [s]."""
+    lift_share: float = 0.0
+    """Share of the worlds in which success asks that the object does not touch the table: those that lose
+    it first, then others. success.no_table_contact asks it of all."""
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        if not 0.0 <= self.away_share <= 1.0:
-            raise ValueError(f"table.away_share is {self.away_share:g}; it has to lie within 0 and 1")
+        for name in ("away_share", "lift_share"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"table.{name} is {getattr(self, name):g}; it has to lie within 0 and 1")
         if not 0.0 < self.away_s[0] <= self.away_s[1]:
             raise ValueError(
                 f"table.away_s is {self.away_s[0]:g} {self.away_s[1]:g}; it has to rise, and be positive"

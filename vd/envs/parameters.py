@@ -115,7 +115,6 @@ class TaskParameters:
             object_speed=threshold(success.object_speed_m_s, loose.object_speed_m_s),
             object_spin=threshold(success.object_spin_rad_s, loose.object_spin_rad_s),
             action_norm=threshold(success.action_norm, loose.action_norm),
-            no_table_contact=int(success.no_table_contact),
             fall_distance=success.fall_m,
             fall_center=np.array(PAPER.scene.goal_position_m, dtype=np.float32),
         )

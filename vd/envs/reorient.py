@@ -24,7 +24,7 @@ from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
 from vd.envs.state import load_state, save_failed_step, save_state
 from vd.envs.symmetry import Views
-from vd.envs.table import table_array
+from vd.envs.table import must_lift, table_array
 from vd.kernels.actions import apply_action_kernel, joint_effort_kernel
 from vd.kernels.guard import void_step_kernel
 from vd.kernels.observations import fingertip_kernel, teacher_observation_kernel, teacher_observation_size
@@ -139,11 +139,9 @@ class ReorientEnv:
 
         self.previous_error = zeros(n)
         """Rotation error at the end of the last step, for the progress in it [rad], shape [N]."""
-        self._reset = zeros(n, dtype=wp.int32)
-        self._new_goal = zeros(n, dtype=wp.int32)
+        self._reset, self._new_goal = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
         self._world_mask = zeros(n + 1, dtype=wp.bool)
-        self._given_start = zeros(n, dtype=wp.quat)
-        self._given_goal = zeros(n, dtype=wp.quat)
+        self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._lower, self._upper = array(self.hand.lower), array(self.hand.upper)
         self._effort_limit = array(self.hand.effort)
         self.tip_body = array(self.scene.link_body[self.hand.tip_link], wp.int32)
@@ -159,6 +157,7 @@ class ReorientEnv:
         self.acts_in_view = True
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
         self._table_steps = table_array(cfg, self.device)
+        self._must_lift = array(must_lift(cfg), wp.int32)
         self.nudges = Nudges(cfg, d, n, self.device) if cfg.nudge.enabled else None
         """What moves hands that are stuck, or None: they stay as they are."""
         self._shapes = ShapeObserver(self)
@@ -283,6 +282,7 @@ class ReorientEnv:
                 self.smoothed,
                 sim.table_force,
                 self.clearance,
+                self._must_lift,
                 self.previous_error,
             ],
             outputs=[self.reward, self.reward_terms, self.rotation_error, self.success, self.fell],

@@ -1,4 +1,4 @@
-"""Tables that are taken away during an episode."""
+"""Tables that are taken away during an episode, and worlds in which they must not be touched."""
 
 import numpy as np
 import warp as wp
@@ -19,6 +19,16 @@ def table_steps(cfg: ReorientCfg) -> np.ndarray:
     away = draw.permutation(n) < round(table.away_share * n)
     steps = np.maximum(1, np.round(draw.uniform(*table.away_s, size=n) * cfg.sim.control_hz))
     return np.where(away, steps, ALWAYS).astype(np.int32)
+
+
+def must_lift(cfg: ReorientCfg) -> np.ndarray:
+    """1 where success asks that the object does not touch the table, int32, shape [N].
+
+    Worlds are chosen in the order of :func:`table_steps`: of two shares the smaller is a part of the larger.
+    """
+    n = cfg.num_worlds
+    share = 1.0 if cfg.success.no_table_contact else cfg.table.lift_share
+    return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
 
 
 def table_array(cfg: ReorientCfg, device: str) -> wp.array | None:
