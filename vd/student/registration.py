@@ -35,7 +35,8 @@ GRID = 32
 BEYOND_M = 0.02
 """How far that grid reaches beyond the shape [m]."""
 ON_MESH_M = 1e-3
-"""A mesh is a shape's surface if the samples are no farther from it than this; that of a scan is its hull."""
+"""A mesh is a shape's surface if the samples are no farther from it than this, root mean square: one that was
+simplified misses a few by more. That of a scan is its hull."""
 FAR_M = 0.012
 """Length at which distances are cut off [m]: what is farther is no point of the object."""
 CELL_PX = 4.0
@@ -134,7 +135,7 @@ class Registration:
         mesh = array([mesh.id for mesh in meshes], wp.uint64)
         off = wp.empty(samples.shape[:2], dtype=float, device=device)
         self._launch(off_mesh_kernel, off.shape, [shapes.samples, mesh], [off])
-        meshed = array(off.numpy().max(axis=1) < ON_MESH_M, wp.int32)
+        meshed = array(np.sqrt(np.square(off.numpy()).mean(axis=1)) < ON_MESH_M, wp.int32)
         self._launch(
             shape_distance_kernel,
             shapes.distance.shape,
