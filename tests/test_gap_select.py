@@ -407,6 +407,18 @@ def test_a_search_that_comes_back_to_where_it_began_ends() -> None:
     assert found.effects == ("coulomb_friction",) and rounds == [1, 2]
 
 
+@pytest.mark.parametrize(("whole", "most"), [(30.0, 1.1), (70.0, 1.4), (200.0, 2.0)])
+def test_beside_a_large_gap_a_little_more_than_noise_begins_no_search(whole: float, most: float) -> None:
+    """In noise floors; a right model leaves 1.3 beside a gap of 70 where times are good to 0.1 ms."""
+    selection, _ = searching([])
+    selection.refined = lambda fit: fit  # type: ignore[method-assign]
+    selection.whole, pairs = whole * FLOOR, np.full(10, 400.0)
+    for left, ends in ((0.98, True), (1.02, False)):
+        fit = made_up(("coulomb_friction",), left * most * FLOOR)
+        fit = replace(fit, structure=np.stack([0.05 * FLOOR**2 * pairs, pairs]))
+        assert selection.noise_only(fit) is ends
+
+
 def test_a_search_that_fails_is_repeated_before_it_counts() -> None:
     present = made_up(("backlash",), 0.004)
     selection, seeds = searching([0.030, 0.00401, 0.0])

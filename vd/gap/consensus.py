@@ -8,7 +8,7 @@ from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import NAMED, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import CONTAINED_FLOORS, MIN_GAIN, RANDOM, SMALL_EXCESS_FLOORS
+from vd.gap.judge import AT_FLOOR, CONTAINED_FLOORS, MIN_GAIN, RANDOM, SMALL_EXCESS_FLOORS
 from vd.gap.verdict import UNEXPLAINED, explains
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
         baseline, fit = search.run(
             [search.plain(baseline), search.call(baseline, effects, [fit.values], FULL_ITERATIONS)]
         )
-    if fit.at_bound or not search.noise_only(fit):
+    if fit.at_bound or not search.noise_only(fit, AT_FLOOR):
         return None
     others = [name for name in search.candidates if name not in {*effects, *search.vetoes, RANDOM}]
     added = [start for name in others for start in sizes(name, search.others, search.scales)]

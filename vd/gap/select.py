@@ -16,7 +16,7 @@ from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.frictions import EXACTLY, Frictions
 from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import ONE_SIDED, JointFit
-from vd.gap.judge import EXPLAINED, NESTED, RANDOM, REPEATABLE, SHARP
+from vd.gap.judge import EXPLAINED, MIN_SHARE, NESTED, RANDOM, REPEATABLE, SHARP
 from vd.gap.telemetry import BEHIND_SENSOR
 from vd.gap.verdict import cancelled
 
@@ -113,7 +113,8 @@ class Selection(Frictions):
             rivals = {name: self.rivals(present, name) for name in present.effects}
         beside: tuple[Accepted, ...] = ()
         # What is fitted well leaves none to chance, nor does a spring.
-        if not self.no_gap(present) and not self.white(present) and not self.a_spring(present):
+        fitted = self.no_gap(present) or self.white(present) or self.noise_only(present)
+        if not fitted and not self.a_spring(present):
             chance, beside, rows = try_random(self, baseline, present)
             trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
             if chance is not present:
@@ -351,9 +352,18 @@ class Selection(Frictions):
         """Whether a model is near enough to stand for a cause that the table has not: it is no answer."""
         return present.rmse < NEAR * self.floor and bool(cancelled(present, self.joint, self.rest))
 
-    def noise_only(self, present: JointFit) -> bool:
-        """Whether a model leaves noise on what it was fitted to: no other search finds a better one."""
-        return self.white(present) and not self.lack_of_fit(self.refined(present))
+    def noise_only(self, present: JointFit, floors: float = EXPLAINED) -> bool:
+        """Whether a model leaves noise on what it was fitted to: no other search finds a better one.
+
+        Beside a gap of some sixty noise floors a little more than noise is what no fit is better than: the
+        times of a recording are good to 0.1 ms, a milliradian where a joint is fast.
+
+        Args:
+            present: The model.
+            floors: Error up to which it may be noise, in noise floors.
+        """
+        best = max(floors * self.floor, min(MIN_SHARE * self.whole, REPEATABLE * self.floor))
+        return (self.veiled or present.rmse < best) and not self.lack_of_fit(self.refined(present))
 
     def whitens(self, before: JointFit, after: JointFit) -> bool:
         """Whether a larger model leaves noise where the smaller leaves structure.
