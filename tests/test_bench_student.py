@@ -9,7 +9,7 @@ import torch
 
 from vd.assets_usd.objects.model import load_set
 from vd.bench.cli import StudentCommand
-from vd.bench.student import Scenes, measure_training, take_turns
+from vd.bench.student import Scenes, measure_training, open_network, take_turns
 from vd.bench.student_twins import DenseEncoder, scattered, voxels_per_cell
 from vd.student.cfg import LEAN
 from vd.student.clouds import Voxeliser
@@ -33,16 +33,19 @@ def test_latency_row_and_what_is_missing(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "spconv", None)
     monkeypatch.setitem(sys.modules, "spconv.pytorch", None)
     out = tmp_path / "rows.json"
-    StudentCommand(networks=("lean",), objects=("cube",), hand="dclaw3", calls=2, threads=1, json=out).run()
-    (row,) = json.loads(out.read_text())["latency"]
+    networks = ("lean", "dclaw3-student")
+    StudentCommand(networks=networks, objects=("cube",), hand="dclaw3", calls=2, threads=1, json=out).run()
+    row, installed = json.loads(out.read_text())["latency"]
+    # the installed one is of the same network, and has its teacher's layers besides
+    assert installed["points"] == row["points"] and installed["parameters"] > row["parameters"]
     assert row["points"] == 500 + 12 * 500 + 6000
     assert 1000 < row["voxels"] < 500 + 12 * 500
     assert row["sites"] == sorted(row["sites"], reverse=True) and len(row["sites"]) == 5
     assert 0.0 < row["median_ms"] <= row["p99_ms"]
     assert set(row["encoder_ms"]) == set(row["encoder_cpu_ms"]) == {"ours", "per offset", "dense"}
-    assert row["cpu_ms"] > 0.0
+    assert row["cpu_ms"] > 0.0 and set(row["parts_cpu_ms"]) == set(row["parts_ms"])
     assert "spconv" in row["missing"]
-    assert json.loads(capsys.readouterr().out.splitlines()[-1])["network"] == "lean"
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["network"] == "dclaw3-student"
 
 
 def test_training_row(device):
@@ -90,3 +93,5 @@ def test_turns_are_taken():
 def test_refuses_an_unknown_network():
     with pytest.raises(ValueError, match="paper"):
         StudentCommand(networks=("fat",)).run()
+    with pytest.raises(ValueError, match="a teacher"):
+        open_network("dclaw3-table", "dclaw3")

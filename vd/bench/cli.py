@@ -163,7 +163,7 @@ class StudentCommand:
     """
 
     networks: tuple[str, ...] = ("lean", "paper")
-    """Presets to measure."""
+    """Presets to measure; for the latency also students, installed ones by name, or their files."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets."""
     hand: str = "dclaw4"
@@ -189,12 +189,17 @@ class StudentCommand:
 
         from vd.assets_usd.objects.model import load_set
         from vd.bench.student import measure_latency, measure_training
+        from vd.evaluate.agents import SHIPPED_POLICIES
         from vd.files import write_json
         from vd.student.cfg import PRESETS
 
+        presets = [name for name in self.networks if name in PRESETS]
         for name in self.networks:
-            if name not in PRESETS:
-                raise ValueError(f"--networks {name}: no such preset; choose of {', '.join(PRESETS)}")
+            if name not in presets and name not in SHIPPED_POLICIES and not Path(name).exists():
+                raise ValueError(
+                    f"--networks {name}: no such preset or student; choose of {', '.join(PRESETS)}, or give "
+                    "a student.pt"
+                )
         wp.config.log_level = wp.LOG_WARNING
         device = choose_device(self.device)
         objects = load_set(list(self.objects))
@@ -220,7 +225,7 @@ class StudentCommand:
                 ),
             )
         training = device != "cpu" or self.device == "cpu"
-        for name in self.networks if training else ():
+        for name in presets if training else ():
             for worlds in self.worlds:
                 for half in (True, False):
                     row = measure_training(

@@ -20,6 +20,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.bench.depth import JOINT_SPREAD_RAD, OBJECT_HEIGHT_M, bench_scene
 from vd.bench.student_twins import DenseEncoder, SpconvEncoder, scattered
+from vd.evaluate.agents import open_policy
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
@@ -29,6 +30,7 @@ from vd.student.cfg import PRESETS, NoiseCfg
 from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
 from vd.student.network import Student
 from vd.student.object_sense import ObjectSense
+from vd.student.saved import SavedStudent
 from vd.student.sites import Sites
 
 WARM_UP = 5
@@ -42,7 +44,7 @@ class LatencyRow:
     """One control step of one network on the CPU."""
 
     network: str
-    """Preset."""
+    """Preset, or the student."""
     parameters: int
     """Numbers in the network."""
     precision: str
@@ -63,6 +65,8 @@ class LatencyRow:
     """The same, processor time of all threads, median: other programs on the machine do not lengthen it."""
     parts_ms: dict[str, float] = field(default_factory=dict)
     """Medians of its parts."""
+    parts_cpu_ms: dict[str, float] = field(default_factory=dict)
+    """The same, processor time of all threads."""
     encoder_ms: dict[str, float] = field(default_factory=dict)
     """Voxels to pooled features, maps included: ours, the others of ``student_twins``; medians."""
     encoder_cpu_ms: dict[str, float] = field(default_factory=dict)
@@ -192,6 +196,21 @@ class ControlStep:
         return self.act()
 
 
+def open_network(name: str, hand: str) -> tuple[Student, str]:
+    """A preset for a hand, with random weights; or a student, installed or in a file, and its own hand.
+
+    Raises:
+        FileNotFoundError: There is neither.
+        ValueError: It is no student.
+    """
+    if name in PRESETS:
+        return Student(PRESETS[name], load_hand(hand).num_joints).eval(), hand
+    saved = open_policy(name, "cpu")
+    if not isinstance(saved, SavedStudent):
+        raise ValueError(f"--networks {name}: a teacher has no clouds; give a preset or a student")
+    return saved.network.eval(), str(saved.task["hand"])
+
+
 def measure_latency(
     objects: list[ObjectModel],
     network: str,
@@ -206,8 +225,8 @@ def measure_latency(
 
     Args:
         objects: The first of them lies on the table.
-        network: Preset.
-        hand: Hand.
+        network: Preset, or a student: the name of an installed one or a file.
+        hand: Hand of a preset; a student has its own.
         threads: Threads of torch.
         half: Encoder in bfloat16; the others it is timed beside stay in float32.
         calls: Control steps to time.
@@ -215,7 +234,7 @@ def measure_latency(
     """
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
-    net = Student(PRESETS[network], load_hand(hand).num_joints).eval()
+    net, hand = open_network(network, hand)
     offsets = scattered(net.encoder)
     if half:
         net.encoder.bfloat16()
@@ -264,6 +283,7 @@ def measure_latency(
         p99_ms=float(np.percentile(whole[:, 0], 99)),
         cpu_ms=float(np.median(whole[:, 1])),
         parts_ms={name: float(np.median(times[:, 0])) for name, times in parts.items()},
+        parts_cpu_ms={name: float(np.median(times[:, 1])) for name, times in parts.items()},
         encoder_ms={name: float(np.median(times[:, 0])) for name, times in beside.items()},
         encoder_cpu_ms={name: float(np.median(times[:, 1])) for name, times in beside.items()},
         missing=missing,
