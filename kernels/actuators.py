@@ -8,9 +8,12 @@ apply ``stiffness (reference - q) - damping qd + torque`` with the damping treat
 ``friction`` as the bound of a dry friction force, so that a light joint holds still at coarse steps.
 Filter and profile give their mean over the step, as does a command that arrives within it.
 
-Parameters and states are rows of columns (``PARAMETER_*``, ``STATE_*``) of one joint in one world.
+Parameters and states are rows of columns (``PARAMETER_*``, ``STATE_*``) of one joint in one world; the
+parameters' are in an array, or in a matrix that a kernel has read once.
 SI units, radians; time in seconds since the joint was switched on.
 """
+
+from typing import Any
 
 import warp as wp
 
@@ -142,7 +145,7 @@ def dead_zone(error: float, width: float) -> float:
 
 @wp.func
 def motor_torque(
-    wanted: float, speed: float, time: float, effort: float, parameters: wp.array2d[float], row: int
+    wanted: float, speed: float, time: float, effort: float, parameters: Any, row: int
 ) -> wp.vec3:
     """What the motor gives when the controller wants ``wanted`` [N m] at ``speed`` [rad/s].
 
@@ -205,7 +208,7 @@ def motor_torque(
 
 
 @wp.func
-def dry_friction(motor: float, speed: float, parameters: wp.array2d[float], row: int) -> wp.vec2:
+def dry_friction(motor: float, speed: float, parameters: Any, row: int) -> wp.vec2:
     """Friction torque [N m]: Coulomb, Stribeck, load-dependent and asymmetric, added up.
 
     Friction F+ against positive motion and F- against negative motion is, in motion and at rest, a
@@ -236,7 +239,7 @@ def elastic_load(
     position: float,
     speed: float,
     dt: float,
-    parameters: wp.array2d[float],
+    parameters: Any,
     row: int,
     state: wp.array2d[float],
 ) -> wp.vec2:
@@ -284,7 +287,7 @@ def rest_play(
     position: float,
     load: float,
     power: float,
-    parameters: wp.array2d[float],
+    parameters: Any,
     row: int,
     state: wp.array2d[float],
 ):
@@ -311,7 +314,7 @@ def rest_play(
 
 @wp.func
 def shape_command(
-    command: float, dt: float, parameters: wp.array2d[float], row: int, state: wp.array2d[float]
+    command: float, dt: float, parameters: Any, row: int, state: wp.array2d[float]
 ) -> float:
     """The reference that firmware and transmission make of a command: filter, profile, backlash.
 
@@ -350,7 +353,7 @@ def drive_joint(
     power: float,
     dt: float,
     effort: float,
-    parameters: wp.array2d[float],
+    parameters: Any,
     row: int,
     state: wp.array2d[float],
 ) -> Servo:
@@ -427,12 +430,10 @@ def drive_joint(
     result.reference = reference
     result.stiffness = kp
     result.damping = damping + open_damping + load[1]
-    result.torque = (
-        steady
-        - parameters[row, GRAVITY_TORQUE] * wp.sin(position + parameters[row, GRAVITY_PHASE])
-        + load[0]
-        + friction[1]
-    )
+    weight = parameters[row, GRAVITY_TORQUE]
+    if weight != 0.0:
+        weight *= wp.sin(position + parameters[row, GRAVITY_PHASE])
+    result.torque = steady - weight + load[0] + friction[1]
     result.friction = friction[0]
     result.motor = carried
     result.motor_damping = wp.sign(motor[0]) * damping
@@ -447,7 +448,7 @@ def servo(
     speed: float,
     power: float,
     dt: float,
-    parameters: wp.array2d[float],
+    parameters: Any,
     row: int,
     state: wp.array2d[float],
 ) -> Servo:

@@ -15,6 +15,8 @@ A command takes the share of a step that remains when it arrives, so the motion 
 of its delay. SI units, radians; times are whole steps and a fraction, exact over any duration.
 """
 
+from typing import Any
+
 import warp as wp
 
 from vd.kernels.actuators import (
@@ -26,6 +28,7 @@ from vd.kernels.actuators import (
     JITTER_SIGMA,
     KP,
     LOAD_FRICTION,
+    PARAMETER_COLUMNS,
     PAYLOAD_INERTIA,
     READ_DELAY,
     STATE_TIME,
@@ -35,8 +38,6 @@ from vd.kernels.actuators import (
     shape_command,
     start_servo,
 )
-
-wp.set_module_options({"enable_backward": False})
 
 MAX_JOINTS = 3
 """Joints of a chain at most: Warp's vectors of three hold them."""
@@ -50,23 +51,37 @@ DIVERGED = 100.0
 """Distance from the start [rad] at which a rollout stops to mean anything and is held."""
 
 
+wp.set_module_options(
+    {
+        "enable_backward": False,
+        # Everything that a step reads is in registers or on the stack: no write makes it be read again.
+        "max_unroll": PARAMETER_COLUMNS,
+        # Vectors of three fill no register of a CPU: packing them costs more than it saves.
+        "optimization_level": 3,
+        "cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -fno-slp-vectorize",
+    }
+)
+Rows = wp.types.matrix(shape=(MAX_JOINTS, PARAMETER_COLUMNS), dtype=float)
+mat93 = wp.types.matrix(shape=(3 * MAX_JOINTS, 3), dtype=float)
+
+
 @wp.struct
 class Links:
     """Bodies of a chain, in the base frame with all joints at zero; rows beyond its joints are zero.
 
-    axis: Unit joint axes [MAX_JOINTS].
-    offset: From the joint before (the base, for the first) to the joint [MAX_JOINTS] [m].
-    mass: Masses of the links after each joint [MAX_JOINTS] [kg].
-    com: From the joint to the centre of mass [MAX_JOINTS] [m].
-    inertia: About the centre of mass [MAX_JOINTS] [kg m^2].
+    axis: Unit joint axes, one a row.
+    offset: From the joint before (the base, for the first) to the joint, one a row [m].
+    mass: Masses of the links after each joint [kg].
+    com: From the joint to the centre of mass, one a row [m].
+    inertia: About the centre of mass, three rows a link [kg m^2].
     gravity: Acceleration of gravity [m/s^2].
     """
 
-    axis: wp.array[wp.vec3]
-    offset: wp.array[wp.vec3]
-    mass: wp.array[float]
-    com: wp.array[wp.vec3]
-    inertia: wp.array[wp.mat33]
+    axis: wp.mat33
+    offset: wp.mat33
+    mass: wp.vec3
+    com: wp.mat33
+    inertia: mat93
     gravity: wp.vec3
 
 
@@ -119,19 +134,28 @@ def chain_dynamics(q: wp.vec3, speed: wp.vec3, links: Links):
                 if j < i:
                     levers[j] = turn * (levers[j] + wp.cross(axes[j], offset))
                     axes[j] = turn * axes[j]
-        omega = turn * omega + speed[i] * axis
+            omega = turn * omega
+        omega += speed[i] * axis
         acceleration = turn * acceleration
         axes[i] = axis
 
         arm = links.com[i]
-        inertia = links.inertia[i]
+        inertia = wp.matrix_from_rows(
+            links.inertia[3 * i], links.inertia[3 * i + 1], links.inertia[3 * i + 2]
+        )
         weight = links.mass[i]
-        force = weight * (acceleration + wp.cross(alpha, arm) + wp.cross(omega, wp.cross(omega, arm)))
-        moment = inertia * alpha + wp.cross(omega, inertia * omega)
+        pushed = acceleration
+        moment = wp.cross(omega, inertia * omega)
+        if i > 0:  # the base does not turn
+            pushed += wp.cross(alpha, arm)
+            moment = inertia * alpha + moment
+        force = weight * (pushed + wp.cross(omega, wp.cross(omega, arm)))
         moved = wp.mat33(0.0)
         for j in range(MAX_JOINTS):
             if j <= i:
-                lever = levers[j] + wp.cross(axes[j], arm)
+                lever = wp.cross(axes[j], arm)
+                if j < i:
+                    lever = levers[j] + lever
                 moved[j] = lever
                 bias[j] += wp.dot(axes[j], moment) + wp.dot(lever, force)
                 turned = inertia * axes[j]
@@ -167,7 +191,7 @@ def arrival(
     samples: Samples,
     write: int,
     stream: int,
-    parameters: wp.array2d[float],
+    parameters: Any,
     row: int,
     dt: float,
 ):
@@ -208,15 +232,19 @@ def friction_impulses(wanted: wp.vec3, inverse: wp.mat33, bound: wp.vec3, before
         if i < count:
             impulse[i] = wp.clamp(before[i], -bound[i], bound[i])
     speed = wanted + inverse * impulse
+    moved = wp.bool(True)
     for _sweep in range(FRICTION_SWEEPS):
-        for i in range(MAX_JOINTS):
-            if i < count:
-                new = wp.clamp(impulse[i] - speed[i] / inverse[i, i], -bound[i], bound[i])
-                change = new - impulse[i]
-                impulse[i] = new
-                for j in range(MAX_JOINTS):
-                    if j < count:
-                        speed[j] += inverse[j, i] * change
+        if moved:  # what a sweep leaves as it is the next would too
+            moved = wp.bool(False)
+            for i in range(MAX_JOINTS):
+                if i < count:
+                    new = wp.clamp(impulse[i] - speed[i] / inverse[i, i], -bound[i], bound[i])
+                    change = new - impulse[i]
+                    moved = moved or change != 0.0
+                    impulse[i] = new
+                    for j in range(MAX_JOINTS):
+                        if j < count:
+                            speed[j] += inverse[j, i] * change
     for i in range(MAX_JOINTS):
         if i < count and wp.abs(impulse[i]) < bound[i]:
             speed[i] = 0.0
@@ -266,7 +294,7 @@ def rollout_kernel(
     parameters: wp.array2d[float],
     dt: float,
     # Out:
-    state: wp.array2d[float],
+    state: wp.array3d[float],
     predicted: wp.array2d[float],
 ):
     """Simulate trajectories with parameter sets. Launch: [R].
@@ -287,7 +315,7 @@ def rollout_kernel(
         links: The links, if they have mass.
         parameters: Parameter rows by rollout and joint, shape [R n, PARAMETER_COLUMNS].
         dt: Time step [s].
-        state: Working memory, shape [R n, STATE_COLUMNS].
+        state: Working memory, shape [R, n, STATE_COLUMNS].
         predicted: Positions as the servo would have reported them, shape [S', n] or [S', 1] [rad].
     """
     run = wp.tid()
@@ -297,6 +325,16 @@ def rollout_kernel(
     end = begin + sample_count[run]
     to_output = first_output[run] - begin
     only = wanted[run]
+    memory = state[run]
+    rows = Rows(0.0)
+    coupling = wp.mat33(0.0)
+    for j in range(MAX_JOINTS):
+        if j < count:
+            for column in range(PARAMETER_COLUMNS):
+                rows[j, column] = parameters[base_row + j, column]
+            for i in range(MAX_JOINTS):
+                if i < count:
+                    coupling[j, i] = parameters[base_row + j, COUPLING_0 + slot[i]]
 
     q = wp.vec3(0.0)
     q_start = wp.vec3(0.0)
@@ -315,19 +353,18 @@ def rollout_kernel(
     dry = wp.int32(0)  # typed: it changes in a loop
     for j in range(MAX_JOINTS):
         if j < count:
-            row = base_row + j
-            q[j] = start[run, j] - parameters[row, ENCODER_BIAS]
+            q[j] = start[run, j] - rows[j, ENCODER_BIAS]
             q_start[j] = q[j]
             held[j] = samples.command[begin, j]
             held_power[j] = samples.power[begin, j]
-            start_servo(held[j], q[j], row, state)
-            state[row, STATE_TIME] = dt * float(samples.step[begin])
-            step, fraction, kept = arrival(samples, begin, stream[run], parameters, row, dt)
+            start_servo(held[j], q[j], j, memory)
+            memory[j, STATE_TIME] = dt * float(samples.step[begin])
+            step, fraction, kept = arrival(samples, begin, stream[run], rows, j, dt)
             due_step[j] = step
             due_fraction[j] = fraction
             due_kept[j] = kept
             step, fraction = split_steps(
-                samples.step[begin], samples.fraction[begin], -parameters[row, READ_DELAY] / dt
+                samples.step[begin], samples.fraction[begin], -rows[j, READ_DELAY] / dt
             )
             read_step[j] = step
             read_fraction[j] = fraction
@@ -336,13 +373,12 @@ def rollout_kernel(
         _resting, weight = chain_dynamics(q, wp.vec3(0.0), links)
     for j in range(MAX_JOINTS):
         if j < count:
-            row = base_row + j
             # What coupled joints add to the reference is a load in the units of the drive.
             load = -weight[j]
             for i in range(MAX_JOINTS):
                 if i < count and i != j:
-                    load += held_power[j] * parameters[row, KP] * parameters[row, COUPLING_0 + slot[i]] * q[i]
-            rest_play(held[j], q[j], load, held_power[j], parameters, row, state)
+                    load += held_power[j] * rows[j, KP] * coupling[j, i] * q[i]
+            rest_play(held[j], q[j], load, held_power[j], rows, j, memory)
 
     for k in range(samples.step[begin], samples.step[end - 1] + 1):
         # From rest at the first position to the velocity half a step later.
@@ -358,7 +394,6 @@ def rollout_kernel(
         loaded = wp.vec3(0.0)
         for j in range(MAX_JOINTS):
             if j < count:
-                row = base_row + j
                 # Commands that arrive within the step divide it; the reference is the mean over it.
                 reference = wp.float32(0.0)
                 power = held_power[j]
@@ -369,14 +404,14 @@ def rollout_kernel(
                         if due_step[j] == k:
                             part = due_fraction[j] - done
                         if part > 0.0:
-                            reference += part * shape_command(held[j], part * dt, parameters, row, state)
+                            reference += part * shape_command(held[j], part * dt, rows, j, memory)
                             done += part
                         power += (1.0 - done) * (samples.power[write[j], j] - held_power[j])
                         held[j] = samples.command[write[j], j]
                         held_power[j] = samples.power[write[j], j]
                     write[j] = write[j] + 1
                     if write[j] < end:
-                        step, fraction, kept = arrival(samples, write[j], stream[run], parameters, row, dt)
+                        step, fraction, kept = arrival(samples, write[j], stream[run], rows, j, dt)
                         # In order: no command overtakes the one before.
                         if step < due_step[j] or (step == due_step[j] and fraction < due_fraction[j]):
                             step = due_step[j]
@@ -390,14 +425,14 @@ def rollout_kernel(
                 if count > 1:
                     for i in range(MAX_JOINTS):
                         if i < count:
-                            coupled += parameters[row, COUPLING_0 + slot[i]] * q[i]
+                            coupled += coupling[j, i] * q[i]
                 before = wp.float32(0.0)
                 if done > 0.0:
                     before = reference / done + coupled
                 part = 1.0 - done
-                reference += part * shape_command(held[j], part * dt, parameters, row, state) + coupled
+                reference += part * shape_command(held[j], part * dt, rows, j, memory) + coupled
                 drive = drive_joint(
-                    reference, before, done, q[j], speed[j], power, dt, effort[j], parameters, row, state
+                    reference, before, done, q[j], speed[j], power, dt, effort[j], rows, j, memory
                 )
                 torque[j] = (
                     drive.stiffness * (drive.reference - q[j]) - drive.damping * speed[j] + drive.torque
@@ -405,11 +440,11 @@ def rollout_kernel(
                 damping[j] = drive.damping
                 stiffness[j] = drive.stiffness
                 bound[j] = kick * drive.friction
-                motor[j] = parameters[row, LOAD_FRICTION] * drive.motor
-                loaded[j] = parameters[row, LOAD_FRICTION] * drive.motor_damping
+                motor[j] = rows[j, LOAD_FRICTION] * drive.motor
+                loaded[j] = rows[j, LOAD_FRICTION] * drive.motor_damping
                 if drive.friction > 0.0:
                     dry = 1
-                diagonal[j] = parameters[row, INERTIA] + parameters[row, PAYLOAD_INERTIA]
+                diagonal[j] = rows[j, INERTIA] + rows[j, PAYLOAD_INERTIA]
 
         mass = wp.mat33(0.0)
         if bodies == 1:
@@ -440,8 +475,7 @@ def rollout_kernel(
                     new_speed, impulse = friction_impulses(free_speed, inverse, bound, impulse, count)
         for j in range(MAX_JOINTS):
             if j < count:
-                row = base_row + j
-                limit = parameters[row, VELOCITY_LIMIT]
+                limit = rows[j, VELOCITY_LIMIT]
                 v = wp.clamp(new_speed[j], -limit, limit)
                 last = q[j]
                 after = last + dt * v
@@ -458,7 +492,7 @@ def rollout_kernel(
                     share = 0.0
                     if read_step[j] == k:
                         share = read_fraction[j]
-                    position = last + share * (after - last) + parameters[row, ENCODER_BIAS]
+                    position = last + share * (after - last) + rows[j, ENCODER_BIAS]
                     if only < 0:
                         predicted[to_output + read[j], j] = position
                     elif only == j:
@@ -468,7 +502,7 @@ def rollout_kernel(
                         step, fraction = split_steps(
                             samples.step[read[j]],
                             samples.fraction[read[j]],
-                            -parameters[row, READ_DELAY] / dt,
+                            -rows[j, READ_DELAY] / dt,
                         )
                         read_step[j] = step
                         read_fraction[j] = fraction

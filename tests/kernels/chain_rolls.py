@@ -4,8 +4,9 @@ import numpy as np
 import warp as wp
 from kernel_oracle import device_array, unwritten
 
+from vd.gap.rollout import links_of
 from vd.kernels import actuators as servo
-from vd.kernels.chains import MAX_JOINTS, Links, Samples, rollout_kernel
+from vd.kernels.chains import Links, Samples, rollout_kernel
 from vd.kernels.effects import neutral_row
 
 DT = 1 / 480
@@ -29,20 +30,8 @@ def random_bodies(rng, n):
     }
 
 
-def links_struct(bodies, gravity, device):
-    links = Links()
-    for name, dtype in (
-        ("axis", wp.vec3),
-        ("offset", wp.vec3),
-        ("mass", float),
-        ("com", wp.vec3),
-        ("inertia", wp.mat33),
-    ):
-        rows = np.zeros((MAX_JOINTS, *bodies[name].shape[1:]))
-        rows[: len(bodies[name])] = bodies[name]
-        setattr(links, name, device_array(rows, dtype, device))
-    links.gravity = wp.vec3(*gravity)
-    return links
+def links_struct(bodies, gravity):
+    return links_of(**bodies, gravity=gravity)
 
 
 def rows_of(*settings, n=1):
@@ -85,7 +74,7 @@ def roll(
         """What belongs to a trajectory, for the rollouts of all sets."""
         return device_array(np.concatenate([values] * sets), dtype, device)
 
-    links = Links() if bodies is None else links_struct(bodies, gravity, device)
+    links = Links() if bodies is None else links_struct(bodies, gravity)
     parameters = np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS)
     predicted = unwritten((rolls * count, n), float, device)
     wp.launch(
@@ -108,7 +97,7 @@ def roll(
             device_array(parameters, float, device),
             dt,
         ],
-        outputs=[unwritten((len(parameters), servo.STATE_COLUMNS), float, device), predicted],
+        outputs=[unwritten((rolls, n, servo.STATE_COLUMNS), float, device), predicted],
         device=device,
     )
     result = predicted.numpy().astype(float)

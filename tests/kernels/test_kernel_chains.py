@@ -79,7 +79,7 @@ def test_mass_matrix_and_bias_are_mujocos(device, seed, n):
         inputs=[
             device_array(q, wp.vec3, device),
             device_array(speed, wp.vec3, device),
-            links_struct(bodies, GRAVITY, device),
+            links_struct(bodies, GRAVITY),
         ],
         outputs=[mass, bias],
         device=device,

@@ -29,6 +29,24 @@ CPU_BLOCK = 256
 _MAKING = threading.Lock()
 
 
+def links_of(
+    axis: np.ndarray,
+    offset: np.ndarray,
+    mass: np.ndarray,
+    com: np.ndarray,
+    inertia: np.ndarray,
+    gravity: np.ndarray,
+) -> Links:
+    """The bodies of a chain of up to ``MAX_JOINTS`` joints [n, ..] as kernels take them; see :class:`Links`."""
+    links = Links()
+    for name, values in (("axis", axis), ("offset", offset), ("mass", mass), ("com", com), ("inertia", inertia)):
+        rows = np.zeros((MAX_JOINTS, *values.shape[1:]))
+        rows[: len(values)] = values
+        setattr(links, name, type(getattr(links, name))(*rows.ravel().tolist()))
+    links.gravity = wp.vec3(*np.asarray(gravity, float).tolist())
+    return links
+
+
 @dataclass(frozen=True, eq=False)
 class Call:
     """One call of :meth:`Rollouts.predict`.
@@ -157,19 +175,7 @@ class Rollouts:
     def _links(self) -> tuple[Links, wp.array, wp.array, wp.array, wp.array]:
         """The links; slots; lower and upper stops; efforts."""
         chain = self.chain
-        links = Links()
-        for name, dtype in (
-            ("axis", wp.vec3),
-            ("offset", wp.vec3),
-            ("mass", float),
-            ("com", wp.vec3),
-            ("inertia", wp.mat33),
-        ):
-            values = getattr(chain, name)
-            rows = np.zeros((MAX_JOINTS, *values.shape[1:]))
-            rows[: len(values)] = values
-            setattr(links, name, wp.array(rows, dtype=dtype, device=self.device))
-        links.gravity = wp.vec3(*chain.gravity)
+        links = links_of(chain.axis, chain.offset, chain.mass, chain.com, chain.inertia, chain.gravity)
         slot = wp.array(chain.slot, dtype=int, device=self.device)
         bounds = (chain.lower, chain.upper, chain.effort)
         lower, upper, effort = (wp.array(v, dtype=float, device=self.device) for v in bounds)
@@ -260,7 +266,8 @@ class Rollouts:
                 each[order] for each in (parameters, trajectory, output, wanted)
             )
             block = CUDA_BLOCK
-        state = wp.empty((len(trajectory) * self.num_joints, servo.STATE_COLUMNS), dtype=float, device=device)
+        shape = (len(trajectory), self.num_joints, servo.STATE_COLUMNS)
+        state = wp.empty(shape, dtype=float, device=device)
         links, slot, lower, upper, effort = self._links
 
         def integers(values: np.ndarray) -> wp.array:
