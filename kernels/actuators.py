@@ -313,9 +313,7 @@ def rest_play(
 
 
 @wp.func
-def shape_command(
-    command: float, dt: float, parameters: Any, row: int, state: wp.array2d[float]
-) -> float:
+def shape_command(command: float, dt: float, parameters: Any, row: int, state: wp.array2d[float]) -> float:
     """The reference that firmware and transmission make of a command: filter, profile, backlash.
 
     Args:

@@ -260,11 +260,12 @@ class ReplayCommand:
 class GapCommand:
     """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
 
-    One result file per case: run it again to go on, give --shard on each machine, --collect for the figures.
+    One result file per case: run it again to go on, give --shard on each machine, then --merge and --collect
+    for the figures. rows.csv has all results in little space, to go on from elsewhere or later.
     """
 
     out: Path = Path("runs/gap-battery")
-    """Folder of the results, figures (summary.json) and tables (summary.md)."""
+    """Folder of the results, of all in one table (rows.csv), figures (summary.json) and tables."""
     model: str = "dclaw3"
     """dclaw3 or dclaw4 (one finger), or servo or pendulum, which are quick."""
     kinds: tuple[str, ...] = ("single", "none", "pair", "outside")
@@ -285,6 +286,10 @@ class GapCommand:
     """Size of both effects of a pair."""
     shard: str = "1/1"
     """Part i/n of the cases, for n machines."""
+    backwards: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Begin with the last case: two machines meet wherever they are when the time is over."""
+    merge: tuple[Path, ...] = ()
+    """Results from elsewhere, folders or their rows.csv: their cases are not run again."""
     jobs: int = 1
     """Cases at a time, one process and one thread each."""
     limit_s: float = 1800.0
@@ -300,7 +305,8 @@ class GapCommand:
 
     def run(self) -> int:
         """Run the cases, then write and print the tables."""
-        from vd.bench.gap import battery, collect, parse_shard, run_battery
+        from vd.bench.gap import battery, collect, parse_shard, run_battery, take_over
+        from vd.bench.gap_rows import write_rows
         from vd.bench.gap_score import markdown, summary
         from vd.files import write_json, write_text
 
@@ -315,6 +321,9 @@ class GapCommand:
             pairs=self.pairs,
             pair_size=self.pair_size,
         )
+        if self.merge:
+            self.out.mkdir(parents=True, exist_ok=True)
+            print(f"{take_over(self.merge, self.out)} results taken over")
         if not self.collect:
             device = choose_device(self.device)
             shard = parse_shard(self.shard)
@@ -322,6 +331,7 @@ class GapCommand:
                 cases,
                 self.out,
                 shard=shard,
+                backwards=self.backwards,
                 jobs=max(self.jobs, 1),
                 device=device,
                 keep=self.keep,
@@ -331,6 +341,7 @@ class GapCommand:
         results = collect(self.out)
         if not results:
             raise ValueError(f"{self.out} holds no results; run the battery without --collect first")
+        write_rows(self.out / "rows.csv", results)
         write_json(self.out / "summary.json", summary(results))
         write_text(self.out / "summary.md", markdown(results))
         print(markdown(results))

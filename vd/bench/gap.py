@@ -10,6 +10,7 @@ import itertools
 import json
 import math
 import shutil
+import time
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
@@ -20,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from vd.bench.gap_beside import beside
+from vd.bench.gap_rows import merged
 from vd.bench.gap_score import KINDS, Case, said, score
 from vd.bench.workers import run_tasks
 from vd.files import write_json
@@ -27,6 +29,7 @@ from vd.gap.hidden_plant import OUTSIDE
 from vd.gap.hide import simulate_hidden, write_hidden
 from vd.gap.recording import BARE_MODELS
 from vd.gap.sizes import GAPS, showing
+from vd.versions import source_commit
 
 PAIR_SIZE = 2
 """Size of both effects of a pair, some six noise floors each: from there on single effects are told apart."""
@@ -113,7 +116,8 @@ def run_case(case: Case, folder: Path, device: str = "cpu", keep: bool = False) 
         keep: Keep the recording and the analysis beside the result.
 
     Returns:
-        What :func:`score` returns; or the traceback under ``error``.
+        What :func:`score` returns, or the traceback under ``error``; with the commit and the processor time
+        of this process ``cpu_s`` [s].
     """
     import warp as wp
 
@@ -121,7 +125,7 @@ def run_case(case: Case, folder: Path, device: str = "cpu", keep: bool = False) 
     from vd.gap import workflow
 
     wp.config.log_level = wp.LOG_WARNING
-    work = folder / "work" / case.name
+    work, begin = folder / "work" / case.name, time.process_time()
     try:
         (hidden,) = simulate_hidden([case.hiding()])
         write_hidden(hidden, work / "recording")
@@ -134,6 +138,7 @@ def run_case(case: Case, folder: Path, device: str = "cpu", keep: bool = False) 
             result["beside"] = beside(case.hiding())
     except Exception:  # one case that fails is a figure of the battery, not its end
         result = {"case": asdict(case), "error": traceback.format_exc(limit=6)}
+    result |= {"commit": source_commit(), "cpu_s": time.process_time() - begin}
     if not keep:
         shutil.rmtree(work, ignore_errors=True)
     write_json(folder / f"{case.name}.json", result)
@@ -145,6 +150,7 @@ def run_battery(
     folder: Path,
     *,
     shard: tuple[int, int] = (0, 1),
+    backwards: bool = False,
     jobs: int = 0,
     device: str = "cpu",
     keep: bool = False,
@@ -158,6 +164,7 @@ def run_battery(
         cases: The battery.
         folder: Folder of results; those of all shards may lie in one.
         shard: (index, count): this process takes every ``count``-th case from ``index`` on.
+        backwards: The last case first: a second machine meets the first one half way.
         jobs: Processes; 0 runs the cases in this one, without limits of time.
         device: Warp device of the analyses.
         keep: Keep recordings and analyses.
@@ -169,7 +176,7 @@ def run_battery(
         The results of the shard's cases, in order.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    mine = list(cases[shard[0] :: shard[1]])
+    mine = list(cases[shard[0] :: shard[1]])[:: -1 if backwards else 1]
     done = {case: read_result(folder / f"{case.name}.json") for case in mine}
     failed = [case for case in mine if "error" in (done[case] or {})]
     open_cases = [*(case for case in mine if done[case] is None), *failed]
@@ -222,6 +229,23 @@ def read_result(path: Path) -> dict[str, Any] | None:
         return json.loads(path.read_text())
     except (OSError, ValueError):
         return None
+
+
+def take_over(sources: Sequence[Path], folder: Path) -> int:
+    """Add results of other folders, or of their ``rows.csv``, to a folder; returns how many are new to it.
+
+    Raises:
+        ValueError: A source is no folder or table, or is damaged.
+    """
+    new = 0
+    for result in merged(sources):
+        case = Case(**{**result["case"], "effects": tuple(result["case"]["effects"])})
+        path = folder / f"{case.name}.json"
+        known = read_result(path)
+        if known is None or ("error" in known and "error" not in result):
+            write_json(path, result)
+            new += 1
+    return new
 
 
 def collect(folder: Path) -> list[dict[str, Any]]:

@@ -1,6 +1,8 @@
 """Processes for many long tasks of unequal length: one that hangs or dies costs its own task only."""
 
+import multiprocessing
 import os
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -110,11 +112,20 @@ def run_tasks(
 
 def _serve(work: Callable[[Any], Any], pipe: connection.Connection) -> None:
     """A worker: tasks in, results out, until the other end closes."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
         while True:
             pipe.send(work(pipe.recv()))
     except (EOFError, OSError, KeyboardInterrupt):
         return
+
+
+def _end_with_parent() -> None:
+    """End this process in the middle of its task once its parent is gone: nobody waits for the result."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
 
 
 @contextmanager

@@ -37,9 +37,15 @@ def links_of(
     inertia: np.ndarray,
     gravity: np.ndarray,
 ) -> Links:
-    """The bodies of a chain of up to ``MAX_JOINTS`` joints [n, ..] as kernels take them; see :class:`Links`."""
+    """The bodies of a chain of n joints [n, ..], ``MAX_JOINTS`` at most, as kernels take them (:class:`Links`)."""
     links = Links()
-    for name, values in (("axis", axis), ("offset", offset), ("mass", mass), ("com", com), ("inertia", inertia)):
+    for name, values in (
+        ("axis", axis),
+        ("offset", offset),
+        ("mass", mass),
+        ("com", com),
+        ("inertia", inertia),
+    ):
         rows = np.zeros((MAX_JOINTS, *values.shape[1:]))
         rows[: len(values)] = values
         setattr(links, name, type(getattr(links, name))(*rows.ravel().tolist()))
