@@ -291,3 +291,38 @@ def test_every_sample_is_predicted_wherever_its_stamp_falls_within_a_step(rate, 
         del left  # memory that the predictions are likely to get
         predicted = Rollouts(chain, found, dt=1.0 / rate).predict(chain.start_row[None])
         np.testing.assert_allclose(predicted, 0.1, atol=1e-5)
+
+
+def test_what_was_simulated_a_short_while_ago_is_the_same(monkeypatch):
+    """Asked for again, in another order, with others, of all joints or one, rollouts are those made anew."""
+    motions = recording("servo", ("joint",), *(trajectory(f"m{i}", wave(phase=i)) for i in range(3)))
+    chain = chains(motions, None)[0]
+    rows = np.repeat(chain.start_row[None], 5, axis=0)
+    rows[:, 0, servo.KP] *= np.linspace(0.8, 1.2, 5)
+    rollouts = Rollouts(chain, motions)
+    first = rollouts.predict(rows[:4], [0, 2])
+    launched = []
+    launch = Rollouts._launch
+    monkeypatch.setattr(Rollouts, "_launch", lambda self, *a: (launched.append(len(a[1])), launch(self, *a)))
+    again = rollouts.predict(rows[[4, 2, 0]], [2, 0])
+    assert launched == [2]
+    one = rollouts.predict(rows[[4, 2, 0]], [2, 0], joint=0)
+    assert launched == [2, 6], "a single joint's are kept apart"
+    fresh = Rollouts(chain, motions).predict(rows[[4, 2, 0]], [2, 0])
+    np.testing.assert_array_equal(again, fresh)
+    np.testing.assert_array_equal(one, fresh[:, :, 0])
+    again[:] = np.nan
+    np.testing.assert_array_equal(rollouts.predict(rows[:4], [0, 2]), first)
+
+
+def test_few_rollouts_are_kept(monkeypatch):
+    monkeypatch.setattr("vd.gap.rollout.RECALLED", 3)
+    motions = recording("servo", ("joint",), *(trajectory(f"m{i}", wave(phase=i)) for i in range(3)))
+    chain = chains(motions, None)[0]
+    rows = np.repeat(chain.start_row[None], 5, axis=0)
+    rows[:, 0, servo.KP] *= np.linspace(0.8, 1.2, 5)
+    rollouts = Rollouts(chain, motions)
+    first = rollouts.predict(rows, [0])
+    assert len(rollouts._recent) == 3
+    np.testing.assert_array_equal(rollouts.predict(rows, [0]), first)
+    assert len(rollouts._recent) == 3

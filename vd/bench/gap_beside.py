@@ -16,7 +16,7 @@ from vd.gap.sizes import CALIBRATION_STEP_S, nudged
 
 NUDGE = 0.05
 """Relative change of an effect's parameter for its sensitivity."""
-BATCH = 2
+BATCH = 8
 """Motions simulated together."""
 
 

@@ -4,6 +4,7 @@ Chains: :mod:`vd.gap.chain`. Physics: :mod:`vd.kernels.chains`.
 """
 
 import copy
+import itertools
 import threading
 import zlib
 from collections.abc import Sequence
@@ -26,6 +27,8 @@ STREAM_BITS = 28
 CUDA_BLOCK = 32
 """Threads of a block: few, so that the few thousand rollouts of a launch are spread over all processors."""
 CPU_BLOCK = 256
+RECALLED = 3000
+"""Rollouts that are kept: searches ask for the same again, where one fit ends and the next begins."""
 _MAKING = threading.Lock()
 
 
@@ -37,7 +40,7 @@ def links_of(
     inertia: np.ndarray,
     gravity: np.ndarray,
 ) -> Links:
-    """The bodies of a chain of n joints [n, ..], ``MAX_JOINTS`` at most, as kernels take them (:class:`Links`)."""
+    """The bodies of a chain [n, ..] of up to ``MAX_JOINTS`` joints as kernels take them: :class:`Links`."""
     links = Links()
     for name, values in (
         ("axis", axis),
@@ -112,6 +115,7 @@ class Rollouts:
         self.chain, self.recording, self.dt, self.device = chain, recording, dt, device
         self.crowd = crowd
         self._finer: dict[float, Rollouts] = {}
+        self._recent: dict[bytes, np.ndarray] = {}
         self.num_joints = len(chain.joints)
         trajectories = recording.trajectories
         counts = [len(t.time) for t in trajectories]
@@ -139,14 +143,14 @@ class Rollouts:
     def with_chain(self, chain: Chain) -> "Rollouts":
         """The same motions of a chain with other links; joints and columns are the same."""
         other = copy.copy(self)
-        other.chain, other.crowd, other._finer = chain, None, {}
+        other.chain, other.crowd, other._finer, other._recent = chain, None, {}, {}
         other.__dict__.pop("_links", None)
         return other
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the device's arrays behind: another process makes its own."""
         kept = {key: value for key, value in self.__dict__.items() if key not in ("_samples", "_links")}
-        return {**kept, "crowd": None, "_finer": {}}
+        return {**kept, "crowd": None, "_finer": {}, "_recent": {}}
 
     @cached_property
     def _samples(self) -> Samples:
@@ -235,8 +239,10 @@ class Rollouts:
         parameters, trajectory, output, wanted = (np.concatenate(each) for each in zip(*parts, strict=True))
         empty = wp.empty if all(call.keep is None for call in calls) else wp.zeros
         predicted = empty((int(ends[-1]), width), dtype=float, device=self.device)
-        if len(trajectory):
+        if len(trajectory) and wp.get_device(self.device).is_cuda:
             self._launch(parameters, trajectory, output, wanted, predicted)
+        elif len(trajectory):
+            self._recall(parameters, trajectory, output, wanted, predicted)
         answers = np.split(predicted.numpy(), ends[:-1])
         shapes = [
             (len(call.rows), length) if call.joint is not None else (len(call.rows), length, width)
@@ -254,6 +260,32 @@ class Rollouts:
         self._scale_loads(parameters, trajectory)
         output = first + index * int(counts.sum()) + (np.cumsum(counts) - counts)[place]
         return parameters, trajectory, output, np.full(len(index), -1 if call.joint is None else call.joint)
+
+    def _recall(
+        self,
+        parameters: np.ndarray,
+        trajectory: np.ndarray,
+        output: np.ndarray,
+        wanted: np.ndarray,
+        predicted: wp.array,
+    ) -> None:
+        """As :meth:`_launch`, but what was simulated a short while ago is not again. On a CPU each counts."""
+        positions, recent, counts = predicted.numpy(), self._recent, self._count[trajectory]
+        names = np.stack([trajectory, wanted], axis=1).astype(np.int64)
+        keys = [row.tobytes() + name.tobytes() for row, name in zip(parameters, names, strict=True)]
+        new = []
+        for i, key in enumerate(keys):
+            if (known := recent.pop(key, None)) is None:
+                new.append(i)
+            else:
+                recent[key] = known  # the last one used is the last to go
+                positions[output[i] : output[i] + counts[i]] = known
+        if new:
+            self._launch(parameters[new], trajectory[new], output[new], wanted[new], predicted)
+        for i in new[-RECALLED:]:
+            recent[keys[i]] = positions[output[i] : output[i] + counts[i]].copy()
+        for key in list(itertools.islice(recent, max(len(recent) - RECALLED, 0))):
+            del recent[key]
 
     def _launch(
         self,
