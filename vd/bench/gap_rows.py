@@ -77,7 +77,7 @@ def _number(value: float | None) -> str:
 
 
 def _result(line: Mapping[str, str]) -> dict[str, Any]:
-    case = {key: int(line[key]) if key in ("size", "seed") else line[key] for key in CASE}
+    case: dict[str, Any] = {key: int(line[key]) if key in ("size", "seed") else line[key] for key in CASE}
     case["effects"] = [name for name in line["effects"].split("+") if name]
     result: dict[str, Any] = {"case": case, "commit": line["commit"]}
     if line["cpu_s"]:

@@ -27,7 +27,7 @@ STREAM_BITS = 28
 CUDA_BLOCK = 32
 """Threads of a block: few, so that the few thousand rollouts of a launch are spread over all processors."""
 CPU_BLOCK = 256
-RECALLED = 3000
+RECALLED = 10_000
 """Rollouts that are kept: searches ask for the same again, where one fit ends and the next begins."""
 _MAKING = threading.Lock()
 
