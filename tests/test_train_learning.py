@@ -13,7 +13,7 @@ from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 
 from vd.policy import TrainedPolicy
 from vd.train.config import PolicyCfg, PpoCfg, RunCfg, minibatches, validate
-from vd.train.distribution import BoundedStdGaussian
+from vd.train.distribution import BoundedStdGaussian, draw
 from vd.train.metrics import GoalWindow, StepMeans, read_progress
 from vd.train.vec_env import ReorientVecEnv
 
@@ -191,7 +191,8 @@ def test_every_sample_is_used_once_an_epoch(tmp_path):
             observation, reward, done, extras = runner.env.step(actions)
             runner.alg.process_env_step(observation, reward, done, extras)
     wanted = runner.alg.storage.actions_log_prob.flatten().sort().values
-    batches = [batch["log_prob"] for batch in runner.alg._minibatches()]
+    runner.alg._take_samples()
+    batches = [runner.alg._samples["log_prob"][rows] for rows in runner.alg._minibatches()]
     assert len(batches) == 2 * 4
     for epoch in (batches[:4], batches[4:]):
         assert torch.equal(torch.cat(epoch).sort().values, wanted)
@@ -279,3 +280,122 @@ def test_a_step_copies_nothing_to_the_host():
         env.step(torch.zeros((4, 2), device="cuda:0"))
     finally:
         torch.cuda.set_sync_debug_mode("default")
+
+
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="CUDA graphs and waits need a GPU")
+NORMALISING = dataclasses.replace(SMALL_POLICY, normalise_observations=True)
+TIGHTENING = dataclasses.replace(NORMALISING, std_range=(0.2, 1.0), quiet_std=0.05)
+
+
+def _after_a_rollout(runner):
+    """The runner with a rollout whose samples lie where minibatches are gathered from."""
+    observation = runner.env.get_observations()
+    with torch.inference_mode():
+        for _ in range(8):
+            observation, reward, done, extras = runner.env.step(runner.alg.act(observation))
+            runner.alg.process_env_step(observation, reward, done, extras)
+        runner.alg.compute_returns(observation)
+    runner.alg._take_samples()
+    return runner
+
+
+def test_actions_are_drawn_as_torch_draws_them():
+    mean, std = torch.randn(40, 3), torch.rand(40, 3) + 0.1
+    torch.manual_seed(5)
+    wanted = torch.normal(mean, std)
+    torch.manual_seed(5)
+    assert torch.allclose(draw(mean, std), wanted, atol=1e-6)
+
+
+def test_gradients_change_nothing_but_gradients(tmp_path):
+    """A recording runs them a few times before, and must not draw from the random numbers of the run."""
+    alg = _after_a_rollout(make_runner(tmp_path, policy=NORMALISING)).alg
+    before = [
+        tensor.clone() for network in (alg.actor, alg.critic) for tensor in network.state_dict().values()
+    ]
+    random, rows = torch.get_rng_state(), torch.arange(64)
+    first = alg._gradients(rows)
+    gradients = [parameter.grad.clone() for parameter in alg._parameters]
+    assert torch.equal(alg._gradients(rows), first)
+    assert all(torch.equal(p.grad, g) for p, g in zip(alg._parameters, gradients, strict=True))
+    assert any(g.abs().max() > 0.0 for g in gradients)
+    after = [tensor for network in (alg.actor, alg.critic) for tensor in network.state_dict().values()]
+    assert all(torch.equal(one, two) for one, two in zip(before, after, strict=True))
+    assert torch.equal(torch.get_rng_state(), random)
+
+
+def test_what_gradients_are_computed_from_stays_where_it_is_in_memory(tmp_path):
+    """A recorded graph reads the addresses of the recording, whatever an attribute has become since."""
+
+    def read(alg) -> dict[str, int]:
+        tensors = dict(alg._samples) | {"rows": alg._rows}
+        for name, network in (("actor", alg.actor), ("critic", alg.critic)):
+            tensors |= {f"{name}.{key}": tensor for key, tensor in network.named_parameters()}
+            tensors |= {f"{name}.{key}": tensor for key, tensor in network.named_buffers()}
+        return {name: tensor.data_ptr() for name, tensor in tensors.items()}
+
+    runner = make_runner(tmp_path, policy=TIGHTENING, save_every=1)
+    runner.learn(1)
+    before = read(runner.alg)
+    assert {"advantages", "old 1", "actor.obs_normalizer._std", "actor.distribution.log_floor"} <= set(before)
+    std = runner.alg.actor.obs_normalizer._std.clone()
+    runner.learn(2)
+    runner.load(str(tmp_path / "checkpoints" / "model_0000002.pt"))
+    runner.learn(1)
+    assert read(runner.alg) == before
+    normaliser = runner.alg.actor.obs_normalizer
+    assert not torch.equal(normaliser._std, std)
+    assert torch.allclose(normaliser._std, normaliser._var.sqrt())
+
+
+@needs_gpu
+@pytest.mark.parametrize("distribution", ["state-dependent", "gaussian"])
+def test_neither_actions_nor_gradients_wait_for_the_device(tmp_path, distribution):
+    policy = dataclasses.replace(NORMALISING, distribution=distribution)
+    runner = _after_a_rollout(make_runner(tmp_path, policy=policy, device="cuda:0"))
+    observation, rows = runner.env.get_observations(), torch.arange(64, device="cuda:0")
+    runner.alg._gradients(rows)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        with torch.inference_mode():
+            runner.alg.act(observation)
+        runner.alg._minibatch_step(rows)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+@needs_gpu
+def test_a_recorded_graph_gives_the_gradients_of_every_minibatch(tmp_path):
+    graphed = dataclasses.replace(SMALL_PPO, cuda_graph=True)
+    plain, recorded = (
+        _after_a_rollout(make_runner(tmp_path, ppo=ppo, policy=TIGHTENING, device="cuda:0")).alg
+        for ppo in (SMALL_PPO, graphed)
+    )
+    assert torch.equal(plain._samples["actions"], recorded._samples["actions"])
+    for rows in (*torch.randperm(128, device="cuda:0").split(64), torch.arange(64, device="cuda:0")):
+        for alg in (plain, recorded):
+            alg.actor.distribution.set_floor(0.1)
+        statistics = [alg._minibatch_step(rows) for alg in (plain, recorded)]
+        assert torch.allclose(*statistics, rtol=1e-4, atol=1e-5)
+        for one, two in zip(plain._parameters, recorded._parameters, strict=True):
+            assert torch.allclose(one.grad, two.grad, rtol=1e-3, atol=1e-5)
+            with torch.no_grad():  # rounding must not add up
+                two.copy_(one)
+
+
+@needs_gpu
+def test_a_run_with_a_recorded_graph_learns_saves_and_goes_on(tmp_path):
+    ppo = dataclasses.replace(SMALL_PPO, minibatch_size=128, cuda_graph=True, schedule="adaptive")
+    env = DummyEnv(num_worlds=64, device="cuda:0")
+    runner = make_runner(tmp_path, env=env, ppo=ppo, policy=NORMALISING, device="cuda:0", save_every=25)
+    runner.learn(25)
+    rows = read_progress(tmp_path / "progress.jsonl")
+    assert rows[-1]["success_per_goal"] > 2 * rows[0]["success_per_goal"]
+    assert rows[-1]["loss/value"] < 0.2 * rows[0]["loss/value"]
+    again = make_runner(tmp_path, env=env, ppo=ppo, policy=NORMALISING, device="cuda:0")
+    again.load(str(tmp_path / "checkpoints" / "model_0000025.pt"))
+    again.learn(1)
+    eager = dataclasses.replace(ppo, cuda_graph=False)
+    again = make_runner(tmp_path, env=env, ppo=eager, policy=NORMALISING, device="cuda:0")
+    again.load(str(tmp_path / "checkpoints" / "model_0000025.pt"))
+    again.learn(1)

@@ -165,13 +165,14 @@ def make_runner(
     policy: PolicyCfg = SMALL_POLICY,
     seed: int = 0,
     deadline: float | None = None,
+    device: str = "cpu",
     **run: Any,
 ) -> TeacherRunner:
     """A runner on the dummy, deterministic from ``seed``."""
     torch.manual_seed(seed)
-    env = env or DummyEnv(num_worlds=16, seed=seed)
-    settings = RunCfg(run_dir=run_dir, device="cpu", **{"save_every": 3, "tensorboard": False, **run})
+    env = env or DummyEnv(num_worlds=16, seed=seed, device=device)
+    settings = RunCfg(run_dir=run_dir, device=device, **{"save_every": 3, "tensorboard": False, **run})
     task = {"hand": "dummy", "tolerance": PAPER.success.rotation_rad}
     return TeacherRunner(
-        ReorientVecEnv(env), ppo, policy, settings, task=task, device="cpu", deadline=deadline
+        ReorientVecEnv(env), ppo, policy, settings, task=task, device=device, deadline=deadline
     )

@@ -45,6 +45,9 @@ class PpoCfg:
     """Joint gradient norm of actor and critic is clipped to this."""
     optimizer: Literal["adam", "adamw"] = "adam"
     """Optimiser: the paper says Adam, its code uses AdamW."""
+    cuda_graph: bool = False
+    """Record forward and backward pass of a minibatch once as a CUDA graph, and replay it: where launching
+    some hundred kernels takes longer than running them, as on busy processors. On one GPU; else ignored."""
     critic_warmup_iterations: int | None = None
     """Iterations at the begin of a run in which the critic learns alone; the actor acts and stays as it is.
     None: as many as what --init begins from needs, 50 without a critic, 3 without an optimiser, else 0."""
@@ -150,12 +153,12 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
 
 def rsl_rl_config(ppo: PpoCfg, policy: PolicyCfg, num_envs: int) -> dict[str, Any]:
     """The dictionary that rsl-rl's runner builds algorithm and models from."""
-    from vd.train.distribution import BoundedStdGaussian  # imports torch
+    from vd.train.distribution import BoundedStdGaussian, FreeStdGaussian  # imports torch
     from vd.train.ppo import TeacherPPO
 
     distribution: dict[str, Any] = {"init_std": policy.initial_std, "std_range": policy.std_range}
     if policy.distribution == "gaussian":
-        distribution |= {"class_name": "GaussianDistribution", "std_type": "log"}
+        distribution |= {"class_name": FreeStdGaussian, "std_type": "log"}
     else:
         distribution |= {"class_name": BoundedStdGaussian}
     network = {
@@ -183,6 +186,7 @@ def rsl_rl_config(ppo: PpoCfg, policy: PolicyCfg, num_envs: int) -> dict[str, An
             "value_loss_coef": ppo.value_coefficient,
             "entropy_coef": ppo.entropy_coefficient,
             "bound_coef": ppo.bound_coefficient,
+            "cuda_graph": ppo.cuda_graph,
             "max_grad_norm": ppo.grad_norm,
             "optimizer": ppo.optimizer,
             "use_clipped_value_loss": False,

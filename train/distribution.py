@@ -1,10 +1,18 @@
-"""A Gaussian whose standard deviation depends on the state and stays inside its range smoothly."""
+"""Gaussians of actions that are sampled without a wait for the device, one of them with a bounded std."""
 
 import math
 
 import torch
-from rsl_rl.modules.distribution import HeteroscedasticGaussianDistribution
+from rsl_rl.modules.distribution import GaussianDistribution, HeteroscedasticGaussianDistribution
 from torch.distributions import Normal
+
+
+class FreeStdGaussian(GaussianDistribution):
+    """rsl-rl's Gaussian of one std per action, with :func:`draw`."""
+
+    def sample(self) -> torch.Tensor:
+        """One draw for every state."""
+        return draw(self.mean, self.std)
 
 
 class BoundedStdGaussian(HeteroscedasticGaussianDistribution):
@@ -21,7 +29,8 @@ class BoundedStdGaussian(HeteroscedasticGaussianDistribution):
         std_range: Open interval ``(low, high)`` of the standard deviation.
     """
 
-    log_std_range: list[float]
+    log_floor: torch.Tensor
+    """Logarithm of the least std: a tensor, since a CUDA graph bakes numbers in."""
 
     def __init__(
         self, output_dim: int, init_std: float = 0.5, std_range: tuple[float, float] = (0.02, 1.0)
@@ -32,21 +41,37 @@ class BoundedStdGaussian(HeteroscedasticGaussianDistribution):
                 f"the std range {low} to {high} has to be positive and hold the initial std {init_std} inside"
             )
         super().__init__(output_dim, init_std=init_std, std_range=std_range, std_type="log")
+        self._log_ceiling = math.log(high)
+        # No part of a checkpoint: it follows from the settings and the stage of the curriculum.
+        self.register_buffer("log_floor", torch.tensor(math.log(low)), persistent=False)
 
     def set_floor(self, std: float) -> None:
         """Lower the standard deviation's least value to ``std``, or raise it; those above move with it."""
-        self.log_std_range = [math.log(std), self.log_std_range[1]]
+        self.log_floor.fill_(math.log(std))
 
     def update(self, mlp_output: torch.Tensor) -> None:
         """Set mean and standard deviation from the network's output, shape ``[..., 2, D]``."""
         mean, raw = torch.unbind(mlp_output, dim=-2)
-        low, high = self.log_std_range
+        low, high = self.log_floor, self._log_ceiling
         self._distribution = Normal(mean, torch.exp(low + (high - low) * torch.sigmoid(raw)))
+
+    def sample(self) -> torch.Tensor:
+        """One draw for every state."""
+        return draw(self.mean, self.std)
 
     def init_mlp_weights(self, mlp: torch.nn.Module) -> None:
         """Make the standard deviation ``init_std`` everywhere: zero weights, and the bias that gives it."""
-        low, high = self.log_std_range
+        low, high = (math.log(bound) for bound in self.std_range)
         share = (math.log(self.init_std) - low) / (high - low)
         head = mlp[-2]  # the linear layer before the reshape to [2, D]
         torch.nn.init.zeros_(head.weight[self.output_dim :])
         torch.nn.init.constant_(head.bias[self.output_dim :], math.log(share / (1.0 - share)))
+
+
+def draw(mean: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
+    """Normal numbers of these means and standard deviations, the same as ``torch.normal`` gives.
+
+    ``torch.normal`` looks whether every std is positive, and so waits for the device at every control step.
+    """
+    with torch.no_grad():
+        return torch.randn_like(mean) * std + mean

@@ -1,14 +1,16 @@
 """Proximal policy optimisation as the paper runs it, on top of rsl-rl's."""
 
 from collections.abc import Iterator
-from itertools import chain
 from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
 from torch import nn
+
+from vd.train.graphed import Recorded
 
 MIN_LEARNING_RATE, MAX_LEARNING_RATE = 1e-5, 1e-2
 """Bounds of the adaptive schedule, as in rsl-rl."""
@@ -38,7 +40,9 @@ class TeacherPPO(PPO):
     * the gradient is clipped by the joint norm of actor and critic, as in the paper's code. The value
       coefficient acts through that norm alone, because Adam ignores the scale of a gradient;
     * samples are permuted in every epoch (rsl-rl repeats the same minibatches), and statistics stay on
-      the device until the end of the update (rsl-rl waits for the device after each minibatch).
+      the device until the end of the update (rsl-rl waits for the device after each minibatch);
+    * forward and backward pass of a minibatch can be a CUDA graph (:mod:`vd.train.graphed`). The optimiser's
+      step stays outside: its rates are numbers that change, and its state is that of any checkpoint.
 
     Time-outs: rsl-rl adds ``gamma * V(s_t)`` to the reward of a step that timed out and treats it as
     terminal. The value belongs to the stored observation *before* the step, because the observation
@@ -51,6 +55,8 @@ class TeacherPPO(PPO):
         storage: Rollout of T steps in N worlds.
         critic_learning_rate: The critic's rate; ``learning_rate`` is the actor's.
         bound_coef: Weight of the squared excess of mean actions beyond :data:`ACTION_BOUND`.
+        cuda_graph: Whether to record the passes of a minibatch; with several GPUs, which exchange gradients
+            in the middle, never.
         **kwargs: rsl-rl's PPO arguments.
 
     Attributes:
@@ -71,6 +77,7 @@ class TeacherPPO(PPO):
         *,
         critic_learning_rate: float,
         bound_coef: float = 0.0,
+        cuda_graph: bool = False,
         **kwargs: Any,
     ) -> None:
         super().__init__(actor, critic, storage, **kwargs)
@@ -78,6 +85,16 @@ class TeacherPPO(PPO):
             raise ValueError("TeacherPPO trains feed-forward networks, without RND and symmetry")
         self.bound_coef = bound_coef
         self.actor_learns = True
+        self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        # The rollout as rows of samples, in the same memory in every update, and the rows of a minibatch.
+        self._samples: dict[str, torch.Tensor] = {}
+        self._rows = torch.zeros(self._minibatch_size, dtype=torch.long, device=self.device)
+        self._gradients = Recorded(
+            self._compute_gradients,
+            [self._rows],
+            self._parameters,
+            record=cuda_graph and not self.is_multi_gpu and str(self.device).startswith("cuda"),
+        )
         self.optimizer = type(self.optimizer)(
             [
                 {"params": list(self.actor.parameters()), "lr": self.learning_rate},
@@ -106,70 +123,106 @@ class TeacherPPO(PPO):
         """
         group = self.optimizer.param_groups[ACTOR_GROUP]
         group["lr"] = self.learning_rate if self.actor_learns else 0.0
-        steps = torch.stack([self._minibatch_step(batch) for batch in self._minibatches()])
+        self._take_samples()
+        steps = torch.stack([self._minibatch_step(rows) for rows in self._minibatches()])
         group["lr"] = self.learning_rate
-        flat = self.storage.observations.flatten(0, 1)
         if self.actor_learns:
             if self.schedule == "adaptive":
                 self._adapt_learning_rate(steps[-self.num_mini_batches :, STATISTICS.index("kl")].mean())
-            self.actor.update_normalization(flat)
-        self.critic.update_normalization(flat)
+            self._update_normalisation(self.actor)
+        self._update_normalisation(self.critic)
         returns, values = self.storage.returns, self.storage.values
         explained = 1.0 - (returns - values).var() / returns.var().clamp_min(1e-8)
         self.storage.clear()
         names = (*STATISTICS, "explained_variance")
         return dict(zip(names, torch.cat((steps.mean(dim=0), explained[None])).tolist(), strict=True))
 
-    def _minibatches(self) -> Iterator[dict[str, Any]]:
-        """Samples of the rollout, permuted anew in every epoch; a remainder is left out at random."""
+    @property
+    def _minibatch_size(self) -> int:
         storage = self.storage
-        flat = {
-            "observations": storage.observations.flatten(0, 1),
+        return storage.num_envs * storage.num_transitions_per_env // self.num_mini_batches
+
+    def _take_samples(self) -> None:
+        """Copy the rollout into the memory that minibatches are gathered from."""
+        storage = self.storage
+        assert storage.distribution_params is not None, "there is no rollout"
+        rollout = {
             "actions": storage.actions.flatten(0, 1),
             "log_prob": storage.actions_log_prob.flatten(),
             "advantages": storage.advantages.flatten(),
             "returns": storage.returns.flatten(),
         }
-        parameters = tuple(p.flatten(0, 1) for p in storage.distribution_params)
-        samples = storage.num_envs * storage.num_transitions_per_env
-        size = samples // self.num_mini_batches
+        rollout |= {f"observed {key}": value.flatten(0, 1) for key, value in storage.observations.items()}
+        rollout |= {f"old {i}": value.flatten(0, 1) for i, value in enumerate(storage.distribution_params)}
+        if not self._samples:
+            self._samples = {name: torch.empty_like(tensor) for name, tensor in rollout.items()}
+        for name, tensor in rollout.items():
+            self._samples[name].copy_(tensor)
+
+    def _minibatches(self) -> Iterator[torch.Tensor]:
+        """Rows of samples, permuted anew in every epoch; a remainder is left out at random."""
+        samples, size = self.storage.num_envs * self.storage.num_transitions_per_env, self._minibatch_size
         for _ in range(self.num_learning_epochs):
             order = torch.randperm(samples, device=self.device)
-            for index in order[: size * self.num_mini_batches].split(size):
-                batch: dict[str, Any] = {name: tensor[index] for name, tensor in flat.items()}
-                yield batch | {"old": tuple(p[index] for p in parameters)}
+            yield from order[: size * self.num_mini_batches].split(size)
 
-    def _minibatch_step(self, batch: dict[str, Any]) -> torch.Tensor:
-        """One optimiser step.
+    def _minibatch_step(self, rows: torch.Tensor) -> torch.Tensor:
+        """One optimiser step on these samples.
 
         Returns:
             :data:`STATISTICS`, shape [7], on the device.
         """
-        self.actor(batch["observations"], stochastic_output=True)
+        statistics = self._gradients(rows)
+        self.optimizer.step()
+        return statistics
+
+    def _compute_gradients(self) -> torch.Tensor:
+        """Gradients of the loss over the samples in ``_rows``, clipped; nothing else changes.
+
+        All it reads stays where it is in memory, and nothing waits for the device: it can be recorded.
+
+        Returns:
+            :data:`STATISTICS`, shape [7], on the device.
+        """
+        batch = {name: tensor[self._rows] for name, tensor in self._samples.items()}
+        observed = {
+            name.removeprefix("observed "): t for name, t in batch.items() if name.startswith("observed ")
+        }
+        observations = TensorDict(observed, batch_size=[len(self._rows)])
+        old = tuple(tensor for name, tensor in batch.items() if name.startswith("old "))
+        # Without the sample that the actor's own forward pass would draw.
+        self.actor.distribution.update(self.actor.mlp(self.actor.get_latent(observations)))
         log_ratio = self.actor.get_output_log_prob(batch["actions"]) - batch["log_prob"]
         entropy = self.actor.output_entropy.mean()
         with torch.no_grad():
-            kl = self.actor.get_kl_divergence(batch["old"], self.actor.output_distribution_params).mean()
+            kl = self.actor.get_kl_divergence(old, self.actor.output_distribution_params).mean()
         ratio = torch.exp(log_ratio)
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = -torch.minimum(batch["advantages"] * ratio, batch["advantages"] * clipped).mean()
-        value = (batch["returns"] - self.critic(batch["observations"]).squeeze(-1)).square().mean()
+        value = (batch["returns"] - self.critic(observations).squeeze(-1)).square().mean()
         excess = (self.actor.output_mean.abs() - ACTION_BOUND).clamp_min(0.0)
         loss = surrogate + self.value_loss_coef * value - self.entropy_coef * entropy
         if self.bound_coef:
             loss = loss + self.bound_coef * excess.square().sum(dim=-1).mean()
 
-        self.optimizer.zero_grad()
         loss.backward()
         if self.is_multi_gpu:
             self.reduce_parameters()
-        parameters = chain(self.actor.parameters(), self.critic.parameters())
-        grad_norm = nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
-        self.optimizer.step()
+        grad_norm = nn.utils.clip_grad_norm_(self._parameters, self.max_grad_norm)
+        self.actor.distribution._distribution = None  # or this pass would outlive itself, and a recording
         with torch.no_grad():
             clip_fraction = ((ratio - 1.0).abs() > self.clip_param).float().mean()
             beyond = (excess > 0.0).float().mean()
             return torch.stack((surrogate, value, entropy, kl, clip_fraction, grad_norm, beyond)).detach()
+
+    def _update_normalisation(self, network: MLPModel) -> None:
+        """Let a network's normaliser learn from the rollout; its numbers stay where they are in memory."""
+        normaliser = network.obs_normalizer
+        std = getattr(normaliser, "_std", None)
+        network.update_normalization(self.storage.observations.flatten(0, 1))
+        if std is not None:  # rsl-rl makes a new tensor of it, which a recorded graph would not read
+            std.copy_(normaliser._std)
+            normaliser._std = std
 
     def _adapt_learning_rate(self, kl: torch.Tensor) -> None:
         """Move the actor's learning rate so that the KL divergence of an update nears ``desired_kl``."""

@@ -190,11 +190,7 @@ class TeacherRunner(OnPolicyRunner):
                     self.alg.storage.clear()
                     self._means.clear()
                     return None, observation
-                try:
-                    actions = self.alg.act(observation)
-                except RuntimeError:  # torch refuses to sample from NaN on the CPU
-                    self._check_rollout(observation)
-                    raise
+                actions = self.alg.act(observation)
                 observation, rewards, dones, extras = self.env.step(actions)
                 self.alg.process_env_step(observation, rewards, dones, extras)
                 self._means.add(extras["log"])
@@ -403,21 +399,29 @@ class TeacherRunner(OnPolicyRunner):
     def _check_rollout(self, latest: TensorDict) -> None:
         """Stop before an update on values that are not finite. One wait for the device an iteration."""
         storage = self.alg.storage
+        # In the order in which a step makes them.
         tensors = (
-            ("observations", latest[OBSERVATION_GROUP][None]),
-            ("observations", storage.observations[OBSERVATION_GROUP]),
-            ("rewards", storage.rewards),
-            ("actions", storage.actions),
+            (
+                "observations",
+                torch.cat((storage.observations[OBSERVATION_GROUP], latest[OBSERVATION_GROUP][None])),
+            ),
             ("values", storage.values),
+            ("actions", storage.actions),
+            ("rewards", storage.rewards),
         )
         finite = torch.stack([torch.isfinite(tensor).all() for _, tensor in tensors]).tolist()
-        bad = [pair for pair, ok in zip(tensors, finite, strict=True) if not ok]
+        bad = [
+            (name, ~torch.isfinite(t).all(dim=2))
+            for (name, t), ok in zip(tensors, finite, strict=True)
+            if not ok
+        ]
         if not bad:
             return
-        self.env.check()  # says more, if the simulation is the cause
-        name, tensor = bad[0]
-        worlds = ~torch.isfinite(tensor).all(dim=2).all(dim=0)
+        # What was not finite first has made the rest so.
+        name, where = min(bad, key=lambda pair: int(pair[1].any(dim=1).nonzero()[0]))
+        worlds = where.any(dim=0)
         if name in ("observations", "rewards"):
+            self.env.check()  # says more, if the simulation is the cause
             remedy = "the simulation gave them: raise --env.sim.physics-hz or lower --env.action.scale-rad-s"
         else:
             remedy = f"the networks gave them: {LOWER_RATES}"
