@@ -51,6 +51,7 @@ DIVERGED = 100.0
 """Distance from the start [rad] at which a rollout stops to mean anything and is held."""
 
 
+COMPILER = "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
 wp.set_module_options(
     {
         "enable_backward": False,
@@ -58,7 +59,7 @@ wp.set_module_options(
         "max_unroll": PARAMETER_COLUMNS,
         # Vectors of three fill no register of a CPU: packing them costs more than it saves.
         "optimization_level": 3,
-        "cpu_compiler_flags": f"{wp.config.cpu_compiler_flags or '-march=native'} -fno-slp-vectorize",
+        "cpu_compiler_flags": f"{COMPILER} -fno-slp-vectorize",
     }
 )
 Rows = wp.types.matrix(shape=(MAX_JOINTS, PARAMETER_COLUMNS), dtype=float)

@@ -388,8 +388,13 @@ class _Motor:
             slope = slope * (np.abs(torque) < bound)
             torque = np.minimum(np.maximum(torque, -bound), bound)
         if self.bends:
-            return torque.mean(axis=0), slope.mean(axis=0), np.abs(torque).mean(axis=0)
+            return _mean(torque), _mean(slope), _mean(np.abs(torque))
         return torque, slope, np.abs(torque)
+
+
+def _mean(parts: np.ndarray) -> np.ndarray:
+    """Mean over the parts of a step; the method of arrays takes three times as long for so few."""
+    return np.add.reduce(parts, axis=0) / PARTS
 
 
 def _where_on(values: np.ndarray) -> np.ndarray:
