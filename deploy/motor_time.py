@@ -14,10 +14,6 @@ TICK_S = 1e-3
 """Motors count whole milliseconds, each from a moment of its own: the mean of nine is as good as 0.1 ms."""
 SAMPLES = 200
 """By which two clocks are compared."""
-EARLY_S = 1e-3
-"""A state that was measured so long before a goal was sent answers the question before."""
-SOON_S = 0.01
-"""A state that was measured so long after a goal was sent was asked for again."""
 
 
 def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
@@ -37,21 +33,3 @@ def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
     some = np.unique(np.linspace(0, len(own) - 1, SAMPLES).astype(int))
     rate, begin, *_ = theilslopes((asked_s - own)[some], own[some])
     return np.asarray(own * (1.0 + rate) + begin)
-
-
-def arrived_at(sent_s: np.ndarray, measured_s: np.ndarray) -> np.ndarray:
-    """When goals arrived, each of which was sent with the question for a state.
-
-    That is when the state was measured which answers this question: usually the one that was read next, but
-    where a question was given up, its answer is taken for the next one's, and so on, each a sample late.
-
-    Args:
-        sent_s: When each goal was sent [T] [s].
-        measured_s: When the state that was read after it was measured [T] [s].
-
-    Returns:
-        When each arrived [T] [s]; when it was sent where no state tells.
-    """
-    answer = np.searchsorted(measured_s, sent_s - EARLY_S)
-    heard_s = np.append(measured_s, np.inf)[answer]
-    return np.where(heard_s - sent_s < SOON_S, heard_s, sent_s)

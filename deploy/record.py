@@ -21,7 +21,7 @@ from vd.deploy.connect import Connection, HandOptions, connect
 from vd.deploy.control_table import RAD_PER_COUNT
 from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import move
-from vd.deploy.motor_time import arrived_at, measured_at
+from vd.deploy.motor_time import measured_at
 from vd.deploy.safety import SafeHand
 from vd.deploy.timely import Priority, real_time, undisturbed
 
@@ -45,6 +45,8 @@ WIDE = SafetyCfg(step_rad=4.0)
 TWIN_ARGS = "--physics-hz 3840"
 """Steps of the twin so short that its integrator is as exact as vd-gap's: at 960 Hz it is off by 0.3 mrad
 (median of a moving hand; up to 0.9), two thirds of what the encoders round."""
+AGAIN_S = 0.01
+"""A state that was asked for so long after its goal was sent was asked for again."""
 STATE_CHANNELS = ("velocity", "current", "pwm", "voltage", "temperature")
 
 
@@ -258,7 +260,8 @@ class Recorder:
 
         asked_s, sent_s = np.array([state.time_s for state in states]), np.array([row.sent_s for row in rows])
         measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
-        heard_s = arrived_at(sent_s, measured_s)
+        # A goal arrives with the question for its state, unless that was asked again.
+        sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
         measured = {name: column([getattr(state, name) for state in states]) for name in STATE_CHANNELS}
         excitation = motion.excitation
         return Trajectory(
@@ -267,7 +270,7 @@ class Recorder:
             joints=excitation.joints,
             conditions=excitation.conditions,
             time=measured_s - measured_s[0],
-            command_time=heard_s - measured_s[0],
+            command_time=sent_s - measured_s[0],
             command=column([row.goal for row in rows]),
             position=column([state.position for state in states]),
             enabled=column([row.on for row in rows]),
