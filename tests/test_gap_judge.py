@@ -184,6 +184,19 @@ def test_sets_of_several_joints_meet_in_one_name() -> None:
     assert adopted.reason == "coulomb_friction and gravity_load explain it, as on the other joints"
 
 
+@pytest.mark.parametrize(("error", "named"), [(1.03, "coulomb_friction"), (1.08, "asymmetric_friction")])
+def test_a_fuller_form_of_what_the_others_have_must_gain_as_an_effect_does(error: float, named: str) -> None:
+    """A right model leaves more than the floor where times are rounded; two sides of friction do a little."""
+
+    def explanation(name: str, left: float = FLOOR) -> Explanation:
+        accepted = (Accepted(name, 1.0, {}, (), (), False),)
+        return Explanation(made_up((), 0.02), made_up((name,), left), "effects", "", accepted)
+
+    three = [explanation("asymmetric_friction", 1.1 * FLOOR), *[explanation("coulomb_friction")] * 2]
+    fits = [lambda effects, starts: made_up(effects, 1.1 * error * FLOOR)] * 3
+    assert agree(three, [FLOOR] * 3, [0, 0, 0], fits)[0].accepted[0].name == named
+
+
 @pytest.mark.parametrize(
     ("error", "own", "adopted"),
     [

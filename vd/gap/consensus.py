@@ -8,7 +8,7 @@ from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import NAMED, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import AT_FLOOR, CONTAINED_FLOORS, MIN_GAIN, RANDOM, SMALL_EXCESS_FLOORS
+from vd.gap.judge import AT_FLOOR, CONTAINED_FLOORS, MIN_GAIN, NESTED, RANDOM, SMALL_EXCESS_FLOORS
 from vd.gap.verdict import UNEXPLAINED, explains
 
 if TYPE_CHECKING:
@@ -116,7 +116,8 @@ def agree(
     """Explain a joint as all others of its finger are explained, where that is as good.
 
     A search can end where no step leads out: with a filter and another load in the place of the delay and the
-    load that the other joints have. Their values are a start that it did not have.
+    load that the other joints have. Their values are a start that it did not have. A fuller form of what the
+    others have has to be better by what an effect must gain: it is found where it imitates something else.
 
     Args:
         explanations: Of the joints.
@@ -142,8 +143,11 @@ def agree(
             for fit in (own.final, own.baseline, model.final)
         ]
         fit = fits[i](effects, starts)
-        worse = (fit.rmse**2 - own.final.rmse**2) / floors[i] ** 2
-        if fit.at_bound or worse > SMALL_EXCESS_FLOORS**2:
+        if all({name, *NESTED.get(name, ())} & {*effects} for name in mine):
+            worse = fit.held_out_rmse * (1.0 - MIN_GAIN) > own.final.held_out_rmse
+        else:
+            worse = fit.rmse**2 - own.final.rmse**2 > (SMALL_EXCESS_FLOORS * floors[i]) ** 2
+        if fit.at_bound or worse:
             continue
         spread = intervals(fit, floors[i])
         result[i] = replace(
