@@ -14,6 +14,8 @@ from vd.deploy.packets import ALERT, Failure
 
 STATE_ADDRESS, STATE_BYTES = 120, 27
 """From the realtime tick to the temperature: one read for the whole state."""
+OTHER_BYTES = STATE_BYTES + 1
+"""Asked for after a question that was given up, whose answer is then known by its length when it comes."""
 CLOCK_TOLERANCE_S = 0.04
 """A state whose clock went on by so much more or less than ours is an old one, or from after a restart; the
 packet's own time on the line and in the driver is within it."""
@@ -104,12 +106,13 @@ class StateCheck:
         """The next state follows none: motors were configured, or restarted."""
         self._last = None
 
-    def accept(self, time_s: float, answers: Sequence[Answer]) -> HandState:
+    def accept(self, time_s: float, answers: Sequence[Answer], length: int = STATE_BYTES) -> HandState:
         """The state in the motors' answers.
 
         Args:
             time_s: When it was read [s].
             answers: One of each motor, in their order.
+            length: How many bytes were asked for.
 
         Raises:
             BusError: A motor refused, sent something else, or a state that cannot be.
@@ -117,10 +120,8 @@ class StateCheck:
         for answer in answers:
             if answer.refused:
                 raise BusError(f"motor {answer.id}: {answer.refused}")
-            if len(answer.data) != STATE_BYTES:
-                raise BusError(
-                    f"motor {answer.id}: {len(answer.data)} bytes of state came, not {STATE_BYTES}"
-                )
+            if len(answer.data) != length:
+                raise BusError(f"motor {answer.id}: {len(answer.data)} bytes of state came, not {length}")
         columns = [answer.data for answer in answers]
 
         def column(name: str) -> np.ndarray:

@@ -15,6 +15,7 @@ import numpy as np
 
 from vd.deploy.answers import (
     CLOCK_TOLERANCE_S,
+    OTHER_BYTES,
     STATE_ADDRESS,
     STATE_BYTES,
     Answer,
@@ -164,7 +165,7 @@ class MotorBus:
         self._lock = threading.RLock()
         self._packets = self._sdk.PacketHandler(2.0)
         self._states = StateCheck(self.ids, self.model)
-        self._goals = b""
+        self._goals, self._length = b"", STATE_BYTES
         self._settings: dict[int, MotorSettings] = {}
         self.rejected = 0
         """States that were not accepted."""
@@ -396,6 +397,7 @@ class MotorBus:
                 return self._read_state()
             except BusError:
                 self.rejected += 1
+                self._length = STATE_BYTES + OTHER_BYTES - self._length
                 if attempt == retries:
                     raise
         raise AssertionError("retries are not negative")
@@ -405,7 +407,7 @@ class MotorBus:
         with self._line():
             asked = self.clock.now()
             question = _Kept()
-            self._packets.syncReadTx(question, STATE_ADDRESS, STATE_BYTES, ids, len(ids), fast_option=False)
+            self._packets.syncReadTx(question, STATE_ADDRESS, self._length, ids, len(ids), fast_option=False)
             packets, self._goals = self._goals + question.packet, b""
             self._port.clearPort()
             if self._port.writePort(packets) != len(packets):
@@ -420,7 +422,7 @@ class MotorBus:
                 raise BusError(f"the state took {took:.3f} s")
             # Motors measure when they have heard it, or not before they answer. A later time than theirs
             # would look like a delay of the goals, which has a name; an earlier one does not.
-            return self._states.accept(heard, answers)
+            return self._states.accept(heard, answers, self._length)
 
     def _answer(self, id: int) -> Answer:
         """This motor's next answer."""
@@ -431,8 +433,9 @@ class MotorBus:
             answer = read_answer(bytes(frame))
             if answer is None:
                 raise BusError(f"motor {id}: what answered is no status packet")
-            if answer.id == id:
-                return answer  # others' come late from an exchange before; the time limit is one for all
+            late = len(answer.data) in {STATE_BYTES, OTHER_BYTES} - {self._length}
+            if answer.id == id and not late:
+                return answer  # others come late from an exchange before; the time limit is one for all
 
     def _words(self, result: int) -> str:
         """What went wrong in an exchange, in the SDK's words."""

@@ -34,13 +34,15 @@ class SimulatedPort(dynamixel_sdk.PortHandler):
         super().__init__("simulated")
         self.clock, self.line = clock, None
         self.is_open, self.tx_time_per_byte = True, 1e3 * BYTE_S
+        self.lag_s = 0.0
+        """How much later than that bytes of the motors arrive."""
         self._coming: list[tuple[float, int]] = []
         self._free_s = 0.0
 
     def put(self, data: bytes) -> None:
         """Bytes of the motors, one after the other."""
         for byte in data:
-            self._free_s = max(self._free_s, self.clock.now()) + BYTE_S
+            self._free_s = max(self._free_s, self.clock.now() + self.lag_s) + BYTE_S
             self._coming.append((self._free_s, byte))
 
     def clearPort(self) -> None:  # noqa: N802 (the SDK's name)

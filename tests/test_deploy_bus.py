@@ -14,10 +14,13 @@ import pytest
 sdk = pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
 from simulated_clock import SimulatedClock  # noqa: E402
+from simulated_hand import simulated_bus  # noqa: E402
 
+from vd.assets_usd.hands import load_hand  # noqa: E402
 from vd.deploy.answers import BusError  # noqa: E402
 from vd.deploy.bus import MotorBus, MotorSettings  # noqa: E402
 from vd.deploy.control_table import MODELS, HardwareError, table, to_angle, to_counts  # noqa: E402
+from vd.deploy.joints import uncalibrated  # noqa: E402
 from vd.deploy.line import Faults, MotorLine  # noqa: E402
 from vd.deploy.motor import Motor  # noqa: E402
 from vd.deploy.packets import ALERT, Failure, Instruction, Packet, PacketReader, encode  # noqa: E402
@@ -288,6 +291,25 @@ def test_late_lost_and_corrupted_states_are_not_taken_for_fresh_ones(bus, twin):
         time.sleep(0.01 * (step % 2))
     assert accepted > 60
     assert bus.rejected > 10
+
+
+def test_the_answer_to_a_question_that_was_given_up_is_not_taken_for_the_next_ones():
+    """A line that was 50 ms behind once and 20 from then on was a question late all the time."""
+    hand = load_hand("dclaw3")
+    given_up = []
+    with simulated_bus(hand, uncalibrated(hand)) as (_, bus):
+        first = bus.read_state()
+        for step in range(40):
+            bus.clock.sleep(0.005)
+            bus._port.lag_s = (0.0, 0.05, 0.02)[(step >= 10) + (step > 10)]
+            try:
+                state = bus.read_state(retries=0)
+            except BusError:
+                given_up.append(step)
+                continue
+            gone_s = 1e-3 * (state.tick - first.tick)
+            np.testing.assert_allclose(gone_s, state.time_s - first.time_s, rtol=0.0, atol=0.003)
+    assert given_up == [10]
 
 
 class Noise:
