@@ -258,8 +258,9 @@ def _teacher(arguments: list[str], started: float) -> int:
         runner = build_teacher(cfg, started=started)
     folder = cfg.run.run_dir
     if runner.current_learning_iteration and main_process:
-        print(f"resumed after iteration {runner.current_learning_iteration} of {runner.total_iterations}")
-        if runner.new_episodes:
+        how = f"begins from {cfg.init}" if runner.begun else "resumed"
+        print(f"{how} after iteration {runner.current_learning_iteration} of {runner.total_iterations}")
+        if runner.new_episodes and not runner.begun:
             print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
         if runner.new_inputs:
             print(f"{runner.new_inputs} observed values are new to the networks and start without effect")

@@ -64,6 +64,7 @@ class TeacherRunner(OnPolicyRunner):
         new_episodes: Why the checkpoint that was loaded could not restore the worlds; empty if it did.
         new_inputs: Observed values that the networks of that checkpoint did not read.
         critic_warmup: Iterations left in which the critic learns alone (``PpoCfg.critic_warmup_iterations``).
+        begun: Whether this run began from another one's networks, in this process.
         unlike: What observations and actions mean otherwise than to the policy that the run began from.
     """
 
@@ -100,6 +101,7 @@ class TeacherRunner(OnPolicyRunner):
         self.new_episodes = ""
         self.new_inputs = 0
         self.critic_warmup = ppo.critic_warmup_iterations or 0
+        self.begun = False
         self.unlike: list[str] = []
 
     @property
@@ -294,7 +296,7 @@ class TeacherRunner(OnPolicyRunner):
             state = at_stage(state, stage)
         self._restore(state, path, None, True)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
-        self.new_episodes = "it is of another run"
+        self.begun, self.new_episodes = True, "it is of another run"
         self.critic_warmup = warmup
         self._best = None
         self._window = GoalWindow(self._window_length)
