@@ -189,7 +189,13 @@ def test_other_answers_than_the_golden_ones_are_refused(teacher_bundle, tmp_path
     del tensors["mlp.0.bias"]
     save_file(tensors, path)
     edit(teacher_bundle, lambda values: None)
-    with pytest.raises(ContractError, match="the weights do not fit the network"):
+    with pytest.raises(ContractError, match=r'Missing key.* "0\.bias".*: write the bundle again'):
+        read_bundle(teacher_bundle)
+
+
+def test_a_setting_that_this_version_has_not_is_named_with_the_remedy(teacher_bundle):
+    edit(teacher_bundle, lambda values: values["provenance"]["task"].update(gone=1))
+    with pytest.raises(ContractError, match=r"has no field gone.* another one wrote .*vd-train bundle"):
         read_bundle(teacher_bundle)
 
 

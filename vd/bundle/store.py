@@ -153,11 +153,13 @@ def read_bundle(folder: str | Path, device: str = "cpu") -> Bundle:
     weights = _tensors(folder / WEIGHTS_FILE, contract, device)
     golden = _tensors(folder / GOLDEN_FILE, contract, "cpu")
     try:
+        _ = contract.task  # its settings are those of this version
         bundle = _build(contract, weights, device)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        first = " ".join(str(error).split("\n\t")[:2])  # of torch's list of what does not fit
         raise ContractError(
-            f"{folder}: the weights do not fit the network of {CONTRACT_FILE} ({error}); "
-            "write the bundle again with vd-train bundle"
+            f"{folder}: policy and {CONTRACT_FILE} do not fit this version ({first}); "
+            "another one wrote them: write the bundle again with vd-train bundle"
         ) from error
     if bundle.teacher is not None:
         on_device = {name: value.to(device) for name, value in golden.items()}
