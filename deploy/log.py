@@ -128,8 +128,7 @@ class LogWriter:
 
     def image(self, step: int, depth_m: np.ndarray) -> None:
         """Keep the depth image of a step [m] [H, W]."""
-        (self.folder / IMAGES).mkdir(exist_ok=True)
-        self._later(np.save, self.folder / IMAGES / f"{step:06d}.npy", depth_m.copy())
+        self._later(_save, self.folder / IMAGES / f"{step:06d}.npy", depth_m.copy())
 
     def event(self, event: str, **values: Any) -> None:
         """Append an event of this moment."""
@@ -160,3 +159,9 @@ class LogWriter:
         """Raise what went wrong in writing: a run without its log is not worth going on with."""
         if self._written is not None and self._written.done():
             self._written.result()
+
+
+def _save(file: Path, values: np.ndarray) -> None:
+    """Write an array, in a folder that is made for the first one."""
+    file.parent.mkdir(exist_ok=True)
+    np.save(file, values)
