@@ -417,6 +417,10 @@ def test_beside_a_large_gap_a_little_more_than_noise_begins_no_search(whole: flo
         fit = made_up(("coulomb_friction",), left * most * FLOOR)
         fit = replace(fit, structure=np.stack([0.05 * FLOOR**2 * pairs, pairs]))
         assert selection.noise_only(fit) is ends
+    # What the time step of the search leaves beside it is not held against a model.
+    selection.refined = lambda fit: made_up(fit.effects, fit.rmse / 1.08)  # type: ignore[method-assign]
+    assert selection.noise_only(made_up(("command_delay",), 1.06 * most * FLOOR))
+    assert not selection.noise_only(made_up(("command_delay",), 1.1 * most * FLOOR))
 
 
 def test_a_search_that_fails_is_repeated_before_it_counts() -> None:

@@ -363,7 +363,10 @@ class Selection(Frictions):
             floors: Error up to which it may be noise, in noise floors.
         """
         best = max(floors * self.floor, min(MIN_SHARE * self.whole, REPEATABLE * self.floor))
-        return (self.veiled or present.rmse < best) and not self.lack_of_fit(self.refined(present))
+        if not self.veiled and COARSE * present.rmse > best:
+            return False
+        refined = self.refined(present)  # without what the time step of the search leaves
+        return (self.veiled or refined.rmse < best) and not self.lack_of_fit(refined)
 
     def whitens(self, before: JointFit, after: JointFit) -> bool:
         """Whether a larger model leaves noise where the smaller leaves structure.
