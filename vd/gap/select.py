@@ -16,7 +16,7 @@ from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.frictions import EXACTLY, Frictions
 from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import ONE_SIDED, JointFit
-from vd.gap.judge import EXPLAINED, MIN_SHARE, NESTED, RANDOM, REPEATABLE, SHARP
+from vd.gap.judge import EXPLAINED, MIN_GAIN_FLOORS, MIN_SHARE, NESTED, RANDOM, REPEATABLE, SHARP
 from vd.gap.telemetry import BEHIND_SENSOR
 from vd.gap.verdict import cancelled
 
@@ -31,6 +31,8 @@ LOOKS = 2
 """Rounds in which they are: each costs as much as several others."""
 RESTARTS = 2
 """Searches from another first effect, where the first search leaves a gap."""
+UNEARNED = float(np.hypot(1.0, MIN_GAIN_FLOORS))
+"""Error, in noise floors, from which down to the floor no further effect can close what it has to."""
 COARSE = 0.9
 """Share of an error that a finer time step leaves, at which the search is made with that."""
 LARGE = 4.0
@@ -352,11 +354,12 @@ class Selection(Frictions):
         """Whether a model is near enough to stand for a cause that the table has not: it is no answer."""
         return present.rmse < NEAR * self.floor and bool(cancelled(present, self.joint, self.rest))
 
-    def noise_only(self, present: JointFit, floors: float = EXPLAINED) -> bool:
+    def noise_only(self, present: JointFit, floors: float = UNEARNED) -> bool:
         """Whether a model leaves noise on what it was fitted to: no other search finds a better one.
 
-        Beside a gap of some sixty noise floors a little more than noise is what no fit is better than: the
-        times of a recording are good to 0.1 ms, a milliradian where a joint is fast.
+        It may be a little more than the floor: at rest the rounding to counts repeats. Beside a gap of some
+        sixty noise floors more than that is what no fit is better than: the times of a recording are good to
+        0.1 ms, a milliradian where a joint is fast.
 
         Args:
             present: The model.
