@@ -50,7 +50,7 @@ STAGES, MESH_STAGES = 10, 2
 RESERVE_MIN, RESERVE_MESHES_MIN = 5.5, 1.75
 # Time kept back for the page alone.
 PAGE_MIN = 0.3
-# Time kept back from the student for the twins, with half a minute to spare, and from both for the evaluation.
+# Time kept back from the student for the twins, half a minute of it spare, and from both for the evaluation.
 PAPER_MIN = 0.8
 TWINS_MIN = 1.5
 # Training is worth starting with at least this much time left.
