@@ -76,8 +76,7 @@ def test_rotations_lie_evenly():
 
 
 def test_distances_are_those_of_the_mesh_where_the_samples_lie_on_it(device):
-    """Of the cube as authored, of one whose samples a simpler mesh misses here and there (by 1.5 mm, two of
-    500), and of one whose samples are noisy as those of a scan are."""
+    """As authored, where a simpler mesh misses samples (by 1.5 mm, two of 500), and noisy as a scan's are."""
     cube, rng = load_set(["cube"])[0], np.random.default_rng(0)
     missed = cube.surface_points.copy()
     missed[:2] *= 1.0 + 0.0015 / (cube.longest_side / 2)
