@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 import vd.kernels.actuators as servo
-from vd.gap.consensus import agree, share
+from vd.gap.consensus import agree, no_spring, share
 from vd.gap.coordinates import Coordinate
 from vd.gap.explanation import Accepted, Explanation, intervals
 from vd.gap.joint_fit import JointFit
+from vd.gap.result import Verdict
 from vd.gap.statistics import resamples
 from vd.gap.verdict import Verdicts, cancelled
 
@@ -225,6 +226,24 @@ def test_a_joint_takes_the_model_of_all_others_where_it_is_as_good(
     assert found[1:] == three[1:]
     assert agree(three, [FLOOR] * 3, [0, 1, 2], [fit] * 3) == three, "of other fingers"
     assert agree(three[:2], [FLOOR] * 2, [0, 0], [fit] * 2) == three[:2], "one other is no agreement"
+
+
+def test_a_load_and_an_offset_are_no_names_where_another_joint_shows_a_spring() -> None:
+    def explanation(verdict: Verdict, *names: str) -> Explanation:
+        accepted = tuple(Accepted(name, 1.0, {}, (), (), False) for name in names)
+        return Explanation(made_up((), 0.02), made_up(names, FLOOR), verdict, "", accepted)
+
+    both = ("gravity_load", "encoder_bias")
+    here = explanation("effects", *both[::-1])
+    refused, other = explanation("unknown", *both), explanation("unknown", "backlash")
+    found = no_spring([here, refused, other], [0, 0, 0])
+    assert [e.verdict for e in found] == ["unknown"] * 3 and "spring" in found[0].reason
+    assert found[1:] == [refused, other]
+    named = [here, explanation("effects", *both), other]
+    assert no_spring(named, [0, 0, 0]) == named, "no joint refuses them"
+    assert no_spring([here, refused], [0, 1]) == [here, refused], "of other fingers"
+    more = explanation("effects", *both, "backlash")
+    assert no_spring([more, refused], [0, 0]) == [more, refused], "more than the two"
 
 
 @pytest.mark.parametrize(("floor", "tied"), [(FLOOR, ("supply_sag",)), (10.0 * FLOOR, ())])

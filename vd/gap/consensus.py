@@ -9,7 +9,7 @@ from vd.gap.coordinates import sizes
 from vd.gap.explanation import NAMED, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import AT_FLOOR, CONTAINED_FLOORS, MIN_GAIN, NESTED, RANDOM, SMALL_EXCESS_FLOORS
-from vd.gap.verdict import UNEXPLAINED, explains
+from vd.gap.verdict import CANCELLING, UNEXPLAINED, explains
 
 if TYPE_CHECKING:
     from vd.gap.select import Selection
@@ -158,6 +158,34 @@ def agree(
             reason=f"{explains(effects)}, as on the other joints",
         )
     return result
+
+
+def no_spring(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[Explanation]:
+    """Explanations without a load and an offset that another joint of the finger shows to be neither.
+
+    Together they imitate a spring where a joint travels little or the spring is soft. Where they come nearest
+    on another joint, too, and leave structure, its cause is none of the table, and so is this one's.
+
+    Args:
+        explanations: Of the joints.
+        groups: Number of the finger of each joint.
+    """
+    both = {*CANCELLING}
+    refused = {
+        group
+        for e, group in zip(explanations, groups, strict=True)
+        if e.verdict == "unknown" and both <= {*e.final.effects}
+    }
+    reason = (
+        f"{explains(CANCELLING)} here, but leave structure on another joint of the finger, where they come "
+        "nearest, too: the cause is another, such as a spring"
+    )
+    return [
+        replace(e, verdict="unknown", reason=reason)
+        if group in refused and e.verdict in ("effects", "ambiguous") and both == {*e.final.effects}
+        else e
+        for e, group in zip(explanations, groups, strict=True)
+    ]
 
 
 def _as_it_is(fit: JointFit) -> JointFit:

@@ -10,7 +10,7 @@ import numpy as np
 
 from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
 from vd.gap.chain import candidates, others_in
-from vd.gap.consensus import agree, share
+from vd.gap.consensus import agree, no_spring, share
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.explanation import NAMED, Accepted, Explanation, lacking, polished
 from vd.gap.joint_fit import JointFit
@@ -134,7 +134,8 @@ def explain_joints(
     ends = [partial(finished, joint) for joint in joints]
     shared = share(alone, floors, fingers, ends)
     agreed = agree(shared, floors, fingers, [partial(fitted, joint) for joint in joints])
-    return _consistent(team, joints, _beside_masses(team, joints, agreed))
+    found = _consistent(team, joints, _beside_masses(team, joints, agreed))
+    return no_spring(found, fingers)
 
 
 def _in_turn(
