@@ -336,6 +336,9 @@ def test_a_table_that_is_damaged_is_named_with_its_line(tmp_path):
         read_rows(table)
     with pytest.raises(ValueError, match="no such folder"):
         gap.take_over([tmp_path / "none"], tmp_path)
+    (tmp_path / "cut-seed0.json").write_text("{")
+    with pytest.raises(ValueError, match=r"cut-seed0.json is damaged .*remove it"):
+        gap.take_over([tmp_path], tmp_path / "into")
 
 
 def test_two_machines_meet_and_their_results_are_put_together(tmp_path, monkeypatch, capsys):

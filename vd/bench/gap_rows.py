@@ -109,12 +109,12 @@ def merged(sources: Sequence[Path]) -> list[dict[str, Any]]:
     """Results of folders and tables; of a case in several, the first that did not fail.
 
     Raises:
-        ValueError: A source that is neither a folder nor a table.
+        ValueError: A source that is neither a folder nor a table, or is damaged.
     """
     found: dict[str, dict[str, Any]] = {}
     for source in sources:
         if source.is_dir():
-            parts = [json.loads(path.read_text()) for path in sorted(source.glob("*-seed*.json"))]
+            parts = [_read_result(path) for path in sorted(source.glob("*-seed*.json"))]
         elif source.is_file():
             parts = read_rows(source)
         else:
@@ -124,3 +124,12 @@ def merged(sources: Sequence[Path]) -> list[dict[str, Any]]:
             if key not in found or ("error" in found[key] and "error" not in result):
                 found[key] = result
     return list(found.values())
+
+
+def _read_result(path: Path) -> dict[str, Any]:
+    """One result of a folder."""
+    try:
+        result: dict[str, Any] = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged ({error}); remove it to run its case again") from error
+    return result

@@ -160,7 +160,8 @@ class ReorientEnv:
         self._must_lift = array(must_lift(cfg), wp.int32)
         self.nudges = Nudges(cfg, d, n, self.device) if cfg.nudge.enabled else None
         """What moves hands that are stuck, or None: they stay as they are."""
-        self._shapes = ShapeObserver(self)
+        self._lifts = cfg.reward.lift != 0.0
+        self._shapes = ShapeObserver(self) if self.sees_shape or self._lifts else None
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
         self.randomiser = Randomiser(self)
 
@@ -266,7 +267,7 @@ class ReorientEnv:
             sim.put_back(self.step_count, self.max_episode_steps - 1)
         self._fingertips()
         self._motor_torque()
-        if self.cfg.reward.lift != 0.0:
+        if self._shapes is not None and self._lifts:
             self._shapes.measure_clearance()
         wp.launch(
             reward_kernel,
@@ -433,7 +434,7 @@ class ReorientEnv:
             outputs=[self.world_observation],
             device=self.device,
         )
-        if self.sees_shape:
+        if self._shapes is not None and self.sees_shape:
             self._shapes.launch()
         if self.views is not None:
             self.views.observe()
