@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from vd.config import from_dict, to_dict
+from vd.envs.cfg import FocusCfg
 from vd.files import write_json
 from vd.train.begin import find_start, settings_of
+from vd.train.focus import read_success, worlds_text
 from vd.train.presets import PRESETS, TeacherCfg, smoke
 
 if TYPE_CHECKING:
@@ -147,8 +149,10 @@ def parse_teacher(arguments: Sequence[str]) -> TeacherCfg:
     run's own configuration with ``--resume``), the second reads every flag with those values as defaults.
 
     Raises:
-        FileNotFoundError: ``--resume`` names a run without a configuration.
-        ValueError: The run's configuration is not one of this version, or ``--init`` is no teacher.
+        FileNotFoundError: ``--resume`` names a run without a configuration, or
+            ``--focus-on`` no file.
+        ValueError: The run's configuration is not one of this version, ``--init`` is no teacher, or
+            ``--focus-on`` no evaluation.
     """
     arguments = normalise(arguments, SHORT_FORMS, "env")
     preset, init = value_of(arguments, "--preset"), value_of(arguments, "--init")
@@ -159,9 +163,14 @@ def parse_teacher(arguments: Sequence[str]) -> TeacherCfg:
     else:  # the second pass refuses an unknown name
         start = PRESETS.get(preset or "paper", PRESETS["paper"])()
     base = _saved_config(arguments, start) if "--resume" in arguments else start
-    return tyro.cli(
+    cfg = tyro.cli(
         TeacherCfg, args=arguments, default=base, prog="vd-train teacher", description=TEACHER_HELP
     )
+    if cfg.focus_on is None:
+        return cfg
+    # What the run needs of the file is kept with it.
+    success = read_success(cfg.focus_on)
+    return replace(cfg, focus_on=None, env=replace(cfg.env, focus=replace(cfg.env.focus, success=success)))
 
 
 def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherRunner":
@@ -199,7 +208,8 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     from vd.train.runner import TeacherRunner
     from vd.train.vec_env import ReorientVecEnv
 
-    task = to_dict(cfg.env)
+    # How worlds were shared out is this run's alone: its config.json says it, and its policies do not.
+    task = to_dict(replace(cfg.env, focus=FocusCfg()))
     if rank == 0:
         # Before anything is built: a run that fails at once still says what it was.
         saved = to_dict(replace(cfg, resume=None))
@@ -257,6 +267,9 @@ def _teacher(arguments: list[str], started: float) -> int:
     with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):
         runner = build_teacher(cfg, started=started)
     folder = cfg.run.run_dir
+    if cfg.env.focus.success and main_process:
+        simulation = runner.env.env
+        print(worlds_text([item.name for item in simulation.objects], simulation.world_object))
     if runner.current_learning_iteration and main_process:
         how = f"begins from {cfg.init}" if runner.begun else "resumed"
         print(f"{how} after iteration {runner.current_learning_iteration} of {runner.total_iterations}")

@@ -44,6 +44,10 @@ class TeacherCfg:
     init_stage: tuple[float, float] | None = None
     """Difficulty and tightness of the curriculum at which a run with --init begins. None: those of what it
     begins from; 1 and 1 for a policy that does not say, which is the task as configured."""
+    focus_on: Path | None = None
+    """More worlds for the objects that a policy fails with: eval.json of a vd-eval on the objects
+    trained on. Its success rates become --env.focus.success, so that the file is not needed again; see
+    --env.focus.share."""
     smoke: bool = False
     """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)

@@ -248,6 +248,28 @@ class CurriculumCfg:
 
 
 @dataclass(frozen=True)
+class FocusCfg:
+    """Ours: more worlds for the objects that fail. Without success rates, the default, all get the same."""
+
+    success: dict[str, float] = field(default_factory=dict)
+    """Success rate of every object, 0 to 1, by name, measured before; --focus-on takes them from an
+    evaluation. Those of objects that are not simulated are not used."""
+    share: float = 0.5
+    """Share of the worlds that is given by failure, in proportion to it. The others are spread evenly, so
+    that no object is forgotten."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        if not 0.0 <= self.share < 1.0:
+            raise ValueError(
+                f"focus.share is {self.share:g}; it is from 0 to below 1: every object keeps some worlds"
+            )
+        for name, rate in self.success.items():
+            if not 0.0 <= rate <= 1.0:
+                raise ValueError(f"focus.success of {name} is {rate:g}; a success rate is within 0 and 1")
+
+
+@dataclass(frozen=True)
 class RandomisationCfg:
     """Table S3 and the disturbance force."""
 
@@ -335,6 +357,7 @@ class ReorientCfg:
     table: TableCfg = field(default_factory=TableCfg)
     nudge: NudgeCfg = field(default_factory=NudgeCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
+    focus: FocusCfg = field(default_factory=FocusCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
 
     @property
@@ -348,6 +371,7 @@ class ReorientCfg:
         self.reward.validate()
         self.randomisation.validate()
         self.curriculum.validate()
+        self.focus.validate()
         self.table.validate()
         self.nudge.validate()
         if self.start.at_rest and (self.start.poses < 1 or self.start.settle_s <= 0.0):

@@ -17,6 +17,7 @@ from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.nudges import Nudges
+from vd.envs.objects import object_scales, object_weights
 from vd.envs.parameters import TaskParameters
 from vd.envs.randomise import Randomiser
 from vd.envs.servo import needs_servo, servo_ranges
@@ -59,22 +60,25 @@ class ReorientEnv:
         self.device = str(wp.get_device(device or ("cuda:0" if wp.is_cuda_available() else "cpu")))
         self.hand: HandModel = load_hand(cfg.hand, cfg.fingertip, cfg.hand_layer)
         self.objects: list[ObjectModel] = load_set(list(cfg.objects))
-        random = cfg.randomisation
-        scales = np.linspace(*random.object_scale, random.object_scale_count) if random.enabled else [1.0]
         self.scene = build_scene(
             hand=self.hand,
             objects=self.objects,
             num_worlds=cfg.num_worlds,
             cfg=cfg.sim,
             device=self.device,
-            scales=[float(s) for s in scales],
+            scales=object_scales(cfg.randomisation),
+            weights=object_weights([item.name for item in self.objects], cfg.focus),
             visuals=cfg.visuals,
         )
-        self.servo_ranges = servo_ranges(self.hand, random)
+        self.servo_ranges = servo_ranges(self.hand, cfg.randomisation)
         """Range (low, high) of each number of each joint's servo, shape [D, P, 2]; equal ends are fixed."""
         largest = self.servo_ranges[:, :, 1] if needs_servo(self.servo_ranges) else None
         self.sim = Simulator(
-            self.scene, cfg.sim, servo_rows=largest, servo_seed=cfg.seed, restitution=random.bounces
+            self.scene,
+            cfg.sim,
+            servo_rows=largest,
+            servo_seed=cfg.seed,
+            restitution=cfg.randomisation.bounces,
         )
         servo = self.sim.servo
         self.measured_q = self.sim.joint_q if servo is None else servo.measured_q

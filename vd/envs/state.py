@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import warp as wp
 
 from vd.envs.cfg import CurriculumCfg
@@ -22,6 +23,7 @@ def save_state(env: "ReorientEnv") -> dict[str, Any]:
         "tightening": env.cfg.curriculum.tightening.enabled,
         "tightness": env.stage.tightness,
         "steps": env.steps,
+        "objects": _objects(env),
     }
 
 
@@ -40,7 +42,7 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
     """Continue from :func:`save_state`.
 
     Raises:
-        ValueError: If it belongs to another number of worlds, another hand or another servo model.
+        ValueError: If it belongs to another number of worlds, other objects, another hand or servo model.
     """
     here = _arrays(env)
     if state["arrays"].keys() != here.keys():
@@ -57,7 +59,13 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
                 f"this one {array.numpy().shape}; "
                 "resume with the num_worlds and hand of the checkpoint"
             )
-        array.assign(saved)
+    if state.get("objects", _objects(env)) != _objects(env):
+        raise ValueError(
+            "the worlds of the saved environment hold other objects; resume with objects and focus of the "
+            "checkpoint, or from one without worlds (vd-train export --resumable)"
+        )
+    for name, array in here.items():
+        array.assign(state["arrays"][name])
     env.steps = int(state["steps"])
     if env.nudges is not None:
         env.nudges.forget()
@@ -81,6 +89,12 @@ def save_failed_step(env: "ReorientEnv") -> Path | None:
         objects=cfg.objects,
         sim=cfg.sim,
     )
+
+
+def _objects(env: "ReorientEnv") -> list[tuple[str, int]]:
+    """Worlds of each object, in the order of the worlds."""
+    counts = np.bincount(env.world_object, minlength=len(env.objects))
+    return [(item.name, int(count)) for item, count in zip(env.objects, counts, strict=True)]
 
 
 def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
