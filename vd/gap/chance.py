@@ -112,6 +112,7 @@ def behind(search: "Selection", veil: Veil) -> "Selection":
         candidates=[name for name in search.candidates if name != RANDOM],
         restarts=0,
         like=((), {}),
+        changing=((), {}),
         veiled=True,
         report=lambda line: search.report(f"beside {RANDOM}: {line}"),
         without={},

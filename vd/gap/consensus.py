@@ -8,8 +8,17 @@ from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import NAMED, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import AT_FLOOR, CONTAINED_FLOORS, MIN_GAIN, NESTED, RANDOM, SMALL_EXCESS_FLOORS
+from vd.gap.judge import (
+    AT_FLOOR,
+    CONTAINED_FLOORS,
+    MIN_GAIN,
+    NESTED,
+    RANDOM,
+    RECOVERED,
+    SMALL_EXCESS_FLOORS,
+)
 from vd.gap.verdict import CANCELLING, UNEXPLAINED, explains
+from vd.gap.warming import LEVELS
 
 if TYPE_CHECKING:
     from vd.gap.select import Selection
@@ -20,6 +29,9 @@ OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag",
 SHOWN_TAIL = 0.4
 """Share of the resamples that may see no gain from an effect that another joint has for sure: one motion of a
 dozen can be all that shows it, and a third of the resamples leave that out."""
+
+CHANGING = "its friction changes over the recording, as another joint of the finger shows"
+"""Why a constant friction is no name, nor what is found beside it."""
 
 Polish = Callable[[JointFit], JointFit]
 """Fits a model to the end."""
@@ -80,6 +92,32 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
     rivals = {name: [fit] for name in effects}
     refined = search.refined(fit)
     return search.explained(search.conclude(baseline, fit, rivals, trials, loose, refined))
+
+
+def as_changing(search: "Selection", baseline: JointFit, loose: str) -> Explanation | None:
+    """No names on a joint, without a search, where another of its finger has a friction that changes.
+
+    None where that friction does not explain most of the gap here, too.
+
+    Args:
+        search: Of the joint; :attr:`~vd.gap.select.Selection.changing` is the other joint's model.
+        baseline: The plain model.
+        loose: What of the baseline the motions leave open.
+    """
+    effects, values = search.changing
+    if not effects or {*effects} & {*search.vetoes}:
+        return None
+    starts = [{**baseline.values, **values}, {**search.nominal, **values}]
+    fit = search.run([search.call(baseline, effects, starts, FULL_ITERATIONS)])[0]
+    if fit.held_out_rmse**2 > (1.0 - RECOVERED) * baseline.held_out_rmse**2:
+        return None
+    names, (gain, ci) = " and ".join(effects), search.gain(baseline, fit)
+    before, after = 1e3 * baseline.held_out_rmse, 1e3 * fit.held_out_rmse
+    search.report(f"+ {names}, as on another joint: {before:.2f} -> {after:.2f} mrad held out")
+    trials = [Trial(1, name, fit, gain, ci, "rejected", CHANGING) for name in effects]
+    rivals = {name: [fit] for name in effects}
+    found = search.conclude(baseline, fit, rivals, trials, loose, search.refined(fit))
+    return replace(found, verdict="unknown", reason=f"{names} as on another joint: {CHANGING}")
 
 
 def share(
@@ -183,6 +221,25 @@ def no_spring(explanations: Sequence[Explanation], groups: Sequence[int]) -> lis
     return [
         replace(e, verdict="unknown", reason=reason)
         if group in refused and e.verdict in ("effects", "ambiguous") and both == {*e.final.effects}
+        else e
+        for e, group in zip(explanations, groups, strict=True)
+    ]
+
+
+def no_constant_friction(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[Explanation]:
+    """Explanations without a friction that is seen to change on another joint of the finger.
+
+    Where it moves only early in a recording, or late, a joint shows no change of its own, and a play or a
+    coupling stands for it.
+
+    Args:
+        explanations: Of the joints.
+        groups: Number of the finger of each joint.
+    """
+    changing = {group for e, group in zip(explanations, groups, strict=True) if e.warms}
+    return [
+        replace(e, verdict="unknown", reason=CHANGING)
+        if group in changing and e.verdict in ("effects", "ambiguous") and {*LEVELS} & {*e.final.effects}
         else e
         for e, group in zip(explanations, groups, strict=True)
     ]

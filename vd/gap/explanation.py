@@ -66,6 +66,8 @@ class Explanation:
     trials: tuple[Trial, ...] = ()
     rivals: Mapping[str, Sequence[JointFit]] = field(default_factory=dict)
     """Fits with others in the place of each effect."""
+    warms: bool = False
+    """Whether a friction of the final model changes over the recording, as none of the table does."""
 
 
 def intervals(fit: JointFit, floor: float) -> dict[str, tuple[float, float]]:
@@ -99,10 +101,14 @@ def polished(explanation: Explanation, fit: JointFit, floor: float) -> Explanati
     return replace(explanation, final=fit, accepted=accepted)
 
 
+def added(fit: JointFit) -> tuple[tuple[str, ...], dict[str, float]]:
+    """The effects of a model, and their values by key."""
+    return fit.effects, {key: value for key, value in fit.values.items() if "." in key}
+
+
 def lacking(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
     """The effects that a joint is certain to lack, and their values by key; none where it is not."""
-    effects = explanation.final.effects
     certain = explanation.verdict == "effects" and all(one.named for one in explanation.accepted)
-    if not certain or RANDOM in effects:
+    if not certain or RANDOM in explanation.final.effects:
         return (), {}
-    return effects, {key: value for key, value in explanation.final.values.items() if "." in key}
+    return added(explanation.final)

@@ -10,9 +10,9 @@ import numpy as np
 
 from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
 from vd.gap.chain import candidates, others_in
-from vd.gap.consensus import agree, no_spring, share
+from vd.gap.consensus import agree, no_constant_friction, no_spring, share
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.explanation import NAMED, Accepted, Explanation, lacking, polished
+from vd.gap.explanation import NAMED, Accepted, Explanation, added, lacking, polished
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import EXCESS_FLOORS, NESTED, NO_GAP, RANDOM
 from vd.gap.masses import Masses, fit_masses
@@ -22,6 +22,7 @@ from vd.gap.statistics import resamples
 from vd.gap.team import JointSpec, Team
 from vd.gap.telemetry import vetoes
 from vd.gap.verdict import cancelled, explains
+from vd.gap.warming import middles
 from vd.kernels.effects import EFFECTS
 
 POLISH_ITERATIONS = 5
@@ -66,6 +67,7 @@ def explain_joints(
         progress: Called with lines of progress.
     """
     masses = _masses(team, joints)
+    when = middles(recording)
 
     def plain(joint: Joint, explained: Explained) -> JointFit:
         """The plain model, fitted again beside joints of which more is known than theirs."""
@@ -111,7 +113,9 @@ def explain_joints(
             vetoes={**stood_for(same), **told},
             report=lambda line: progress(f"explain: {joint.name}: {line}"),
             rest=_rest(recording, int(chain.columns[joint.spec.joint]), joint.spec.trajectories),
+            when=when[list(joint.spec.trajectories)],
             like=next((like for _, found in explained if (like := lacking(found))[0]), ((), {})),
+            changing=next((added(found.final) for _, found in explained if found.warms), ((), {})),
         )
         result = selection.explain(plain(joint, explained))
         progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
@@ -135,7 +139,7 @@ def explain_joints(
     shared = share(alone, floors, fingers, ends)
     agreed = agree(shared, floors, fingers, [partial(fitted, joint) for joint in joints])
     found = _consistent(team, joints, _beside_masses(team, joints, agreed))
-    return no_spring(found, fingers)
+    return no_constant_friction(no_spring(found, fingers), fingers)
 
 
 def _in_turn(
@@ -199,7 +203,8 @@ def _beside_masses(
         known = [(joints[i], explanations[i]) for i in own]
         models = {frozenset(found.final.effects) for _, found in known if found.verdict != "no_gap"}
         certain = all(found.verdict in ("effects", "no_gap") for _, found in known)
-        if not chain.bodies or not models or (certain and len(models) == 1):
+        warms = any(found.warms for _, found in known)
+        if not chain.bodies or not models or warms or (certain and len(models) == 1):
             continue
         told = [found for core in _cores(known) if (found := _all_with(team, known, core))]
         fewest = min((found.effects for found in told), default=0)

@@ -11,7 +11,7 @@ import numpy as np
 
 from vd.gap.candidates import BETTER, HOPELESS, Call
 from vd.gap.chance import try_random
-from vd.gap.consensus import as_another
+from vd.gap.consensus import as_another, as_changing
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.frictions import EXACTLY, Frictions
 from vd.gap.jitter import CALLS
@@ -57,12 +57,14 @@ class Selection(Frictions):
         looks: Rounds in which every start may be tried (:meth:`look_wider`).
         wide: Whether more is tried than the best starts and one effect after the other.
         like: What another joint of the finger certainly lacks: effects, and values by key.
+        changing: The same of one whose friction changes over the recording: what comes nearest there.
     """
 
     restarts: int = RESTARTS
     looks: int = LOOKS
     wide: bool = True
     like: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
+    changing: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
 
     def explain(self, baseline: JointFit) -> Explanation:
         """Select effects, starting from the fitted baseline."""
@@ -77,7 +79,7 @@ class Selection(Frictions):
             if loose:
                 return Explanation(baseline, baseline, "under_excited", loose)
             return Explanation(baseline, baseline, "no_gap", "the plain model is within the noise floor")
-        known = as_another(self, baseline, loose)
+        known = as_another(self, baseline, loose) or as_changing(self, baseline, loose)
         if known is not None:
             return known
         trials = self.contradicted(baseline)

@@ -20,6 +20,7 @@ from vd.gap.judge import (
     SHARP,
     Judge,
 )
+from vd.gap.warming import warming
 from vd.kernels.effects import BESIDE
 
 UNEXPLAINED = 1.5
@@ -48,11 +49,13 @@ class Verdicts(Judge):
         equivalent: Effects that one stands for, since the recording cannot tell them apart.
         apart: Fits with several effects in the place of one that they are together, by its name.
         joint: Index of the joint in its chain.
+        when: Time of each trajectory [S] [s]; None where it is not known.
     """
 
     equivalent: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     apart: dict[str, JointFit] = field(default_factory=dict)
     joint: int = 0
+    when: np.ndarray | None = None
 
     def undetermined(self, fit: JointFit) -> str:
         """Which parameter of the baseline the motions leave open, in words; empty if none."""
@@ -123,6 +126,10 @@ class Verdicts(Judge):
         if lack:
             names = " and ".join(a.name for a in accepted)
             return replace(explanation, reason=f"{names} come nearest, but {lack}: the cause is another")
+        warms = self.warms(told)
+        if warms:
+            text = f"{warms}: the cause is a friction that changes, as with temperature"
+            return replace(explanation, warms=True, reason=text)
         named = [a.name for a in accepted if a.named]
         if named:
             return replace(explanation, verdict="effects", reason=explains(named))
@@ -152,6 +159,12 @@ class Verdicts(Judge):
         if mean < STRUCTURE or sure < STRUCTURE_SURE or small:
             return ""
         return f"what is left has structure ({np.sqrt(mean):.2f} noise floors that are not noise)"
+
+    def warms(self, fit: JointFit) -> str:
+        """Which friction of a model near the floor changes over the recording, in words, or nothing."""
+        if self.when is None or self.veiled or fit.rmse > REPEATABLE * self.floor:
+            return ""
+        return warming(fit, self.when, self.floor)
 
     def disagreement(
         self,
