@@ -196,6 +196,7 @@ def test_unusable_recordings_exit_with_2_and_a_message(tmp_path, capsys):
         (["--effects", "coulomb_friction,stiction"], "stiction"),
         (["--hand", "dclaw3", "--model", "hand.usda"], "--hand and --model"),
         (["--device", "tpu"], "--device is 'tpu'"),
+        (["--hand", "dclaw3"], "is of a bare servo, not of dclaw3"),
     ],
 )
 def test_wrong_flags_are_named(recording, tmp_path, capsys, flags, message):

@@ -128,6 +128,8 @@ def test_a_finger_is_recorded_by_name():
         ({"model": "servo", "effects": {"gremlins": {}}}, "gremlins"),
         ({"model": "servo", "effects": {"backlash": {"depth": 1.0}}}, "depth"),
         ({"model": "servo", "effects": {"backlash": {"width_rad": np.nan}}}, "finite"),
+        ({"model": "servo", "effects": {"backlash": {"width_rad": -0.04}}}, "negative"),
+        ({"model": "servo", "effects": {"joint_coupling": {}}}, "one joint"),
         ({"model": "servo", "effects": {"backlash": {}}, "effect_joints": {"backlash": ("x",)}}, "'x'"),
         ({"model": "servo", "excitations": ("dance",)}, "dance"),
     ],

@@ -1,6 +1,7 @@
 """Recordings: what is written is read, and what cannot be used is refused with file, place and remedy."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,12 +121,29 @@ def test_time_starts_at_zero_and_need_not_be_regular(folder):
         ({"joints": None}, ("joints",)),
         ({"encoder_resolution_rad": None}, ("encoder_resolution_rad", "0.001534")),
         ({"encoder_resolution_rad": -1.0}, ("encoder_resolution_rad",)),
+        (
+            {"encoder_resolution_rad": 360.0 / 4096},
+            ("encoder_resolution_rad", "degrees", "71.5 counts a turn"),
+        ),
+        ({"encoder_resolution_rad": 4096}, ("encoder_resolution_rad", "counts a turn")),
         ({"trajectories": []}, ("trajectories", "empty")),
         ({"trajectories": [{"excitation": "x", "joints": ["f0_j1"]}]}, ("trajectories[0]", "file")),
         ({"trajectories": [{"file": "b.csv", "joints": ["f0_j1"]}]}, ("b.csv", "no such file")),
         ({"trajectories": [{"file": "../a.csv", "joints": ["f0_j1"]}]}, ("folder",)),
         ({"trajectories": [{"file": "a.csv", "joints": ["f0_j3"]}]}, ("unknown joint 'f0_j3'",)),
         ({"trajectories": [{"file": "a.csv", "joints": ["f0_j1"], "conditions": [1]}]}, ("conditions",)),
+        (
+            {"trajectories": [{"file": "a.csv", "joints": ["f0_j1"], "conditions": {"p_gain": "high"}}]},
+            ("trajectories[0]", "'p_gain'", "'high'", "number"),
+        ),
+        (
+            {"trajectories": [{"file": "a.csv", "joints": ["f0_j1"], "conditions": {"payload_kg": -0.2}}]},
+            ("trajectories[0]", "'payload_kg'", "-0.2", "not negative"),
+        ),
+        (
+            {"trajectories": [{"file": "a.csv", "joints": ["f0_j1"]}] * 2},
+            ("trajectories[1]", "'a.csv'", "trajectories[0]", "once"),
+        ),
     ],
 )
 def test_a_header_that_cannot_be_used_is_refused(folder, changes, words):
@@ -140,6 +158,9 @@ def test_a_header_that_cannot_be_used_is_refused(folder, changes, words):
         (lambda t: [[*row, *row[-1:]] for row in t], ("'position.f0_j2' twice",)),
         (lambda t: t[0].__setitem__(1, "command.f0_j9"), ("row 1", "unknown joint 'f0_j9'")),
         (lambda t: t[0].__setitem__(0, "time"), ("no column 't'",)),
+        (lambda t: [[";".join(row)] for row in t], ("no column 't'", "commas")),
+        (lambda t: [t[0], ["s", *["rad"] * (len(t[0]) - 1)], *t[1:]], ("row 2", "'t'", "s is not a finite")),
+        (set_cells("t", lambda t: f"{1e3 * t:.3f}"), ("'t'", "10 s between samples", "milliseconds")),
         (lambda t: t[:4], ("3 samples", "at least")),
         (lambda t: t[:1], ("0 samples",)),
         (lambda t: [*t[:50], t[48], *t[50:]], ("row 51", "'t'", "runs backward")),
@@ -150,13 +171,14 @@ def test_a_header_that_cannot_be_used_is_refused(folder, changes, words):
         (lambda t: t[30].append("0"), ("row 31", "cells")),
         (set_cells("position.f0_j2", lambda q: f"{np.degrees(q):.6f}"), ("position.f0_j2", "degrees")),
         (set_cells("command.f0_j1", lambda q: f"{np.degrees(q):.6f}"), ("command.f0_j1", "degrees")),
+        (set_cells("position.f0_j2", lambda q: f"{-q:.6f}"), ("position.f0_j2", "sign")),
         (set_cells("position.f0_j1", "0.1"), ("position.f0_j1", "dead encoder")),
     ],
 )
 def test_a_table_that_cannot_be_used_is_refused(folder, change, words):
     edit_table(folder, change)
     message = refused(folder, *words)
-    assert "a.csv" in message or "degrees" in message
+    assert "a.csv" in message or "in every motion" in message or "degrees" in message
 
 
 def test_commands_that_never_move_are_refused(folder):
@@ -170,6 +192,26 @@ def test_a_joint_at_rest_and_a_servo_that_is_off_are_no_dead_encoders(tmp_path):
     recording = example(enabled=np.zeros((SAMPLES, 2), dtype=bool))
     recording.trajectories[0].position[:, 0] = 0.1
     read_recording(write_recording(recording, tmp_path / "off"))
+
+
+def test_an_encoder_that_only_flickers_is_dead(tmp_path):
+    recording = example()
+    (trajectory,) = recording.trajectories
+    trajectory.position[:, 1] = COUNT * np.random.default_rng(0).integers(-1, 2, SAMPLES)
+    refused(write_recording(recording, tmp_path / "r"), "a.csv", "position.f0_j2", "flickers", "dead encoder")
+    moves = replace(trajectory, file="b.csv", position=trajectory.command.copy())
+    whole = replace(recording, trajectories=(trajectory, moves))
+    read_recording(write_recording(whole, tmp_path / "sticks"))  # it may stick in one motion
+
+
+def test_files_of_a_spreadsheet_are_read(folder):
+    plain = read_recording(folder).trajectories[0]
+    for file in ("a.csv", "recording.json"):  # a byte order mark, and lines that end in CR LF
+        text = (folder / file).read_text()
+        (folder / file).write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    marked = read_recording(folder).trajectories[0]
+    np.testing.assert_array_equal(marked.position, plain.position)
+    assert marked.conditions == plain.conditions
 
 
 def test_small_motions_in_degrees_show_in_the_encoder_counts(tmp_path):

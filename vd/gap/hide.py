@@ -49,6 +49,9 @@ BARE_REACH_RAD = 1.5
 INERTIA_SPREAD = math.log(2.0)
 """The unknown inertia and gravity of a bare servo vary by a factor of two, log-uniform."""
 
+COUPLING = "joint_coupling"
+"""The effect that takes more than one joint."""
+
 Effects = Mapping[str, Mapping[str, float]]
 
 
@@ -308,10 +311,20 @@ def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant
                 raise ValueError(f"{name} has no parameter {key!r}; it has {', '.join(typical)}")
             if not math.isfinite(value):
                 raise ValueError(f"{name}: {key} is {value}; give a finite number")
+            if value < 0.0 and key not in _signed(name):
+                raise ValueError(f"{name}: {key} is {value}; it cannot be negative")
         having = _effect_joints(hiding, name, plant.joints)
+        if name == COUPLING and len(plant.joints) == 1:
+            raise ValueError(f"{name}: {hiding.model} has one joint, which nothing can drive; take a hand")
         on = np.array([joint in having for joint in plant.joints], dtype=float)
         effects[name] = {key: on * given.get(key, value) for key, value in typical.items()}
     return reach, Plant(**{**vars(plant), "effects": effects})
+
+
+def _signed(name: str) -> set[str]:
+    """Parameters of an effect that can be negative."""
+    known = EFFECTS[name].parameters if name in EFFECTS else ()
+    return {parameter.name for parameter in known if parameter.signed}
 
 
 def _effect_joints(hiding: Hiding, name: str, joints: tuple[str, ...]) -> tuple[str, ...]:

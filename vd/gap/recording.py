@@ -16,6 +16,13 @@ from typing import Any
 import numpy as np
 
 from vd.files import atomic_path, write_json
+from vd.gap.recording_checks import (
+    COMMAND_TIME,
+    RecordingError,
+    check_motion,
+    check_units,
+    check_values,
+)
 
 FORMAT = "vd-recording/1"
 BARE_MODELS = ("servo", "pendulum")
@@ -27,21 +34,13 @@ USD_SUFFIXES = (".usd", ".usda", ".usdc")
 
 MIN_SAMPLES = 20
 """Samples of a trajectory below which no motion can be told from noise."""
-PLAUSIBLE_RAD = 2.2 * math.pi
-"""Largest position or command [rad] of a servo in position mode: one turn, and a tenth for offsets."""
-MOVING_COUNTS = 20.0
-"""Encoder counts by which a command must move before the position has to answer."""
-MIN_DISTINCT = 50
-"""Distinct positions from which the smallest step between two of them tells the unit."""
-DEGREES_RATIO = 20.0
-"""A smallest step above this many encoder counts is in another unit (degrees are 57 times radians)."""
-COMMAND_TIME = "t_command"
-"""Optional column: when the commands of a row were sent [s], if not at the row's time stamp."""
+COARSEST_RAD = 2.0 * math.pi / 256
+"""Largest encoder count [rad]: eight bits a turn. Twelve bits a turn are 0.088 if written in degrees."""
+POSITIVE = ("p_gain", "payload_kg", "arm_length_m")
+"""Conditions that the model computes with: numbers, not negative."""
+TEXT = "utf-8-sig"
+"""Encoding of the files; spreadsheets put a mark in front."""
 CSV_DIGITS = 6
-
-
-class RecordingError(ValueError):
-    """A recording that cannot be used; names file, row, column, why, and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +144,11 @@ def read_recording(path: str | Path) -> Recording:
             f"{file}: 'encoder_resolution_rad' is {resolution!r}; give the size of one encoder count in rad, "
             "e.g. 0.001534 for 4096 counts a turn"
         )
+    if resolution > COARSEST_RAD:
+        raise RecordingError(
+            f"{file}: 'encoder_resolution_rad' is {resolution:g}, {2.0 * math.pi / resolution:.3g} counts a "
+            "turn: this looks like degrees, or like counts a turn; write radians a count, e.g. 0.001534"
+        )
     servo = header.get("servo", {})
     if not isinstance(servo, dict):
         raise RecordingError(f"{file}: 'servo' is {servo!r}; make it an object such as {{\"model\": ..}}")
@@ -154,9 +158,16 @@ def read_recording(path: str | Path) -> Recording:
             f"{file}: 'trajectories' is empty; list at least one {{file, excitation, joints}}"
         )
     trajectories = tuple(_read_trajectory(file, i, entry, joints) for i, entry in enumerate(entries))
+    names = [trajectory.file for trajectory in trajectories]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise RecordingError(
+                f"{file}: trajectories[{i}]: {name!r} is listed before as trajectories[{names.index(name)}]; "
+                "list each file once, or it counts twice as evidence"
+            )
     recording = Recording(file.parent, header["model"], joints, servo, float(resolution), trajectories)
-    _check_motion(recording)
-    _check_units(recording)
+    check_motion(recording)
+    check_units(recording)
     return recording
 
 
@@ -201,7 +212,7 @@ def _read_header(file: Path) -> dict[str, Any]:
     if not file.is_file():
         raise RecordingError(f"{file}: no such file; give a folder with recording.json and its CSV files")
     try:
-        header = json.loads(file.read_text())
+        header = json.loads(file.read_text(encoding=TEXT))
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise RecordingError(f"{file}: not JSON ({error}); correct it at that place") from error
     if not isinstance(header, dict):
@@ -278,6 +289,10 @@ def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...
         isinstance(value, str) or _is_number(value) for value in conditions.values()
     ):
         raise RecordingError(f"{where}: 'conditions' is {conditions!r}; map names to numbers or words")
+    for key in POSITIVE:
+        value = conditions.get(key, 0.0)
+        if isinstance(value, str) or value < 0.0:
+            raise RecordingError(f"{where}: condition {key!r} is {value!r}; give a number, not negative")
     table = file.parent / name
     columns = _read_csv(table, joints)
     time = columns.pop("t")
@@ -306,7 +321,7 @@ def _read_csv(file: Path, joints: tuple[str, ...]) -> dict[str, np.ndarray]:
     if not file.is_file():
         raise RecordingError(f"{file}: no such file; put it there or drop it from 'trajectories'")
     try:
-        with file.open(newline="") as stream:
+        with file.open(newline="", encoding=TEXT) as stream:
             rows = list(csv.reader(stream))
     except UnicodeDecodeError as error:
         raise RecordingError(f"{file}: not a text file ({error}); export it as CSV in UTF-8") from error
@@ -330,7 +345,7 @@ def _read_csv(file: Path, joints: tuple[str, ...]) -> dict[str, np.ndarray]:
     columns = {name: _numbers(file, name, [row[index] for row in body]) for name, index in kept.items()}
     if COMMAND_TIME in columns:
         columns = _told_once(columns)
-    _check_values(file, columns)
+    check_values(file, columns)
     return columns
 
 
@@ -355,7 +370,8 @@ def _check_columns(file: Path, names: list[str], joints: tuple[str, ...]) -> dic
     required = ["t", *(f"{channel}.{joint}" for joint in joints for channel in ("command", "position"))]
     for name in required:
         if name not in names:
-            raise RecordingError(f"{file}: row 1 has no column {name!r}; add it")
+            remedy = "separate columns by commas" if set(";\t") & set(names[0]) else "add it"
+            raise RecordingError(f"{file}: row 1 has no column {name!r}; {remedy}")
     wanted = {"t", COMMAND_TIME, *(f"{channel}.{joint}" for channel in CHANNELS for joint in joints)}
     return {name: index for index, name in enumerate(names) if name in wanted}
 
@@ -373,84 +389,6 @@ def _numbers(file: Path, name: str, cells: list[str]) -> np.ndarray:
                 "number; drop the row, or the column if it is optional"
             )
     return values
-
-
-def _check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Time runs forward, and every value can be what its column says."""
-    time = columns["t"]
-    bad = np.flatnonzero(np.diff(time) <= 0.0)
-    if len(bad):
-        i = int(bad[0]) + 1
-        how = "repeats" if time[i] == time[i - 1] else "runs backward"
-        raise RecordingError(
-            f"{file}: row {i + 2}, column 't': time {how} ({time[i - 1]:g} s, then {time[i]:g} s); "
-            "sort the rows and keep one per stamp"
-        )
-    back = np.flatnonzero(np.diff(columns.get(COMMAND_TIME, time)) < 0.0)
-    if len(back):
-        raise RecordingError(
-            f"{file}: row {int(back[0]) + 3}, column {COMMAND_TIME!r}: sent before the commands of the row "
-            "before; commands go out in the order of the rows: correct it"
-        )
-    for name, values in columns.items():
-        channel = name.partition(".")[0]
-        if channel in ("command", "position"):
-            i, limit = int(np.argmax(np.abs(values))), PLAUSIBLE_RAD
-            why = "more than a turn, so these look like degrees or counts; write radians"
-        elif channel == "pwm":
-            i, limit = int(np.argmax(np.abs(values))), 1.0
-            why = "a duty cycle lies in [-1, 1]; divide by the full scale"
-        elif channel == "enabled":
-            i, limit = int(np.argmax(np.abs(values - 0.5))), 1.0
-            why = "it must be 0 or 1; correct it"
-            if values[i] in (0.0, 1.0):
-                continue
-            limit = 0.0
-        else:
-            continue
-        if abs(values[i]) > limit:
-            raise RecordingError(f"{file}: row {i + 2}, column {name!r}: {values[i]:g}: {why}")
-
-
-def _check_motion(recording: Recording) -> None:
-    """Some command moves, and where a command moves the encoder answers."""
-    needed = MOVING_COUNTS * recording.encoder_resolution_rad
-    moved = False
-    for trajectory in recording.trajectories:
-        travel = np.ptp(trajectory.command, axis=0)
-        moved |= bool((travel > 0.0).any())
-        for j, joint in enumerate(recording.joints):
-            if (
-                travel[j] > needed
-                and np.ptp(trajectory.position[:, j]) == 0.0
-                and trajectory.enabled[:, j].all()
-            ):
-                raise RecordingError(
-                    f"{recording.path / trajectory.file}: column 'position.{joint}' is "
-                    f"{trajectory.position[0, j]:g} in every row while 'command.{joint}' moves by "
-                    f"{travel[j]:.3g} rad: a dead encoder, or a servo that is off; record it again"
-                )
-    if not moved:
-        raise RecordingError(
-            f"{recording.path / 'recording.json'}: no 'command.' column moves in any trajectory, so nothing "
-            "can be identified; record steps and sines"
-        )
-
-
-def _check_units(recording: Recording) -> None:
-    """Small motions in degrees show in the size of an encoder count."""
-    for j, joint in enumerate(recording.joints):
-        levels = np.unique(np.concatenate([t.position[:, j] for t in recording.trajectories]))
-        if len(levels) < MIN_DISTINCT:
-            continue
-        steps = np.diff(levels)
-        step = float(steps[steps > 1e-9].min())
-        if step > DEGREES_RATIO * recording.encoder_resolution_rad:
-            raise RecordingError(
-                f"{recording.path}: column 'position.{joint}' moves in steps of {step:.3g}, but "
-                f"'encoder_resolution_rad' is {recording.encoder_resolution_rad:g}: these look like degrees "
-                "or counts; write radians"
-            )
 
 
 def _write_csv(file: Path, trajectory: Trajectory, joints: tuple[str, ...]) -> None:

@@ -101,10 +101,19 @@ class Analysis:
 
     @cached_property
     def hand_name(self) -> str | None:
-        """Name or file of the hand, None for a bare servo or pendulum."""
-        if self.settings.hand is not None:
-            return self.settings.hand
-        model = self.recording.model
+        """Name or file of the hand, None for a bare servo or pendulum.
+
+        Raises:
+            ValueError: A hand is named for a recording of a bare servo or pendulum.
+        """
+        model, named = self.recording.model, self.settings.hand
+        if named is not None and model in BARE_MODELS:
+            raise ValueError(
+                f"{self.recording.path} is of a bare {model}, not of {named}: leave out --hand and --model, "
+                "or name the hand as 'model' in recording.json"
+            )
+        if named is not None:
+            return named
         if model in BARE_MODELS:
             return None
         return str(self.recording.path / model) if model.endswith(USD_SUFFIXES) else model
@@ -116,7 +125,13 @@ class Analysis:
             return None
         from vd.assets_usd.hands import load_hand
 
-        return load_hand(self.hand_name, layer=self.settings.hand_layer)
+        hand = load_hand(self.hand_name, layer=self.settings.hand_layer)
+        if stray := [joint for joint in self.recording.joints if joint not in hand.joint_names]:
+            raise ValueError(
+                f"{self.recording.path}: {hand.name} has no joint {', '.join(stray)}, only "
+                f"{', '.join(hand.joint_names)}; name the hand that was recorded"
+            )
+        return hand
 
     @cached_property
     def start(self) -> dict[str, np.ndarray]:
@@ -194,8 +209,9 @@ class Analysis:
         digest.update((recording.path / "recording.json").read_bytes())
         for trajectory in recording.trajectories:
             digest.update((recording.path / trajectory.file).read_bytes())
-        if self.settings.hand_layer is not None and self.settings.hand_layer.is_file():
-            digest.update(self.settings.hand_layer.read_bytes())
+        for model in (self.hand_name, self.settings.hand_layer):  # the files, where they are some
+            if model is not None and Path(model).is_file():
+                digest.update(Path(model).read_bytes())
         if name != STEPS[0]:
             for file in OUTPUTS[STEPS[STEPS.index(name) - 1]]:
                 digest.update((self.out / file).read_bytes())
