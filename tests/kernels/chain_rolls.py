@@ -6,7 +6,8 @@ from kernel_oracle import device_array, unwritten
 
 from vd.gap.rollout import links_of
 from vd.kernels import actuators as servo
-from vd.kernels.chains import Links, Samples, rollout_kernel
+from vd.kernels.chain_bodies import Links
+from vd.kernels.chains import Samples, rollout_kernel
 from vd.kernels.effects import neutral_row
 
 DT = 1 / 480

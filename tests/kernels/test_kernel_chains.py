@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, unwritten
 
 from vd.kernels import actuators as servo
-from vd.kernels.chains import Links, chain_dynamics
+from vd.kernels.chain_bodies import Links, chain_dynamics
 from vd.kernels.effects import EFFECTS
 
 # --- Bodies ---
