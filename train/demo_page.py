@@ -21,8 +21,8 @@ from vd.train.metrics import PROGRESS_FILE, read_progress
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from vd.train.demo import DemoCfg
     from vd.train.demo_agents import GoalCount
+    from vd.train.demo_config import DemoCfg
 
 COLORS = {"trained": "#0072B2", "random": "#D55E00", "zero": "#8a8f98"}
 """Of Okabe and Ito, which colour-blind readers can tell apart."""
