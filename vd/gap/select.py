@@ -66,8 +66,14 @@ class Selection(Frictions):
     like: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
     changing: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
 
-    def explain(self, baseline: JointFit) -> Explanation:
-        """Select effects, starting from the fitted baseline."""
+    def explain(self, baseline: JointFit, start: tuple[JointFit, list[Trial]] | None = None) -> Explanation:
+        """Select effects, starting from the fitted baseline.
+
+        Args:
+            baseline: The plain model.
+            start: A model that leaves noise, and the evidence for it, where a search with a coarser step has
+                found one: it is only compared with others.
+        """
         loose = self.undetermined(baseline)
         self.whole = baseline.held_out_rmse
         if len(baseline.sse) < MIN_TRAJECTORIES:
@@ -79,11 +85,11 @@ class Selection(Frictions):
             if loose:
                 return Explanation(baseline, baseline, "under_excited", loose)
             return Explanation(baseline, baseline, "no_gap", "the plain model is within the noise floor")
-        known = as_another(self, baseline, loose) or as_changing(self, baseline, loose)
+        known = None if start else as_another(self, baseline, loose) or as_changing(self, baseline, loose)
         if known is not None:
             return known
-        trials = self.contradicted(baseline)
-        present, rivals, rows = self.first(baseline)
+        trials = [] if start else self.contradicted(baseline)
+        present, rivals, rows = (start[0], {}, start[1]) if start else self.first(baseline)
         trials += rows
         alone = [t for t in rows if t.round == 1 and len(t.fit.effects) == 1]
         first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
@@ -104,8 +110,11 @@ class Selection(Frictions):
                 trials += [replace(row, round=row.round + MAX_ROUNDS) for row in rows]
         if self.too_coarse(present):
             self.report(f"{' and '.join(present.effects)}: the time step shows, so again with a finer one")
-            fine = self.finer()
-            return fine.explain(fine.run([fine.plain(baseline)])[0])
+            fine, refined = self.finer(), self.refined(present)
+            plain = fine.run([fine.plain(baseline)])[0]
+            if refined.rmse > UNEARNED * self.floor or self.lack_of_fit(refined):
+                return fine.explain(plain)
+            return fine.explain(plain, (fine.refit(refined, refined.effects), trials))
         if present.effects:
             earned, why = self.better(baseline, present)
             if not earned:
