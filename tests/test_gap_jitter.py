@@ -1,5 +1,6 @@
 """Delays that vary by chance: how much they vary, what that does to samples, what is found beside them."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,8 +10,9 @@ from test_gap_fit import problem_of
 from vd.gap.explanation import intervals
 from vd.gap.fit import JointProblem
 from vd.gap.hide import Hidden, Hiding, simulate_hidden
-from vd.gap.jitter import fit_jitter, look
+from vd.gap.jitter import DRAWS, JitterFit, fit_jitter, look
 from vd.gap.joint_fit import JointFit
+from vd.gap.rollout import Rollouts
 from vd.gap.veil import Veil
 from vd.gap.workflow import explain
 
@@ -51,7 +53,8 @@ def test_through_its_veil_a_right_model_leaves_the_noise_floor_and_chance_bends_
     jitter, veil = look(seen, naive, seen.scales(naive.rows[0], seen.floor))
     for _ in range(2):
         behind = fitted(seen.through(veil))
-        jitter, veil = look(seen, behind, seen.scales(behind.rows[0], seen.floor), jitter)
+        found, veil = fit_jitter(seen, behind, seen.scales(behind.rows[0], seen.floor), jitter)
+        jitter = found.values["command_jitter.sigma_s"], found.values["command_jitter.p_drop"]
     behind = fitted(seen.through(veil))
     assert 0.5 < jitter[0] / JITTER["sigma_s"] < 1.5, "what is dropped is late as well"
     assert naive.rmse > 3.0 * seen.floor
@@ -63,15 +66,36 @@ def test_through_its_veil_a_right_model_leaves_the_noise_floor_and_chance_bends_
     assert np.median(veil.growth[calm]) < 1.1 < np.median(veil.growth[~calm])
 
 
+def test_a_motion_whose_command_stays_needs_one_draw() -> None:
+    recording = hidden().recording
+    held = recording.trajectories[2]
+    calm = replace(held, command=np.full_like(held.command, held.command[0, 0]))
+    parts = (*recording.trajectories[:2], calm, *recording.trajectories[3:])
+    seen = problem_of(replace(recording, trajectories=parts))
+    every = range(len(parts))
+    seen = JointProblem(seen.rollouts, 0, every, every, seen.floor, seen.baseline)
+    fit = fitted(seen)
+    jitter = JitterFit(seen, fit, seen.scales(fit.rows[0], seen.floor))
+    mean, variance = jitter.draws(0.008, 0.05)
+    names = [replace(t, file=f"{t.file}#{draw}") for draw in range(DRAWS) for t in parts]
+    drawing = Rollouts(seen.rollouts.chain, replace(recording, trajectories=tuple(names)))
+    drawn = drawing.predict(jitter.row(0.008, 0.05)[None], joint=0)[0].reshape(DRAWS, -1).astype(float)
+    assert mean == pytest.approx(drawn.mean(axis=0), abs=1e-9)
+    spread = [part.sum() for part in np.split(drawn.var(axis=0, ddof=1), jitter.ends)]
+    found = [part.sum() for part in np.split(variance, jitter.ends)]
+    assert found == pytest.approx([(1.0 + 1.0 / DRAWS) * each for each in spread], rel=0.1, abs=1e-12)
+    assert found[2] == 0.0 and len(jitter.needed) == DRAWS * (len(parts) - 1) + 1
+
+
 def test_the_likelihood_finds_the_jitter_beside_an_effect() -> None:
     seen = problem_of(hidden(encoder_bias=BIAS).recording)
     fit = fitted(seen, "encoder_bias", start={"encoder_bias.bias_rad": 0.002})
     scales = seen.scales(fit.rows[0], seen.floor)
-    both = fit_jitter(seen, fit, scales, (0.003, 0.01))
+    both, _ = fit_jitter(seen, fit, scales, (0.003, 0.01))
     assert both.effects == ("encoder_bias", "command_jitter")
     low, high = intervals(both, seen.floor)["command_jitter.sigma_s"]
     assert low < JITTER["sigma_s"] < high
-    alone = fit_jitter(seen, fitted(seen), scales, (0.003, 0.01))
+    alone, _ = fit_jitter(seen, fitted(seen), scales, (0.003, 0.01))
     assert both.rmse < 0.8 * alone.rmse
 
 

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +9,9 @@ from test_gap_fit import TRUE, blank, recorded
 from test_gap_judge import FLOOR, made_up
 
 import vd.kernels.actuators as servo
-from vd.gap import chance
 from vd.gap.chain import chains
-from vd.gap.chance import with_random
 from vd.gap.coordinates import Coordinate, Scales
-from vd.gap.explanation import Accepted, Explanation, Trial
+from vd.gap.explanation import Trial
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
 from vd.gap.recording import Recording
@@ -23,7 +20,6 @@ from vd.gap.rollout import Rollouts
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.telemetry import vetoes
-from vd.gap.veil import Veil
 from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain, find
 from vd.kernels.effects import EFFECTS
@@ -450,53 +446,3 @@ def test_an_effect_that_leaves_noise_where_structure_was_is_earned_however_small
     assert not selection.whitens(one, leaving(both.effects, 0.95 * FLOOR, 0.2)), "structure is left"
     assert not selection.whitens(leaving(("supply_sag",), 1.05 * FLOOR, 0.02), both), "there was none"
     assert not selection.whitens(leaving((), 9.0 * FLOOR, 9.0), both), "far from the floor it says nothing"
-
-
-@pytest.mark.parametrize(("left", "named"), [(1.2, True), (5.0, False)])
-def test_what_leaves_more_than_chance_does_is_no_chance(left: float, named: bool) -> None:
-    present, random = made_up(("backlash",), 0.02), made_up(("command_jitter",), 0.01)
-    selection = replace(searching([])[0], candidates=("backlash", "command_jitter"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chance, "with_random", lambda *_: (random, (), [], left * FLOOR))
-        patch.setattr(Selection, "refit", lambda *_: made_up((), 0.02))
-        found, _, (row,) = chance.try_random(selection, made_up((), 0.03), present)
-    assert (found is random) == named and (found is present) != named
-    assert named or "more than chance" in row.reason
-
-
-def test_beside_chance_the_search_goes_on_until_the_spread_stays() -> None:
-    baseline, asked = made_up((), 0.010), []
-    spreads = iter([0.003, 0.007, 0.0072, 0.5])
-    veil = Veil(np.zeros(3), np.ones(3))
-
-    def run(calls: list[tuple[str, dict[str, Any]]]) -> list[object]:
-        ((name, options),) = calls
-        asked.append((name, options.get("veil") is veil))
-        if name == "look":
-            return [((next(spreads), 0.1), veil)]
-        return [made_up((*options["fit"].effects, "command_jitter") if name == "fit_jitter" else (), 0.005)]
-
-    selection = replace(searching([])[0], run=run, candidates=("encoder_bias", "command_jitter"))
-    searched: list[Selection] = []
-
-    def explain(inner: Selection, plain: JointFit) -> Explanation:
-        searched.append(inner)
-        final = made_up(("encoder_bias",), FLOOR)
-        one = Accepted("encoder_bias", 1.0, {}, (), (), False)
-        return Explanation(
-            plain, final, "effects", "", (one,), (Trial(1, one.name, final, 0.5, (0.4, 0.6), "named"),)
-        )
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Selection, "explain", explain)
-        fit, beside, rows, left = with_random(selection, baseline, made_up(("backlash",), 0.02))
-    assert fit.effects == ("encoder_bias", "command_jitter") and [one.name for one in beside] == [
-        "encoder_bias"
-    ]
-    assert [(row.name, row.fit.effects) for row in rows] == [
-        ("encoder_bias", ("command_jitter", "encoder_bias"))
-    ]
-    assert left == pytest.approx(FLOOR)
-    assert [name for name, _ in asked] == ["look", *2 * ["fit", "look", "fit_jitter"]]
-    assert all(seen == (name == "fit") for name, seen in asked), "the rest is fitted through the veil"
-    assert all(inner.veiled and "command_jitter" not in inner.candidates for inner in searched)

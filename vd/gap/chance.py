@@ -18,6 +18,7 @@ from vd.gap.veil import Veil
 if TYPE_CHECKING:
     from vd.gap.select import Selection
 
+SIGMA, DROP = (f"{RANDOM}.{name}" for name in ("sigma_s", "p_drop"))
 VEILS = 2
 """Searches for what there is beside random delays, each with these as they are beside what the last found."""
 NOT_NEAR = 1.5
@@ -79,11 +80,9 @@ def with_random(
         found = inner.explain(plain)
         clear = found.verdict in ("effects", "ambiguous")
         rest, beside = (found.final, found.accepted) if clear else (plain, ())
-        before = jitter
         call = {"fit": rest, "scales": search.scales, "start": jitter}
-        jitter, veil = search.run([("look", call)])[0]
-        call = {"fit": rest, "scales": search.scales, "start": jitter}
-        random = search.run([("fit_jitter", call)])[0]
+        random, veil = search.run([("fit_jitter", call)])[0]
+        before, jitter = jitter, (random.values[SIGMA], random.values[DROP])
         same = abs(np.log(jitter[0] / before[0])) < SAME_SPREAD
         hopeless = rest.rmse > HOPELESS * REPEATABLE * search.floor
         if same or hopeless or equivalent(random) > NOT_NEAR * equivalent(present):

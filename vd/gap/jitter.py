@@ -70,6 +70,10 @@ class JitterFit:
         self.size = len(chosen)
         # A trajectory's name seeds its draws.
         copies = tuple(replace(t, file=f"{t.file}#{draw}") for draw in range(DRAWS) for t in chosen)
+        # Where the command stays as it is, delays change nothing: one draw is all.
+        varied = np.array([bool(np.ptp(t.command[:, self._column])) for t in chosen])
+        self.needed = np.flatnonzero(np.concatenate([np.ones(self.size, bool), np.tile(varied, DRAWS - 1)]))
+        self.varied = np.repeat(varied, [len(t.time) for t in chosen])
         self.rollouts = Rollouts(
             problem.rollouts.chain,
             replace(recording, trajectories=copies),
@@ -95,14 +99,18 @@ class JitterFit:
 
     def draws(self, sigma: float, drop: float) -> tuple[np.ndarray, np.ndarray]:
         """Mean of the positions [N] [rad] over draws of the delays, and their variance [N] [rad^2]."""
-        predicted = self.rollouts.predict(self.row(sigma, drop)[None], joint=self.problem.joint)[0]
-        self.problem.simulated += DRAWS * self.size
-        draws = predicted.reshape(DRAWS, -1).astype(float)
-        spread = np.split(draws.var(axis=0, ddof=1), self.ends)
+        rows, joint = self.row(sigma, drop)[None], self.problem.joint
+        predicted = self.rollouts.predict(rows, self.needed, joint=joint)[0]
+        self.problem.simulated += len(self.needed)
+        mean, others = np.split(predicted.astype(float), [len(self.varied)])
+        draws = np.concatenate([mean[None, self.varied], others.reshape(DRAWS - 1, -1)])
+        variance = np.zeros(len(mean))
+        mean[self.varied], variance[self.varied] = draws.mean(axis=0), draws.var(axis=0, ddof=1)
+        spread = np.split(variance, self.ends)
         kernel = np.ones(SMOOTH) / SMOOTH
         smooth = np.concatenate([np.convolve(part, kernel, mode="same") for part in spread])
         # The mean of the draws has an error of its own.
-        return draws.mean(axis=0), (1.0 + 1.0 / DRAWS) * smooth
+        return mean, (1.0 + 1.0 / DRAWS) * smooth
 
     def losses(self, sigma: float, drop: float, noises: Sequence[float] = (1.0,)) -> np.ndarray:
         """Negative log-likelihood of each trajectory [S], less a constant that all models share.
@@ -248,19 +256,20 @@ class JitterFit:
         )
 
 
-def look(
-    problem: JointProblem, fit: JointFit, scales: Scales, start: tuple[float, float] | None = None
-) -> tuple[tuple[float, float], Veil]:
-    """The likeliest jitter of a model and what it does to the samples; a first guess without a start."""
+def look(problem: JointProblem, fit: JointFit, scales: Scales) -> tuple[tuple[float, float], Veil]:
+    """A first guess of the jitter of a model, and what it does to the samples."""
     jitter = JitterFit(problem, fit, scales)
-    values = jitter.guess() if start is None else jitter.search(start)
+    values = jitter.guess()
     return values, jitter.veil(*values)
 
 
-def fit_jitter(problem: JointProblem, fit: JointFit, scales: Scales, start: tuple[float, float]) -> JointFit:
-    """The model with jitter of the largest likelihood, as a fit like any other."""
+def fit_jitter(
+    problem: JointProblem, fit: JointFit, scales: Scales, start: tuple[float, float]
+) -> tuple[JointFit, Veil]:
+    """The model with jitter of the largest likelihood, as any other fit, and what it does to the samples."""
     jitter = JitterFit(problem, fit, scales)
-    return jitter.result(*jitter.search(start))
+    values = jitter.search(start)
+    return jitter.result(*values), jitter.veil(*values)
 
 
 CALLS: dict[str, Callable[..., Any]] = {"look": look, "fit_jitter": fit_jitter}
