@@ -305,6 +305,19 @@ def test_what_has_structure_is_not_explained(judge: Verdicts) -> None:
     assert with_structure(8.0, rms=5.0 * FLOOR).verdict == "effects"
 
 
+def test_a_motion_that_alone_shows_an_effect_does_not_unname_it(judge: Verdicts) -> None:
+    unseen = np.full(10, FLOOR)
+    unseen[2] = 30.0 * FLOOR
+    baseline = made_up((), 0.010)
+
+    def verdict(fitted: float) -> Verdict:
+        final = made_up(("load_friction",), unseen, fitted=fitted)
+        return judge.conclude(baseline, final, {"load_friction": [final]}, [], "").verdict
+
+    assert made_up((), unseen).held_out_rmse > 0.9 * baseline.held_out_rmse
+    assert verdict(FLOOR) == "effects" and verdict(2.0 * FLOOR) == "unknown"
+
+
 def test_what_the_time_step_leaves_open_widens_the_interval(judge: Verdicts) -> None:
     fit = made_up((), FLOOR)
     plain = intervals(fit, FLOOR)["p0"]

@@ -27,6 +27,9 @@ HOPELESS = 1.5
 IDLE = 0.99
 """Share of the error before it that a further effect leaves at least half way if it does nothing: where more
 than noise is left such a fit is not finished either."""
+NEARLY_ALL = 0.05
+"""Share of the error before a round that its best leaves, up to which only what comes near it is tried from
+every start: what else is missing is another effect beside it, or the bottom of its valley."""
 SCREEN_ITERATIONS = 6
 HALF_ITERATIONS = 4
 FULL_ITERATIONS = 12
@@ -230,12 +233,14 @@ class CandidateFits:
     def look_wider(self, present: JointFit, fits: Mapping[str, JointFit]) -> dict[str, JointFit]:
         """The fits of a round, and those of all candidates from every start where these are better."""
         out = {*present.effects, *self.vetoes, RANDOM}
+        least = min(fit.rmse for fit in fits.values())
+        if least < NEARLY_ALL * present.rmse:
+            out |= {name for name in self.candidates if name not in fits or fits[name].rmse > BEHIND * least}
         names = [name for name in self.candidates if name not in out]
         calls = [
             self.call(present, name, self.starts(present, self.sized(present, name)), SCREEN_ITERATIONS)
             for name in names
         ]
-        least = min(fit.rmse for fit in fits.values())
         found = sorted(self.run(calls), key=lambda fit: fit.rmse)
         better = [
             fit

@@ -116,8 +116,10 @@ class Verdicts(Judge):
             if loose:
                 return replace(explanation, verdict="under_excited", reason=loose)
             return replace(explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}")
-        gap = baseline.held_out_rmse**2 - self.floor**2
-        share = (baseline.held_out_rmse**2 - final.held_out_rmse**2) / max(gap, 1e-30)
+        # One motion can be all that shows a parameter: that no fit without it predicts it says nothing then.
+        fitted = self.white(final) and not self.veiled
+        before, after = ((f.rmse if fitted else f.held_out_rmse) ** 2 for f in (baseline, final))
+        share = (before - after) / max(before - self.floor**2, 1e-30)
         # What chance does to each sample stays, however well its size is known.
         if share < RECOVERED and RANDOM not in final.effects:
             text = f"the best candidate recovers {100.0 * share:.0f} % of the squared gap, less than half"
