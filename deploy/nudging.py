@@ -1,4 +1,4 @@
-"""A pilot that is moved at random for a moment where its object stands still far from the goal."""
+"""A pilot that gets help from chance while its object is far from the goal."""
 
 import numpy as np
 import warp as wp
@@ -11,12 +11,12 @@ from vd.envs.nudges import Nudges
 
 
 class NudgedPilot:
-    """A policy, and the kernel that acts in its place where it is stuck (``kernels/nudges.py``).
+    """A policy, and the kernels that add noise to it or act in its place (``kernels/nudges.py``).
 
     Args:
         pilot: The policy.
         hand: The hand.
-        task: The task it was trained in; its settings of nudges count.
+        task: The task it was trained in; its settings ``nudge`` and ``explore`` count.
     """
 
     def __init__(self, pilot: Pilot, hand: HandModel, task: ReorientCfg):
@@ -37,10 +37,10 @@ class NudgedPilot:
         self._new_goal.fill_(1)
 
     def decide(self, sensed: Sensed) -> Decision:
-        """The policy's action, or a random one where it is stuck; the policy's distance."""
+        """The policy's action, with noise or a random one as the task says; the policy's distance."""
         decision = self.pilot.decide(sensed)
         self._action.assign(decision.action.astype(np.float32)[None])
-        known = not np.isnan(decision.distance)  # who knows no distance is never stuck
+        known = not np.isnan(decision.distance)  # who knows no distance is never far
         self._distance.fill_(decision.distance if known else 0.0)
         action = self._nudges.action(self._action, self._distance, self._steps, self._new_goal)
         self._steps.fill_(1)

@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -68,6 +68,8 @@ class RunCfg(HandOptions):
     """How long the hand holds still between goals [s]."""
     nudge: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
+    explore: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Take the twin's table away after 2 s, as the paper's test in the air does."""
     realistic: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -168,7 +170,13 @@ def _fly(
             view = look(flight, camera, hand, cfg.camera_layer)
             fps = flight.task.sim.control_hz if cfg.twin else cfg.camera.fps
             seen = camera_findings(camera, view, fps=fps)
-        pilot = NudgedPilot(flight.pilot, hand, flight.task) if cfg.nudge else flight.pilot
+        chance = replace(
+            flight.task,
+            nudge=replace(flight.task.nudge, enabled=cfg.nudge),
+            explore=replace(flight.task.explore, enabled=cfg.explore),
+        )
+        by_chance = cfg.nudge or cfg.explore
+        pilot = NudgedPilot(flight.pilot, hand, chance) if by_chance else flight.pilot
         warm_up(pilot, hand, goals[0], camera, link)
         stack.enter_context(undisturbed())
         stack.enter_context(real_time(cfg.realtime))
@@ -186,7 +194,8 @@ def _fly(
                 "goals": [[float(value) for value in goal] for goal in goals],
                 "control_hz": flight.task.sim.control_hz,
                 "stopping": vars(pilot.rule),
-                "nudge": vars(flight.task.nudge) if cfg.nudge else None,
+                "nudge": vars(chance.nudge) if cfg.nudge else None,
+                "explore": vars(chance.explore) if cfg.explore else None,
                 "action": vars(flight.task.action),
             },
             servo={"model": cfg.motor, "p_gain": P_GAIN, "d_gain": D_GAIN},

@@ -1,4 +1,4 @@
-"""Nudges: a hand whose object stands still, but not where it is wanted, is moved at random for a moment."""
+"""Randomness where a policy is caught: nudges where its object stands still, noise while its goal is far."""
 
 import warp as wp
 
@@ -93,3 +93,42 @@ def nudge_kernel(
     last[world] = distance
     waited[world] = count
     left[world] = wp.max(nudges - 1, 0)
+
+
+@wp.kernel
+def explore_kernel(
+    # Model:
+    beyond: float,
+    std: float,
+    # In:
+    action_in: wp.array2d[float],
+    distance_in: wp.array[float],
+    predicted_in: wp.array[float],
+    # In/Out:
+    rng: wp.array[wp.uint32],
+    # Out:
+    action_out: wp.array2d[float],
+):
+    """Add noise to the actions of hands whose goal is far. Launch: [N].
+
+    N(0, std) for each joint, and clipped to [-1, 1]; other actions stay as they are.
+
+    Args:
+        beyond: Distance from the goal above which it is far [rad].
+        std: Standard deviation of the noise.
+        action_in: Action of the policy, shape [N, D].
+        distance_in: Angle to the goal [rad], shape [N].
+        predicted_in: The same as a student predicts it, negative where there is no prediction: then
+            ``distance_in`` counts, shape [N].
+        rng: Random stream of each world, shape [N].
+        action_out: Action to apply, shape [N, D]; may be ``action_in``.
+    """
+    world = wp.tid()
+    distance = wp.where(predicted_in[world] >= 0.0, predicted_in[world], distance_in[world])
+    state = rng[world]
+    for joint in range(action_in.shape[1]):
+        action = action_in[world, joint]
+        if distance > beyond:
+            action = wp.clamp(action + std * wp.randn(state), -1.0, 1.0)
+        action_out[world, joint] = action
+    rng[world] = next_stream(state, world)

@@ -7,11 +7,11 @@ from vd.assets_usd.hands import load_hand
 from vd.deploy.nudging import NudgedPilot
 from vd.deploy.observation import Sensed
 from vd.deploy.pilot import Decision
-from vd.envs.cfg import ReorientCfg
+from vd.envs.cfg import ExploreCfg, NudgeCfg, ReorientCfg
 from vd.student.stopping import StoppingRule
 
 HAND = load_hand("dclaw3", "rigid", None)
-TASK = ReorientCfg(hand="dclaw3")
+TASK = ReorientCfg(hand="dclaw3", nudge=NudgeCfg(enabled=True))
 WAITS, NUDGES = (round(s * TASK.sim.control_hz) for s in (TASK.nudge.still_s, TASK.nudge.nudge_s))
 OWN = np.full(9, 0.125)
 
@@ -82,3 +82,13 @@ def test_a_pilot_that_knows_no_distance_is_left_alone(pilots):
     stubborn, nudged = pilots
     stubborn.distance = float("nan")
     assert not any(nudged_in(nudged, 3 * WAITS))
+
+
+def test_a_pilot_that_explores_has_noise_until_it_has_arrived():
+    stubborn = Stubborn()
+    noisy = NudgedPilot(stubborn, HAND, ReorientCfg(hand="dclaw3", explore=ExploreCfg(enabled=True)))
+    noisy.begin()
+    assert all(nudged_in(noisy, 2 * WAITS))
+    for distance in (0.3, float("nan")):
+        stubborn.distance = distance
+        assert not any(nudged_in(noisy, 5))

@@ -1,4 +1,4 @@
-"""When a hand is nudged, against a NumPy oracle that looks back over the distances; and how."""
+"""When a hand is nudged, against a NumPy oracle that looks back over the distances; and how; and noise."""
 
 import numpy as np
 import warp as wp
@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, settings_array, streams, unwritten
 
-from vd.kernels.nudges import UNKNOWN, NudgeParams, nudge_kernel
+from vd.kernels.nudges import UNKNOWN, NudgeParams, explore_kernel, nudge_kernel
 
 JOINTS = 3
 
@@ -121,3 +121,43 @@ def test_a_large_nudge_is_clipped(device):
         nudge_steps=1,
     )
     assert np.abs(found).max() == 1.0
+
+
+def explored(device, action, distance, predicted, rng, *, beyond=0.5, std=0.25):
+    """Actions of the kernel with noise, [N, D]."""
+    out = unwritten(action.shape, float, device)
+    inputs = [device_array(values, float, device) for values in (action, distance, predicted)]
+    wp.launch(
+        explore_kernel, dim=len(action), inputs=[beyond, std, *inputs, rng], outputs=[out], device=device
+    )
+    return out.numpy()
+
+
+@EXAMPLES
+@given(seed=st.integers(0, 2**31), worlds=st.integers(1, 40))
+def test_actions_have_noise_only_while_the_goal_is_far(device, seed, worlds):
+    random = np.random.default_rng(seed)
+    action = random.uniform(-2.0, 2.0, (worlds, JOINTS)).astype(np.float32)
+    distance = random.choice([0.2, 0.8], worlds)
+    predicted = np.where(random.random(worlds) < 0.5, UNKNOWN, random.choice([0.0, 0.2, 0.8], worlds))
+    found = explored(device, action, distance, predicted, streams(worlds, seed, device))
+    far = np.where(predicted < 0.0, distance, predicted) > 0.5
+    assert np.array_equal(found[~far], action[~far]), "not even clipped"
+    assert np.abs(found[far]).max(initial=0.0) <= 1.0
+    inside = far[:, None] & (np.abs(found) < 1.0)
+    assert (found[inside] != action[inside]).all()
+
+
+def test_noise_is_drawn_anew_for_each_world_joint_and_step(device):
+    worlds = 4000
+    rng = streams(worlds, 7, device)
+    action = np.full((worlds, JOINTS), 0.125, dtype=np.float32)
+    far, unknown = np.full(worlds, 2.0), np.full(worlds, UNKNOWN)
+    first, second = (
+        explored(device, action, far, unknown, rng, std=0.125).astype(float) - 0.125 for _ in range(2)
+    )
+    for noise in (first, second):
+        assert abs(noise.mean()) < 0.005 and abs(noise.std() - 0.125) < 0.005
+        assert np.abs(np.corrcoef(noise.T) - np.eye(JOINTS)).max() < 0.08
+    assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.05
+    assert not np.array_equal(first[:1], first[1:2])

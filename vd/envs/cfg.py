@@ -165,6 +165,27 @@ class NudgeCfg:
 
 
 @dataclass(frozen=True)
+class ExploreCfg:
+    """Ours: noise on the actions, as in training, but only while the goal is far. Off by default.
+
+    Near the goal the mean action is stiller; far from it, it is caught where noise is not.
+    """
+
+    enabled: bool = False
+    """Whether there is noise."""
+    beyond_rad: float = PAPER.success.rotation_rad
+    """Distance from the goal above which there is [rad]."""
+    action_std: float = 0.15
+    """Standard deviation of the noise of each joint's action, drawn anew in every control step."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        for name in ("beyond_rad", "action_std"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"explore.{name} is {getattr(self, name):g}; it has to be positive")
+
+
+@dataclass(frozen=True)
 class TighteningCfg:
     """Ours: ask for little stillness at first, later for that of ``success``. Off by default.
 
@@ -356,6 +377,7 @@ class ReorientCfg:
     goal: GoalCfg = field(default_factory=GoalCfg)
     table: TableCfg = field(default_factory=TableCfg)
     nudge: NudgeCfg = field(default_factory=NudgeCfg)
+    explore: ExploreCfg = field(default_factory=ExploreCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
     focus: FocusCfg = field(default_factory=FocusCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
@@ -374,6 +396,7 @@ class ReorientCfg:
         self.focus.validate()
         self.table.validate()
         self.nudge.validate()
+        self.explore.validate()
         if self.start.at_rest and (self.start.poses < 1 or self.start.settle_s <= 0.0):
             raise ValueError(
                 f"start.at_rest needs start.poses >= 1 (now {self.start.poses}) and start.settle_s > 0 "

@@ -1,10 +1,10 @@
-"""Hands that are moved at random where they are stuck; see :func:`vd.kernels.nudges.nudge_kernel`."""
+"""Hands that are moved at random where they are caught, see :mod:`vd.kernels.nudges`."""
 
 from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
-from vd.kernels.nudges import UNKNOWN, NudgeParams, nudge_kernel
+from vd.kernels.nudges import UNKNOWN, NudgeParams, explore_kernel, nudge_kernel
 from vd.kernels.rng import init_rng_kernel
 
 if TYPE_CHECKING:
@@ -21,10 +21,10 @@ def nudge_params(task: "ReorientCfg", device: str) -> wp.array:
 
 
 class Nudges:
-    """What decides in every world whether the policy acts or the hand is nudged.
+    """What decides in every world whether the policy acts alone, with noise, or the hand is nudged.
 
     Args:
-        task: The task, with its settings of nudges and its seed.
+        task: The task, with its settings of nudges (``nudge``) and noise (``explore``) and its seed.
         num_joints: D.
         num_worlds: N.
         device: Warp device.
@@ -36,6 +36,7 @@ class Nudges:
 
     def __init__(self, task: "ReorientCfg", num_joints: int, num_worlds: int, device: str):
         self._params, self._device = nudge_params(task, device), device
+        self._nudge, self._explore = task.nudge, task.explore
 
         def full(value: float, dtype: Any = float) -> wp.array:
             return wp.full(num_worlds, value, dtype=dtype, device=device)
@@ -58,26 +59,28 @@ class Nudges:
             step_count: Control steps since the reset, shape [N].
             new_goal: 1 where the goal is new, shape [N].
         """
-        wp.launch(
-            nudge_kernel,
-            dim=len(self._waited),
-            inputs=[
-                self._params,
-                action,
-                distance,
-                self.predicted,
-                step_count,
-                new_goal,
-                self._last,
-                self._waited,
-                self._left,
-                self._kick,
-                self._rng,
-            ],
-            outputs=[self._action],
-            device=self._device,
-        )
-        return self._action
+        worlds, goal = len(self._waited), [distance, self.predicted]
+        if self._explore.enabled:
+            settings = [self._explore.beyond_rad, self._explore.action_std]
+            wp.launch(
+                explore_kernel,
+                dim=worlds,
+                inputs=[*settings, action, *goal, self._rng],
+                outputs=[self._action],
+                device=self._device,
+            )
+            action = self._action
+        if self._nudge.enabled:  # a nudge takes the place of an action, its noise included
+            state = [self._last, self._waited, self._left, self._kick, self._rng]
+            wp.launch(
+                nudge_kernel,
+                dim=worlds,
+                inputs=[self._params, action, *goal, step_count, new_goal, *state],
+                outputs=[self._action],
+                device=self._device,
+            )
+            action = self._action
+        return action
 
     def predict(self, distance: Any) -> None:
         """Go by a student's distance to the goal [rad], shape [N] (torch), until told otherwise."""

@@ -162,8 +162,8 @@ class ReorientEnv:
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
         self._table_steps = table_array(cfg, self.device)
         self._must_lift = array(must_lift(cfg), wp.int32)
-        self.nudges = Nudges(cfg, d, n, self.device) if cfg.nudge.enabled else None
-        """What moves hands that are stuck, or None: they stay as they are."""
+        self.nudges = Nudges(cfg, d, n, self.device) if cfg.nudge.enabled or cfg.explore.enabled else None
+        """What moves hands that are stuck or far from the goal, or None: they act as the policy does."""
         self._lifts = cfg.reward.lift != 0.0
         self._shapes = ShapeObserver(self) if self.sees_shape or self._lifts else None
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)

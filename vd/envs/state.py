@@ -48,8 +48,8 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
     if state["arrays"].keys() != here.keys():
         raise ValueError(
             "the saved environment has other servos, views, contacts or nudges; resume with hand_layer, "
-            "observation.view, nudge, randomisation.effects and randomisation.restitution of the checkpoint, "
-            "or from one without worlds (vd-train export --resumable)"
+            "observation.view, nudge, explore, randomisation.effects and randomisation.restitution of the "
+            "checkpoint, or from one without worlds (vd-train export --resumable)"
         )
     for name, array in here.items():
         saved = state["arrays"][name]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 
 from vd.bundle import is_bundle
 from vd.config import from_dict
-from vd.envs.cfg import CurriculumCfg, NudgeCfg, ObservationCfg, ReorientCfg, SuccessCfg, TableCfg
+from vd.envs.cfg import CurriculumCfg, ExploreCfg, NudgeCfg, ObservationCfg, ReorientCfg, SuccessCfg, TableCfg
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -178,6 +178,7 @@ def task_for(
     at_rest: bool | None = None,
     hand_layer: str | None = None,
     nudge: bool = False,
+    explore: bool = False,
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
 
@@ -200,6 +201,7 @@ def task_for(
         hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is, None: as
             trained.
         nudge: Whether hands that are stuck are nudged.
+        explore: Whether actions have noise while the goal is far.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     if is_saved_student(policy):
@@ -222,5 +224,6 @@ def task_for(
         curriculum=CurriculumCfg(),
         table=TableCfg(),
         nudge=NudgeCfg(enabled=nudge),
+        explore=ExploreCfg(enabled=explore),
         randomisation=replace(base.randomisation, enabled=randomised),
     )

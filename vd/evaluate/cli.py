@@ -30,6 +30,7 @@ OF_THE_SUITE = (
     "episode_s",
     "in_air",
     "nudge",
+    "explore",
     "table_friction",
     "scanned_goals",
     "sees",
@@ -94,6 +95,8 @@ class EvalCfg:
     """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
     nudge: tyro.conf.FlagCreatePairsOff[bool] = False
     """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
+    explore: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     scanned_goals: tyro.conf.FlagCreatePairsOff[bool] = False
     """Students get goals with the errors of a scan: 4 mm of noise, a fifth of the points missing."""
     sees: Literal["auto", "complete", "rendered"] = "auto"
@@ -288,6 +291,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
         nudge=cfg.nudge,
+        explore=cfg.explore,
     )
     check_bundle(name, task)
     print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
@@ -329,6 +333,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         at_rest=task.start.at_rest,
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
         nudge=cfg.nudge,
+        explore=cfg.explore,
     )
     result = summarise(
         protocol,

@@ -105,6 +105,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             table_friction=cfg.table_friction,
             scanned_goals=cfg.scanned_goals,
             nudge=cfg.nudge,
+            explore=cfg.explore,
         )
         index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
@@ -146,6 +147,7 @@ def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
         nudge=cfg.nudge,
+        explore=cfg.explore,
     )
     if cfg.table_friction is not None:
         task = replace(task, table_friction=cfg.table_friction)

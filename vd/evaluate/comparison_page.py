@@ -291,6 +291,8 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
         rows.append(("friction of the table", f"{protocol.table_friction:g}"))
     if protocol.nudge:
         rows.append(("hands whose object stands still far from the goal", "are nudged"))
+    if protocol.explore:
+        rows.append(("actions far from the goal", "have noise"))
     if protocol.scanned_goals:
         rows.append(("goals of students", "from scans"))
     by_group = {row.group: row.result.protocol.objects for row in comparison.rows}

@@ -119,6 +119,7 @@ def task_line(result: EvalResult) -> str:
         f"starts {starts_text(protocol)}; goals {goals_text(protocol)}; stop within "
         f"{protocol.stop_tolerance_rad:g} rad and still; randomisation {randomisation}"
         + ("; stuck hands are nudged" if protocol.nudge else "")
+        + ("; actions have noise far from the goal" if protocol.explore else "")
     )
 
 

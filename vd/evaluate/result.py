@@ -95,6 +95,8 @@ class Protocol:
     """Students get their goals from scans, with the errors of these."""
     nudge: bool = False
     """Hands whose object stands still far from the goal are nudged."""
+    explore: bool = False
+    """Actions have noise while the goal is far."""
 
     @property
     def hand_name(self) -> str:

@@ -70,6 +70,8 @@ class PlayCfg:
     """Start from a drop, whatever the training."""
     nudge: tyro.conf.FlagCreatePairsOff[bool] = False
     """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
+    explore: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float = PAPER.scene.episode_s
@@ -262,6 +264,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
         nudge=cfg.nudge,
+        explore=cfg.explore,
     )
     check_bundle(cfg.agent_name, task)
     env = ReorientEnv(task, device)
