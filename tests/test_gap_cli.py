@@ -14,7 +14,7 @@ from vd.gap import cli, steps
 from vd.gap.chain import chains
 from vd.gap.close import counterparts, simulate_again, write_identified
 from vd.gap.hide import hide
-from vd.gap.plan import _fitted, plan, write_plan
+from vd.gap.plan import _fitted, discard_plan, plan, write_plan
 from vd.gap.recording import read_recording
 from vd.gap.result import (
     Candidate,
@@ -280,6 +280,22 @@ def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tm
         time = [float(row["t"]) for row in rows]
         assert time[0] == 0.0 and np.all(np.diff(time) > 0.0)
         assert time[-1] == pytest.approx(entry["duration_s"], abs=1e-5)
+    commands = {tmp_path / entry["file"] for entry in written["trajectories"]}
+    shorter = dataclasses.replace(result, motions=result.motions[:1])
+    write_plan(shorter, tmp_path)
+    left = set((tmp_path / "next_experiment").iterdir())
+    assert len(left) == 1 and left < commands, "of a plan before nothing is left"
+    (tmp_path / "next_experiment" / "mine.csv").write_text("t\n")
+    discard_plan(tmp_path)
+    assert [path.name for path in (tmp_path / "next_experiment").iterdir()] == ["mine.csv"]
+    assert not (tmp_path / "next_experiment.json").exists()
+
+
+def test_a_plan_needs_what_was_explained(fitted, recording, tmp_path, capsys):
+    out = str(tmp_path / "gap")
+    assert cli.main(["find", str(recording), "--out", out]) == 0
+    assert cli.main(["plan", "--out", out]) == 1
+    assert "run vd-gap explain" in capsys.readouterr().err
 
 
 def test_plan_counts_the_pairs_of_every_set_that_a_motion_tells_apart(recording):

@@ -134,7 +134,9 @@ class Plan(_Step):
         analysis = self.analysis()
         if self.recording is not None:
             analysis.run("explain", fresh=self.fresh)
-        result = plan(analysis.explained(), analysis.recording, analysis.hand, analysis.start)
+        device = analysis.settings.device
+        report = analysis.explained()
+        result = plan(report, analysis.recording, analysis.hand, analysis.start, device=device)
         path = write_plan(result, self.out)
         if self.json:
             print(path.read_text())

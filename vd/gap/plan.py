@@ -6,9 +6,11 @@ changes of their parameters is taken out, as far as those parameters are uncerta
 they already disagree about. The set of motions that tells most pairs of models apart is proposed.
 """
 
+import contextlib
 import csv
 import io
 import itertools
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -168,6 +170,7 @@ def write_plan(result: Plan, folder: Path) -> Path:
     Returns:
         The JSON file.
     """
+    discard_plan(folder)
     entries = []
     for index, motion in enumerate(result.motions):
         name = f"{index:03d}_{motion.joints[0]}_{motion.name}.csv"
@@ -196,6 +199,20 @@ def write_plan(result: Plan, folder: Path) -> Path:
         },
     )
     return path
+
+
+def discard_plan(folder: Path) -> None:
+    """Remove a plan that :func:`write_plan` wrote, and no other file."""
+    path = Path(folder) / PLAN_JSON
+    try:
+        files = [entry["file"] for entry in json.loads(path.read_text())["trajectories"]]
+    except (OSError, ValueError, KeyError, TypeError):
+        files = []  # none, or not of this program
+    for file in files:
+        (Path(folder) / PLAN_FOLDER / Path(file).name).unlink(missing_ok=True)
+    path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # something else is in it, or it is not there
+        (Path(folder) / PLAN_FOLDER).rmdir()
 
 
 def _targets(report: Report) -> dict[str, tuple[tuple[str, ...], ...]]:

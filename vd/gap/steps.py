@@ -228,7 +228,13 @@ class Analysis:
         return options
 
     def explained(self) -> Report:
-        """What ``explain`` wrote."""
+        """What ``explain`` wrote.
+
+        Raises:
+            ValueError: It has not run.
+        """
+        if not (self.out / EXPLAIN).is_file():
+            raise ValueError(f"{self.out / EXPLAIN} is missing; run vd-gap explain --out {self.out} first")
         return Report.read(self.out / EXPLAIN)
 
     def command(self) -> str:
@@ -261,7 +267,7 @@ def _explain(analysis: Analysis) -> None:
 
 def _close(analysis: Analysis) -> None:
     from vd.gap.close import WHOLE_HAND_LAYER, one_finger, simulate_again, write_identified
-    from vd.gap.plan import PLAN_JSON, plan, write_plan
+    from vd.gap.plan import discard_plan, plan, write_plan
 
     report, layer = analysis.explained(), analysis.out / LAYER
     whole = layer.with_name(WHOLE_HAND_LAYER)
@@ -281,10 +287,12 @@ def _close(analysis: Analysis) -> None:
     )
     closing = replace(closing, whole_hand_layer=whole.name if partly else "")
     curves.write(analysis.out / CLOSING_CURVES)
-    (analysis.out / PLAN_JSON).unlink(missing_ok=True)
+    discard_plan(analysis.out)
     if report.verdict == "under_excited" or report.open_sets:
         _show("close: looking for the motions that would decide")
-        write_plan(plan(report, analysis.recording, analysis.hand, analysis.start), analysis.out)
+        device = analysis.settings.device
+        chosen = plan(report, analysis.recording, analysis.hand, analysis.start, device=device)
+        write_plan(chosen, analysis.out)
     write_json(analysis.out / CLOSE, to_dict(closing))
 
 
