@@ -126,6 +126,8 @@ def test_time_starts_at_zero_and_need_not_be_regular(folder):
             ("encoder_resolution_rad", "degrees", "71.5 counts a turn"),
         ),
         ({"encoder_resolution_rad": 4096}, ("encoder_resolution_rad", "counts a turn")),
+        ({"servo": {"kp_nm_rad": "stiff"}}, ("servo.kp_nm_rad", "'stiff'", "N m/rad")),
+        ({"servo": {"kp_nm_rad": {"f0_j1": 2.0, "f9_j1": 2.0}}}, ("servo.kp_nm_rad", "f0_j1, f0_j2")),
         ({"trajectories": []}, ("trajectories", "empty")),
         ({"trajectories": [{"excitation": "x", "joints": ["f0_j1"]}]}, ("trajectories[0]", "file")),
         ({"trajectories": [{"file": "b.csv", "joints": ["f0_j1"]}]}, ("b.csv", "no such file")),

@@ -153,7 +153,7 @@ class Hide:
     base parameters, encoder counts, noise and jittered time stamps. The truth is written beside the folder.
     """
 
-    model: Annotated[str, tyro.conf.Positional]
+    model: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
     """dclaw3, dclaw4 (one finger of it), servo or pendulum."""
     out: Path
     """Folder of the recording to write."""

@@ -16,7 +16,7 @@ from vd.files import write_json
 from vd.gap.excitations import Excitation, JointRange, excitation_set
 from vd.gap.hidden_finger import FingerBody
 from vd.gap.hidden_plant import OUTSIDE, Plant, Run, simulate, simulate_with_duty
-from vd.gap.recording import BARE_MODELS, Recording, Trajectory, write_recording
+from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording, Trajectory, write_recording
 from vd.kernels.effects import EFFECTS
 
 ENCODER_COUNT = 2.0 * math.pi / 4096
@@ -255,7 +255,9 @@ class _Session:
                     pwm=None if duties is None else np.round(duties[i] * PWM_COUNTS) / PWM_COUNTS,
                 )
             )
-        servo = {"model": "test rig", "p_gain": self.plant.full_gain}
+        servo: dict[str, Any] = {"model": "test rig", "p_gain": self.plant.full_gain}
+        if hiding.model in BARE_MODELS:  # without masses nothing else tells how large torques are
+            servo[STIFFNESS] = _by_joint(self.plant, self.plant.kp)
         recording = Recording(
             Path(),
             hiding.model,

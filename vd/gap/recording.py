@@ -38,6 +38,8 @@ COARSEST_RAD = 2.0 * math.pi / 256
 """Largest encoder count [rad]: eight bits a turn. Twelve bits a turn are 0.088 if written in degrees."""
 POSITIVE = ("p_gain", "payload_kg", "arm_length_m")
 """Conditions that the model computes with: numbers, not negative."""
+STIFFNESS = "kp_nm_rad"
+"""Key of ``servo``: the drive's stiffness at the largest P gain recorded [N m/rad], one or by joint."""
 TEXT = "utf-8-sig"
 """Encoding of the files; spreadsheets put a mark in front."""
 CSV_DIGITS = 6
@@ -152,6 +154,7 @@ def read_recording(path: str | Path) -> Recording:
     servo = header.get("servo", {})
     if not isinstance(servo, dict):
         raise RecordingError(f"{file}: 'servo' is {servo!r}; make it an object such as {{\"model\": ..}}")
+    _check_stiffness(file, servo.get(STIFFNESS), joints)
     entries = header.get("trajectories")
     if not isinstance(entries, list) or not entries:
         raise RecordingError(
@@ -234,6 +237,17 @@ def _names(file: Path, key: str, value: Any) -> tuple[str, ...]:
     if len(set(value)) != len(value):
         raise RecordingError(f"{file}: {key!r} names a joint twice: {', '.join(value)}; name each once")
     return tuple(value)
+
+
+def _check_stiffness(file: Path, told: Any, joints: tuple[str, ...]) -> None:
+    """What the servo's stiffness is said to be is a number, or one for some joints."""
+    values = told if isinstance(told, dict) else {} if told is None else {joints[0]: told}
+    for joint, value in values.items():
+        if joint not in joints or not _is_number(value) or value <= 0.0:
+            raise RecordingError(
+                f"{file}: servo.{STIFFNESS} is {told!r}; give a positive number in N m/rad, or one by joint: "
+                f"{', '.join(joints)}"
+            )
 
 
 def _check_model(file: Path, model: Any, joints: tuple[str, ...]) -> None:

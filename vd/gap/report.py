@@ -332,10 +332,11 @@ def _parameters(page: Page, report: Report) -> None:
             "these numbers are bent to make up for it.",
             small=True,
         )
-        if report.recording.model == "servo":
+        if report.recording.relative_torques:
             page.text(
                 "Torques are relative: commands and positions of a bare servo do not show how large they "
-                "are. kp is held at a nominal value, and all that is in N m or kg m² would double with it.",
+                "are. kp is held at a nominal value, and all that is in N m or kg m² would double with it. "
+                "Its stiffness, as servo.kp_nm_rad in recording.json, makes them absolute.",
                 small=True,
             )
     if report.closing is not None:

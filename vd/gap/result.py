@@ -205,6 +205,8 @@ class Source:
     samples: int
     seconds: float
     servo: str = ""
+    relative_torques: bool = False
+    """Nothing tells how large torques are: all in N m or kg m^2 is known up to one factor a joint."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,126 @@
+"""Torques of a machine without known masses, in the unit that the recording tells."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vd.gap.chain import chains
+from vd.gap.hide import Hiding, simulate_hidden
+from vd.gap.result import (
+    Candidate,
+    Estimate,
+    Fit,
+    HeldOut,
+    NamedEffect,
+    Report,
+    Source,
+    parameter_columns,
+)
+from vd.gap.rollout import Rollouts
+from vd.gap.torque_unit import in_known_unit, known_stiffness, relative_torques
+from vd.kernels.effects import EFFECTS
+
+BASE = {"kp": 3.0, "kd": 0.3, "velocity_limit": 7.0, "inertia": 2e-3}
+JOINTS = ("a", "b")
+
+
+def machine(model="servo", joints=JOINTS, **servo):
+    (hidden,) = simulate_hidden([Hiding(model, joints=joints, base_spread=0.0)])
+    return replace(hidden.recording, servo=servo)
+
+
+def effect(name, joints=("a",), **values):
+    units = {p.name: p.unit for p in EFFECTS[name].parameters}
+    estimates = {key: Estimate(v, (0.9 * v, 1.1 * v), units[key]) for key, v in values.items()}
+    return NamedEffect(name, joints, 1.0, estimates)
+
+
+def report(*effects, joints=JOINTS):
+    fit = Fit(0.01, dict.fromkeys(joints, 0.01), 0.01, {joint: dict(BASE) for joint in joints})
+    return Report(
+        verdict="effects",
+        noise_floor_rad=5e-4,
+        baseline=fit,
+        findings=(),
+        effects=effects,
+        ambiguous=(),
+        identified=fit,
+        held_out=HeldOut(("x.csv",), 0.01, 0.001, 0.9, (0.8, 0.95)),
+        next_experiment="",
+        seconds=1.0,
+        recording=Source("r", "servo", joints, 8, 100, 40.0),
+        evidence=(
+            Candidate(("a",), 1, "supply_sag", 0.01, 0.1, (0.0, 0.2), "rejected", "", {"relative": 0.5}),
+        ),
+    )
+
+
+def test_a_known_stiffness_makes_torques_absolute_and_nothing_else():
+    recording = machine(kp_nm_rad={"a": 6.0})
+    found = report(effect("coulomb_friction", tau_c_nm=0.1), effect("command_delay", delay_s=0.04))
+    told = in_known_unit(found, recording)
+    friction, delay = told.effects
+    torque = friction.parameters["tau_c_nm"]
+    assert (torque.value, *torque.ci95) == pytest.approx((0.2, 0.18, 0.22)) and torque.unit == "N m"
+    assert delay == found.effects[1]
+    expected = {"kp": 6.0, "kd": 0.6, "velocity_limit": 7.0, "inertia": 4e-3}
+    assert told.identified.parameters["a"] == told.baseline.parameters["a"] == pytest.approx(expected)
+    assert told.identified.parameters["b"] == BASE
+    assert told.evidence[0].parameters == {"relative": 0.25}
+    assert told.recording.relative_torques, "joint b's are"
+    assert in_known_unit(told, recording) == told, "a second time changes nothing"
+
+
+def test_joints_in_different_units_share_no_torque():
+    found = report(
+        effect("coulomb_friction", JOINTS, tau_c_nm=0.1), effect("backlash", JOINTS, width_rad=0.1)
+    )
+    told = in_known_unit(found, machine(kp_nm_rad={"a": 6.0, "b": 1.5}))
+    assert [(e.joints, e.parameters["tau_c_nm"].value) for e in told.effects[:2]] == [
+        (("a",), 0.2),
+        (("b",), 0.05),
+    ]
+    assert told.effects[2:] == found.effects[1:] and not told.recording.relative_torques
+    same = in_known_unit(found, machine(kp_nm_rad={"a": 6.0, "b": 6.0}))
+    assert [e.joints for e in same.effects] == [JOINTS, JOINTS]
+
+
+def test_what_moves_is_the_same_in_either_unit():
+    recording = machine(joints=("a",), kp_nm_rad=2.3)
+    effects = (
+        effect("stribeck_friction", tau_s_nm=0.2, tau_c_nm=0.1, v_s_rad_s=0.5),
+        effect("supply_sag", relative=0.4),
+        effect("torque_limit", tau_max_nm=0.7),
+        effect("integral_action", k_i=2.0),
+        effect("payload_inertia", j_kgm2=2e-3),
+        effect("elastic_transmission", k_nm_rad=5.0, c_nms_rad=5e-3, j_kgm2=1e-3),
+        effect("thermal_drift", rate_per_s=0.01),
+        effect("load_friction", k_load=0.1),
+    )
+    found = report(*effects, joints=("a",))
+    (chain,) = chains(recording, None)
+    rows = []
+    for each in (found, in_known_unit(found, recording)):
+        row = np.array(chain.start_row)
+        for column, value in parameter_columns(each, "a").items():
+            row[0, column] = value
+        rows.append(row)
+    first, second = Rollouts(chain, recording).predict(np.array(rows))
+    assert np.ptp(first) > 1.0
+    np.testing.assert_allclose(second, first, atol=2e-5)
+
+
+def test_where_masses_are_known_torques_are_absolute_anyway():
+    pendulum = machine("pendulum", ("a",))
+    assert relative_torques(pendulum) and known_stiffness(pendulum, "a") is None
+    load = {"payload_kg": 0.4, "arm_length_m": 0.1}
+    weighed = replace(
+        pendulum,
+        trajectories=tuple(replace(t, conditions={**t.conditions, **load}) for t in pendulum.trajectories),
+    )
+    assert not relative_torques(weighed)
+    found = report(effect("torque_limit", tau_max_nm=0.7), joints=("a",))
+    assert in_known_unit(found, replace(weighed, servo={"kp_nm_rad": 6.0})) == found
+    assert not relative_torques(replace(weighed, model="dclaw3", path=Path("r")))
