@@ -8,6 +8,7 @@ stamps increase but need not be regular.
 import csv
 import json
 import math
+import sys
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -228,7 +229,8 @@ def _read_header(file: Path) -> dict[str, Any]:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    largest = sys.float_info.max
+    return isinstance(value, int | float) and not isinstance(value, bool) and -largest <= value <= largest
 
 
 def _names(file: Path, key: str, value: Any) -> tuple[str, ...]:
@@ -384,7 +386,7 @@ def _check_columns(file: Path, names: list[str], joints: tuple[str, ...]) -> dic
     required = ["t", *(f"{channel}.{joint}" for joint in joints for channel in ("command", "position"))]
     for name in required:
         if name not in names:
-            remedy = "separate columns by commas" if set(";\t") & set(names[0]) else "add it"
+            remedy = "separate columns by commas" if set(";\t") & set("".join(names)) else "add it"
             raise RecordingError(f"{file}: row 1 has no column {name!r}; {remedy}")
     wanted = {"t", COMMAND_TIME, *(f"{channel}.{joint}" for channel in CHANNELS for joint in joints)}
     return {name: index for index, name in enumerate(names) if name in wanted}
