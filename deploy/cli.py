@@ -61,6 +61,15 @@ def usage() -> str:
     return USAGE.format(run=RUN.summary, commands="\n".join(lines))
 
 
+def _is_policy(text: str) -> bool:
+    """Whether it is a file, a folder or an installed policy."""
+    if Path(text).exists():
+        return True
+    from vd.evaluate.agents import SHIPPED_POLICIES
+
+    return text in SHIPPED_POLICIES
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-deploy``; returns the exit status."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
@@ -71,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments[0] in COMMANDS:
         name = arguments.pop(0)
         entry = COMMANDS[name]
-    elif not arguments[0].startswith("-") and not Path(arguments[0]).exists():
+    elif not arguments[0].startswith("-") and not _is_policy(arguments[0]):
         print(
             f"vd-deploy: no command and no policy {arguments[0]!r}; commands are {', '.join(COMMANDS)}",
             file=sys.stderr,

@@ -230,6 +230,13 @@ def test_options_and_commands_that_cannot_be_are_refused(capsys):
     assert cli.main([]) == cli.OK and "vd-deploy COMMAND" in capsys.readouterr().out
 
 
+def test_an_installed_policy_may_come_first(monkeypatch):
+    flown = []
+    monkeypatch.setattr("vd.deploy.run.run", lambda cfg: flown.append(cfg) or 0)
+    assert cli.main(["dclaw3-table", "--hand", "dclaw3", "--twin"]) == cli.OK
+    assert flown[0].policy == "dclaw3-table" and flown[0].twin
+
+
 def test_a_twin_that_cannot_start_says_why():
     command = [sys.executable, "-m", "vd.deploy.cli", "scan", "--twin", "--twin-args=--seed no"]
     run = subprocess.run(command, capture_output=True, text=True, check=False)
