@@ -320,6 +320,8 @@ def _print_report(analysis: "Analysis", as_json: bool) -> int:
     print(next_step(report))
     for line in open_questions(report):
         print(f"  open: {line}")
+    for line in report.warnings:
+        print(f"  note: {line}")
     print(f"\n{analysis.out / 'report.html'}\n{path}")
     return OK
 

@@ -299,6 +299,7 @@ def _close(analysis: Analysis) -> None:
 
 
 def _report(analysis: Analysis) -> None:
+    from vd.gap.cautions import cautions
     from vd.gap.plan import PLAN_JSON
     from vd.gap.report import write_report
 
@@ -315,6 +316,7 @@ def _report(analysis: Analysis) -> None:
         seconds=sum(step["seconds"] for step in steps.values()),
         hand=analysis.hand_name,
         hand_layer=None if analysis.settings.hand_layer is None else str(analysis.settings.hand_layer),
+        warnings=cautions(analysis.recording),
         command=analysis.command(),
         software=installed_versions(_PACKAGES),
     )
