@@ -6,8 +6,8 @@ from vd.gap.recording import Recording
 
 MIN_KINDS = 4
 """Kinds of motion below which little is left to fit when one is held out."""
-SLOW_S = 0.02
-"""Median time between samples [s] above which steps of a servo are not resolved."""
+SLOW_S = 0.025
+"""Median time between samples [s] above which steps of a servo are not resolved: 50 Hz, a quarter late."""
 COARSE = 1.5
 """Smallest step of a reading, in encoder counts, above which it is coarser than the recording says."""
 MIN_LEVELS = 20

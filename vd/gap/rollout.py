@@ -194,7 +194,7 @@ class Rollouts:
     def predict(
         self,
         rows: np.ndarray,
-        trajectories: Sequence[int] | None = None,
+        trajectories: Sequence[int] | np.ndarray | None = None,
         *,
         joint: int | None = None,
         keep: np.ndarray | None = None,
