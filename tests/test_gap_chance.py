@@ -13,8 +13,25 @@ from vd.gap.chance import DROP, SIGMA, with_random
 from vd.gap.coordinates import Coordinate
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.joint_fit import JointFit
+from vd.gap.judge import Judge
 from vd.gap.select import Selection
+from vd.gap.statistics import resamples
 from vd.gap.veil import Veil
+
+
+@pytest.mark.parametrize(
+    ("left", "found"), [(2.5, (True, True)), (2.75, (False, True)), (3.0, (False, False))]
+)
+def test_chance_is_judged_where_a_command_moves(left: float, found: tuple[bool, bool]) -> None:
+    """A joint that rests is nearer than the floor, which says nothing against chance: it has none there."""
+    moves = np.arange(10) % 2 == 0
+    resting = 0.3
+    before = made_up(("command_delay",), np.where(moves, 3.0, resting) * FLOOR)
+    likelihood = np.exp(0.5 * (resting**2 - 1.0))  # of a width that is the floor, as of one without chance
+    after = made_up(("command_jitter",), np.where(moves, left, likelihood) * FLOOR)
+    judge = Judge(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
+    told = [one.better(before, after)[0] for one in (judge, replace(judge, moves=moves))]
+    assert tuple(told) == found, "all motions alike, and those that can tell"
 
 
 @pytest.mark.parametrize(("left", "named"), [(1.2, True), (5.0, False)])

@@ -113,6 +113,7 @@ def explain_joints(
             vetoes={**stood_for(same), **told},
             report=lambda line: progress(f"explain: {joint.name}: {line}"),
             rest=_rest(recording, int(chain.columns[joint.spec.joint]), joint.spec.trajectories),
+            moves=_moves(recording, int(chain.columns[joint.spec.joint]), joint.spec.trajectories),
             when=when[list(joint.spec.trajectories)],
             like=next((like for _, found in explained if (like := lacking(found))[0]), ((), {})),
             changing=next((added(found.final) for _, found in explained if found.warms), ((), {})),
@@ -296,6 +297,11 @@ def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | 
 def _rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:
     """Where a joint begins most of its motions [rad]."""
     return float(np.median([recording.trajectories[i].position[0, column] for i in trajectories]))
+
+
+def _moves(recording: Recording, column: int, trajectories: Sequence[int]) -> np.ndarray:
+    """Whether a joint's command changes in each trajectory [S]."""
+    return np.array([bool(np.ptp(recording.trajectories[i].command[:, column])) for i in trajectories])
 
 
 def _consistent(

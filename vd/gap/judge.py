@@ -79,6 +79,7 @@ class Judge:
         weights: Bootstrap weights of the trajectories [R, S].
         whole: Held-out RMSE of the baseline [rad]; what is small beside it is the model's own error.
         without: Held-out RMSE of the present model without each of its effects [rad].
+        moves: Whether the joint's command changes, of each trajectory [S]; None: in all.
         veiled: Whether the samples are seen through what chance does to them (:mod:`vd.gap.veil`).
     """
 
@@ -86,6 +87,7 @@ class Judge:
     weights: np.ndarray
     whole: float = 0.0
     without: dict[str, float] = field(default_factory=dict)
+    moves: np.ndarray | None = None
     veiled: bool = False
 
     def white(self, fit: JointFit) -> bool:
@@ -155,9 +157,13 @@ class Judge:
             sampled = _likelihood_gain(fitted, after, self.weights)
             # The share by which the widths shrink, as the likelihood has it: on the geometric mean. The other
             # model has a width of its own for every motion here, lest chance be credited with what any excuse
-            # for some of them would gain.
-            own = 0.5 * after.count * np.log(np.maximum(before.sse, 1e-30) / np.maximum(after.sse, 1e-30))
-            gain = 1.0 - float(np.exp(-own.sum() / after.count.sum()))
+            # for some of them would gain. It is no less than the floor, nor does a motion count whose command
+            # stays as it is: nothing can be late there.
+            power = before.sse / after.count / self.floor**2
+            widths = self.floor**2 * np.where(power < 1.0, np.exp(power - 1.0), power)
+            count = after.count if self.moves is None else after.count * self.moves
+            own = 0.5 * count * np.log(np.maximum(widths * after.count, 1e-30) / np.maximum(after.sse, 1e-30))
+            gain = 1.0 - float(np.exp(-own.sum() / max(count.sum(), 1.0)))
         low = float(np.quantile(sampled, tail))
         closed = before.held_out_rmse * np.sqrt(max(1.0 - (1.0 - gain) ** 2, 0.0))
         if gain < MIN_GAIN:
