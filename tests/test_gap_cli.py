@@ -298,6 +298,22 @@ def test_a_plan_needs_what_was_explained(fitted, recording, tmp_path, capsys):
     assert "run vd-gap explain" in capsys.readouterr().err
 
 
+def test_plan_does_not_explain_two_rivals_away_together(tmp_path):
+    """Friction and a dead zone leave the same errors at one gain; at others they cannot both be right."""
+    friction = 0.015
+    hide("servo", {"coulomb_friction": {"tau_c_nm": friction}}, tmp_path / "r", seed=3, base_spread=0.0)
+    names = ("coulomb_friction", "dead_zone")
+    report, _ = servo_report(tmp_path / "r", verdict="ambiguous", ambiguous=(names,))
+    values = ({"tau_c_nm": friction}, {"width_rad": 2.0 * friction / BASE["kp"]})
+    evidence = tuple(
+        Candidate((JOINT,), 1, name, 0.01, 0.8, (0.7, 0.9), "tied", "", fitted)
+        for name, fitted in zip(names, values, strict=True)
+    )
+    result = plan(dataclasses.replace(report, evidence=evidence), read_recording(tmp_path / "r"), None)
+    assert result.ranking[0].name == "gain_ladder" and result.ranking[0].floors > 3.0
+    assert "to decide between coulomb friction and dead zone" in result.sentence
+
+
 def test_plan_counts_the_pairs_of_every_set_that_a_motion_tells_apart(recording):
     sets = (("coulomb_friction", "backlash"), ("torque_limit", "torque_saturation"))
     report, _ = servo_report(recording, verdict="ambiguous", ambiguous=sets)

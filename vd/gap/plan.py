@@ -1,9 +1,9 @@
 """Plan the next experiment: the motions on which the models that are still possible disagree most.
 
 Every set of motions of the menu is simulated under every model in question, together with what has been
-recorded. Two models differ by what refitting to both cannot absorb: the part of their difference along small
-changes of their parameters is taken out, as far as those parameters are uncertain, and so is the size of what
-they already disagree about. The set of motions that tells most pairs of models apart is proposed.
+recorded. Two models differ by what refitting cannot absorb: the part of their difference along small changes
+of their parameters is taken out, as far as each goes on explaining the recording, and so is what one of them
+explains worse of it. The set of motions that tells most pairs of models apart is proposed.
 """
 
 import contextlib
@@ -371,15 +371,20 @@ def _disagreements(
         curves.append(predicted[place])
         slopes.append((predicted[place + 1 : place + 1 + len(columns)] - predicted[place]) / STEP)
         place += 1 + len(columns)
+    left = rollouts.measured[old, index]
     count = len(models)
     plain_first = PLAIN in models  # then every effect is one of many, and is compared with none
-    pairs = [(0, b) for b in range(1, count)] if plain_first else itertools.combinations(range(count), 2)
-    result: dict[str, list[float]] = {name: [] for name in menu}
-    for a, b in pairs:
-        difference, both = curves[a] - curves[b], np.concatenate([slopes[a], slopes[b]])
-        for name, values in result.items():
-            seen = old | (owner == name)
-            values.append(_left_over(difference[seen], both[:, seen], floor, int(old.sum())))
+    pairs = (
+        [(0, b) for b in range(1, count)] if plain_first else list(itertools.combinations(range(count), 2))
+    )
+    result: dict[str, list[float]] = {}
+    for name in menu:
+        new = owner == name
+        rivals = [
+            _Rival(left - curve[old], curve[new], np.concatenate([slope[:, old], slope[:, new]], axis=1))
+            for curve, slope in zip(curves, slopes, strict=True)
+        ]
+        result[name] = [_left_over(rivals[a], rivals[b], floor) for a, b in pairs]
     return result
 
 
@@ -400,22 +405,50 @@ def _known(recording: Recording, joint: str) -> tuple[Trajectory, ...]:
     return tuple(own[: max(int(np.searchsorted(ends, KNOWN_S, side="right")), 1)])
 
 
-def _left_over(difference: np.ndarray, slopes: np.ndarray, floor: float, old: int) -> float:
+@dataclass(frozen=True)
+class _Rival:
+    """A model in question: K samples that are recorded, then M imagined ones, P parameters."""
+
+    recorded: np.ndarray
+    """What it leaves of the recording [K] [rad]."""
+    imagined: np.ndarray
+    """What it predicts of new motions [M] [rad]."""
+    slopes: np.ndarray
+    """Change of its predictions with the logarithm of each parameter [P, K + M] [rad]."""
+
+
+def _left_over(a: _Rival, b: _Rival, floor: float) -> float:
     """What two models say differently about new motions once both have been refitted.
 
+    Each may change its parameters as far as it goes on explaining what is recorded; the changes are those
+    that bring the two together. What one explains worse of the recording is known, and tells nothing new.
+
     Args:
-        difference: Of their predictions [S] [rad].
-        slopes: Change of a prediction with the logarithm of a parameter [P, S] [rad].
+        a: A model.
+        b: Its rival.
         floor: Noise floor [rad].
-        old: Samples at the start that have been recorded, and do not tell the models apart.
+
+    Returns:
+        RMS of their difference [rad].
     """
-    # Ridge regression as an augmented least-squares problem: the rivals share most of their slopes.
-    system = np.concatenate([slopes, np.eye(len(slopes)) * floor / UNCERTAINTY], axis=1).T
-    target = np.concatenate([difference, np.zeros(len(slopes))])
-    change = np.linalg.lstsq(system, target, rcond=None)[0]
-    square = (difference - change @ slopes) ** 2
-    blind = float(np.mean(square[:old])) if old else 0.0
-    return math.sqrt(max(float(np.mean(square[old:])) - blind, 0.0))
+    known, new, count = len(a.recorded), len(a.imagined), len(a.slopes)
+    blank = np.zeros((known, count)), np.zeros((known, len(b.slopes)))
+    ridge = (
+        math.sqrt(new) * floor / UNCERTAINTY
+    )  # one sigma of a parameter weighs as one floor on all samples
+    system = np.block(
+        [
+            [a.slopes[:, :known].T, blank[1]],
+            [blank[0], b.slopes[:, :known].T],
+            [a.slopes[:, known:].T, -b.slopes[:, known:].T],
+        ]
+    )
+    target = np.concatenate([a.recorded, b.recorded, b.imagined - a.imagined])
+    free = count + len(b.slopes)
+    bounded = np.concatenate([system, ridge * np.eye(free)]), np.concatenate([target, np.zeros(free)])
+    left = target - system @ np.linalg.lstsq(*bounded, rcond=None)[0]
+    worse = abs(float(np.sum(left[:known] ** 2) - np.sum(left[known : 2 * known] ** 2))) / max(known, 1)
+    return math.sqrt(max(float(np.mean(left[2 * known :] ** 2)) - worse, 0.0))
 
 
 def _sentence(best: Score, report: Report, joints: tuple[str, ...]) -> str:
