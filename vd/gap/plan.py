@@ -43,8 +43,9 @@ KNOWN_S = 60.0
 """Recorded time that refits are held to [s]."""
 FINE_STEP_S = 1.0 / 2400.0
 """Time step [s]: rivals differ by less than a delay of the fit's own step."""
-VISIBLE = 3.0
-"""Disagreement, in noise floors, from which a recording is expected to decide."""
+VISIBLE = 1.5
+"""Disagreement, in noise floors, from which a recording is expected to decide: who is wrong leaves 1.8 floors
+there, noise included, and 1.3 are the most that an accepted model may leave."""
 PLAIN = "plain servo"
 """The model without any further effect."""
 PAYLOAD_SET = "second_payload"
