@@ -91,7 +91,8 @@ def test_a_friction_that_changes_is_no_name() -> None:
     def concluded(falls: float, left: float = FLOOR) -> Explanation:
         fit, _ = warm_fit(falls, 3)
         final = replace(fit, held_out=fit.count * left**2, sse=fit.count * left**2)
-        plain = replace(fit, effects=(), held_out=fit.count * (10.0 * FLOOR) ** 2)
+        gap = fit.count * (10.0 * FLOOR) ** 2
+        plain = replace(fit, effects=(), held_out=gap, sse=gap)
         return judge.conclude(plain, final, {"coulomb_friction": [final]}, [], "")
 
     assert concluded(0.0).verdict == "effects" and not concluded(0.0).warms
