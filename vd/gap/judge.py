@@ -160,7 +160,7 @@ class Judge:
             # for some of them would gain. It is no less than the floor, nor does a motion count whose command
             # stays as it is: nothing can be late there.
             power = before.sse / after.count / self.floor**2
-            widths = self.floor**2 * np.where(power < 1.0, np.exp(power - 1.0), power)
+            widths = self.floor**2 * np.where(power < 1.0, np.exp(np.minimum(power, 1.0) - 1.0), power)
             count = after.count if self.moves is None else after.count * self.moves
             own = 0.5 * count * np.log(np.maximum(widths * after.count, 1e-30) / np.maximum(after.sse, 1e-30))
             gain = 1.0 - float(np.exp(-own.sum() / max(count.sum(), 1.0)))
