@@ -198,6 +198,12 @@ def test_a_joint_at_rest_and_a_servo_that_is_off_are_no_dead_encoders(tmp_path):
     read_recording(write_recording(recording, tmp_path / "off"))
 
 
+def test_half_a_torque_is_neither_on_nor_off(folder):
+    cells = ["enabled.f0_j1", "0", "0.5", *["1"] * (SAMPLES - 2)]
+    edit_table(folder, lambda table: [[*row, cell] for row, cell in zip(table, cells, strict=True)])
+    refused(folder, "a.csv", "row 3", "'enabled.f0_j1'", "0.5", "0 or 1")
+
+
 def test_an_encoder_that_only_flickers_is_dead(tmp_path):
     recording = example()
     (trajectory,) = recording.trajectories

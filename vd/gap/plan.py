@@ -434,9 +434,8 @@ def _left_over(a: _Rival, b: _Rival, floor: float) -> float:
     """
     known, new, count = len(a.recorded), len(a.imagined), len(a.slopes)
     blank = np.zeros((known, count)), np.zeros((known, len(b.slopes)))
-    ridge = (
-        math.sqrt(new) * floor / UNCERTAINTY
-    )  # one sigma of a parameter weighs as one floor on all samples
+    # One sigma of a parameter weighs as one floor on all samples.
+    ridge = math.sqrt(new) * floor / UNCERTAINTY
     system = np.block(
         [
             [a.slopes[:, :known].T, blank[1]],

@@ -66,11 +66,10 @@ def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
             i, limit = int(np.argmax(np.abs(values))), 1.0
             why = "a duty cycle lies in [-1, 1]; divide by the full scale"
         elif channel == "enabled":
-            i, limit = int(np.argmax(np.abs(values - 0.5))), 1.0
+            i, limit = int(np.argmax(~np.isin(values, (0.0, 1.0)))), 0.0
             why = "it must be 0 or 1; correct it"
             if values[i] in (0.0, 1.0):
                 continue
-            limit = 0.0
         else:
             continue
         if abs(values[i]) > limit:
