@@ -112,15 +112,33 @@ def write_friction_kernel(
 
 @wp.kernel
 def write_object_force_kernel(
+    # Model:
+    object_mass: wp.array[float],
+    lightened: wp.array[wp.int32],
+    gravity: wp.vec3,
+    weight: wp.array[float],
+    object_body: int,
     # In:
     force_in: wp.array[wp.vec3],
-    object_body: int,
     # Out:
     body_force_out: wp.array2d[wp.spatial_vector],
 ):
-    """Write a force [N] at the object's centre of mass, shape [N], into the body forces, shape [N, B]."""
+    """Write a force at the object's centre of mass, and what carries a part of its weight. Launch: [N].
+
+    Args:
+        object_mass: Mass of the object [kg], shape [N].
+        lightened: 1 where a part of the weight is carried, shape [N].
+        gravity: Acceleration of gravity [m/s^2].
+        weight: Share of its weight that a lightened object has left, shape [1].
+        object_body: The object's body within a world.
+        force_in: Force on the object, world frame [N], shape [N].
+        body_force_out: Force and torque on each body [N, N m], shape [N, B]; only the object's is written.
+    """
     world = wp.tid()
-    body_force_out[world, object_body] = wp.spatial_vector(force_in[world], wp.vec3(0.0))
+    force = force_in[world]
+    if lightened[world] != 0:
+        force -= (1.0 - weight[0]) * object_mass[world] * gravity
+    body_force_out[world, object_body] = wp.spatial_vector(force, wp.vec3(0.0))
 
 
 @wp.kernel

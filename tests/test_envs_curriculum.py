@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TighteningCfg
+from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TableCfg, TighteningCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.reorient import ReorientEnv
 from vd.paper import PAPER
@@ -105,6 +105,40 @@ def test_thresholds_shrink_by_the_same_factor_from_loose_to_those_of_success():
     assert update(env, SO_SO)["tightness"] == 1.0
     assert update(env, BADLY)["tightness"] == 0.75
     assert thresholds(env) == pytest.approx(seen[3])
+
+
+def test_goals_are_asked_for_more_exactly_as_stillness_tightens():
+    tightening = dataclasses.replace(TIGHTENING, rotation_rad=0.4)
+    env = make(CurriculumCfg(tightening=tightening), success=SuccessCfg(rotation_rad=0.1))
+    seen = []
+    for tightness in (0.0, 0.5, 1.0):
+        env.set_stage(Stage(1.0, tightness))
+        seen.append(float(env.parameters.success.numpy()["rotation"][0]))
+    assert seen == pytest.approx([0.4, 0.2, 0.1])
+
+
+def test_what_has_to_be_lifted_gets_its_weight_as_stillness_tightens():
+    tightening = dataclasses.replace(TIGHTENING, object_weight=0.01)
+    table = TableCfg(lift_share=0.5, away_share=1.0, away_s=(0.01, 0.01))
+    env = make(CurriculumCfg(tightening=tightening), table=table, num_worlds=4)
+    lifted = env.must_lift.numpy() == 1
+    assert sorted(lifted) == [False, False, True, True]
+
+    def fallen() -> np.ndarray:
+        """How far each object falls in a control step, from where nothing is in its way [m]."""
+        env.reset()
+        q = env.sim.joint_q.numpy()
+        q[:, env.num_actions + 2] = 0.6
+        env.sim.joint_q.assign(q)
+        env.launch_step()
+        return 0.6 - env.object_pose_end.numpy()[:, 2]
+
+    step = env.cfg.sim.control_dt
+    plain, light = fallen()[~lifted], fallen()[lifted]
+    assert plain == pytest.approx(0.5 * 9.81 * step**2, rel=0.2)
+    assert light == pytest.approx(0.01 * plain, rel=0.05)
+    env.set_stage(Stage())
+    assert fallen() == pytest.approx(plain[0], rel=1e-3), "at the end of the curriculum they weigh the same"
 
 
 def test_a_saved_environment_goes_on_with_its_tightness():

@@ -228,15 +228,25 @@ def test_gains_force_pose_masks_and_counts_go_where_they_belong(device):
     assert np.isnan(model_kp.numpy()[:, joints:]).all(), "the object's free joint has no gains"
 
     force = random.normal(size=(worlds, 3)).astype(np.float32)
+    mass, lightened = random.uniform(0.05, 0.2, worlds).astype(np.float32), np.array([0, 1, 1, 0])
     body_force = wp.zeros((worlds, 5), dtype=wp.spatial_vector, device=device)
     wp.launch(
         write_object_force_kernel,
         dim=worlds,
-        inputs=[device_array(force, wp.vec3, device), 4],
+        inputs=[
+            device_array(mass, float, device),
+            device_array(lightened, int, device),
+            wp.vec3(0.5, 0.0, -9.81),
+            device_array(np.array([0.3]), float, device),
+            4,
+            device_array(force, wp.vec3, device),
+        ],
         outputs=[body_force],
         device=device,
     )
-    np.testing.assert_array_equal(body_force.numpy()[:, 4, :3], force)
+    carried = force - 0.7 * (lightened * mass)[:, None] * np.array([0.5, 0.0, -9.81])
+    np.testing.assert_allclose(body_force.numpy()[:, 4, :3], carried, rtol=1e-5, atol=1e-6)
+    np.testing.assert_array_equal(body_force.numpy()[lightened == 0, 4, :3], force[lightened == 0])
     assert not body_force.numpy()[:, :4].any() and not body_force.numpy()[:, 4, 3:].any()
 
     q = random.normal(size=(worlds, joints + 7)).astype(np.float32)

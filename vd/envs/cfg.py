@@ -187,7 +187,7 @@ class ExploreCfg:
 
 @dataclass(frozen=True)
 class TighteningCfg:
-    """Ours: ask for little stillness at first, later for that of ``success``. Off by default.
+    """Ours: ask for little at first, later for the stillness and nearness of ``success``. Off by default.
 
     Noise in the actions moves the fingers more than the paper's success allows, and without noise nothing
     is learned, so both have to fall together (``policy.quiet_std``). Where the difficulty is 1, the tightness
@@ -205,6 +205,11 @@ class TighteningCfg:
     """Largest angular speed of the object at tightness 0 [rad/s]."""
     action_norm: float = 3.5
     """Largest norm of the smoothed action at tightness 0; that of twelve actions of 1 is 3.46."""
+    rotation_rad: float = PAPER.success.rotation_rad
+    """Largest rotation error at tightness 0 [rad]; a smaller success.rotation_rad makes it finer."""
+    object_weight: float = 1.0
+    """Share of its weight that the object has at tightness 0 in the worlds of table.lift_share: what is light
+    is easily held, and not lost before it is."""
     raise_at: float = 0.5
     """Success rate of goals above which stillness tightens."""
     lower_at: float = 0.3
@@ -214,7 +219,14 @@ class TighteningCfg:
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
-        for name in ("joint_speed_rad_s", "object_speed_m_s", "object_spin_rad_s", "action_norm"):
+        for name in (
+            "joint_speed_rad_s",
+            "object_speed_m_s",
+            "object_spin_rad_s",
+            "action_norm",
+            "rotation_rad",
+            "object_weight",
+        ):
             if not getattr(self, name) > 0.0:
                 raise ValueError(
                     f"curriculum.tightening.{name} is {getattr(self, name):g}; it has to be positive "
@@ -257,6 +269,11 @@ class CurriculumCfg:
     energy_start: float = 0.0
     """Factor on the energy term at difficulty 0; it grows to 1."""
     tightening: TighteningCfg = field(default_factory=TighteningCfg)
+
+    @property
+    def lightens(self) -> bool:
+        """Whether objects that have to be lifted are lighter at first."""
+        return self.tightening.object_weight != 1.0
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""

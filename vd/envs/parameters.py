@@ -73,6 +73,8 @@ class TaskParameters:
         self.reward = array(RewardParams)
         self.success = array(SuccessParams)
         self.goal = array(GoalParams)
+        self.weight = wp.ones(1, dtype=float, device=device)
+        """Share of its weight that an object which has to be lifted has, shape [1]."""
         self._staging = {name: getattr(self, name).numpy() for name in ("reward", "success", "goal")}
         self.set_stage(Stage())
 
@@ -110,7 +112,7 @@ class TaskParameters:
         )
         self._write(
             "success",
-            rotation=success.rotation_rad,
+            rotation=blend(loose.rotation_rad, success.rotation_rad, stage.tightness),
             joint_speed=threshold(success.joint_speed_rad_s, loose.joint_speed_rad_s),
             object_speed=threshold(success.object_speed_m_s, loose.object_speed_m_s),
             object_spin=threshold(success.object_spin_rad_s, loose.object_spin_rad_s),
@@ -123,6 +125,8 @@ class TaskParameters:
             max_angle=start + (cfg.goal.max_angle_rad - start) * _progress(difficulty, curriculum.goal_span),
             about_vertical=int(cfg.goal.about_vertical),
         )
+
+        self.weight.fill_(blend(loose.object_weight, 1.0, stage.tightness))
 
     def _write(self, name: str, **values: Any) -> None:
         staging = self._staging[name]

@@ -59,6 +59,7 @@ class Randomiser:
         self.observation_offset = zeros(n, teacher_observation_size(env.num_fingers))
         self.force = zeros(n, dtype=wp.vec3)
         """Disturbance force on the object [N], world frame, shape [N]."""
+        self._gravity = wp.vec3(*env.sim.model.gravity.numpy()[0].tolist())
         self._age, self._due = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
         self._interval = round(cfg.randomisation.redraw_s * cfg.sim.control_hz)
         self._push_interval = round(PUSH_INTERVAL_S * cfg.sim.control_hz)
@@ -164,20 +165,28 @@ class Randomiser:
             )
 
     def disturb(self) -> None:
-        """Draw this control step's disturbance force and apply it to the object."""
+        """Draw this control step's disturbance force, and apply it and what carries the object."""
         env = self._env
-        if not self.enabled:
+        if self.enabled:
+            wp.launch(
+                disturbance_force_kernel,
+                dim=env.num_worlds,
+                inputs=[self.object_mass, env.parameters.force, self.force, env.rng],
+                device=env.device,
+            )
+        elif not env.cfg.curriculum.lightens:
             return
-        wp.launch(
-            disturbance_force_kernel,
-            dim=env.num_worlds,
-            inputs=[self.object_mass, env.parameters.force, self.force, env.rng],
-            device=env.device,
-        )
         wp.launch(
             write_object_force_kernel,
             dim=env.num_worlds,
-            inputs=[self.force, env.scene.object_body],
+            inputs=[
+                self.object_mass,
+                env.must_lift,
+                self._gravity,
+                env.parameters.weight,
+                env.scene.object_body,
+                self.force,
+            ],
             outputs=[env.sim.body_force],
             device=env.device,
         )

@@ -161,7 +161,8 @@ class ReorientEnv:
         self.acts_in_view = True
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
         self._table_steps = table_array(cfg, self.device)
-        self._must_lift = array(must_lift(cfg), wp.int32)
+        self.must_lift = array(must_lift(cfg), wp.int32)
+        """1 where success asks that the object does not touch the table, shape [N]."""
         self.nudges = Nudges(cfg, d, n, self.device) if cfg.nudge.enabled or cfg.explore.enabled else None
         """What moves hands that are stuck or far from the goal, or None: they act as the policy does."""
         self._lifts = cfg.reward.lift != 0.0
@@ -287,7 +288,7 @@ class ReorientEnv:
                 self.smoothed,
                 sim.table_force,
                 self.clearance,
-                self._must_lift,
+                self.must_lift,
                 self.previous_error,
             ],
             outputs=[self.reward, self.reward_terms, self.rotation_error, self.success, self.fell],
