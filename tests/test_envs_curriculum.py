@@ -5,7 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vd.envs.cfg import CurriculumCfg, GoalCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TableCfg, TighteningCfg
+from vd.envs.cfg import (
+    CurriculumCfg,
+    GoalCfg,
+    RandomisationCfg,
+    ReorientCfg,
+    SuccessCfg,
+    TableCfg,
+    TighteningCfg,
+)
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.reorient import ReorientEnv
 from vd.paper import PAPER
