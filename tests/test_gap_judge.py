@@ -185,6 +185,24 @@ def test_sets_of_several_joints_meet_in_one_name() -> None:
     assert adopted.reason == "coulomb_friction and gravity_load explain it, as on the other joints"
 
 
+def test_what_comes_nearest_to_an_unknown_cause_is_no_name_by_other_joints() -> None:
+    """Beside a torque ripple joints came with sets that share play, all refused, and ended with its name."""
+
+    def explanation(verdict: Verdict, name: str, *tied: str) -> Explanation:
+        accepted = Accepted(name, 0.6 if tied else 1.0, {}, (), tied, False)
+        fits = [made_up((other,), 0.01) for other in (name, *tied)]
+        return Explanation(made_up((), 0.011), fits[0], verdict, "refused", (accepted,), (), {name: fits})
+
+    refused = explanation("unknown", "backlash", "dead_zone")
+    again = explanation("unknown", "backlash", "coulomb_friction")
+    sure = explanation("unknown", "backlash")
+    for joints in ([refused, again, sure], [refused, explanation("effects", "backlash")]):
+        assert share(joints, [FLOOR] * len(joints)) == joints
+    open_set = explanation("ambiguous", "backlash", "dead_zone")
+    assert share([open_set, sure, again], [FLOOR] * 3) == [open_set, sure, again], "nor do they settle sets"
+    assert share([open_set, explanation("effects", "backlash")], [FLOOR] * 2)[0].verdict == "effects"
+
+
 @pytest.mark.parametrize(("error", "named"), [(1.03, "coulomb_friction"), (1.08, "asymmetric_friction")])
 def test_a_fuller_form_of_what_the_others_have_must_gain_as_an_effect_does(error: float, named: str) -> None:
     """A right model leaves more than the floor where times are rounded; two sides of friction do a little."""

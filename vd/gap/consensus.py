@@ -130,7 +130,8 @@ def share(
 
     The joints of a finger are built alike: one cause on all of them is simpler than another on each. Joints
     that have nothing in common but the machine share its bus, its supply, and that it stands in gravity, but
-    not the friction or the play of one gear.
+    not the friction or the play of one gear. What comes nearest on a joint whose gap nothing explains is no
+    answer: other joints do not make it one, nor does it settle theirs.
 
     Args:
         explanations: Of the joints.
@@ -142,6 +143,9 @@ def share(
     result = []
     finish = [_as_it_is] * len(explanations) if polish is None else polish
     for explanation, floor, finger, end in zip(explanations, floors, fingers, finish, strict=True):
+        if not _answered(explanation):
+            result.append(explanation)
+            continue
         alike = [e for e, other in zip(explanations, fingers, strict=True) if other == finger]
         named = _named(alike) | (_named(explanations) & OF_THE_MACHINE)
         result.append(_adopt(explanation, named, floor, end))
@@ -220,7 +224,7 @@ def no_spring(explanations: Sequence[Explanation], groups: Sequence[int]) -> lis
     )
     return [
         replace(e, verdict="unknown", reason=reason)
-        if group in refused and e.verdict in ("effects", "ambiguous") and both == {*e.final.effects}
+        if group in refused and _answered(e) and both == {*e.final.effects}
         else e
         for e, group in zip(explanations, groups, strict=True)
     ]
@@ -239,10 +243,15 @@ def no_constant_friction(explanations: Sequence[Explanation], groups: Sequence[i
     changing = {group for e, group in zip(explanations, groups, strict=True) if e.warms}
     return [
         replace(e, verdict="unknown", reason=CHANGING)
-        if group in changing and e.verdict in ("effects", "ambiguous") and {*LEVELS} & {*e.final.effects}
+        if group in changing and _answered(e) and {*LEVELS} & {*e.final.effects}
         else e
         for e, group in zip(explanations, groups, strict=True)
     ]
+
+
+def _answered(explanation: Explanation) -> bool:
+    """Whether it gives names or sets; one that does not keeps the effects that come nearest."""
+    return explanation.verdict in ("effects", "ambiguous")
 
 
 def _as_it_is(fit: JointFit) -> JointFit:
@@ -251,8 +260,9 @@ def _as_it_is(fit: JointFit) -> JointFit:
 
 def _named(explanations: Sequence[Explanation]) -> set[str]:
     """What some joint names, and the only effect that is in the set of every joint that has one set."""
-    named = {a.name for e in explanations for a in e.accepted if a.named}
-    open_sets = [[{a.name, *a.tied} for a in e.accepted if a.tied and not a.at_bound] for e in explanations]
+    answers = [e for e in explanations if _answered(e)]
+    named = {a.name for e in answers for a in e.accepted if a.named}
+    open_sets = [[{a.name, *a.tied} for a in e.accepted if a.tied and not a.at_bound] for e in answers]
     sets = [of_joint[0] for of_joint in open_sets if len(of_joint) == 1]
     if len(sets) > 1:
         common = set.intersection(*sets)
