@@ -28,6 +28,7 @@ from vd.gap.workflow import baseline_of
 JOINTS = ("f0_j1", "f0_j2", "f0_j3")
 NOISE = 3e-4
 DT = 1.0 / 240.0
+NO_STRUCTURE = (np.zeros((2, 10)),) * 3
 
 
 def blank() -> Recording:
@@ -162,7 +163,7 @@ def test_beside_other_masses_a_spring_is_no_load_with_an_offset(
 
     Nor is anything else where the masses are not others: it is not they that are the rest.
     """
-    masses = Masses(np.array([1.0, 1.0 - off, 1.0]), np.full(3, NOISE))
+    masses = Masses(np.array([1.0, 1.0 - off, 1.0]), np.full(3, NOISE), NO_STRUCTURE)
     monkeypatch.setattr(joints, "fit_masses", lambda *_: masses)
     monkeypatch.setattr(joints, "_cores", lambda _: [("gravity_load", "encoder_bias")])
     recording = blank()
@@ -191,6 +192,51 @@ def test_beside_other_masses_a_spring_is_no_load_with_an_offset(
         found.append(Explanation(own[-1].fit, fit, "unknown", "structure is left", accepted))
     told = _beside_masses(team, own, found)  # type: ignore[arg-type]
     assert [each.verdict for each in told] == [verdict] * 3
+
+
+@pytest.mark.parametrize(
+    ("backlash", "friction", "structure", "named"),
+    [
+        (1.0, 1.1, 0.0, "backlash"),
+        (1.2, 1.0, 0.0, "coulomb_friction"),
+        (1.0, 1.0, 0.0, ""),  # both do
+        (1.0, 1.1, 0.4, ""),  # another joint lacks more than other masses
+    ],
+    ids=["the first", "the second", "both", "structure elsewhere"],
+)
+def test_masses_name_one_of_a_set_only_where_it_alone_leaves_noise_with_them(
+    backlash: float, friction: float, structure: float, named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All members of a set are tried beside other masses, and all joints must be left with noise."""
+    left = {"backlash": backlash, "coulomb_friction": friction}
+    kept = np.stack([np.full(10, structure * NOISE**2 * 100.0), np.full(10, 100.0)])
+
+    def masses(_: Sequence[JointProblem], fits: Sequence[JointFit]) -> Masses:
+        errors = NOISE * np.array([left[fits[0].effects[0]], 1.0, 1.0])
+        return Masses(np.array([1.1, 1.0, 1.0]), errors, (NO_STRUCTURE[0], kept, NO_STRUCTURE[0]))
+
+    monkeypatch.setattr(joints, "fit_masses", masses)
+    recording = blank()
+    (chain,) = chains(recording, load_hand("dclaw3"))
+
+    def fit(*effects: str) -> JointFit:
+        # At the floor without structure, made up of parameters that no effect has.
+        return replace(made_up(effects, NOISE), rows=chain.start_row)
+
+    bench = SimpleNamespace(chains=[chain], recording=recording, problem=lambda _: None)
+    team = SimpleNamespace(bench=bench, run=lambda _, calls: [fit(*calls[0][1]["effects"])])
+    accepted = Accepted("backlash", 0.6, {}, (), ("coulomb_friction",), False)
+    rivals = {"backlash": [fit("backlash"), fit("coulomb_friction")]}
+    gap = Explanation(fit(), fit("backlash"), "ambiguous", "a set", (accepted,), (), rivals)
+    found = [gap, *[Explanation(fit(), fit(), "no_gap", "")] * 2]
+    specs = [JointSpec(0, index, *design(recording, chain, index), NOISE, ()) for index in range(3)]
+    scales = Scales(1.0, 1.0, 2.0, 3.0, 10.0, 1e-3, 0.01, 6.0)
+    own = [Joint(name, spec, scales, fit()) for name, spec in zip(JOINTS, specs, strict=True)]
+    monkeypatch.setattr(joints, "polished", lambda explanation, *_: explanation)
+    told = _beside_masses(team, own, found)  # type: ignore[arg-type]
+    assert told[1:] == found[1:]
+    assert [one.name for one in told[0].accepted if one.named] == ([named] if named else [])
+    assert (told[0] is gap) == (not named)
 
 
 def test_masses_stay_in_the_range_that_policies_are_trained_on() -> None:

@@ -341,7 +341,7 @@ class JointProblem:
             residual = self.residuals(result.rows[None])[0]
         finally:
             self.rollouts, self.coarse = given
-        structure = None if self._growth else self._structure(residual)  # chance has a memory
+        structure = None if self._growth else self.structure(residual)  # chance has a memory
         return replace(
             result,
             held_out=fit.held_out,
@@ -350,7 +350,7 @@ class JointProblem:
             structure=structure,
         )
 
-    def _structure(self, residual: np.ndarray) -> np.ndarray:
+    def structure(self, residual: np.ndarray) -> np.ndarray:
         """Products of successive residuals in motion [2, S]; at rest the rounding to counts repeats."""
         count = self.rollouts.recording.encoder_resolution_rad
         sums = []

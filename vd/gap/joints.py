@@ -1,6 +1,6 @@
 """Explain the joints of a recording, those of a finger in turn, each knowing what the others have."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +21,7 @@ from vd.gap.select import LOOKS, RESTARTS, Selection
 from vd.gap.statistics import resamples
 from vd.gap.team import JointSpec, Team
 from vd.gap.telemetry import vetoes
-from vd.gap.verdict import cancelled, explains
+from vd.gap.verdict import Verdicts, cancelled, explains
 from vd.gap.warming import middles
 from vd.kernels.effects import EFFECTS
 
@@ -246,18 +246,13 @@ class _Finger:
 
 def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | None:
     """The joints of a finger with these effects alone, if links of other mass then leave noise on all."""
-    models = [
-        (found.final.values, {one.name: one for one in found.accepted if not (one.at_bound or one.doubt)})
-        for _, found in known
-    ]
-    named = {name: next((m for m in models if name in m[1]), None) for name in core}
     start: dict[str, float] = {}
     accepted: list[Accepted] = []
-    for name, model in named.items():
-        if model is None:
+    for name in core:
+        one, values = next((one for _, found in known for one in _can_have(found, name)), (None, {}))
+        if one is None:
             return None
-        start |= {key: value for key, value in model[0].items() if key.startswith(f"{name}.")}
-        one = model[1][name]
+        start |= {key: value for key, value in values.items() if key.startswith(f"{name}.")}
         accepted.append(replace(one, tied=(), confidence=max(one.confidence, NAMED)))
     rows = known[0][0].fit.rows.copy()
     for joint, found in known:
@@ -282,7 +277,11 @@ def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | 
     if not masses.other or (masses.errors >= NO_GAP * floors).any():
         return None
     reason, explanations = f"{explains(core)}, {masses.text}", []
-    for (joint, found), fit in zip(known, fits, strict=True):
+    for (joint, found), fit, structure in zip(known, fits, masses.structure, strict=True):
+        weights = resamples(len(fit.sse), np.random.default_rng(joint.spec.joint))
+        judge = Verdicts(floor=joint.spec.floor, weights=weights, whole=joint.fit.held_out_rmse)
+        if judge.lack_of_fit(replace(fit, structure=structure)):
+            return None  # other masses are not the rest either
         column = int(team.bench.chains[joint.spec.chain].columns[joint.spec.joint])
         rest = _rest(team.bench.recording, column, joint.spec.trajectories)
         if cancelled(fit, joint.spec.joint, rest):
@@ -292,6 +291,18 @@ def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | 
             found = polished(plain, fit, joint.spec.floor)
         explanations.append(found)
     return _Finger(len(core), float(np.sum((masses.errors / floors) ** 2)), explanations)
+
+
+def _can_have(found: Explanation, name: str) -> Iterator[tuple[Accepted, dict[str, float]]]:
+    """An effect as a joint has it, or could have it in the place of another that it is not told from."""
+    for one in found.accepted:
+        if one.at_bound or one.doubt:
+            continue
+        if one.name == name:
+            yield one, found.final.values
+        for fit in found.rivals.get(one.name, ()):
+            if fit.effects[-1] == name and name in one.tied and not fit.at_bound:
+                yield replace(one, name=name, alternatives=(), equivalent=()), fit.values
 
 
 def _rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:

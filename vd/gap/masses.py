@@ -34,10 +34,12 @@ class Masses:
     Attributes:
         factors: Masses as shares of the model's, one a joint [n].
         errors: RMSE of each joint's motions [J] [rad].
+        structure: Of what is left of each joint's motions, as in :class:`~vd.gap.joint_fit.JointFit`.
     """
 
     factors: np.ndarray
     errors: np.ndarray
+    structure: tuple[np.ndarray, ...]
 
     @property
     def other(self) -> bool:
@@ -87,6 +89,7 @@ def fit_masses(problems: Sequence[JointProblem], fits: Sequence[JointFit]) -> Ma
     return Masses(
         factors=np.exp(found.x[0, : len(links)]),
         errors=np.array([np.sqrt(np.mean(part**2)) for part in parts]),
+        structure=tuple(p.structure(part) for p, part in zip(problems, parts, strict=True)),
     )
 
 
