@@ -271,3 +271,19 @@ def test_a_finger_is_explained_from_its_tip_on_each_joint_beside_those_before() 
     rows = _beside(joints[2], list(zip(joints, found, strict=True)))
     chance = [servo.JITTER_SIGMA, servo.JITTER_DROP]
     assert rows[:, servo.KP].tolist() == [1.5, 0.5, 3.5] and not rows[[0, 2]][:, chance].any()
+
+
+@pytest.mark.parametrize("first", ["command_delay", "backlash"])
+def test_a_fixed_delay_before_chance_was_found_on_another_joint_is_looked_at_again(first: str) -> None:
+    def explained(joint: Joint, known: list, own: Explanation | None = None) -> Explanation:
+        asked.append((joint.name, [other.name for other, _ in known], own is not None))
+        name = first if joint.name == "tip" and own is None else "command_jitter"
+        return Explanation(joint.fit, made_up((name,), FLOOR), "effects", name)
+
+    asked: list[tuple[str, list[str], bool]] = []
+    specs = {name: JointSpec(0, i, (0,), (0,), FLOOR, ()) for i, name in enumerate(("palm", "tip"))}
+    joints = [Joint(name, spec, Scales(*[1.0] * 8), made_up((), 0.01)) for name, spec in specs.items()]
+    found = [each.reason for each in _in_turn(joints, explained)]
+    again = [("tip", ["palm"], True)] if first == "command_delay" else []
+    assert asked == [("tip", [], False), ("palm", ["tip"], False), *again]
+    assert found == ["command_jitter", "command_jitter" if again else first]

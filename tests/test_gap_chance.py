@@ -9,14 +9,16 @@ from test_gap_judge import FLOOR, made_up
 from test_gap_select import searching
 
 from vd.gap import chance
-from vd.gap.chance import DROP, SIGMA, with_random
-from vd.gap.coordinates import Coordinate
+from vd.gap.chance import DROP, SIGMA, behind, with_random
+from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import Judge
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.veil import Veil
+
+SCALES = Scales(3.0, 0.5, 2.0, 6.0, 70.0, 1e-3, 1e-3, 12.0)
 
 
 @pytest.mark.parametrize(
@@ -40,6 +42,7 @@ def test_what_leaves_more_than_chance_does_is_no_chance(left: float, named: bool
     selection = replace(searching([])[0], candidates=("backlash", "command_jitter"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(chance, "with_random", lambda *_: (random, (), [], left * FLOOR))
+        patch.setattr(chance, "bounded", lambda _, fit: fit)
         patch.setattr(Selection, "refit", lambda *_: made_up((), 0.02))
         found, _, (row,) = chance.try_random(selection, made_up((), 0.03), present)
     assert (found is random) == named and (found is present) != named
@@ -89,3 +92,68 @@ def test_beside_chance_the_search_goes_on_until_the_spread_stays() -> None:
     assert [name for name, _ in asked] == ["look", *2 * ["fit", "fit_jitter"]]
     assert all(seen == (name == "fit") for name, seen in asked), "the rest is fitted through the veil"
     assert all(inner.veiled and "command_jitter" not in inner.candidates for inner in searched)
+
+
+@pytest.mark.parametrize(("sigmas", "found"), [(1.0, True), (1.6, False)])
+def test_chance_replaces_a_fixed_delay_where_its_spread_is_the_one_that_is_there(
+    sigmas: float, found: bool
+) -> None:
+    """Errors that grow as chance says are chance: with a width for each motion, no model is much likelier."""
+    moves, fast = np.arange(10) % 2 == 0, np.linspace(1.0, 4.0, 10)
+    left = np.where(moves, fast, 0.7)
+    width = np.where(moves, np.hypot(1.0, sigmas * np.sqrt(fast**2 - 1.0)), 1.0)  # of the right size, or more
+    likelihood = width * np.exp(0.5 * ((left / width) ** 2 - 1.0))
+    before = made_up(("command_delay",), left * FLOOR)
+    after = made_up(("command_jitter",), likelihood * FLOOR)
+    judge = Judge(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)), moves=moves)
+    assert not judge.better(before, after)[0], "as a further effect it is not earned"
+    assert judge.likelier(before, after) == found
+
+
+@pytest.mark.parametrize(
+    ("fixed", "through", "found"),
+    [(0.4, 0.9, True), (0.4, 1.4, False), (0.1, 0.9, False), (0.98, 0.9, False)],
+)
+def test_chance_alone_leaves_noise_where_a_fixed_delay_leaves_more(
+    fixed: float, through: float, found: bool
+) -> None:
+    baseline, veil = made_up((), 10.0 * FLOOR), Veil(np.zeros(3), np.ones(3))
+
+    def run(calls: list[tuple[str, dict[str, Any]]]) -> list[object]:
+        ((name, options),) = calls
+        if name == "look":
+            return [((0.003, 0.1), veil)]
+        if name == "fit_jitter":
+            random = replace(
+                made_up(("command_jitter",), FLOOR),
+                coordinates=tuple(Coordinate(key, 0, False, 1.0, 0.0, 9.0) for key in (SIGMA, DROP)),
+                x=np.array([0.003, 0.1]),
+            )
+            return [(random, veil)]
+        return [made_up(options["effects"], through * FLOOR if "veil" in options else fixed * 10.0 * FLOOR)]
+
+    names = ("command_delay", "command_jitter")
+    selection = replace(searching([])[0], run=run, candidates=names, scales=SCALES)
+    assert (chance.alone(selection, baseline) is not None) == found
+    vetoed = replace(selection, vetoes={"command_jitter": "told otherwise"})
+    assert chance.alone(vetoed, baseline) is None and chance.alone(behind(selection, veil), baseline) is None
+
+
+@pytest.mark.parametrize(("left", "found"), [(1.0, True), (1.4, False)])
+def test_what_is_chance_on_one_joint_is_chance_on_another(left: float, found: bool) -> None:
+    random = replace(
+        made_up(("command_jitter",), 2.0 * FLOOR),
+        coordinates=tuple(Coordinate(key, 0, False, 1.0, 0.0, 9.0) for key in (SIGMA, DROP)),
+        x=np.array([0.003, 0.1]),
+        gram=np.tile(np.eye(2), (10, 1, 1)),
+        gradient=np.zeros((10, 2)),
+    )
+    selection = replace(searching([])[0], candidates=("backlash", "command_jitter"), random=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chance, "with_random", lambda *_: (random, (), [], left * FLOOR))
+        patch.setattr(chance, "bounded", lambda _, fit: fit)
+        told = chance.as_random(selection, made_up((), 4.0 * FLOOR), "")
+        nobody = chance.as_random(replace(selection, random=False), made_up((), 4.0 * FLOOR), "")
+    assert nobody is None and (told is not None) == found
+    if told is not None:
+        assert told.verdict == "effects" and [one.name for one in told.accepted] == ["command_jitter"]

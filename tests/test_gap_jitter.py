@@ -10,7 +10,7 @@ from test_gap_fit import problem_of
 from vd.gap.explanation import intervals
 from vd.gap.fit import JointProblem
 from vd.gap.hide import Hidden, Hiding, simulate_hidden
-from vd.gap.jitter import DRAWS, JitterFit, fit_jitter, look
+from vd.gap.jitter import DRAWS, JitterFit, bound_jitter, fit_jitter, look
 from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
 from vd.gap.veil import Veil
@@ -93,6 +93,7 @@ def test_the_likelihood_finds_the_jitter_beside_an_effect() -> None:
     scales = seen.scales(fit.rows[0], seen.floor)
     both, _ = fit_jitter(seen, fit, scales, (0.003, 0.01))
     assert both.effects == ("encoder_bias", "command_jitter")
+    both = bound_jitter(seen, both, scales)
     low, high = intervals(both, seen.floor)["command_jitter.sigma_s"]
     assert low < JITTER["sigma_s"] < high
     alone, _ = fit_jitter(seen, fitted(seen), scales, (0.003, 0.01))

@@ -9,16 +9,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vd.gap.candidates import Call
-from vd.gap.explanation import Accepted, Trial
+from vd.gap.candidates import FULL_ITERATIONS, Call
+from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import RANDOM, REPEATABLE
+from vd.gap.judge import NO_GAP, RANDOM, REPEATABLE
 from vd.gap.veil import Veil
 
 if TYPE_CHECKING:
     from vd.gap.select import Selection
 
 SIGMA, DROP = (f"{RANDOM}.{name}" for name in ("sigma_s", "p_drop"))
+FIXED = "command_delay"
+"""What is the mean of random delays, too."""
+HELPS = 0.95
+"""Share of the error that the fixed delay leaves at most where delays are random."""
 VEILS = 2
 """Searches for what there is beside random delays, each with these as they are beside what the last found."""
 NOT_NEAR = 1.5
@@ -27,6 +31,8 @@ HOPELESS = 3.0
 """The same of what is left through it, in what may be left in the end: the first is too narrow a veil."""
 SAME_SPREAD = 0.1
 """Relative change of their standard deviation up to which they are the same."""
+SPREAD = "its spread is what is measured"
+"""Why they are named."""
 
 
 def try_random(
@@ -45,24 +51,92 @@ def try_random(
     if RANDOM not in search.candidates or RANDOM in search.vetoes:
         return present, (), []
     random, beside, rows, left = with_random(search, baseline, present)
-    rest = search.refit(random, [name for name in random.effects if name != RANDOM])
-    rest = search.look_beside(rest, search.whole)
-    if rest.effects and search.white(rest) and not search.better(rest, random)[0]:
-        # No chance is needed: it has only smoothed the way to where the search before did not come.
-        search.report(f"+ {' and '.join(rest.effects)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")
-        return rest, (), []
+    others = [name for name in random.effects if name != RANDOM]
+    if others:
+        rest = search.look_beside(search.refit(random, others), search.whole)
+        if search.white(rest) and not search.better(rest, random)[0]:
+            # No chance is needed: it has only smoothed the way to where the search before did not come.
+            search.report(f"+ {' and '.join(others)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")
+            return rest, (), []
     accepted, why = search.better(present, random)
+    if not accepted and len(random.effects) <= len(present.effects) and left < NO_GAP * search.floor:
+        # In the place of as many effects they are no further one.
+        accepted = search.likelier(present, random)
     if left > REPEATABLE * search.floor:
         accepted, why = False, f"leaves {left / search.floor:.1f} noise floors besides, more than chance does"
     gain, ci = search.gain(present, random)
     decision = "named" if accepted else "rejected"
-    row = Trial(1, RANDOM, random, gain, ci, decision, why or "its spread is what is measured")
+    row = Trial(1, RANDOM, random, gain, ci, decision, SPREAD if accepted else why)
     if not accepted:
         return present, (), [row]
+    random = bounded(search, random)
     names, before, after = " and ".join(random.effects), present.held_out_rmse, random.held_out_rmse
     text = f"as likely as {1e3 * after:.2f} mrad of constant width, before {1e3 * before:.2f}"
     search.report(f"+ {names}: {text}")
     return random, beside, [row, *rows]
+
+
+def alone(search: "Selection", baseline: JointFit) -> tuple[JointFit, Veil] | None:
+    """Random delays with nothing beside them, where they leave noise and are likelier than the fixed one.
+
+    Then no wide search for anything else is worth its time. Asked again, it is answered at once.
+
+    Args:
+        search: The search that is to be made.
+        baseline: The plain model.
+
+    Returns:
+        The model, and what the delays do to the samples.
+    """
+    if search.veiled or not {RANDOM, FIXED} <= {*search.candidates} - {*search.vetoes}:
+        return None
+    starts = search.starts(baseline, search.sized(baseline, FIXED))
+    fixed = search.run([search.call(baseline, (FIXED,), starts, FULL_ITERATIONS)])[0]
+    if search.white(fixed) or fixed.rmse > HELPS * baseline.rmse:
+        return None
+    jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
+    for _ in range(VEILS):
+        inner = behind(search, veil)
+        plain = inner.run([inner.plain(baseline)])[0]
+        call = {"fit": plain, "scales": search.scales, "start": jitter}
+        random, veil = search.run([("fit_jitter", call)])[0]
+        jitter = random.values[SIGMA], random.values[DROP]
+        if not search.likelier(fixed, random):
+            return None
+    inner = behind(search, veil)
+    left = inner.run([inner.plain(baseline)])[0].rmse
+    return (random, veil) if left < NO_GAP * search.floor else None
+
+
+def as_random(search: "Selection", baseline: JointFit, loose: str) -> Explanation | None:
+    """The explanation of a joint by random delays where another of its finger has them, without a search.
+
+    The commands of a finger go out together: what is late by chance on one joint is on all. None where more
+    than noise is left, or where they are not likelier than the plain model.
+
+    Args:
+        search: Of the joint.
+        baseline: The plain model.
+        loose: What of the baseline the motions leave open.
+    """
+    if not search.random or RANDOM not in search.candidates or RANDOM in search.vetoes:
+        return None
+    random, beside, rows, left = with_random(search, baseline, baseline)
+    if left > NO_GAP * search.floor or not search.likelier(baseline, random):
+        return None
+    random = bounded(search, random)
+    gain, ci = search.gain(baseline, random)
+    names, before, after = " and ".join(random.effects), baseline.held_out_rmse, random.held_out_rmse
+    search.report(
+        f"+ {names}, as on another joint: as likely as {1e3 * after:.2f} mrad, before {1e3 * before:.2f}"
+    )
+    row = Trial(1, RANDOM, random, gain, ci, "named", f"as on another joint: {SPREAD}")
+    return search.conclude(baseline, random, {}, [row, *rows], loose, known=beside)
+
+
+def bounded(search: "Selection", random: JointFit) -> JointFit:
+    """A model with the intervals of its random delays."""
+    return search.run([("bound_jitter", {"fit": random, "scales": search.scales})])[0]
 
 
 def with_random(
@@ -73,7 +147,12 @@ def with_random(
     The arguments are those of :func:`try_random`. The last result is the error of the rest of the model, seen
     through what the delays do [rad]: the noise floor if it is right.
     """
-    jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
+    known = alone(search, baseline)
+    if known is None:
+        jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
+    else:
+        # Nearly all is known of them: there is no need to begin with less than the likeliest.
+        jitter, veil = (known[0].values[SIGMA], known[0].values[DROP]), known[1]
     for _ in range(VEILS):
         inner = behind(search, veil)
         plain = inner.run([inner.plain(baseline)])[0]
@@ -112,6 +191,7 @@ def behind(search: "Selection", veil: Veil) -> "Selection":
         restarts=0,
         like=((), {}),
         changing=((), {}),
+        random=False,
         veiled=True,
         report=lambda line: search.report(f"beside {RANDOM}: {line}"),
         without={},

@@ -169,12 +169,13 @@ class JitterFit:
         count = self.problem.count
         return count * np.exp(np.minimum(2.0 * losses / count - 1.0, LARGEST))
 
-    def _extents(self, sigma: float, drop: float, here: np.ndarray) -> dict[str, tuple[float, float]]:
+    def extents(self, sigma: float, drop: float) -> dict[str, tuple[float, float]]:
         """Intervals of both parameters: the values of the pairs that the trajectories do not reject.
 
         Delays and losses stand in for each other in part, so that the pairs are what is judged; each end
         is half way to the first value that is rejected with every other.
         """
+        here = self.losses(sigma, drop)
         sigmas = [sigma * f for f in FACTORS]
         drops = sorted({max(drop, LEAST_DROP), *DROPS})
         kept = np.zeros((len(sigmas), len(drops)), bool)
@@ -235,7 +236,7 @@ class JitterFit:
         floor = self.problem.floor**2
         for i in range(2):
             fit.gram[:, i - 2, i - 2], fit.gradient[:, i - 2] = curved[i] * floor, slope[i] * floor
-        return replace(fit, extents=self._extents(sigma, drop, here))
+        return fit
 
     def _as_fit(self, sigma: float, drop: float, here: np.ndarray) -> JointFit:
         """A pair of values, and the losses there, as a fit whose matrices leave them out."""
@@ -272,5 +273,15 @@ def fit_jitter(
     return jitter.result(*values), jitter.veil(*values)
 
 
-CALLS: dict[str, Callable[..., Any]] = {"look": look, "fit_jitter": fit_jitter}
+def bound_jitter(problem: JointProblem, fit: JointFit, scales: Scales) -> JointFit:
+    """A fitted model with the intervals of its jitter, which take longer than the fit."""
+    rows, values = fit.rows.copy(), fit.values
+    for c in fit.coordinates[-2:]:
+        rows[problem.joint, c.column] = 0.0
+    rest = replace(fit, effects=fit.effects[:-1], coordinates=fit.coordinates[:-2], x=fit.x[:-2], rows=rows)
+    sigma, drop = (values[c.key] for c in fit.coordinates[-2:])
+    return replace(fit, extents=JitterFit(problem, rest, scales).extents(sigma, drop))
+
+
+CALLS: dict[str, Callable[..., Any]] = {"look": look, "fit_jitter": fit_jitter, "bound_jitter": bound_jitter}
 """What is asked of a joint's problem by name, besides its methods."""

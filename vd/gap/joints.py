@@ -10,6 +10,7 @@ import numpy as np
 
 from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
 from vd.gap.chain import candidates, others_in
+from vd.gap.chance import FIXED, as_random
 from vd.gap.consensus import agree, no_constant_friction, no_spring, share
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.explanation import NAMED, Accepted, Explanation, added, lacking, polished
@@ -78,7 +79,7 @@ def explain_joints(
         call |= {"iterations": POLISH_ITERATIONS, "refits": REFITS}
         return team.run(joint.spec, [("fit", call)])[0]
 
-    def one(joint: Joint, explained: Explained) -> Explanation:
+    def one(joint: Joint, explained: Explained, own: Explanation | None = None) -> Explanation:
         chain = team.bench.chains[joint.spec.chain]
         if joint.spec.chain in masses:
             text = f"the plain model is within the noise floor {masses[joint.spec.chain].text}"
@@ -87,9 +88,12 @@ def explain_joints(
         # What is none of the table on one joint is none on the others, and what is chance on one is chance on
         # all: what is plain to see is enough there.
         unknown = any(found.verdict == "unknown" for _, found in explained)
-        hidden = unknown or any(RANDOM in found.final.effects for _, found in explained)
+        random = any(RANDOM in found.final.effects for _, found in explained)
+        hidden = unknown or random
         rng = np.random.default_rng([seed, joint.spec.chain, joint.spec.joint])
-        names = [n for n in candidates(chain, effects) if n != RANDOM or not unknown]
+        # Chance is none here where it was tried there and refused, not where too little was left to try it.
+        refused = any(row.name == RANDOM for _, found in explained for row in found.trials) and not random
+        names = [n for n in candidates(chain, effects) if n != RANDOM or not (unknown and refused)]
         told = vetoes(recording, chain, joint.spec, joint.fit.rows)
         pairs = alike(effects, recording.model).items()
         same = {name: others for name, others in pairs if not {name, *others} & set(told)}
@@ -117,8 +121,12 @@ def explain_joints(
             when=when[list(joint.spec.trajectories)],
             like=next((like for _, found in explained if (like := lacking(found))[0]), ((), {})),
             changing=next((added(found.final) for _, found in explained if found.warms), ((), {})),
+            random=random,
         )
-        result = selection.explain(plain(joint, explained))
+        baseline = plain(joint, explained)
+        if own is not None:
+            return as_random(selection, baseline, selection.undetermined(baseline)) or own
+        result = selection.explain(baseline)
         progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
         return result
 
@@ -143,14 +151,13 @@ def explain_joints(
     return no_constant_friction(no_spring(found, fingers), fingers)
 
 
-def _in_turn(
-    joints: Sequence[Joint], explain: Callable[[Joint, Explained], Explanation]
-) -> list[Explanation]:
+def _in_turn(joints: Sequence[Joint], explain: Callable[..., Explanation]) -> list[Explanation]:
     """Explanations of all joints: of each finger from its tip on, as a joint's motion shakes those before it.
 
     Args:
         joints: The joints.
-        explain: Explains a joint, knowing those of its finger that are explained already.
+        explain: Explains a joint, knowing those of its finger that are explained already; one that was
+            explained before random delays were found on another once more.
     """
 
     def finger(chain: int) -> Explained:
@@ -158,6 +165,11 @@ def _in_turn(
         own = [joint for joint in joints if joint.spec.chain == chain]
         for joint in sorted(own, key=lambda each: -each.spec.joint):
             found.append((joint, explain(joint, found)))
+        chance = [RANDOM in explanation.final.effects for _, explanation in found]
+        for i, (joint, before) in enumerate(found[: chance.index(True) if any(chance) else 0]):
+            # What a late command is the mean of, or what nothing explained.
+            if FIXED in before.final.effects or before.verdict in ("unknown", "ambiguous"):
+                found[i] = joint, explain(joint, [*found[:i], *found[i + 1 :]], before)
         return found
 
     explained = parallel(finger, sorted({joint.spec.chain for joint in joints}))

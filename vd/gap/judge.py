@@ -155,14 +155,8 @@ class Judge:
             # Its errors are not held out: what it is compared with must not gain by being so either.
             fitted = replace(before, held_out=before.sse)
             sampled = _likelihood_gain(fitted, after, self.weights)
-            # The share by which the widths shrink, as the likelihood has it: on the geometric mean. The other
-            # model has a width of its own for every motion here, lest chance be credited with what any excuse
-            # for some of them would gain. It is no less than the floor, nor does a motion count whose command
-            # stays as it is: nothing can be late there.
-            power = before.sse / after.count / self.floor**2
-            widths = self.floor**2 * np.where(power < 1.0, np.exp(np.minimum(power, 1.0) - 1.0), power)
-            count = after.count if self.moves is None else after.count * self.moves
-            own = 0.5 * count * np.log(np.maximum(widths * after.count, 1e-30) / np.maximum(after.sse, 1e-30))
+            # The share by which the widths shrink, as the likelihood has it: on the geometric mean.
+            own, count = self._own_widths(before, after)
             gain = 1.0 - float(np.exp(-own.sum() / max(count.sum(), 1.0)))
         low = float(np.quantile(sampled, tail))
         closed = before.held_out_rmse * np.sqrt(max(1.0 - (1.0 - gain) ** 2, 0.0))
@@ -175,6 +169,35 @@ class Judge:
         if closed < (VEILED_GAIN_FLOORS if self.veiled else MIN_GAIN_FLOORS) * self.floor:
             return False, "what it removes is below the noise floor"
         return True, ""
+
+    def likelier(self, before: JointFit, after: JointFit) -> bool:
+        """Whether random delays are likelier than a model of as many effects without them.
+
+        What they add to a model has to be worth another effect; a fixed delay, whose mean they have as well,
+        they only replace. A width of its own for every motion, which the other model has here as there, is a
+        parameter, and costs it what one costs (half the log of its samples).
+
+        Args:
+            before: The model without them.
+            after: The model with them.
+        """
+        sampled = _likelihood_gain(replace(before, held_out=before.sse), after, self.weights)
+        own, count = self._own_widths(before, after)
+        price = 0.5 * np.log(np.maximum(count, 1.0))
+        return float(np.quantile(sampled, 0.025)) > 0.0 and float((own + price).sum()) > 0.0
+
+    def _own_widths(self, before: JointFit, after: JointFit) -> tuple[np.ndarray, np.ndarray]:
+        """Log-likelihood gained by random delays over a model with a width for each motion, and samples; [S].
+
+        The other model has a width of its own for every motion, lest chance be credited with what any excuse
+        for some of them would gain. It is no less than the floor, nor does a motion count whose command stays
+        as it is: nothing can be late there.
+        """
+        power = before.sse / after.count / self.floor**2
+        widths = self.floor**2 * np.where(power < 1.0, np.exp(np.minimum(power, 1.0) - 1.0), power)
+        count = after.count if self.moves is None else after.count * self.moves
+        ratio = np.maximum(widths * after.count, 1e-30) / np.maximum(after.sse, 1e-30)
+        return 0.5 * count * np.log(ratio), count
 
     def tied(
         self, winner: JointFit, other: JointFit, loose: bool = False

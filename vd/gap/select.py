@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vd.gap.candidates import BETTER, HOPELESS, Call
-from vd.gap.chance import try_random
+from vd.gap.chance import alone, as_random, try_random
 from vd.gap.consensus import as_another, as_changing
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.frictions import EXACTLY, Frictions
@@ -58,6 +58,7 @@ class Selection(Frictions):
         wide: Whether more is tried than the best starts and one effect after the other.
         like: What another joint of the finger certainly lacks: effects, and values by key.
         changing: The same of one whose friction changes over the recording: what comes nearest there.
+        random: Whether another joint of the finger has random delays.
     """
 
     restarts: int = RESTARTS
@@ -65,6 +66,7 @@ class Selection(Frictions):
     wide: bool = True
     like: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
     changing: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
+    random: bool = False
 
     def explain(self, baseline: JointFit, start: tuple[JointFit, list[Trial]] | None = None) -> Explanation:
         """Select effects, starting from the fitted baseline.
@@ -86,6 +88,8 @@ class Selection(Frictions):
                 return Explanation(baseline, baseline, "under_excited", loose)
             return Explanation(baseline, baseline, "no_gap", "the plain model is within the noise floor")
         known = None if start else as_another(self, baseline, loose) or as_changing(self, baseline, loose)
+        if not start and known is None:
+            known = as_random(self, baseline, loose)
         if known is not None:
             return known
         trials = [] if start else self.contradicted(baseline)
@@ -126,7 +130,7 @@ class Selection(Frictions):
             rivals = {name: self.rivals(present, name) for name in present.effects}
         beside: tuple[Accepted, ...] = ()
         # What is fitted well leaves none to chance, nor does a spring.
-        fitted = self.no_gap(present) or self.white(present) or self.noise_only(present)
+        fitted = self.finished(present) or self.white(present) or self.noise_only(present)
         if not fitted and not self.a_spring(present):
             chance, beside, rows = try_random(self, baseline, present)
             trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
@@ -192,12 +196,16 @@ class Selection(Frictions):
         return replace(explanation, reason="; ".join([explanation.reason, *notes]))
 
     def first(self, baseline: JointFit) -> tuple[JointFit, dict[str, list[JointFit]], list[Trial]]:
-        """The first search; it looks wide at once where a gap is small."""
-        if not self.veiled and baseline.held_out_rmse > LARGE * self.floor:
+        """The first search; it looks wide at once where a gap is small, but not where chance fills it."""
+        by_chance = alone(self, baseline) is not None
+        if by_chance:
+            self.report(f"{RANDOM} leaves noise: nothing else is looked for from every start")
+            self.restarts = 0
+        if by_chance or (not self.veiled and baseline.held_out_rmse > LARGE * self.floor):
             self.wide = False
             found = self.search(baseline, baseline)
             self.wide = True
-            if self.finished(found[0]) or self.ended(found[0]):
+            if by_chance or self.finished(found[0]) or self.ended(found[0]):
                 return found
             self.report("not explained: every candidate is tried from every start")
         return self.search(baseline, baseline)
