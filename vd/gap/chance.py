@@ -23,6 +23,8 @@ FIXED = "command_delay"
 """What is the mean of random delays, too."""
 HELPS = 0.95
 """Share of the error that the fixed delay leaves at most where delays are random."""
+MOST = 0.2
+"""Share of commands dropped from which the spread is as wide as the motion, and hides any cause."""
 VEILS = 2
 """Searches for what there is beside random delays, each with these as they are beside what the last found."""
 NOT_NEAR = 1.5
@@ -101,7 +103,7 @@ def alone(search: "Selection", baseline: JointFit) -> tuple[JointFit, Veil] | No
         call = {"fit": plain, "scales": search.scales, "start": jitter}
         random, veil = search.run([("fit_jitter", call)])[0]
         jitter = random.values[SIGMA], random.values[DROP]
-        if not search.likelier(fixed, random):
+        if not search.likelier(fixed, random) or jitter[1] > MOST:
             return None
     inner = behind(search, veil)
     left = inner.run([inner.plain(baseline)])[0].rmse

@@ -197,15 +197,16 @@ class Selection(Frictions):
 
     def first(self, baseline: JointFit) -> tuple[JointFit, dict[str, list[JointFit]], list[Trial]]:
         """The first search; it looks wide at once where a gap is small, but not where chance fills it."""
-        by_chance = alone(self, baseline) is not None
-        if by_chance:
-            self.report(f"{RANDOM} leaves noise: nothing else is looked for from every start")
-            self.restarts = 0
-        if by_chance or (not self.veiled and baseline.held_out_rmse > LARGE * self.floor):
+        if not self.veiled and (baseline.held_out_rmse > LARGE * self.floor or alone(self, baseline)):
             self.wide = False
             found = self.search(baseline, baseline)
             self.wide = True
-            if by_chance or self.finished(found[0]) or self.ended(found[0]):
+            if self.finished(found[0]) or self.ended(found[0]):
+                return found
+            chance = alone(self, baseline)
+            if chance is not None and self.likelier(found[0], chance[0]):
+                self.report(f"{RANDOM} leaves noise: nothing else is tried from every start")
+                self.restarts = 0
                 return found
             self.report("not explained: every candidate is tried from every start")
         return self.search(baseline, baseline)
