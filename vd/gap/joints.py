@@ -16,7 +16,7 @@ from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.explanation import NAMED, Accepted, Explanation, added, lacking, polished
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import EXCESS_FLOORS, NESTED, NO_GAP, RANDOM
-from vd.gap.masses import Masses, fit_masses
+from vd.gap.masses import Masses, fit_masses, widened, with_free_masses
 from vd.gap.recording import Recording
 from vd.gap.select import LOOKS, RESTARTS, Selection
 from vd.gap.statistics import resamples
@@ -223,8 +223,12 @@ def _beside_masses(
         fewest = min((found.effects for found in told), default=0)
         best = sorted((found for found in told if found.effects == fewest), key=lambda found: found.left)
         if best and (len(best) == 1 or best[1].left - best[0].left > EXCESS_FLOORS**2):
-            for i, explanation in zip(own, best[0].explanations, strict=True):
-                result[i] = explanation
+            problems = [team.bench.problem(joint.spec) for joint, _ in known]
+            free = with_free_masses(problems, best[0].fits, best[0].masses)
+            for i, explanation, extents in zip(own, best[0].explanations, free, strict=True):
+                floor = joints[i].spec.floor
+                fit = widened(explanation.final, floor, extents)
+                result[i] = polished(explanation, fit, floor) if explanation.accepted else explanation
     return result
 
 
@@ -249,11 +253,15 @@ class _Finger:
         effects: How many effects.
         left: Sum of the joints' squared errors, in squared noise floors.
         explanations: Of the joints.
+        fits: Of the joints, with the masses of the model.
+        masses: What they are found to be.
     """
 
     effects: int
     left: float
     explanations: list[Explanation]
+    fits: list[JointFit]
+    masses: Masses
 
 
 def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | None:
@@ -284,7 +292,8 @@ def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | 
         return team.run(joint.spec, [("fit", call)])[0]
 
     fits = parallel(fitted, known)
-    masses = fit_masses([team.bench.problem(joint.spec) for joint, _ in known], fits)
+    problems = [team.bench.problem(joint.spec) for joint, _ in known]
+    masses = fit_masses(problems, fits)
     floors = np.array([joint.spec.floor for joint, _ in known])
     if not masses.other or (masses.errors >= NO_GAP * floors).any():
         return None
@@ -302,7 +311,8 @@ def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | 
             plain = replace(found, accepted=tuple(accepted), verdict="effects", reason=reason)
             found = polished(plain, fit, joint.spec.floor)
         explanations.append(found)
-    return _Finger(len(core), float(np.sum((masses.errors / floors) ** 2)), explanations)
+    left = float(np.sum((masses.errors / floors) ** 2))
+    return _Finger(len(core), left, explanations, list(fits), masses)
 
 
 def _can_have(found: Explanation, name: str) -> Iterator[tuple[Accepted, dict[str, float]]]:
@@ -344,7 +354,10 @@ def _consistent(
             return own
         rows[joint.spec.joint] = own.final.rows[joint.spec.joint]
         call = {"fit": replace(own.final, rows=rows), "scales": joint.scales}
-        return polished(own, team.run(joint.spec, [("refine", call)])[0], joint.spec.floor)
+        fit = team.run(joint.spec, [("refine", call)])[0]
+        if own.final.extents:
+            fit = widened(fit, joint.spec.floor, own.final.extents)
+        return polished(own, fit, joint.spec.floor)
 
     return parallel(again, range(len(joints)))
 
