@@ -134,9 +134,11 @@ def test_chance_alone_leaves_noise_where_a_fixed_delay_leaves_more(
 
     names = ("command_delay", "command_jitter")
     selection = replace(searching([])[0], run=run, candidates=names, scales=SCALES)
-    assert (chance.alone(selection, baseline) is not None) == found
+    assert (chance.at_once(selection, baseline) is not None) == found
     vetoed = replace(selection, vetoes={"command_jitter": "told otherwise"})
-    assert chance.alone(vetoed, baseline) is None and chance.alone(behind(selection, veil), baseline) is None
+    assert (
+        chance.at_once(vetoed, baseline) is None and chance.at_once(behind(selection, veil), baseline) is None
+    )
 
 
 @pytest.mark.parametrize(("left", "found"), [(1.0, True), (1.4, False)])
@@ -157,3 +159,12 @@ def test_what_is_chance_on_one_joint_is_chance_on_another(left: float, found: bo
     assert nobody is None and (told is not None) == found
     if told is not None:
         assert told.verdict == "effects" and [one.name for one in told.accepted] == ["command_jitter"]
+
+
+@pytest.mark.parametrize("sure", [True, False])
+def test_what_is_late_beside_chance_is_not_taken_for_its_spread(sure: bool) -> None:
+    """Where all motions are sure of a mean of its own beside chance, the spread is the one beside that."""
+    judge = Judge(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
+    alone = made_up(("command_jitter",), 3.0 * FLOOR)
+    errors = np.full(10, 2.5) if sure else np.where(np.arange(10) < 2, 1.0, 3.1)
+    assert judge.sure(alone, made_up(("command_delay", "command_jitter"), errors * FLOOR)) == sure

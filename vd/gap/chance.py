@@ -78,10 +78,12 @@ def try_random(
     return random, beside, [row, *rows]
 
 
-def alone(search: "Selection", baseline: JointFit) -> tuple[JointFit, Veil] | None:
-    """Random delays with nothing beside them, where they leave noise and are likelier than the fixed one.
+def at_once(search: "Selection", baseline: JointFit) -> tuple[JointFit, Veil] | None:
+    """Random delays of a model in which nothing else is missing but what a fixed delay can stand for.
 
-    Then no wide search for anything else is worth its time. Asked again, it is answered at once.
+    Given where they leave noise and are likelier than that delay: then no wide search is worth its time. A
+    filter or a payload beside them is late as well, and they alone would have its mean in their spread.
+    So a fixed delay stands for it where the motions are sure of one. Asked again, it is answered at once.
 
     Args:
         search: The search that is to be made.
@@ -96,18 +98,32 @@ def alone(search: "Selection", baseline: JointFit) -> tuple[JointFit, Veil] | No
     fixed = search.run([search.call(baseline, (FIXED,), starts, FULL_ITERATIONS)])[0]
     if search.white(fixed) or fixed.rmse > HELPS * baseline.rmse:
         return None
+    alone = _spread(search, baseline, baseline, fixed)
+    if alone is None:
+        return None
+    beside = _spread(search, baseline, fixed, fixed)
+    if beside is None or not search.sure(alone[0], beside[0]):
+        return alone
+    return beside
+
+
+def _spread(
+    search: "Selection", baseline: JointFit, rest: JointFit, fixed: JointFit
+) -> tuple[JointFit, Veil] | None:
+    """Random delays beside nothing but a model, as :func:`at_once` has them."""
+
+    def through(veil: Veil) -> JointFit:
+        return search.run([("fit", {**refit, "veil": veil})])[0]
+
+    refit = {**search.call(rest, (), [rest.values], FULL_ITERATIONS)[1], "refits": 0}
     jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
     for _ in range(VEILS):
-        inner = behind(search, veil)
-        plain = inner.run([inner.plain(baseline)])[0]
-        call = {"fit": plain, "scales": search.scales, "start": jitter}
+        call = {"fit": through(veil), "scales": search.scales, "start": jitter}
         random, veil = search.run([("fit_jitter", call)])[0]
         jitter = random.values[SIGMA], random.values[DROP]
         if not search.likelier(fixed, random) or jitter[1] > MOST:
             return None
-    inner = behind(search, veil)
-    left = inner.run([inner.plain(baseline)])[0].rmse
-    return (random, veil) if left < NO_GAP * search.floor else None
+    return (random, veil) if through(veil).rmse < NO_GAP * search.floor else None
 
 
 def as_random(search: "Selection", baseline: JointFit, loose: str) -> Explanation | None:
@@ -149,7 +165,7 @@ def with_random(
     The arguments are those of :func:`try_random`. The last result is the error of the rest of the model, seen
     through what the delays do [rad]: the noise floor if it is right.
     """
-    known = alone(search, baseline)
+    known = at_once(search, baseline)
     if known is None:
         jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
     else:

@@ -186,6 +186,10 @@ class Judge:
         price = 0.5 * np.log(np.maximum(count, 1.0))
         return float(np.quantile(sampled, 0.025)) > 0.0 and float((own + price).sum()) > 0.0
 
+    def sure(self, alone: JointFit, beside: JointFit) -> bool:
+        """Whether the motions are sure of what a model has beside random delays."""
+        return float(np.quantile(_likelihood_gain(alone, beside, self.weights), 0.025)) > 0.0
+
     def _own_widths(self, before: JointFit, after: JointFit) -> tuple[np.ndarray, np.ndarray]:
         """Log-likelihood gained by random delays over a model with a width for each motion, and samples; [S].
 

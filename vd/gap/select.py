@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vd.gap.candidates import BETTER, HOPELESS, Call
-from vd.gap.chance import alone, as_random, try_random
+from vd.gap.chance import as_random, at_once, try_random
 from vd.gap.consensus import as_another, as_changing
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.frictions import EXACTLY, Frictions
@@ -197,13 +197,13 @@ class Selection(Frictions):
 
     def first(self, baseline: JointFit) -> tuple[JointFit, dict[str, list[JointFit]], list[Trial]]:
         """The first search; it looks wide at once where a gap is small, but not where chance fills it."""
-        if not self.veiled and (baseline.held_out_rmse > LARGE * self.floor or alone(self, baseline)):
+        if not self.veiled and (baseline.held_out_rmse > LARGE * self.floor or at_once(self, baseline)):
             self.wide = False
             found = self.search(baseline, baseline)
             self.wide = True
             if self.finished(found[0]) or self.ended(found[0]):
                 return found
-            chance = alone(self, baseline)
+            chance = at_once(self, baseline)
             if chance is not None and self.likelier(found[0], chance[0]):
                 self.report(f"{RANDOM} leaves noise: nothing else is tried from every start")
                 self.restarts = 0
