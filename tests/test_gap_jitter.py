@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from test_gap_fit import problem_of
 
-from vd.gap.explanation import intervals
+from vd.gap.assemble import _entry
+from vd.gap.explanation import Accepted, intervals
 from vd.gap.fit import JointProblem
 from vd.gap.hide import Hidden, Hiding, simulate_hidden
 from vd.gap.jitter import DRAWS, JitterFit, bound_jitter, fit_jitter, look
@@ -119,3 +120,13 @@ def test_nothing_is_named_beside_chance_alone(tmp_path: Path) -> None:
 def _motions(problem: JointProblem) -> list:
     recording = problem.rollouts.recording
     return [recording.trajectories[int(t)] for t in problem.trajectories]
+
+
+def test_the_interval_of_all_joints_ends_where_a_parameter_does() -> None:
+    def found(drop: float) -> Accepted:
+        values = {"sigma_s": (0.002, 0.0015, 0.003), "p_drop": (drop, 0.0, 0.03)}
+        return Accepted("command_jitter", 1.0, values, (), (), False)
+
+    entry = _entry("command_jitter", [("f0_j1", found(0.02)), ("f0_j2", found(0.001))])
+    low, high = entry.parameters["p_drop"].ci95
+    assert low == 0.0 and 0.02 < high < 0.04, "no share of commands is less than none"

@@ -315,6 +315,7 @@ def _agree(one: Accepted, other: Accepted) -> bool:
 def _entry(name: str, group: Sequence[tuple[str, Accepted]]) -> NamedEffect:
     """One effect of joints that agree, its numbers weighted by their precision."""
     units = {p.name: p.unit for p in EFFECTS[name].parameters}
+    bounds = {p.name: -np.inf if p.signed else 0.0 for p in EFFECTS[name].parameters}
     parameters = {}
     for key in group[0][1].estimates:
         values = np.array([accepted.estimates[key] for _, accepted in group])
@@ -326,7 +327,7 @@ def _entry(name: str, group: Sequence[tuple[str, Accepted]]) -> NamedEffect:
         # No narrower than the joints' own values lie apart from the pooled one.
         apart = float(np.sqrt(weight @ (values[:, 0] - value) ** 2 / max(len(group) - 1, 1)))
         below, above = max(below, 2.0 * apart), max(above, 2.0 * apart)
-        parameters[key] = Estimate(value, (value - below, value + above), units[key])
+        parameters[key] = Estimate(value, (max(value - below, bounds[key]), value + above), units[key])
     best = max(group, key=lambda item: item[1].confidence)[1]
     return NamedEffect(
         name=name,
