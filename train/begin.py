@@ -156,6 +156,7 @@ def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, A
         ValueError: Another hand, or networks of another shape.
     """
     from vd.policy import PolicySpec
+    from vd.train.widen import can_grow
 
     found = from_dict(PolicySpec, state["policy"], where="policy")
     hand, here = state["task"].get("hand"), task.get("hand")
@@ -166,6 +167,8 @@ def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, A
         )
     wanted, given = _networks(found), _networks(spec)
     for name, value in wanted.items():
+        if name == "hidden" and can_grow(value, given[name]):
+            continue
         if value != given[name]:
             flag = f"--policy.{name.replace('_', '-')}"
             words = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -277,6 +277,8 @@ def _teacher(arguments: list[str], started: float) -> int:
             print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
         if runner.new_inputs:
             print(f"{runner.new_inputs} observed values are new to the networks and start without effect")
+        if runner.new_units:
+            print(f"{runner.new_units} hidden units are new to each network and start without effect")
         if runner.critic_warmup:
             print(f"the critic learns alone for {runner.critic_warmup} iterations, the actor stays as it is")
         for difference in runner.unlike:

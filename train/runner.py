@@ -35,7 +35,7 @@ from vd.train.metrics import GoalWindow, ProgressFile, StepMeans
 from vd.train.ppo import TeacherPPO
 from vd.train.progress import ProgressLine
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
-from vd.train.widen import new_inputs, widen
+from vd.train.widen import new_inputs, new_units, widen
 
 POLICY_NAME = "policy.pt"
 """The best policy so far, in the run's folder: what vd-eval, vd-play and deployment read."""
@@ -63,6 +63,7 @@ class TeacherRunner(OnPolicyRunner):
         env_steps: Control steps completed, over all worlds and processes.
         new_episodes: Why the checkpoint that was loaded could not restore the worlds; empty if it did.
         new_inputs: Observed values that the networks of that checkpoint did not read.
+        new_units: Hidden units that each network of that checkpoint did not have.
         critic_warmup: Iterations left in which the critic learns alone (``PpoCfg.critic_warmup_iterations``).
         begun: Whether this run began from another one's networks, in this process.
         unlike: What observations and actions mean otherwise than to the policy that the run began from.
@@ -99,7 +100,7 @@ class TeacherRunner(OnPolicyRunner):
         self._end = EndRequest(deadline, device=device, distributed=self.is_distributed)
         self._stagger_due = True
         self.new_episodes = ""
-        self.new_inputs = 0
+        self.new_inputs = self.new_units = 0
         self.critic_warmup = ppo.critic_warmup_iterations or 0
         self.begun = False
         self.unlike: list[str] = []
@@ -255,7 +256,8 @@ class TeacherRunner(OnPolicyRunner):
 
         With the processes and worlds of the checkpoint the run goes on exactly. With others, or from a
         checkpoint without worlds, all but worlds and random states is restored, and episodes start anew.
-        So they do where the run observes more than the checkpoint's networks read; those are widened.
+        So they do where the run observes more than the checkpoint's networks read; those are widened, and
+        where its hidden layers are wider.
 
         Args:
             path: The checkpoint.
@@ -288,9 +290,7 @@ class TeacherRunner(OnPolicyRunner):
         check_fit(state, self._spec(), self.task, path)
         self.unlike = unlike(state["task"], self.task)
         warmup = warmup_iterations(state, self.ppo.critic_warmup_iterations)
-        self.new_inputs = new_inputs(state, self.num_observations)
-        if self.new_inputs:
-            state = widen(state, self.new_inputs, self.alg.actor, self.alg.critic)
+        state = self._widened(state)
         state = without_worlds(completed(state, self.alg.save() | {"window": self._window.state_dict()}))
         if stage is not None:
             state = at_stage(state, stage)
@@ -304,10 +304,7 @@ class TeacherRunner(OnPolicyRunner):
     def _restore(self, state: dict[str, Any], path: str, load_cfg: dict | None, strict: bool) -> dict:
         """Take over a checkpoint that was read; see :meth:`load`."""
         try:
-            if extra := new_inputs(state, self.num_observations):
-                self.new_inputs = extra
-                state = widen(state, extra, self.alg.actor, self.alg.critic)
-            everything = self.alg.load(state, load_cfg, strict)
+            everything = self.alg.load(self._widened(state), load_cfg, strict)
         except (RuntimeError, ValueError, KeyError) as error:
             raise ValueError(
                 f"{path} does not fit this run's networks or hand; resume with the configuration it was "
@@ -322,6 +319,23 @@ class TeacherRunner(OnPolicyRunner):
             self._window.load_state_dict(state["window"])
             self._load_worlds(state["ranks"])
         return state["infos"]
+
+    def _widened(self, state: dict[str, Any]) -> dict[str, Any]:
+        """A checkpoint with networks of this run's size, if its own are smaller."""
+        inputs, units = (
+            new_inputs(state, self.num_observations),
+            new_units(state, self.policy_cfg.hidden),
+        )
+        if not inputs and not units:
+            return state
+        self.new_inputs, self.new_units = inputs, units
+        return widen(
+            state,
+            self.alg.actor,
+            self.alg.critic,
+            num_observations=self.num_observations,
+            hidden=self.policy_cfg.hidden,
+        )
 
     def _load_worlds(self, ranks: list[dict[str, Any]]) -> None:
         """Restore worlds and random state, or else the curriculum alone. All processes decide alike."""
