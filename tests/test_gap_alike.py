@@ -9,14 +9,15 @@ from test_gap_fit import TRUE, problem_of, recorded
 from test_gap_judge import FLOOR, made_up
 
 import vd.kernels.actuators as servo
-from vd.gap import judge
+from vd.gap import consensus, judge
 from vd.gap.chain import candidates
 from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.explanation import Accepted, Explanation, Trial, lacking
 from vd.gap.fit import JointProblem
 from vd.gap.hide import Hiding, simulate_hidden
 from vd.gap.joint_fit import JointFit
-from vd.gap.joints import Joint, _beside, _in_turn
+from vd.gap.joints import Joint, _beside, _in_turn, steady
+from vd.gap.result import Verdict
 from vd.gap.rollout import Rollouts
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
@@ -108,6 +109,57 @@ def test_what_another_joint_lacks_is_not_named_where_it_is_too_small_to_show(
     found = joint.explain((("coulomb_friction",), {"coulomb_friction.tau_c_nm": FRICTION}))
     assert found.verdict == "no_gap" and "below the noise floor" in found.reason
     assert joint.fits == 2
+
+
+@pytest.mark.parametrize(("least", "named"), [(0.0, True), (-0.1, False)], ids=["gains", "may gain nothing"])
+def test_what_another_joint_lacks_is_named_however_small_where_the_rest_does_not_explain_a_joint(
+    monkeypatch: pytest.MonkeyPatch, least: float, named: bool
+) -> None:
+    """Both of a delay and a load were less than an effect must gain: a filter was named in their place."""
+    joint = Servo()
+    search = joint.selection(
+        (
+            ("coulomb_friction", "thermal_drift"),
+            {"coulomb_friction.tau_c_nm": FRICTION, "thermal_drift.rate_per_s": 0.02},
+        )
+    )
+    both, alone = made_up(search.like[0], FLOOR), made_up(("coulomb_friction",), 1.2 * FLOOR)
+    search.floor = FLOOR
+    search.run = lambda calls: [both if name == "fit" else np.zeros(1) for name, _ in calls]
+    search.refit = lambda fit, rest: alone  # type: ignore[method-assign]
+    search.better = lambda *_: (False, "below the noise floor")  # type: ignore[method-assign]
+    search.gain = lambda *_: (0.1, (least + 0.01, 0.2))  # type: ignore[method-assign]
+    search.noise_only = lambda fit, _: fit is both  # type: ignore[method-assign, assignment]
+    search.too_coarse = lambda fit: False  # type: ignore[method-assign]
+    search.refined = lambda fit: fit  # type: ignore[method-assign]
+    search.conclude = (  # type: ignore[method-assign]
+        lambda baseline, fit, *_: Explanation(baseline, fit, "effects", "")
+    )
+    search.explained = lambda found: found  # type: ignore[method-assign]
+    asked = [0]
+
+    def simpler(inner: Selection, *rest: object) -> Explanation | None:
+        asked[0] += 1
+        return None
+
+    real = consensus.as_another
+    monkeypatch.setattr(consensus, "as_another", simpler)
+    found = real(search, joint.baseline, "")
+    assert asked[0] > 0, "the rest was not tried alone"
+    assert (found is not None and found.final is both) == named
+
+
+def test_chance_is_no_cause_on_a_joint_where_another_is_explained_without() -> None:
+    joint = Joint("tip", JointSpec(0, 1, (0,), (0,), FLOOR, ()), Scales(*[1.0] * 8), made_up((), 0.01))
+
+    def found(*names: str, left: float = FLOOR, verdict: Verdict = "effects") -> Explanation:
+        return Explanation(joint.fit, made_up(names, left), verdict, "")
+
+    assert steady(joint, found("command_filter", "torque_limit"))
+    assert not steady(joint, found("command_filter", left=1.5 * FLOOR)), "chance may be what is left"
+    assert not steady(joint, found("command_filter", verdict="unknown"))
+    assert not steady(joint, found("command_delay", "torque_limit")), "it may be the mean of random delays"
+    assert not steady(joint, found("command_jitter"))
 
 
 def test_on_a_pendulum_a_load_off_the_arm_and_an_offset_of_the_encoder_are_one(tmp_path: Path) -> None:

@@ -242,8 +242,37 @@ def test_a_joint_takes_the_model_of_all_others_where_it_is_as_good(
     found = agree(three, [FLOOR] * 3, [0, 0, 0], [fit] * 3)
     assert {a.name for a in found[0].accepted} == {*(both if adopted else own)}
     assert found[1:] == three[1:]
+    fits = [fit, *[lambda effects, _: made_up(effects, 9.0 * FLOOR)] * 2]
+    part = [three[0], explanation("gravity_load"), three[2]]
+    shown = agree(part, [FLOOR] * 3, [0, 0, 0], fits)[0]
+    assert shown.accepted == found[0].accepted, "one of the two shows the load only"
+    apart = [three[0], explanation("backlash"), three[2]]
+    assert agree(apart, [FLOOR] * 3, [0, 0, 0], fits)[0] == three[0], "they do not agree"
     assert agree(three, [FLOOR] * 3, [0, 1, 2], [fit] * 3) == three, "of other fingers"
     assert agree(three[:2], [FLOOR] * 2, [0, 0], [fit] * 2) == three[:2], "one other is no agreement"
+
+
+@pytest.mark.parametrize(
+    ("own", "fit", "adopted"),
+    [
+        (3.0, 1.0, True),
+        (1.1, 1.0, False),  # closes less than an effect must
+        (3.0, 1.2, False),  # leaves more than noise
+    ],
+)
+def test_a_joint_takes_a_larger_model_of_all_others_where_it_alone_leaves_noise(
+    own: float, fit: float, adopted: bool
+) -> None:
+    """Chance stood for a filter and a limit that a search had missed and the other joints had."""
+
+    def explanation(left: float, *names: str) -> Explanation:
+        accepted = tuple(Accepted(name, 1.0, {}, (), (), False) for name in names)
+        return Explanation(made_up((), 0.02), made_up(names, left * FLOOR), "effects", "", accepted)
+
+    both = ("command_filter", "torque_limit")
+    three = [explanation(own, "command_delay"), explanation(1.0, *both), explanation(1.0, *both)]
+    found = agree(three, [FLOOR] * 3, [0, 0, 0], [lambda effects, _: made_up(effects, fit * FLOOR)] * 3)
+    assert [a.name for a in found[0].accepted] == ([*both] if adopted else ["command_delay"])
 
 
 def test_a_load_and_an_offset_are_no_names_where_another_joint_shows_a_spring() -> None:

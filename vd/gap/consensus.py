@@ -11,7 +11,9 @@ from vd.gap.joint_fit import JointFit
 from vd.gap.judge import (
     AT_FLOOR,
     CONTAINED_FLOORS,
+    EXPLAINED,
     MIN_GAIN,
+    MIN_GAIN_FLOORS,
     NESTED,
     RANDOM,
     RECOVERED,
@@ -73,7 +75,11 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
         without = search.refit(fit, rest)
         needed, why = search.better(without, fit, SHOWN_TAIL)
         if not needed and rest:
-            return as_another(replace(search, like=(rest, values)), baseline, loose)
+            simpler = as_another(replace(search, like=(rest, values)), baseline, loose)
+            # Small as it is, it is what the joint lacks where the others alone do not explain it.
+            if simpler is not None or search.gain(without, fit)[1][0] <= 0.0:
+                return simpler
+            needed = True
         if not needed and baseline.held_out_rmse > UNEXPLAINED * search.floor:
             return None
         if not needed:
@@ -155,11 +161,12 @@ def share(
 def agree(
     explanations: Sequence[Explanation], floors: Sequence[float], groups: Sequence[int], fits: Sequence[Fit]
 ) -> list[Explanation]:
-    """Explain a joint as all others of its finger are explained, where that is as good.
+    """Explain a joint as all others of its finger are explained, or have a part of, where that is as good.
 
     A search can end where no step leads out: with a filter and another load in the place of the delay and the
     load that the other joints have. Their values are a start that it did not have. A fuller form of what the
-    others have has to be better by what an effect must gain: it is found where it imitates something else.
+    others have has to be better by what an effect must gain: it is found where it imitates something else. So
+    has a model of more effects than the joint's own, which also has to leave noise.
 
     Args:
         explanations: Of the joints.
@@ -170,14 +177,16 @@ def agree(
     result = list(explanations)
     for i, own in enumerate(explanations):
         others = [e for j, e in enumerate(explanations) if j != i and groups[j] == groups[i]]
-        models = {frozenset(e.final.effects) for e in others}
         certain = all(e.verdict == "effects" and all(a.named for a in e.accepted) for e in others)
-        if len(others) < 2 or len(models) != 1 or not certain:
+        if len(others) < 2 or not certain:
             continue
-        model = others[0]
+        # Where one of two effects is too small to show there, a joint has the other alone.
+        model = max(others, key=lambda e: len(e.final.effects))
+        if any({*e.final.effects} - {*model.final.effects} for e in others):
+            continue
         effects = model.final.effects
         mine = own.final.effects
-        if RANDOM in effects or set(effects) == set(mine) or len(effects) > len(mine):
+        if RANDOM in effects or set(effects) == set(mine) or not mine:
             continue
         theirs = {key: value for key, value in model.final.values.items() if "." in key}
         starts = [
@@ -185,7 +194,10 @@ def agree(
             for fit in (own.final, own.baseline, model.final)
         ]
         fit = fits[i](effects, starts)
-        if all({name, *NESTED.get(name, ())} & {*effects} for name in mine):
+        if len(effects) > len(mine):
+            closed = own.final.rmse**2 - fit.rmse**2
+            worse = closed < (MIN_GAIN_FLOORS * floors[i]) ** 2 or fit.rmse > EXPLAINED * floors[i]
+        elif all({name, *NESTED.get(name, ())} & {*effects} for name in mine):
             worse = fit.held_out_rmse * (1.0 - MIN_GAIN) > own.final.held_out_rmse
         else:
             worse = fit.rmse**2 - own.final.rmse**2 > (SMALL_EXCESS_FLOORS * floors[i]) ** 2

@@ -15,7 +15,7 @@ from vd.gap.consensus import agree, no_constant_friction, no_spring, share
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.explanation import NAMED, Accepted, Explanation, added, lacking, polished
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXCESS_FLOORS, NESTED, NO_GAP, RANDOM
+from vd.gap.judge import EXCESS_FLOORS, EXPLAINED, NESTED, NO_GAP, RANDOM
 from vd.gap.masses import Masses, fit_masses, widened, with_free_masses
 from vd.gap.recording import Recording
 from vd.gap.select import LOOKS, RESTARTS, Selection
@@ -93,7 +93,9 @@ def explain_joints(
         rng = np.random.default_rng([seed, joint.spec.chain, joint.spec.joint])
         # Chance is none here where it was tried there and refused, not where too little was left to try it.
         refused = any(row.name == RANDOM for _, found in explained for row in found.trials) and not random
-        names = [n for n in candidates(chain, effects) if n != RANDOM or not (unknown and refused)]
+        # Nor where another is explained without: commands go out together.
+        refused = (unknown and refused) or any(steady(other, found) for other, found in explained)
+        names = [n for n in candidates(chain, effects) if n != RANDOM or not refused]
         told = vetoes(recording, chain, joint.spec, joint.fit.rows)
         pairs = alike(effects, recording.model).items()
         same = {name: others for name, others in pairs if not {name, *others} & set(told)}
@@ -149,6 +151,16 @@ def explain_joints(
     agreed = agree(shared, floors, fingers, [partial(fitted, joint) for joint in joints])
     found = _consistent(team, joints, _beside_masses(team, joints, agreed))
     return no_constant_friction(no_spring(found, fingers), fingers)
+
+
+def steady(joint: Joint, explanation: Explanation) -> bool:
+    """Whether a joint is explained down to noise without random delays, nor by a fixed one, their mean."""
+    final = explanation.final
+    return (
+        explanation.verdict == "effects"
+        and not {RANDOM, FIXED} & {*final.effects}
+        and final.rmse < EXPLAINED * joint.spec.floor
+    )
 
 
 def _in_turn(joints: Sequence[Joint], explain: Callable[..., Explanation]) -> list[Explanation]:
