@@ -176,3 +176,17 @@ def test_a_tightening_that_cannot_work_is_refused(change, message):
     cfg = dataclasses.replace(TIGHTENING, **change)
     with pytest.raises(ValueError, match=rf"curriculum\.tightening.*{message}"):
         CurriculumCfg(tightening=cfg).validate()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [({"object_weight": 0.1}, r"give table\.lift_share"), ({"rotation_rad": 0.2}, "raise the latter")],
+    ids=["nothing has to be lifted", "it would loosen"],
+)
+def test_a_tightening_that_would_do_nothing_or_the_opposite_is_refused(change, message):
+    curriculum = CurriculumCfg(tightening=dataclasses.replace(TIGHTENING, **change))
+    with pytest.raises(ValueError, match=message):
+        ReorientCfg(curriculum=curriculum).validate()
+    ReorientCfg(
+        curriculum=curriculum, success=SuccessCfg(rotation_rad=0.1), table=TableCfg(lift_share=0.5)
+    ).validate()
