@@ -13,6 +13,7 @@ from vd.evaluate.agents import (
     find_policy,
     is_saved_student,
     open_policy,
+    policy_name,
     start_at_rest,
     task_for,
 )
@@ -53,6 +54,13 @@ def test_installed_policies_load_and_act(name):
 def test_there_is_an_installed_policy():
     assert "dclaw4-cube" in SHIPPED_POLICIES
     assert find_policy("dclaw4-cube") == SHIPPED_POLICIES["dclaw4-cube"]
+
+
+def test_the_file_of_an_installed_policy_is_called_by_its_name(tmp_path, monkeypatch):
+    path = SHIPPED_POLICIES["dclaw4-cube"]
+    monkeypatch.chdir(path.parent)
+    assert policy_name(path) == policy_name(path.name) == policy_name("dclaw4-cube") == "dclaw4-cube"
+    assert policy_name(tmp_path / "dclaw4-cube.pt") == str(tmp_path / "dclaw4-cube.pt")
 
 
 def test_a_run_folder_means_its_best_policy(tmp_path):

@@ -102,7 +102,7 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
 
     # A line for each of some hundred kernels would scroll the progress away.
     wp.config.log_level = wp.LOG_WARNING
-    from vd.evaluate.agents import find_policy
+    from vd.evaluate.agents import find_policy, policy_name
     from vd.policy import load_policy
     from vd.student.network import Student
     from vd.student.saved import StudentSpec
@@ -147,7 +147,7 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         network=cfg.network,
         num_actions=teacher.num_actions,
         stage=cfg.stage,
-        teacher=str(cfg.teacher),
+        teacher=policy_name(str(cfg.teacher)),
         camera=cfg.camera,
     )
     runner = StudentRunner(

@@ -56,6 +56,12 @@ def find_policy(name: str | Path) -> Path:
     raise FileNotFoundError(f"{path} holds no {' or '.join(_RUN_FILES)}; give a policy.pt or a checkpoint")
 
 
+def policy_name(name: str | Path) -> str:
+    """``name`` as it is told to others: the name of an installed policy if it is the file of one."""
+    path = Path(name).resolve()
+    return next((known for known, file in SHIPPED_POLICIES.items() if file.resolve() == path), str(name))
+
+
 def trained_task(policy: Any) -> ReorientCfg:
     """The configuration a policy was trained in."""
     return from_dict(ReorientCfg, policy.task, where="task of the policy")

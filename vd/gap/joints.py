@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -163,7 +163,15 @@ def steady(joint: Joint, explanation: Explanation) -> bool:
     )
 
 
-def _in_turn(joints: Sequence[Joint], explain: Callable[..., Explanation]) -> list[Explanation]:
+class _Explain(Protocol):
+    """Explains a joint, knowing those of its finger that are explained already."""
+
+    def __call__(
+        self, joint: Joint, explained: Explained, own: Explanation | None = None, /
+    ) -> Explanation: ...
+
+
+def _in_turn(joints: Sequence[Joint], explain: _Explain) -> list[Explanation]:
     """Explanations of all joints: of each finger from its tip on, as a joint's motion shakes those before it.
 
     Args:
