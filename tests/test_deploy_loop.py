@@ -214,7 +214,7 @@ def test_a_teacher_flies_a_twin(hand, tmp_path, capsys, patient):
     pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
     folder = tmp_path / "log"
     flags = ["--hand", hand, "--twin", "--goal-s", "2", "--hold-s", "0.2", "--log", str(folder)]
-    goals = ["--goal", "0,0,0,1", "0,0,0.3,0.954"]
+    goals = ["--goal", "0,0,0,1", "0,0,0.84147,0.5403"]  # the second 2 rad away, so that it takes a while
     status, words = cli.main([*flags, *patient, *goals]), capsys.readouterr().err
     if "loop rate" in words or "asked again" in words:
         pytest.skip(f"this machine is too busy: {words.splitlines()[-1]}")
