@@ -422,8 +422,10 @@ def test_networks_that_see_more_act_as_before_and_learn_on(tmp_path, how, normal
 
 
 @pytest.mark.parametrize("env", [DummyEnv, SeeingEnv])
-@pytest.mark.parametrize("critic", [True, False])
-def test_networks_with_wider_layers_act_as_before_and_come_to_use_them(tmp_path, env, critic):
+@pytest.mark.parametrize(
+    ("how", "critic"), [("begin_from", True), ("begin_from", False), ("load", True)]
+)  # nothing without a critic can be resumed
+def test_networks_with_wider_layers_act_as_before_and_come_to_use_them(tmp_path, env, how, critic):
     from dataclasses import replace
 
     from train_dummy import SMALL_POLICY
@@ -437,7 +439,7 @@ def test_networks_with_wider_layers_act_as_before_and_come_to_use_them(tmp_path,
     policy = replace(SMALL_POLICY, hidden=(24, 40), normalise_observations=True)
     ppo = replace(SMALL_PPO, critic_warmup_iterations=1)
     wide = make_runner(tmp_path / "wide", env=env(num_worlds=16, seed=4), policy=policy, ppo=ppo, seed=4)
-    wide.begin_from(str(checkpoint))
+    getattr(wide, how)(str(checkpoint))
     assert wide.new_units == 8 + 24 and wide.new_inputs == wide.num_observations - 5
 
     observation = torch.randn(50, wide.num_observations)

@@ -256,8 +256,8 @@ class TeacherRunner(OnPolicyRunner):
 
         With the processes and worlds of the checkpoint the run goes on exactly. With others, or from a
         checkpoint without worlds, all but worlds and random states is restored, and episodes start anew.
-        So they do where the run observes more than the checkpoint's networks read; those are widened, and
-        where its hidden layers are wider.
+        So they do where the run observes more than the checkpoint's networks read. Those are widened, as they
+        are to hidden layers with more units.
 
         Args:
             path: The checkpoint.
@@ -322,10 +322,8 @@ class TeacherRunner(OnPolicyRunner):
 
     def _widened(self, state: dict[str, Any]) -> dict[str, Any]:
         """A checkpoint with networks of this run's size, if its own are smaller."""
-        inputs, units = (
-            new_inputs(state, self.num_observations),
-            new_units(state, self.policy_cfg.hidden),
-        )
+        inputs = new_inputs(state, self.num_observations)
+        units = new_units(state, self.policy_cfg.hidden)
         if not inputs and not units:
             return state
         self.new_inputs, self.new_units = inputs, units

@@ -103,9 +103,9 @@ def _grown_moments(moment: dict[str, Any], shape: torch.Size) -> dict[str, Any]:
     first, second = moment[MOMENT], moment[SECOND_MOMENT]
     if first.shape == shape:
         return moment
-    both = first.new_zeros(shape), torch.full(shape, float(second.mean())).to(second)
+    old = tuple(slice(size) for size in first.shape)
+    grown, squares = first.new_zeros(shape), second.new_full(shape, float(second.mean()))
     if second.dim() == 2:
-        both[1][: second.shape[0]] = second.mean(dim=1, keepdim=True)
-    for grown, old in zip(both, (first, second), strict=True):
-        grown[tuple(slice(size) for size in old.shape)] = old
-    return moment | {MOMENT: both[0], SECOND_MOMENT: both[1]}
+        squares[: second.shape[0]] = second.mean(dim=1, keepdim=True)
+    grown[old], squares[old] = first, second
+    return moment | {MOMENT: grown, SECOND_MOMENT: squares}

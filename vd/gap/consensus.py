@@ -76,7 +76,7 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
         needed, why = search.better(without, fit, SHOWN_TAIL)
         if not needed and rest:
             simpler = as_another(replace(search, like=(rest, values)), baseline, loose)
-            # Small as it is, it is what the joint lacks where the others alone do not explain it.
+            # Small as it is, the joint lacks it: the rest does not explain it, and the motions are sure.
             if simpler is not None or search.gain(without, fit)[1][0] <= 0.0:
                 return simpler
             needed = True

@@ -154,7 +154,7 @@ def explain_joints(
 
 
 def steady(joint: Joint, explanation: Explanation) -> bool:
-    """Whether a joint is explained down to noise without random delays, nor by a fixed one, their mean."""
+    """Whether a joint is explained down to noise with neither random delays nor a fixed one, their mean."""
     final = explanation.final
     return (
         explanation.verdict == "effects"
