@@ -44,7 +44,7 @@ WAIT_S = 0.002
 """How long a read of the port sleeps at most until its bytes are there. The SDK's own does not sleep but asks
 again and again, which takes a core, and keeps whatever shares it from answering."""
 LATE_S = 0.02
-"""Pause before a motor is asked again; what arrives meanwhile is dropped."""
+"""Pause after a question that was asked in vain or again; what arrives meanwhile is dropped."""
 
 
 @dataclass(frozen=True)
@@ -197,12 +197,18 @@ class MotorBus:
 
     def _ask(self, ask: Callable[..., tuple[Any, int, int]], *arguments: Any) -> tuple[Any, int, int]:
         """One exchange with one motor, again if no sound answer came: answer, result and error byte."""
+        first = self.clock.now()
         for attempt in range(self.retries + 1):
+            last = self.clock.now()
             with self._line():
                 answer, result, error = ask(self._port, *arguments)
-            if result == self._sdk.COMM_SUCCESS or attempt == self.retries:
+            sound = result == self._sdk.COMM_SUCCESS
+            if not sound or attempt:
+                # An answer that comes now is none to the next question. A sound one may have been to the
+                # first try, and that to the last is as late.
+                self.clock.sleep(LATE_S + (last - first if sound else 0.0))
+            if sound:
                 break
-            self.clock.sleep(LATE_S)  # an answer that comes now is none to the next question
         return answer, result, error
 
     def ping(self, id: int) -> int | None:

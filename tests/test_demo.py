@@ -293,8 +293,8 @@ def test_a_stage_that_fails_is_run_again(tmp_path, capsys):
 def test_the_alarm_ends_a_block_and_leaves_no_alarm_behind():
     started = time.monotonic()
     with pytest.raises(TimeUp), time_limit(0.05):
-        time.sleep(5.0)
-    assert time.monotonic() - started < 2.0
+        time.sleep(120.0)
+    assert time.monotonic() - started < 60.0
     with time_limit(0.05):
         pass
     time.sleep(0.1)

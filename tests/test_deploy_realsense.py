@@ -39,7 +39,7 @@ rs = camera_sdk()
 LENS = Intrinsics(640, 360, 455.0, 456.0, 323.5, 177.0)
 NORMAL, DISTANCE = np.array([0.3, -0.2, 1.0]), 0.7
 """An inclined plane: NORMAL . p = DISTANCE in the optical frame [m]."""
-PATIENCE_S = 2.0
+PATIENCE_S = 10.0
 BAG = Path(__file__).parent / "data" / "realsense-2.54.bag.gz"
 OFF = FilterCfg(decimation=1)
 

@@ -126,7 +126,7 @@ def test_flags_of_the_start_exclude_each_other(capsys):
 @pytest.mark.parametrize("module", ["vd.evaluate.cli", "vd.play.cli"])
 def test_help_lists_the_installed_policies(module):
     done = subprocess.run(
-        [sys.executable, "-m", module, "--help"], capture_output=True, text=True, timeout=60
+        [sys.executable, "-m", module, "--help"], capture_output=True, text=True, timeout=300
     )
     assert done.returncode == 0 and "dclaw4-cube" in done.stdout
 

@@ -81,7 +81,7 @@ if __name__ == "__main__":
         print(*(child.pid for child in multiprocessing.active_children()), flush=True)
         time.sleep(60.0)
 """
-ENDING_S = 20.0
+ENDING_S = 120.0
 """Time for orphans to end."""
 
 

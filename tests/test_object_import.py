@@ -191,14 +191,14 @@ def test_interrupted_import_leaves_no_part_and_no_process(tmp_path: Path):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
     marker = str(folder)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 120
     while not _workers(child.pid) and time.monotonic() < deadline:
         time.sleep(0.1)
     workers = _workers(child.pid)
     assert workers
     time.sleep(1.0)
     child.send_signal(signal.SIGINT)
-    _, errors = child.communicate(timeout=20)
+    _, errors = child.communicate(timeout=120)
     assert child.returncode == 130
     assert "goes on from there" in errors
     assert not any(Path(f"/proc/{pid}").exists() for pid in workers), marker

@@ -34,7 +34,7 @@ FLAGS = (
     "--window-size=1280,800",
     "--remote-debugging-port=0",
 )
-START_S = 60.0
+START_S = 300.0
 
 
 class Browser:
@@ -113,7 +113,7 @@ class Browser:
         with contextlib.suppress(Exception):
             self._socket.close()
         self._process.terminate()
-        self._process.wait(timeout=20)
+        self._process.wait(timeout=120)
 
 
 @pytest.fixture

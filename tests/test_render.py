@@ -1,7 +1,5 @@
 """The headless renderer: things are where the camera model says, in their colours, and files decode."""
 
-import time
-
 import imageio.v3 as iio
 import numpy as np
 import pytest
@@ -146,17 +144,6 @@ def test_fingertips_are_drawn_where_kinematics_puts_them(hand, name):
     inside = mount.apply(model.tip_poses(joints)[:, :3]) + np.array([0.0, 0.0, 0.25 + 0.012])
     column, row = renderer.camera.project(inside, 320, 240).round().astype(int).T
     assert (np.abs(hands - none).sum(axis=2)[row, column] > 20).all()
-
-
-def test_a_frame_takes_a_fraction_of_a_second_of_processor_time(hand):
-    model = hand["dclaw4"]
-    renderer = Renderer(model, [box("cube", [0.05] * 3)])
-    q = np.concatenate([np.tile([0.0, 0.8, -1.1], 4), [0.0, 0.0, 0.05], IDENTITY])[None]
-    renderer.render(q, np.array([IDENTITY]))
-    start = time.process_time()
-    for _ in range(5):
-        renderer.render(q, np.array([IDENTITY]))
-    assert (time.process_time() - start) / 5 < 0.25  # 0.09 s was measured; the rest is slack
 
 
 def frames(count, height=64, width=96):

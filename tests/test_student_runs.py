@@ -305,7 +305,7 @@ def test_two_processes_share_gradients_and_keep_their_worlds(tmp_path):
     environments = [common | {"RANK": rank, "LOCAL_RANK": rank} for rank in "01"]
     processes = [subprocess.Popen([sys.executable, "-c", code], env=one) for one in environments]
     try:
-        assert [process.wait(timeout=120) for process in processes] == [0, 0]
+        assert [process.wait(timeout=300) for process in processes] == [0, 0]
     finally:
         for process in processes:
             process.kill()
