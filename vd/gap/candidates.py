@@ -77,6 +77,7 @@ class CandidateFits:
             model first.
         veiled: Whether the samples are seen through what chance does to them.
         fine: Whether rollouts have the step at which estimates are finished.
+        clocked: Whether samples are weighted by what errors of the clock do to them (:mod:`vd.gap.clock`).
     """
 
     floor: float
@@ -93,6 +94,7 @@ class CandidateFits:
     added: dict[frozenset[str], tuple[JointFit, ...]] = field(default_factory=dict)
     veiled: bool = False
     fine: bool = False
+    clocked: bool = False
 
     def fit_candidates(
         self,

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from vd.gap.candidates import FULL_ITERATIONS
+from vd.gap.clock import swayed, weighted
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import NAMED, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import JointFit
@@ -62,6 +63,10 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
         baseline, fit = search.run(
             [search.plain(baseline), search.call(baseline, effects, [fit.values], FULL_ITERATIONS)]
         )
+    if veil := swayed(search, fit):
+        seen = weighted(search, veil)
+        found = as_another(seen, seen.run([seen.plain(baseline)])[0], loose)
+        return found and replace(found, veil=veil)
     if fit.at_bound or not search.noise_only(fit, AT_FLOOR):
         return None
     others = [name for name in search.candidates if name not in {*effects, *search.vetoes, RANDOM}]

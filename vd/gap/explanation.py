@@ -10,6 +10,7 @@ from vd.gap.joint_fit import JointFit
 from vd.gap.judge import RANDOM
 from vd.gap.result import Verdict
 from vd.gap.statistics import covariance, half_width
+from vd.gap.veil import Veil
 from vd.kernels.effects import EFFECTS
 
 NAMED = 0.9
@@ -66,6 +67,8 @@ class Explanation:
     trials: tuple[Trial, ...] = ()
     rivals: Mapping[str, Sequence[JointFit]] = field(default_factory=dict)
     """Fits with others in the place of each effect."""
+    veil: Veil | None = None
+    """What the samples were seen through; errors of the fits are in what it weighs them by."""
     warms: bool = False
     """Whether a friction of the final model changes over the recording, as none of the table does."""
 

@@ -27,6 +27,9 @@ SMOOTH = 9
 """Samples over which the variance is averaged: 16 draws alone leave a third of error in it."""
 START_SIGMA_DROP = tuple((sigma, drop) for sigma in (0.0015, 0.005, 0.015) for drop in (0.01, 0.1, 0.4))
 """Where the search starts: [s] and the share of commands dropped."""
+CLOCK_S = 1e-4
+"""Standard deviation [s] of a recording's times from those of the machine: when a command leaves, by the
+computer's clock, is not quite when it arrives (our choice)."""
 ROUNDS = 2
 """Searches, with the rest of the model linearised anew before the second."""
 NOISES = (1.0, 3.0, 10.0)
@@ -283,5 +286,16 @@ def bound_jitter(problem: JointProblem, fit: JointFit, scales: Scales) -> JointF
     return replace(fit, extents=JitterFit(problem, rest, scales).extents(sigma, drop))
 
 
-CALLS: dict[str, Callable[..., Any]] = {"look": look, "fit_jitter": fit_jitter, "bound_jitter": bound_jitter}
+def sway(problem: JointProblem, fit: JointFit, scales: Scales) -> Veil:
+    """What errors of the recording's clock add to the samples under a model: no mean, and their spread."""
+    veil = JitterFit(problem, fit, scales).veil(CLOCK_S, 0.0)
+    return Veil(np.zeros_like(veil.shift), veil.growth)
+
+
+CALLS: dict[str, Callable[..., Any]] = {
+    "look": look,
+    "fit_jitter": fit_jitter,
+    "bound_jitter": bound_jitter,
+    "sway": sway,
+}
 """What is asked of a joint's problem by name, besides its methods."""

@@ -19,6 +19,7 @@ from vd.gap.judge import EXCESS_FLOORS, EXPLAINED, NESTED, NO_GAP, RANDOM
 from vd.gap.masses import Masses, fit_masses, widened, with_free_masses
 from vd.gap.recording import Recording
 from vd.gap.select import LOOKS, RESTARTS, Selection
+from vd.gap.sketch import outline, sketched
 from vd.gap.statistics import resamples
 from vd.gap.team import JointSpec, Team
 from vd.gap.telemetry import vetoes
@@ -69,15 +70,35 @@ def explain_joints(
     """
     masses = _masses(team, joints)
     when = middles(recording)
+    rough: dict[Joint, JointFit] = {}
 
     def plain(joint: Joint, explained: Explained) -> JointFit:
         """The plain model, fitted again beside joints of which more is known than theirs."""
         rows = _beside(joint, explained)
+        for other in set(rough) - {joint, *(known for known, _ in explained)}:
+            if other.spec.chain == joint.spec.chain:
+                rows[other.spec.joint] = rough[other].rows[other.spec.joint]
         if np.array_equal(rows, joint.fit.rows):
             return joint.fit
         call = {"base": rows, "effects": (), "starts": [{}], "scales": joint.scales}
         call |= {"iterations": POLISH_ITERATIONS, "refits": REFITS}
         return team.run(joint.spec, [("fit", call)])[0]
+
+    def sketch(joint: Joint, found: JointFit) -> None:
+        """Rough models of the other joints of a finger, beside a rough one of its first."""
+
+        def fit(other: Joint, effects: tuple[str, ...], values: Mapping[str, float]) -> JointFit:
+            rows = other.fit.rows.copy()
+            rows[joint.spec.joint] = found.rows[joint.spec.joint]
+            call = {"base": rows, "effects": effects, "starts": [values], "scales": other.scales}
+            return team.run(other.spec, [("fit", {**call, "iterations": FULL_ITERATIONS})])[0]
+
+        others = {j.name: j for j in joints if j.spec.chain == joint.spec.chain and j is not joint}
+        fits = {name: partial(fit, other) for name, other in others.items()}
+        models = sketched(found, {name: other.fit for name, other in others.items()}, fits)
+        rough.update({others[name]: model for name, model in models.items()})
+        if models:
+            progress(f"explain: {' and '.join(models)}: roughly with {' and '.join(found.effects)} as well")
 
     def one(joint: Joint, explained: Explained, own: Explanation | None = None) -> Explanation:
         chain = team.bench.chains[joint.spec.chain]
@@ -128,6 +149,9 @@ def explain_joints(
         baseline = plain(joint, explained)
         if own is not None:
             return as_random(selection, baseline, selection.undetermined(baseline)) or own
+        if not explained and (found := outline(selection, baseline)):
+            sketch(joint, found)
+            baseline = plain(joint, explained)
         result = selection.explain(baseline)
         progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
         return result
@@ -140,8 +164,9 @@ def explain_joints(
         rows = _beside(joint, known)
         call = {"base": rows, "effects": effects, "starts": list(starts), "scales": joint.scales}
         call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
-        whole = team.run(joint.spec, [("fit", call)])[0]
-        return team.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales})])[0]
+        seen = _seen(next(found for other, found in known if other is joint))
+        whole = team.run(joint.spec, [("fit", {**call, **seen})])[0]
+        return team.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales, **seen})])[0]
 
     def finished(joint: Joint, fit: JointFit) -> JointFit:
         return fitted(joint, fit.effects, [fit.values])
@@ -206,6 +231,11 @@ def _beside(joint: Joint, explained: Explained) -> np.ndarray:
             for parameter in EFFECTS[RANDOM].parameters:
                 rows[other.spec.joint, parameter.column] = parameter.neutral
     return rows
+
+
+def _seen(found: Explanation) -> dict[str, Any]:
+    """What the samples of an explained joint are to be seen through, as an argument of a call."""
+    return {} if found.veil is None else {"veil": found.veil}
 
 
 def _masses(team: Team, joints: Sequence[Joint]) -> dict[int, Masses]:
@@ -373,7 +403,7 @@ def _consistent(
         if not changed or not own.final.effects or RANDOM in own.final.effects:
             return own
         rows[joint.spec.joint] = own.final.rows[joint.spec.joint]
-        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales}
+        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales, **_seen(own)}
         fit = team.run(joint.spec, [("refine", call)])[0]
         if own.final.extents:
             fit = widened(fit, joint.spec.floor, own.final.extents)

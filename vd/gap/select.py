@@ -11,6 +11,7 @@ import numpy as np
 
 from vd.gap.candidates import BETTER, HOPELESS, Call
 from vd.gap.chance import as_random, at_once, try_random
+from vd.gap.clock import swayed, weighted
 from vd.gap.consensus import as_another, as_changing
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.frictions import EXACTLY, Frictions
@@ -18,6 +19,7 @@ from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import ONE_SIDED, JointFit
 from vd.gap.judge import EXPLAINED, MIN_GAIN_FLOORS, MIN_SHARE, NESTED, RANDOM, REPEATABLE, SHARP
 from vd.gap.telemetry import BEHIND_SENSOR
+from vd.gap.veil import Veil
 from vd.gap.verdict import cancelled
 
 MIN_TRAJECTORIES = 3
@@ -95,6 +97,8 @@ class Selection(Frictions):
         trials = [] if start else self.contradicted(baseline)
         present, rivals, rows = (start[0], {}, start[1]) if start else self.first(baseline)
         trials += rows
+        if veil := swayed(self, present):
+            return self.told_by_the_clock(baseline, present, veil)
         alone = [t for t in rows if t.round == 1 and len(t.fit.effects) == 1]
         first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
         tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
@@ -225,7 +229,7 @@ class Selection(Frictions):
             rivals.update(added)
             grown = longer is not present
             present = longer
-            if (not grown and present is not start) or self.too_coarse(present):
+            if (not grown and present is not start) or swayed(self, present) or self.too_coarse(present):
                 break
             if len(present.effects) > 1:
                 revised, rivals = self.revise(present)
@@ -288,7 +292,8 @@ class Selection(Frictions):
                 self.looks -= 1
                 fits = self.look_wider(present, fits)
                 best = self.winner(list(fits.values()))
-            best = fits[best.effects[-1]] = self.look_beside(best, self.whole)
+            if not swayed(self, best):
+                best = fits[best.effects[-1]] = self.look_beside(best, self.whole)
             accepted, why = self.better(present, best, SEARCH_TAIL)
             if not accepted and self.whitens(present, best):
                 accepted, why = True, ""
@@ -335,11 +340,19 @@ class Selection(Frictions):
             rivals[name] = list(fits.values())
             self.added[frozenset(present.effects)] = (present, *fits.values())
             present = best
-            if self.finished(present) or self.too_coarse(present) or self.a_spring(present):
+            if self.finished(present) or swayed(self, present):
+                break
+            if self.too_coarse(present) or self.a_spring(present):
                 break
             if len(present.effects) >= MAX_EFFECTS:
                 break
         return present, rivals, trials
+
+    def told_by_the_clock(self, baseline: JointFit, present: JointFit, veil: Veil) -> Explanation:
+        """The explanation by samples weighted by how surely the recording's clock lets them be known."""
+        self.report(f"{' and '.join(present.effects)}: errors of the clock grow, so again with weights")
+        seen = weighted(self, veil)
+        return replace(seen.explain(seen.run([seen.plain(baseline)])[0]), veil=veil)
 
     def too_coarse(self, present: JointFit) -> bool:
         """Whether it is the time step of the search that keeps a model from leaving no more than noise."""
@@ -368,6 +381,8 @@ class Selection(Frictions):
 
     def ended(self, present: JointFit) -> bool:
         """Whether no other search would change what a model says."""
+        if swayed(self, present):
+            return True
         return self.noise_only(present) or self.too_coarse(present) or self.a_spring(present)
 
     def a_spring(self, present: JointFit) -> bool:

@@ -1,0 +1,52 @@
+"""What errors of a recording's clock do where a model lets them grow.
+
+A profile of bounded acceleration that cannot follow its command turns at moments that hang on ever smaller
+things: a tenth of a millisecond is tens of milliradians some seconds later, and no fit of the right model
+leaves noise there. Such samples say little. Weighted by how surely they are known
+(:class:`vd.gap.veil.Veil`), the right model leaves noise again, and a search ends with it.
+"""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vd.gap.candidates import Call
+from vd.gap.jitter import CALLS
+from vd.gap.joint_fit import JointFit
+from vd.gap.judge import RANDOM
+from vd.gap.veil import Veil
+
+if TYPE_CHECKING:
+    from vd.gap.select import Selection
+
+GROWN = 1.5
+"""Spread of the samples of a motion, in that of the noise alone, from which they are weighted. Motions that
+do not let errors grow have 1.05 at most."""
+
+
+def swayed(search: "Selection", fit: JointFit) -> Veil | None:
+    """What errors of the clock do under a model that leaves more than noise; None where they do not grow.
+
+    Args:
+        search: Whose model it is; one that weighs its samples already does not ask again.
+        fit: The model.
+    """
+    if search.clocked or search.veiled or not fit.effects or RANDOM in fit.effects or search.no_gap(fit):
+        return None
+    veil = search.run([("sway", {"fit": fit, "scales": search.scales})])[0]
+    ends = np.cumsum(fit.count.astype(int))[:-1]
+    spread = [float(np.sqrt(np.mean(part**2))) for part in np.split(veil.growth, ends)]
+    return veil if max(spread) > GROWN else None
+
+
+def weighted(search: "Selection", veil: Veil) -> "Selection":
+    """The same search with samples weighted by how surely they are known."""
+
+    def run(calls: list[Call]) -> list[Any]:
+        # What chance does is more than what the clock does, and is measured on the samples themselves.
+        return search.run(
+            [(name, options if name in CALLS else {"veil": veil, **options}) for name, options in calls]
+        )
+
+    return replace(search, run=run, clocked=True, without={}, apart={}, promised={}, added={})
