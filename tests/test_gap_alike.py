@@ -15,6 +15,7 @@ from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.explanation import Accepted, Explanation, Trial, lacking
 from vd.gap.fit import JointProblem
 from vd.gap.hide import Hiding, simulate_hidden
+from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import JointFit
 from vd.gap.joints import Joint, _beside, _in_turn, steady
 from vd.gap.result import Verdict
@@ -22,6 +23,7 @@ from vd.gap.rollout import Rollouts
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.team import JointSpec
+from vd.gap.veil import Veil
 from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain
 
@@ -51,7 +53,12 @@ class Servo:
 
         def run(calls: list) -> list:
             self.fits += sum(name == "fit" for name, _ in calls)
-            return [getattr(self.problem, name)(**options) for name, options in calls]
+            return [
+                CALLS[name](self.problem, **options)
+                if name in CALLS
+                else getattr(self.problem, name)(**options)
+                for name, options in calls
+            ]
 
         return Selection(
             floor=self.problem.floor,
@@ -279,6 +286,9 @@ def test_a_search_that_its_time_step_holds_up_is_made_with_a_finer_one(
         asked.extend((name, bool(options.get("finer"))) for name, options in calls)
         if calls[0][0] == "refine":
             return [made_up(found.effects, refined * 1.5 * FLOOR)]
+        if calls[0][0] == "sway":
+            size = int(found.count.sum())
+            return [Veil(np.zeros(size), np.ones(size))]
         raise EndError
 
     selection = Selection(
