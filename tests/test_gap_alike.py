@@ -23,7 +23,6 @@ from vd.gap.rollout import Rollouts
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.team import JointSpec
-from vd.gap.veil import Veil
 from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain
 
@@ -286,9 +285,6 @@ def test_a_search_that_its_time_step_holds_up_is_made_with_a_finer_one(
         asked.extend((name, bool(options.get("finer"))) for name, options in calls)
         if calls[0][0] == "refine":
             return [made_up(found.effects, refined * 1.5 * FLOOR)]
-        if calls[0][0] == "sway":
-            size = int(found.count.sum())
-            return [Veil(np.zeros(size), np.ones(size))]
         raise EndError
 
     selection = Selection(
@@ -300,6 +296,7 @@ def test_a_search_that_its_time_step_holds_up_is_made_with_a_finer_one(
         candidates=(),
         scales=Scales(3.0, 0.5, 2.0, 6.0, 70.0, 1e-3, 1e-3, 12.0),
         restarts=restarts,
+        clocked=True,
     )
     result = found, {"acceleration_limit": [found]}, []
     far = made_up(("torque_limit",), 20.0 * FLOOR)

@@ -277,6 +277,7 @@ def searching(answers: list[float]) -> tuple[Selection, list[int]]:
         others=(),
         candidates=SMALL,
         scales=None,  # type: ignore[arg-type]
+        clocked=True,
     )
     return selection, seeds
 
