@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vd.gap.candidates import Call
+from vd.gap.explanation import Explanation
 from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import RANDOM
@@ -50,3 +51,16 @@ def weighted(search: "Selection", veil: Veil) -> "Selection":
         )
 
     return replace(search, run=run, clocked=True, without={}, apart={}, promised={}, added={})
+
+
+def explain_weighted(search: "Selection", baseline: JointFit, veil: Veil) -> Explanation:
+    """What a search finds with samples weighted by how surely they are known.
+
+    Args:
+        search: The search.
+        baseline: The plain model, fitted to samples that all count the same.
+        veil: What errors of the clock do.
+    """
+    search.report("errors of the clock grow: samples are weighted by how surely they are known")
+    seen = weighted(search, veil)
+    return replace(seen.explain(seen.run([seen.plain(baseline)])[0]), veil=veil)

@@ -58,15 +58,15 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
         return None
     starts = [{**baseline.values, **values}, {**search.nominal, **values}]
     fit = search.run([search.call(baseline, effects, starts, FULL_ITERATIONS)])[0]
+    if veil := swayed(search, fit):
+        seen = weighted(search, veil)
+        found = as_another(seen, seen.run([seen.plain(baseline)])[0], loose)
+        return found and replace(found, veil=veil)
     if search.too_coarse(fit):
         search = search.finer()
         baseline, fit = search.run(
             [search.plain(baseline), search.call(baseline, effects, [fit.values], FULL_ITERATIONS)]
         )
-    if veil := swayed(search, fit):
-        seen = weighted(search, veil)
-        found = as_another(seen, seen.run([seen.plain(baseline)])[0], loose)
-        return found and replace(found, veil=veil)
     if fit.at_bound or not search.noise_only(fit, AT_FLOOR):
         return None
     others = [name for name in search.candidates if name not in {*effects, *search.vetoes, RANDOM}]

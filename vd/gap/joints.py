@@ -11,6 +11,7 @@ import numpy as np
 from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
 from vd.gap.chain import candidates, others_in
 from vd.gap.chance import FIXED, as_random
+from vd.gap.clock import explain_weighted, swayed
 from vd.gap.consensus import agree, no_constant_friction, no_spring, share
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.explanation import NAMED, Accepted, Explanation, added, lacking, polished
@@ -149,10 +150,15 @@ def explain_joints(
         baseline = plain(joint, explained)
         if own is not None:
             return as_random(selection, baseline, selection.undetermined(baseline)) or own
-        if not explained and (found := outline(selection, baseline)):
+        found = None if explained else outline(selection, baseline)
+        if found is not None:
             sketch(joint, found)
             baseline = plain(joint, explained)
-        result = selection.explain(baseline)
+            (found,) = selection.run(
+                [selection.call(baseline, found.effects, [found.values], FULL_ITERATIONS)]
+            )
+        veil = None if found is None else swayed(selection, found)
+        result = explain_weighted(selection, baseline, veil) if veil else selection.explain(baseline)
         progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
         return result
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from vd.gap.candidates import BETTER, HOPELESS, Call
 from vd.gap.chance import as_random, at_once, try_random
-from vd.gap.clock import swayed, weighted
+from vd.gap.clock import explain_weighted, swayed
 from vd.gap.consensus import as_another, as_changing
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.frictions import EXACTLY, Frictions
@@ -19,7 +19,6 @@ from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import ONE_SIDED, JointFit
 from vd.gap.judge import EXPLAINED, MIN_GAIN_FLOORS, MIN_SHARE, NESTED, RANDOM, REPEATABLE, SHARP
 from vd.gap.telemetry import BEHIND_SENSOR
-from vd.gap.veil import Veil
 from vd.gap.verdict import cancelled
 
 MIN_TRAJECTORIES = 3
@@ -98,7 +97,7 @@ class Selection(Frictions):
         present, rivals, rows = (start[0], {}, start[1]) if start else self.first(baseline)
         trials += rows
         if veil := swayed(self, present):
-            return self.told_by_the_clock(baseline, present, veil)
+            return explain_weighted(self, baseline, veil)
         alone = [t for t in rows if t.round == 1 and len(t.fit.effects) == 1]
         first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
         tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
@@ -347,12 +346,6 @@ class Selection(Frictions):
             if len(present.effects) >= MAX_EFFECTS:
                 break
         return present, rivals, trials
-
-    def told_by_the_clock(self, baseline: JointFit, present: JointFit, veil: Veil) -> Explanation:
-        """The explanation by samples weighted by how surely the recording's clock lets them be known."""
-        self.report(f"{' and '.join(present.effects)}: errors of the clock grow, so again with weights")
-        seen = weighted(self, veil)
-        return replace(seen.explain(seen.run([seen.plain(baseline)])[0]), veil=veil)
 
     def too_coarse(self, present: JointFit) -> bool:
         """Whether it is the time step of the search that keeps a model from leaving no more than noise."""
