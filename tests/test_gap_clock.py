@@ -1,5 +1,6 @@
 """Gaps so large that small things grow: errors of the clock, and what the joints beside one do."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from vd.gap.workflow import explain
 LIMIT = "acceleration_limit.a_max_rad_s2"
 
 
+@functools.cache
 def fitted(limit: float) -> tuple[JointProblem, JointFit, Scales]:
     """A servo whose profile accelerates with up to ``limit`` [rad/s^2], and the fit of the right model."""
     effects = {"acceleration_limit": {"a_max_rad_s2": limit}}
@@ -79,7 +81,6 @@ def test_a_search_asks_once_whether_errors_grow_and_weighs_all_but_chance(grown:
 
     search = selection(run)
     assert (swayed(search, fit) is veil) == grown
-    assert swayed(search, made_up((), 3.0 * FLOOR)) is None, "no effect"
     assert swayed(search, made_up(("acceleration_limit",), FLOOR)) is None, "noise"
     assert swayed(search, made_up(("acceleration_limit", "command_jitter"), 3.0 * FLOOR)) is None, "chance"
     assert [name for name, _ in asked] == ["sway"]
@@ -100,6 +101,15 @@ def test_an_acceleration_limit_that_cannot_follow_is_named_with_the_samples_weig
     (estimate,) = report.effects[0].parameters.values()
     assert estimate.value == pytest.approx(10.0, rel=0.01)
     assert sum("errors of the clock grow" in line for line in said) == 1
+
+
+def test_with_the_limit_in_the_model_nothing_is_left_to_explain(tmp_path: Path) -> None:
+    problem, fit, _ = fitted(10.0)
+    assert fit.held_out_rmse > 2.0 * problem.floor
+    recording, tried = problem.rollouts.recording, ("command_delay", "coulomb_friction")
+    start = {recording.joints[0]: fit.rows[0]}
+    report = explain(recording, None, tmp_path, effects=tried, workers=1, start=start)
+    assert report.verdict == "no_gap" and "errors of the recording's clock" in report.joints[0].reason
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,10 @@ GROWN = 1.5
 do not let errors grow have 1.05 at most."""
 
 
+WEIGHTED = "where errors of the recording's clock grow, samples count by how surely they are known"
+"""What a reason says of it."""
+
+
 def swayed(search: "Selection", fit: JointFit) -> Veil | None:
     """What errors of the clock do under a model that leaves more than noise; None where they do not grow.
 
@@ -33,7 +37,7 @@ def swayed(search: "Selection", fit: JointFit) -> Veil | None:
         search: Whose model it is; one that weighs its samples already does not ask again.
         fit: The model.
     """
-    if search.clocked or search.veiled or not fit.effects or RANDOM in fit.effects or search.no_gap(fit):
+    if search.clocked or search.veiled or RANDOM in fit.effects or search.no_gap(fit):
         return None
     veil = search.run([("sway", {"fit": fit, "scales": search.scales})])[0]
     ends = np.cumsum(fit.count.astype(int))[:-1]
@@ -63,4 +67,5 @@ def explain_weighted(search: "Selection", baseline: JointFit, veil: Veil) -> Exp
     """
     search.report("errors of the clock grow: samples are weighted by how surely they are known")
     seen = weighted(search, veil)
-    return replace(seen.explain(seen.run([seen.plain(baseline)])[0]), veil=veil)
+    found = seen.explain(seen.run([seen.plain(baseline)])[0])
+    return replace(found, veil=veil, reason=f"{found.reason}; {WEIGHTED}")

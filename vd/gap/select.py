@@ -88,6 +88,8 @@ class Selection(Frictions):
             if loose:
                 return Explanation(baseline, baseline, "under_excited", loose)
             return Explanation(baseline, baseline, "no_gap", "the plain model is within the noise floor")
+        if veil := swayed(self, baseline):  # with an identified limit in it
+            return explain_weighted(self, baseline, veil)
         known = None if start else as_another(self, baseline, loose) or as_changing(self, baseline, loose)
         if not start and known is None:
             known = as_random(self, baseline, loose)
