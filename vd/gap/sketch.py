@@ -18,6 +18,9 @@ FAR = 50.0
 """Gap in noise floors from which a joint shakes others by more than noise: one of four hundred does so by
 five."""
 
+NEARER = 0.5
+"""Share of a plain model's error up to which a rough one is the better company: it may lack something more."""
+
 Fit = Callable[[tuple[str, ...], Mapping[str, float]], JointFit]
 """Fits a joint with these effects from these values."""
 
@@ -39,7 +42,7 @@ def outline(search: "Selection", baseline: JointFit) -> JointFit | None:
 
 
 def sketched(rough: JointFit, plain: Mapping[str, JointFit], fits: Mapping[str, Fit]) -> dict[str, JointFit]:
-    """Models of the other joints with what one mostly lacks, of those which that explains as well.
+    """Models of the other joints with what one mostly lacks, of those which that explains for the most part.
 
     Args:
         rough: Model of the one.
@@ -48,4 +51,4 @@ def sketched(rough: JointFit, plain: Mapping[str, JointFit], fits: Mapping[str, 
     """
     values = {key: value for key, value in rough.values.items() if "." in key}
     found = {name: fits[name](rough.effects, values) for name in plain}
-    return {name: fit for name, fit in found.items() if fit.rmse < SHARP * plain[name].rmse}
+    return {name: fit for name, fit in found.items() if fit.rmse < NEARER * plain[name].rmse}
