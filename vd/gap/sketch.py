@@ -19,7 +19,7 @@ FAR = 50.0
 five."""
 
 NEARER = 0.5
-"""Share of a plain model's error up to which a rough one is the better company: it may lack something more."""
+"""Share of a plain model's error up to which a rough one is better company: it may lack something more."""
 
 Fit = Callable[[tuple[str, ...], Mapping[str, float]], JointFit]
 """Fits a joint with these effects from these values."""
