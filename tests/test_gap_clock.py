@@ -1,6 +1,7 @@
 """Gaps so large that small things grow: errors of the clock, and what the joints beside one do."""
 
 import functools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -123,7 +124,10 @@ def test_a_joint_is_outlined_where_one_effect_explains_nearly_all_of_a_large_gap
     best = made_up(("acceleration_limit",), left * FLOOR)
     search = selection()
     search.fit_candidates = lambda _: {"acceleration_limit": best}  # type: ignore[assignment,method-assign,misc]
-    assert outline(search, made_up((), gap * FLOOR)) is (best if rough else None)
+    baseline = made_up((), gap * FLOOR)
+    assert outline(search, baseline) is (best if rough else None)
+    few = replace(baseline, **{key: getattr(baseline, key)[:2] for key in ("sse", "held_out", "count")})
+    assert outline(search, few) is None, "none to hold out"
 
 
 def test_the_other_joints_are_sketched_with_what_explains_them_as_well() -> None:

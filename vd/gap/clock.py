@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 
 GROWN = 1.5
 """Spread of the samples of a motion, in that of the noise alone, from which they are weighted. Motions that
-do not let errors grow have 1.05 at most."""
-
-
+do not let errors grow have 1.05 at most (our choice)."""
 WEIGHTED = "where errors of the recording's clock grow, samples count by how surely they are known"
 """What a reason says of it."""
 
@@ -67,5 +65,9 @@ def explain_weighted(search: "Selection", baseline: JointFit, veil: Veil) -> Exp
     """
     search.report("errors of the clock grow: samples are weighted by how surely they are known")
     seen = weighted(search, veil)
-    found = seen.explain(seen.run([seen.plain(baseline)])[0])
+    return told(seen.explain(seen.run([seen.plain(baseline)])[0]), veil)
+
+
+def told(found: Explanation, veil: Veil) -> Explanation:
+    """What was found with samples weighted, which says so."""
     return replace(found, veil=veil, reason=f"{found.reason}; {WEIGHTED}")

@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from vd.gap.candidates import FULL_ITERATIONS
-from vd.gap.clock import swayed, weighted
+from vd.gap.clock import swayed, told, weighted
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import NAMED, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import JointFit
@@ -61,7 +61,7 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
     if veil := swayed(search, fit):
         seen = weighted(search, veil)
         found = as_another(seen, seen.run([seen.plain(baseline)])[0], loose)
-        return found and replace(found, veil=veil)
+        return found and told(found, veil)
     if search.too_coarse(fit):
         search = search.finer()
         baseline, fit = search.run(

@@ -9,6 +9,7 @@ distribution of constant width would need for the same likelihood.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -86,8 +87,12 @@ class JitterFit:
         )
         self.measured = np.concatenate([t.position[:, self._column] for t in chosen])
         self.ends = np.cumsum([len(t.time) for t in chosen])[:-1]
-        self.jacobian = problem.jacobian(base)
         self.shift = np.zeros(len(base.x))
+
+    @cached_property
+    def jacobian(self) -> np.ndarray:
+        """d(predicted)/dx of the rest of the model [P, N]; a veil alone needs none."""
+        return self.problem.jacobian(self.base)
 
     @property
     def _column(self) -> int:

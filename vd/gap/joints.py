@@ -71,14 +71,15 @@ def explain_joints(
     """
     masses = _masses(team, joints)
     when = middles(recording)
-    rough: dict[Joint, JointFit] = {}
+    rough: dict[int, dict[Joint, JointFit]] = {}  # by chain
 
     def plain(joint: Joint, explained: Explained) -> JointFit:
         """The plain model, fitted again beside joints of which more is known than theirs."""
         rows = _beside(joint, explained)
-        for other in set(rough) - {joint, *(known for known, _ in explained)}:
-            if other.spec.chain == joint.spec.chain:
-                rows[other.spec.joint] = rough[other].rows[other.spec.joint]
+        known = {joint, *(other for other, _ in explained)}
+        for other, model in rough.get(joint.spec.chain, {}).items():
+            if other not in known:
+                rows[other.spec.joint] = model.rows[other.spec.joint]
         if np.array_equal(rows, joint.fit.rows):
             return joint.fit
         call = {"base": rows, "effects": (), "starts": [{}], "scales": joint.scales}
@@ -97,7 +98,7 @@ def explain_joints(
         others = {j.name: j for j in joints if j.spec.chain == joint.spec.chain and j is not joint}
         fits = {name: partial(fit, other) for name, other in others.items()}
         models = sketched(found, {name: other.fit for name, other in others.items()}, fits)
-        rough.update({others[name]: model for name, model in models.items()})
+        rough[joint.spec.chain] = {others[name]: model for name, model in models.items()}
         if models:
             progress(f"explain: {' and '.join(models)}: roughly with {' and '.join(found.effects)} as well")
 

@@ -6,26 +6,23 @@ What it mostly lacks they mostly lack as well: with that they do as they did.
 """
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import SHARP
-
-if TYPE_CHECKING:
-    from vd.gap.select import Selection
+from vd.gap.select import MIN_TRAJECTORIES, Selection
 
 FAR = 50.0
 """Gap in noise floors from which a joint shakes others by more than noise: one of four hundred does so by
-five."""
-
+five (our choice)."""
 NEARER = 0.5
-"""Share of a plain model's error up to which a rough one is better company: it may lack something more."""
+"""Share of a plain model's error up to which a rough one is better company (our choice): it may lack
+something more."""
 
 Fit = Callable[[tuple[str, ...], Mapping[str, float]], JointFit]
 """Fits a joint with these effects from these values."""
 
 
-def outline(search: "Selection", baseline: JointFit) -> JointFit | None:
+def outline(search: Selection, baseline: JointFit) -> JointFit | None:
     """What a joint mostly lacks: the best model with one effect, where it explains nearly all but not all.
 
     The search makes the same fits, and does not make them again.
@@ -34,11 +31,11 @@ def outline(search: "Selection", baseline: JointFit) -> JointFit | None:
         search: Of the joint.
         baseline: Its plain model.
     """
-    if baseline.held_out_rmse < FAR * search.floor:
+    if len(baseline.sse) < MIN_TRAJECTORIES or baseline.held_out_rmse < FAR * search.floor:
         return None
     fits = search.fit_candidates(baseline)
     best = search.winner(list(fits.values())) if fits else baseline
-    return best if search.floor < best.rmse < SHARP * baseline.rmse and not search.white(best) else None
+    return best if best.rmse < SHARP * baseline.rmse and not search.white(best) else None
 
 
 def sketched(rough: JointFit, plain: Mapping[str, JointFit], fits: Mapping[str, Fit]) -> dict[str, JointFit]:
