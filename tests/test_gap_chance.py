@@ -11,7 +11,7 @@ from test_gap_select import searching
 from vd.gap import chance
 from vd.gap.chance import DROP, SIGMA, behind, with_random
 from vd.gap.coordinates import Coordinate, Scales
-from vd.gap.explanation import Accepted, Explanation, Trial
+from vd.gap.explanation import Accepted, Explanation, Trial, added
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import Judge
 from vd.gap.select import Selection
@@ -141,6 +141,73 @@ def test_chance_alone_leaves_noise_where_a_fixed_delay_leaves_more(
     )
 
 
+@pytest.mark.parametrize(
+    ("present", "through", "found"),
+    [
+        (("coulomb_friction", "command_delay"), 0.9, True),
+        (("coulomb_friction", "command_delay"), 1.4, False),
+        (("command_filter", "coulomb_friction"), 0.9, True),
+        (("backlash", "coulomb_friction"), 0.9, False),
+        (("command_delay",), 0.9, False),
+    ],
+)
+def test_chance_takes_the_place_of_what_is_late_beside_another_effect(
+    present: tuple[str, ...], through: float, found: bool
+) -> None:
+    veil = Veil(np.zeros(3), np.ones(3))
+
+    def run(calls: list[tuple[str, dict[str, Any]]]) -> list[object]:
+        ((name, options),) = calls
+        if name == "look":
+            assert options["fit"].effects == ("coulomb_friction",)
+            return [((0.003, 0.1), veil)]
+        if name == "fit_jitter":
+            random = replace(
+                made_up((*options["fit"].effects, "command_jitter"), FLOOR),
+                coordinates=tuple(Coordinate(key, 0, False, 1.0, 0.0, 9.0) for key in (SIGMA, DROP)),
+                x=np.array([0.003, 0.1]),
+            )
+            return [(random, veil)]
+        return [made_up(options["effects"], through * FLOOR if "veil" in options else 8.0 * FLOOR)]
+
+    names = ("backlash", "command_delay", "command_filter", "coulomb_friction", "command_jitter")
+    selection = replace(searching([])[0], run=run, candidates=names, scales=SCALES)
+    told = chance.in_place(selection, made_up(present, 4.0 * FLOOR))
+    assert (told is not None) == found
+    if told is not None:
+        assert told[0].effects == ("coulomb_friction", "command_jitter") and told[1] is veil
+    assert chance.in_place(behind(selection, veil), made_up(present, 4.0 * FLOOR)) is None, "not behind it"
+
+
+def test_beside_the_chance_of_another_joint_what_that_joint_lacks_is_tried_first() -> None:
+    baseline, started, searched = made_up((), 0.010), [], []
+    veil = Veil(np.zeros(3), np.ones(3))
+    keys = ("coulomb_friction.tau_c_nm", SIGMA, DROP)
+    other = replace(
+        made_up(("coulomb_friction", "command_jitter"), FLOOR),
+        coordinates=tuple(Coordinate(key, 0, False, 1.0, 0.0, 9.0) for key in keys),
+        x=np.array([0.02, 0.003, 0.1]),
+    )
+
+    def run(calls: list[tuple[str, dict[str, Any]]]) -> list[object]:
+        ((name, options),) = calls
+        if name == "look":
+            started.append(options["start"])
+            return [(options["start"], veil)]
+        return [(other, veil)] if name == "fit_jitter" else [made_up((), 0.005)]
+
+    def explain(inner: Selection, plain: JointFit) -> Explanation:
+        searched.append(inner.like)
+        return Explanation(plain, made_up(("coulomb_friction",), FLOOR), "effects", "")
+
+    selection = replace(searching([])[0], run=run, candidates=("coulomb_friction", "command_jitter"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Selection, "explain", explain)
+        with_random(replace(selection, random=added(other)), baseline, baseline)
+    assert started == [(0.003, 0.1)], "commands of a finger go out together"
+    assert searched == [(("coulomb_friction",), {"coulomb_friction.tau_c_nm": 0.02})]
+
+
 @pytest.mark.parametrize(("left", "found"), [(1.0, True), (1.4, False)])
 def test_what_is_chance_on_one_joint_is_chance_on_another(left: float, found: bool) -> None:
     random = replace(
@@ -150,12 +217,12 @@ def test_what_is_chance_on_one_joint_is_chance_on_another(left: float, found: bo
         gram=np.tile(np.eye(2), (10, 1, 1)),
         gradient=np.zeros((10, 2)),
     )
-    selection = replace(searching([])[0], candidates=("backlash", "command_jitter"), random=True)
+    selection = replace(searching([])[0], candidates=("backlash", "command_jitter"), random=added(random))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(chance, "with_random", lambda *_: (random, (), [], left * FLOOR))
         patch.setattr(chance, "bounded", lambda _, fit: fit)
         told = chance.as_random(selection, made_up((), 4.0 * FLOOR), "")
-        nobody = chance.as_random(replace(selection, random=False), made_up((), 4.0 * FLOOR), "")
+        nobody = chance.as_random(replace(selection, random=((), {})), made_up((), 4.0 * FLOOR), "")
     assert nobody is None and (told is not None) == found
     if told is not None:
         assert told.verdict == "effects" and [one.name for one in told.accepted] == ["command_jitter"]

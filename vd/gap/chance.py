@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 SIGMA, DROP = (f"{RANDOM}.{name}" for name in ("sigma_s", "p_drop"))
 FIXED = "command_delay"
 """What is the mean of random delays, too."""
+LATE = (FIXED, "read_delay", "command_filter", "payload_inertia")
+"""What makes a joint late as random delays do in the mean: a search finds one of these in their place."""
+PROMISING = 2.0
+"""Error, in noise floors, that a model leaves at most through a first guess of random delays that are all it
+lacks: it left 1.1 where they were, 5 and more where something else was missing as well (our choice)."""
 HELPS = 0.95
 """Share of the error that a fixed delay, their mean, leaves at most where delays are random (our choice)."""
 MOST = 0.2
@@ -52,7 +57,7 @@ def try_random(
     Returns:
         The better model; what it has besides random delays, if it has these; and the evidence.
     """
-    if RANDOM not in search.candidates or RANDOM in search.vetoes:
+    if not _tried(search):
         return present, (), []
     random, beside, rows, left = with_random(search, baseline, present)
     others = [name for name in random.effects if name != RANDOM]
@@ -94,7 +99,7 @@ def at_once(search: "Selection", baseline: JointFit) -> tuple[JointFit, Veil] | 
     Returns:
         The model, and what the delays do to the samples.
     """
-    if search.veiled or not {RANDOM, FIXED} <= {*search.candidates} - {*search.vetoes}:
+    if not _tried(search) or FIXED not in {*search.candidates} - {*search.vetoes}:
         return None
     starts = search.starts(baseline, search.sized(baseline, FIXED))
     fixed = search.run([search.call(baseline, (FIXED,), starts, FULL_ITERATIONS)])[0]
@@ -109,21 +114,55 @@ def at_once(search: "Selection", baseline: JointFit) -> tuple[JointFit, Veil] | 
     return beside
 
 
+def in_place(search: "Selection", present: JointFit) -> tuple[JointFit, Veil] | None:
+    """Random delays in the place of what is late in a model of several effects, as :func:`at_once` has them.
+
+    A search that goes on from there adds what imitates their spread, motion by motion, and drops it again.
+
+    Args:
+        search: The search.
+        present: The model.
+    """
+    if not _tried(search) or len(present.effects) < 2 or search.white(present):
+        return None
+    for name in present.effects:
+        if name in LATE:
+            rest = search.refit(present, [other for other in present.effects if other != name])
+            if found := _spread(search, rest, rest, present, PROMISING * search.floor):
+                return found
+    return None
+
+
+def _tried(search: "Selection") -> bool:
+    """Whether random delays are among what a search may find."""
+    return not search.veiled and RANDOM in search.candidates and RANDOM not in search.vetoes
+
+
 def _spread(
-    search: "Selection", baseline: JointFit, rest: JointFit, fixed: JointFit
+    search: "Selection", baseline: JointFit, rest: JointFit, late: JointFit, promising: float = np.inf
 ) -> tuple[JointFit, Veil] | None:
-    """Random delays beside nothing but a model, as :func:`at_once` has them."""
+    """Random delays beside nothing but a model, as :func:`at_once` has them.
+
+    Args:
+        search: The search.
+        baseline: Model for the first guess.
+        rest: The model beside them.
+        late: The model without chance that they have to be likelier than.
+        promising: Error through the first guess from which no better one is looked for [rad].
+    """
 
     def through(veil: Veil) -> JointFit:
         return search.run([("fit", {**refit, "veil": veil})])[0]
 
     refit = {**search.call(rest, (), [rest.values], FULL_ITERATIONS)[1], "refits": 0}
     jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
+    if through(veil).rmse > promising:
+        return None
     for _ in range(VEILS):
         call = {"fit": through(veil), "scales": search.scales, "start": jitter}
         random, veil = search.run([("fit_jitter", call)])[0]
         jitter = random.values[SIGMA], random.values[DROP]
-        if not search.likelier(fixed, random) or jitter[1] > MOST:
+        if not search.likelier(late, random) or jitter[1] > MOST:
             return None
     return (random, veil) if through(veil).rmse < NO_GAP * search.floor else None
 
@@ -135,11 +174,11 @@ def as_random(search: "Selection", baseline: JointFit, loose: str) -> Explanatio
     than noise is left, or where they are not likelier than the plain model.
 
     Args:
-        search: Of the joint.
+        search: Of the joint; :attr:`~vd.gap.select.Selection.random` is what the other has.
         baseline: The plain model.
         loose: What of the baseline the motions leave open.
     """
-    if not search.random or RANDOM not in search.candidates or RANDOM in search.vetoes:
+    if not search.random[0] or not _tried(search):
         return None
     random, beside, rows, left = with_random(search, baseline, baseline)
     if left > NO_GAP * search.floor or not search.likelier(baseline, random):
@@ -167,14 +206,19 @@ def with_random(
     The arguments are those of :func:`try_random`. The last result is the error of the rest of the model, seen
     through what the delays do [rad]: the noise floor if it is right.
     """
-    known = at_once(search, baseline)
-    if known is None:
-        jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
-    else:
+    names, values = search.random
+    like = tuple(name for name in names if name != RANDOM)
+    lacking = like, {key: value for key, value in values.items() if not key.startswith(RANDOM)}
+    known = None if like else at_once(search, baseline) or in_place(search, present)
+    if known is not None:
         # Nearly all is known of them: there is no need to begin with less than the likeliest.
         jitter, veil = (known[0].values[SIGMA], known[0].values[DROP]), known[1]
+    else:
+        look = {"fit": baseline, "scales": search.scales}
+        look |= {"start": (values[SIGMA], values[DROP])} if like else {}
+        jitter, veil = search.run([("look", look)])[0]
     for _ in range(VEILS):
-        inner = behind(search, veil)
+        inner = replace(behind(search, veil), like=lacking)
         plain = inner.run([inner.plain(baseline)])[0]
         found = inner.explain(plain)
         clear = found.verdict in ("effects", "ambiguous")
@@ -211,7 +255,7 @@ def behind(search: "Selection", veil: Veil) -> "Selection":
         restarts=0,
         like=((), {}),
         changing=((), {}),
-        random=False,
+        random=((), {}),
         veiled=True,
         report=lambda line: search.report(f"beside {RANDOM}: {line}"),
         without={},

@@ -265,10 +265,12 @@ class JitterFit:
         )
 
 
-def look(problem: JointProblem, fit: JointFit, scales: Scales) -> tuple[tuple[float, float], Veil]:
-    """A first guess of the jitter of a model, and what it does to the samples."""
+def look(
+    problem: JointProblem, fit: JointFit, scales: Scales, start: tuple[float, float] | None = None
+) -> tuple[tuple[float, float], Veil]:
+    """A first guess of the jitter of a model, or what it starts from, and what it does to the samples."""
     jitter = JitterFit(problem, fit, scales)
-    values = jitter.guess()
+    values = jitter.guess() if start is None else start
     return values, jitter.veil(*values)
 
 

@@ -111,11 +111,13 @@ def explain_joints(
         # What is none of the table on one joint is none on the others, and what is chance on one is chance on
         # all: what is plain to see is enough there.
         unknown = any(found.verdict == "unknown" for _, found in explained)
-        random = any(RANDOM in found.final.effects for _, found in explained)
-        hidden = unknown or random
+        chance = (added(found.final) for _, found in explained if RANDOM in found.final.effects)
+        random = next(chance, ((), {}))
+        hidden = unknown or bool(random[0])
         rng = np.random.default_rng([seed, joint.spec.chain, joint.spec.joint])
         # Chance is none here where it was tried there and refused, not where too little was left to try it.
-        refused = any(row.name == RANDOM for _, found in explained for row in found.trials) and not random
+        refused = any(row.name == RANDOM for _, found in explained for row in found.trials)
+        refused = refused and not random[0]
         # Nor where another is explained without: commands go out together.
         refused = (unknown and refused) or any(steady(other, found) for other, found in explained)
         names = [n for n in candidates(chain, effects) if n != RANDOM or not refused]

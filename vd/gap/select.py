@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vd.gap.candidates import BETTER, HOPELESS, Call
-from vd.gap.chance import as_random, at_once, try_random
+from vd.gap.chance import as_random, at_once, in_place, try_random
 from vd.gap.clock import explain_weighted, swayed
 from vd.gap.consensus import as_another, as_changing
 from vd.gap.explanation import Accepted, Explanation, Trial
@@ -59,7 +59,7 @@ class Selection(Frictions):
         wide: Whether more is tried than the best starts and one effect after the other.
         like: What another joint of the finger certainly lacks: effects, and values by key.
         changing: The same of one whose friction changes over the recording: what comes nearest there.
-        random: Whether another joint of the finger has random delays.
+        random: The same of one that has random delays, these among the effects.
     """
 
     restarts: int = RESTARTS
@@ -67,7 +67,7 @@ class Selection(Frictions):
     wide: bool = True
     like: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
     changing: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
-    random: bool = False
+    random: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
 
     def explain(self, baseline: JointFit, start: tuple[JointFit, list[Trial]] | None = None) -> Explanation:
         """Select effects, starting from the fitted baseline.
@@ -129,10 +129,6 @@ class Selection(Frictions):
             if not earned:
                 self.report(f"taken back: {why}")
                 present, rivals = baseline, {}
-        behind = set(BEHIND_SENSOR) & set(self.vetoes) & set(self.candidates)
-        stale = any(len(fit.effects) != len(present.effects) for fits in rivals.values() for fit in fits)
-        if present.effects and (behind or stale or set(rivals) != set(present.effects)):
-            rivals = {name: self.rivals(present, name) for name in present.effects}
         beside: tuple[Accepted, ...] = ()
         # What is fitted well leaves none to chance, nor does a spring.
         fitted = self.finished(present) or self.white(present) or self.noise_only(present)
@@ -143,6 +139,11 @@ class Selection(Frictions):
                 present, rivals = chance, {}
                 if RANDOM not in present.effects:
                     present, rivals = self.revise(present)
+        behind = set(BEHIND_SENSOR) & set(self.vetoes) & set(self.candidates)
+        stale = any(len(fit.effects) != len(present.effects) for fits in rivals.values() for fit in fits)
+        named = present.effects and RANDOM not in present.effects
+        if named and (behind or stale or set(rivals) != set(present.effects)):
+            rivals = {name: self.rivals(present, name) for name in present.effects}
         together = self.as_an_offset(self.put_together(present))
         if together is not present:
             present = together
@@ -232,11 +233,13 @@ class Selection(Frictions):
             present = longer
             if (not grown and present is not start) or swayed(self, present) or self.too_coarse(present):
                 break
+            if in_place(self, present):
+                break
             if len(present.effects) > 1:
                 revised, rivals = self.revise(present)
                 settled = set(revised.effects) in (set(present.effects), begun)  # or back where it began
                 present = revised
-                if settled:
+                if settled or in_place(self, present):
                     break
             if not grown or self.finished(present) or self.a_spring(present):
                 break
@@ -341,7 +344,7 @@ class Selection(Frictions):
             rivals[name] = list(fits.values())
             self.added[frozenset(present.effects)] = (present, *fits.values())
             present = best
-            if self.finished(present) or swayed(self, present):
+            if self.finished(present) or swayed(self, present) or in_place(self, present):
                 break
             if self.too_coarse(present) or self.a_spring(present):
                 break
@@ -378,7 +381,9 @@ class Selection(Frictions):
         """Whether no other search would change what a model says."""
         if swayed(self, present):
             return True
-        return self.noise_only(present) or self.too_coarse(present) or self.a_spring(present)
+        if self.noise_only(present) or self.too_coarse(present) or self.a_spring(present):
+            return True
+        return in_place(self, present) is not None
 
     def a_spring(self, present: JointFit) -> bool:
         """Whether a model is near enough to stand for a cause that the table has not: it is no answer."""
