@@ -17,7 +17,8 @@ from vd.gap.fit import JointProblem
 from vd.gap.hide import Hiding, simulate_hidden
 from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import JointFit
-from vd.gap.joints import Joint, _beside, _in_turn, steady
+from vd.gap.joints import _in_turn
+from vd.gap.one_joint import Joint, beside, steady
 from vd.gap.result import Verdict
 from vd.gap.rollout import Rollouts
 from vd.gap.select import Selection
@@ -328,7 +329,7 @@ def test_a_finger_is_explained_from_its_tip_on_each_joint_beside_those_before() 
     found = _in_turn(joints, explained)
     assert [each.reason for each in found] == ["a1", "b1", "a2", "a3"]
     assert seen == {"a3": [], "a2": ["a3"], "a1": ["a3", "a2"], "b1": []}
-    rows = _beside(joints[2], list(zip(joints, found, strict=True)))
+    rows = beside(joints[2], list(zip(joints, found, strict=True)))
     chance = [servo.JITTER_SIGMA, servo.JITTER_DROP]
     assert rows[:, servo.KP].tolist() == [1.5, 0.5, 3.5] and not rows[[0, 2]][:, chance].any()
 

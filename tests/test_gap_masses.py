@@ -11,15 +11,16 @@ from test_gap_judge import made_up
 
 import vd.kernels.actuators as servo
 from vd.assets_usd.hands import load_hand
-from vd.gap import joints
+from vd.gap import finger_masses
 from vd.gap.chain import Chain, chains
 from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.design import design
 from vd.gap.explanation import Accepted, Explanation, intervals
+from vd.gap.finger_masses import masses_beside
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
-from vd.gap.joints import Joint, _beside_masses
 from vd.gap.masses import RANGE, Masses, fit_masses, widened, with_free_masses
+from vd.gap.one_joint import Joint
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Rollouts
 from vd.gap.team import Bench, JointSpec, Team
@@ -132,7 +133,7 @@ def beside_masses(
             final = problem.fit(plain.rows, own, [given], scales)
             accepted = tuple(Accepted(effect, 1.0, {}, (), (), False) for effect in own)
             found.append(Explanation(plain, final, "unknown", "structure is left", accepted))
-        return found, _beside_masses(team, every, found)
+        return found, masses_beside(team, every, found)
 
 
 @pytest.mark.parametrize(
@@ -174,9 +175,9 @@ def test_beside_other_masses_a_spring_is_no_load_with_an_offset(
     Nor is anything else where the masses are not others: it is not they that are the rest.
     """
     masses = Masses(np.array([1.0, 1.0 - off, 1.0]), np.full(3, NOISE), NO_STRUCTURE, np.zeros(3))
-    monkeypatch.setattr(joints, "fit_masses", lambda *_: masses)
-    monkeypatch.setattr(joints, "with_free_masses", lambda *_: [{}] * 3)
-    monkeypatch.setattr(joints, "_cores", lambda _: [("gravity_load", "encoder_bias")])
+    monkeypatch.setattr(finger_masses, "fit_masses", lambda *_: masses)
+    monkeypatch.setattr(finger_masses, "with_free_masses", lambda *_: [{}] * 3)
+    monkeypatch.setattr(finger_masses, "_cores", lambda _: [("gravity_load", "encoder_bias")])
     recording = blank()
     (chain,) = chains(recording, load_hand("dclaw3"))
     load, phase = 0.05, -1.3
@@ -201,7 +202,7 @@ def test_beside_other_masses_a_spring_is_no_load_with_an_offset(
         spec = JointSpec(0, index, *design(recording, chain, index), NOISE, ())
         own.append(Joint(name, spec, scales, replace(fit, effects=())))
         found.append(Explanation(own[-1].fit, fit, "unknown", "structure is left", accepted))
-    told = _beside_masses(team, own, found)  # type: ignore[arg-type]
+    told = masses_beside(team, own, found)  # type: ignore[arg-type]
     assert [each.verdict for each in told] == [verdict] * 3
 
 
@@ -250,8 +251,8 @@ def test_masses_name_one_of_a_set_only_where_it_alone_leaves_noise_with_them(
         structure = (NO_STRUCTURE[0], kept, NO_STRUCTURE[0])
         return Masses(np.array([1.1, 1.0, 1.0]), errors, structure, np.zeros(3))
 
-    monkeypatch.setattr(joints, "fit_masses", masses)
-    monkeypatch.setattr(joints, "with_free_masses", lambda *_: [{}] * 3)
+    monkeypatch.setattr(finger_masses, "fit_masses", masses)
+    monkeypatch.setattr(finger_masses, "with_free_masses", lambda *_: [{}] * 3)
     recording = blank()
     (chain,) = chains(recording, load_hand("dclaw3"))
 
@@ -268,8 +269,8 @@ def test_masses_name_one_of_a_set_only_where_it_alone_leaves_noise_with_them(
     specs = [JointSpec(0, index, *design(recording, chain, index), NOISE, ()) for index in range(3)]
     scales = Scales(1.0, 1.0, 2.0, 3.0, 10.0, 1e-3, 0.01, 6.0)
     own = [Joint(name, spec, scales, fit()) for name, spec in zip(JOINTS, specs, strict=True)]
-    monkeypatch.setattr(joints, "polished", lambda explanation, *_: explanation)
-    told = _beside_masses(team, own, found)  # type: ignore[arg-type]
+    monkeypatch.setattr(finger_masses, "polished", lambda explanation, *_: explanation)
+    told = masses_beside(team, own, found)  # type: ignore[arg-type]
     assert told[1:] == found[1:]
     assert [one.name for one in told[0].accepted if one.named] == ([named] if named else [])
     assert (told[0] is gap) == (not named)

@@ -18,10 +18,9 @@ from vd.gap.assemble import curves
 from vd.gap.chain import chains
 from vd.gap.crowd import Crowd
 from vd.gap.design import design
-from vd.gap.joints import parallel
 from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.statistics import noise_floor
-from vd.gap.team import Bench, Call, JointSpec, Team
+from vd.gap.team import Bench, Call, JointSpec, Team, parallel
 from vd.gap.workflow import baseline_of
 
 EFFECTS = ("coulomb_friction", "backlash", "load_friction")

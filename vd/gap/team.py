@@ -5,7 +5,7 @@ import multiprocessing
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -224,3 +224,13 @@ class Team:
             return self.bench.call(spec, call)
         finally:
             self.bench.crowd.leave()
+
+
+def parallel(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """Results in order; threads, since the work waits for processes."""
+    pool = ThreadPoolExecutor(max(len(items), 1))
+    try:
+        return list(pool.map(work, items))
+    finally:
+        # Nobody waits for the others after a failure or Ctrl-C: they end with the team's processes.
+        pool.shutdown(wait=False, cancel_futures=True)

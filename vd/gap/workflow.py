@@ -27,12 +27,13 @@ from vd.gap.design import design, pieces
 from vd.gap.explanation import Explanation
 from vd.gap.find import findings
 from vd.gap.joint_fit import JointFit
-from vd.gap.joints import POLISH_ITERATIONS, REFITS, Joint, Progress, explain_joints, parallel
+from vd.gap.joints import explain_joints
+from vd.gap.one_joint import POLISH_ITERATIONS, REFITS, Joint, Progress
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S
 from vd.gap.statistics import noise_floor
-from vd.gap.team import Bench, JointSpec, Team
+from vd.gap.team import Bench, JointSpec, Team, parallel
 from vd.kernels.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"

@@ -1,0 +1,220 @@
+"""Explain one joint of a finger, knowing what the others of it have been found to lack."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
+from vd.gap.chain import candidates, others_in
+from vd.gap.chance import FIXED, as_random
+from vd.gap.clock import explain_weighted, swayed
+from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
+from vd.gap.explanation import Explanation, added, lacking
+from vd.gap.joint_fit import JointFit
+from vd.gap.judge import EXPLAINED, RANDOM
+from vd.gap.recording import Recording
+from vd.gap.select import LOOKS, RESTARTS, Selection
+from vd.gap.sketch import outline, sketched
+from vd.gap.statistics import resamples
+from vd.gap.team import JointSpec, Team
+from vd.gap.telemetry import vetoes
+from vd.gap.warming import middles
+from vd.kernels.effects import EFFECTS
+
+POLISH_ITERATIONS = 5
+"""Steps of a fit that has to follow small changes of the other joints."""
+REFITS = 3
+"""Steps of Levenberg-Marquardt of each refit without a fold."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """A joint under analysis: its data and its baseline."""
+
+    name: str
+    spec: JointSpec
+    scales: Scales
+    fit: JointFit
+
+
+Explained = list[tuple[Joint, Explanation]]
+"""Joints, and what they lack."""
+
+
+@dataclass(eq=False)
+class Explainer:
+    """Explains joints, one at a time.
+
+    Attributes:
+        team: Who fits.
+        joints: All joints with their plain models.
+        recording: The recording.
+        effects: Effects to consider.
+        seed: Of everything random.
+        progress: Called with lines of progress.
+        rough: Rough models of joints that are not explained yet, by chain.
+    """
+
+    team: Team
+    joints: Sequence[Joint]
+    recording: Recording
+    effects: Sequence[str]
+    seed: int
+    progress: Progress
+    rough: dict[int, dict[Joint, JointFit]] = field(default_factory=dict)
+
+    @cached_property
+    def when(self) -> np.ndarray:
+        """When each trajectory was recorded (:func:`vd.gap.warming.middles`)."""
+        return middles(self.recording)
+
+    def explain(self, joint: Joint, explained: Explained, own: Explanation | None = None) -> Explanation:
+        """What a joint lacks.
+
+        Args:
+            joint: The joint.
+            explained: Joints of its finger that are explained already.
+            own: What it was found to lack before random delays were found on another: only these are tried.
+        """
+        selection = self.selection(joint, explained)
+        baseline = self.plain(joint, explained)
+        if own is not None:
+            return as_random(selection, baseline, selection.undetermined(baseline)) or own
+        found = None if explained else outline(selection, baseline)
+        if found is not None:
+            self.sketch(joint, found)
+            baseline = self.plain(joint, explained)
+            (found,) = selection.run(
+                [selection.call(baseline, found.effects, [found.values], FULL_ITERATIONS)]
+            )
+        veil = None if found is None else swayed(selection, found)
+        result = explain_weighted(selection, baseline, veil) if veil else selection.explain(baseline)
+        self.progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
+        return result
+
+    def selection(self, joint: Joint, explained: Explained) -> Selection:
+        """The search for what a joint lacks, with what the others of its finger say of it."""
+        chain, spec = self.team.bench.chains[joint.spec.chain], joint.spec
+        column = int(chain.columns[spec.joint])
+        chance = (added(found.final) for _, found in explained if RANDOM in found.final.effects)
+        random = next(chance, ((), {}))
+        # What is none of the table on one joint is none on the others, and what is chance on one is chance on
+        # all: what is plain to see is enough there.
+        hidden = bool(random[0]) or any(found.verdict == "unknown" for _, found in explained)
+        names = candidates(chain, self.effects)
+        if _no_chance(explained):
+            names = [name for name in names if name != RANDOM]
+        told = vetoes(self.recording, chain, spec, joint.fit.rows)
+        pairs = alike(self.effects, self.recording.model).items()
+        same = {name: others for name, others in pairs if not {name, *others} & set(told)}
+        rng = np.random.default_rng([self.seed, spec.chain, spec.joint])
+        return Selection(
+            run=lambda calls: self.team.run(spec, calls),
+            joint=spec.joint,
+            others=others_in(chain, spec.joint),
+            candidates=names,
+            equivalent=same,
+            seed=self.seed,
+            nominal={
+                key: float(chain.start_row[spec.joint, BASELINE_PARAMETERS[key].column])
+                for key in spec.baseline
+            },
+            floor=spec.floor,
+            scales=joint.scales,
+            weights=resamples(len(spec.trajectories), rng),
+            refits=REFITS,
+            restarts=0 if hidden else RESTARTS,
+            looks=0 if hidden else LOOKS,
+            vetoes={**stood_for(same), **told},
+            report=lambda line: self.progress(f"explain: {joint.name}: {line}"),
+            rest=rest(self.recording, column, spec.trajectories),
+            moves=moves(self.recording, column, spec.trajectories),
+            when=self.when[list(spec.trajectories)],
+            like=next((like for _, found in explained if (like := lacking(found))[0]), ((), {})),
+            changing=next((added(found.final) for _, found in explained if found.warms), ((), {})),
+            random=random,
+        )
+
+    def plain(self, joint: Joint, explained: Explained) -> JointFit:
+        """The plain model, fitted again beside joints of which more is known than theirs."""
+        rows = beside(joint, explained)
+        known = {joint, *(other for other, _ in explained)}
+        for other, model in self.rough.get(joint.spec.chain, {}).items():
+            if other not in known:
+                rows[other.spec.joint] = model.rows[other.spec.joint]
+        if np.array_equal(rows, joint.fit.rows):
+            return joint.fit
+        call = {"base": rows, "effects": (), "starts": [{}], "scales": joint.scales}
+        call |= {"iterations": POLISH_ITERATIONS, "refits": REFITS}
+        return self.team.run(joint.spec, [("fit", call)])[0]
+
+    def sketch(self, joint: Joint, found: JointFit) -> None:
+        """Take rough models of the other joints of a finger, beside a rough one of its first."""
+
+        def fit(other: Joint, effects: tuple[str, ...], values: Mapping[str, float]) -> JointFit:
+            rows = other.fit.rows.copy()
+            rows[joint.spec.joint] = found.rows[joint.spec.joint]
+            call = {"base": rows, "effects": effects, "starts": [values], "scales": other.scales}
+            return self.team.run(other.spec, [("fit", {**call, "iterations": FULL_ITERATIONS})])[0]
+
+        others = {j.name: j for j in self.joints if j.spec.chain == joint.spec.chain and j is not joint}
+        fits = {name: partial(fit, other) for name, other in others.items()}
+        models = sketched(found, {name: other.fit for name, other in others.items()}, fits)
+        self.rough[joint.spec.chain] = {others[name]: model for name, model in models.items()}
+        if models:
+            names = " and ".join(models)
+            self.progress(f"explain: {names}: roughly with {' and '.join(found.effects)} as well")
+
+
+def _no_chance(explained: Explained) -> bool:
+    """Whether random delays are none on a joint, by what is known of the others of its finger.
+
+    Not where they were tried there and refused (too little may have been left to try them), nor where another
+    is explained without: commands go out together.
+    """
+    unknown = any(found.verdict == "unknown" for _, found in explained)
+    random = any(RANDOM in found.final.effects for _, found in explained)
+    tried = any(row.name == RANDOM for _, found in explained for row in found.trials)
+    refused = unknown and tried and not random
+    return refused or any(steady(other, found) for other, found in explained)
+
+
+def steady(joint: Joint, explanation: Explanation) -> bool:
+    """Whether a joint is explained down to noise with neither random delays nor a fixed one, their mean."""
+    final = explanation.final
+    return (
+        explanation.verdict == "effects"
+        and not {RANDOM, FIXED} & {*final.effects}
+        and final.rmse < EXPLAINED * joint.spec.floor
+    )
+
+
+def beside(joint: Joint, explained: Explained) -> np.ndarray:
+    """Rows of a joint's chain with its plain model, the others as they were found to be, chance aside."""
+    rows = joint.fit.rows.copy()
+    for other, found in explained:
+        if other is not joint and other.spec.chain == joint.spec.chain and found.final.effects:
+            rows[other.spec.joint] = found.final.rows[other.spec.joint]
+            for parameter in EFFECTS[RANDOM].parameters:
+                rows[other.spec.joint, parameter.column] = parameter.neutral
+    return rows
+
+
+def seen(found: Explanation) -> dict[str, Any]:
+    """What the samples of an explained joint are to be seen through, as an argument of a call."""
+    return {} if found.veil is None else {"veil": found.veil}
+
+
+def rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:
+    """Where a joint begins most of its motions [rad]."""
+    return float(np.median([recording.trajectories[i].position[0, column] for i in trajectories]))
+
+
+def moves(recording: Recording, column: int, trajectories: Sequence[int]) -> np.ndarray:
+    """Whether a joint's command changes in each trajectory [S]."""
+    return np.array([bool(np.ptp(recording.trajectories[i].command[:, column])) for i in trajectories])
