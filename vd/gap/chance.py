@@ -25,7 +25,8 @@ LATE = (FIXED, "read_delay", "command_filter", "payload_inertia")
 """What makes a joint late as random delays do in the mean: a search finds one of these in their place."""
 PROMISING = 2.0
 """Error, in noise floors, that a model leaves at most through a first guess of random delays that are all it
-lacks: it left 1.1 where they were, 5 and more where something else was missing as well (our choice)."""
+lacks (our choice): 1.1 where they were, 5.4 where friction was missing as well, on one recording
+(docs/results/gap.md, seed 14048)."""
 HELPS = 0.95
 """Share of the error that a fixed delay, their mean, leaves at most where delays are random (our choice)."""
 MOST = 0.2
@@ -204,11 +205,12 @@ def with_random(
     """The model with random delays, what is named beside them, and the evidence for that.
 
     The arguments are those of :func:`try_random`. The last result is the error of the rest of the model, seen
-    through what the delays do [rad]: the noise floor if it is right.
+    through what the delays do [rad]: the noise floor if it is right. What another joint of the finger has
+    beside random delays is tried first, and its delays are where the search begins.
     """
     names, values = search.random
     like = tuple(name for name in names if name != RANDOM)
-    lacking = like, {key: value for key, value in values.items() if not key.startswith(RANDOM)}
+    beside_them = like, {key: value for key, value in values.items() if not key.startswith(RANDOM)}
     known = None if like else at_once(search, baseline) or in_place(search, present)
     if known is not None:
         # Nearly all is known of them: there is no need to begin with less than the likeliest.
@@ -218,7 +220,7 @@ def with_random(
         look |= {"start": (values[SIGMA], values[DROP])} if like else {}
         jitter, veil = search.run([("look", look)])[0]
     for _ in range(VEILS):
-        inner = replace(behind(search, veil), like=lacking)
+        inner = replace(behind(search, veil), like=beside_them)
         plain = inner.run([inner.plain(baseline)])[0]
         found = inner.explain(plain)
         clear = found.verdict in ("effects", "ambiguous")

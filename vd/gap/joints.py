@@ -15,38 +15,24 @@ from vd.gap.finger_masses import masses_alone, masses_beside
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import RANDOM
 from vd.gap.masses import widened
-from vd.gap.one_joint import REFITS, Explained, Explainer, Joint, Progress, beside, seen
-from vd.gap.recording import Recording
+from vd.gap.one_joint import REFITS, Explained, Explainer, Joint, beside, seen
 from vd.gap.team import Team, parallel
 
 
-def explain_joints(
-    team: Team,
-    joints: Sequence[Joint],
-    recording: Recording,
-    *,
-    effects: Sequence[str],
-    seed: int,
-    progress: Progress,
-) -> list[Explanation]:
+def explain_joints(explainer: Explainer) -> list[Explanation]:
     """What every joint lacks.
 
     Args:
-        team: Who fits.
-        joints: The joints with their plain models.
-        recording: The recording.
-        effects: Effects to consider.
-        seed: Of everything random.
-        progress: Called with lines of progress.
+        explainer: Explains one.
     """
+    team, joints = explainer.team, explainer.joints
     masses = masses_alone(team, joints)
-    explainer = Explainer(team, joints, recording, effects, seed, progress)
 
     def one(joint: Joint, explained: Explained, own: Explanation | None = None) -> Explanation:
         if joint.spec.chain not in masses:
             return explainer.explain(joint, explained, own)
         text = f"the plain model is within the noise floor {masses[joint.spec.chain].text}"
-        progress(f"explain: {joint.name}: no_gap: {text}")
+        explainer.progress(f"explain: {joint.name}: no_gap: {text}")
         return Explanation(joint.fit, joint.fit, "no_gap", text)
 
     floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))

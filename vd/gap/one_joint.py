@@ -52,17 +52,15 @@ class Explainer:
 
     Attributes:
         team: Who fits.
-        joints: All joints with their plain models.
-        recording: The recording.
+        joints: All joints of the recording, with their plain models.
         effects: Effects to consider.
         seed: Of everything random.
         progress: Called with lines of progress.
-        rough: Rough models of joints that are not explained yet, by chain.
+        rough: Rough models of joints that are not explained yet, by chain: each has a thread of its own.
     """
 
     team: Team
     joints: Sequence[Joint]
-    recording: Recording
     effects: Sequence[str]
     seed: int
     progress: Progress
@@ -71,7 +69,7 @@ class Explainer:
     @cached_property
     def when(self) -> np.ndarray:
         """When each trajectory was recorded (:func:`vd.gap.warming.middles`)."""
-        return middles(self.recording)
+        return middles(self.team.bench.recording)
 
     def explain(self, joint: Joint, explained: Explained, own: Explanation | None = None) -> Explanation:
         """What a joint lacks.
@@ -100,6 +98,7 @@ class Explainer:
     def selection(self, joint: Joint, explained: Explained) -> Selection:
         """The search for what a joint lacks, with what the others of its finger say of it."""
         chain, spec = self.team.bench.chains[joint.spec.chain], joint.spec
+        recording = self.team.bench.recording
         column = int(chain.columns[spec.joint])
         chance = (added(found.final) for _, found in explained if RANDOM in found.final.effects)
         random = next(chance, ((), {}))
@@ -109,8 +108,8 @@ class Explainer:
         names = candidates(chain, self.effects)
         if _no_chance(explained):
             names = [name for name in names if name != RANDOM]
-        told = vetoes(self.recording, chain, spec, joint.fit.rows)
-        pairs = alike(self.effects, self.recording.model).items()
+        told = vetoes(recording, chain, spec, joint.fit.rows)
+        pairs = alike(self.effects, recording.model).items()
         same = {name: others for name, others in pairs if not {name, *others} & set(told)}
         rng = np.random.default_rng([self.seed, spec.chain, spec.joint])
         return Selection(
@@ -132,8 +131,8 @@ class Explainer:
             looks=0 if hidden else LOOKS,
             vetoes={**stood_for(same), **told},
             report=lambda line: self.progress(f"explain: {joint.name}: {line}"),
-            rest=rest(self.recording, column, spec.trajectories),
-            moves=moves(self.recording, column, spec.trajectories),
+            rest=rest(recording, column, spec.trajectories),
+            moves=moves(recording, column, spec.trajectories),
             when=self.when[list(spec.trajectories)],
             like=next((like for _, found in explained if (like := lacking(found))[0]), ((), {})),
             changing=next((added(found.final) for _, found in explained if found.warms), ((), {})),
@@ -174,8 +173,8 @@ class Explainer:
 def _no_chance(explained: Explained) -> bool:
     """Whether random delays are none on a joint, by what is known of the others of its finger.
 
-    Not where they were tried there and refused (too little may have been left to try them), nor where another
-    is explained without: commands go out together.
+    They are none where they were tried on one and refused, not where too little was left there to try them;
+    and where another is explained without, as commands go out together.
     """
     unknown = any(found.verdict == "unknown" for _, found in explained)
     random = any(RANDOM in found.final.effects for _, found in explained)

@@ -28,7 +28,7 @@ from vd.gap.explanation import Explanation
 from vd.gap.find import findings
 from vd.gap.joint_fit import JointFit
 from vd.gap.joints import explain_joints
-from vd.gap.one_joint import POLISH_ITERATIONS, REFITS, Joint, Progress
+from vd.gap.one_joint import POLISH_ITERATIONS, REFITS, Explainer, Joint, Progress
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S
@@ -177,9 +177,7 @@ def explain(
     answers = Answers(out / FOLDER, key)
     with _team(recording, hand, chosen, answers) as team:
         joints = _resume(team, _specs(recording, team.bench.chains), known["joints"])
-        explained = explain_joints(
-            team, joints, recording, effects=chosen.effects, seed=chosen.seed, progress=progress
-        )
+        explained = explain_joints(Explainer(team, joints, chosen.effects, chosen.seed, progress))
         analysed = [
             Analysed(j.name, j.spec, replace_baseline(e, j.fit), j.scales)
             for j, e in zip(joints, explained, strict=True)
