@@ -11,9 +11,10 @@ from test_gap_select import searching
 from vd.gap import chance
 from vd.gap.chance import DROP, SIGMA, behind, with_random
 from vd.gap.coordinates import Coordinate, Scales
-from vd.gap.explanation import Accepted, Explanation, Trial, added
+from vd.gap.explanation import Accepted, Explanation, Trial, added, by_chance
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import Judge
+from vd.gap.result import Verdict
 from vd.gap.select import Selection
 from vd.gap.statistics import resamples
 from vd.gap.veil import Veil
@@ -206,6 +207,36 @@ def test_beside_the_chance_of_another_joint_what_that_joint_lacks_is_tried_first
         with_random(replace(selection, random=added(other)), baseline, baseline)
     assert started == [(0.003, 0.1)], "commands of a finger go out together"
     assert searched == [(("coulomb_friction",), {"coulomb_friction.tau_c_nm": 0.02})]
+
+
+@pytest.mark.parametrize(
+    ("tied", "verdict", "beside"),
+    [
+        ((), "effects", True),
+        (("encoder_bias",), "effects", False),
+        ((), "ambiguous", False),
+    ],
+    ids=["named", "one of a set", "ambiguous"],
+)
+def test_another_joint_takes_beside_chance_only_what_is_sure(
+    tied: tuple[str, ...], verdict: Verdict, beside: bool
+) -> None:
+    keys = ("coulomb_friction.tau_c_nm", SIGMA, DROP)
+    final = replace(
+        made_up(("coulomb_friction", "command_jitter"), FLOOR),
+        coordinates=tuple(Coordinate(key, 0, False, 1.0, 0.0, 9.0) for key in keys),
+        x=np.array([0.02, 0.003, 0.1]),
+    )
+    accepted = (
+        Accepted("command_jitter", 1.0, {}, (), (), False),
+        Accepted("coulomb_friction", 1.0, {}, (), tied, False),
+    )
+    effects, values = by_chance(Explanation(made_up((), 0.02), final, verdict, "", accepted))
+    assert {SIGMA: 0.003, DROP: 0.1}.items() <= values.items(), "commands of a finger go out together"
+    assert ("coulomb_friction" in effects) == ("coulomb_friction.tau_c_nm" in values) == beside
+    assert "command_jitter" in effects
+    steady = replace(final, effects=("coulomb_friction",))
+    assert by_chance(Explanation(steady, steady, "effects", "", accepted[1:])) == ((), {})
 
 
 @pytest.mark.parametrize(("left", "found"), [(1.0, True), (1.4, False)])

@@ -205,8 +205,8 @@ def with_random(
     """The model with random delays, what is named beside them, and the evidence for that.
 
     The arguments are those of :func:`try_random`. The last result is the error of the rest of the model, seen
-    through what the delays do [rad]: the noise floor if it is right. What another joint of the finger has
-    beside random delays is tried first, and its delays are where the search begins.
+    through what the delays do [rad]: the noise floor if it is right. What another joint of the finger is sure
+    to have beside random delays is tried first, and its delays are where the search begins.
     """
     names, values = search.random
     like = tuple(name for name in names if name != RANDOM)
@@ -217,7 +217,7 @@ def with_random(
         jitter, veil = (known[0].values[SIGMA], known[0].values[DROP]), known[1]
     else:
         look = {"fit": baseline, "scales": search.scales}
-        look |= {"start": (values[SIGMA], values[DROP])} if like else {}
+        look |= {"start": (values[SIGMA], values[DROP])} if names else {}
         jitter, veil = search.run([("look", look)])[0]
     for _ in range(VEILS):
         inner = replace(behind(search, veil), like=beside_them)

@@ -109,9 +109,27 @@ def added(fit: JointFit) -> tuple[tuple[str, ...], dict[str, float]]:
     return fit.effects, {key: value for key, value in fit.values.items() if "." in key}
 
 
+def _certain(explanation: Explanation) -> bool:
+    """Whether every effect of the final model is the answer rather than one of a set."""
+    return explanation.verdict == "effects" and all(one.named for one in explanation.accepted)
+
+
 def lacking(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
     """The effects that a joint is certain to lack, and their values by key; none where it is not."""
-    certain = explanation.verdict == "effects" and all(one.named for one in explanation.accepted)
-    if not certain or RANDOM in explanation.final.effects:
+    if not _certain(explanation) or RANDOM in explanation.final.effects:
         return (), {}
     return added(explanation.final)
+
+
+def by_chance(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
+    """The random delays of a joint and what it is certain to lack beside them, and their values by key.
+
+    None where it has none. One of a set is no certainty: another joint has to search for itself, or the first
+    one's luck among several that fit alike would be the answer of all.
+    """
+    effects, values = added(explanation.final)
+    if RANDOM not in effects:
+        return (), {}
+    if _certain(explanation):
+        return effects, values
+    return (RANDOM,), {key: value for key, value in values.items() if key.startswith(f"{RANDOM}.")}

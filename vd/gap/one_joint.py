@@ -12,7 +12,7 @@ from vd.gap.chain import candidates, others_in
 from vd.gap.chance import FIXED, as_random
 from vd.gap.clock import explain_weighted, swayed
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.explanation import Explanation, added, lacking
+from vd.gap.explanation import Explanation, added, by_chance, lacking
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import EXPLAINED, RANDOM
 from vd.gap.recording import Recording
@@ -100,8 +100,7 @@ class Explainer:
         chain, spec = self.team.bench.chains[joint.spec.chain], joint.spec
         recording = self.team.bench.recording
         column = int(chain.columns[spec.joint])
-        chance = (added(found.final) for _, found in explained if RANDOM in found.final.effects)
-        random = next(chance, ((), {}))
+        random = next((like for _, found in explained if (like := by_chance(found))[0]), ((), {}))
         # What is none of the table on one joint is none on the others, and what is chance on one is chance on
         # all: what is plain to see is enough there.
         hidden = bool(random[0]) or any(found.verdict == "unknown" for _, found in explained)

@@ -59,7 +59,7 @@ class Selection(Frictions):
         wide: Whether more is tried than the best starts and one effect after the other.
         like: What another joint of the finger certainly lacks: effects, and values by key.
         changing: The same of one whose friction changes over the recording: what comes nearest there.
-        random: The same of one that has random delays, these among the effects.
+        random: The same of one that has random delays, these among the effects: what is sure beside them.
     """
 
     restarts: int = RESTARTS
