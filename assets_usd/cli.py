@@ -50,9 +50,10 @@ class Objects:
 class Import:
     """Import meshes (OBJ, STL, PLY, GLB): repair, scale, decompose, one USD per object.
 
-    Units are guessed (m, mm or cm, whichever needs the least rescaling); a longest side outside
-    0.095-0.165 m is scaled to the nearer bound. An import that was interrupted goes on where it
-    stopped. The exit status is 1 if any mesh was refused.
+    Units are guessed (m, mm or cm, whichever needs the least rescaling). A mesh is scaled as little as
+    makes it fit the hand: longest side 0.095-0.165 m, mean width at most 0.13 m, shortest side at least
+    0.025 m where the others let it. An import that was interrupted goes on where it stopped. The exit
+    status is 1 if any mesh was refused.
     """
 
     paths: tyro.conf.Positional[tuple[Path, ...]]

@@ -212,22 +212,39 @@ def _workers(parent: int) -> list[int]:
 
 
 @pytest.mark.parametrize(
-    ("longest", "side", "note"),
+    ("sides", "scaled", "note"),
     [
-        (0.12, 0.12, ""),
-        (0.095, 0.095, ""),
-        (0.05, 0.095, "scaled by 1.9"),
-        (0.33, 0.165, "scaled by 0.5"),
-        (120.0, 0.12, "taken as mm"),
-        (12.0, 0.12, "taken as cm"),
-        (250.0, 0.165, "taken as mm, scaled"),
-        (2.0, 0.095, "taken as cm, scaled"),
+        ((0.12, 0.08, 0.05), (0.12, 0.08, 0.05), ""),
+        ((0.095, 0.095, 0.095), (0.095, 0.095, 0.095), ""),
+        ((0.03, 0.05, 0.04), (0.057, 0.095, 0.076), "scaled by 1.9"),
+        ((0.08, 0.33, 0.06), (0.04, 0.165, 0.03), "scaled by 0.5"),
+        ((120.0, 80.0, 50.0), (0.12, 0.08, 0.05), "taken as mm"),
+        ((12.0, 8.0, 5.0), (0.12, 0.08, 0.05), "taken as cm"),
+        ((250.0, 50.0, 50.0), (0.165, 0.033, 0.033), "taken as mm, scaled"),
+        ((2.0, 1.0, 1.0), (0.095, 0.0475, 0.0475), "taken as cm, scaled"),
+        ((0.16, 0.12, 0.04), (0.13, 0.0975, 0.0325), "scaled by 0.812"),  # too wide for the fingers
+        ((0.12, 0.12, 0.12), (0.095, 0.095, 0.095), "scaled by 0.792"),  # which is as far as its length goes
+        ((0.1, 0.03, 0.02), (0.125, 0.0375, 0.025), "scaled by 1.25"),  # too thin to be got hold of
+        ((0.15, 0.03, 0.02), (0.165, 0.033, 0.022), "scaled by 1.1"),  # which is as far as its length goes
+        ((0.12, 0.1, 0.02), (0.13, 0.10833, 0.02167), "scaled by 1.08"),  # or its width
     ],
 )
-def test_scaling_rule(longest: float, side: float, note: str):
-    factor, words = m.choose_scale(longest)
-    assert longest * factor == pytest.approx(side)
+def test_meshes_are_scaled_to_fit_the_hand(
+    sides: tuple[float, ...], scaled: tuple[float, ...], note: str
+) -> None:
+    width = m.mean_width(trimesh.creation.box(sides).vertices)
+    assert width == pytest.approx(sum(sides) / 2)
+    factor, words = m.choose_scale(sides, width)
+    assert np.asarray(sides) * factor == pytest.approx(scaled, rel=1e-3)
     assert words.startswith(note) and bool(words) == bool(note)
+
+
+def test_the_mean_width_of_points_is_that_of_their_hull() -> None:
+    points = np.random.default_rng(0).normal(size=(200, 3)) * (0.05, 0.03, 0.02)
+    towards = np.random.default_rng(1).normal(size=(20000, 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    expected = np.ptp(points @ towards.T, axis=0).mean()
+    assert m.mean_width(points) == pytest.approx(expected, rel=0.01)
 
 
 def test_repair_closes_and_turns_a_mesh():

@@ -26,13 +26,14 @@ from vd.assets_usd.objects.meshes import (
     check_file,
     choose_scale,
     load_mesh,
+    mean_width,
     repair_mesh,
     solid_of,
 )
 from vd.assets_usd.objects.model import SURFACE_POINTS, build_model, read_hash, read_object, write_object
 from vd.files import atomic_path
 
-IMPORT_VERSION = 3
+IMPORT_VERSION = 4
 """Part of every content hash: raise it when the import computes something else."""
 
 MAX_VISUAL_FACES = 3000
@@ -230,7 +231,7 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     """
     mesh = repair_mesh(load_mesh(Path(job.source)))
     notes = list(mesh.notes)
-    scale, note = choose_scale(float(np.ptp(mesh.vertices, axis=0).max()))
+    scale, note = choose_scale(np.ptp(mesh.vertices, axis=0), mean_width(mesh.vertices))
     if note:
         notes.append(note)
     mesh = mesh.scaled(scale)
