@@ -36,6 +36,9 @@ from vd.files import atomic_path
 IMPORT_VERSION = 4
 """Part of every content hash: raise it when the import computes something else."""
 
+DECOMPOSITION_VERSION = 3
+"""Part of the key of every cached decomposition: raise it when the parts of the same scaled mesh differ."""
+
 MAX_VISUAL_FACES = 3000
 """Faces of the visual mesh: files stay below 40 kB, and no picture here shows more."""
 
@@ -240,7 +243,7 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
         raise MeshError("degenerate: encloses no volume")
 
     key = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes())
-    key.update(json.dumps([IMPORT_VERSION, asdict(settings.decompose)], sort_keys=True).encode())
+    key.update(json.dumps([DECOMPOSITION_VERSION, asdict(settings.decompose)], sort_keys=True).encode())
     cache = Path(settings.cache) / f"{key.hexdigest()}.npz" if settings.cache else None
     whole = 0 < len(mesh.pieces) <= settings.decompose.max_hulls
     cached = None if whole or cache is None else _cached_hulls(cache)

@@ -33,7 +33,8 @@ a policy brought 22 % to their goals, of the others 92 % (docs/results/runs.md).
 THINNEST_M = 0.025
 """Least of the shortest side, as far as the other bounds let it be (our choice).
 
-What is thinner lies flat on the table, where no finger gets under it: 49 % came to their goals.
+What is thinner lies flat on the table, where no finger gets under it: of eight such objects the same policy
+brought 49 % to their goals (docs/results/runs.md).
 """
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
@@ -184,11 +185,14 @@ def mean_width(vertices: np.ndarray) -> float:
     sum of its sides for a box.
 
     Args:
-        vertices: Points, not all in a plane [V, 3].
+        vertices: Points in any unit and frame, not all in a plane [V, 3].
+
+    Returns:
+        The mean width in the points' unit.
     """
     import trimesh
 
-    return float(trimesh.Trimesh(vertices, process=False).convex_hull.integral_mean_curvature / (2.0 * np.pi))
+    return float(trimesh.convex.convex_hull(vertices).integral_mean_curvature / (2.0 * np.pi))
 
 
 def choose_scale(sides: Sequence[float], width: float) -> tuple[float, str]:
@@ -201,7 +205,7 @@ def choose_scale(sides: Sequence[float], width: float) -> tuple[float, str]:
     unit (m, mm, cm) is the one that needs the least rescaling.
 
     Args:
-        sides: Sides of the bounding box in the mesh's units, in any order [3].
+        sides: Sides of the bounding box in the mesh's units, in any order, none of them 0 [3].
         width: :func:`mean_width` in the mesh's units.
 
     Returns:
@@ -211,8 +215,7 @@ def choose_scale(sides: Sequence[float], width: float) -> tuple[float, str]:
     longest, shortest = float(max(sides)), float(min(sides))
     least = low / longest
     most = max(min(high / longest, MEAN_WIDTH_M / width), least)
-    if shortest > 0.0:
-        least = min(max(least, THINNEST_M / shortest), most)
+    least = min(max(least, THINNEST_M / shortest), most)
 
     def fitting(unit: float) -> float:
         return float(np.clip(unit, least, most))

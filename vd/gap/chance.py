@@ -26,7 +26,7 @@ LATE = (FIXED, "read_delay", "command_filter", "payload_inertia")
 PROMISING = 2.0
 """Error, in noise floors, that a model leaves at most through a first guess of random delays that are all it
 lacks (our choice): 1.1 where they were, 5.4 where friction was missing as well, on one recording
-(docs/results/gap.md, seed 14048)."""
+(docs/results/gap-log.md, seed 14048)."""
 HELPS = 0.95
 """Share of the error that a fixed delay, their mean, leaves at most where delays are random (our choice)."""
 MOST = 0.2
