@@ -18,6 +18,7 @@ from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_teacher
 from vd.evaluate.statistics import symmetric_error
+from vd.evaluate.trace import Trace
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import LEAN, NoiseCfg, StudentCfg
 from vd.student.saved import load_student, read_student
@@ -221,7 +222,7 @@ def test_another_network_or_no_teacher_is_explained(tmp_path, stage, capsys):
 
 
 @pytest.mark.slow
-def test_stages_on_the_command_line(tmp_path, capsys):
+def test_stages_on_the_command_line(tmp_path, capsys, monkeypatch):
     """Stage 1 by imitation of an installed teacher, stage 2 from it, resumed; then its stopping rule."""
     small = ["--preset", "cpu-demo", "--num-worlds", "2", "--dagger.rollout-steps", "3", "--no-tensorboard"]
     small += ["--dagger.validation-worlds", "1"]
@@ -255,6 +256,24 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     spec = load_student(path).spec
     assert spec.stopping.distance_rad == rule["distance_rad"] and "2 episodes" in spec.calibrated_on
     assert read_student(path)["iter"] == 2
+    _check_calibration_in_air(path, monkeypatch)
+
+
+def _check_calibration_in_air(path, monkeypatch):
+    """The table goes when that of the paper's in-air test does, and the file says so."""
+    asked = []
+
+    def spy(env, actor, episodes, *, table_steps):
+        asked.append((table_steps, env.max_episode_steps))
+        seen = np.zeros((1, 2, 4))
+        none, turn = np.zeros((1, 2), dtype=bool), np.zeros((1, 2, 4))
+        norms = np.linspace(1.0, 0.0, seen.size).reshape(seen.shape)
+        return Trace(turn, turn, seen, seen, norms, seen, np.full((1, 2), 3), none)
+
+    monkeypatch.setattr("vd.train.student.calibrate.record", spy)
+    assert main(["calibrate", str(path), "--episodes", "2", "--in-air"]) == 0
+    assert asked == [(24, 180)]
+    assert "2 episodes in the air" in load_student(path).spec.calibrated_on
 
 
 @pytest.mark.slow

@@ -45,6 +45,7 @@ def calibrate_student(
     episodes: int,
     tolerance_rad: float = PAPER.success.rotation_rad,
     randomise: bool = False,
+    in_air: bool = False,
     seed: int = 0,
     device: str,
 ) -> Calibration:
@@ -56,6 +57,7 @@ def calibrate_student(
         episodes: Number of episodes, one a world, rounded up to as many of each object.
         tolerance_rad: Largest true distance that counts as right [rad].
         randomise: Domain randomisation.
+        in_air: Episodes of the paper's in-air test: longer, and the table is taken away.
         seed: Of starts, goals and sensor errors.
         device: Warp and torch device.
 
@@ -73,17 +75,20 @@ def calibrate_student(
         objects=sets,
         num_worlds=each * count,
         seed=seed,
+        episode_s=PAPER.scene.air_episode_s if in_air else trained.episode_s,
         success=replace(trained.success, rotation_rad=NEVER_RAD),
         randomisation=replace(trained.randomisation, enabled=randomise),
     )
     env = ReorientEnv(task, device)
     env.objects = with_symmetries(env.objects, device)
-    trace = record(env, StudentActor(env, saved, seed=seed), each)
+    table_steps = round(PAPER.scene.air_table_s * task.sim.control_hz) if in_air else None
+    trace = record(env, StudentActor(env, saved, seed=seed), each, table_steps=table_steps)
     env.check()
     env.close()
     result = calibrate_trace(trace, tolerance_rad=tolerance_rad)
     state = read_student(path)
-    what = f"{', '.join(sets)}: {result.episodes} episodes, tolerance {tolerance_rad:g} rad, seed {seed}"
+    what = f"{', '.join(sets)}: {result.episodes} episodes{' in the air' if in_air else ''}, "
+    what += f"tolerance {tolerance_rad:g} rad, seed {seed}"
     spec = replace(saved_spec(state, path), stopping=result.rule, calibrated_on=what)
     save_checkpoint(path, {**state, "spec": to_dict(spec)})
     return result

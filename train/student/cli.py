@@ -39,6 +39,8 @@ class CalibrateCfg:
     """Largest true distance that counts as right [rad]."""
     randomise: bool = False
     """Domain randomisation and disturbances."""
+    in_air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Take the table away, as vd-eval --in-air does: the rule of a student that is to hold its object."""
     seed: int = 1000
     """Of starts, goals and sensor errors."""
     device: str = "auto"
@@ -142,6 +144,7 @@ def calibrate_command(arguments: list[str], _started: float) -> int:
             episodes=cfg.episodes,
             tolerance_rad=cfg.tolerance_rad,
             randomise=cfg.randomise,
+            in_air=cfg.in_air,
             seed=cfg.seed,
             device=resolve_device(cfg.device),
         )

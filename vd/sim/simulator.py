@@ -24,8 +24,8 @@ MAX_SPEED = 500.0
 # Height of a table that is not there [m]: an object that is lost on the way down is reset long before.
 AWAY_M = -10.0
 
-# Work space of convex pairs is shared by all worlds; few worlds have no average to rely on.
-FEWEST_CONVEX_PAIRS = 64
+# Work space of convex pairs (5 kB each) is shared by all worlds; few worlds have no average to rely on.
+FEWEST_CONVEX_PAIRS = 1024
 
 # MuJoCo Warp's overflow bits that mean lost contacts or constraint rows, by the setting to change.
 # Its other bits count solver and line-search iterations, which are stopping rules, not losses.
