@@ -34,8 +34,14 @@ CHOSEN = ("coulomb_friction", "command_delay", "torque_saturation", "gravity_loa
 class Servo:
     """A servo with Coulomb friction, its plain model, and how often its search asks for fits."""
 
-    def __init__(self, friction: float = FRICTION) -> None:
-        self.problem: JointProblem = problem_of(recorded({servo.COULOMB_TORQUE: friction}))
+    def __init__(
+        self,
+        friction: float = FRICTION,
+        hidden: dict[int, float] | None = None,
+        chosen: tuple[str, ...] = CHOSEN,
+    ) -> None:
+        self.chosen = chosen
+        self.problem: JointProblem = problem_of(recorded(hidden or {servo.COULOMB_TORQUE: friction}))
         base = self.problem.rollouts.chain.start_row.copy()
         for column, value in TRUE.items():
             base[0, column] = value
@@ -66,7 +72,7 @@ class Servo:
             run=run,
             joint=0,
             others=(),
-            candidates=candidates(self.problem.rollouts.chain, CHOSEN),
+            candidates=candidates(self.problem.rollouts.chain, self.chosen),
             scales=self.scales,
             refits=3,
             like=like,
@@ -103,6 +109,16 @@ def test_a_joint_that_lacks_something_else_is_searched_by_itself(
 ) -> None:
     found = Servo().explain((effects, values))
     assert found.verdict == "effects" and [one.name for one in found.accepted] == ["coulomb_friction"]
+
+
+def test_a_joint_may_lack_the_fuller_form_of_what_another_lacks() -> None:
+    """A slow joint shows the ceiling of the torque alone; on a quick one the search missed the line."""
+    line = {servo.STALL_TORQUE: 0.35, servo.NO_LOAD_SPEED: 3.0}
+    joint = Servo(hidden=line, chosen=(*CHOSEN, "torque_limit", "torque_speed_limit"))
+    found = joint.explain((("torque_limit",), {"torque_limit.tau_max_nm": 0.35}))
+    assert found.verdict == "effects" and [one.name for one in found.accepted] == ["torque_speed_limit"]
+    assert found.reason.startswith("torque_speed_limit") and joint.fits < 8, "without a search"
+    assert found.final.values["torque_speed_limit.omega_0_rad_s"] == pytest.approx(3.0, rel=0.1)
 
 
 def test_what_another_joint_lacks_is_not_named_where_it_is_too_small_to_show(

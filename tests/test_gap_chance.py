@@ -142,6 +142,29 @@ def test_chance_alone_leaves_noise_where_a_fixed_delay_leaves_more(
     )
 
 
+@pytest.mark.parametrize(("limited", "ends"), [(1.5, False), (2.5, True), (3.1, True)])
+def test_chance_ends_no_search_where_a_limit_from_every_start_is_likelier(limited: float, ends: bool) -> None:
+    """A torque-speed line beside a delay leaves 1.5 floors from the best of its starts, chance 2."""
+    asked: list[tuple[str, int, int]] = []
+
+    def run(calls: list[tuple[str, dict[str, Any]]]) -> list[object]:
+        asked.extend((o["effects"][-1], len(o["starts"]), o["iterations"]) for _, o in calls)
+        return [made_up(o["effects"], limited * FLOOR) for _, o in calls]
+
+    names = ("torque_speed_limit", "torque_limit", "supply_sag", "backlash", "command_jitter")
+    selection = replace(searching([])[0], run=run, candidates=names, scales=SCALES)
+    selection = replace(selection, vetoes={"torque_limit": "told otherwise"})
+    late, random = (
+        made_up((name,), n * FLOOR) for name, n in (("command_delay", 3.0), ("command_jitter", 2.0))
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Selection, "likelier", lambda _, before, after: after.rmse < before.rmse)
+        assert chance.unlimited(selection, late, random) == ends
+    screened = {name: starts for name, starts, _ in asked[:2]}
+    assert screened == {"torque_speed_limit": 5, "supply_sag": 4}, "every start of what may be a limit"
+    assert len(asked) == (2 if limited > 3.0 else 4), "what gains nothing is not fitted to the end"
+
+
 @pytest.mark.parametrize(
     ("present", "through", "found"),
     [

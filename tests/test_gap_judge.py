@@ -234,8 +234,8 @@ def test_a_joint_takes_the_model_of_all_others_where_it_is_as_good(
         return Explanation(made_up((), 0.02), made_up(names, FLOOR), verdict, "", accepted)
 
     def fit(effects: tuple[str, ...], starts: Sequence[Mapping[str, float]]) -> JointFit:
-        assert effects == both and all(start for start in starts)
-        return made_up(effects, error * FLOOR)
+        assert all(start for start in starts)
+        return made_up(effects, (error if effects == both else 9.0) * FLOOR)
 
     both = ("command_delay", "gravity_load")
     three = [explanation(*own), explanation(*both), explanation(*both)]
@@ -247,7 +247,8 @@ def test_a_joint_takes_the_model_of_all_others_where_it_is_as_good(
     shown = agree(part, [FLOOR] * 3, [0, 0, 0], fits)[0]
     assert shown.accepted == found[0].accepted, "one of the two shows the load only"
     apart = [three[0], explanation("backlash"), three[2]]
-    assert agree(apart, [FLOOR] * 3, [0, 0, 0], fits)[0] == three[0], "they do not agree"
+    far = [lambda effects, _: made_up(effects, 9.0 * FLOOR if "backlash" in effects else FLOOR)] * 3
+    assert agree(apart, [FLOOR] * 3, [0, 0, 0], far)[0] == three[0], "they do not agree"
     assert agree(three, [FLOOR] * 3, [0, 1, 2], [fit] * 3) == three, "of other fingers"
     assert agree(three[:2], [FLOOR] * 2, [0, 0], [fit] * 2) == three[:2], "one other is no agreement"
 
@@ -273,6 +274,34 @@ def test_a_joint_takes_a_larger_model_of_all_others_where_it_alone_leaves_noise(
     three = [explanation(own, "command_delay"), explanation(1.0, *both), explanation(1.0, *both)]
     found = agree(three, [FLOOR] * 3, [0, 0, 0], [lambda effects, _: made_up(effects, fit * FLOOR)] * 3)
     assert [a.name for a in found[0].accepted] == ([*both] if adopted else ["command_delay"])
+
+
+@pytest.mark.parametrize(
+    ("verdict", "left", "adopted"),
+    [
+        ("effects", 1.0, True),
+        ("effects", 1.2, False),  # it leaves more
+        ("unknown", 1.0, False),  # what nothing explains is not explained by less
+    ],
+)
+def test_a_joint_takes_the_model_of_fewer_effects_that_one_other_is_sure_of(
+    verdict: Verdict, left: float, adopted: bool
+) -> None:
+    """A load and a coupling stood for a limit that the first of three joints showed."""
+
+    def explanation(verdict: Verdict, *names: str) -> Explanation:
+        accepted = tuple(Accepted(name, 1.0, {}, (), (), False) for name in names)
+        return Explanation(made_up((), 0.02), made_up(names, FLOOR), verdict, "", accepted)
+
+    few, many = ("payload_inertia", "torque_limit"), ("payload_inertia", "gravity_load", "joint_coupling")
+    three = [explanation("effects", *few), explanation(verdict, *many), explanation("effects", *many)]
+    found = agree(three, [FLOOR] * 3, [0, 0, 0], [lambda effects, _: made_up(effects, left * FLOOR)] * 3)
+    assert found[0] == three[0], "more effects have to be earned"
+    assert [a.name for a in found[1].accepted] == [*(few if adopted else many)]
+    assert [a.name for a in found[2].accepted] == [*(few if left == 1.0 else many)]
+    unsure, never = replace(three[0], verdict="ambiguous"), lambda *_: pytest.fail("tried")
+    fits = [lambda effects, _: made_up(effects, 9.0 * FLOOR), never, never]
+    assert agree([unsure, *three[1:]], [FLOOR] * 3, [0, 0, 0], fits) == [unsure, *three[1:]]
 
 
 def test_a_load_and_an_offset_are_no_names_where_another_joint_shows_a_spring() -> None:

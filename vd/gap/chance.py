@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vd.gap.candidates import FULL_ITERATIONS, Call
+from vd.gap.candidates import BETTER, FULL_ITERATIONS, SCREEN_ITERATIONS, Call
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import NO_GAP, RANDOM, REPEATABLE
@@ -23,6 +23,8 @@ FIXED = "command_delay"
 """What is the mean of random delays, too."""
 LATE = (FIXED, "read_delay", "command_filter", "payload_inertia")
 """What makes a joint late as random delays do in the mean: a search finds one of these in their place."""
+LIMITS = ("torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag")
+"""What keeps a joint late where it starts and turns, as random delays do; from few starts it is not found."""
 PROMISING = 2.0
 """Error, in noise floors, that a model leaves at most through a first guess of random delays that are all it
 lacks (our choice): 1.1 where they were, 5.4 where friction was missing as well, on one recording
@@ -132,6 +134,25 @@ def in_place(search: "Selection", present: JointFit) -> tuple[JointFit, Veil] | 
             if found := _spread(search, rest, rest, present, PROMISING * search.floor):
                 return found
     return None
+
+
+def unlimited(search: "Selection", late: JointFit, random: JointFit) -> bool:
+    """Whether random delays are likelier than a limit of the torque beside what is late, from every start.
+
+    Lest the early end of a search be for the want of a start: so two torque-speed lines beside a delay or a
+    payload were taken for random delays (docs/results/gap-log.md, seeds 15025 and 15123).
+
+    Args:
+        search: The search that would end.
+        late: What it has found.
+        random: The model with random delays.
+    """
+    names = [name for name in LIMITS if name in {*search.candidates} - {*search.vetoes, *late.effects}]
+    starts = [search.starts(late, search.sized(late, name)) for name in names]
+    calls = [search.call(late, *pair, SCREEN_ITERATIONS) for pair in zip(names, starts, strict=True)]
+    near = [fit for fit in search.run(calls) if fit.rmse < BETTER * late.rmse]
+    fits = search.run([search.call(late, f.effects[-1], [f.values], FULL_ITERATIONS) for f in near])
+    return all(search.likelier(fit, random) for fit in fits)
 
 
 def _tried(search: "Selection") -> bool:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.clock import swayed, told, weighted
 from vd.gap.coordinates import sizes
-from vd.gap.explanation import NAMED, Explanation, Trial, estimates, intervals
+from vd.gap.explanation import NAMED, Explanation, Trial, added, certain, estimates, intervals
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import (
     AT_FLOOR,
@@ -68,10 +68,11 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
             [search.plain(baseline), search.call(baseline, effects, [fit.values], FULL_ITERATIONS)]
         )
     if fit.at_bound or not search.noise_only(fit, AT_FLOOR):
-        return None
+        fuller = _fuller(search, baseline)
+        return as_another(fuller, baseline, loose) if fuller else None
     others = [name for name in search.candidates if name not in {*effects, *search.vetoes, RANDOM}]
-    added = [start for name in others for start in sizes(name, search.others, search.scales)]
-    promise = search.run([("promise", {"fit": fit, "starts": added, "scales": search.scales})])[0]
+    further = [start for name in others for start in sizes(name, search.others, search.scales)]
+    promise = search.run([("promise", {"fit": fit, "starts": further, "scales": search.scales})])[0]
     if promise.max(initial=0.0) > CONTAINED_FLOORS**2:
         return None
     gain, ci = search.gain(baseline, fit)
@@ -103,6 +104,25 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
     rivals = {name: [fit] for name in effects}
     refined = search.refined(fit)
     return search.explained(search.conclude(baseline, fit, rivals, trials, loose, refined))
+
+
+def _fuller(search: "Selection", baseline: JointFit) -> "Selection | None":
+    """The search with what another joint lacks in a fuller form that leaves noise here; None without one.
+
+    A slow joint shows the ceiling of its torque and not the slope with speed, a quick one both.
+    """
+    effects, values = search.like
+    for i, name in enumerate(effects):
+        for form, simpler in NESTED.items():
+            if name not in simpler or form not in {*search.candidates} - {*search.vetoes, *effects}:
+                continue
+            fuller = (*effects[:i], *effects[i + 1 :], form)
+            rest = {key: value for key, value in values.items() if not key.startswith(f"{name}.")}
+            starts = [{**baseline.values, **rest, **start} for start in search.sized(baseline, form)]
+            fit = search.run([search.call(baseline, fuller, starts, FULL_ITERATIONS)])[0]
+            if not fit.at_bound and search.noise_only(fit, AT_FLOOR):
+                return replace(search, like=added(fit))
+    return None
 
 
 def as_changing(search: "Selection", baseline: JointFit, loose: str) -> Explanation | None:
@@ -171,7 +191,9 @@ def agree(
     A search can end where no step leads out: with a filter and another load in the place of the delay and the
     load that the other joints have. Their values are a start that it did not have. A fuller form of what the
     others have has to be better by what an effect must gain: it is found where it imitates something else. So
-    has a model of more effects than the joint's own, which also has to leave noise.
+    has a model of more effects than the joint's own, which also has to leave noise. A model of fewer effects
+    needs no second joint: a load and a coupling stood for a limit that one of three joints had been found to
+    have (docs/results/gap-log.md, seed 15108).
 
     Args:
         explanations: Of the joints.
@@ -182,41 +204,53 @@ def agree(
     result = list(explanations)
     for i, own in enumerate(explanations):
         others = [e for j, e in enumerate(explanations) if j != i and groups[j] == groups[i]]
-        certain = all(e.verdict == "effects" and all(a.named for a in e.accepted) for e in others)
-        if len(others) < 2 or not certain:
-            continue
-        # Where one of two effects is too small to show there, a joint has the other alone.
-        model = max(others, key=lambda e: len(e.final.effects))
-        if any({*e.final.effects} - {*model.final.effects} for e in others):
-            continue
-        effects = model.final.effects
-        mine = own.final.effects
-        if RANDOM in effects or set(effects) == set(mine) or not mine:
-            continue
-        theirs = {key: value for key, value in model.final.values.items() if "." in key}
-        starts = [
-            {**{k: v for k, v in fit.values.items() if "." not in k}, **theirs}
-            for fit in (own.final, own.baseline, model.final)
-        ]
-        fit = fits[i](effects, starts)
-        if len(effects) > len(mine):
-            closed = own.final.rmse**2 - fit.rmse**2
-            worse = closed < (MIN_GAIN_FLOORS * floors[i]) ** 2 or fit.rmse > EXPLAINED * floors[i]
-        elif all({name, *NESTED.get(name, ())} & {*effects} for name in mine):
-            worse = fit.held_out_rmse * (1.0 - MIN_GAIN) > own.final.held_out_rmse
-        else:
-            worse = fit.rmse**2 - own.final.rmse**2 > (SMALL_EXCESS_FLOORS * floors[i]) ** 2
-        if fit.at_bound or worse:
-            continue
-        spread = intervals(fit, floors[i])
-        result[i] = replace(
-            own,
-            final=fit,
-            accepted=tuple(replace(a, estimates=estimates(fit, a.name, spread)) for a in model.accepted),
-            verdict="effects",
-            reason=f"{explains(effects)}, as on the other joints",
-        )
+        for model in _models(own, others):
+            fit = _as(model, own, fits[i])
+            if fit.at_bound or _worse(fit, own.final, floors[i]):
+                continue
+            spread, effects = intervals(fit, floors[i]), model.final.effects
+            result[i] = replace(
+                own,
+                final=fit,
+                accepted=tuple(replace(a, estimates=estimates(fit, a.name, spread)) for a in model.accepted),
+                verdict="effects",
+                reason=f"{explains(effects)}, as on the other joints",
+            )
+            break
     return result
+
+
+def _models(own: Explanation, others: Sequence[Explanation]) -> list[Explanation]:
+    """What a joint may have as well: what all others have, or a part of, or fewer effects that one has."""
+    mine, sure = {*own.final.effects}, [e for e in others if certain(e)]
+    if not mine or not sure:
+        return []
+    # Where one of two effects is too small to show there, a joint has the other alone.
+    most = max(sure, key=lambda e: len(e.final.effects))
+    common = len(sure) == len(others) > 1 and all({*e.final.effects} <= {*most.final.effects} for e in sure)
+    fewer = [e for e in sure if _answered(own) and 0 < len(e.final.effects) < len(mine)]
+    models = [*([most] if common else []), *sorted(fewer, key=lambda e: len(e.final.effects))]
+    return [e for e in models if RANDOM not in e.final.effects and {*e.final.effects} != mine]
+
+
+def _as(model: Explanation, own: Explanation, fit: Fit) -> JointFit:
+    """The fit of a joint with the effects of another's model, from the values that these have there."""
+    theirs = {key: value for key, value in model.final.values.items() if "." in key}
+    starts = [
+        {**{k: v for k, v in start.values.items() if "." not in k}, **theirs}
+        for start in (own.final, own.baseline, model.final)
+    ]
+    return fit(model.final.effects, starts)
+
+
+def _worse(fit: JointFit, own: JointFit, floor: float) -> bool:
+    """Whether a joint's own model is to be kept; see :func:`agree`."""
+    if len(fit.effects) > len(own.effects):
+        closed = own.rmse**2 - fit.rmse**2
+        return closed < (MIN_GAIN_FLOORS * floor) ** 2 or fit.rmse > EXPLAINED * floor
+    if all({name, *NESTED.get(name, ())} & {*fit.effects} for name in own.effects):
+        return fit.held_out_rmse * (1.0 - MIN_GAIN) > own.held_out_rmse
+    return fit.rmse**2 - own.rmse**2 > (SMALL_EXCESS_FLOORS * floor) ** 2
 
 
 def no_spring(explanations: Sequence[Explanation], groups: Sequence[int]) -> list[Explanation]:

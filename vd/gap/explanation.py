@@ -109,14 +109,14 @@ def added(fit: JointFit) -> tuple[tuple[str, ...], dict[str, float]]:
     return fit.effects, {key: value for key, value in fit.values.items() if "." in key}
 
 
-def _certain(explanation: Explanation) -> bool:
+def certain(explanation: Explanation) -> bool:
     """Whether every effect of the final model is the answer rather than one of a set."""
     return explanation.verdict == "effects" and all(one.named for one in explanation.accepted)
 
 
 def lacking(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
     """The effects that a joint is certain to lack, and their values by key; none where it is not."""
-    if not _certain(explanation) or RANDOM in explanation.final.effects:
+    if not certain(explanation) or RANDOM in explanation.final.effects:
         return (), {}
     return added(explanation.final)
 
@@ -130,6 +130,6 @@ def by_chance(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, floa
     effects, values = added(explanation.final)
     if RANDOM not in effects:
         return (), {}
-    if _certain(explanation):
+    if certain(explanation):
         return effects, values
     return (RANDOM,), {key: value for key, value in values.items() if key.startswith(f"{RANDOM}.")}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vd.gap.candidates import BETTER, HOPELESS, Call
-from vd.gap.chance import as_random, at_once, in_place, try_random
+from vd.gap.chance import as_random, at_once, in_place, try_random, unlimited
 from vd.gap.clock import explain_weighted, swayed
 from vd.gap.consensus import as_another, as_changing
 from vd.gap.explanation import Accepted, Explanation, Trial
@@ -210,7 +210,7 @@ class Selection(Frictions):
             if self.finished(found[0]) or self.ended(found[0]):
                 return found
             chance = at_once(self, baseline)
-            if chance is not None and self.likelier(found[0], chance[0]):
+            if chance and self.likelier(found[0], chance[0]) and unlimited(self, found[0], chance[0]):
                 self.report(f"{RANDOM} leaves noise: nothing else is tried from every start")
                 self.restarts = 0
                 return found

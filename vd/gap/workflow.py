@@ -37,7 +37,7 @@ from vd.gap.team import Bench, JointSpec, Team, parallel
 from vd.kernels.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"
-VERSION = 9
+VERSION = 10
 """Of the method; a result of another version is not resumed."""
 CMA_GENERATIONS = 20
 BASELINE_ITERATIONS = 15
