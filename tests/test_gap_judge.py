@@ -280,7 +280,8 @@ def test_a_joint_takes_a_larger_model_of_all_others_where_it_alone_leaves_noise(
     ("verdict", "left", "adopted"),
     [
         ("effects", 1.0, True),
-        ("effects", 1.2, False),  # it leaves more
+        ("effects", 1.08, True),  # the joint's own gains less over it than an effect must
+        ("effects", 1.2, False),  # it leaves more than noise
         ("unknown", 1.0, False),  # what nothing explains is not explained by less
     ],
 )
@@ -298,7 +299,7 @@ def test_a_joint_takes_the_model_of_fewer_effects_that_one_other_is_sure_of(
     found = agree(three, [FLOOR] * 3, [0, 0, 0], [lambda effects, _: made_up(effects, left * FLOOR)] * 3)
     assert found[0] == three[0], "more effects have to be earned"
     assert [a.name for a in found[1].accepted] == [*(few if adopted else many)]
-    assert [a.name for a in found[2].accepted] == [*(few if left == 1.0 else many)]
+    assert [a.name for a in found[2].accepted] == [*(few if left < 1.1 else many)]
     unsure, never = replace(three[0], verdict="ambiguous"), lambda *_: pytest.fail("tried")
     fits = [lambda effects, _: made_up(effects, 9.0 * FLOOR), never, never]
     assert agree([unsure, *three[1:]], [FLOOR] * 3, [0, 0, 0], fits) == [unsure, *three[1:]]

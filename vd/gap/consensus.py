@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}
 """What all joints of a machine have or have not: its bus, its supply, gravity."""
 
+CEILINGS = {"torque_limit": "torque_speed_limit"}
+"""What a slow joint shows of a motor, and a quick one."""
+
 SHOWN_TAIL = 0.4
 """Share of the resamples that may see no gain from an effect that another joint has for sure: one motion of a
 dozen can be all that shows it, and a third of the resamples leave that out."""
@@ -107,21 +110,20 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
 
 
 def _fuller(search: "Selection", baseline: JointFit) -> "Selection | None":
-    """The search with what another joint lacks in a fuller form that leaves noise here; None without one.
+    """The search with the line of a motor whose ceiling another joint shows; None where it is not that.
 
-    A slow joint shows the ceiling of its torque and not the slope with speed, a quick one both.
+    A slow joint shows the ceiling of the torque and not how it falls with speed, a quick one both.
     """
     effects, values = search.like
-    for i, name in enumerate(effects):
-        for form, simpler in NESTED.items():
-            if name not in simpler or form not in {*search.candidates} - {*search.vetoes, *effects}:
-                continue
-            fuller = (*effects[:i], *effects[i + 1 :], form)
-            rest = {key: value for key, value in values.items() if not key.startswith(f"{name}.")}
-            starts = [{**baseline.values, **rest, **start} for start in search.sized(baseline, form)]
-            fit = search.run([search.call(baseline, fuller, starts, FULL_ITERATIONS)])[0]
-            if not fit.at_bound and search.noise_only(fit, AT_FLOOR):
-                return replace(search, like=added(fit))
+    for ceiling, line in CEILINGS.items():
+        if ceiling not in effects or line not in {*search.candidates} - {*search.vetoes, *effects}:
+            continue
+        fuller = (*(name for name in effects if name != ceiling), line)
+        rest = {key: value for key, value in values.items() if not key.startswith(f"{ceiling}.")}
+        starts = [{**baseline.values, **rest, **start} for start in search.sized(baseline, line)]
+        fit = search.run([search.call(baseline, fuller, starts, FULL_ITERATIONS)])[0]
+        if not fit.at_bound and search.noise_only(fit, AT_FLOOR):
+            return replace(search, like=added(fit))
     return None
 
 
@@ -192,8 +194,9 @@ def agree(
     load that the other joints have. Their values are a start that it did not have. A fuller form of what the
     others have has to be better by what an effect must gain: it is found where it imitates something else. So
     has a model of more effects than the joint's own, which also has to leave noise. A model of fewer effects
-    needs no second joint: a load and a coupling stood for a limit that one of three joints had been found to
-    have (docs/results/gap-log.md, seed 15108).
+    needs no second joint, and where it leaves noise the joint's own has to gain as much over it: a load and a
+    coupling stood for a limit that one of three joints had been found to have, a filter for what a line was
+    short of at the end of its fit (docs/results/gap-log.md, seeds 15108 and 15125).
 
     Args:
         explanations: Of the joints.
@@ -245,9 +248,11 @@ def _as(model: Explanation, own: Explanation, fit: Fit) -> JointFit:
 
 def _worse(fit: JointFit, own: JointFit, floor: float) -> bool:
     """Whether a joint's own model is to be kept; see :func:`agree`."""
+    earns, noise = (MIN_GAIN_FLOORS * floor) ** 2, EXPLAINED * floor
     if len(fit.effects) > len(own.effects):
-        closed = own.rmse**2 - fit.rmse**2
-        return closed < (MIN_GAIN_FLOORS * floor) ** 2 or fit.rmse > EXPLAINED * floor
+        return own.rmse**2 - fit.rmse**2 < earns or fit.rmse > noise
+    if len(fit.effects) < len(own.effects) and fit.rmse < noise:
+        return fit.rmse**2 - own.rmse**2 > earns  # a further effect has to be earned here, too
     if all({name, *NESTED.get(name, ())} & {*fit.effects} for name in own.effects):
         return fit.held_out_rmse * (1.0 - MIN_GAIN) > own.held_out_rmse
     return fit.rmse**2 - own.rmse**2 > (SMALL_EXCESS_FLOORS * floor) ** 2
