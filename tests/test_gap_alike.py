@@ -32,7 +32,7 @@ CHOSEN = ("coulomb_friction", "command_delay", "torque_saturation", "gravity_loa
 
 
 class Servo:
-    """A servo with Coulomb friction, its plain model, and how often its search asks for fits."""
+    """A servo with friction, or what else is hidden, its plain model, and how often fits are asked for."""
 
     def __init__(
         self,

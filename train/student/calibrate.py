@@ -11,6 +11,7 @@ from vd.assets_usd.objects.model import load_set
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
+from vd.evaluate.result import air_table_steps
 from vd.evaluate.student import StudentActor
 from vd.evaluate.trace import NEVER_RAD, Trace, record
 from vd.paper import PAPER
@@ -81,7 +82,7 @@ def calibrate_student(
     )
     env = ReorientEnv(task, device)
     env.objects = with_symmetries(env.objects, device)
-    table_steps = round(PAPER.scene.air_table_s * task.sim.control_hz) if in_air else None
+    table_steps = air_table_steps(task.sim.control_hz) if in_air else None
     trace = record(env, StudentActor(env, saved, seed=seed), each, table_steps=table_steps)
     env.check()
     env.close()

@@ -16,7 +16,6 @@ from vd.evaluate.agents import (
     start_at_rest,
     task_for,
 )
-from vd.paper import PAPER
 
 if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
@@ -187,6 +186,7 @@ def _run(cfg: "EvalCfg", env: Any, actor: Any, name: str) -> Any:
     from tqdm import tqdm
 
     from vd.evaluate.cli import LOG_EVERY_S
+    from vd.evaluate.result import air_table_steps
     from vd.evaluate.rollout import draw_starts_and_goals
     from vd.evaluate.trace import record
 
@@ -207,7 +207,7 @@ def _run(cfg: "EvalCfg", env: Any, actor: Any, name: str) -> Any:
             cfg.episodes,
             starts=starts,
             goals=goals,
-            table_steps=round(PAPER.scene.air_table_s * env.cfg.sim.control_hz) if cfg.in_air else None,
+            table_steps=air_table_steps(env.cfg.sim.control_hz) if cfg.in_air else None,
             on_step=bar.update,
         )
     env.check()

@@ -21,11 +21,17 @@ from vd.evaluate.statistics import (
     rate_intervals,
 )
 from vd.files import write_json
+from vd.paper import PAPER
 
 TOLERANCES_RAD = (0.1, 0.2, 0.4, 0.8)
 """Errors at which success is reported; the paper's figures use 0.1, 0.4 and 0.8."""
 
 FORMAT_VERSION = 1
+
+
+def air_table_steps(control_hz: float) -> int:
+    """Control steps at this rate [Hz] after which the paper's in-air test takes the table away."""
+    return round(PAPER.scene.air_table_s * control_hz)
 
 
 @dataclass(frozen=True)

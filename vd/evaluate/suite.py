@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from vd.evaluate.comparison import Comparison, Row, StoppedBy
+from vd.evaluate.result import air_table_steps
 from vd.evaluate.statistics import Interval, choose_unit, order_interval, rate_intervals
 from vd.paper import PAPER, provenance
 
@@ -144,14 +145,14 @@ def dropped(_: Comparison, row: Row) -> Interval:
 def dropped_at_once(_: Comparison, row: Row) -> Interval:
     """Share of episodes that lost the object in the half second after the table went."""
     hz = row.result.protocol.control_hz
-    gone = round(PAPER.scene.air_table_s * hz)
+    gone = air_table_steps(hz)
     return _share(row, [e.fell and gone < e.steps <= gone + round(0.5 * hz) for e in row.result.episodes])
 
 
 def success_without_table(_: Comparison, row: Row) -> Interval:
     """Share of episodes that were stopped within the tolerance when the table had gone."""
     protocol = row.result.protocol
-    gone, tolerance = round(PAPER.scene.air_table_s * protocol.control_hz), protocol.stop_tolerance_rad
+    gone, tolerance = air_table_steps(protocol.control_hz), protocol.stop_tolerance_rad
     return _share(
         row, [e.stopped and e.error_rad <= tolerance and e.steps > gone for e in row.result.episodes]
     )

@@ -232,18 +232,20 @@ def _models(own: Explanation, others: Sequence[Explanation]) -> list[Explanation
     most = max(sure, key=lambda e: len(e.final.effects))
     common = len(sure) == len(others) > 1 and all({*e.final.effects} <= {*most.final.effects} for e in sure)
     fewer = [e for e in sure if _answered(own) and 0 < len(e.final.effects) < len(mine)]
-    models = [*([most] if common else []), *sorted(fewer, key=lambda e: len(e.final.effects))]
+    models = sorted(fewer, key=lambda e: len(e.final.effects))
+    if common:
+        models = [most, *(e for e in models if e is not most)]
     return [e for e in models if RANDOM not in e.final.effects and {*e.final.effects} != mine]
 
 
 def _as(model: Explanation, own: Explanation, fit: Fit) -> JointFit:
     """The fit of a joint with the effects of another's model, from the values that these have there."""
-    theirs = {key: value for key, value in model.final.values.items() if "." in key}
+    effects, theirs = added(model.final)
     starts = [
         {**{k: v for k, v in start.values.items() if "." not in k}, **theirs}
         for start in (own.final, own.baseline, model.final)
     ]
-    return fit(model.final.effects, starts)
+    return fit(effects, starts)
 
 
 def _worse(fit: JointFit, own: JointFit, floor: float) -> bool:
