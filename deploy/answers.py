@@ -1,7 +1,8 @@
 """What motors answer, and which of their states are accepted.
 
-A state counts only whole and fresh: right motor, right length, no error number, a clock that went on as ours
-did, and no farther from the last one than the motor can turn.
+A state counts only whole and fresh: right motor, right length, no error number, angles that a motor can count,
+a clock that went on as ours did, and no farther from the last one than the motor can turn. A checksum alone is not
+enough: its 16 bits pass one of 65536 broken packets.
 """
 
 from collections.abc import Sequence
@@ -9,7 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vd.deploy.control_table import FULL_PWM, RAD_S_PER_COUNT, TICK_MODULUS, Item, Model, table, to_angle
+from vd.deploy.control_table import (
+    FARTHEST_COUNTS,
+    FULL_PWM,
+    RAD_S_PER_COUNT,
+    TICK_MODULUS,
+    Item,
+    Model,
+    table,
+    to_angle,
+)
 from vd.deploy.packets import ALERT, Failure
 
 STATE_ADDRESS, STATE_BYTES = 120, 27
@@ -129,9 +139,13 @@ class StateCheck:
             start = item.address - STATE_ADDRESS
             return np.array([item.from_bytes(data[start : start + item.size]) for data in columns])
 
+        counts = column("present_position")
+        for answer, count in zip(answers, counts, strict=True):
+            if abs(count) > FARTHEST_COUNTS:
+                raise BusError(f"motor {answer.id}: its position came as {count} counts, which it cannot reach")
         state = HandState(
             time_s=time_s,
-            position=np.array([to_angle(int(count)) for count in column("present_position")]),
+            position=np.array([to_angle(int(count)) for count in counts]),
             velocity=column("present_velocity") * RAD_S_PER_COUNT,
             current=column("present_current") * self._model.current_unit_a,
             pwm=column("present_pwm") / FULL_PWM,
