@@ -1,5 +1,6 @@
 """Calls one after the other, in processes, and in threads that simulate together."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -113,6 +114,18 @@ def runs(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except OSError:
         return False
+
+
+def test_a_worker_that_is_killed_ends_the_run_with_what_to_change() -> None:
+    bench, spec = problem({})
+    others = multiprocessing.active_children()
+    with Team(bench, workers=2) as team:
+        answers(team, spec)
+        for process in multiprocessing.active_children():
+            if process not in others:
+                process.kill()
+        with pytest.raises(ChildProcessError, match=r"one of 2 processes was killed.*memory"):
+            team.run(spec, [("scales", {"row": bench.chains[0].start_row[0], "residual": 0.03})])
 
 
 def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import connection
@@ -204,7 +205,11 @@ class Team:
             return [self.answers[key] for key in keys]
 
     def _made(self, spec: JointSpec, calls: Sequence[Call]) -> list[Answer]:
-        """Run calls."""
+        """Run calls.
+
+        Raises:
+            ChildProcessError: A worker process was killed.
+        """
         if self._pool is None:
             with self._lock:
                 return [self.bench.call(spec, call) for call in calls]
@@ -214,8 +219,14 @@ class Team:
                 self.bench.problem(spec)  # made once, before threads ask for it
             crowd.join(len(calls))
         work = _work if crowd is None else self._together
-        waiting: list[Future] = [self._pool.submit(work, spec, call) for call in calls]
-        return [future.result() for future in waiting]
+        try:
+            waiting: list[Future] = [self._pool.submit(work, spec, call) for call in calls]
+            return [future.result() for future in waiting]
+        except BrokenProcessPool as error:
+            raise ChildProcessError(
+                f"one of {self.workers} processes was killed, most often since memory ran out: free some, or "
+                "give fewer processors (taskset), and run the same command again, which goes on with its step"
+            ) from error
 
     def _together(self, spec: JointSpec, call: Call) -> Answer:
         """Run a call in one of the threads that simulate together."""
