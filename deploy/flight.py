@@ -50,7 +50,14 @@ class Flight:
 
 
 def make_flight(
-    name: str, hand_name: str, item_name: str, hand: HandModel, item: ObjectModel, *, seed: int = 0
+    name: str,
+    hand_name: str,
+    item_name: str,
+    hand: HandModel,
+    item: ObjectModel,
+    *,
+    tolerance_rad: float = PAPER.success.rotation_rad,
+    seed: int = 0,
 ) -> Flight:
     """Load a policy, and make it ready.
 
@@ -60,6 +67,7 @@ def make_flight(
         item_name: Name of the object's set or its USD.
         hand: The hand.
         item: The object.
+        tolerance_rad: How near to the goal it is to stop [rad].
         seed: Of the choice of camera points.
 
     Raises:
@@ -76,11 +84,12 @@ def make_flight(
         raise ValueError(f"{name} moves {moves} joints, the hand {hand.name} has {hand.num_joints}")
     check_bundle(name, replace(trained_task(policy), hand=hand_name))
     if student:
-        pilot = StudentPilot(policy, hand, item, seed=seed)
+        pilot = StudentPilot(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
         camera = pilot.camera
         return Flight(name, "student", pilot, trained_task(policy), camera, needs_truth=camera is None)
     task = mirror_task(policy, hand_name, item_name)
-    return Flight(name, "teacher", TeacherPilot(policy, Mirror(task)), task, needs_truth=True)
+    teacher = TeacherPilot(policy, Mirror(task), tolerance_rad)
+    return Flight(name, "teacher", teacher, task, needs_truth=True)
 
 
 def mirror_task(policy: Any, hand_name: str, item_name: str) -> ReorientCfg:

@@ -14,6 +14,7 @@ from vd.deploy.mirror import Mirror, TeacherSight
 from vd.deploy.observation import Sensed, StudentSight
 from vd.evaluate.statistics import rotation_angle
 from vd.evaluate.student import PRETRAINED, RENDERED
+from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.saved import SavedStudent
 from vd.student.stopping import StoppingRule
@@ -52,17 +53,26 @@ class StudentPilot:
         student: The student.
         hand: The hand.
         item: The object.
+        tolerance_rad: How near to the goal it is to stop [rad].
         seed: Of the choice of camera points.
 
     Attributes:
         camera: Where its camera has to be; None: it sees complete clouds, which only a twin has.
     """
 
-    def __init__(self, student: SavedStudent, hand: HandModel, item: ObjectModel, *, seed: int = 0):
+    def __init__(
+        self,
+        student: SavedStudent,
+        hand: HandModel,
+        item: ObjectModel,
+        *,
+        tolerance_rad: float = PAPER.success.rotation_rad,
+        seed: int = 0,
+    ):
         spec = student.spec
         if spec.stage == PRETRAINED:
             raise ValueError("a student of stage 0 is an encoder, which cannot act; give one of stage 1 or 2")
-        self.rule, self._network = spec.stopping, student.network
+        self.rule, self._network = spec.rule_for(tolerance_rad), student.network
         self.camera = student_camera(student, hand)
         depth = None
         if self.camera is not None:
@@ -102,10 +112,11 @@ class TeacherPilot:
     Args:
         policy: The teacher.
         mirror: A world of its training.
+        tolerance_rad: How near to the goal it is to stop [rad].
     """
 
-    def __init__(self, policy: Any, mirror: Mirror):
-        self.rule = StoppingRule()
+    def __init__(self, policy: Any, mirror: Mirror, tolerance_rad: float = PAPER.success.rotation_rad):
+        self.rule = StoppingRule(tolerance_rad)
         self._sight = TeacherSight(policy, mirror)
 
     def begin(self) -> None:

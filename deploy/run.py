@@ -66,6 +66,8 @@ class RunCfg(HandOptions):
     """Time for each goal [s]; then the next one is pursued."""
     hold_s: float = 1.0
     """How long the hand holds still between goals [s]."""
+    precise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Stop within 0.1 rad rather than 0.4, as the paper's precise variant does: fewer goals, nearer."""
     nudge: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
     explore: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -125,7 +127,15 @@ def run(cfg: RunCfg) -> int:
     torch.set_num_threads(1)  # of several, some would wait for one that has no core
     hand, _ = read_hand_and_joints(cfg)
     item = one_object(cfg.object)
-    flight = make_flight(cfg.policy or f"{hand.name}-table", cfg.hand, cfg.object, hand, item, seed=cfg.seed)
+    flight = make_flight(
+        cfg.policy or f"{hand.name}-table",
+        cfg.hand,
+        cfg.object,
+        hand,
+        item,
+        tolerance_rad=PAPER.success.precise_rad if cfg.precise else PAPER.success.rotation_rad,
+        seed=cfg.seed,
+    )
     if flight.needs_truth and not cfg.twin:
         raise ValueError(
             f"{cfg.policy} needs the object's true pose, which no real hand tells; give a student of stage 2"

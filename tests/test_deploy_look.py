@@ -7,7 +7,7 @@ from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
 from vd.config import to_dict
-from vd.deploy.flight import Flight, look
+from vd.deploy.flight import Flight, look, make_flight
 from vd.deploy.observation import Sensed
 from vd.deploy.pilot import StudentPilot
 from vd.envs.cfg import ReorientCfg
@@ -15,6 +15,7 @@ from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import PRESETS
 from vd.student.network import Student
 from vd.student.saved import SavedStudent, StudentSpec
+from vd.student.stopping import StoppingRule
 
 SHIFT_M = 0.01
 
@@ -25,12 +26,26 @@ class Source:
     intrinsics = Intrinsics(64, 36, 55.0, 55.0, 31.0, 19.0)
 
 
-def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
-    hand, network = load_hand("dclaw3"), PRESETS["small"]
-    spec = StudentSpec(network, 9, 2)
+def make_student(**rules):
+    """A student of stage 2 with random weights."""
+    network = PRESETS["small"]
     task, depth = to_dict(ReorientCfg(hand="dclaw3", objects=("cube",))), to_dict(DepthCameraCfg(points=500))
-    student = SavedStudent(spec, Student(network, 9).eval(), task, depth, 1, 1)
-    pilot = StudentPilot(student, hand, load_set("cube")[0])
+    return SavedStudent(StudentSpec(network, 9, 2, **rules), Student(network, 9).eval(), task, depth, 1, 1)
+
+
+def test_a_pilot_stops_by_the_rule_for_its_tolerance():
+    near, precise = StoppingRule(0.37, 2.0), StoppingRule(0.07, 0.9)
+    hand, (item,) = load_hand("dclaw3"), load_set("cube")
+    student = make_student(stopping=near, precise=precise)
+    assert StudentPilot(student, hand, item).rule == near
+    assert StudentPilot(student, hand, item, tolerance_rad=0.1).rule == precise
+    teacher = make_flight("dclaw3-table", "dclaw3", "cube", hand, item, tolerance_rad=0.1)
+    assert teacher.pilot.rule == StoppingRule(0.1)
+
+
+def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
+    hand = load_hand("dclaw3")
+    pilot = StudentPilot(make_student(), hand, load_set("cube")[0])
     flight = Flight("student", "student", pilot, ReorientCfg(hand="dclaw3"), pilot.camera)
     zero, image = np.zeros(9), np.full((36, 64), 0.6, dtype=np.float32)
     sensed = Sensed(zero, zero, zero, np.array([0.0, 0.0, 0.0, 1.0]), depth=image)

@@ -121,7 +121,7 @@ def test_errors_and_stops_are_up_to_symmetry():
     assert stopped.tolist() == [[False, False], [True, True]]
     rule = StoppingRule(0.4, 2.0)
     square_only = trace.of([1]), protocol("zero", 2), [square]
-    rows, _ = judge(*square_only, kind="zero", sees="nothing", group="b", rule=rule)
+    rows, _ = judge(*square_only, kind="zero", sees="nothing", group="b", rules=lambda _: rule)
     assert rows[0].outcomes["success"].value == 1.0 and rows[0].exact.value == 0.0
 
 
@@ -157,7 +157,7 @@ def protocol(name, episodes, **changes):
     return Protocol(**{**values, **changes})
 
 
-def compared(offset=-0.3, fall_at=None):
+def compared(offset=-0.3, fall_at=None, rules=lambda _: StoppingRule(0.2, 2.0)):
     objects = (FakeObject("a"), FakeObject("b"))
     trace = traced(objects=objects, episodes=4, policy={"offset": offset}, fall_at=fall_at)
     return judge(
@@ -167,7 +167,7 @@ def compared(offset=-0.3, fall_at=None):
         kind="student of stage 1",
         sees="complete clouds",
         group="training",
-        rule=StoppingRule(0.2, 2.0),
+        rules=rules,
     )
 
 
@@ -193,11 +193,22 @@ def test_what_predictions_are_worth():
     said = true - 0.3 <= 0.4
     assert far.seen == 1.0 and far.right == pytest.approx((true[said] <= 0.4).mean())
     by_prediction, by_truth = (row.stops_within for row in rows)
-    assert by_prediction["0.4"].value == 0.0, "it stops at 0.65 rad"
+    assert by_prediction["0.4"].value == 0.0, "it stops at 0.45 rad"
     assert by_truth["0.4"].value == by_truth["0.1"].value == 1.0
-    rows, sure = compared(offset=0.0)
+    rows, sure = compared(offset=0.0, rules=lambda tolerance: StoppingRule(tolerance, 2.0))
     assert [bound.right for bound in sure.bounds] == [1.0, 1.0]
     assert rows[0].stops_within == rows[1].stops_within
+
+
+def test_each_tolerance_has_its_own_rule():
+    """Predictions are 0.3 rad too small; the rule for 0.4 rad knows of it, the one for 0.1 does not."""
+    bounds = {0.1: 0.1, 0.4: 0.05}
+    rows, _ = compared(rules=lambda tolerance: StoppingRule(bounds[tolerance], 2.0))
+    by_prediction, by_truth = rows
+    assert by_prediction.rule.distance_rad == 0.05 and by_truth.rule.distance_rad == 0.4
+    assert by_prediction.stops_within["0.4"].value == by_prediction.outcomes["success"].value == 1.0
+    assert by_prediction.stops_within["0.1"].value == 0.0
+    assert by_truth.stops_within["0.1"].value == by_truth.stops_within["0.4"].value == 1.0
 
 
 def test_page_and_file(tmp_path):

@@ -273,7 +273,11 @@ def _check_calibration_in_air(path, monkeypatch):
     monkeypatch.setattr("vd.train.student.calibrate.record", spy)
     assert main(["calibrate", str(path), "--episodes", "2", "--in-air"]) == 0
     assert asked == [(24, 180)]
-    assert "2 episodes in the air" in load_student(path).spec.calibrated_on
+    spec = load_student(path).spec
+    assert "2 episodes in the air" in spec.calibrated_on
+    # Both episodes lie at their goals, so that the strictest bounds that stop them are the best for both.
+    assert spec.precise is not None and spec.rule_for(0.1) == spec.precise
+    assert 0.0 < spec.precise.distance_rad < spec.stopping.distance_rad
 
 
 @pytest.mark.slow

@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from vd.evaluate.trace import Trace
+from vd.student.cfg import StudentCfg
+from vd.student.saved import StudentSpec
 from vd.student.stopping import StoppingRule, calibrate
 from vd.train.student.calibrate import calibrate_trace
 
@@ -77,6 +79,22 @@ def test_nothing_to_calibrate_on_is_an_error():
         calibrate(predicted, norm, true, np.zeros_like(alive))
     with pytest.raises(ValueError, match="no rule stops any of 60 episodes"):
         calibrate(predicted, norm, true + 2.0, alive)
+
+
+def test_each_tolerance_has_the_rule_that_was_calibrated_for_it():
+    spec = StudentSpec(StudentCfg(), 9, 2, stopping=StoppingRule(0.3, 2.0))
+    assert spec.rule_for(TOLERANCE) == spec.stopping
+    assert spec.rule_for(0.1) == StoppingRule(0.1, 2.0), "nothing better is known"
+    precise = dataclasses.replace(spec, precise=StoppingRule(0.07, 1.0))
+    assert precise.rule_for(0.1) == precise.precise and precise.rule_for(0.4) == spec.stopping
+    assert precise.rule_for(0.2) == StoppingRule(0.2, 2.0)
+
+
+def test_a_rule_for_less_is_stricter():
+    """Predictions with an error of 0.03 rad: asked for 0.1 rad, a bound of 0.1 stops too many outside."""
+    data = episodes(7, noise=0.03)
+    wide, near = calibrate(*data), calibrate(*data, tolerance_rad=0.1)
+    assert near.rule.distance_rad < 0.1 < wide.rule.distance_rad and near.success > 0.0
 
 
 def test_a_recorded_trace_gives_the_same_rule():

@@ -88,7 +88,8 @@ class RewardConstants:
 class SuccessConstants:
     """Success and fall thresholds (paper, Supplementary Methods, success criteria; Table S1)."""
 
-    rotation_rad: float = source(0.4, "P", "theta; 0.1 in the precise variant")
+    rotation_rad: float = source(0.4, "P", "theta")
+    precise_rad: float = source(0.1, "P", "theta in the precise variant")
     joint_speed_rad_s: float = source(0.25, "P", "norm of qd")
     object_speed_m_s: float = source(0.04, "P", "norm of v")
     object_spin_rad_s: float = source(0.5, "P", "norm of omega")

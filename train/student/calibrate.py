@@ -1,4 +1,4 @@
-"""The rule by which a student stops, from episodes that nothing stops."""
+"""The rules by which a student stops, from episodes that nothing stops."""
 
 import math
 from dataclasses import replace
@@ -49,8 +49,10 @@ def calibrate_student(
     in_air: bool = False,
     seed: int = 0,
     device: str,
-) -> Calibration:
-    """Calibrate the stopping rule of a student and store it in its file.
+) -> tuple[Calibration, Calibration | None]:
+    """Calibrate the stopping rules of a student and store them in its file.
+
+    One is for the tolerance, one for that of the paper's precise variant, from the same episodes.
 
     Args:
         path: ``student.pt``.
@@ -62,8 +64,12 @@ def calibrate_student(
         seed: Of starts, goals and sensor errors.
         device: Warp and torch device.
 
+    Returns:
+        What either rule gave; None for the precise one where no rule stops any episode so near its goal.
+
     Raises:
-        ValueError: The student is one of stage 0, which cannot act.
+        ValueError: The student is one of stage 0, which cannot act, or no rule stops any episode within the
+            tolerance.
     """
     wp.config.log_level = wp.LOG_WARNING
     saved = load_student(path, device)
@@ -87,9 +93,18 @@ def calibrate_student(
     env.check()
     env.close()
     result = calibrate_trace(trace, tolerance_rad=tolerance_rad)
+    try:
+        precise = calibrate_trace(trace, tolerance_rad=PAPER.success.precise_rad)
+    except ValueError:  # of a student that never came so near there is nothing to learn
+        precise = None
     state = read_student(path)
     what = f"{', '.join(sets)}: {result.episodes} episodes{' in the air' if in_air else ''}, "
     what += f"tolerance {tolerance_rad:g} rad, seed {seed}"
-    spec = replace(saved_spec(state, path), stopping=result.rule, calibrated_on=what)
+    spec = replace(
+        saved_spec(state, path),
+        stopping=result.rule,
+        precise=None if precise is None else precise.rule,
+        calibrated_on=what,
+    )
     save_checkpoint(path, {**state, "spec": to_dict(spec)})
-    return result
+    return result, precise

@@ -36,7 +36,7 @@ class CalibrateCfg:
     episodes: int = 256
     """Episodes, all side by side; rounded up to as many of each object."""
     tolerance_rad: float = PAPER.success.rotation_rad
-    """Largest true distance that counts as right [rad]."""
+    """Largest true distance that counts as right [rad]; a rule for 0.1 rad is always chosen too."""
     randomise: bool = False
     """Domain randomisation and disturbances."""
     in_air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -138,7 +138,7 @@ def calibrate_command(arguments: list[str], _started: float) -> int:
     from vd.train.student.calibrate import calibrate_student
 
     with waiting("running the episodes", not cfg.json):
-        result = calibrate_student(
+        found, precise = calibrate_student(
             cfg.student,
             objects=cfg.objects,
             episodes=cfg.episodes,
@@ -149,14 +149,18 @@ def calibrate_command(arguments: list[str], _started: float) -> int:
             device=resolve_device(cfg.device),
         )
     if cfg.json:
-        print(json.dumps(to_dict(result), indent=1))
+        print(json.dumps(to_dict(found) | {"precise": precise and to_dict(precise)}, indent=1))
         return 0
-    rule = result.rule
-    print(
-        f"{cfg.student}: stop below {rule.distance_rad:.3f} rad predicted and an action norm of "
-        f"{rule.action_norm:.3f}. Of {result.episodes} episodes {result.success:.1%} stop within "
-        f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} came that near"
-    )
+    for result in (found, precise):
+        if result is None:
+            print(f"{cfg.student}: none came within {PAPER.success.precise_rad:g} rad: no rule for it")
+            continue
+        rule = result.rule
+        print(
+            f"{cfg.student}: stop below {rule.distance_rad:.3f} rad predicted and an action norm of "
+            f"{rule.action_norm:.3f}. Of {result.episodes} episodes {result.success:.1%} stop within "
+            f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} came that near"
+        )
     return 0
 
 

@@ -147,6 +147,8 @@ class StoppingPart:
     action_norm: float
     calibrated_on: str
     """Objects and episodes; empty: the paper's bounds."""
+    precise: tuple[float, float] | None = None
+    """The same two to stop within 0.1 rad; None: not calibrated."""
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,12 @@ def write_student(folder: Path, student: "SavedStudent", hand: HandModel) -> Con
             camera=spec.camera,
         ),
         network=to_dict(spec.network),
-        stopping=StoppingPart(spec.stopping.distance_rad, spec.stopping.action_norm, spec.calibrated_on),
+        stopping=StoppingPart(
+            spec.stopping.distance_rad,
+            spec.stopping.action_norm,
+            spec.calibrated_on,
+            None if spec.precise is None else (spec.precise.distance_rad, spec.precise.action_norm),
+        ),
         provenance=replace(
             _provenance(student.task, spec.teacher, spec.stage, student.iteration, student.env_steps),
             depth=student.depth if rendered else {},
@@ -203,6 +208,7 @@ def _build(contract: Contract, weights: dict[str, torch.Tensor], device: str) ->
         teacher=source.teacher,
         camera=camera.pose_in_base if camera is not None and camera.source == "policy" else None,
         stopping=StoppingRule(stopping.distance_rad, stopping.action_norm),
+        precise=None if stopping.precise is None else StoppingRule(*stopping.precise),
         calibrated_on=stopping.calibrated_on,
     )
     network = Student(spec.network, spec.num_actions).to(device)

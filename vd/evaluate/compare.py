@@ -84,7 +84,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             env.objects = with_symmetries(env.objects, device)
             task, start = wanted, env.state_dict()
         env.load_state_dict(start)
-        actor, kind, sees, rule = _actor(cfg, name, policy, env, device)
+        actor, kind, sees, rules = _actor(cfg, name, policy, env, device)
         trace = _run(cfg, env, actor, name)
         protocol = Protocol(
             policy=name,
@@ -116,7 +116,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
                 kind=kind,
                 sees=sees,
                 group=group,
-                rule=rule,
+                rules=rules,
                 resample=cfg.resample,
             )
             rows += found
@@ -163,21 +163,21 @@ def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int
 
 
 def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str) -> tuple[Any, str, str, Any]:
-    """What acts, its kind, what it sees, and its rule to stop."""
+    """What acts, its kind, what it sees, and its rules to stop, by tolerance."""
     from vd.policy import TrainedPolicy
     from vd.student.stopping import StoppingRule
 
     if name in BUILT_IN:
-        return built_in(name, env.num_actions, seed=cfg.seed, device=device), name, "nothing", StoppingRule()
+        return built_in(name, env.num_actions, seed=cfg.seed, device=device), name, "nothing", StoppingRule
     if isinstance(policy, TrainedPolicy):
-        return policy, "teacher", "state", StoppingRule()
+        return policy, "teacher", "state", StoppingRule
     from vd.evaluate.student import StudentActor
 
     assert policy is not None
     rendered = None if cfg.sees == "auto" else cfg.sees == "rendered"
     actor = StudentActor(env, policy, rendered=rendered, scanned_goals=cfg.scanned_goals, seed=cfg.seed)
     sees = "rendered clouds" if actor.rendered else "complete clouds"
-    return actor, f"student of stage {policy.spec.stage}", sees, policy.spec.stopping
+    return actor, f"student of stage {policy.spec.stage}", sees, policy.spec.rule_for
 
 
 def _run(cfg: "EvalCfg", env: Any, actor: Any, name: str) -> Any:

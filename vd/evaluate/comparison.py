@@ -4,7 +4,8 @@ Angles are radians, times seconds.
 """
 
 import json
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,12 +16,13 @@ from vd.evaluate.result import EvalResult, Protocol, summarise
 from vd.evaluate.statistics import Interval, Unit, choose_unit, rate_intervals
 from vd.evaluate.trace import Trace
 from vd.files import write_json
+from vd.paper import PAPER
 from vd.student.stopping import StoppingRule
 
-COMPARISON_FORMAT = "visual-dexterity comparison 3"
+COMPARISON_FORMAT = "visual-dexterity comparison 4"
 OUTCOMES = ("success", "orientation error", "time-out", "object falls")
 """Classes of episodes: stopped within the tolerance, stopped outside of it, never stopped, lost."""
-BOUNDS_RAD = (0.1, 0.4)
+BOUNDS_RAD = (PAPER.success.precise_rad, PAPER.success.rotation_rad)
 """Bounds on the distance at which stops and predictions are judged, as in the paper."""
 SCATTER = 2000
 """Pairs of predicted and true distance that are kept for a figure."""
@@ -48,8 +50,7 @@ class Row:
     exact: Interval
     """Share of episodes stopped within the tolerance of the very goal, not of what looks like it."""
     stops_within: dict[str, Interval]
-    """By bound [rad] (as text): share of episodes that stop within it if the distance has to be below this
-    bound rather than the rule's."""
+    """By tolerance [rad] (as text): share of episodes that stop within it, by the rule for this tolerance."""
     result: EvalResult
     """Episodes and summaries; their stops are those of ``stopped_by``."""
 
@@ -130,7 +131,7 @@ def judge(
     kind: str,
     sees: str,
     group: str,
-    rule: StoppingRule,
+    rules: Callable[[float], StoppingRule],
     resample: Literal["auto", "object", "episode"] = "auto",
 ) -> tuple[list[Row], Prediction | None]:
     """Rows of one policy in one group, and what its predictions are worth if it is a student.
@@ -142,11 +143,12 @@ def judge(
         kind: Of the policy.
         sees: What it sees.
         group: Name of the group.
-        rule: The policy's own; the true distance is held against the tolerance of the protocol, with the same
-            bound on the action.
+        rules: The policy's own rule for a tolerance [rad]; where the true distance decides, it is held
+            against the tolerance itself, with the same bound on the action.
         resample: Of the intervals.
     """
-    true_rule = StoppingRule(protocol.stop_tolerance_rad, rule.action_norm)
+    rule = rules(protocol.stop_tolerance_rad)
+    true_rule = replace(rule, distance_rad=protocol.stop_tolerance_rad)
     ways: list[tuple[StoppedBy, StoppingRule]] = [("true distance", true_rule)]
     if trace.predicted is not None:
         ways.insert(0, ("prediction", rule))
@@ -171,7 +173,7 @@ def judge(
                 rule=bounds,
                 outcomes=outcome_shares(result, resample=resample),
                 exact=_exact(trace, bounds, protocol.stop_tolerance_rad, by_prediction, unit),
-                stops_within=_stops_within(trace, rule.action_norm, by_prediction, unit),
+                stops_within=_stops_within(trace, rules, by_prediction, unit),
                 result=result,
             )
         )
@@ -202,11 +204,16 @@ def _exact(
     return rate_intervals((stopped & (error <= tolerance_rad))[None], unit)[0]
 
 
-def _stops_within(trace: Trace, action_norm: float, by_prediction: bool, unit: Unit) -> dict[str, Interval]:
-    """Share of episodes that stop within each of BOUNDS_RAD with the bound in place of the rule's."""
+def _stops_within(
+    trace: Trace, rules: Callable[[float], StoppingRule], by_prediction: bool, unit: Unit
+) -> dict[str, Interval]:
+    """Share of episodes that stop within each of BOUNDS_RAD by the rule for it."""
     within = []
     for bound in BOUNDS_RAD:
-        steps, stopped = trace.ends(StoppingRule(bound, action_norm), by_prediction=by_prediction)
+        rule = rules(bound)
+        if not by_prediction:
+            rule = replace(rule, distance_rad=bound)
+        steps, stopped = trace.ends(rule, by_prediction=by_prediction)
         error = np.take_along_axis(trace.error, steps[..., None], axis=-1)[..., 0]
         within.append(stopped & (error <= bound))
     return dict(zip(map(str, BOUNDS_RAD), rate_intervals(np.stack(within), unit), strict=True))

@@ -115,7 +115,7 @@ def within(tolerance_rad: float) -> Measure:
 
 
 def stops_within(bound_rad: float) -> Measure:
-    """Share of episodes that stop within a bound which the distance has to be below to stop."""
+    """Share of episodes that stop within a tolerance, by the rule for it."""
     return lambda _, row: row.stops_within[str(bound_rad)]
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from vd.config import from_dict
+from vd.paper import PAPER
 from vd.student.cfg import StudentCfg
 from vd.student.network import Student
 from vd.student.packed import pack, unpack
@@ -31,8 +32,21 @@ class StudentSpec:
     """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the hand's."""
     stopping: StoppingRule = field(default_factory=StoppingRule)
     """When to stop; the paper's bounds until they are calibrated."""
+    precise: StoppingRule | None = None
+    """When to stop within the tolerance of the paper's precise variant; None: not calibrated."""
     calibrated_on: str = ""
-    """Objects and episodes on which the stopping rule was calibrated; empty if it was not."""
+    """Objects and episodes on which the stopping rules were calibrated; empty if they were not."""
+
+    def rule_for(self, tolerance_rad: float) -> StoppingRule:
+        """When to stop within a tolerance [rad]: the rule calibrated for it, else the tolerance as bound.
+
+        ``stopping`` serves the paper's tolerance, whatever ``--tolerance-rad`` it was calibrated for.
+        """
+        if tolerance_rad == PAPER.success.rotation_rad:
+            return self.stopping
+        if tolerance_rad == PAPER.success.precise_rad and self.precise is not None:
+            return self.precise
+        return StoppingRule(tolerance_rad, self.stopping.action_norm)
 
 
 @dataclass(frozen=True)
