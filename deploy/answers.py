@@ -1,8 +1,8 @@
 """What motors answer, and which of their states are accepted.
 
-A state counts only whole and fresh: right motor, right length, no error number, angles that a motor can count,
-a clock that went on as ours did, and no farther from the last one than the motor can turn. A checksum alone is not
-enough: its 16 bits pass one of 65536 broken packets.
+A state counts only whole and fresh: right motor, right length, no error number, angles that a motor can
+count, a clock that went on as ours did, and no farther from the last one than the motor can turn. A checksum
+alone is not enough: its 16 bits pass one of 65536 broken packets.
 """
 
 from collections.abc import Sequence
@@ -142,7 +142,7 @@ class StateCheck:
         counts = column("present_position")
         for answer, count in zip(answers, counts, strict=True):
             if abs(count) > FARTHEST_COUNTS:
-                raise BusError(f"motor {answer.id}: its position came as {count} counts, which it cannot reach")
+                raise BusError(f"motor {answer.id}: its position came as {count} counts, beyond reach")
         state = HandState(
             time_s=time_s,
             position=np.array([to_angle(int(count)) for count in counts]),

@@ -47,6 +47,8 @@ class Flight:
     """Where its depth camera has to be; None: it has none."""
     needs_truth: bool = False
     """Whether it needs the object's true pose, which only a twin knows."""
+    calibrated: bool = True
+    """Whether its rule to stop comes from episodes; a teacher's needs none."""
 
 
 def make_flight(
@@ -86,7 +88,15 @@ def make_flight(
     if student:
         pilot = StudentPilot(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
         camera = pilot.camera
-        return Flight(name, "student", pilot, trained_task(policy), camera, needs_truth=camera is None)
+        return Flight(
+            name,
+            "student",
+            pilot,
+            trained_task(policy),
+            camera,
+            needs_truth=camera is None,
+            calibrated=policy.spec.calibrated_for(tolerance_rad),
+        )
     task = mirror_task(policy, hand_name, item_name)
     teacher = TeacherPilot(policy, Mirror(task), tolerance_rad)
     return Flight(name, "teacher", teacher, task, needs_truth=True)

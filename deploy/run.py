@@ -136,6 +136,12 @@ def run(cfg: RunCfg) -> int:
         tolerance_rad=PAPER.success.precise_rad if cfg.precise else PAPER.success.rotation_rad,
         seed=cfg.seed,
     )
+    if cfg.precise and not flight.calibrated:
+        print(
+            f"{flight.name} has no rule of its own for {PAPER.success.precise_rad:g} rad: it stops where it "
+            "predicts that distance; vd-train calibrate finds a better one",
+            file=sys.stderr,
+        )
     if flight.needs_truth and not cfg.twin:
         raise ValueError(
             f"{cfg.policy} needs the object's true pose, which no real hand tells; give a student of stage 2"

@@ -42,7 +42,15 @@ def make_student(stage=2, goal="merged", camera=None):
     torch.manual_seed(0)
     cfg = replace(TINY, goal=goal)
     spec = StudentSpec(
-        cfg, 9, stage, TEACHER, camera, StoppingRule(0.31, 0.7), StoppingRule(0.08, 0.9), "cube: 8 episodes"
+        cfg,
+        9,
+        stage,
+        TEACHER,
+        camera,
+        stopping=StoppingRule(0.31, 0.7),
+        tolerance_rad=0.3,
+        precise=StoppingRule(0.08, 0.9),
+        calibrated_on="cube: 8 episodes",
     )
     task = to_dict(ReorientCfg(hand="dclaw3", objects=("/somewhere/mine/training-set", "cube")))
     network = Student(cfg, 9).eval().requires_grad_(False)

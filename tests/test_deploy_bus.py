@@ -377,8 +377,8 @@ def test_a_position_that_no_motor_can_count_is_refused_before_any_other_is_known
 def test_ten_thousand_broken_packets_make_no_hang_no_crash_and_no_position():
     """Every accepted state would be wrong: none of the packets that arrive is a whole answer of the motor.
 
-    Of so many a few have a right checksum all the same: which, the timing decides. Motors are configured as before
-    every run, so that their speeds are known and such a position has to be one that they can have turned to.
+    Of so many one may have a right checksum all the same: whether, the timing decides. The motor is
+    configured as before every run, so that its speed is known, and a position has to be within its reach.
     """
     motor = Motor(MODELS[MODEL], 1)
     with Twin([motor]) as twin, MotorBus(twin.path, [1], MODEL, retries=20) as bus:

@@ -255,6 +255,7 @@ def test_stages_on_the_command_line(tmp_path, capsys, monkeypatch):
     rule = json.loads(capsys.readouterr().out)["rule"]
     spec = load_student(path).spec
     assert spec.stopping.distance_rad == rule["distance_rad"] and "2 episodes" in spec.calibrated_on
+    assert spec.tolerance_rad == 3.1416, "what the rule is for is kept with it"
     assert read_student(path)["iter"] == 2
     _check_calibration_in_air(path, monkeypatch)
 

@@ -88,6 +88,11 @@ def test_each_tolerance_has_the_rule_that_was_calibrated_for_it():
     precise = dataclasses.replace(spec, precise=StoppingRule(0.07, 1.0))
     assert precise.rule_for(0.1) == precise.precise and precise.rule_for(0.4) == spec.stopping
     assert precise.rule_for(0.2) == StoppingRule(0.2, 2.0)
+    other = dataclasses.replace(precise, tolerance_rad=0.2)
+    assert other.rule_for(0.2) == other.stopping and other.rule_for(0.4) == StoppingRule(0.4, 2.0)
+    known = dataclasses.replace(other, calibrated_on="cube: 8 episodes")
+    assert known.calibrated_for(0.2) and known.calibrated_for(0.1) and not known.calibrated_for(0.4)
+    assert not spec.calibrated_for(TOLERANCE), "the paper's bounds are of no episodes"
 
 
 def test_a_rule_for_less_is_stricter():

@@ -103,6 +103,7 @@ def calibrate_student(
     spec = replace(
         saved_spec(state, path),
         stopping=result.rule,
+        tolerance_rad=tolerance_rad,
         precise=None if precise is None else precise.rule,
         calibrated_on=what,
     )

@@ -149,6 +149,8 @@ class StoppingPart:
     """Objects and episodes; empty: the paper's bounds."""
     precise: tuple[float, float] | None = None
     """The same two to stop within 0.1 rad; None: not calibrated."""
+    tolerance_rad: float = PAPER.success.rotation_rad
+    """Tolerance that the first two are for [rad]."""
 
 
 @dataclass(frozen=True)

@@ -105,6 +105,7 @@ def write_student(folder: Path, student: "SavedStudent", hand: HandModel) -> Con
             spec.stopping.action_norm,
             spec.calibrated_on,
             None if spec.precise is None else (spec.precise.distance_rad, spec.precise.action_norm),
+            spec.tolerance_rad,
         ),
         provenance=replace(
             _provenance(student.task, spec.teacher, spec.stage, student.iteration, student.env_steps),
@@ -208,6 +209,7 @@ def _build(contract: Contract, weights: dict[str, torch.Tensor], device: str) ->
         teacher=source.teacher,
         camera=camera.pose_in_base if camera is not None and camera.source == "policy" else None,
         stopping=StoppingRule(stopping.distance_rad, stopping.action_norm),
+        tolerance_rad=stopping.tolerance_rad,
         precise=None if stopping.precise is None else StoppingRule(*stopping.precise),
         calibrated_on=stopping.calibrated_on,
     )

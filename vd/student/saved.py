@@ -31,22 +31,26 @@ class StudentSpec:
     camera: tuple[float, ...] | None = None
     """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the hand's."""
     stopping: StoppingRule = field(default_factory=StoppingRule)
-    """When to stop; the paper's bounds until they are calibrated."""
+    """When to stop within ``tolerance_rad``; the paper's bounds until they are calibrated."""
+    tolerance_rad: float = PAPER.success.rotation_rad
+    """Tolerance that ``stopping`` is for [rad]."""
     precise: StoppingRule | None = None
     """When to stop within the tolerance of the paper's precise variant; None: not calibrated."""
     calibrated_on: str = ""
     """Objects and episodes on which the stopping rules were calibrated; empty if they were not."""
 
     def rule_for(self, tolerance_rad: float) -> StoppingRule:
-        """When to stop within a tolerance [rad]: the rule calibrated for it, else the tolerance as bound.
-
-        ``stopping`` serves the paper's tolerance, whatever ``--tolerance-rad`` it was calibrated for.
-        """
-        if tolerance_rad == PAPER.success.rotation_rad:
+        """When to stop within a tolerance [rad]: the rule for it, else the tolerance itself as bound."""
+        if tolerance_rad == self.tolerance_rad:
             return self.stopping
         if tolerance_rad == PAPER.success.precise_rad and self.precise is not None:
             return self.precise
         return StoppingRule(tolerance_rad, self.stopping.action_norm)
+
+    def calibrated_for(self, tolerance_rad: float) -> bool:
+        """Whether the rule for a tolerance [rad] comes from episodes."""
+        precise = tolerance_rad == PAPER.success.precise_rad and self.precise is not None
+        return precise or (tolerance_rad == self.tolerance_rad and bool(self.calibrated_on))
 
 
 @dataclass(frozen=True)
