@@ -73,6 +73,10 @@ class FakeEnv:
         self.resets += 1
         self._publish()
 
+    def has_table(self):
+        """Tables stay."""
+        return np.ones(self.num_worlds, dtype=bool)
+
     def _restart(self, worlds, object_quat=None, goal_quat=None):
         if object_quat is None:
             object_quat = Rotation.random(len(worlds), rng=self._rng).as_quat()

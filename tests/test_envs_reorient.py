@@ -120,8 +120,11 @@ def test_tables_leave_their_share_of_worlds_in_time():
         heights.append(env.object_pose_end.numpy()[:, 2].copy())
         fell += env.fell.numpy()
         if len(heights) == gone:
-            assert not fell.any()
+            assert not fell.any() and env.has_table().all()
+        if len(heights) == gone + 1:
+            np.testing.assert_array_equal(env.has_table(), ~lost)
     assert (fell[lost] > 0).all() and not fell[~lost].any()
+    assert env.has_table().all(), "tables are back when episodes begin anew"
     before, after = heights[gone - 1], heights[gone + 1]
     assert (after[lost] < before[lost] - 0.02).all() and np.allclose(after[~lost], before[~lost], atol=2e-3)
 
@@ -275,7 +278,8 @@ def test_a_run_goes_on_without_the_few_worlds_that_fail(tmp_path, effects):
     np.testing.assert_array_equal(np.delete(env.step_count.numpy(), 2), np.delete(before + 1, 2))
     assert env.reward.numpy()[2] == 0.0
     run(env, 3)
-    for array in (env.observation, env.reward, env.reward_terms, env.rotation_error, env.tip_pos, env.effort):
+    fingers = env.fingers.tip_pos, env.fingers.effort
+    for array in (env.observation, env.reward, env.reward_terms, env.rotation_error, *fingers):
         assert np.isfinite(array.numpy()).all()
     for _ in range(8):
         env.sim.joint_qd.numpy()[1, 0] = np.nan

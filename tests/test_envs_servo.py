@@ -207,7 +207,7 @@ def test_a_torque_limit_bounds_the_torque_that_costs_energy(layer):
         for index, world in enumerate((env, plain)):
             world.action.fill_(1.0)
             world.step(world.action)
-            largest[index] = max(largest[index], float(np.abs(world.effort.numpy()).max()))
+            largest[index] = max(largest[index], float(np.abs(world.fingers.effort.numpy()).max()))
     assert largest[0] <= 0.02 * (1 + 1e-5) and largest[1] > 0.04
 
 

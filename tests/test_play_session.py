@@ -169,6 +169,7 @@ def test_cells_show_different_objects_first():
         ({"cells": 0}, "--cells is 0"),
         ({"seconds": 0.0}, "--seconds"),
         ({"max_goal_angle": 4.0}, "--max-goal-angle is 4.0"),
+        ({"episode_s": 0.0}, "--episode-s is 0.0"),
     ],
 )
 def test_bad_settings_are_refused_by_flag(fields, message):
@@ -181,6 +182,11 @@ def test_the_installed_policy_is_shown_unless_one_agent_is_named():
     with pytest.raises(ValueError, match="name one agent"):
         _ = PlayCfg(policy="a.pt", agent="zero").agent_name
     assert PlayCfg(policy="a.pt").agent_name == "a.pt"
+
+
+def test_episodes_in_the_air_are_longer_unless_asked_otherwise():
+    assert PlayCfg().limit_s == 10.0 and PlayCfg(in_air=True).limit_s == 15.0
+    assert PlayCfg(in_air=True, episode_s=4.0).limit_s == 4.0
 
 
 @pytest.mark.parametrize("module", ["vd.play.cli", "vd.evaluate.cli"])
@@ -198,6 +204,7 @@ def test_help_imports_nothing_heavy(module):
 
 @pytest.mark.slow
 def test_video_of_the_real_environment(tmp_path):
+    """In the air: the last of 25 frames is the first after the table has gone."""
     from vd.play.cli import main
 
     path = tmp_path / "random.png"
@@ -209,7 +216,8 @@ def test_video_of_the_real_environment(tmp_path):
         "--video",
         str(path),
         "--seconds",
-        "0.5",
+        "2.084",
+        "--in-air",
         "--device",
         "cpu",
     ]
@@ -219,6 +227,10 @@ def test_video_of_the_real_environment(tmp_path):
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 500
     first, last = sheet[:400, :480], sheet[480:880, 1280 : 1280 + 480]
     assert (np.abs(first.astype(int) - last).sum(axis=2) > 60).sum() > 200  # fingers moved
+    corner = slice(340, 390), slice(20, 60)  # of the table, out of the fingers' reach
+    before, after = (moment[corner].reshape(-1, 3).astype(int) for moment in (first, last))
+    background = last[200, 5]
+    assert (after == background).all() and (np.abs(before - background).max(axis=1) > 10).all()
 
 
 @pytest.mark.slow

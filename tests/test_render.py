@@ -110,6 +110,17 @@ def test_table_receives_the_shadow_of_the_object():
     assert middle(darker)[1] > middle(orange(with_shadow))[1]  # on the table, below the object in the picture
 
 
+def test_a_table_that_is_taken_away_is_not_drawn():
+    renderer = Renderer(None, [box("cube", [0.05] * 3)] * 2, width=160, height=120, goal_size=60)
+    q, goals = np.repeat(pose((0.0, 0.0, 0.1)), 2, axis=0), np.array([IDENTITY] * 2)
+    there, gone = (one.scene for one in renderer.render(q, goals, np.array([True, False])))
+    spot = renderer.camera.project(np.array([[0.1, 0.0, 0.0]]), 160, 120)[0].round().astype(int)
+    background = gone[0, 0]
+    np.testing.assert_array_equal(gone[spot[1], spot[0]], background)
+    assert np.abs(there[spot[1], spot[0]].astype(int) - background).max() > 10
+    assert orange(gone).sum() == pytest.approx(orange(there).sum(), rel=0.05), "the object stays"
+
+
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory):
     from vd.assets_usd.hand_author import hand_usd

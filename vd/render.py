@@ -22,7 +22,7 @@ from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
-from vd.sim.scene import add_object, add_table, build_hand, hand_mount, new_builder
+from vd.sim.scene import TABLE_LABEL, add_object, build_hand, hand_mount, new_builder, show_table
 
 # Packed as the renderer packs its bytes: A B G R.
 BACKGROUND = 0xFFEBE1D8
@@ -31,6 +31,8 @@ GHOST_OPACITY = 0.7
 # Light direction in the camera's right, forward (level) and up: from the upper left behind the viewer, and
 # low enough to reach under the palm.
 LIGHT_DIRECTION = (0.35, 0.9, -0.8)
+IN_PLACE, UNSEEN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -100.0, 0.0, 0.0, 0.0, 1.0)
+"""Poses of what is shown, and of what is hidden far below: viewers have no cheaper way to hide one shape."""
 SKY, GROUND = (0.42, 0.43, 0.46), (0.22, 0.21, 0.20)
 
 
@@ -140,8 +142,12 @@ class PictureModel:
             world = new_builder()
             if hand_builder:
                 world.add_builder(hand_builder)
-            add_table(world, cfg, visible=True)
             add_object(world, item, cfg, scale=1.0, visuals=True)
+            # A body, although it never moves in the simulation: so it can be shown as taken away.
+            table = world.add_body(
+                mass=1.0, inertia=wp.mat33(np.eye(3)), label=TABLE_LABEL, lock_inertia=True
+            )
+            show_table(world, cfg, table)
             ghost = world if ghost_in_scene else new_builder()
             body = add_object(ghost, item, cfg, scale=1.0, visuals=True)
             visual = ghost.body_shapes[body][-1]
@@ -157,20 +163,28 @@ class PictureModel:
         self.state = self.model.state()
 
     def pose(
-        self, joint_q: np.ndarray, goal_quat: np.ndarray, goal_position: Sequence[float] = (0.0, 0.0, 0.0)
+        self,
+        joint_q: np.ndarray,
+        goal_quat: np.ndarray,
+        goal_position: Sequence[float] = (0.0, 0.0, 0.0),
+        *,
+        table: np.ndarray | bool = True,
     ) -> None:
-        """Place hands, objects and goals.
+        """Place hands, objects, tables and goals.
 
         Args:
             joint_q: Hand joints [rad], object position [m] and quaternion xyzw, shape [C, D + 7].
             goal_quat: Goal orientations xyzw, shape [C, 4].
             goal_position: Where the goals' objects are drawn [m].
+            table: Whether the table is there, shape [C] or one for all.
         """
         goal = np.concatenate([np.tile(goal_position, (self.cells, 1)), goal_quat], axis=1)
+        tables = np.where(np.reshape(table, (-1, 1)), IN_PLACE, UNSEEN) + np.zeros((self.cells, 1))
+        scene = np.concatenate([joint_q, tables], axis=1)
         if self.ghost_in_scene:
-            q = np.concatenate([joint_q, goal], axis=1)
+            q = np.concatenate([scene, goal], axis=1)
         else:
-            q = np.concatenate([np.ravel(joint_q), np.ravel(goal)])
+            q = np.concatenate([np.ravel(scene), np.ravel(goal)])
         self.state.joint_q.assign(np.ravel(q).astype(np.float32))
         newton.eval_fk(self.model, self.state.joint_q, self.state.joint_qd, self.state)
 
@@ -228,17 +242,20 @@ class Renderer:
             device,
         )
 
-    def render(self, joint_q: np.ndarray, goal_quat: np.ndarray) -> list[Picture]:
+    def render(
+        self, joint_q: np.ndarray, goal_quat: np.ndarray, table: np.ndarray | bool = True
+    ) -> list[Picture]:
         """Draw all cells.
 
         Args:
             joint_q: Hand joints [rad], object position [m] and quaternion xyzw, shape [C, D + 7].
             goal_quat: Goal orientations xyzw, shape [C, 4].
+            table: Whether the table is there, shape [C] or one for all.
 
         Returns:
             C pictures.
         """
-        self.pictured.pose(joint_q, goal_quat)
+        self.pictured.pose(joint_q, goal_quat, table=table)
         state = self.pictured.state
         self.pictured.model.bvh_refit_shapes(state)
         scenes = self._scene_view.draw(state, self._config)

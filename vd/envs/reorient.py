@@ -16,6 +16,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
+from vd.envs.fingers import Fingers
 from vd.envs.nudges import Nudges
 from vd.envs.objects import object_scales, object_weights
 from vd.envs.parameters import TaskParameters
@@ -25,15 +26,15 @@ from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
 from vd.envs.state import load_state, save_failed_step, save_state
 from vd.envs.symmetry import Views
-from vd.envs.table import must_lift, table_array
-from vd.kernels.actions import apply_action_kernel, joint_effort_kernel
+from vd.envs.table import must_lift, table_array, tables_there
+from vd.kernels.actions import apply_action_kernel
 from vd.kernels.guard import void_step_kernel
-from vd.kernels.observations import fingertip_kernel, teacher_observation_kernel, teacher_observation_size
+from vd.kernels.observations import teacher_observation_kernel, teacher_observation_size
 from vd.kernels.resets import episode_kernel, reset_kernel
 from vd.kernels.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.shapes import shape_observation_size
-from vd.kernels.worlds import copy_columns_kernel, count_goals_kernel, record_step_kernel, world_mask_kernel
+from vd.kernels.worlds import count_goals_kernel, record_step_kernel, world_mask_kernel
 from vd.paper import PAPER
 from vd.sim.scene import build_scene
 from vd.sim.simulator import SimulationError, Simulator
@@ -132,10 +133,6 @@ class ReorientEnv:
         """Object pose at the end of the step, before resets, shape [N]."""
         self.goal_counts = zeros(3)
         """Goals ended, goals reached and objects lost since cleared, over all worlds, shape [3]."""
-        self.tip_pos = zeros(n, f, dtype=wp.vec3)
-        """Fingertip positions [m], shape [N, F]."""
-        self.effort = zeros(n, d)
-        """Joint torques [N m], shape [N, D]."""
         self.clearance = zeros(n)
         """Height of the object's lowest point above the table [m], shape [N]; 0 unless it is rewarded."""
         self.rng = zeros(n, dtype=wp.uint32)
@@ -147,11 +144,8 @@ class ReorientEnv:
         self._world_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._lower, self._upper = array(self.hand.lower), array(self.hand.upper)
-        self._effort_limit = array(self.hand.effort)
-        self.tip_body = array(self.scene.link_body[self.hand.tip_link], wp.int32)
-        """Link of each fingertip, an index within a world, shape [F]."""
-        self.tip_offset = array(self.hand.tip_frame, wp.transform)
-        """Fingertip frames in the frames of their links, shape [F]."""
+        self.fingers = Fingers(self)
+        """Positions of the fingertips and torques of the joints."""
         self._body_com = wp.clone(self.sim.model.body_com[: self.scene.bodies_per_world])
         self._reset_q = array(np.tile(PAPER.scene.reset_joint_rad, f))
         self.views = Views(self) if cfg.observation.view == "goal" else None
@@ -270,8 +264,7 @@ class ReorientEnv:
         sim.step()
         if self.cfg.failures_per_million > 0.0:
             sim.put_back(self.step_count, self.max_episode_steps - 1)
-        self._fingertips()
-        self._motor_torque()
+        self.fingers.measure()
         if self._shapes is not None and self._lifts:
             self._shapes.measure_clearance()
         wp.launch(
@@ -282,8 +275,8 @@ class ReorientEnv:
                 p.success,
                 sim.joint_q,
                 sim.joint_qd,
-                self.tip_pos,
-                self.effort,
+                self.fingers.tip_pos,
+                self.fingers.effort,
                 self.goal_quat,
                 self.smoothed,
                 sim.table_force,
@@ -379,39 +372,6 @@ class ReorientEnv:
         if sim.servo is not None:
             sim.servo.reset(self._reset)
 
-    def _motor_torque(self) -> None:
-        n, d, sim = self.num_worlds, self.num_actions, self.sim
-        if sim.servo is not None:
-            # Only the servo knows what it had in the last physics step: a late command, a limited torque.
-            torque = sim.solver.mjw_data.qfrc_actuator
-            wp.launch(
-                copy_columns_kernel, dim=(n, d), inputs=[torque], outputs=[self.effort], device=self.device
-            )
-            return
-        wp.launch(
-            joint_effort_kernel,
-            dim=(n, d),
-            inputs=[
-                self._effort_limit,
-                self.randomiser.kp,
-                self.randomiser.kd,
-                sim.target,
-                sim.joint_q,
-                sim.joint_qd,
-            ],
-            outputs=[self.effort],
-            device=self.device,
-        )
-
-    def _fingertips(self) -> None:
-        wp.launch(
-            fingertip_kernel,
-            dim=(self.num_worlds, self.num_fingers),
-            inputs=[self.tip_body, self.tip_offset, self.sim.body_q],
-            outputs=[self.tip_pos],
-            device=self.device,
-        )
-
     def observe(self) -> None:
         """Refresh the observation from the present state; :meth:`step` and :meth:`reset` have done so."""
         sim = self.sim
@@ -421,8 +381,8 @@ class ReorientEnv:
             inputs=[
                 self._lower,
                 self._upper,
-                self.tip_body,
-                self.tip_offset,
+                self.fingers.tip_body,
+                self.fingers.tip_offset,
                 self._body_com,
                 self.parameters.observation,
                 self.measured_q,
@@ -445,6 +405,10 @@ class ReorientEnv:
             self.views.observe()
 
     # Reading
+
+    def has_table(self) -> np.ndarray:
+        """Whether each world's table is there, shape [N] (host copy)."""
+        return tables_there(self.step_count, self._table_steps)
 
     def object_pose(self) -> np.ndarray:
         """Present object poses, position [m] and quaternion xyzw, shape [N, 7] (host copy)."""

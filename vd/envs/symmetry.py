@@ -140,7 +140,7 @@ def _tips(env: "ReorientEnv") -> np.ndarray:
     bodies = env.sim.body_q.numpy()[0].copy()
     env.sim.joint_q.assign(joints)
     env.sim.forward_kinematics()
-    pairs = zip(bodies[env.tip_body.numpy()], env.tip_offset.numpy(), strict=True)
+    pairs = zip(bodies[env.fingers.tip_body.numpy()], env.fingers.tip_offset.numpy(), strict=True)
     tips: list[Any] = [wp.transform_multiply(wp.transform(*body), wp.transform(*tip)) for body, tip in pairs]
     return np.array([[tip[i] for i in range(7)] for tip in tips])
 

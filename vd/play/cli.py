@@ -6,7 +6,7 @@
 import math
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -74,8 +74,10 @@ class PlayCfg:
     """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
-    episode_s: float = PAPER.scene.episode_s
-    """Time after which a world starts anew [s]."""
+    episode_s: float | None = None
+    """Time after which a world starts anew [s]; 10 by default, 15 with --in-air."""
+    in_air: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
     randomise: bool = False
     """Randomise dynamics and add noise and disturbances as in training."""
     device: str = "auto"
@@ -92,6 +94,13 @@ class PlayCfg:
             raise ValueError("name one agent: a policy, or --agent zero or --agent random")
         return self.policy or self.agent or DEFAULT_POLICY
 
+    @property
+    def limit_s(self) -> float:
+        """Time limit of an episode [s]."""
+        if self.episode_s is not None:
+            return self.episode_s
+        return PAPER.scene.air_episode_s if self.in_air else PAPER.scene.episode_s
+
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
         start_at_rest(self.at_rest, self.no_at_rest)
@@ -99,6 +108,8 @@ class PlayCfg:
             raise ValueError(f"--cells is {self.cells}; at least 1 is needed")
         if not self.seconds > 0.0:
             raise ValueError(f"--seconds is {self.seconds}; it must be positive")
+        if not self.limit_s > 0.0:
+            raise ValueError(f"--episode-s is {self.episode_s}; it must be positive")
         if self.max_goal_angle is not None and not 0.0 < self.max_goal_angle <= math.pi + 1e-6:
             raise ValueError(
                 f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
@@ -241,6 +252,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
 
     wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would scroll the rest away
     from vd.assets_usd.objects.model import load_set
+    from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.agents import check_bundle, is_saved_student, open_policy, task_for
     from vd.evaluate.cli import resolve_device
@@ -258,7 +270,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         seed=cfg.seed,
         stop_tolerance_rad=cfg.stop_tolerance,
         max_goal_angle_rad=cfg.max_goal_angle,
-        episode_s=cfg.episode_s,
+        episode_s=cfg.limit_s,
         randomised=cfg.randomise,
         success_ends_episode=False,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
@@ -266,6 +278,8 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         nudge=cfg.nudge,
         explore=cfg.explore,
     )
+    if cfg.in_air:
+        task = replace(task, table=TableCfg(away_share=1.0))
     check_bundle(cfg.agent_name, task)
     env = ReorientEnv(task, device)
     if is_saved_student(trained):

@@ -57,6 +57,8 @@ class Snapshot:
     """Drops since the recording began."""
     terms: np.ndarray
     """Reward terms of the step, shape [T]."""
+    table: bool = True
+    """The table was there."""
 
 
 class Watcher:
@@ -90,6 +92,7 @@ class Watcher:
         self.steps += stepped
         q, goal = env.sim.joint_q.numpy()[worlds], env.goal_quat.numpy()[worlds]
         error, terms = env.rotation_error.numpy()[worlds], env.reward_terms.numpy()[worlds]
+        table = env.has_table()[worlds]
         if not stepped:  # what the environment holds is of the step before the reset
             error, terms = rotation_angle(q[:, -4:].astype(float), goal.astype(float)), np.zeros_like(terms)
         return [
@@ -104,6 +107,7 @@ class Watcher:
                 goals=int(self.goals[i]),
                 drops=int(self.drops[i]),
                 terms=terms[i].copy(),
+                table=bool(table[i]),
             )
             for i, world in enumerate(worlds)
         ]
@@ -131,7 +135,9 @@ def record(
         act(env, policy)
         snapshots = watcher.read()
         pictures = renderer.render(
-            np.stack([one.joint_q for one in snapshots]), np.stack([one.goal_quat for one in snapshots])
+            np.stack([one.joint_q for one in snapshots]),
+            np.stack([one.goal_quat for one in snapshots]),
+            np.array([one.table for one in snapshots]),
         )
         yield composer.frame(pictures, snapshots)
 

@@ -20,15 +20,13 @@ from vd.paper import PAPER
 from vd.play.replay import ReplaySession
 from vd.play.session import Session
 from vd.play.video import Snapshot
-from vd.render import Camera, PictureModel
+from vd.render import UNSEEN, Camera, PictureModel
 
 # Where the goal's object floats, in the camera's right and up [m]: left of the hand, for panels are right.
 GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
 # The viewer's camera stands this much farther than that of videos: a browser window has panels around it.
 CAMERA_DISTANCE = 1.25
 BESIDE, ON_OBJECT, HIDDEN = "beside the hand", "on the object", "hidden"
-# Far below the table, where nothing is seen: viser has no cheaper way to hide one instance of a batch.
-UNSEEN = (0.0, 0.0, -100.0)
 POSITIVE, NEGATIVE, GROUND = "#3b82f6", "#e2683c", "rgba(128,128,128,.18)"
 
 
@@ -92,7 +90,8 @@ class PlayViewer:
     def draw(self) -> None:
         """Send the present state to the browser."""
         shot = self.session.snapshot
-        self._pictured.pose(shot.joint_q[None], shot.goal_quat[None], self._ghost_position(shot))
+        ghost = self._ghost_position(shot)
+        self._pictured.pose(shot.joint_q[None], shot.goal_quat[None], ghost, table=shot.table)
         self.viewer.begin_frame(shot.time_s)
         self.viewer.log_state(self._pictured.state)
         self.viewer.log_scalar("orientation error [rad]", shot.error_rad)
@@ -127,7 +126,7 @@ class PlayViewer:
 
     def _ghost_position(self, shot: Snapshot) -> tuple[float, float, float]:
         if self._ghost == HIDDEN:
-            return UNSEEN
+            return UNSEEN[0], UNSEEN[1], UNSEEN[2]
         if self._ghost == ON_OBJECT:
             x, y, z = (float(value) for value in shot.joint_q[-7:-4])
             return x, y, z

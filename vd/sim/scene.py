@@ -165,9 +165,8 @@ def add_table(builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool) -> No
     nothing can tell a plane from it, except that contacts with a plane are exact: against a box, a
     quarter of the imported objects never come to rest.
     """
-    size, top = PAPER.scene.table_size_m, PAPER.scene.table_top_m
     builder.add_shape_plane(
-        plane=(0.0, 0.0, 1.0, -top),
+        plane=(0.0, 0.0, 1.0, -PAPER.scene.table_top_m),
         width=0.0,
         length=0.0,
         body=-1,
@@ -176,16 +175,22 @@ def add_table(builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool) -> No
         custom_attributes=contact_attributes(cfg, PRIORITY_TABLE),
     )
     if visible:
-        builder.add_shape_box(
-            body=-1,
-            xform=wp.transform(wp.vec3(0.0, 0.0, top - 0.5 * size[2]), wp.quat_identity()),
-            hx=0.5 * size[0],
-            hy=0.5 * size[1],
-            hz=0.5 * size[2],
-            cfg=shape_cfg(cfg, PAPER.materials.table_friction, visual=True),
-            label=f"{TABLE_LABEL}/visual",
-            color=TABLE_COLOR,
-        )
+        show_table(builder, cfg)
+
+
+def show_table(builder: newton.ModelBuilder, cfg: SimCfg, body: int = -1) -> None:
+    """Add what is seen of the table, a box, to the world or to a body at the world's origin."""
+    size, top = PAPER.scene.table_size_m, PAPER.scene.table_top_m
+    builder.add_shape_box(
+        body=body,
+        xform=wp.transform(wp.vec3(0.0, 0.0, top - 0.5 * size[2]), wp.quat_identity()),
+        hx=0.5 * size[0],
+        hy=0.5 * size[1],
+        hz=0.5 * size[2],
+        cfg=shape_cfg(cfg, PAPER.materials.table_friction, visual=True),
+        label=f"{TABLE_LABEL}/visual",
+        color=TABLE_COLOR,
+    )
 
 
 def scaled_mesh(vertices: np.ndarray, faces: np.ndarray, scale: float) -> newton.Mesh:
