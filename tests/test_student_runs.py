@@ -247,22 +247,19 @@ def test_stages_on_the_command_line(tmp_path, capsys, monkeypatch):
     assert network.turn.vectors == 4 and network.state.values == teacher.num_observations
     assert saved.network.state is not None and saved.network.state.fitted
     assert saved.depth["points"] == 2000 and saved.task["randomisation"]["observation_noise_std"] == 0.0
-    state = read_student(path)
-    state["task"]["episode_s"] = 0.5
-    save_checkpoint(path, state)
-    tolerance = ["--tolerance-rad", "3.1416", "--episodes", "2", "--json"]
+    tolerance = ["--tolerance-rad", "3.1416", "--episodes", "2", "--episode-s", "0.5", "--json"]
     assert main(["calibrate", str(path), *tolerance]) == 0
     rule = json.loads(capsys.readouterr().out)["rule"]
     spec = load_student(path).spec
     assert spec.stopping.distance_rad == rule["distance_rad"] and "2 episodes" in spec.calibrated_on
     assert spec.tolerance_rad == 3.1416, "what the rule is for is kept with it"
     assert read_student(path)["iter"] == 2
-    _check_calibration_in_air(path, monkeypatch)
+    _check_calibration(path, monkeypatch)
 
 
-def _check_calibration_in_air(path, monkeypatch):
-    """The table goes when that of the paper's in-air test does, and the file says so."""
-    asked = []
+def _check_calibration(path, monkeypatch):
+    """Tables and times are those of the paper's tests, and the file says which."""
+    asked: list[tuple[int | None, int]] = []
 
     def spy(env, actor, episodes, *, table_steps):
         asked.append((table_steps, env.max_episode_steps))
@@ -272,8 +269,9 @@ def _check_calibration_in_air(path, monkeypatch):
         return Trace(turn, turn, seen, seen, norms, seen, np.full((1, 2), 3), none)
 
     monkeypatch.setattr("vd.train.student.calibrate.record", spy)
+    assert main(["calibrate", str(path), "--episodes", "2"]) == 0
     assert main(["calibrate", str(path), "--episodes", "2", "--in-air"]) == 0
-    assert asked == [(24, 180)]
+    assert asked == [(None, 120), (24, 180)], "both as long as the paper's tests"
     spec = load_student(path).spec
     assert "2 episodes in the air" in spec.calibrated_on
     # Both episodes lie at their goals, so that the strictest bounds that stop them are the best for both.

@@ -45,6 +45,7 @@ def calibrate_student(
     objects: tuple[str, ...] = (),
     episodes: int,
     tolerance_rad: float = PAPER.success.rotation_rad,
+    episode_s: float | None = None,
     randomise: bool = False,
     in_air: bool = False,
     seed: int = 0,
@@ -59,8 +60,9 @@ def calibrate_student(
         objects: Object sets to calibrate on; the training's by default.
         episodes: Number of episodes, one a world, rounded up to as many of each object.
         tolerance_rad: Largest true distance that counts as right [rad].
+        episode_s: Length of an episode [s]; None: that of the paper's tests.
         randomise: Domain randomisation.
-        in_air: Episodes of the paper's in-air test: longer, and the table is taken away.
+        in_air: Episodes of the paper's in-air test, in which the table is taken away.
         seed: Of starts, goals and sensor errors.
         device: Warp and torch device.
 
@@ -82,7 +84,7 @@ def calibrate_student(
         objects=sets,
         num_worlds=each * count,
         seed=seed,
-        episode_s=PAPER.scene.air_episode_s if in_air else trained.episode_s,
+        episode_s=episode_s or (PAPER.scene.air_episode_s if in_air else PAPER.scene.episode_s),
         success=replace(trained.success, rotation_rad=NEVER_RAD),
         randomisation=replace(trained.randomisation, enabled=randomise),
     )

@@ -37,6 +37,8 @@ class CalibrateCfg:
     """Episodes, all side by side; rounded up to as many of each object."""
     tolerance_rad: float = PAPER.success.rotation_rad
     """Largest true distance that counts as right [rad]; a rule for 0.1 rad is always chosen too."""
+    episode_s: float | None = None
+    """Length of an episode [s]; that of the paper's tests by default: 10, with --in-air 15."""
     randomise: bool = False
     """Domain randomisation and disturbances."""
     in_air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -143,6 +145,7 @@ def calibrate_command(arguments: list[str], _started: float) -> int:
             objects=cfg.objects,
             episodes=cfg.episodes,
             tolerance_rad=cfg.tolerance_rad,
+            episode_s=cfg.episode_s,
             randomise=cfg.randomise,
             in_air=cfg.in_air,
             seed=cfg.seed,
