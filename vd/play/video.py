@@ -20,6 +20,8 @@ STRIP_HEIGHT = 80
 MARGIN = 10
 # Share of a column of reward terms that their names take, and its width [pixel] from which 11 points fit.
 NAME_SHARE, FULL_COLUMN = 0.66, 140
+# Width of the column of numbers [pixel] from which 12 points fit.
+FULL_NUMBERS = 170
 # Error curve: as long as an episode of the paper.
 CURVE_STEPS = round(PAPER.scene.episode_s * PAPER.scene.control_hz)
 # A reached goal or a drop colours the frame's edge for this many control steps, half a second.
@@ -186,7 +188,7 @@ class Composer:
         self._errors[index].append(shot.error_rad)
         top = height + MARGIN
         third = (width - 4 * MARGIN) // 10
-        _numbers(draw, MARGIN, top, shot)
+        _numbers(draw, MARGIN, top, 3 * third, shot)
         _curve(
             draw,
             (MARGIN + 3 * third, top, 2 * third + 2 * MARGIN, STRIP_HEIGHT - 2 * MARGIN),
@@ -230,17 +232,15 @@ class Composer:
             draw.line((middle, y + 2, middle, y + 12), fill=SOFT)
 
 
-def _numbers(draw: ImageDraw.ImageDraw, x: int, y: int, shot: Snapshot) -> None:
+def _numbers(draw: ImageDraw.ImageDraw, x: int, y: int, width: int, shot: Snapshot) -> None:
     name = shot.name if len(shot.name) <= 22 else shot.name[:21] + "…"
     within = shot.error_rad <= PAPER.success.rotation_rad
     draw.text((x, y - 2), name, fill=INK, font=_font(14))
     draw.text((x, y + 17), f"error {shot.error_rad:.2f} rad", fill=GREEN if within else INK, font=_font(18))
-    draw.text(
-        (x, y + 43),
-        f"{shot.time_s:.1f} s   goals {shot.goals}   drops {shot.drops}",
-        fill=SOFT,
-        font=_font(12),
-    )
+    # As far apart as there is room beside the curve.
+    gap, size = ("   ", 12) if width >= FULL_NUMBERS else ("  ", 10)
+    counts = gap.join((f"{shot.time_s:.1f} s", f"goals {shot.goals}", f"drops {shot.drops}"))
+    draw.text((x, y + 43), counts, fill=SOFT, font=_font(size))
 
 
 def _curve(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], errors: Sequence[float]) -> None:
