@@ -40,7 +40,20 @@ def test_a_pilot_stops_by_the_rule_for_its_tolerance():
     assert StudentPilot(student, hand, item).rule == near
     assert StudentPilot(student, hand, item, tolerance_rad=0.1).rule == precise
     teacher = make_flight("dclaw3-table", "dclaw3", "cube", hand, item, tolerance_rad=0.1)
-    assert teacher.pilot.rule == StoppingRule(0.1)
+    assert teacher.pilot.rule == StoppingRule(0.1) and teacher.calibrated
+
+
+def test_installed_students_stop_by_rules_from_episodes_and_a_flight_says_where_there_is_none():
+    (item,) = load_set("cube")
+    for name in ("dclaw3", "dclaw4"):
+        hand = load_hand(name)
+        flights = {
+            tolerance: make_flight(f"{name}-student", name, "cube", hand, item, tolerance_rad=tolerance)
+            for tolerance in (0.4, 0.2, 0.1)
+        }
+        assert [flight.calibrated for flight in flights.values()] == [True, False, True]
+        bounds = [flight.pilot.rule.distance_rad for flight in flights.values()]
+        assert bounds[0] > bounds[1] > bounds[2] > 0.0
 
 
 def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
