@@ -11,7 +11,7 @@ COUNTS_PER_TURN = 4096
 CENTRE = 2048
 """Count of the middle of the range, the zero of all angles here."""
 FARTHEST_COUNTS = 256 * COUNTS_PER_TURN
-"""Beyond so many a motor does not count its turns."""
+"""Range of the extended position mode, 256 turns either way: no sound position lies beyond."""
 RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
 RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
 SIZE = 148

@@ -16,7 +16,8 @@ from vd.deploy.shadow import Difference, ShadowCfg, differences, summary
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.hand_log import JOINT_CHANNELS, LogError, read_log
 from vd.play.cli import main as play
-from vd.play.replay import OUT_OF_SIGHT, Replay, ReplaySession
+from vd.play.replay import Replay, ReplaySession
+from vd.render import OUT_OF_SIGHT
 from vd.vision import StudentView
 
 STEPS = 24

@@ -31,8 +31,9 @@ GHOST_OPACITY = 0.7
 # Light direction in the camera's right, forward (level) and up: from the upper left behind the viewer, and
 # low enough to reach under the palm.
 LIGHT_DIRECTION = (0.35, 0.9, -0.8)
-IN_PLACE, UNSEEN = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -100.0, 0.0, 0.0, 0.0, 1.0)
-"""Poses of what is shown, and of what is hidden far below: viewers have no cheaper way to hide one shape."""
+IN_PLACE, OUT_OF_SIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -100.0, 0.0, 0.0, 0.0, 1.0)
+"""Poses, [m] and xyzw, of what is shown at the origin and of what is hidden far below: viewers have no
+cheaper way to hide one shape."""
 SKY, GROUND = (0.42, 0.43, 0.46), (0.22, 0.21, 0.20)
 
 
@@ -179,7 +180,7 @@ class PictureModel:
             table: Whether the table is there, shape [C] or one for all.
         """
         goal = np.concatenate([np.tile(goal_position, (self.cells, 1)), goal_quat], axis=1)
-        tables = np.where(np.reshape(table, (-1, 1)), IN_PLACE, UNSEEN) + np.zeros((self.cells, 1))
+        tables = np.where(np.broadcast_to(table, self.cells)[:, None], IN_PLACE, OUT_OF_SIGHT)
         scene = np.concatenate([joint_q, tables], axis=1)
         if self.ghost_in_scene:
             q = np.concatenate([scene, goal], axis=1)

@@ -11,6 +11,7 @@ from vd.assets_usd.objects.model import load_set
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
+from vd.evaluate.agents import episode_limit_s
 from vd.evaluate.result import air_table_steps
 from vd.evaluate.student import StudentActor
 from vd.evaluate.trace import NEVER_RAD, Trace, record
@@ -84,7 +85,7 @@ def calibrate_student(
         objects=sets,
         num_worlds=each * count,
         seed=seed,
-        episode_s=episode_s or (PAPER.scene.air_episode_s if in_air else PAPER.scene.episode_s),
+        episode_s=episode_limit_s(episode_s, in_air=in_air),
         success=replace(trained.success, rotation_rad=NEVER_RAD),
         randomisation=replace(trained.randomisation, enabled=randomise),
     )

@@ -156,7 +156,7 @@ def calibrate_command(arguments: list[str], _started: float) -> int:
         return 0
     for result in (found, precise):
         if result is None:
-            print(f"{cfg.student}: none came within {PAPER.success.precise_rad:g} rad: no rule for it")
+            print(f"{cfg.student}: no rule stops any within {PAPER.success.precise_rad:g} rad: none for it")
             continue
         rule = result.rule
         print(

@@ -26,7 +26,7 @@ from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
 from vd.envs.state import load_state, save_failed_step, save_state
 from vd.envs.symmetry import Views
-from vd.envs.table import must_lift, table_array, tables_there
+from vd.envs.table import must_lift, table_array
 from vd.kernels.actions import apply_action_kernel
 from vd.kernels.guard import void_step_kernel
 from vd.kernels.observations import teacher_observation_kernel, teacher_observation_size
@@ -407,8 +407,9 @@ class ReorientEnv:
     # Reading
 
     def has_table(self) -> np.ndarray:
-        """Whether each world's table is there, shape [N] (host copy)."""
-        return tables_there(self.step_count, self._table_steps)
+        """Whether each world's table was there in its last step, by the task, bool, shape [N] (host copy)."""
+        last = self._table_steps
+        return np.ones(self.num_worlds, bool) if last is None else self.step_count.numpy() <= last.numpy()
 
     def object_pose(self) -> np.ndarray:
         """Present object poses, position [m] and quaternion xyzw, shape [N, 7] (host copy)."""

@@ -36,14 +36,3 @@ def table_array(cfg: ReorientCfg, device: str) -> wp.array | None:
     if cfg.table.away_share == 0.0:
         return None
     return wp.array(table_steps(cfg), dtype=wp.int32, device=device)
-
-
-def tables_there(step_count: wp.array, last_step: wp.array | None) -> np.ndarray:
-    """Whether each world's table was there in its last control step, bool, shape [N].
-
-    Args:
-        step_count: Control steps since the world's reset, shape [N].
-        last_step: Of :func:`table_array`.
-    """
-    count = step_count.numpy()
-    return np.ones(len(count), dtype=bool) if last_step is None else count <= last_step.numpy()

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 from vd.bundle import is_bundle
 from vd.config import from_dict
 from vd.envs.cfg import CurriculumCfg, ExploreCfg, NudgeCfg, ObservationCfg, ReorientCfg, SuccessCfg, TableCfg
+from vd.paper import PAPER
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -158,6 +159,13 @@ def start_at_rest(yes: bool, no: bool) -> bool | None:
     if yes and no:
         raise ValueError("--at-rest and --no-at-rest exclude each other; give one of them, or none")
     return yes if yes or no else None
+
+
+def episode_limit_s(episode_s: float | None, *, in_air: bool) -> float:
+    """Length of an episode [s]: as asked for, or that of the paper's test on the table or in the air."""
+    if episode_s is not None:
+        return episode_s
+    return PAPER.scene.air_episode_s if in_air else PAPER.scene.episode_s
 
 
 def built_in(name: str, num_actions: int, *, seed: int, device: str) -> Any:

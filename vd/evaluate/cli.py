@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from vd.evaluate.agents import LAYER_HELP, SHIPPED_POLICIES, sees_clouds, start_at_rest
+from vd.evaluate.agents import LAYER_HELP, SHIPPED_POLICIES, episode_limit_s, sees_clouds, start_at_rest
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -140,9 +140,7 @@ class EvalCfg:
     @property
     def limit_s(self) -> float:
         """Time limit of an episode [s]."""
-        if self.episode_s is not None:
-            return self.episode_s
-        return PAPER.scene.air_episode_s if self.in_air else PAPER.scene.episode_s
+        return episode_limit_s(self.episode_s, in_air=self.in_air)
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""

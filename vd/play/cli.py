@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, start_at_rest
+from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, episode_limit_s, start_at_rest
 from vd.evaluate.cli import POLICY_HELP
 from vd.hand_log import is_log
 from vd.paper import PAPER
@@ -97,9 +97,7 @@ class PlayCfg:
     @property
     def limit_s(self) -> float:
         """Time limit of an episode [s]."""
-        if self.episode_s is not None:
-            return self.episode_s
-        return PAPER.scene.air_episode_s if self.in_air else PAPER.scene.episode_s
+        return episode_limit_s(self.episode_s, in_air=self.in_air)
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""

@@ -10,12 +10,10 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.hand_log import HandLog, LogError
 from vd.play.video import Composer, Snapshot
-from vd.render import Renderer
+from vd.render import OUT_OF_SIGHT, Renderer
 
 BARS = ("loop_time", "lateness", "largest_current", "largest_speed")
 """What the bars show in place of the terms of a reward."""
-OUT_OF_SIGHT = (0.0, 0.0, -10.0, 0.0, 0.0, 0.0, 1.0)
-"""Pose of an object that nobody measured: far below the table."""
 
 
 class Replay:
@@ -51,7 +49,7 @@ class Replay:
         log, columns = self.log, self.log.columns
         steps = len(columns["t"])
         position, pose = log.channel("position"), log.object_pose
-        if pose is None:
+        if pose is None:  # nobody measured it
             pose = np.tile(OUT_OF_SIGHT, (steps, 1))
         error = columns.get("error", columns["distance"])
         loads = np.stack(

@@ -20,7 +20,7 @@ from vd.paper import PAPER
 from vd.play.replay import ReplaySession
 from vd.play.session import Session
 from vd.play.video import Snapshot
-from vd.render import UNSEEN, Camera, PictureModel
+from vd.render import OUT_OF_SIGHT, Camera, PictureModel
 
 # Where the goal's object floats, in the camera's right and up [m]: left of the hand, for panels are right.
 GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
@@ -126,7 +126,7 @@ class PlayViewer:
 
     def _ghost_position(self, shot: Snapshot) -> tuple[float, float, float]:
         if self._ghost == HIDDEN:
-            return UNSEEN[0], UNSEEN[1], UNSEEN[2]
+            return OUT_OF_SIGHT[:3]
         if self._ghost == ON_OBJECT:
             x, y, z = (float(value) for value in shot.joint_q[-7:-4])
             return x, y, z
