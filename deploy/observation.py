@@ -99,6 +99,7 @@ class StudentSight:
                 world_scale=np.ones(1),
                 camera=camera,
                 voxel_m=network.voxel_m,
+                aim=network.aim,
                 device="cpu",
             )
         self._fresh = torch.ones(1, dtype=torch.bool)

@@ -9,6 +9,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from vd.aim import AimCfg
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
@@ -16,7 +17,7 @@ from vd.envs.reorient import ReorientEnv
 from vd.kernels.shapes import shape_observation_size
 from vd.student.cfg import LEAN, EncoderCfg
 from vd.student.network import Student
-from vd.student.object_sense import ANGLE, STATE_VALUES
+from vd.student.object_sense import ANGLE, ROTATION, STATE_VALUES
 from vd.student.registration import KEPT, POINTS, ROTATIONS, Registration, even_rotations
 from vd.vision import StudentView
 
@@ -207,6 +208,28 @@ def test_a_student_senses_what_the_teacher_observes(corner, rendered):
     observed = wp.to_torch(env.world_observation)[:, -shape_observation_size(env.num_fingers) :]
     torch.testing.assert_close(exact, observed, atol=1e-5, rtol=0.0)
     assert (values[:, STATE_VALUES:] - observed).abs().mean() < 0.5
+
+
+def test_a_student_that_aims_senses_a_near_goal_farther_and_its_distance_as_it_is():
+    """The cube of one world is 0.2 rad from its goal, that of the other as far as a cube can be."""
+    task = ReorientCfg(num_worlds=2, objects=("cube",), seed=1, randomisation=RandomisationCfg(enabled=False))
+    env = ReorientEnv(task, "cpu")
+    plain = StudentView(env, LEAN, rendered=False)
+    plain.frame()
+    assert plain._sense is not None
+    base = Rotation.from_quat(wp.to_torch(env.sim.body_q)[:, 0, 3:].numpy())
+    believed = base * Rotation.from_quat(plain._sense.registration.pose[:, 0, 3:].numpy())
+    turn = Rotation.from_rotvec([[0.0, 0.0, 0.2], [np.pi / 4.0, 0.0, 0.0]])
+    env.goal_quat.assign((turn * believed).as_quat().astype(np.float32))
+    aim = AimCfg(enabled=True, past_rad=0.3, within_rad=0.5)
+    views = [StudentView(env, replace(LEAN, aim=cfg), rendered=False) for cfg in (AimCfg(), aim)]
+    exact, aimed = (view.frame()["object"] for view in views)
+    torch.testing.assert_close(aimed[:, ANGLE], exact[:, ANGLE], atol=2e-3, rtol=0.0)
+    angles = [Rotation.from_quat(values[:, ROTATION].numpy()).magnitude() for values in (exact, aimed)]
+    np.testing.assert_allclose(angles[0], exact[:, ANGLE], atol=2e-3)
+    np.testing.assert_allclose(angles[1] - angles[0], [0.3, 0.0], atol=4e-3)
+    with pytest.raises(ValueError, match="object to be found"):
+        replace(LEAN, aim=aim, senses=("action",)).validate()
 
 
 def test_motion_is_that_between_two_looks():

@@ -227,7 +227,8 @@ def test_stages_on_the_command_line(tmp_path, capsys, monkeypatch):
     small = ["--preset", "cpu-demo", "--num-worlds", "2", "--dagger.rollout-steps", "3", "--no-tensorboard"]
     small += ["--dagger.validation-worlds", "1"]
     small += ["--task.at-rest", "False"]  # the search for poses at rest takes long
-    first = ["student", *small, "--network.turn.vectors", "4", "--run-dir", str(tmp_path / "stage1")]
+    both = ["--network.turn.vectors", "4", "--network.senses", "action", "position", "velocity", "object"]
+    first = ["student", *small, *both, "--run-dir", str(tmp_path / "stage1")]
     assert main([*first, "--max-steps", "6"]) == 0
     (row,) = read_progress(tmp_path / "stage1" / "progress.jsonl")
     assert all(row[f"loss/{name}"] > 0.0 for name in ("imitation", "distance", "pose", "state", "match"))
@@ -277,6 +278,11 @@ def _check_calibration(path, monkeypatch):
     # Both episodes lie at their goals, so that the strictest bounds that stop them are the best for both.
     assert spec.precise is not None and spec.rule_for(0.1) == spec.precise
     assert 0.0 < spec.precise.distance_rad < spec.stopping.distance_rad
+    assert not spec.network.aim.enabled
+    for asked_for, aims in (("on", True), ("kept", True), ("off", False)):
+        flags = ["--episodes", "2", "--aim", asked_for]
+        assert main(["calibrate", str(path), *flags]) == 0
+        assert load_student(path).spec.network.aim.enabled == aims
 
 
 @pytest.mark.slow

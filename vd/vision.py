@@ -152,6 +152,7 @@ class StudentView:
                 world_scale=scene.world_scale,
                 camera=model,
                 voxel_m=network.voxel_m,
+                aim=network.aim,
                 device=env.device,
             )
         # Encoders that read late or wrong show the hand where they say it is, as they do on the robot.

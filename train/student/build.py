@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vd.aim import AimCfg
 from vd.config import to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.files import write_json
@@ -298,9 +299,10 @@ def _dagger(
     if fresh and cfg.run.stagger and not cfg.dagger.reset:
         steps = env.episode_length_buf
         env.episode_length_buf = torch.randint_like(steps, high=int(env.max_episode_length))
+    # Teachers aim at the goals themselves, and so does whoever learns from them.
     view = StudentView(
         simulation,
-        cfg.network,
+        replace(cfg.network, aim=AimCfg()),
         rendered=cfg.stage == RENDERED,
         depth=cfg.depth,
         camera=cfg.camera,

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import warp as wp
 
+from vd.aim import AimCfg
 from vd.assets_usd.objects.model import load_set
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
@@ -49,6 +50,7 @@ def calibrate_student(
     episode_s: float | None = None,
     randomise: bool = False,
     in_air: bool = False,
+    aim: bool | None = None,
     seed: int = 0,
     device: str,
 ) -> tuple[Calibration, Calibration | None]:
@@ -64,6 +66,7 @@ def calibrate_student(
         episode_s: Length of an episode [s]; None: that of the paper's tests.
         randomise: Domain randomisation.
         in_air: Episodes of the paper's in-air test, in which the table is taken away.
+        aim: Whether it aims past near goals, from now on; None: as it does.
         seed: Of starts, goals and sensor errors.
         device: Warp and torch device.
 
@@ -76,6 +79,11 @@ def calibrate_student(
     """
     wp.config.log_level = wp.LOG_WARNING
     saved = load_student(path, device)
+    network = saved.spec.network
+    if aim is not None:
+        network = replace(network, aim=AimCfg(enabled=aim))
+        network.validate()
+        saved = replace(saved, spec=replace(saved.spec, network=network))
     trained = from_dict(ReorientCfg, saved.task, where="task of the student")
     sets = objects or trained.objects
     count = len(load_set(list(sets)))
@@ -105,6 +113,7 @@ def calibrate_student(
     what += f"tolerance {tolerance_rad:g} rad, seed {seed}"
     spec = replace(
         saved_spec(state, path),
+        network=network,
         stopping=result.rule,
         tolerance_rad=tolerance_rad,
         precise=None if precise is None else precise.rule,

@@ -137,7 +137,12 @@ class ControlStep:
         self.sense: ObjectSense | None = None
         if "object" in net.cfg.senses:
             self.sense = ObjectSense(
-                scene.hand, scene.objects, camera=scene.hand.camera, voxel_m=net.cfg.voxel_m, **worlds
+                scene.hand,
+                scene.objects,
+                camera=scene.hand.camera,
+                voxel_m=net.cfg.voxel_m,
+                aim=net.cfg.aim,
+                **worlds,
             )
         self.fresh = torch.ones(1, dtype=torch.bool)
         size = self.clouds.item.start + self.camera.cloud.points.shape[1]

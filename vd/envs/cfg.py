@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from math import pi
 from typing import Literal
 
+from vd.aim import AimCfg
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
@@ -395,6 +396,7 @@ class ReorientCfg:
     table: TableCfg = field(default_factory=TableCfg)
     nudge: NudgeCfg = field(default_factory=NudgeCfg)
     explore: ExploreCfg = field(default_factory=ExploreCfg)
+    aim: AimCfg = field(default_factory=AimCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
     focus: FocusCfg = field(default_factory=FocusCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
@@ -414,6 +416,7 @@ class ReorientCfg:
         self.table.validate()
         self.nudge.validate()
         self.explore.validate()
+        self.aim.validate()
         if self.start.at_rest and (self.start.poses < 1 or self.start.settle_s <= 0.0):
             raise ValueError(
                 f"start.at_rest needs start.poses >= 1 (now {self.start.poses}) and start.settle_s > 0 "

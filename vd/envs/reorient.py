@@ -28,6 +28,7 @@ from vd.envs.state import load_state, save_failed_step, save_state
 from vd.envs.symmetry import Views
 from vd.envs.table import must_lift, table_array
 from vd.kernels.actions import apply_action_kernel
+from vd.kernels.aim import aim_kernel
 from vd.kernels.guard import void_step_kernel
 from vd.kernels.observations import teacher_observation_kernel, teacher_observation_size
 from vd.kernels.resets import episode_kernel, reset_kernel
@@ -125,6 +126,8 @@ class ReorientEnv:
         """1 where the return ends: success, fall or time-out, shape [N]."""
         self.goal_quat = zeros(n, dtype=wp.quat)
         """Wanted orientation of the object, shape [N]."""
+        self.aimed_quat = zeros(n, dtype=wp.quat) if cfg.aim.enabled else self.goal_quat
+        """The same as it is observed, shape [N]."""
         self.step_count = zeros(n, dtype=wp.int32)
         """Control steps since the world's reset, shape [N]."""
         self.goals_reached = zeros(n, dtype=wp.int32)
@@ -375,6 +378,20 @@ class ReorientEnv:
     def observe(self) -> None:
         """Refresh the observation from the present state; :meth:`step` and :meth:`reset` have done so."""
         sim = self.sim
+        if self.cfg.aim.enabled:
+            wp.launch(
+                aim_kernel,
+                dim=self.num_worlds,
+                inputs=[
+                    self.cfg.aim.past_rad,
+                    self.cfg.aim.within_rad,
+                    self.num_actions + 3,
+                    sim.joint_q,
+                    self.goal_quat,
+                ],
+                outputs=[self.aimed_quat],
+                device=self.device,
+            )
         wp.launch(
             teacher_observation_kernel,
             dim=self.num_worlds,
@@ -391,7 +408,7 @@ class ReorientEnv:
                 sim.joint_qd,
                 sim.body_q,
                 sim.body_qd,
-                self.goal_quat,
+                self.aimed_quat,
                 self.smoothed,
                 self.randomiser.observation_offset,
                 self.rng,

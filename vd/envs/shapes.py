@@ -88,7 +88,7 @@ class ShapeObserver:
                 env.num_actions,
                 self._extent_column,
                 env.sim.joint_q,
-                env.goal_quat,
+                env.aimed_quat,
             ],
             outputs=[env.world_observation],
             device=env.device,

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
+from vd.aim import AimCfg
 from vd.bundle import is_bundle
 from vd.config import from_dict
 from vd.envs.cfg import CurriculumCfg, ExploreCfg, NudgeCfg, ObservationCfg, ReorientCfg, SuccessCfg, TableCfg
@@ -193,6 +194,7 @@ def task_for(
     hand_layer: str | None = None,
     nudge: bool = False,
     explore: bool = False,
+    aim: bool = False,
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
 
@@ -216,6 +218,7 @@ def task_for(
             trained.
         nudge: Whether hands that are stuck are nudged.
         explore: Whether actions have noise while the goal is far.
+        aim: Whether it is told to turn past a goal that is near.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     if is_saved_student(policy):
@@ -239,5 +242,6 @@ def task_for(
         table=TableCfg(),
         nudge=NudgeCfg(enabled=nudge),
         explore=ExploreCfg(enabled=explore),
+        aim=AimCfg(enabled=aim),
         randomisation=replace(base.randomisation, enabled=randomised),
     )

@@ -31,6 +31,7 @@ OF_THE_SUITE = (
     "in_air",
     "nudge",
     "explore",
+    "aim",
     "table_friction",
     "scanned_goals",
     "sees",
@@ -97,6 +98,8 @@ class EvalCfg:
     """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
     explore: tyro.conf.FlagCreatePairsOff[bool] = False
     """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
+    aim: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Aim 0.2 rad past the goal while the object is within 0.4 rad of it, also by a student that does not."""
     scanned_goals: tyro.conf.FlagCreatePairsOff[bool] = False
     """Students get goals with the errors of a scan: 4 mm of noise, a fifth of the points missing."""
     sees: Literal["auto", "complete", "rendered"] = "auto"
@@ -290,6 +293,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         hand_layer=cfg.hand_layer,
         nudge=cfg.nudge,
         explore=cfg.explore,
+        aim=cfg.aim,
     )
     check_bundle(name, task)
     print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
@@ -332,6 +336,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
         nudge=cfg.nudge,
         explore=cfg.explore,
+        aim=cfg.aim,
     )
     result = summarise(
         protocol,

@@ -11,6 +11,7 @@ from vd.evaluate.agents import (
     BUILT_IN,
     built_in,
     check_bundle,
+    is_saved_student,
     open_policy,
     sees_clouds,
     start_at_rest,
@@ -105,6 +106,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             scanned_goals=cfg.scanned_goals,
             nudge=cfg.nudge,
             explore=cfg.explore,
+            aim=cfg.aim or (is_saved_student(policy) and policy.spec.network.aim.enabled),
         )
         index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
@@ -147,6 +149,7 @@ def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int
         hand_layer=cfg.hand_layer,
         nudge=cfg.nudge,
         explore=cfg.explore,
+        aim=cfg.aim,
     )
     if cfg.table_friction is not None:
         task = replace(task, table_friction=cfg.table_friction)

@@ -300,7 +300,8 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
     for row in comparison.rows:
         if row.stopped_by == "prediction" or row.kind == "teacher":
             rule = f"distance {row.rule.distance_rad:.3g} rad, action norm {row.rule.action_norm:.3g}"
-            rows.append((f"{row.policy}, {row.group}", f"sees {row.sees}, stops below {rule}"))
+            aims = ", aims past goals that are near" if row.result.protocol.aim else ""
+            rows.append((f"{row.policy}, {row.group}", f"sees {row.sees}, stops below {rule}{aims}"))
     return rows + list(comparison.software.items())
 
 

@@ -120,6 +120,7 @@ def task_line(result: EvalResult) -> str:
         f"{protocol.stop_tolerance_rad:g} rad and still; randomisation {randomisation}"
         + ("; stuck hands are nudged" if protocol.nudge else "")
         + ("; actions have noise far from the goal" if protocol.explore else "")
+        + ("; aimed past goals that are near" if protocol.aim else "")
     )
 
 

@@ -103,6 +103,8 @@ class Protocol:
     """Hands whose object stands still far from the goal are nudged."""
     explore: bool = False
     """Actions have noise while the goal is far."""
+    aim: bool = False
+    """The policy is told to turn past a goal that is near."""
 
     @property
     def hand_name(self) -> str:

@@ -1,5 +1,6 @@
 """A student at work in an environment."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -38,6 +39,8 @@ class StudentActor:
     ):
         """Open its eyes in every world.
 
+        It aims past near goals if its file says so, or the environment.
+
         Args:
             env: The environment.
             student: The student.
@@ -58,9 +61,10 @@ class StudentActor:
             )
         self.env, self.num_actions, self._student = env, spec.num_actions, student.network
         self.rendered = spec.stage == RENDERED if rendered is None else rendered
+        aim = env.cfg.aim if env.cfg.aim.enabled else spec.network.aim
         self._view = (ScannedGoalView if scanned_goals else StudentView)(
             env,
-            spec.network,
+            replace(spec.network, aim=aim),
             rendered=self.rendered,
             depth=from_dict(DepthCameraCfg, student.depth, where="depth camera of the student"),
             camera=spec.camera,

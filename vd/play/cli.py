@@ -72,6 +72,8 @@ class PlayCfg:
     """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
     explore: tyro.conf.FlagCreatePairsOff[bool] = False
     """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
+    aim: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Aim 0.2 rad past the goal while the object is within 0.4 rad of it, also by a student that does not."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float | None = None
@@ -275,6 +277,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         hand_layer=cfg.hand_layer,
         nudge=cfg.nudge,
         explore=cfg.explore,
+        aim=cfg.aim,
     )
     if cfg.in_air:
         task = replace(task, table=TableCfg(away_share=1.0))

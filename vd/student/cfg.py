@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from vd.aim import AimCfg
 from vd.paper import PAPER
 
 DistancePlace = Literal["before", "after"]
@@ -139,6 +140,8 @@ class StudentCfg:
     state: StateCfg = field(default_factory=StateCfg)
     """What the teacher would observe, estimated, and the teacher's layers that act by it. Its sizes are the
     teacher's; training fills them in (``--dagger.state-weight``)."""
+    aim: AimCfg = field(default_factory=AimCfg)
+    """Where it acts as if its goal were. Not in training; ``vd-train calibrate --aim`` sets it."""
     action_hidden: int = 128
     """Width of the layers for the senses."""
     memory: int = PAPER.student.memory
@@ -160,10 +163,13 @@ class StudentCfg:
         self.encoder.validate()
         self.turn.validate()
         self.state.validate()
+        self.aim.validate()
         if self.turn.vectors and "marks" not in self.encoder.inputs:
             raise ValueError("student.turn needs voxels that are marked: add marks to encoder.inputs")
         if "object" in self.senses and "marks" not in self.encoder.inputs:
             raise ValueError("an object is found among voxels that are marked: add marks to encoder.inputs")
+        if self.aim.enabled and "object" not in self.senses:
+            raise ValueError("student.aim needs the object to be found: add object to senses, or do not aim")
         if "action" not in self.senses or len(set(self.senses)) != len(self.senses):
             raise ValueError(f"student.senses = {self.senses} must hold action, and nothing twice")
         if not self.voxel_m > 0.0:

@@ -12,8 +12,10 @@ import numpy as np
 import torch
 import warp as wp
 
+from vd.aim import AimCfg
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
+from vd.kernels.aim import aim_kernel
 from vd.kernels.observations import (
     JOINTS_PER_FINGER,
     teacher_observation_size,
@@ -90,6 +92,7 @@ class ObjectSense:
         world_scale: np.ndarray,
         camera: CameraModel | None,
         voxel_m: float,
+        aim: AimCfg,
         device: str,
     ):
         """Put shapes and fingertips on the device.
@@ -102,9 +105,10 @@ class ObjectSense:
             world_scale: Size factor of each world's object, shape [N].
             camera: What sees them, posed in the base frame; None where clouds are complete.
             voxel_m: Side of a voxel [m].
+            aim: Where the goal is said to be while it is near.
             device: Warp device.
         """
-        self.device = device
+        self.device, self._aim = device, aim
         self._symmetry = symmetries_of_worlds(objects, world_object, device)
         self._voxel_m, self._fingers, self._base = voxel_m, hand.num_fingers, int(link_body[0])
         self.registration = Registration(
@@ -145,7 +149,7 @@ class ObjectSense:
             points: What the camera sees, base frame [m], NaN for none, shape [N, K, 3].
 
         Returns:
-            Angle to the goal [rad], rotation q_object conj(q_goal) of less than half a turn, position
+            Angle to the goal [rad], rotation q_object conj(q_aimed) of at most half a turn, position
             [PLACE_M], velocity [PLACE_M / s], spin [rad/s, scaled as the teacher's], root of the misfit
             [FAR_M], the misfit as a share of that of the next pose, and the shape's values as the teacher
             observes them (:mod:`vd.kernels.shapes`): [N, V].
@@ -164,13 +168,16 @@ class ObjectSense:
         self._before.copy_(pose)
         orientation, position = product(turn, pose[:, 3:]), base[:, :3] + rotated(turn, pose[:, :3])
         goal_quat = nearest_goal(orientation, goal_quat, self._symmetry)
+        angle = rotation_distance(orientation, goal_quat)[:, None]
+        if self._aim.enabled:
+            goal_quat = self._aimed(orientation, goal_quat)
         rotation = relative_rotation(orientation, goal_quat)
         rotation = torch.where(rotation[:, 3:] < 0.0, -rotation, rotation)
         rate, moves = PAPER.scene.control_hz, known[:, None].float()
         first, second = found.misfit[:, :1], found.misfit[:, 1:2]
         return torch.cat(
             [
-                rotation_distance(orientation, goal_quat)[:, None],
+                angle,
                 rotation,
                 position / PLACE_M,
                 moves * shift * (rate / PLACE_M),
@@ -187,6 +194,24 @@ class ObjectSense:
         found = self.registration
         state = {"pose": found.pose, "misfit": found.misfit, "looks": found.looks, "before": self._before}
         return {f"object_{name}": wp.from_torch(value) for name, value in state.items()}
+
+    def _aimed(self, orientation: torch.Tensor, goal_quat: torch.Tensor) -> torch.Tensor:
+        """Orientations to aim at [N, 4], for those of objects and goals [N, 4]."""
+        aimed = torch.empty_like(orientation)
+        wp.launch(
+            aim_kernel,
+            dim=len(aimed),
+            inputs=[
+                self._aim.past_rad,
+                self._aim.within_rad,
+                0,
+                wp.from_torch(orientation.contiguous()),
+                wp.from_torch(goal_quat.contiguous(), dtype=wp.quat),
+            ],
+            outputs=[wp.from_torch(aimed, dtype=wp.quat)],
+            device=self.device,
+        )
+        return aimed
 
     def _shape(self, pose: torch.Tensor, body_q: torch.Tensor, goal_quat: torch.Tensor) -> torch.Tensor:
         """The shape's values of poses [N, 7], as the environment computes those of true ones."""
