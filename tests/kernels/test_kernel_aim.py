@@ -17,7 +17,8 @@ EDGE = 1e-3
 
 def run(device, orientation, goal, *, past, within):
     """Aimed orientations of the kernel, [N, 4]."""
-    rows = np.concatenate([np.full((len(goal), COLUMN), 7.0), orientation, np.full((len(goal), 2), 9.0)], axis=1)
+    rows = np.full((len(goal), COLUMN + 6), 7.0)
+    rows[:, COLUMN : COLUMN + 4] = orientation
     out = unwritten(len(goal), wp.quat, device)
     inputs = [past, within, COLUMN, device_array(rows, float, device), device_array(goal, wp.quat, device)]
     wp.launch(aim_kernel, dim=len(goal), inputs=inputs, outputs=[out], device=device)
