@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from scipy.spatial.transform import Rotation
 from student_dummy import TINY
 
+from vd.aim import AimCfg
 from vd.config import to_dict
 from vd.envs.cfg import RandomisationCfg, ReorientCfg, SuccessCfg
 from vd.envs.reorient import ReorientEnv
@@ -41,9 +43,9 @@ TASK = ReorientCfg(
 )
 
 
-def make_student(stage=1, goal="merged", num_actions=9):
+def make_student(stage=1, goal="merged", num_actions=9, cfg=TINY):
     torch.manual_seed(stage)
-    cfg = replace(TINY, goal=goal)
+    cfg = replace(cfg, goal=goal)
     spec = StudentSpec(cfg, num_actions, stage, "dclaw3-table", None, StoppingRule(0.4, 1.0))
     network = Student(cfg, num_actions).eval().requires_grad_(False)
     return SavedStudent(spec, network, to_dict(TASK), to_dict(DepthCameraCfg(points=300)), 1, 100)
@@ -94,6 +96,29 @@ def test_worlds_are_seen_in_parts_without_a_difference(env, monkeypatch):
     torch.testing.assert_close(some[[0, 2]], whole[[0, 2]], atol=1e-4, rtol=0.0)
     assert not some[1].any()
     assert (actor.predicted > 0.0).any() or (actor.predicted < 0.0).any()
+
+
+def test_a_student_aims_if_its_file_says_so_or_the_environment(env, monkeypatch):
+    """Near their goals, which they then see farther away; the distance that they predict stays."""
+    encoder = replace(TINY.encoder, inputs=("constant", "marks"))
+    sees = replace(TINY, senses=("action", "object"), encoder=encoder)
+    env.reset()
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.2])
+    here = env.object_pose()[:, 3:7]
+    env.reset(object_quat=here, goal_quat=(turn * Rotation.from_quat(here)).as_quat())
+    aims = AimCfg(enabled=True, past_rad=0.5)
+    state, task = env.state_dict(), env.cfg
+    found = []
+    for own, asked in ((AimCfg(), AimCfg()), (aims, AimCfg()), (AimCfg(), aims)):
+        monkeypatch.setattr(env, "cfg", replace(task, aim=asked))
+        env.load_state_dict(state)
+        actor = StudentActor(env, make_student(cfg=replace(sees, aim=own)))
+        found.append((actor.act(wp.to_torch(env.observation)), actor.predicted))
+    (plain, distance), (own, near), (asked, same) = found
+    torch.testing.assert_close(own, asked, atol=1e-5, rtol=0.0)
+    assert not torch.allclose(plain, own, atol=1e-4)
+    for other in (near, same):
+        torch.testing.assert_close(distance, other, atol=1e-5, rtol=0.0)
 
 
 def test_memory_lasts_until_the_reset(env):
