@@ -25,7 +25,7 @@ LEAVES = ("vd.paper", "vd.files", "vd.aim")
 ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.paper": (),
     "vd.files": (),
-    "vd.aim": ("vd.paper",),
+    "vd.aim": (),
     "vd.kernels": ("vd.kernels",),
     "vd.assets_usd": (*LEAVES, "vd.kernels", "vd.assets_usd"),
     "vd.sim": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim"),

@@ -45,6 +45,7 @@ def test_installed_policies_load_and_act(name):
         seen = torch.zeros((1, 3, student.cfg.encoder.embedding)), torch.zeros((1, 3, student.num_senses))
         action, actions = student(*seen, student.initial_hidden(3)).mean[0], policy.spec.num_actions
         assert policy.spec.calibrated_on and "/" not in policy.spec.teacher + policy.spec.calibrated_on
+        assert student.cfg.aim.enabled, "its rule for stops within 0.1 rad is that of a hand that aims"
     else:
         action, actions = policy.act(torch.zeros(3, policy.num_observations)), policy.num_actions
     assert action.shape == (3, actions) and torch.isfinite(action).all()

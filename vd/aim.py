@@ -7,8 +7,6 @@ it goes on turning. The goal itself, and the distance by which an episode is sto
 
 from dataclasses import dataclass
 
-from vd.paper import PAPER
-
 
 @dataclass(frozen=True)
 class AimCfg:
@@ -18,8 +16,8 @@ class AimCfg:
     """Whether to."""
     past_rad: float = 0.2
     """How far past the goal [rad]."""
-    within_rad: float = PAPER.success.rotation_rad
-    """Distance to the goal below which it is near [rad]."""
+    within_rad: float = 0.3
+    """Distance to the goal below which it is near [rad]: who stops within the paper's 0.4 rad has stopped."""
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
