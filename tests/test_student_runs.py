@@ -255,15 +255,17 @@ def test_stages_on_the_command_line(tmp_path, capsys, monkeypatch):
     assert spec.stopping.distance_rad == rule["distance_rad"] and "2 episodes" in spec.calibrated_on
     assert spec.tolerance_rad == 3.1416, "what the rule is for is kept with it"
     assert read_student(path)["iter"] == 2
-    _check_calibration(path, monkeypatch)
+    _check_calibration(path, monkeypatch, capsys)
 
 
-def _check_calibration(path, monkeypatch):
+def _check_calibration(path, monkeypatch, capsys):
     """Tables and times are those of the paper's tests, and the file says which."""
     asked: list[tuple[int | None, int]] = []
 
-    def spy(env, actor, episodes, *, table_steps):
+    def spy(env, actor, episodes, *, table_steps, on_step):
         asked.append((table_steps, env.max_episode_steps))
+        for _ in range(env.max_episode_steps):
+            on_step()
         seen = np.zeros((1, 2, 4))
         none, turn = np.zeros((1, 2), dtype=bool), np.zeros((1, 2, 4))
         norms = np.linspace(1.0, 0.0, seen.size).reshape(seen.shape)
@@ -273,6 +275,7 @@ def _check_calibration(path, monkeypatch):
     assert main(["calibrate", str(path), "--episodes", "2"]) == 0
     assert main(["calibrate", str(path), "--episodes", "2", "--in-air"]) == 0
     assert asked == [(None, 120), (24, 180)], "both as long as the paper's tests"
+    assert "120/120" in (progress := capsys.readouterr().err) and "180/180" in progress
     spec = load_student(path).spec
     assert "2 episodes in the air" in spec.calibrated_on
     # Both episodes lie at their goals, so that the strictest bounds that stop them are the best for both.

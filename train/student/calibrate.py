@@ -1,11 +1,13 @@
 """The rules by which a student stops, from episodes that nothing stops."""
 
 import math
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import warp as wp
+from tqdm import tqdm
 
 from vd.aim import AimCfg
 from vd.assets_usd.objects.model import load_set
@@ -13,6 +15,7 @@ from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import episode_limit_s
+from vd.evaluate.cli import LOG_EVERY_S
 from vd.evaluate.result import air_table_steps
 from vd.evaluate.student import StudentActor
 from vd.evaluate.trace import NEVER_RAD, Trace, record
@@ -100,7 +103,9 @@ def calibrate_student(
     env = ReorientEnv(task, device)
     env.objects = with_symmetries(env.objects, device)
     table_steps = air_table_steps(task.sim.control_hz) if in_air else None
-    trace = record(env, StudentActor(env, saved, seed=seed), each, table_steps=table_steps)
+    actor, refresh = StudentActor(env, saved, seed=seed), 0.5 if sys.stderr.isatty() else LOG_EVERY_S
+    with tqdm(total=env.max_episode_steps, unit="step", desc=path.name, mininterval=refresh) as bar:
+        trace = record(env, actor, each, table_steps=table_steps, on_step=bar.update)
     env.check()
     env.close()
     result = calibrate_trace(trace, tolerance_rad=tolerance_rad)
