@@ -119,6 +119,8 @@ def test_a_student_aims_if_its_file_says_so_or_the_environment(env, monkeypatch)
     assert not torch.allclose(plain, own, atol=1e-4)
     for other in (near, same):
         torch.testing.assert_close(distance, other, atol=1e-5, rtol=0.0)
+    with pytest.raises(ValueError, match="object to be found"):
+        StudentActor(env, make_student())  # the environment still asks for it
 
 
 def test_memory_lasts_until_the_reset(env):

@@ -10,7 +10,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class AimCfg:
-    """Ours: aim past the goal while it is near (``kernels/aim.py``). Off by default."""
+    """Ours: aim past the goal while it is near (``kernels/aim.py``). Off by default.
+
+    Chosen on training objects: docs/evaluation.md, "Aiming past a near goal".
+    """
 
     enabled: bool = False
     """Whether to."""

@@ -77,15 +77,14 @@ def calibrate_student(
         What either rule gave; None for the precise one where no rule stops any episode so near its goal.
 
     Raises:
-        ValueError: The student is one of stage 0, which cannot act, or no rule stops any episode within the
-            tolerance.
+        ValueError: The student is one of stage 0, which cannot act, or is to aim and does not look for its
+            object, or no rule stops any episode within the tolerance.
     """
     wp.config.log_level = wp.LOG_WARNING
     saved = load_student(path, device)
     network = saved.spec.network
     if aim is not None:
         network = replace(network, aim=AimCfg(enabled=aim))
-        network.validate()
         saved = replace(saved, spec=replace(saved.spec, network=network))
     trained = from_dict(ReorientCfg, saved.task, where="task of the student")
     sets = objects or trained.objects
@@ -115,6 +114,7 @@ def calibrate_student(
         precise = None
     state = read_student(path)
     what = f"{', '.join(sets)}: {result.episodes} episodes{' in the air' if in_air else ''}, "
+    what += "aimed past near goals, " if network.aim.enabled else ""
     what += f"tolerance {tolerance_rad:g} rad, seed {seed}"
     spec = replace(
         saved_spec(state, path),

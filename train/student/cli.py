@@ -44,8 +44,7 @@ class CalibrateCfg:
     in_air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Take the table away, as vd-eval --in-air does: the rule of a student that is to hold its object."""
     aim: Literal["kept", "on", "off"] = "kept"
-    """Whether it aims 0.2 rad past the goal while the object is within 0.3 rad of it, from now on: more stops
-    within 0.1 rad."""
+    """Whether it aims past the goal while the object is near it, from now on: more stops within 0.1 rad."""
     seed: int = 1000
     """Of starts, goals and sensor errors."""
     device: str = "auto"

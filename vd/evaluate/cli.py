@@ -99,7 +99,7 @@ class EvalCfg:
     explore: tyro.conf.FlagCreatePairsOff[bool] = False
     """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Aim 0.2 rad past the goal while the object is within 0.3 rad of it, also by a student that does not."""
+    """Aim past the goal while the object is near it: more come within 0.1 rad. Some students do so anyway."""
     scanned_goals: tyro.conf.FlagCreatePairsOff[bool] = False
     """Students get goals with the errors of a scan: 4 mm of noise, a fifth of the points missing."""
     sees: Literal["auto", "complete", "rendered"] = "auto"

@@ -49,7 +49,8 @@ class StudentActor:
             seed: Of the errors of camera and scans.
 
         Raises:
-            ValueError: It is one of stage 0, which cannot act, or of another hand.
+            ValueError: It is one of stage 0, which cannot act, or of another hand, or is to aim and does not
+                look for its object.
         """
         spec = student.spec
         if spec.stage == PRETRAINED:
@@ -61,10 +62,13 @@ class StudentActor:
             )
         self.env, self.num_actions, self._student = env, spec.num_actions, student.network
         self.rendered = spec.stage == RENDERED if rendered is None else rendered
-        aim = env.cfg.aim if env.cfg.aim.enabled else spec.network.aim
+        network = spec.network
+        if env.cfg.aim.enabled:
+            network = replace(network, aim=env.cfg.aim)
+        network.validate()
         self._view = (ScannedGoalView if scanned_goals else StudentView)(
             env,
-            replace(spec.network, aim=aim),
+            network,
             rendered=self.rendered,
             depth=from_dict(DepthCameraCfg, student.depth, where="depth camera of the student"),
             camera=spec.camera,

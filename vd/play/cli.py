@@ -73,7 +73,7 @@ class PlayCfg:
     explore: tyro.conf.FlagCreatePairsOff[bool] = False
     """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Aim 0.2 rad past the goal while the object is within 0.3 rad of it, also by a student that does not."""
+    """Aim past the goal while the object is near it: more come within 0.1 rad. Some students do so anyway."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float | None = None
