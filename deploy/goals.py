@@ -1,7 +1,8 @@
 """What to reach: the shape of an object, from its USD or any scan, and the orientations it shall take.
 
-A scan is a mesh or a cloud of points, with noise, holes and what floats about it. Only its surface samples
-are needed, the goal's cloud of a student, so it need not be closed as for a simulation (vd-assets import).
+A scan is a mesh or a cloud of points, with noise, holes and what floats about it. A closed surface is laid
+through it, by which a student finds the object; it need not be closed before, as for a simulation
+(vd-assets import).
 
 Orientations are quaternions ``x,y,z,w`` or turns ``x,y,z@degrees`` about an axis, from how the object is in
 its file, in the world frame; or a file with one on each line.
@@ -12,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -20,15 +20,14 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import compose, invert
 from vd.assets_usd.objects.geometry import (
-    Solid,
     convex_hull,
     random_surface_points,
     solid_of_mesh,
-    solid_of_voxels,
-    spread,
+    surface_points,
 )
 from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, UNITS_M, MeshError, check_file, repair_mesh
 from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectError, ObjectModel, build_model, load_set
+from vd.assets_usd.objects.scans import Surface, surface_of_scan
 from vd.paper import PAPER
 from vd.sensors.depth_cloud import BASE_IN_WORLD
 
@@ -41,15 +40,13 @@ CANDIDATES = 20_000
 LEAST_POINTS = 200
 """Points of a scan below which its shape is a guess."""
 NEIGHBOURS = 24
-"""Samples that make a piece of the surface: a plane is laid through them, which takes noise out."""
+"""Samples by whose distance one is told that floats about by itself."""
 FAR = 6.0
 """Distance to the neighbours, of the usual, from which a sample floats about by itself."""
 LEAST_PIECE = 0.05
 """Share of all samples below which a separate piece is taken for dirt."""
-VOXELS = 64
-"""Voxels along the longest side of a scan, to find its centre of mass."""
-CLOSED_VOXELS = 6
-"""Half the width of holes that are closed for that: a tenth of the object."""
+THINNEST = 1e-3
+"""Thickness below which points are of one side only, as a share of the longest side."""
 LARGER = 1.5
 """How much larger or smaller than the objects of the paper an object may be."""
 
@@ -74,7 +71,7 @@ def one_object(name: str) -> ObjectModel:
 
 
 def scan_object(path: Path, unit: str | None = None, *, seed: int = 0) -> ObjectModel:
-    """An object from a scan, for its cloud; its collision shape is its convex hull.
+    """An object from a scan, for its surface; its collision shape is its convex hull.
 
     Args:
         path: PLY, OBJ or GLB; a mesh or points.
@@ -86,25 +83,19 @@ def scan_object(path: Path, unit: str | None = None, *, seed: int = 0) -> Object
     """
     path = Path(path)
     try:
-        points, centre = _samples(path, np.random.default_rng(seed))
+        surface = _surface(path, np.random.default_rng(seed))
     except MeshError as error:
         raise GoalError(f"{path}: {error}; scan it again, or export it as PLY") from error
-    longest = float(np.ptp(points, axis=0).max())
-    factor = _unit(path, longest, unit)
-    points = points * factor
-    hull = convex_hull(points)
-    solid = filled(points)
-    if centre is not None:
-        solid = solid._replace(centroid=centre * factor)
-    chosen = points[spread(points, SURFACE_POINTS)]
+    factor = _unit(path, float(np.ptp(surface.vertices, axis=0).max()), unit)
+    vertices, faces = surface.vertices * factor, surface.faces
     try:
         return build_model(
             "scan",
-            hull.vertices,
-            hull.faces,
-            [hull],
-            solid,
-            chosen,
+            vertices,
+            faces,
+            [convex_hull(vertices)],
+            solid_of_mesh(vertices, faces),
+            surface_points(vertices, faces, SURFACE_POINTS, seed=seed),
             source=str(path),
             family="scan",
             scale=factor,
@@ -173,8 +164,8 @@ def _goal(text: str, where: str) -> np.ndarray:
     return Rotation.from_rotvec(angle * numbers / length).as_quat()
 
 
-def _samples(path: Path, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray | None]:
-    """Dense samples of a scan's surface [N, 3] in its own unit; the centre of mass of a closed mesh [3]."""
+def _surface(path: Path, generator: np.random.Generator) -> Surface:
+    """Closed surface of a scan, in its own unit: a closed mesh as it is, else one through its samples."""
     import trimesh
 
     check_file(path)
@@ -192,32 +183,26 @@ def _samples(path: Path, generator: np.random.Generator) -> tuple[np.ndarray, np
     faces = getattr(loaded, "faces", None)
     if faces is not None and len(faces):
         mesh = repair_mesh(loaded)
-        points = random_surface_points(mesh.vertices, mesh.faces, CANDIDATES, generator)
         if mesh.watertight:
-            return points, solid_of_mesh(mesh.vertices, mesh.faces).centroid
+            return Surface(mesh.vertices, mesh.faces)
+        points = random_surface_points(mesh.vertices, mesh.faces, CANDIDATES, generator)
     else:
         points = vertices[generator.permutation(len(vertices))[:CANDIDATES]]
     if len(points) < LEAST_POINTS:
         raise MeshError(f"{len(points)} points; {LEAST_POINTS} at least make a shape")
-    points = _smooth(_without_dirt(points))
-    if np.ptp(
-        points @ np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2].T, axis=0
-    ).min() < (1e-3 * np.ptp(points, axis=0).max()):
+    points = _without_dirt(points)
+    if _thickness(points) < THINNEST * np.ptp(points, axis=0).max():
         raise MeshError("flat: the scan shows one side only")
-    return points, None
+    try:
+        return surface_of_scan(points)
+    except ValueError as error:
+        raise MeshError(str(error)) from error
 
 
-def filled(points: np.ndarray) -> Solid:
-    """Mass properties (density 1) of the solid behind samples of its surface [N, 3], holes closed."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    pitch = float((high - low).max()) / VOXELS
-    margin = CLOSED_VOXELS + 2
-    origin = low - margin * pitch
-    surface = np.zeros(np.ceil((high - low) / pitch).astype(int) + 1 + 2 * margin, dtype=bool)
-    surface[tuple(np.rint((points - origin) / pitch).astype(int).T)] = True
-    grown = ndimage.binary_fill_holes(ndimage.distance_transform_edt(~surface) <= CLOSED_VOXELS)
-    shrunk = ndimage.distance_transform_edt(grown) > CLOSED_VOXELS
-    return solid_of_voxels(ndimage.binary_fill_holes(shrunk | surface), origin, pitch)
+def _thickness(points: np.ndarray) -> float:
+    """Least extent of points along their principal axes."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    return float(np.ptp(points @ axes.T, axis=0).min())
 
 
 def _without_dirt(points: np.ndarray) -> np.ndarray:
@@ -230,16 +215,6 @@ def _without_dirt(points: np.ndarray) -> np.ndarray:
     piece = connected_components(graph, directed=False)[1]
     size = np.bincount(piece)
     return points[size[piece] >= LEAST_PIECE * len(points)]
-
-
-def _smooth(points: np.ndarray) -> np.ndarray:
-    """Each sample moved onto the plane through its neighbours."""
-    rows = cKDTree(points).query(points, NEIGHBOURS)[1]
-    middle = points[rows].mean(axis=1)
-    apart = points[rows] - middle[:, None]
-    normal = np.linalg.eigh(np.einsum("nki,nkj->nij", apart, apart))[1][:, :, 0]
-    off = np.einsum("ni,ni->n", points - middle, normal)
-    return points - off[:, None] * normal
 
 
 def _unit(path: Path, longest: float, unit: str | None) -> float:

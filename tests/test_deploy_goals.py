@@ -40,7 +40,7 @@ def dirty(item, seed=2):
 
 @pytest.mark.parametrize("unit", [1.0, 1000.0])
 def test_a_dirty_cloud_keeps_its_shape(item, tmp_path, unit):
-    """In the frame of the true centre of mass: a wrong centre counts too, by 5 mm at most."""
+    """In the frame of the true centre of mass: a wrong centre counts too, by 3 mm at most."""
     path = tmp_path / "scan.ply"
     trimesh.PointCloud(dirty(item) * unit).export(path)
     scan = scan_object(path)
@@ -53,12 +53,14 @@ def test_a_dirty_cloud_keeps_its_shape(item, tmp_path, unit):
     for _ in range(30):
         near = true[tree.query(scan.surface_points + shift)[1]]
         shift += (near - scan.surface_points - shift).mean(axis=0)
-    assert np.linalg.norm(shift) < 0.005
+    assert np.linalg.norm(shift) < 0.003
     away = tree.query(scan.surface_points + shift)[0]
     assert np.median(away) < 0.0012
-    assert np.quantile(away, 0.99) < 0.004
+    assert np.quantile(away, 0.95) < 0.003
+    assert np.quantile(away, 0.99) < 0.006, "over holes the surface is a guess"
     covered = cKDTree(scan.surface_points + shift).query(true)[0]
-    assert np.quantile(covered, 0.9) < 0.008
+    assert np.quantile(covered, 0.99) < 0.008, "holes are closed"
+    assert trimesh.Trimesh(scan.vertices, scan.faces, process=False).is_watertight
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".glb"])

@@ -1,8 +1,9 @@
-"""Goals as a scan gives them: the student's goal cloud with noise and a side that the scanner did not see.
+"""Goals as a scan gives them: students know shapes by points with noise, of which a side is missing.
 
 The paper's goals for household objects come from a tablet's scans, which are imperfect in ways it does not
 quantify (its Figure 5). Here a scan errs as much as a cloud in training may, but lastingly: the same points
-are wrong in every step.
+are wrong in every step. The surface behind them is laid as through those of a real scan
+(:mod:`vd.assets_usd.objects.scans`); the true shape is the simulation's alone.
 """
 
 from collections.abc import Mapping
@@ -13,6 +14,9 @@ import numpy as np
 import torch
 import warp as wp
 
+from vd.assets_usd.objects.geometry import surface_points
+from vd.assets_usd.objects.model import ObjectModel
+from vd.assets_usd.objects.scans import surface_of_scan
 from vd.paper import PAPER
 from vd.student.cfg import StudentCfg
 from vd.student.clouds import SceneClouds
@@ -41,13 +45,31 @@ def scan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return points[np.concatenate([seen, again])] + noise
 
 
+def known_by_scan(item: ObjectModel, rng: np.random.Generator, device: str) -> ObjectModel:
+    """An object as its scan tells it: surface and samples, in the frame of the true one.
+
+    Args:
+        item: The object.
+        rng: Where randomness comes from.
+        device: Warp device.
+    """
+    vertices, faces = surface_of_scan(scan(item.surface_points, rng), device)
+    samples = surface_points(vertices, faces, len(item.surface_points))
+    return replace(
+        item,
+        vertices=vertices.astype(np.float32),
+        faces=faces,
+        surface_points=samples.astype(np.float32),
+    )
+
+
 class ScannedGoalView(StudentView):
     """What a student sees whose goals were scanned; one scan for each object."""
 
     def __init__(self, env: Any, network: StudentCfg, *, seed: int = 0, **settings: Any):
         """Scan the objects; arguments are those of :class:`vd.vision.StudentView`."""
         rng = np.random.default_rng(seed)
-        scanned = [replace(item, surface_points=scan(item.surface_points, rng)) for item in env.objects]
+        scanned = [known_by_scan(item, rng, env.device) for item in env.objects]
         super().__init__(env, network, seed=seed, known=scanned, **settings)
         scene = env.scene
         self._scanned = SceneClouds(

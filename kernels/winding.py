@@ -1,0 +1,40 @@
+"""Winding numbers of a surface that is known by samples: what is inside of it, and what is outside."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def winding_kernel(
+    # Model:
+    samples: wp.array[wp.vec3],
+    areas: wp.array[wp.vec3],
+    width: float,
+    corner: wp.vec3,
+    pitch: float,
+    # Out:
+    winding_out: wp.array3d[float],
+):
+    """Winding numbers of a surface at the points of a grid. Launch: [X, Y, Z].
+
+    The solid angles of its pieces as a share of the full one: about 1 inside, 0 outside and a half on the
+    surface (Gauss). A piece nearer than ``width`` counts as if it were that far away, where its solid angle
+    would go to infinity.
+
+    Args:
+        samples: Centres of the pieces [m], shape [K].
+        areas: Outward normals of the pieces, as long as their areas [m^2], shape [K].
+        width: Least distance [m].
+        corner: Place of the first grid point [m].
+        pitch: Distance between grid points [m].
+        winding_out: Winding numbers, shape [X, Y, Z].
+    """
+    i, j, k = wp.tid()
+    place = corner + pitch * wp.vec3(float(i), float(j), float(k))
+    total = wp.float32(0.0)
+    for sample in range(samples.shape[0]):
+        away = samples[sample] - place
+        distance = wp.max(wp.length(away), width)
+        total += wp.dot(away, areas[sample]) / (distance * distance * distance)
+    winding_out[i, j, k] = total / (4.0 * wp.PI)

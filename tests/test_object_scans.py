@@ -1,0 +1,93 @@
+"""Surfaces behind scanned points: closed, outward, and where the object's is."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import cKDTree
+
+from vd.assets_usd.objects.geometry import mesh_volume, random_surface_points, surface_points
+from vd.assets_usd.objects.model import SURFACE_POINTS, load_set
+from vd.assets_usd.objects.scans import smooth, surface_of_scan
+from vd.evaluate.scanned import known_by_scan
+from vd.student.registration import Registration
+from vd.student.symmetry import symmetries
+
+RADIUS_M = 0.05
+
+
+def ball(count, seed=0):
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    return RADIUS_M * points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def off(points, surface):
+    """Distances of points from a mesh [m], to a millimetre."""
+    samples = random_surface_points(*surface, 20_000, np.random.default_rng(5))
+    return cKDTree(samples).query(points)[0]
+
+
+@pytest.mark.parametrize(
+    "count, noise, within, volume", [(8000, 0.001, 0.0007, 0.04), (600, 0.004, 0.003, 0.15)]
+)
+def test_a_ball_is_found_behind_noise(device, count, noise, within, volume):
+    """Of few samples a round piece as wide as 24 of them is made flat: 2 mm of the radius of 50."""
+    points = ball(count) + np.random.default_rng(1).normal(scale=noise, size=(count, 3))
+    surface = surface_of_scan(points, device)
+    mesh = trimesh.Trimesh(*surface, process=False)
+    assert mesh.is_watertight and len(mesh.split()) == 1
+    assert abs(np.linalg.norm(surface.vertices, axis=1) - RADIUS_M).mean() < within
+    assert mesh_volume(*surface) == pytest.approx(4 / 3 * np.pi * RADIUS_M**3, rel=volume), "faces look out"
+
+
+def test_the_unit_does_not_matter():
+    points = ball(400) + 1.0
+    for factor in (0.01, 1000.0):
+        surface = surface_of_scan(factor * points)
+        size = np.ptp(surface.vertices, axis=0) / factor
+        np.testing.assert_allclose(size, 2 * RADIUS_M, rtol=0.08)
+
+
+def test_what_is_missing_is_closed():
+    points = ball(8000)
+    surface = surface_of_scan(points[points[:, 2] > -0.6 * RADIUS_M])
+    assert trimesh.Trimesh(*surface, process=False).is_watertight
+    # No farther in than a lid on the hole, no farther out than the ball goes, by a cell or two.
+    lowest = surface.vertices[:, 2].min()
+    assert -1.1 * RADIUS_M < lowest < -0.55 * RADIUS_M
+    seen = surface.vertices[surface.vertices[:, 2] > -0.5 * RADIUS_M]
+    assert abs(np.linalg.norm(seen, axis=1) - RADIUS_M).max() < 0.003
+
+
+def test_smoothing_takes_noise_out():
+    cube = load_set(["cube"])[0]
+    exact = surface_points(cube.vertices, cube.faces, 1500)
+    noisy = exact + np.random.default_rng(0).normal(scale=0.002, size=exact.shape)
+    half = cube.longest_side / 2
+
+    def off_cube(points):
+        beyond = np.abs(points) - half
+        return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) - np.minimum(beyond.max(axis=1), 0.0)
+
+    before, after = off_cube(noisy), off_cube(smooth(noisy))
+    assert np.sqrt((after**2).mean()) < 0.65 * np.sqrt((before**2).mean())
+    assert np.quantile(after, 0.99) < 0.006
+
+
+def test_points_that_enclose_nothing_are_refused():
+    with pytest.raises(ValueError, match="enclose nothing"):
+        surface_of_scan(np.full((300, 3), 0.02))
+
+
+def test_an_object_is_known_by_its_scan(device):
+    """Surface and samples agree, so that it is looked for by its surface, inside and outside told apart."""
+    items = load_set("procedural-150-seed0")[:40:13]
+    known = [known_by_scan(item, np.random.default_rng(i), device) for i, item in enumerate(items)]
+    for item, found in zip(items, known, strict=True):
+        assert found.name == item.name and found.surface_points.shape == (SURFACE_POINTS, 3)
+        assert off(found.surface_points, (found.vertices, found.faces)).max() < 1.5e-3
+        # Where the scanner has been: nearer than the noise (4 mm along each axis) at most points.
+        away = cKDTree(surface_points(item.vertices, item.faces, 8000)).query(found.surface_points)[0]
+        assert np.median(away) < 0.003
+    found = Registration(known, world_object=np.arange(4), world_scale=np.ones(4), camera=None, device=device)
+    assert (found._shapes.distance.numpy().min(axis=(1, 2, 3)) < 0.0).all()
+    assert [len(turns) for turns in symmetries(known, device)] == [1] * 4, "noise makes nothing symmetric"
