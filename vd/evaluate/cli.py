@@ -101,7 +101,7 @@ class EvalCfg:
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
     """Aim past the goal while the object is near it: more come within 0.1 rad. Some students do so anyway."""
     scanned_goals: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Students get goals with the errors of a scan: 4 mm of noise, a fifth of the points missing."""
+    """Students know shapes by scans: points with 4 mm of noise, a fifth missing, a surface through them."""
     sees: Literal["auto", "complete", "rendered"] = "auto"
     """What students see: complete clouds, a depth camera's, or what their stage was trained on."""
     randomise: bool = False
