@@ -36,7 +36,7 @@ SCAN_SUFFIXES = (".ply", ".obj", ".glb")
 GOALS_SUFFIXES = (".txt", ".csv")
 """Files that are taken as lists of orientations."""
 CANDIDATES = 20_000
-"""Samples of a scan from which those of the goal are chosen: 1 mm apart on an object of the paper's size."""
+"""Samples of a scan at most that are smoothed: 1 mm apart on an object of the paper's size."""
 LEAST_POINTS = 200
 """Points of a scan below which its shape is a guess."""
 NEIGHBOURS = 24
