@@ -25,6 +25,11 @@ class SimCommand:
     """Warp device; auto is the first GPU, or else the CPU."""
     randomise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
     """Domain randomisation on."""
+    policy: str | None = None
+    """Name or file of a teacher that acts, in the task it was trained in (hand and randomisation are then
+    that task's); by default a network with random weights that closes the hand now and then."""
+    kernels: int = 0
+    """On a GPU list as many kernels, those that take the most time of a control step."""
     allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
     """Also step Newton's own Allegro example at the same world counts; where its asset cannot be fetched,
     with a hand of boxes of that size."""
@@ -38,15 +43,20 @@ class SimCommand:
         import warp as wp
 
         from vd.bench.allegro import allegro_rate
-        from vd.bench.sim import measure, task
+        from vd.bench.sim import measure, task, teacher_task
 
         wp.config.log_level = wp.LOG_WARNING
         device = choose_device(self.device)
         rows: list[dict[str, Any]] = []
         for worlds in self.worlds:
-            row = measure(task(self.objects, worlds, self.hand, self.randomise), device)
+            if self.policy is None:
+                cfg = task(self.objects, worlds, self.hand, self.randomise)
+            else:
+                cfg = teacher_task(self.policy, self.objects, worlds)
+            row = measure(cfg, device, teacher=self.policy)
             record: dict[str, Any] = dataclasses.asdict(row)
-            substeps = round(task(self.objects, worlds, self.hand, True).sim.physics_hz / 12.0)
+            record["kernels"] = record["kernels"][: self.kernels]
+            substeps = cfg.sim.substeps
             if self.allegro:
                 try:
                     beside = allegro_rate(worlds, device, file=self.allegro_file)

@@ -2,7 +2,8 @@
 
 Every row says what it includes. Physics only replays the solver's steps of a control step; the
 whole step adds actions, observations, rewards, resets and randomisation; with a policy adds its
-network and noise. States come from that policy's own actions in contact.
+network and noise. States come from that policy's own actions in contact: those of a stand-in for an
+untrained one, or of a trained teacher, whose fingers touch more and for longer.
 """
 
 import dataclasses
@@ -10,6 +11,7 @@ import gc
 import importlib
 import pkgutil
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -18,10 +20,25 @@ import numpy as np
 import warp as wp
 
 from vd.envs.cfg import ReorientCfg, RewardCfg
+from vd.envs.curriculum import Stage
 from vd.envs.reorient import ReorientEnv
 
 WARM_UP_STEPS = 36
 """Control steps before timing: objects have landed and fingers reached them (3 s)."""
+
+
+@dataclass(frozen=True)
+class KernelRow:
+    """What one kernel takes of a control step."""
+
+    kernel: str
+    """Its name, as Warp reports it."""
+    launches: int
+    """Launches in the step."""
+    seconds: float
+    """Device time of all of them [s]."""
+    share: float
+    """Of the device time of all kernels, in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -48,6 +65,8 @@ class SimRow:
     """Contacts per world, mean over worlds at the end."""
     rows_max: int
     """Most constraint rows in any world at the end."""
+    kernels: tuple[KernelRow, ...] = ()
+    """Every kernel of a control step, the longest first; none on the CPU, not measured."""
 
 
 def seconds_per_call(function: Any, calls: int, device: str) -> float:
@@ -99,18 +118,42 @@ def reaching_policy(env: ReorientEnv, seed: int) -> Any:
     return act
 
 
-def own_share(env: ReorientEnv) -> float:
-    """Share of our kernels in the device time of one control step, by a timer around every kernel.
+def teacher_policy(env: ReorientEnv, name: str) -> Callable[[], None]:
+    """The mean actions of a trained teacher, as a call that writes them where the next step reads them."""
+    import torch
 
-    Launched without the graph, so that kernels can be told apart; idle gaps do not count.
+    from vd.evaluate.agents import find_policy
+    from vd.policy import load_policy
+
+    policy = load_policy(find_policy(name), str(torch.device(str(env.device))))
+    observation, action = wp.to_torch(env.observation), wp.to_torch(env.action)
+
+    def act() -> None:
+        action.copy_(policy.act(observation).clamp(-1.0, 1.0))
+
+    return act
+
+
+def kernel_rows(env: ReorientEnv) -> tuple[KernelRow, ...]:
+    """Device time of one control step by kernel, by a timer around every launch.
+
+    Launched without the graph, in which the passes of a solver's loop cannot be told apart; idle gaps do not
+    count.
     """
     with wp.ScopedTimer("step", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True) as timer:
         env.launch_step()
-    # Warp reports "forward kernel NAME_HASH".
+    seconds: dict[str, list[float]] = {}
+    for result in timer.timing_results:  # "forward kernel NAME_HASH", milliseconds
+        seconds.setdefault(result.name.split()[-1], []).append(1e-3 * result.elapsed)
+    total = sum(map(sum, seconds.values()))
+    rows = [KernelRow(name, len(times), sum(times), sum(times) / total) for name, times in seconds.items()]
+    return tuple(sorted(rows, key=lambda row: row.seconds, reverse=True))
+
+
+def own_share(rows: tuple[KernelRow, ...]) -> float:
+    """Share of our kernels in the device time of a step."""
     own = tuple(f"{name}_" for name in own_kernel_names())
-    times = [(result.name.split()[-1], result.elapsed) for result in timer.timing_results]
-    total = sum(elapsed for _, elapsed in times)
-    return sum(elapsed for name, elapsed in times if name.startswith(own)) / total if total else 0.0
+    return sum(row.share for row in rows if row.kernel.startswith(own))
 
 
 def own_kernel_names() -> set[str]:
@@ -124,8 +167,25 @@ def own_kernel_names() -> set[str]:
     return names
 
 
-def measure(cfg: ReorientCfg, device: str, *, calls: int = 24, seed: int = 0, label: str = "mixed") -> SimRow:
-    """Measure one configuration; raises if any contact was lost."""
+def measure(
+    cfg: ReorientCfg,
+    device: str,
+    *,
+    teacher: str | None = None,
+    calls: int = 24,
+    seed: int = 0,
+    label: str = "mixed",
+) -> SimRow:
+    """Measure one configuration; raises if any contact was lost.
+
+    Args:
+        cfg: Task.
+        device: Warp device.
+        teacher: Name or file of a trained policy of that task; a stand-in for an untrained one if None.
+        calls: Control steps to time, each way.
+        seed: Of the stand-in.
+        label: Name of the row's scene.
+    """
     begin = time.perf_counter()
     on_gpu = device != "cpu"
     before = free_memory(device) if on_gpu else 0
@@ -137,7 +197,11 @@ def measure(cfg: ReorientCfg, device: str, *, calls: int = 24, seed: int = 0, la
         env.step(env.action)
     # Before the policy, whose network and matrix workspace are no part of the simulation.
     memory = (before - free_memory(device)) / 1e9 if on_gpu else 0.0
-    policy = reaching_policy(env, seed)
+    if teacher is None:
+        policy = reaching_policy(env, seed)
+    else:
+        env.set_stage(Stage())  # a teacher has learned the task as it is configured
+        policy = teacher_policy(env, teacher)
     for _ in range(WARM_UP_STEPS):
         policy()
         env.step(env.action)
@@ -160,6 +224,7 @@ def measure(cfg: ReorientCfg, device: str, *, calls: int = 24, seed: int = 0, la
     env.check()
     data = env.sim.solver.mjw_data
     contacts, rows = float(data.nacon.numpy()[0]), int(np.max(data.nefc.numpy()))
+    kernels = kernel_rows(env) if on_gpu else ()
     n = cfg.num_worlds
     return SimRow(
         scene=label,
@@ -167,11 +232,12 @@ def measure(cfg: ReorientCfg, device: str, *, calls: int = 24, seed: int = 0, la
         physics_only=n / physics_s,
         whole_step=n / (whole_s - policy_s),
         with_policy=n / whole_s,
-        own_kernels=own_share(env) if on_gpu else 0.0,
+        own_kernels=own_share(kernels),
         memory_gb=memory,
         start_s=start_s,
         contacts_mean=contacts / n,
         rows_max=rows,
+        kernels=kernels,
     )
 
 
@@ -184,6 +250,20 @@ def free_memory(device: str) -> int:
     wp.set_mempool_release_threshold(device, 0)
     wp.synchronize_device(device)
     return int(wp.get_device(device).free_memory)
+
+
+def teacher_task(name: str, objects: tuple[str, ...], worlds: int) -> ReorientCfg:
+    """The task a teacher was trained in, on these objects.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+        ValueError: It is none, or its task is not one of this version.
+    """
+    from vd.evaluate.agents import find_policy, trained_task
+    from vd.policy import load_policy
+
+    cfg = trained_task(load_policy(find_policy(name)))
+    return dataclasses.replace(cfg, objects=objects, num_worlds=worlds)
 
 
 def task(objects: tuple[str, ...], worlds: int, hand: str, randomise: bool) -> ReorientCfg:
