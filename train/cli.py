@@ -39,6 +39,7 @@ commands:
             or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
   bundle    write a policy as it is deployed     vd-train bundle student.pt bundles/first
   curves    draw the curves of a run             vd-train curves runs/first
+  noise     how much of an update is signal      vd-train noise --init dclaw4-air --objects SET
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset multi-gpu
 Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
@@ -121,6 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "export": _export,
         "bundle": _bundle,
         "curves": _curves,
+        "noise": _noise,
     }
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
@@ -382,6 +384,12 @@ def _curves(arguments: list[str], _started: float) -> int:
     plot(files, output)
     print(output)
     return 0
+
+
+def _noise(arguments: list[str], _started: float) -> int:
+    from vd.train.noise import noise_command
+
+    return noise_command(arguments, parse_teacher, build_teacher)
 
 
 def normalise(arguments: Sequence[str], short_forms: Sequence[str], group: str) -> list[str]:

@@ -185,7 +185,7 @@ class TeacherRunner(OnPolicyRunner):
             The row for ``progress.jsonl``, or ``None`` if a signal cut the rollout short; the observation.
         """
         start = time.perf_counter()
-        self._set_std_floor()
+        self.set_std_floor()
         with torch.inference_mode():
             for _ in range(self.cfg["num_steps_per_env"]):
                 # With several processes all must do the same collectives, so they stop between iterations.
@@ -231,7 +231,7 @@ class TeacherRunner(OnPolicyRunner):
         self._score = (stage, row["success_per_goal"] or 0.0, row["mean_reward"])
         return row, observation
 
-    def _set_std_floor(self) -> None:
+    def set_std_floor(self) -> None:
         """Let the least std of the actions fall as stillness tightens (``PolicyCfg.quiet_std``)."""
         quiet = self.policy_cfg.quiet_std
         if quiet is not None:
