@@ -37,6 +37,7 @@ commands:
   export    write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
             or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
             or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
+  average   mean weights of a run's policies     vd-train average new.pt old.pt --output policy.pt
   bundle    write a policy as it is deployed     vd-train bundle student.pt bundles/first
   curves    draw the curves of a run             vd-train curves runs/first
   noise     how much of an update is signal      vd-train noise --init dclaw4-air --objects SET
@@ -120,6 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "calibrate": _calibrate,
         "profile": _profile,
         "export": _export,
+        "average": _average,
         "bundle": _bundle,
         "curves": _curves,
         "noise": _noise,
@@ -352,6 +354,12 @@ def _export_onnx(cfg: ExportCfg) -> int:
         print(f"onnxruntime gives the same actions within {worst:.1e}")
     print(cfg.output)
     return 0
+
+
+def _average(arguments: list[str], _started: float) -> int:
+    from vd.train.average import average_command
+
+    return average_command(arguments)
 
 
 def _bundle(arguments: list[str], _started: float) -> int:
