@@ -6,30 +6,14 @@ runs that went on from each other, have weights that can be averaged.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import torch
-import tyro
+
+from vd.train.config import AverageCfg
 
 NETWORKS = ("actor_state_dict", "critic_state_dict")
 _NORMALISER = "obs_normalizer."
-
-
-@dataclass
-class AverageCfg:
-    """Write the mean of several teachers' weights, of one run or of runs that went on from each other.
-
-    Everything else, the normalisation of observations included, is that of the one with most steps.
-    """
-
-    policies: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Installed policies by name, policy files, checkpoints or runs' folders; at least two."""
-    output: Path = Path("policy.pt")
-    """File to write."""
-    weights: tuple[float, ...] = ()
-    """How much each counts, in this order; all alike by default."""
 
 
 def shares(weights: Sequence[float], count: int) -> list[float]:
@@ -89,10 +73,13 @@ def averaged(
     return result | {"averaged_steps": [int(state["env_steps"]) for state in states]}
 
 
-def average_command(arguments: list[str]) -> int:
-    """``vd-train average``."""
-    cfg = tyro.cli(AverageCfg, args=arguments, prog="vd-train average")
+def average_files(cfg: AverageCfg) -> None:
+    """Read, average and write for ``vd-train average``.
 
+    Raises:
+        FileNotFoundError: One of the policies is not there.
+        ValueError: One is no teacher, or they cannot be averaged.
+    """
     from vd.evaluate.agents import find_policy
     from vd.train.checkpoint import load_checkpoint, save_checkpoint
 
@@ -100,5 +87,3 @@ def average_command(arguments: list[str]) -> int:
     with torch.no_grad():
         states = [load_checkpoint(find_policy(name), flag="vd-train average") for name in cfg.policies]
         save_checkpoint(cfg.output, averaged(states, weights, cfg.policies))
-    print(cfg.output)
-    return 0

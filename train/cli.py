@@ -14,6 +14,7 @@ from vd.config import from_dict, to_dict
 from vd.envs.cfg import FocusCfg
 from vd.files import write_json
 from vd.train.begin import find_start, settings_of
+from vd.train.config import AverageCfg, NoiseCfg
 from vd.train.focus import read_success, worlds_text
 from vd.train.presets import PRESETS, TeacherCfg, smoke
 
@@ -357,9 +358,13 @@ def _export_onnx(cfg: ExportCfg) -> int:
 
 
 def _average(arguments: list[str], _started: float) -> int:
-    from vd.train.average import average_command
+    cfg = tyro.cli(AverageCfg, args=arguments, prog="vd-train average")
 
-    return average_command(arguments)
+    from vd.train.average import average_files
+
+    average_files(cfg)
+    print(cfg.output)
+    return 0
 
 
 def _bundle(arguments: list[str], _started: float) -> int:
@@ -395,9 +400,13 @@ def _curves(arguments: list[str], _started: float) -> int:
 
 
 def _noise(arguments: list[str], _started: float) -> int:
-    from vd.train.noise import noise_command
+    cfg, rest = tyro.cli(NoiseCfg, args=arguments, prog="vd-train noise", return_unknown_args=True)
+    teacher = parse_teacher(rest)
 
-    return noise_command(arguments, parse_teacher, build_teacher)
+    from vd.train.noise import print_noise
+
+    print_noise(cfg, teacher, build_teacher)
+    return 0
 
 
 def normalise(arguments: Sequence[str], short_forms: Sequence[str], group: str) -> list[str]:

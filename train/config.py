@@ -6,7 +6,9 @@ Defaults are the paper's (Table S1), or its released code's where the paper says
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+import tyro
 
 from vd.paper import PAPER
 
@@ -94,6 +96,51 @@ class RunCfg:
     """Start worlds at random times of their first episode, so that time-outs do not come all at once."""
     tensorboard: bool = True
     """Write TensorBoard files (tensorboard --logdir RUN-DIR)."""
+
+
+@dataclass
+class AverageCfg:
+    """Write the mean of several teachers' weights, of one run or of runs that went on from each other.
+
+    Everything else, the normalisation of observations included, is that of the one with most steps.
+    """
+
+    policies: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Installed policies by name, policy files, checkpoints or runs' folders; at least two."""
+    output: Path = Path("policy.pt")
+    """File to write."""
+    weights: tuple[float, ...] = ()
+    """How much each counts, in this order; all alike by default."""
+
+
+@dataclass
+class NoiseCfg:
+    """How much of an update is signal: the noise scale of the policy gradient, by GAE lambda.
+
+    All other flags are those of vd-train teacher, --init with the policy in question among them. Nothing is
+    trained.
+    """
+
+    steps: int = 192
+    """Control steps of every world to record, after one episode to get into the way of things."""
+    groups: int = 64
+    """Groups of worlds, each of which gives a gradient of its own."""
+    lambdas: tuple[float, ...] = (0.8, 0.9, 0.95, 0.98)
+    """GAE lambdas to look at, besides 1 and that of the learner."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the rows as JSON."""
+
+    def validate(self, num_worlds: int) -> None:
+        """Raise ValueError naming the flag and the remedy."""
+        if self.steps < 3:
+            raise ValueError(f"--steps is {self.steps}; give at least 3, a third of which is left out")
+        for value in self.lambdas:
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"--lambdas has {value:g}; it has to lie within 0 and 1")
+        if self.groups < 3 or num_worlds % self.groups:
+            raise ValueError(
+                f"--groups is {self.groups}; give at least 3, and a divisor of the {num_worlds} worlds"
+            )
 
 
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:

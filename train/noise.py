@@ -21,12 +21,13 @@ import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
-import tyro
 from tensordict import TensorDict
 
+from vd.train.config import NoiseCfg
 from vd.train.progress import waiting
 from vd.train.vec_env import OBSERVATION_GROUP
 
@@ -36,36 +37,6 @@ if TYPE_CHECKING:
 
 CHUNK = 32768
 """Samples that pass through the actor at a time."""
-
-
-@dataclass
-class NoiseCfg:
-    """How much of an update is signal: the noise scale of the policy gradient, by GAE lambda.
-
-    All other flags are those of vd-train teacher, --init with the policy in question among them. Nothing is
-    trained.
-    """
-
-    steps: int = 192
-    """Control steps of every world to record, after one episode to get into the way of things."""
-    groups: int = 64
-    """Groups of worlds, each of which gives a gradient of its own."""
-    lambdas: tuple[float, ...] = (0.8, 0.9, 0.95, 0.98)
-    """GAE lambdas to look at, besides 1 and that of the learner."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the rows as JSON."""
-
-    def validate(self, num_worlds: int) -> None:
-        """Raise ValueError naming the flag and the remedy."""
-        if self.steps < 3:
-            raise ValueError(f"--steps is {self.steps}; give at least 3, a third of which is left out")
-        for value in self.lambdas:
-            if not 0.0 <= value <= 1.0:
-                raise ValueError(f"--lambdas has {value:g}; it has to lie within 0 and 1")
-        if self.groups < 3 or num_worlds % self.groups:
-            raise ValueError(
-                f"--groups is {self.groups}; give at least 3, and a divisor of the {num_worlds} worlds"
-            )
 
 
 @dataclass(frozen=True)
@@ -278,16 +249,19 @@ def table(rows: Sequence[NoiseRow], samples: int, update: int) -> str:
     return "\n".join(lines)
 
 
-def noise_command(
-    arguments: list[str],
-    parse: Callable[[Sequence[str]], "TeacherCfg"],
-    build: Callable[["TeacherCfg"], "TeacherRunner"],
-) -> int:
-    """``vd-train noise``: ``parse`` and ``build`` are those of ``vd-train teacher``."""
-    cfg, rest = tyro.cli(NoiseCfg, args=arguments, prog="vd-train noise", return_unknown_args=True)
+def print_noise(
+    cfg: NoiseCfg, teacher: "TeacherCfg", build: Callable[["TeacherCfg"], "TeacherRunner"]
+) -> None:
+    """Measure and print for ``vd-train noise``.
+
+    Args:
+        cfg: What to measure.
+        teacher: The run that it is about; its folder is left alone.
+        build: What makes a runner of it.
+    """
+    cfg.validate(teacher.env.num_worlds)
     with tempfile.TemporaryDirectory() as folder:
-        teacher = parse([*rest, "--run-dir", folder])
-        cfg.validate(teacher.env.num_worlds)
+        teacher = dataclasses.replace(teacher, run=dataclasses.replace(teacher.run, run_dir=Path(folder)))
         with waiting("recording (the first start compiles the kernels: minutes)", not cfg.json):
             runner = build(teacher)
             rows, samples = gradient_noise(runner, cfg)
@@ -299,4 +273,3 @@ def noise_command(
         print()
     else:
         print(table(rows, samples, teacher.ppo.rollout_steps * teacher.env.num_worlds))
-    return 0
