@@ -14,7 +14,7 @@ from vd.config import from_dict, to_dict
 from vd.envs.cfg import FocusCfg
 from vd.files import write_json
 from vd.train.begin import find_start, settings_of
-from vd.train.config import AverageCfg, NoiseCfg
+from vd.train.config import NoiseCfg
 from vd.train.focus import read_success, worlds_text
 from vd.train.presets import PRESETS, TeacherCfg, smoke
 
@@ -38,7 +38,6 @@ commands:
   export    write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
             or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
             or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
-  average   mean weights of a run's policies     vd-train average new.pt old.pt --output policy.pt
   bundle    write a policy as it is deployed     vd-train bundle student.pt bundles/first
   curves    draw the curves of a run             vd-train curves runs/first
   noise     how much of an update is signal      vd-train noise --init dclaw4-air --objects SET
@@ -122,7 +121,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "calibrate": _calibrate,
         "profile": _profile,
         "export": _export,
-        "average": _average,
         "bundle": _bundle,
         "curves": _curves,
         "noise": _noise,
@@ -353,16 +351,6 @@ def _export_onnx(cfg: ExportCfg) -> int:
         print("onnxruntime is not installed: not checked (pip install 'visual-dexterity[export]')")
     else:
         print(f"onnxruntime gives the same actions within {worst:.1e}")
-    print(cfg.output)
-    return 0
-
-
-def _average(arguments: list[str], _started: float) -> int:
-    cfg = tyro.cli(AverageCfg, args=arguments, prog="vd-train average")
-
-    from vd.train.average import average_files
-
-    average_files(cfg)
     print(cfg.output)
     return 0
 

@@ -99,21 +99,6 @@ class RunCfg:
 
 
 @dataclass
-class AverageCfg:
-    """Write the mean of several teachers' weights, of one run or of runs that went on from each other.
-
-    Everything else, the normalisation of observations included, is that of the one with most steps.
-    """
-
-    policies: Annotated[tuple[str, ...], tyro.conf.Positional]
-    """Installed policies by name, policy files, checkpoints or runs' folders; at least two."""
-    output: Path = Path("policy.pt")
-    """File to write."""
-    weights: tuple[float, ...] = ()
-    """How much each counts, in this order; all alike by default."""
-
-
-@dataclass
 class NoiseCfg:
     """How much of an update is signal: the noise scale of the policy gradient, by GAE lambda.
 
