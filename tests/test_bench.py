@@ -8,6 +8,8 @@ import pytest
 from vd.bench.cli import PhysicsCommand, SimCommand
 from vd.bench.sim import kernel_rows, own_kernel_names, own_share, task, teacher_task
 from vd.envs.reorient import ReorientEnv
+from vd.evaluate.agents import find_policy
+from vd.policy import load_policy
 
 
 def test_all_kernels_of_a_step_count_as_ours():
@@ -38,7 +40,7 @@ def test_a_teacher_acts_in_its_own_task(tmp_path, capsys):
     ).run()
     (row,) = (json.loads(line) for line in capsys.readouterr().out.splitlines())
     assert row["with_policy"] > 0.0 and row["contacts_mean"] > 0.0
-    assert teacher_task("dclaw4-cube", ("cube",), 4).hand == "dclaw4"
+    assert teacher_task(load_policy(find_policy("dclaw4-cube")), ("cube",), 4).hand == "dclaw4"
 
 
 def test_a_student_is_no_teacher_to_measure():

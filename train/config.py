@@ -107,7 +107,7 @@ class NoiseCfg:
     """
 
     steps: int = 192
-    """Control steps of every world to record, after one episode to get into the way of things."""
+    """Control steps of every world to record, after one episode, so that states are those of training."""
     groups: int = 64
     """Groups of worlds, each of which gives a gradient of its own."""
     lambdas: tuple[float, ...] = (0.8, 0.9, 0.95, 0.98)

@@ -1,6 +1,6 @@
 """The surface behind the points of a scan: noise taken out, what is missing closed.
 
-Lengths in metres, in the frame of the points.
+Lengths in the unit of the points, in their frame.
 """
 
 from typing import NamedTuple

@@ -26,8 +26,9 @@ class SimCommand:
     randomise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
     """Domain randomisation on."""
     policy: str | None = None
-    """Name or file of a teacher that acts, in the task it was trained in (hand and randomisation are then
-    that task's); by default a network with random weights that closes the hand now and then."""
+    """Name or file of a teacher whose mean actions are taken, in the task it was trained in (hand and
+    randomisation are then that task's); by default a network with random weights closes the hand now and
+    then."""
     kernels: int = 0
     """On a GPU list as many kernels, those that take the most time of a control step."""
     allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
@@ -44,16 +45,19 @@ class SimCommand:
 
         from vd.bench.allegro import allegro_rate
         from vd.bench.sim import measure, task, teacher_task
+        from vd.evaluate.agents import find_policy
+        from vd.policy import load_policy
 
         wp.config.log_level = wp.LOG_WARNING
         device = choose_device(self.device)
+        teacher = None if self.policy is None else load_policy(find_policy(self.policy), device)
         rows: list[dict[str, Any]] = []
         for worlds in self.worlds:
-            if self.policy is None:
+            if teacher is None:
                 cfg = task(self.objects, worlds, self.hand, self.randomise)
             else:
-                cfg = teacher_task(self.policy, self.objects, worlds)
-            row = measure(cfg, device, teacher=self.policy)
+                cfg = teacher_task(teacher, self.objects, worlds)
+            row = measure(cfg, device, teacher=teacher)
             record: dict[str, Any] = dataclasses.asdict(row)
             record["kernels"] = record["kernels"][: self.kernels]
             substeps = cfg.sim.substeps

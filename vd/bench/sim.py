@@ -2,8 +2,8 @@
 
 Every row says what it includes. Physics only replays the solver's steps of a control step; the
 whole step adds actions, observations, rewards, resets and randomisation; with a policy adds its
-network and noise. States come from that policy's own actions in contact: those of a stand-in for an
-untrained one, or of a trained teacher, whose fingers touch more and for longer.
+network. States come from that policy's own actions in contact: those of a stand-in for an untrained one,
+with its noise, or the mean actions of a trained teacher, whose fingers touch more and for longer.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
@@ -22,6 +22,9 @@ import warp as wp
 from vd.envs.cfg import ReorientCfg, RewardCfg
 from vd.envs.curriculum import Stage
 from vd.envs.reorient import ReorientEnv
+
+if TYPE_CHECKING:
+    from vd.policy import TrainedPolicy
 
 WARM_UP_STEPS = 36
 """Control steps before timing: objects have landed and fingers reached them (3 s)."""
@@ -54,7 +57,7 @@ class SimRow:
     whole_step: float
     """Control steps/s of the environment's step."""
     with_policy: float
-    """Control steps/s with a policy network and its exploration noise."""
+    """Control steps/s with a policy network and, of the stand-in for an untrained one, its noise."""
     own_kernels: float
     """Share of our kernels in the device time of a control step, in [0, 1]; 0 on the CPU, not measured."""
     memory_gb: float
@@ -65,7 +68,7 @@ class SimRow:
     """Contacts per world, mean over worlds at the end."""
     rows_max: int
     """Most constraint rows in any world at the end."""
-    kernels: tuple[KernelRow, ...] = ()
+    kernels: tuple[KernelRow, ...]
     """Every kernel of a control step, the longest first; none on the CPU, not measured."""
 
 
@@ -118,14 +121,8 @@ def reaching_policy(env: ReorientEnv, seed: int) -> Any:
     return act
 
 
-def teacher_policy(env: ReorientEnv, name: str) -> Callable[[], None]:
-    """The mean actions of a trained teacher, as a call that writes them where the next step reads them."""
-    import torch
-
-    from vd.evaluate.agents import find_policy
-    from vd.policy import load_policy
-
-    policy = load_policy(find_policy(name), str(torch.device(str(env.device))))
+def teacher_policy(env: ReorientEnv, policy: "TrainedPolicy") -> Callable[[], None]:
+    """A teacher's mean actions, as a call that writes them where the next step reads them."""
     observation, action = wp.to_torch(env.observation), wp.to_torch(env.action)
 
     def act() -> None:
@@ -153,7 +150,7 @@ def kernel_rows(env: ReorientEnv) -> tuple[KernelRow, ...]:
 def own_share(rows: tuple[KernelRow, ...]) -> float:
     """Share of our kernels in the device time of a step."""
     own = tuple(f"{name}_" for name in own_kernel_names())
-    return sum(row.share for row in rows if row.kernel.startswith(own))
+    return sum((row.share for row in rows if row.kernel.startswith(own)), start=0.0)
 
 
 def own_kernel_names() -> set[str]:
@@ -171,7 +168,7 @@ def measure(
     cfg: ReorientCfg,
     device: str,
     *,
-    teacher: str | None = None,
+    teacher: "TrainedPolicy | None" = None,
     calls: int = 24,
     seed: int = 0,
     label: str = "mixed",
@@ -181,7 +178,7 @@ def measure(
     Args:
         cfg: Task.
         device: Warp device.
-        teacher: Name or file of a trained policy of that task; a stand-in for an untrained one if None.
+        teacher: A policy trained in that task, on the device; a stand-in for an untrained one if None.
         calls: Control steps to time, each way.
         seed: Of the stand-in.
         label: Name of the row's scene.
@@ -252,18 +249,15 @@ def free_memory(device: str) -> int:
     return int(wp.get_device(device).free_memory)
 
 
-def teacher_task(name: str, objects: tuple[str, ...], worlds: int) -> ReorientCfg:
+def teacher_task(policy: "TrainedPolicy", objects: tuple[str, ...], worlds: int) -> ReorientCfg:
     """The task a teacher was trained in, on these objects.
 
     Raises:
-        FileNotFoundError: There is no such policy.
-        ValueError: It is none, or its task is not one of this version.
+        ValueError: It is not one of this version.
     """
-    from vd.evaluate.agents import find_policy, trained_task
-    from vd.policy import load_policy
+    from vd.evaluate.agents import trained_task
 
-    cfg = trained_task(load_policy(find_policy(name)))
-    return dataclasses.replace(cfg, objects=objects, num_worlds=worlds)
+    return dataclasses.replace(trained_task(policy), objects=objects, num_worlds=worlds)
 
 
 def task(objects: tuple[str, ...], worlds: int, hand: str, randomise: bool) -> ReorientCfg:
