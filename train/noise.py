@@ -245,7 +245,7 @@ def gradient_noise(runner: "TeacherRunner", cfg: NoiseCfg) -> tuple[list[NoiseRo
 def table(rows: Sequence[NoiseRow], samples: int, update: int) -> str:
     """What was found, for people."""
     lines = [
-        f"{samples / 1e6:.3g} M samples; an update of this learner has {update / 1e6:.3g} M",
+        f"{samples:,} samples; an update of this learner has {update:,}",
         f"{'lambda':>8}{'signal':>22}{'noise scale':>14}{'signal in an update':>22}{'progress':>18}",
     ]
     for row in rows:
