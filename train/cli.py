@@ -35,6 +35,7 @@ commands:
   student   imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
   profile   where a student's time goes          vd-train profile --stage 1 --teacher dclaw3-table
   calibrate choose when a student stops          vd-train calibrate student.pt --objects SET
+  follow    give a student a newer teacher       vd-train follow dclaw4-student runs/more student.pt
   export    write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
             or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
             or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
@@ -119,6 +120,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "teacher": _teacher,
         "student": _student,
         "calibrate": _calibrate,
+        "follow": _follow,
         "profile": _profile,
         "export": _export,
         "bundle": _bundle,
@@ -307,6 +309,12 @@ def _calibrate(arguments: list[str], started: float) -> int:
     from vd.train.student.cli import calibrate_command
 
     return calibrate_command(arguments, started)
+
+
+def _follow(arguments: list[str], started: float) -> int:
+    from vd.train.student.cli import follow_command
+
+    return follow_command(arguments, started)
 
 
 def _profile(arguments: list[str], started: float) -> int:

@@ -53,6 +53,21 @@ class CalibrateCfg:
     """Print the outcome as JSON."""
 
 
+@dataclass
+class FollowCfg:
+    """Give a student the layers of its teacher as it is now, without training.
+
+    For a teacher that has gone on with training (vd-train teacher --init). Calibrate the student afterwards.
+    """
+
+    student: Annotated[str, tyro.conf.Positional]
+    """student.pt, a run's folder, or the name of an installed student; it stays as it is."""
+    teacher: Annotated[str, tyro.conf.Positional]
+    """The teacher: a policy.pt, a run's folder, or the name of an installed one."""
+    output: Annotated[Path, tyro.conf.Positional] = Path("student.pt")
+    """File to write."""
+
+
 def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
     """The configuration that command-line flags ask for.
 
@@ -167,6 +182,21 @@ def calibrate_command(arguments: list[str], _started: float) -> int:
             f"{rule.action_norm:.3f}. Of {result.episodes} episodes {result.success:.1%} stop within "
             f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} came that near"
         )
+    return 0
+
+
+def follow_command(arguments: list[str], _started: float) -> int:
+    """``vd-train follow``; the exit status."""
+    cfg = tyro.cli(FollowCfg, args=arguments, prog="vd-train follow")
+
+    from vd.train.student.follow import follow_teacher
+
+    other = follow_teacher(cfg.student, cfg.teacher, cfg.output)
+    print(
+        f"{cfg.output}: {cfg.student} with the layers of {cfg.teacher}"
+        + ("" if other else ", which are those it had")
+        + f"; next, choose when it stops: vd-train calibrate {cfg.output}"
+    )
     return 0
 
 

@@ -98,7 +98,8 @@ class StateHead(nn.Module):
 
         Args:
             teacher: The teacher.
-            tables: The views of its hand (``vd.envs.symmetry.ViewTables``), if it sees its goals in them.
+            tables: The views of its hand (``vd.envs.symmetry.ViewTables``), if it sees its goals in them;
+                None keeps those there are.
 
         Returns:
             Whether it is another one than before; the estimate then is to be fitted anew.
@@ -113,8 +114,9 @@ class StateHead(nn.Module):
             weights[name] = weights[name][: len(value)]
         self.teacher.load_state_dict(weights)
         offset, scale = teacher.offset[0], teacher.scale[0]
-        if self.views is not None and tables is not None:
-            self.views.adopt(tables)
+        if self.views is not None:
+            if tables is not None:
+                self.views.adopt(tables)
             self.view_offset.copy_(offset)
             self.view_scale.copy_(scale)
             offset, scale = self.views.world_moments(offset, scale)
@@ -124,6 +126,32 @@ class StateHead(nn.Module):
             return False
         self.fitted.fill_(False)
         return True
+
+    def follow(self, teacher: MeanAction) -> bool:
+        """Take over a teacher that has gone on since, and estimate the same of the world as before.
+
+        What the estimate is measured in changes with the teacher's normalisation, so it is measured anew,
+        exactly; nothing has to be learned again.
+
+        Args:
+            teacher: The teacher, of the same hand, task and layers.
+
+        Returns:
+            Whether it is another one than before.
+
+        Raises:
+            RuntimeError: Its layers are of other sizes.
+        """
+        offset, scale, fitted = self.offset.clone(), self.scale.clone(), self.fitted.clone()
+        other = self.adopt(teacher)
+        with torch.no_grad():
+            shift = offset - self.offset
+            if self._finds:
+                shift[self.told] = 0.0  # the estimate only adds to what is told of these, in the world
+            self.estimate.weight.mul_((scale / self.scale)[:, None])
+            self.estimate.bias.mul_(scale).add_(shift).div_(self.scale)
+        self.fitted.copy_(fitted)
+        return other
 
     def target(self, observation: torch.Tensor) -> torch.Tensor:
         """What the estimate of an observation in the world frame [.., O] should be, normalised.
