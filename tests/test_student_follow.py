@@ -75,3 +75,17 @@ def test_another_hand_or_observation_is_refused(tmp_path, capsys, teacher, messa
     output = tmp_path / "student.pt"
     assert main(["follow", "dclaw4-student", teacher, str(output)]) == 1
     assert message in capsys.readouterr().err and not output.exists()
+
+
+def test_a_teacher_is_no_student(tmp_path, capsys):
+    assert main(["follow", "dclaw4-air", "dclaw4-table", str(tmp_path / "student.pt")]) == 1
+    assert "no student" in capsys.readouterr().err
+
+
+def test_actions_that_mean_something_else_are_refused(tmp_path, capsys):
+    state = torch.load(find_policy("dclaw4-table"), weights_only=True)
+    state["task"]["action"]["scale_rad_s"] += 1.0
+    torch.save(state, tmp_path / "policy.pt")
+    output = tmp_path / "student.pt"
+    assert main(["follow", "dclaw4-student", str(tmp_path / "policy.pt"), str(output)]) == 1
+    assert "an action of" in capsys.readouterr().err and not output.exists()

@@ -192,17 +192,23 @@ def check_start(cfg: StudentTrainCfg) -> None:
 
 def state_head(cfg: StudentTrainCfg, teacher: "TrainedPolicy") -> "StateCfg":
     """The head for what the teacher observes: a student that acts already keeps to having one, or none."""
-    from vd.evaluate.agents import trained_task
-    from vd.kernels.observations import JOINTS_PER_FINGER
     from vd.student.cfg import StateCfg
     from vd.student.saved import read_student, saved_spec
-    from vd.student.state import state_cfg
 
     wanted = cfg.dagger.state_weight > 0.0
     if cfg.init is not None and saved_spec(read_student(cfg.init), cfg.init).stage != PRETRAINING:
         wanted = cfg.network.state.values > 0
     if not wanted:
         return StateCfg()
+    return head_of(teacher)
+
+
+def head_of(teacher: "TrainedPolicy") -> "StateCfg":
+    """The head that estimates what a teacher observes, in the views that it was trained in."""
+    from vd.evaluate.agents import trained_task
+    from vd.kernels.observations import JOINTS_PER_FINGER
+    from vd.student.state import state_cfg
+
     in_views = trained_task(teacher).observation.view == "goal"
     return state_cfg(teacher.spec, views=teacher.num_actions // JOINTS_PER_FINGER if in_views else 0)
 
@@ -316,8 +322,7 @@ def _dagger(
         tables = view_tables(simulation) if state.views is not None else None
         if fresh and state.adopt(teacher.network, tables):
             # What is added to the actions of another teacher's layers is of no use to these.
-            torch.nn.init.zeros_(student.mean.weight)
-            torch.nn.init.zeros_(student.mean.bias)
+            student.forget_correction()
         if state.views is not None:
             labels = EveryView(teacher, state.views)
     return Dagger(env, view, student, labels, cfg.dagger, world_size=world_size)

@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from vd.config import to_dict
-from vd.evaluate.agents import find_policy, open_teacher, policy_name
-from vd.student.network import Student
-from vd.student.saved import read_student, saved_spec, student_export
+from vd.evaluate.agents import is_saved_student, open_policy, open_teacher, policy_name
+from vd.student.saved import student_export
 from vd.train.checkpoint import save_checkpoint
+from vd.train.student.build import head_of
 
 
 def follow_teacher(student: str, teacher: str, output: Path) -> bool:
@@ -20,7 +20,7 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     Its stopping rules stay, to be calibrated anew.
 
     Args:
-        student: student.pt, a run's folder, or the name of an installed student.
+        student: student.pt, a run's folder, a bundle, or the name of an installed student.
         teacher: One of the same hand and observation: a file, a run's folder, or an installed one's name.
         output: File to write, small as those installed.
 
@@ -29,31 +29,44 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
 
     Raises:
         FileNotFoundError: There is no such student or teacher.
-        ValueError: The student does not act by its teacher's layers, or the teacher is of another kind.
+        ValueError: The student is none, or does not act by its teacher's layers, or the teacher is of another
+            kind.
     """
-    path = find_policy(student)
-    state, policy = read_student(path), open_teacher(teacher, "cpu")
+    saved, policy = open_policy(student, "cpu"), open_teacher(teacher, "cpu")
+    if not is_saved_student(saved):
+        raise ValueError(f"{student} is no student; give a student.pt or the name of an installed student")
     if policy is None:
         raise ValueError(f"{teacher} has no layers; give a trained teacher")
-    spec = saved_spec(state, path)
-    network = Student(spec.network, spec.num_actions)
-    network.load_state_dict(state["student_state_dict"])
+    network = saved.network
     if network.state is None:
         raise ValueError(
-            f"{path} does not act by its teacher's layers (dagger.state-weight 0), so there is nothing to "
+            f"{student} does not act by its teacher's layers (dagger.state-weight 0), so there is nothing to "
             "exchange; train it: vd-train student --init"
         )
-    hands = (str(state["task"].get("hand", "")), policy.hand)
-    if hands[0] != hands[1]:
-        raise ValueError(f"{path} moves {hands[0]}, {teacher} {hands[1]}; give a teacher of the same hand")
-    views = policy.task.get("observation", {}).get("view") == "goal"
-    if views != (network.state.views is not None) or policy.num_observations != spec.network.state.values:
-        raise ValueError(f"{teacher} observes other things than the teacher of {path}; train a student of it")
-    try:
-        other = network.state.follow(policy.network)
-    except RuntimeError as error:
-        raise ValueError(f"{teacher} has other layers than the teacher of {path} ({error})") from error
-    followed = replace(spec, teacher=policy_name(teacher), calibrated_on="")
-    kept = {**state, "spec": to_dict(followed), "student_state_dict": network.state_dict()}
-    save_checkpoint(output, student_export(kept, small=True))
+    hand = str(saved.task.get("hand", ""))
+    if hand != policy.hand:
+        raise ValueError(f"{student} moves {hand}, {teacher} {policy.hand}; give a teacher of the same hand")
+    own = network.cfg.state
+    if replace(head_of(policy), inside=own.inside) != own:
+        raise ValueError(
+            f"{teacher} observes other things than the teacher of {student}, or has other layers; train a "
+            "student of it"
+        )
+    if policy.task.get("action") != saved.task.get("action"):
+        raise ValueError(
+            f"an action of {teacher} means {policy.task.get('action')}, one of {student} "
+            f"{saved.task.get('action')}; train a student of it"
+        )
+    other = network.state.follow(policy.network)
+    if other:
+        network.forget_correction()
+    state = {
+        "spec": to_dict(replace(saved.spec, teacher=policy_name(teacher), calibrated_on="")),
+        "task": saved.task,
+        "depth": saved.depth,
+        "iter": saved.iteration,
+        "env_steps": saved.env_steps,
+        "student_state_dict": network.state_dict(),
+    }
+    save_checkpoint(output, student_export(state, small=True))
     return other

@@ -184,9 +184,7 @@ class Student(nn.Module):
             before = cfg.head_hidden + width
             found = None if self._angle is None else before + self._angle - ANGLE
             self.state = StateHead(cfg.state, before + self.num_senses, num_actions, found=found)
-            # What the teacher does at the estimate stands, until there is something to add.
-            nn.init.zeros_(self.mean.weight)
-            nn.init.zeros_(self.mean.bias)
+            self.forget_correction()
         self.log_std = nn.Linear(cfg.head_hidden, num_actions)
         if cfg.std_range is not None:
             # Broad at first, as without bounds: the likelihood weighs the error of random means by 1 / std^2.
@@ -206,6 +204,11 @@ class Student(nn.Module):
             for layers in self.distance.values():
                 nn.init.zeros_(layers[-1].weight)
                 nn.init.zeros_(layers[-1].bias)
+
+    def forget_correction(self) -> None:
+        """Let what the teacher's layers do at the estimate stand, until there is something to add to it."""
+        nn.init.zeros_(self.mean.weight)
+        nn.init.zeros_(self.mean.bias)
 
     def senses(self, frame: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """What the student knows of itself [.., S].

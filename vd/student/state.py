@@ -142,6 +142,7 @@ class StateHead(nn.Module):
         Raises:
             RuntimeError: Its layers are of other sizes.
         """
+        # Value = offset + scale * (W f + b), of the same features f before and after.
         offset, scale, fitted = self.offset.clone(), self.scale.clone(), self.fitted.clone()
         other = self.adopt(teacher)
         with torch.no_grad():
