@@ -200,7 +200,7 @@ def state_head(cfg: StudentTrainCfg, teacher: "TrainedPolicy") -> "StateCfg":
         wanted = cfg.network.state.values > 0
     if not wanted:
         return StateCfg()
-    return head_of(teacher)
+    return replace(head_of(teacher), fingertips={"position", "velocity"} <= set(cfg.network.senses))
 
 
 def head_of(teacher: "TrainedPolicy") -> "StateCfg":
@@ -289,6 +289,7 @@ def _dagger(
 
     from vd.envs.reorient import ReorientEnv
     from vd.envs.symmetry import WorldOrder, view_tables
+    from vd.sim.scene import hand_mount
     from vd.student.views import EveryView
     from vd.train.student.dagger import Dagger
     from vd.train.vec_env import ReorientVecEnv
@@ -323,6 +324,8 @@ def _dagger(
         if fresh and state.adopt(teacher.network, tables):
             # What is added to the actions of another teacher's layers is of no use to these.
             student.forget_correction()
+        if fresh and state.fingertips is not None:
+            state.fingertips.adopt(simulation.hand, list(hand_mount()))
         if state.views is not None:
             labels = EveryView(teacher, state.views)
     return Dagger(env, view, student, labels, cfg.dagger, world_size=world_size)

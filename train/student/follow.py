@@ -7,8 +7,13 @@ not change when the teacher gets better; when to stop may.
 from dataclasses import replace
 from pathlib import Path
 
-from vd.config import to_dict
+from vd.assets_usd.hand_data import HandModel
+from vd.assets_usd.hands import load_hand
+from vd.config import from_dict, to_dict
+from vd.envs.cfg import ReorientCfg
 from vd.evaluate.agents import is_saved_student, open_policy, open_teacher, policy_name
+from vd.sim.scene import hand_mount
+from vd.student.network import Student
 from vd.student.saved import student_export
 from vd.train.checkpoint import save_checkpoint
 from vd.train.student.build import head_of
@@ -17,7 +22,8 @@ from vd.train.student.build import head_of
 def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     """Write a student with the layers of a newer version of its teacher.
 
-    Its stopping rules stay, to be calibrated anew.
+    Its stopping rules stay, to be calibrated anew. One that estimated its fingertips computes them from then
+    on.
 
     Args:
         student: student.pt, a run's folder, a bundle, or the name of an installed student.
@@ -47,7 +53,7 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     if hand != policy.hand:
         raise ValueError(f"{student} moves {hand}, {teacher} {policy.hand}; give a teacher of the same hand")
     own = network.cfg.state
-    if replace(head_of(policy), inside=own.inside) != own:
+    if replace(head_of(policy), inside=own.inside, fingertips=own.fingertips) != own:
         raise ValueError(
             f"{teacher} observes other things than the teacher of {student}, or has other layers; train a "
             "student of it"
@@ -60,8 +66,12 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     other = network.state.follow(policy.network)
     if other:
         network.forget_correction()
+    if not own.fingertips and {"position", "velocity"} <= set(network.cfg.senses):
+        task = from_dict(ReorientCfg, saved.task, where="task of the student")
+        network = with_fingertips(network, load_hand(task.hand, task.fingertip, task.hand_layer))
+    spec = replace(saved.spec, network=network.cfg, teacher=policy_name(teacher), calibrated_on="")
     state = {
-        "spec": to_dict(replace(saved.spec, teacher=policy_name(teacher), calibrated_on="")),
+        "spec": to_dict(spec),
         "task": saved.task,
         "depth": saved.depth,
         "iter": saved.iteration,
@@ -70,3 +80,16 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     }
     save_checkpoint(output, student_export(state, small=True))
     return other
+
+
+def with_fingertips(student: Student, hand: HandModel) -> Student:
+    """A student that estimates its fingertips, computing them from its joints in place of that."""
+    cfg = student.cfg
+    network = Student(replace(cfg, state=replace(cfg.state, fingertips=True)), student.num_actions)
+    network.load_state_dict(student.state_dict(), strict=False)
+    head = network.state
+    assert head is not None and head.fingertips is not None
+    head.fingertips.adopt(hand, list(hand_mount()))
+    head.estimate.weight.data[head.told] = 0.0
+    head.estimate.bias.data[head.told] = 0.0
+    return network.eval().requires_grad_(False)

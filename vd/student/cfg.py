@@ -114,6 +114,8 @@ class StateCfg:
     """Width of the layer that reads the estimate."""
     views: int = 0
     """Views in which the teacher sees its goals, one for each finger; 0: it sees the world as it is."""
+    fingertips: bool = False
+    """Compute where the fingertips are, and how they move, from the joints, in place of an estimate."""
 
     def validate(self) -> None:
         """Raise ``ValueError`` for sizes that make no network, naming the field."""
@@ -168,6 +170,8 @@ class StudentCfg:
             raise ValueError("student.turn needs voxels that are marked: add marks to encoder.inputs")
         if "object" in self.senses and "marks" not in self.encoder.inputs:
             raise ValueError("an object is found among voxels that are marked: add marks to encoder.inputs")
+        if self.state.fingertips and not {"position", "velocity"} <= set(self.senses):
+            raise ValueError("state.fingertips come from the joints: add position and velocity to senses")
         if self.aim.enabled and "object" not in self.senses:
             raise ValueError("student.aim needs the object to be found: add object to senses, or do not aim")
         if "action" not in self.senses or len(set(self.senses)) != len(self.senses):

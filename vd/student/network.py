@@ -6,6 +6,7 @@ T steps, N worlds, B = T N or N clouds, D actions, E the embedding, G the memory
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from torch import nn
@@ -183,7 +184,11 @@ class Student(nn.Module):
         if cfg.state.values:
             before = cfg.head_hidden + width
             found = None if self._angle is None else before + self._angle - ANGLE
-            self.state = StateHead(cfg.state, before + self.num_senses, num_actions, found=found)
+            starts = dict(zip(cfg.senses, accumulate(widths, initial=before), strict=False))
+            joints = (starts["position"], starts["velocity"]) if cfg.state.fingertips else None
+            self.state = StateHead(
+                cfg.state, before + self.num_senses, num_actions, found=found, joints=joints
+            )
             self.forget_correction()
         self.log_std = nn.Linear(cfg.head_hidden, num_actions)
         if cfg.std_range is not None:

@@ -2,7 +2,7 @@
 
 Convolutions, three quarters of a student, are kept in 8 bits with a scale for each output channel, other
 matrices in half precision. Vectors (scales, statistics) stay as they are, and so do the teacher's layers, by
-which a student knows its teacher again.
+which a student knows its teacher again, and the geometry of its hand.
 """
 
 from typing import Any
@@ -11,8 +11,8 @@ import torch
 
 LEVELS = 127
 """Steps of 8 bits on each side of zero."""
-EXACT = "state.teacher."
-"""Prefix of the weights that nothing may be lost of."""
+EXACT = ("state.teacher.", "state.fingertips.")
+"""Prefixes of the weights that nothing may be lost of."""
 
 Packed = dict[str, Any]
 """Tensors, or for a convolution ``{"levels": int8 [K, in, out], "scale": [1, 1, out]}``, by name."""

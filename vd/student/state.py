@@ -12,8 +12,10 @@ import torch
 from torch import nn
 
 from vd.kernels.observations import JOINTS_PER_FINGER, teacher_observation_slices
+from vd.paper import PAPER
 from vd.policy import MeanAction, PolicySpec, perceptron
 from vd.student.cfg import StateCfg
+from vd.student.fingertips import Fingertips
 from vd.student.object_sense import observed
 from vd.student.views import ViewMaps
 
@@ -51,6 +53,8 @@ class StateHead(nn.Module):
         num_actions: D.
         found: Column of the features at which the sense of the object begins, if there is one: what it tells
             of the observation stands, and the estimate is added to it.
+        joints: Columns of the features at which positions and velocities of the joints begin, as the senses
+            give them; only where ``cfg.fingertips`` are to be computed from them.
     """
 
     offset: torch.Tensor
@@ -63,7 +67,15 @@ class StateHead(nn.Module):
     source: torch.Tensor
     told: torch.Tensor
 
-    def __init__(self, cfg: StateCfg, width: int, num_actions: int, *, found: int | None = None) -> None:
+    def __init__(
+        self,
+        cfg: StateCfg,
+        width: int,
+        num_actions: int,
+        *,
+        found: int | None = None,
+        joints: tuple[int, int] | None = None,
+    ) -> None:
         super().__init__()
         self.inside = nn.Sequential(nn.Linear(width, cfg.inside), nn.GELU())
         self.estimate = nn.Linear(width + cfg.inside, cfg.values)
@@ -83,15 +95,17 @@ class StateHead(nn.Module):
         for name in UNSEEN:
             known[columns[name]] = 0.0
         self.register_buffer("known", known, persistent=False)
-        self._finds = found is not None
-        if found is not None:
-            told, source, factor = observed(num_actions, cfg.values)
-            for name, values in (
-                ("factor", torch.tensor(factor)),
-                ("source", torch.tensor([found + column for column in source])),
-                ("told", torch.tensor(told)),
-            ):
-                self.register_buffer(name, values, persistent=False)
+        told, source, factor = observed(num_actions, cfg.values) if found is not None else ([], [], [])
+        self.fingertips = Fingertips(num_actions) if joints is not None else None
+        self._joints = [slice(first, first + num_actions) for first in joints or ()]
+        if self.fingertips is not None:
+            told = [*told, *range(columns["fingertips"].start, columns["fingertips"].stop)]
+        for name, values in (
+            ("factor", torch.tensor(factor, dtype=torch.float)),
+            ("source", torch.tensor([(found or 0) + column for column in source], dtype=torch.long)),
+            ("told", torch.tensor(told, dtype=torch.long)),
+        ):
+            self.register_buffer(name, values, persistent=False)
 
     def adopt(self, teacher: MeanAction, tables: Any = None) -> bool:
         """Take over the layers of a teacher, the scales of its observation, and its views.
@@ -147,8 +161,7 @@ class StateHead(nn.Module):
         other = self.adopt(teacher)
         with torch.no_grad():
             shift = offset - self.offset
-            if self._finds:
-                shift[self.told] = 0.0  # the estimate only adds to what is told of these, in the world
+            shift[self.told] = 0.0  # the estimate only adds to what is told of these, in the world
             self.estimate.weight.mul_((scale / self.scale)[:, None])
             self.estimate.bias.mul_(scale).add_(shift).div_(self.scale)
         self.fitted.copy_(fitted)
@@ -197,20 +210,26 @@ class StateHead(nn.Module):
             slope, bias = _least_squares(inputs, target, ridge)
             self.estimate.weight.copy_(slope.T)
             self.estimate.bias.copy_(bias)
-            if self._finds:
-                # Least squares would make less of it for the few that are found on the wrong side.
-                self.estimate.weight[self.told] = 0.0
-                self.estimate.bias[self.told] = 0.0
+            # Least squares would make less of an object for the few that are found on the wrong side.
+            self.estimate.weight[self.told] = 0.0
+            self.estimate.bias[self.told] = 0.0
             self.fitted.fill_(True)
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Estimated observation, normalised [.., O], and what :meth:`act` says of it."""
         estimate = self.estimate(torch.cat([features, self.inside(features)], dim=-1))
-        if self._finds:
-            values = self.factor * features[..., self.source]
-            normal = (values - self.offset[self.told]) / self.scale[self.told]
-            estimate = estimate.index_add(-1, self.told, normal)
+        normal = (self._told(features) - self.offset[self.told]) / self.scale[self.told]
+        estimate = estimate.index_add(-1, self.told, normal)
         return estimate, *self.act(estimate)
+
+    def _told(self, features: torch.Tensor) -> torch.Tensor:
+        """What need not be estimated of the observation, columns ``told``: object found, and fingertips."""
+        values = self.factor * features[..., self.source]
+        if self.fingertips is None:
+            return values
+        position, velocity = (features[..., columns] for columns in self._joints)
+        tips = self.fingertips(position, velocity / PAPER.observation.velocity_scale)
+        return torch.cat([values, tips], dim=-1)
 
 
 def _least_squares(
