@@ -22,6 +22,7 @@ import warp as wp
 from vd.envs.cfg import ReorientCfg, RewardCfg
 from vd.envs.curriculum import Stage
 from vd.envs.reorient import ReorientEnv
+from vd.sim.pair_order import leave_pairs, sort_pairs
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -58,6 +59,9 @@ class SimRow:
     """Control steps/s of the environment's step."""
     with_policy: float
     """Control steps/s with a policy network and, of the stand-in for an untrained one, its noise."""
+    pair_order_gain: float
+    """Physics only with candidate pairs sorted by kind (:mod:`vd.sim.pair_order`), as on any GPU, over that
+    with pairs as they are found; 0 on the CPU, where they are not sorted."""
     own_kernels: float
     """Share of our kernels in the device time of a control step, in [0, 1]; 0 on the CPU, not measured."""
     memory_gb: float
@@ -209,17 +213,27 @@ def measure(
         env.step(env.action)
 
     physics = captured(env.launch_physics, device)
+    solver = env.sim.solver
+    if on_gpu:
+        leave_pairs(solver.mjw_data)
+        unsorted = captured(env.launch_physics, device)
+        sort_pairs(solver.mjw_model, solver.mjw_data)
 
     def policy_and_physics() -> None:
         policy()
         physics()
 
+    def policy_and_unsorted() -> None:
+        policy()
+        unsorted()
+
     # The same policy acts in all three, so that the hand moves and pushes alike; its own time is taken off.
     policy_s = seconds_per_call(policy, calls, device)
     whole_s = seconds_per_call(with_policy, calls, device)
     physics_s = seconds_per_call(policy_and_physics, calls, device) - policy_s
+    unsorted_s = seconds_per_call(policy_and_unsorted, calls, device) - policy_s if on_gpu else 0.0
     env.check()
-    data = env.sim.solver.mjw_data
+    data = solver.mjw_data
     contacts, rows = float(data.nacon.numpy()[0]), int(np.max(data.nefc.numpy()))
     kernels = kernel_rows(env) if on_gpu else ()
     n = cfg.num_worlds
@@ -229,6 +243,7 @@ def measure(
         physics_only=n / physics_s,
         whole_step=n / (whole_s - policy_s),
         with_policy=n / whole_s,
+        pair_order_gain=unsorted_s / physics_s,
         own_kernels=own_share(kernels),
         memory_gb=memory,
         start_s=start_s,

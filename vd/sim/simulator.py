@@ -14,6 +14,7 @@ from vd.kernels.worlds import place_table_kernel
 from vd.paper import PAPER
 from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
+from vd.sim.pair_order import sort_pairs
 from vd.sim.restitution import Restitution
 from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
 
@@ -115,6 +116,8 @@ class Simulator:
         self.solver = make_solver(self.model, cfg)
         self.state, self._next = self.model.state(), self.model.state()
         self.control = self.model.control()
+        if self.device.is_cuda:  # a processor has no warps that would wait
+            sort_pairs(self.solver.mjw_model, self.solver.mjw_data)
         self._observables = self.solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW})
         self._overflow_mask = sum(OVERFLOW_REMEDY)
 

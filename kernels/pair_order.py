@@ -1,0 +1,76 @@
+"""Order of the solver's candidate pairs: by the kinds of their shapes, so that threads beside do the same.
+
+P pairs at most, of which the first few are there; G geoms.
+"""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+KIND_BITS = 7
+"""Bits of a key: two kinds of three bits each, and one more for what is no pair."""
+NO_PAIR = 2**KIND_BITS - 1
+"""Key of what is no pair: after all others."""
+
+
+@wp.kernel
+def pair_key_kernel(
+    # Model:
+    geom_type: wp.array[int],
+    # In:
+    pair_count: wp.array[int],
+    pair_in: wp.array[wp.vec2i],
+    # Out:
+    key_out: wp.array[int],
+    order_out: wp.array[int],
+):
+    """Keys to sort candidate pairs by, and their order as it is. Launch: [P].
+
+    Args:
+        geom_type: Kind of each geom, below 8, shape [G].
+        pair_count: Number of pairs, shape [1]; it may be more than P.
+        pair_in: The two geoms of each pair, shape [P].
+        key_out: Key of each pair, :data:`NO_PAIR` behind the last, shape [>= P].
+        order_out: 0, 1, ..., shape [>= P].
+    """
+    pair = wp.tid()
+    key = int(NO_PAIR)
+    if pair < pair_count[0]:
+        geoms = pair_in[pair]
+        key = 8 * geom_type[geoms[0]] + geom_type[geoms[1]]
+    key_out[pair] = key
+    order_out[pair] = pair
+
+
+@wp.kernel
+def reorder_pairs_kernel(
+    # In:
+    pair_count: wp.array[int],
+    order_in: wp.array[int],
+    pair_in: wp.array[wp.vec2i],
+    pair_id_in: wp.array[wp.vec2i],
+    world_in: wp.array[int],
+    # Out:
+    pair_out: wp.array[wp.vec2i],
+    pair_id_out: wp.array[wp.vec2i],
+    world_out: wp.array[int],
+):
+    """Put pairs into an order. Launch: [P].
+
+    Args:
+        pair_count: Number of pairs, shape [1]; it may be more than P.
+        order_in: Which pair comes at each place, shape [>= P].
+        pair_in: The two geoms of each pair, shape [P].
+        pair_id_in: What the solver knows each pair by, shape [P].
+        world_in: World of each pair, shape [P].
+        pair_out: Geoms in the new order, shape [P]; what is behind the last pair stays.
+        pair_id_out: The same of what the solver knows them by.
+        world_out: The same of their worlds.
+    """
+    place = wp.tid()
+    if place >= pair_count[0]:
+        return
+    pair = order_in[place]
+    pair_out[place] = pair_in[pair]
+    pair_id_out[place] = pair_id_in[pair]
+    world_out[place] = world_in[pair]

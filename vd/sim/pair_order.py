@@ -1,0 +1,112 @@
+"""Candidate pairs of shapes, sorted by kind between the solver's broad and narrow phase.
+
+The broad phase lists pairs as it finds them, world by world, and the narrow phase has a kernel for each
+combination of kinds, which passes over all of them: of the threads of a warp few have a pair of its kind,
+and the others wait. Sorted, nearly all of a warp have one, or none. Contacts are the same.
+"""
+
+from typing import Any
+
+import warp as wp
+from mujoco_warp import Data
+from mujoco_warp._src import collision_driver
+
+from vd.kernels.pair_order import KIND_BITS, pair_key_kernel, reorder_pairs_kernel
+
+KINDS = 8
+"""Kinds of shapes that a key has room for: from planes to meshes, all but signed distance fields."""
+
+_in_order_found = collision_driver._narrowphase
+
+
+class PairOrder:
+    """Sorts the candidate pairs of one solver's data, on its device and without waiting for it.
+
+    Attributes:
+        active: Whether it does.
+    """
+
+    def __init__(self, data: Data):
+        """Make room for all pairs that the data has room for."""
+        self.active = True
+        self._most, self._device = data.naconmax, data.geom_xpos.device
+
+        def room(count: int, dtype: type) -> wp.array:
+            return wp.zeros(count, dtype=dtype, device=self._device)
+
+        # Sorting needs as much room again.
+        self._key, self._order = room(2 * self._most, wp.int32), room(2 * self._most, wp.int32)
+        self._pair, self._pair_id = room(self._most, wp.vec2i), room(self._most, wp.vec2i)
+        self._world = room(self._most, wp.int32)
+
+    def sort(self, model: Any, data: Data, found: Any) -> None:
+        """Put the pairs that the broad phase found into order.
+
+        Args:
+            model: MuJoCo Warp's model.
+            data: Its data.
+            found: What the broad phase hands to the narrow phase; its arrays are replaced.
+        """
+        wp.launch(
+            pair_key_kernel,
+            dim=self._most,
+            inputs=[model.geom_type, data.ncollision, found.collision_pair],
+            outputs=[self._key, self._order],
+            device=self._device,
+        )
+        wp.utils.radix_sort_pairs(self._key, self._order, self._most, end_bit=KIND_BITS)
+        wp.launch(
+            reorder_pairs_kernel,
+            dim=self._most,
+            inputs=[
+                data.ncollision,
+                self._order,
+                found.collision_pair,
+                found.collision_pairid,
+                found.collision_worldid,
+            ],
+            outputs=[self._pair, self._pair_id, self._world],
+            device=self._device,
+        )
+        found.collision_pair, found.collision_pairid = self._pair, self._pair_id
+        found.collision_worldid = self._world
+
+
+def sort_pairs(model: Any, data: Data) -> None:
+    """Let the candidate pairs of a solver's data be sorted from now on.
+
+    Args:
+        model: MuJoCo Warp's model.
+        data: Its data, whose ``naconmax`` stays.
+
+    Raises:
+        ValueError: The model has shapes of kinds that a key has no room for.
+    """
+    if int(model.geom_type.numpy().max(initial=0)) >= KINDS:
+        raise ValueError("pairs with signed distance fields cannot be sorted; make their shapes meshes")
+    # The solver has no place for it between the phases: a function of its module is replaced, for all data.
+    collision_driver._narrowphase = _narrowphase
+    if _order_of(data) is None:
+        data.pair_order = PairOrder(data)
+    data.pair_order.active = True
+
+
+def leave_pairs(data: Data) -> None:
+    """Take the candidate pairs of a solver's data as they are found, from now on.
+
+    Graphs that were captured before go on sorting.
+    """
+    order = _order_of(data)
+    if order is not None:
+        order.active = False
+
+
+def _order_of(data: Data) -> PairOrder | None:
+    return getattr(data, "pair_order", None)
+
+
+def _narrowphase(model: Any, data: Data, found: Any) -> None:
+    order = _order_of(data)
+    if order is not None and order.active:
+        order.sort(model, data, found)
+    _in_order_found(model, data, found)
