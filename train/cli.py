@@ -81,6 +81,9 @@ class ExportCfg:
     resumable: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Write a checkpoint for --resume instead, all but the state of the worlds: a run that moves to another
     machine or number of GPUs starts its episodes anew anyway."""
+    default_physics: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Write down the default physics as that of the policy's task: for one that was trained in coarser physics
+    and is to be evaluated, followed and deployed in that of all others."""
 
 
 @dataclass
@@ -327,12 +330,15 @@ def _export(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(ExportCfg, args=arguments, prog="vd-train export")
 
     from vd.policy import policy_export
+    from vd.sim.cfg import SimCfg
     from vd.student.saved import is_student, read_student, student_export
     from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
 
     if is_student(cfg.checkpoint):
-        if cfg.resumable or cfg.output.suffix == ".onnx":
-            raise ValueError(f"{cfg.checkpoint} is a student: leave --resumable out, go on with --init")
+        if cfg.resumable or cfg.default_physics or cfg.output.suffix == ".onnx":
+            raise ValueError(
+                f"{cfg.checkpoint} is a student: leave --resumable and --default-physics out, go on with --init"
+            )
         save_checkpoint(cfg.output, student_export(read_student(cfg.checkpoint), small=True))
         print(cfg.output)
         return 0
@@ -341,6 +347,10 @@ def _export(arguments: list[str], _started: float) -> int:
     state = load_checkpoint(cfg.checkpoint)
     if cfg.resumable and "optimizer_state_dict" not in state:
         raise ValueError(f"{cfg.checkpoint} is a policy, not a checkpoint; nothing can go on from it")
+    if cfg.resumable and cfg.default_physics:
+        raise ValueError("--resumable goes on in the physics it was trained in; leave --default-physics out")
+    if cfg.default_physics:
+        state = {**state, "task": {**state["task"], "sim": to_dict(SimCfg())}}
     save_checkpoint(cfg.output, without_worlds(state) if cfg.resumable else policy_export(state))
     print(cfg.output)
     return 0
