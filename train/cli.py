@@ -82,8 +82,8 @@ class ExportCfg:
     """Write a checkpoint for --resume instead, all but the state of the worlds: a run that moves to another
     machine or number of GPUs starts its episodes anew anyway."""
     default_physics: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Write down the default physics as that of the policy's task: for one that was trained in coarser physics
-    and is to be evaluated, followed and deployed in that of all others."""
+    """Write the default physics down as that of the policy's task: for one that was trained in coarser, and
+    is to be evaluated, followed and deployed in that of all others."""
 
 
 @dataclass
@@ -337,7 +337,8 @@ def _export(arguments: list[str], _started: float) -> int:
     if is_student(cfg.checkpoint):
         if cfg.resumable or cfg.default_physics or cfg.output.suffix == ".onnx":
             raise ValueError(
-                f"{cfg.checkpoint} is a student: leave --resumable and --default-physics out, go on with --init"
+                f"{cfg.checkpoint} is a student, which goes on with --init; leave --resumable and "
+                "--default-physics out"
             )
         save_checkpoint(cfg.output, student_export(read_student(cfg.checkpoint), small=True))
         print(cfg.output)
