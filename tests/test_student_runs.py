@@ -287,6 +287,11 @@ def _check_calibration(path, monkeypatch, capsys):
         assert main(["calibrate", str(path), *flags]) == 0
         spec = load_student(path).spec
         assert spec.network.aim.enabled == aims == ("aimed" in spec.calibrated_on)
+    small = path.with_name("small.pt")
+    assert main(["export", str(path), str(small)]) == 0
+    size = small.stat().st_size
+    assert main(["calibrate", str(small), "--episodes", "2"]) == 0
+    assert load_student(small).spec.calibrated_on and small.stat().st_size < 1.1 * size, "it stays small"
 
 
 @pytest.mark.slow

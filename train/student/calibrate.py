@@ -112,7 +112,7 @@ def calibrate_student(
         precise = calibrate_trace(trace, tolerance_rad=PAPER.success.precise_rad)
     except ValueError:  # of a student that never came so near there is nothing to learn
         precise = None
-    state = read_student(path)
+    state = read_student(path, as_stored=True)
     what = f"{', '.join(sets)}: {result.episodes} episodes{' in the air' if in_air else ''}, "
     what += "aimed past near goals, " if network.aim.enabled else ""
     what += f"tolerance {tolerance_rad:g} rad, seed {seed}"

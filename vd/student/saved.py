@@ -91,8 +91,13 @@ def student_export(state: dict[str, Any], *, small: bool = False) -> dict[str, A
     }
 
 
-def read_student(path: Path, device: str = "cpu") -> dict[str, Any]:
+def read_student(path: Path, device: str = "cpu", *, as_stored: bool = False) -> dict[str, Any]:
     """The contents of ``student.pt`` or of a checkpoint, without building the network.
+
+    Args:
+        path: The file.
+        device: Torch device.
+        as_stored: Leave weights packed where they are, to be written again.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -110,7 +115,7 @@ def read_student(path: Path, device: str = "cpu") -> dict[str, Any]:
         raise ValueError(f"{path} is damaged or no student ({reason}); copy it again") from error
     if not isinstance(state, dict) or not {"spec", "student_state_dict", "task", "depth"} <= state.keys():
         raise ValueError(f"{path} holds no student; give a file that vd-train student wrote")
-    return state | {"student_state_dict": unpack(state["student_state_dict"])}
+    return state if as_stored else state | {"student_state_dict": unpack(state["student_state_dict"])}
 
 
 def saved_spec(state: dict[str, Any], path: Path) -> StudentSpec:
