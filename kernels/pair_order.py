@@ -7,9 +7,11 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-KIND_BITS = 7
-"""Bits of a key: two kinds of three bits each, and one more for what is no pair."""
-NO_PAIR = 2**KIND_BITS - 1
+KINDS = 8
+"""Kinds of shapes that a key has room for: MuJoCo's from planes to meshes, all but signed distance fields."""
+KEY_BITS = 7
+"""Bits of a key: three for either kind, and one more for what is no pair."""
+NO_PAIR = 2**KEY_BITS - 1
 """Key of what is no pair: after all others."""
 
 
@@ -27,7 +29,7 @@ def pair_key_kernel(
     """Keys to sort candidate pairs by, and their order as it is. Launch: [P].
 
     Args:
-        geom_type: Kind of each geom, below 8, shape [G].
+        geom_type: Kind of each geom (``mjtGeom``), below :data:`KINDS`, shape [G].
         pair_count: Number of pairs, shape [1]; it may be more than P.
         pair_in: The two geoms of each pair, shape [P].
         key_out: Key of each pair, :data:`NO_PAIR` behind the last, shape [>= P].
@@ -37,7 +39,7 @@ def pair_key_kernel(
     key = int(NO_PAIR)
     if pair < pair_count[0]:
         geoms = pair_in[pair]
-        key = 8 * geom_type[geoms[0]] + geom_type[geoms[1]]
+        key = KINDS * geom_type[geoms[0]] + geom_type[geoms[1]]
     key_out[pair] = key
     order_out[pair] = pair
 

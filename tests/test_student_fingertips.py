@@ -40,13 +40,8 @@ def tips_of(hand: HandModel) -> Fingertips:
 
 def oracle(hand: HandModel, joint_q: np.ndarray) -> list[tuple[np.ndarray, Rotation]]:
     """Places and orientations of the tips in the world [G] of joint positions [D]."""
-    poses, mount = hand.forward_kinematics(joint_q), Rotation.from_quat(BASE[3:])
-    tips = []
-    for link, tip in zip(hand.tip_link, hand.tip_frame, strict=True):
-        turn = mount * Rotation.from_quat(poses[link, 3:])
-        place = BASE[:3] + mount.apply(poses[link, :3]) + turn.apply(tip[:3])
-        tips.append((place, turn * Rotation.from_quat(tip[3:])))
-    return tips
+    poses, mount = hand.tip_poses(joint_q), Rotation.from_quat(BASE[3:])
+    return [(BASE[:3] + mount.apply(pose[:3]), mount * Rotation.from_quat(pose[3:])) for pose in poses]
 
 
 @pytest.mark.parametrize("name", HANDS)

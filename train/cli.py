@@ -363,6 +363,8 @@ def _export_onnx(cfg: ExportCfg) -> int:
 
     if cfg.resumable:
         raise ValueError(f"--resumable writes a checkpoint, which {cfg.output} is not; leave one of them out")
+    if cfg.default_physics:
+        raise ValueError(f"{cfg.output} holds a network without its task; leave --default-physics out")
     policy = load_policy(cfg.checkpoint)
     export_onnx(policy, cfg.output)
     worst = onnx_difference(policy, cfg.output)

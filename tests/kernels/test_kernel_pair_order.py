@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, SENTINEL, device_array, unwritten
 
-from vd.kernels.pair_order import KIND_BITS, pair_key_kernel, reorder_pairs_kernel
+from vd.kernels.pair_order import KEY_BITS, pair_key_kernel, reorder_pairs_kernel
 
 GEOMS = 30
 
@@ -23,7 +23,7 @@ def test_pairs_are_sorted_by_kind_and_else_as_they_were(device, seed, most, fill
     key, order = (unwritten(2 * most, int, device) for _ in range(2))
     inputs = [device_array(kinds, int, device), counted, found[0]]
     wp.launch(pair_key_kernel, dim=most, inputs=inputs, outputs=[key, order], device=device)
-    wp.utils.radix_sort_pairs(key, order, most, end_bit=KIND_BITS)
+    wp.utils.radix_sort_pairs(key, order, most, end_bit=KEY_BITS)
     out = [unwritten(most, dtype, device) for dtype in (wp.vec2i, wp.vec2i, int)]
     wp.launch(
         reorder_pairs_kernel,

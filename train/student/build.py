@@ -200,7 +200,7 @@ def state_head(cfg: StudentTrainCfg, teacher: "TrainedPolicy") -> "StateCfg":
         wanted = cfg.network.state.values > 0
     if not wanted:
         return StateCfg()
-    return replace(head_of(teacher), fingertips={"position", "velocity"} <= set(cfg.network.senses))
+    return replace(head_of(teacher), fingertips=cfg.network.senses_joints)
 
 
 def head_of(teacher: "TrainedPolicy") -> "StateCfg":

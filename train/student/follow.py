@@ -66,7 +66,7 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     other = network.state.follow(policy.network)
     if other:
         network.forget_correction()
-    if not own.fingertips and {"position", "velocity"} <= set(network.cfg.senses):
+    if not own.fingertips and network.cfg.senses_joints:
         task = from_dict(ReorientCfg, saved.task, where="task of the student")
         network = with_fingertips(network, load_hand(task.hand, task.fingertip, task.hand_layer))
     spec = replace(saved.spec, network=network.cfg, teacher=policy_name(teacher), calibrated_on="")
@@ -90,6 +90,5 @@ def with_fingertips(student: Student, hand: HandModel) -> Student:
     head = network.state
     assert head is not None and head.fingertips is not None
     head.fingertips.adopt(hand, list(hand_mount()))
-    head.estimate.weight.data[head.told] = 0.0
-    head.estimate.bias.data[head.told] = 0.0
+    head.add_nothing_to_told()
     return network.eval().requires_grad_(False)

@@ -212,26 +212,23 @@ def measure(
         policy()
         env.step(env.action)
 
-    physics = captured(env.launch_physics, device)
-    solver = env.sim.solver
-    if on_gpu:
-        leave_pairs(solver.mjw_data)
-        unsorted = captured(env.launch_physics, device)
-        sort_pairs(solver.mjw_model, solver.mjw_data)
+    def physics_seconds() -> float:
+        physics = captured(env.launch_physics, device)
 
-    def policy_and_physics() -> None:
-        policy()
-        physics()
+        def policy_and_physics() -> None:
+            policy()
+            physics()
 
-    def policy_and_unsorted() -> None:
-        policy()
-        unsorted()
+        return seconds_per_call(policy_and_physics, calls, device) - policy_s
 
     # The same policy acts in all three, so that the hand moves and pushes alike; its own time is taken off.
     policy_s = seconds_per_call(policy, calls, device)
     whole_s = seconds_per_call(with_policy, calls, device)
-    physics_s = seconds_per_call(policy_and_physics, calls, device) - policy_s
-    unsorted_s = seconds_per_call(policy_and_unsorted, calls, device) - policy_s if on_gpu else 0.0
+    physics_s, unsorted_s, solver = physics_seconds(), 0.0, env.sim.solver
+    if on_gpu:
+        leave_pairs(solver.mjw_data)
+        unsorted_s = physics_seconds()
+        sort_pairs(solver.mjw_model, solver.mjw_data)
     env.check()
     data = solver.mjw_data
     contacts, rows = float(data.nacon.numpy()[0]), int(np.max(data.nefc.numpy()))

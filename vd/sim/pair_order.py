@@ -11,10 +11,7 @@ import warp as wp
 from mujoco_warp import Data
 from mujoco_warp._src import collision_driver
 
-from vd.kernels.pair_order import KIND_BITS, pair_key_kernel, reorder_pairs_kernel
-
-KINDS = 8
-"""Kinds of shapes that a key has room for: from planes to meshes, all but signed distance fields."""
+from vd.kernels.pair_order import KEY_BITS, KINDS, pair_key_kernel, reorder_pairs_kernel
 
 _in_order_found = collision_driver._narrowphase
 
@@ -54,7 +51,7 @@ class PairOrder:
             outputs=[self._key, self._order],
             device=self._device,
         )
-        wp.utils.radix_sort_pairs(self._key, self._order, self._most, end_bit=KIND_BITS)
+        wp.utils.radix_sort_pairs(self._key, self._order, self._most, end_bit=KEY_BITS)
         wp.launch(
             reorder_pairs_kernel,
             dim=self._most,

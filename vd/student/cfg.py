@@ -160,6 +160,11 @@ class StudentCfg:
     std_range: tuple[float, float] | None = STD_RANGE
     """Open interval of the standard deviation of actions; None for no bounds."""
 
+    @property
+    def senses_joints(self) -> bool:
+        """Whether it knows positions and velocities of its joints."""
+        return {"position", "velocity"} <= set(self.senses)
+
     def validate(self) -> None:
         """Raise ``ValueError`` for what cannot be built, naming the field."""
         self.encoder.validate()
@@ -170,7 +175,7 @@ class StudentCfg:
             raise ValueError("student.turn needs voxels that are marked: add marks to encoder.inputs")
         if "object" in self.senses and "marks" not in self.encoder.inputs:
             raise ValueError("an object is found among voxels that are marked: add marks to encoder.inputs")
-        if self.state.fingertips and not {"position", "velocity"} <= set(self.senses):
+        if self.state.fingertips and not self.senses_joints:
             raise ValueError("state.fingertips come from the joints: add position and velocity to senses")
         if self.aim.enabled and "object" not in self.senses:
             raise ValueError("student.aim needs the object to be found: add object to senses, or do not aim")

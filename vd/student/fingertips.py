@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from vd.assets_usd.hand_data import HandModel
+from vd.assets_usd.hand_data import HandModel, compose, invert
 from vd.kernels.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER
 from vd.student.quaternions import product, rotated
 
@@ -48,14 +48,16 @@ class Fingertips(nn.Module):
         if len(order) != len(self.axis):
             raise ValueError(f"{hand.name} has {len(order)} fingers, the student {len(self.axis)}")
         for finger, joints in enumerate(order):
-            before, links = _tensor(base), [0, *hand.joint_child[joints]]
+            before, links = np.asarray(base, dtype=float), [0, *hand.joint_child[joints]]
             if list(hand.joint_parent[joints]) != links[:-1] or hand.tip_link[finger] != links[-1]:
                 raise ValueError(f"the joints of finger {finger} of {hand.name} are no chain to its tip")
-            for place, joint in enumerate(joints):
-                self.frame[finger, place] = _joined(before, _tensor(hand.joint_parent_frame[joint]))
-                before = _inverse(_tensor(hand.joint_child_frame[joint]))
-            self.frame[finger, -1] = _joined(before, _tensor(hand.tip_frame[finger]))
-            self.axis[finger] = _tensor(hand.joint_axis[joints])
+            frames = []
+            for joint in joints:
+                frames.append(compose(before, hand.joint_parent_frame[joint]))
+                before = invert(hand.joint_child_frame[joint])
+            frames.append(compose(before, hand.tip_frame[finger]))
+            self.frame[finger] = torch.from_numpy(np.stack(frames))
+            self.axis[finger] = torch.from_numpy(hand.joint_axis[joints])
 
     def forward(self, position: torch.Tensor, velocity: torch.Tensor) -> torch.Tensor:
         """Position [m], quaternion, velocity [m/s] and angular velocity [rad/s] of each fingertip in turn.
@@ -72,31 +74,15 @@ class Fingertips(nn.Module):
         turn = torch.cat([self.axis * half.sin(), half.cos()], dim=-1)
         rate = velocity.reshape(*shape, *self.axis.shape[:2], 1)
         pose = self.frame[:, 0].expand(*shape, -1, -1)
-        anchors, axes = [], []
+        spin, moment = torch.zeros_like(pose[..., :3]), torch.zeros_like(pose[..., :3])
         for joint in range(turn.shape[-2]):
-            orientation = product(pose[..., 3:], turn[..., joint, :])
-            anchors.append(pose[..., :3])
-            axis = self.axis[:, joint].expand_as(pose[..., :3])
-            axes.append(rate[..., joint, :] * rotated(orientation, axis))
-            pose = _joined(torch.cat([pose[..., :3], orientation], dim=-1), self.frame[:, joint + 1])
-        spin = torch.stack(axes).sum(dim=0)
-        arms = (torch.linalg.cross(axis, pose[..., :3] - at) for axis, at in zip(axes, anchors, strict=True))
-        values = torch.cat([pose, torch.stack(list(arms)).sum(dim=0), spin], dim=-1)
+            place, orientation = pose[..., :3], product(pose[..., 3:], turn[..., joint, :])
+            axis = rate[..., joint, :] * rotated(orientation, self.axis[:, joint].expand_as(place))
+            spin, moment = spin + axis, moment + torch.linalg.cross(axis, place)
+            following = self.frame[:, joint + 1].expand_as(pose)
+            place = place + rotated(orientation, following[..., :3])
+            pose = torch.cat([place, product(orientation, following[..., 3:])], dim=-1)
+        # Each joint moves the tip by its axis x (tip - joint).
+        velocity = torch.linalg.cross(spin, pose[..., :3]) - moment
+        values = torch.cat([pose, velocity, spin], dim=-1)
         return values.reshape(*shape, FINGERTIP_VALUES * len(self.axis))
-
-
-def _tensor(values: object) -> torch.Tensor:
-    return torch.as_tensor(np.asarray(values, dtype=np.float32))
-
-
-def _joined(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
-    """The pose ``second``, given in the frame of ``first``, position and quaternion [.., 7]."""
-    orientation = first[..., 3:]
-    second = second.expand_as(first)
-    place = first[..., :3] + rotated(orientation, second[..., :3])
-    return torch.cat([place, product(orientation, second[..., 3:])], dim=-1)
-
-
-def _inverse(pose: torch.Tensor) -> torch.Tensor:
-    back = torch.cat([-pose[3:6], pose[6:]])
-    return torch.cat([rotated(back, -pose[:3]), back])

@@ -211,9 +211,14 @@ class StateHead(nn.Module):
             self.estimate.weight.copy_(slope.T)
             self.estimate.bias.copy_(bias)
             # Least squares would make less of an object for the few that are found on the wrong side.
+            self.add_nothing_to_told()
+            self.fitted.fill_(True)
+
+    def add_nothing_to_told(self) -> None:
+        """Let what need not be estimated stand as it is told."""
+        with torch.no_grad():
             self.estimate.weight[self.told] = 0.0
             self.estimate.bias[self.told] = 0.0
-            self.fitted.fill_(True)
 
     def forward(self, features: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Estimated observation, normalised [.., O], and what :meth:`act` says of it."""
