@@ -53,6 +53,8 @@ class SimRow:
     """What was simulated."""
     worlds: int
     """Worlds side by side."""
+    jacobian: str
+    """How the solver keeps the constraints' Jacobian: dense or sparse."""
     physics_only: float
     """Control steps/s of the physics alone, over all worlds."""
     whole_step: float
@@ -237,6 +239,7 @@ def measure(
     return SimRow(
         scene=label,
         worlds=n,
+        jacobian=cfg.sim.jacobian,
         physics_only=n / physics_s,
         whole_step=n / (whole_s - policy_s),
         with_policy=n / whole_s,

@@ -1,6 +1,7 @@
 """Settings of the physics, each with the reason for its value."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from vd.paper import PAPER
 
@@ -28,6 +29,10 @@ class SimCfg:
     """Line-search iterations at most."""
     tolerance: float = 1e-6
     """Solver tolerance; single precision gains nothing below it."""
+    jacobian: Literal["dense", "sparse"] = "sparse"
+    """How the solver keeps the constraints' Jacobian. A contact moves one finger and the object, of
+    four fingers 9 of 18 coordinates; sparse, the solver passes over these alone: the same steps, to
+    rounding."""
     multiccd: bool = False
     """Up to four contacts for a pair of convex parts. Not needed: the table is a plane, whose contacts are
     exact, and fingertips are round. (Against a table made of a box, objects never rest without it.)"""

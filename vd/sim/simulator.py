@@ -71,6 +71,7 @@ def make_solver(model: newton.Model, cfg: SimCfg) -> SolverMuJoCo:
         iterations=cfg.iterations,
         ls_iterations=cfg.ls_iterations,
         tolerance=cfg.tolerance,
+        jacobian=cfg.jacobian,
         njmax=cfg.njmax,
         nconmax=cfg.nconmax,
         enable_multiccd=cfg.multiccd,
