@@ -45,11 +45,18 @@ def rows(page: str, heading: str) -> list[list[str]]:
 RUNS = {row[0]: row for row in rows("runs.md", "Hypotheses and outcomes")}
 
 
-def way(run: str) -> list[Point]:
-    """Points of a run and of those that led to it, from nothing."""
+class Way(NamedTuple):
+    """The points of a run and of those that led to it, from nothing, and what all of them took."""
+
+    points: list[Point]
+    steps: float
+    hours: float
+
+
+def way(run: str) -> Way:
+    """The way to a run. Runs for the air, judged there, add their steps and hours and no point."""
     _, _, parent, added, hours, outcome = RUNS[run]
-    before = [] if parent == "nothing" else way(parent.split(",")[0])
-    steps, spent = (before[-1].steps, before[-1].hours) if before else (0.0, 0.0)
+    before, steps, spent = Way([], 0.0, 0.0) if parent == "nothing" else way(parent.split(",")[0])
     steps, spent = steps + float(added), spent + float(hours)
     within = [
         Point(at, spent * at / steps, *found) for at, found in _first(FIRST.get(run, run)) if at < steps
@@ -57,7 +64,9 @@ def way(run: str) -> list[Point]:
     end = RATE.search(outcome)
     if end is None:
         raise ValueError(f"runs.md, row {run}: no share within 0.4 rad with its interval in {outcome!r}")
-    return [*before, *within, Point(steps, spent, *map(float, end.groups()))]
+    judged_in_air = "in the air" in outcome[: end.start()]
+    last = [] if judged_in_air else [Point(steps, spent, *map(float, end.groups()))]
+    return Way([*before, *within, *last], steps, spent)
 
 
 def _first(name: str) -> list[tuple[float, tuple[float, ...]]]:
@@ -81,7 +90,7 @@ def shipped(policy: str) -> str:
 SERIES = (
     ("three fingers", shipped("dclaw3-table"), "#0072B2"),
     ("four fingers", shipped("dclaw4-table"), "#D55E00"),
-    ("three, procedural objects alone", "d3-procedural", "#009E73"),
+    ("three, procedural objects alone", "d3-own", "#009E73"),
 )
 
 
@@ -93,7 +102,7 @@ def main() -> None:
         (axes[1], "hours", "GPU hours (H200)"),
     ):
         for name, run, colour in SERIES:
-            points = way(run)
+            points = way(run).points
             x, rate = [getattr(p, column) for p in points], [p.rate for p in points]
             spread = [[p.rate - p.low for p in points], [p.high - p.rate for p in points]]
             axis.errorbar(x, rate, yerr=spread, color=colour, marker="o", capsize=3, label=name)
