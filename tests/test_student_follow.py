@@ -57,10 +57,10 @@ def test_the_same_teacher_again_changes_nothing():
 
 def test_the_command_writes_a_student_that_is_to_be_calibrated_anew(tmp_path, capsys):
     output = tmp_path / "student.pt"
-    assert main(["follow", "dclaw4-student", "dclaw4-table", str(output)]) == 0
+    assert main(["follow", "dclaw4-student", "dclaw4-air", str(output)]) == 0
     assert f"vd-train calibrate {output}" in capsys.readouterr().out
-    student, policy = load_student(output), load_policy(find_policy("dclaw4-table"))
-    assert student.spec.teacher == "dclaw4-table" and not student.spec.calibrated_on
+    student, policy = load_student(output), load_policy(find_policy("dclaw4-air"))
+    assert student.spec.teacher == "dclaw4-air" and not student.spec.calibrated_on
     assert student.spec.stopping == load_student(find_policy("dclaw4-student")).spec.stopping
     # Weights of matrices are stored in half precision.
     last = student.network.state.teacher[-1].bias
