@@ -11,7 +11,7 @@ from vd.envs.reorient import ReorientEnv
 from vd.sim import pair_order
 from vd.sim.pair_order import leave_pairs, sort_pairs
 
-STEPS = 4
+STEPS, STEPS_ON_GPU = 8, 4  # sums differ from run to run there, and worlds part sooner
 
 
 def contacts(device: str, *, ordered: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -26,7 +26,7 @@ def contacts(device: str, *, ordered: bool) -> tuple[np.ndarray, np.ndarray]:
     solver = env.sim.solver
     (sort_pairs(solver.mjw_model, solver.mjw_data) if ordered else leave_pairs(solver.mjw_data))
     wp.to_torch(env.action).fill_(-0.7)
-    for _ in range(STEPS):
+    for _ in range(STEPS if device == "cpu" else STEPS_ON_GPU):
         env.step(env.action)
     env.check()
     data = solver.mjw_data
@@ -40,10 +40,11 @@ def test_contacts_are_the_same(device):
     plain, ordered = contacts(device, ordered=False), contacts(device, ordered=True)
     assert plain[1].sum() > 0
     np.testing.assert_array_equal(ordered[1], plain[1])
-    # Forces of a world's contacts are added up in another order, on a GPU in a new one each time; a world in
-    # which an edge then slips off a fingertip a step sooner soon looks another.
-    difference = np.abs(ordered[0] - plain[0]).max(axis=1)
-    assert np.median(difference) < 1e-3 if device != "cpu" else difference.max() < 1e-5
+    # Forces of a world's contacts are added up in another order at most.
+    if device == "cpu":
+        np.testing.assert_allclose(ordered[0], plain[0], atol=1e-5)
+    else:  # a world in which an edge slips off a fingertip a step sooner soon looks another
+        assert np.median(np.abs(ordered[0] - plain[0]).max(axis=1)) < 1e-3
 
 
 def test_the_narrow_phase_gets_them_sorted(device, monkeypatch):
