@@ -11,7 +11,6 @@ from vd.config import to_dict
 from vd.envs.cfg import CurriculumCfg, TighteningCfg
 from vd.evaluate.agents import SHIPPED_POLICIES, trained_task
 from vd.policy import load_policy, policy_export
-from vd.sim.cfg import SimCfg
 from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start, unlike
 from vd.train.checkpoint import BEST_NAME, find_checkpoint, load_checkpoint, save_checkpoint
 from vd.train.cli import main, parse_teacher
@@ -248,21 +247,3 @@ def test_policies_keep_their_critic_when_they_are_exported_and_are_small(tmp_pat
     assert again.keys() == shipped.keys() >= {"actor_state_dict", "critic_state_dict", "stage", "learner"}
     assert "optimizer_state_dict" not in again and "ranks" not in again
     assert _same(again["critic_state_dict"], shipped["critic_state_dict"]) == list(again["critic_state_dict"])
-
-
-def test_a_policy_of_coarser_physics_can_be_written_with_that_of_all_others(tmp_path, capsys):
-    """So that it is judged as they are; going on with its own training, or a student, is another thing."""
-    state = torch.load(SHIPPED_POLICIES["dclaw4-air"], map_location="cpu", weights_only=True)
-    coarse = replace(SimCfg(), physics_hz=96.0, contact_time_constant_s=2.0 / 96.0, iterations=6)
-    state["task"] = {**state["task"], "sim": to_dict(coarse)}
-    source, output = tmp_path / "coarse.pt", tmp_path / "policy.pt"
-    torch.save(state, source)
-    assert main(["export", str(source), str(output)]) == 0
-    assert trained_task(load_policy(output)).sim == coarse, "asked for nothing"
-    assert main(["export", "--default-physics", str(source), str(output)]) == 0
-    written = load_policy(output)
-    assert trained_task(written).sim == SimCfg()
-    observation = torch.randn(5, written.num_observations)
-    torch.testing.assert_close(written.act(observation), load_policy(source).act(observation))
-    assert main(["export", "--default-physics", str(SHIPPED_POLICIES["dclaw4-student"]), str(output)]) == 1
-    assert "is a student" in capsys.readouterr().err

@@ -39,9 +39,3 @@ def test_a_resumable_checkpoint_is_no_network(tmp_path, capsys):
     flags = ["export", "--resumable", str(SHIPPED_POLICIES["dclaw4-cube"]), str(tmp_path / "policy.onnx")]
     assert main(flags) == 1
     assert "leave one of them out" in capsys.readouterr().err
-
-
-def test_a_network_has_no_physics_to_write_down(tmp_path, capsys):
-    output = tmp_path / "policy.onnx"
-    assert main(["export", "--default-physics", str(SHIPPED_POLICIES["dclaw4-cube"]), str(output)]) == 1
-    assert "without its task" in capsys.readouterr().err and not output.exists()

@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 
+from vd.evaluate.agents import trained_task
 from vd.policy import load_policy
+from vd.sim.cfg import SimCfg, coarser
 from vd.train.checkpoint import checkpoint_path
 from vd.train.cli import build_teacher, main
 from vd.train.metrics import PROGRESS_FILE, read_progress
@@ -60,6 +62,20 @@ def test_a_resumed_run_equals_one_that_never_stopped(tmp_path):
     ]
     assert rows[0][2:] == rows[1]
     assert rows[1][-1]["task/difficulty"] > 0.0
+
+
+def test_what_is_learned_in_coarser_physics_is_judged_in_the_default(tmp_path):
+    cfg = smoke()
+    cfg = replace(
+        cfg,
+        run=replace(cfg.run, run_dir=tmp_path, max_minutes=None, coarse_physics=True),
+        ppo=replace(cfg.ppo, rollout_steps=4, minibatch_size=16),
+        env=replace(cfg.env, num_worlds=4),
+    )
+    runner = build_teacher(cfg)
+    assert runner.env.env.cfg.sim == coarser(SimCfg()) != SimCfg()
+    runner.learn(1)
+    assert trained_task(load_policy(tmp_path / "policy.pt")).sim == SimCfg()
 
 
 @pytest.mark.slow

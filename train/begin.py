@@ -63,7 +63,7 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     from vd.envs.cfg import ReorientCfg
     from vd.policy import PolicySpec
     from vd.train.checkpoint import load_checkpoint
-    from vd.train.config import PolicyCfg, PpoCfg, RunCfg
+    from vd.train.config import PolicyCfg, PpoCfg
 
     path = find_start(name)
     state = load_checkpoint(path, flag="--init")
@@ -86,7 +86,7 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
             f"--init: {path} was written by another version ({error}); add --preset and the settings that it "
             "was trained with"
         ) from error
-    run = RunCfg(run_dir=Path("runs") / f"from-{Path(name).stem}")
+    run = replace(base.run, run_dir=Path("runs") / f"from-{Path(name).stem}")
     return replace(base, run=run, ppo=replace(ppo, critic_warmup_iterations=None), policy=policy, env=env)
 
 

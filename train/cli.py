@@ -81,9 +81,6 @@ class ExportCfg:
     resumable: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Write a checkpoint for --resume instead, all but the state of the worlds: a run that moves to another
     machine or number of GPUs starts its episodes anew anyway."""
-    default_physics: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Write the default physics down as that of the policy's task: for one that was trained in coarser, and
-    is to be evaluated, followed and deployed in that of all others."""
 
 
 @dataclass
@@ -213,6 +210,7 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     # A line for each of some hundred kernels would scroll the progress away.
     wp.config.log_level = wp.LOG_WARNING
     from vd.envs.reorient import ReorientEnv
+    from vd.sim.cfg import coarser
     from vd.train.runner import TeacherRunner
     from vd.train.vec_env import ReorientVecEnv
 
@@ -227,7 +225,8 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     torch.manual_seed(cfg.env.seed + rank)
     # TF32 halves the update on a GPU; the simulator is not touched by it.
     torch.set_float32_matmul_precision("high")
-    simulation = ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank), device)
+    physics = coarser(cfg.env.sim) if cfg.run.coarse_physics else cfg.env.sim
+    simulation = ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank, sim=physics), device)
     simulation.dump_dir = cfg.run.run_dir
     env = ReorientVecEnv(simulation)
     deadline = None
@@ -330,15 +329,13 @@ def _export(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(ExportCfg, args=arguments, prog="vd-train export")
 
     from vd.policy import policy_export
-    from vd.sim.cfg import SimCfg
     from vd.student.saved import is_student, read_student, student_export
     from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
 
     if is_student(cfg.checkpoint):
-        if cfg.resumable or cfg.default_physics or cfg.output.suffix == ".onnx":
+        if cfg.resumable or cfg.output.suffix == ".onnx":
             raise ValueError(
-                f"{cfg.checkpoint} is a student, which goes on with --init; leave --resumable and "
-                "--default-physics out"
+                f"{cfg.checkpoint} is a student, which goes on with --init; leave --resumable out"
             )
         save_checkpoint(cfg.output, student_export(read_student(cfg.checkpoint), small=True))
         print(cfg.output)
@@ -348,10 +345,6 @@ def _export(arguments: list[str], _started: float) -> int:
     state = load_checkpoint(cfg.checkpoint)
     if cfg.resumable and "optimizer_state_dict" not in state:
         raise ValueError(f"{cfg.checkpoint} is a policy, not a checkpoint; nothing can go on from it")
-    if cfg.resumable and cfg.default_physics:
-        raise ValueError("--resumable goes on in the physics it was trained in; leave --default-physics out")
-    if cfg.default_physics:
-        state = {**state, "task": {**state["task"], "sim": to_dict(SimCfg())}}
     save_checkpoint(cfg.output, without_worlds(state) if cfg.resumable else policy_export(state))
     print(cfg.output)
     return 0
@@ -363,8 +356,6 @@ def _export_onnx(cfg: ExportCfg) -> int:
 
     if cfg.resumable:
         raise ValueError(f"--resumable writes a checkpoint, which {cfg.output} is not; leave one of them out")
-    if cfg.default_physics:
-        raise ValueError(f"{cfg.output} holds a network without its task; leave --default-physics out")
     policy = load_policy(cfg.checkpoint)
     export_onnx(policy, cfg.output)
     worst = onnx_difference(policy, cfg.output)

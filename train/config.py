@@ -88,6 +88,9 @@ class RunCfg:
     """End after this many control steps, all worlds and GPUs together, resumed ones counted."""
     max_minutes: float | None = None
     """End after this much time since the start of this command, with a checkpoint."""
+    coarse_physics: bool = False
+    """Learn in coarser physics than the task's (vd.sim.cfg.coarser), half as fast again on a GPU. Policies
+    keep the task's own, and are judged in it."""
     save_every: int = 100
     """Iterations between checkpoints."""
     keep_last: int = 3
