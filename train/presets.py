@@ -113,9 +113,10 @@ def gpu() -> TeacherCfg:
         ),
         policy=PolicyCfg(
             distribution="state-dependent",
-            initial_std=0.8,
-            # Below a std of 0.2 noise hides the gradient [d3-small]; paper: one free std per joint.
-            std_range=(0.2, 1.0),
+            initial_std=0.5,
+            # Below a std of 0.2 noise hides the gradient [d3-small], above 0.6 what was learned [d3-calm];
+            # paper: one free std per joint.
+            std_range=(0.2, 0.6),
             quiet_std=0.08,  # where stillness has tightened [d3-tight, d4-tight]
             # Positions and velocities of the object vary by 0.02, those of the goal by 0.5.
             normalise_observations=True,
@@ -130,9 +131,14 @@ def gpu() -> TeacherCfg:
             observation=ObservationCfg(shape="full", view="goal"),
             reward=TOWARDS_GOAL,
             # The tightest: what fingers at a std of 0.08 can keep; without noise they then pass the paper's
-            # test, which evaluation asks for [d3-tight, d4-tight].
+            # test, which evaluation asks for [d3-tight, d4-tight]. Goals end more exactly than there: what is
+            # pressed from 0.4 rad on would never be turned the rest of the way [d3-fine, d4-fine].
             success=SuccessCfg(
-                joint_speed_rad_s=0.7, object_speed_m_s=0.06, object_spin_rad_s=0.8, fall_m=0.12
+                rotation_rad=0.15,
+                joint_speed_rad_s=0.7,
+                object_speed_m_s=0.06,
+                object_spin_rad_s=0.8,
+                fall_m=0.12,
             ),
             # As soon as some goals are reached, and never back [d3-shape-far-bold, d3-small], and then from
             # what fingers at a std of 0.2 can keep [d3-small] to the above [d3-tight]; paper: none.
@@ -141,7 +147,7 @@ def gpu() -> TeacherCfg:
                 raise_at=0.3,
                 lower_at=0.0,
                 rate=0.005,
-                tightening=TighteningCfg(enabled=True, raise_at=0.5, lower_at=0.35, rate=0.003),
+                tightening=TighteningCfg(enabled=True, raise_at=0.4, lower_at=0.3, rate=0.003),
             ),
             randomisation=RandomisationCfg(enabled=False),  # in all rows; paper: Table S3
         ),
