@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.objects import procedural
 from vd.assets_usd.objects.families import HELD_OUT, TRAINING
 from vd.assets_usd.objects.geometry import hull_depth, random_surface_points, union_depth
-from vd.assets_usd.objects.meshes import LONGEST_SIDE_M
+from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, MEAN_WIDTH_M, THINNEST_M, mean_width
 from vd.assets_usd.objects.model import ObjectModel
 
 COUNT = 18
@@ -112,6 +112,10 @@ def test_every_object_is_valid(training: list[ObjectModel], held_out: list[Objec
     for model in training + held_out:
         assert 1 < len(model.hulls) <= procedural.MAX_PARTS, model.name
         assert LONGEST_SIDE_M[0] - 1e-6 <= model.longest_side <= LONGEST_SIDE_M[1] + 1e-6, model.name
+        # It fits the hand, neither wedged between the fingers nor too flat to get hold of.
+        everything = np.concatenate([hull.vertices for hull in model.hulls])
+        assert mean_width(everything) <= MEAN_WIDTH_M + 1e-6, model.name
+        assert np.ptp(everything, axis=0).min() >= THINNEST_M - 1e-6, model.name
         assert procedural.is_connected(model.hulls), model.name
         for hull in model.hulls:
             assert len(hull.vertices) <= 32

@@ -195,6 +195,21 @@ def mean_width(vertices: np.ndarray) -> float:
     return float(trimesh.convex.convex_hull(vertices).integral_mean_curvature / (2.0 * np.pi))
 
 
+def scales_that_fit(sides: Sequence[float], width: float) -> tuple[float, float]:
+    """Least and largest factor to metres by which a shape fits the hand.
+
+    Its longest side is then in ``LONGEST_SIDE_M``, its mean width at most ``MEAN_WIDTH_M`` and its shortest
+    side at least ``THINNEST_M``. A shape that fits at no size has a least factor above the largest.
+
+    Args:
+        sides: Sides of the bounding box in the shape's units, in any order, none of them 0 [3].
+        width: :func:`mean_width` in the shape's units.
+    """
+    low, high = LONGEST_SIDE_M
+    longest, shortest = float(max(sides)), float(min(sides))
+    return max(low / longest, THINNEST_M / shortest), min(high / longest, MEAN_WIDTH_M / width)
+
+
 def choose_scale(sides: Sequence[float], width: float) -> tuple[float, str]:
     """Factor from a mesh's units to metres, so that it fits the hand.
 
@@ -211,11 +226,10 @@ def choose_scale(sides: Sequence[float], width: float) -> tuple[float, str]:
     Returns:
         The factor and a note, empty if the mesh is taken as it is.
     """
-    low, high = LONGEST_SIDE_M
-    longest, shortest = float(max(sides)), float(min(sides))
-    least = low / longest
-    most = max(min(high / longest, MEAN_WIDTH_M / width), least)
-    least = min(max(least, THINNEST_M / shortest), most)
+    least, most = scales_that_fit(sides, width)
+    longest = float(max(sides))
+    most = max(most, LONGEST_SIDE_M[0] / longest)
+    least = min(least, most)
 
     def fitting(unit: float) -> float:
         return float(np.clip(unit, least, most))

@@ -17,11 +17,11 @@ from vd.assets_usd.objects.geometry import (
     union_depth,
     voxelise_hulls,
 )
-from vd.assets_usd.objects.meshes import LONGEST_SIDE_M
+from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, mean_width, scales_that_fit
 from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectModel, build_model
 from vd.assets_usd.objects.primitives import box
 
-PROCEDURAL_VERSION = 2
+PROCEDURAL_VERSION = 3
 """Part of every content hash: raise it when a family draws something else."""
 
 SHAPE_ENTROPY = 1
@@ -146,7 +146,10 @@ def deformed(hulls: Sequence[Hull], rng: np.random.Generator) -> list[Hull]:
 
 
 def draw_object(name: str, make: Maker, seed: Sequence[int], **fields: Any) -> ObjectModel:
-    """One object of a kind: the first draw that is one piece and not rotationally symmetric.
+    """One object of a kind: the first draw that is one piece, fits the hand and has no rotational symmetry.
+
+    Its longest side is uniform in ``LONGEST_SIDE_M``, as far as the object fits the hand at that size
+    (:func:`.meshes.scales_that_fit`). What fits at none is drawn again.
 
     Args:
         name: Object name.
@@ -163,7 +166,12 @@ def draw_object(name: str, make: Maker, seed: Sequence[int], **fields: Any) -> O
         longest = float(rng.uniform(*LONGEST_SIDE_M))
         if len(hulls) > MAX_PARTS or not is_connected(hulls):
             continue
-        model = model_of_parts(name, hulls, longest, **fields)
+        vertices = np.concatenate([hull.vertices for hull in hulls])
+        sides = np.ptp(vertices, axis=0)
+        smallest, largest = np.multiply(scales_that_fit(sides, mean_width(vertices)), sides.max())
+        if smallest > largest:
+            continue
+        model = model_of_parts(name, hulls, float(np.clip(longest, smallest, largest)), **fields)
         if asymmetry(model) >= MIN_ASYMMETRY:
             return model
     raise RuntimeError(f"{name}: no valid object in {ATTEMPTS} draws")
