@@ -42,6 +42,7 @@ commands:
   bundle    write a policy as it is deployed     vd-train bundle student.pt bundles/first
   curves    draw the curves of a run             vd-train curves runs/first
   noise     how much of an update is signal      vd-train noise --init dclaw4-air --objects SET
+  precompile  a run's CUDA kernels, without GPU  vd-train precompile FOLDER --preset gpu
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset multi-gpu
 Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
@@ -126,6 +127,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "bundle": _bundle,
         "curves": _curves,
         "noise": _noise,
+        "precompile": _precompile,
     }
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
@@ -407,6 +409,12 @@ def _noise(arguments: list[str], _started: float) -> int:
 
     print_noise(cfg, teacher, build_teacher)
     return 0
+
+
+def _precompile(arguments: list[str], _started: float) -> int:
+    from vd.train.precompile import precompile_command
+
+    return precompile_command(arguments, parse_teacher, build_teacher)
 
 
 def normalise(arguments: Sequence[str], short_forms: Sequence[str], group: str) -> list[str]:
