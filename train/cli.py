@@ -31,18 +31,18 @@ CONFIG_NAME = "config.json"
 USAGE = """usage: vd-train COMMAND [flags]
 
 commands:
-  teacher   train the teacher with PPO           vd-train teacher --preset gpu --run-dir runs/first
-  student   imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
-  profile   where a student's time goes          vd-train profile --stage 1 --teacher dclaw3-table
-  calibrate choose when a student stops          vd-train calibrate student.pt --objects SET
-  follow    give a student a newer teacher       vd-train follow dclaw4-student runs/more student.pt
-  export    write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
-            or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
-            or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
-  bundle    write a policy as it is deployed     vd-train bundle student.pt bundles/first
-  curves    draw the curves of a run             vd-train curves runs/first
-  noise     how much of an update is signal      vd-train noise --init dclaw4-air --objects SET
-  precompile  a run's CUDA kernels, without GPU  vd-train precompile FOLDER --preset gpu
+  teacher    train the teacher with PPO           vd-train teacher --preset gpu --run-dir runs/first
+  student    imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
+  profile    where a student's time goes          vd-train profile --stage 1 --teacher dclaw3-table
+  calibrate  choose when a student stops          vd-train calibrate student.pt --objects SET
+  follow     give a student a newer teacher       vd-train follow dclaw4-student runs/more student.pt
+  export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
+             or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
+             or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
+  bundle     write a policy as it is deployed     vd-train bundle student.pt bundles/first
+  curves     draw the curves of a run             vd-train curves runs/first
+  noise      how much of an update is signal      vd-train noise --init dclaw4-air --objects SET
+  precompile compile CUDA kernels without a GPU   vd-train precompile FOLDER --preset gpu
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset multi-gpu
 Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
