@@ -3,7 +3,7 @@
 A training launches some 85 modules of kernels, which NVRTC compiles one after the other at the first start:
 about three minutes for which the GPU stands idle. Warp brings NVRTC along, and it needs no GPU. So a few
 steps of the training are taken on the CPU, and each module is compiled for the GPU too when it is first
-launched. Modules that only a GPU launches are not met; they are few and small, and the start compiles them.
+launched. What follows the number of worlds, or is launched on a GPU alone, is not met: two small modules.
 """
 
 import tempfile
