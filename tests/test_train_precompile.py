@@ -50,6 +50,13 @@ def test_what_is_launched_on_the_cpu_is_compiled_for_the_gpu(tmp_path: Path):
     assert [file.stat().st_mtime_ns for file in binaries] == before
 
 
+def test_ptx_is_text(tmp_path: Path):
+    with compiling(tmp_path, ARCH, ptx=True):
+        doubled()
+    (file,) = tmp_path.rglob(f"*.sm{ARCH}.ptx")
+    assert f".target sm_{ARCH}" in file.read_text(errors="replace")
+
+
 def test_launching_is_plain_again_after_a_failure(tmp_path: Path):
     plain = wp.launch, wp.launch_tiled
     with pytest.raises(RuntimeError, match="on purpose"), compiling(tmp_path, ARCH):

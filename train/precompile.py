@@ -41,28 +41,32 @@ class PrecompileCfg:
     """Folder for the kernels, a cache of Warp's; what it holds already is kept."""
     arch: int = 90
     """Compute capability of the GPU, without its point: 90 for H100 and H200, 80 for A100, 89 for RTX 40."""
+    ptx: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Write PTX in place of binaries: what Warp looks for where the driver's CUDA version (nvidia-smi) is that
+    of Warp's own toolkit, or later."""
 
 
 @contextmanager
-def compiling(folder: Path, arch: int) -> Iterator[list[str]]:
+def compiling(folder: Path, arch: int, *, ptx: bool = False) -> Iterator[list[str]]:
     """Compile what is launched in the block, on whichever device, for a GPU too.
 
     Args:
         folder: A cache of Warp's (``WARP_CACHE_PATH``); modules that it holds are not compiled anew.
         arch: Compute capability, 90 for 9.0.
+        ptx: Whether to write PTX rather than binaries.
 
     Yields:
         Names of the modules that have been compiled or found, each with its number of threads a block.
     """
     import warp as wp
 
-    done: set[tuple[int, int, bytes]] = set()
+    done: set[tuple[str, int, bytes]] = set()
     names: list[str] = []
 
     def compile_for(kernel: Any, block_dim: int | None) -> None:
         module, block = kernel.module, int(block_dim or 0)
         block = block if block > 0 else DEFAULT_BLOCK
-        key = (id(module), block, module.get_module_hash(block))
+        key = (module.name, block, module.get_module_hash(block))
         if key in done:
             return
         done.add(key)
@@ -70,8 +74,7 @@ def compiling(folder: Path, arch: int) -> Iterator[list[str]]:
         module.options["block_dim"] = block  # what is compiled, and its hash, depend on it
         try:
             place = folder / module.get_module_identifier(block)
-            # Binaries: drivers refuse the PTX of a toolkit newer than they are.
-            wp.compile_aot_module(module, arch=arch, module_dir=place, use_ptx=False)
+            wp.compile_aot_module(module, arch=arch, module_dir=place, use_ptx=ptx)
         finally:
             module.options["block_dim"] = before
         names.append(f"{module.name}, {block} threads")
@@ -123,7 +126,7 @@ def precompile(
             f"--arch is {cfg.arch}; Warp here compiles for {', '.join(map(str, known)) or 'none'}"
         )
     worlds = len(load_set(teacher.env.objects))  # one of each: kinds of shapes decide which kernels there are
-    with tempfile.TemporaryDirectory() as folder, compiling(cfg.output, cfg.arch) as names:
+    with tempfile.TemporaryDirectory() as folder, compiling(cfg.output, cfg.arch, ptx=cfg.ptx) as names:
         small = replace(
             teacher,
             resume=None,
