@@ -42,8 +42,8 @@ class PrecompileCfg:
     arch: int = 90
     """Compute capability of the GPU, without its point: 90 for H100 and H200, 80 for A100, 89 for RTX 40."""
     ptx: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Write PTX in place of binaries: what Warp looks for where the driver's CUDA version (nvidia-smi) is that
-    of Warp's own toolkit, or later."""
+    """Write PTX in place of binaries: what Warp looks for where the driver's CUDA version (nvidia-smi) is
+    that of Warp's own toolkit, or later."""
 
 
 @contextmanager
