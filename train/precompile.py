@@ -130,6 +130,8 @@ def precompile(
         small = replace(
             teacher,
             resume=None,
+            init=None,  # networks have no kernels of Warp's
+            init_stage=None,
             run=replace(teacher.run, run_dir=Path(folder), device="cpu", tensorboard=False),
             ppo=replace(teacher.ppo, minibatch_size=worlds * teacher.ppo.rollout_steps, cuda_graph=False),
             env=replace(teacher.env, num_worlds=worlds),
@@ -153,7 +155,7 @@ def precompile_command(
     cfg, rest = tyro.cli(PrecompileCfg, args=arguments, prog="vd-train precompile", return_unknown_args=True)
     teacher = parse_teacher(rest)
     started = time.monotonic()
-    with waiting("compiling (five minutes of a core, less where the folder holds kernels)"):
+    with waiting("compiling (some minutes of a core, less where the folder holds kernels)"):
         names = precompile(cfg, teacher, build_teacher)
     size = sum(file.stat().st_size for file in cfg.output.rglob("*") if file.is_file()) / 2**20
     spent = time.monotonic() - started
