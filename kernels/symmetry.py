@@ -2,7 +2,8 @@
 
 World frame (z up), quaternions xyzw. F views: view k is the world turned about the vertical by k / F of a
 full turn, with the fingers renamed. A policy that always takes the view in which the axis of the wanted
-rotation lies in the same sector has an F-th of the goals to learn.
+rotation lies in the same sector has an F-th of the goals to learn. A hand that is its own mirror image has F
+more views, in the mirror: half of that.
 """
 
 import warp as wp
@@ -59,6 +60,7 @@ def view_observation_kernel(
     # Model:
     source: wp.array3d[int],
     factor: wp.array3d[float],
+    offset: wp.array2d[float],
     # In:
     view_in: wp.array[int],
     world_in: wp.array2d[float],
@@ -70,13 +72,14 @@ def view_observation_kernel(
     Args:
         source: Values of the world frame that make each value of a view, shape [F, O, T].
         factor: Their factors, shape [F, O, T].
+        offset: What is added to their sum, shape [F, O].
         view_in: View of each world, shape [N].
         world_in: Observation in the world frame, shape [N, O].
         observation_out: Observation in the view, shape [N, O].
     """
     world, column = wp.tid()
     k = view_in[world]
-    value = wp.float32(0.0)
+    value = offset[k, column]
     for term in range(source.shape[2]):
         value += factor[k, column, term] * world_in[world, source[k, column, term]]
     observation_out[world, column] = value
@@ -86,6 +89,7 @@ def view_observation_kernel(
 def world_action_kernel(
     # Model:
     source: wp.array2d[int],
+    sign: wp.array2d[float],
     # In:
     view_in: wp.array[int],
     action_in: wp.array2d[float],
@@ -96,9 +100,11 @@ def world_action_kernel(
 
     Args:
         source: Joint of the view that is each joint of the world, shape [F, D].
+        sign: -1 where that joint turns the other way, else 1, shape [F, D].
         view_in: View of each world, shape [N].
         action_in: Action in the view, shape [N, D].
         action_out: Action in the world, shape [N, D]; not ``action_in``.
     """
     world, joint = wp.tid()
-    action_out[world, joint] = action_in[world, source[view_in[world], joint]]
+    k = view_in[world]
+    action_out[world, joint] = sign[k, joint] * action_in[world, source[k, joint]]

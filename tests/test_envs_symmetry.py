@@ -98,6 +98,67 @@ def test_turned_worlds_look_and_move_the_same(hand):
         assert np.median(error) < 1e-4 and np.quantile(error, 0.9) < 0.05
 
 
+def test_mirrored_worlds_look_and_move_the_same():
+    """With a cuboid, which is its own mirror image; a reflection in the plane of one finger."""
+    cfg = dataclasses.replace(CFG, observation=ObservationCfg(shape="full", view="mirrored"))
+    env = ReorientEnv(cfg, "cpu")
+    rng = np.random.default_rng(3)
+    for action in rng.uniform(-1, 1, (30, WORLDS, 9)).astype(np.float32):
+        act(env, action)
+    look(env)
+    state, before = env.state_dict(), env.observation.numpy().copy()
+    action = rng.uniform(-1, 1, (WORLDS, 9)).astype(np.float32)
+    act(env, action)
+    after, kept = env.observation.numpy().copy(), env.done.numpy() == 0
+    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the worlds are in different views"
+
+    points = env._shapes._points  # drawn at random, so that theirs is another cuboid
+    surface = points.numpy().copy()
+    tips = load_hand("dclaw3").tip_poses(np.zeros(9))
+    azimuth = np.arctan2(tips[:, 1], -tips[:, 0])  # the base is upside down, turned about y
+    for finger in range(3):
+        others = [f for f in range(3) if f != finger]
+        source = np.arange(3)
+        source[others] = source[others[::-1]]
+        x, y = np.cos(azimuth[finger]), np.sin(azimuth[finger])
+        mirror = np.array([[x * x - y * y, 2 * x * y, 0.0], [2 * x * y, y * y - x * x, 0.0], [0.0, 0.0, 1.0]])
+
+        def in_mirror(quat, mirror=mirror):
+            axes = mirror @ Rotation.from_quat(quat).as_matrix() @ np.diag([1.0, -1.0, 1.0])
+            return Rotation.from_matrix(axes).as_quat().astype(np.float32)
+
+        arrays = {name: value.copy() for name, value in state["arrays"].items()}
+        for name in ("joint_q", "joint_qd", "target", "smoothed"):
+            value = arrays[name][:, :9].reshape(WORLDS, 3, 3)
+            arrays[name][:, :9] = (value[:, source] * [-1.0, 1.0, 1.0]).reshape(WORLDS, 9)
+        q, qd = arrays["joint_q"], arrays["joint_qd"]
+        q[:, 9:12] = q[:, 9:12] @ mirror
+        q[:, 12:] = in_mirror(q[:, 12:])
+        qd[:, 9:12] = qd[:, 9:12] @ mirror
+        qd[:, 12:] = -qd[:, 12:] @ mirror
+        arrays["goal_quat"] = in_mirror(arrays["goal_quat"])
+        arrays["warm_start"][:] = 0.0
+        env.load_state_dict(state | {"arrays": arrays})
+        points.assign(surface * [1.0, -1.0, 1.0])
+        look(env)
+        was, now = state["arrays"]["view"] >= 3, env.views.view.numpy() >= 3
+        assert (was != now).all(), "what was seen in the mirror is seen as it is, and the other way round"
+        seen = with_signs_of(before, env.observation.numpy(), 3)
+        np.testing.assert_allclose(seen, before, atol=2e-4)
+
+        act(env, action)
+        error = np.abs(with_signs_of(after, env.observation.numpy(), 3) - after)[kept]
+        assert np.median(error) < 1e-4 and np.quantile(error, 0.9) < 0.05
+
+
+def test_a_hand_whose_fingers_lean_is_no_mirror_image():
+    cfg = dataclasses.replace(CFG, hand="dclaw4", observation=ObservationCfg(view="mirrored"))
+    with pytest.raises(
+        ValueError, match=r"dclaw4 is not its own mirror image; set observation\.view to goal"
+    ):
+        ReorientEnv(cfg, "cpu")
+
+
 def test_the_axis_of_the_wanted_rotation_is_in_one_sector_when_the_goal_is_new():
     env = ReorientEnv(dataclasses.replace(CFG, num_worlds=60), "cpu")
     pose, goal = env.object_pose()[:, 3:], env.goal_quat.numpy()

@@ -67,6 +67,24 @@ def test_the_command_writes_a_student_that_is_to_be_calibrated_anew(tmp_path, ca
     torch.testing.assert_close(last, policy.network.layers[-1].bias[: len(last)], atol=1e-3, rtol=1e-3)
 
 
+def test_it_follows_a_teacher_that_sees_its_goals_in_other_views(tmp_path):
+    state = torch.load(find_policy("dclaw3-table"), weights_only=True)
+    state["task"]["observation"]["view"] = "mirrored"
+    torch.save(state, tmp_path / "mirrored.pt")
+    for name in ("dclaw3-table", str(tmp_path / "mirrored.pt")):
+        assert main(["follow", "dclaw3-student", name, str(tmp_path / f"{len(name)}.pt")]) == 0
+    names = ("dclaw3-table", str(tmp_path / "mirrored.pt"))
+    turned, mirrored = (load_student(tmp_path / f"{len(name)}.pt").network.state for name in names)
+    assert len(turned.views) == 3 and len(mirrored.views) == 6
+    # An estimate is measured in units of its own; what is told of the world is the same.
+    world = turned.offset + turned.scale * torch.randn(60, len(turned.offset))
+    action, view = turned.act((world - turned.offset) / turned.scale)
+    other, chosen = mirrored.act((world - mirrored.offset) / mirrored.scale)
+    same = view == chosen
+    assert same.any() and not same.all(), "half of them are seen in the mirror"
+    torch.testing.assert_close(action[same], other[same], atol=1e-3, rtol=1e-3)
+
+
 @pytest.mark.parametrize(
     ("teacher", "message"),
     [("dclaw3-table", "same hand"), ("dclaw4-cube", "observes other things"), ("zero", "trained teacher")],

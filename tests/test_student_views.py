@@ -8,25 +8,25 @@ from scipy.spatial.transform import Rotation
 
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.envs.symmetry import view_tables
+from vd.envs.symmetry import ViewTables, view_tables
 from vd.kernels.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
 from vd.student.state import UNSEEN, StateHead, state_cfg
 from vd.student.views import EveryView, ViewMaps
 
-WORLDS, WIDTH = 24, 8
+WORLDS, WIDTH = 48, 8
 
 
-@pytest.fixture(scope="module", params=["dclaw3", "dclaw4"])
+@pytest.fixture(scope="module", params=[("dclaw3", "goal"), ("dclaw4", "goal"), ("dclaw3", "mirrored")])
 def env(request):
     """Worlds after some random steps, in views that were chosen for where the objects are then."""
     made = ReorientEnv(
         ReorientCfg(
-            hand=request.param,
+            hand=request.param[0],
             objects=("cuboid",),
             num_worlds=WORLDS,
             randomisation=RandomisationCfg(enabled=False),
-            observation=ObservationCfg(shape="full", view="goal"),
+            observation=ObservationCfg(shape="full", view=request.param[1]),
         ),
         "cpu",
     )
@@ -39,6 +39,14 @@ def env(request):
     return made
 
 
+def views_of(env: ReorientEnv) -> int:
+    return env.cfg.observation.views(env.num_fingers)
+
+
+def tables_of(env: ReorientEnv) -> ViewTables:
+    return view_tables(env, mirrored=env.cfg.observation.view == "mirrored")
+
+
 def teacher_of(env: ReorientEnv) -> TrainedPolicy:
     torch.manual_seed(0)
     spec = PolicySpec(env.num_observations, env.num_actions, (16, 8), "elu", "gaussian", True)
@@ -49,8 +57,8 @@ def teacher_of(env: ReorientEnv) -> TrainedPolicy:
 
 
 def head_of(env: ReorientEnv, policy: TrainedPolicy) -> StateHead:
-    head = StateHead(state_cfg(policy.spec, views=env.num_fingers), WIDTH, env.num_actions)
-    assert head.adopt(policy.network, view_tables(env)), "random layers before"
+    head = StateHead(state_cfg(policy.spec, views=views_of(env)), WIDTH, env.num_actions)
+    assert head.adopt(policy.network, tables_of(env)), "random layers before"
     return head
 
 
@@ -67,7 +75,7 @@ def with_the_unseen_at_its_mean(env: ReorientEnv, policy: TrainedPolicy, seen: t
 def test_at_a_true_estimate_the_head_acts_as_the_teacher_in_the_simulators_view(env):
     policy = teacher_of(env)
     head, view = head_of(env, policy), wp.to_torch(env.views.view)
-    assert set(view.tolist()) == set(range(env.num_fingers)), "every view is tried"
+    assert set(view.tolist()) == set(range(views_of(env))), "every view is tried"
     world, seen = wp.to_torch(env.world_observation), wp.to_torch(env.observation)
     action, chosen = head.act(head.target(world))
     assert torch.equal(chosen, view.long())
@@ -81,14 +89,14 @@ def test_at_a_true_estimate_the_head_acts_as_the_teacher_in_the_simulators_view(
 def test_asking_for_the_maps_moves_nothing(env):
     before = env.sim.joint_q.numpy().copy(), env.sim.body_q.numpy().copy()
     assert np.abs(before[0][:, : env.num_actions]).min(axis=1).max() > 0.0, "fingers are bent"
-    view_tables(env)
+    tables_of(env)
     np.testing.assert_array_equal(env.sim.joint_q.numpy(), before[0])
     np.testing.assert_allclose(env.sim.body_q.numpy(), before[1], atol=1e-6)
 
 
 def test_maps_are_those_of_the_simulator(env):
-    maps = ViewMaps(env.num_fingers, env.num_observations, env.num_actions)
-    maps.adopt(view_tables(env))
+    maps = ViewMaps(views_of(env), env.num_observations, env.num_actions)
+    maps.adopt(tables_of(env))
     view = wp.to_torch(env.views.view).long()
     seen = maps.take(wp.to_torch(env.world_observation), view)
     torch.testing.assert_close(seen, wp.to_torch(env.observation), rtol=1e-5, atol=1e-6)
@@ -98,7 +106,7 @@ def test_the_label_of_each_view_is_the_teachers_action_in_it(env):
     policy = teacher_of(env)
     head, world = head_of(env, policy), wp.to_torch(env.world_observation)
     labels = EveryView(policy, head.views).act(world)
-    assert labels.shape == (WORLDS, env.num_fingers, env.num_actions)
+    assert labels.shape == (WORLDS, views_of(env), env.num_actions)
     own = env.views.world_action(wp.from_torch(policy.act(wp.to_torch(env.observation)).contiguous()))
     picked = labels[torch.arange(WORLDS), wp.to_torch(env.views.view).long()]
     torch.testing.assert_close(picked, wp.to_torch(own), rtol=1e-4, atol=1e-4)
@@ -110,28 +118,29 @@ def test_an_estimate_is_normalised_in_the_world_as_the_teachers_views_would_have
     """Draws of a view, put back into the world from a view at random, have mean 0 and deviation 1."""
     policy = teacher_of(env)
     head = head_of(env, policy)
-    tables, random = view_tables(env), torch.Generator().manual_seed(1)
+    tables, random = tables_of(env), torch.Generator().manual_seed(1)
     count, values = 30_000, env.num_observations
     offset, scale = policy.network.offset, policy.network.scale
     seen = offset + scale * torch.randn((count, values), generator=random)
-    maps = np.zeros((env.num_fingers, values, values))
-    for view in range(env.num_fingers):
+    maps = np.zeros((views_of(env), values, values))
+    for view in range(views_of(env)):
         for row in range(values):
             for column, factor in zip(tables.source[view, row], tables.factor[view, row], strict=True):
                 maps[view, row, column] += factor
         np.testing.assert_allclose(maps[view] @ maps[view].T, np.eye(values), atol=1e-6)
-    view = torch.randint(env.num_fingers, (count,), generator=random)
+    view = torch.randint(views_of(env), (count,), generator=random)
     back = torch.empty_like(seen)
+    offsets = torch.from_numpy(tables.offset).float()
     for one, turn in enumerate(torch.from_numpy(maps).float()):  # back is its inverse, the transpose
-        back[view == one] = seen[view == one] @ turn
+        back[view == one] = (seen[view == one] - offsets[one]) @ turn
     world = (back - head.offset) / head.scale
     assert world.mean(dim=0).abs().max() < 0.03
     assert (world.std(dim=0) - 1.0).abs().max() < 0.03
 
 
 def test_a_rotation_by_more_than_half_a_turn_is_in_the_view_of_the_shorter_one(env):
-    maps = ViewMaps(env.num_fingers, env.num_observations, env.num_actions)
-    maps.adopt(view_tables(env))
+    maps = ViewMaps(views_of(env), env.num_observations, env.num_actions)
+    maps.adopt(tables_of(env))
     observation = torch.zeros(50, env.num_observations)
     columns = teacher_observation_slices(env.num_fingers)["relative_orientation"]
     observation[:, columns] = torch.from_numpy(Rotation.random(50, random_state=0).as_quat()).float()
@@ -142,7 +151,7 @@ def test_the_same_teacher_again_keeps_the_fitted_estimate_and_another_does_not(e
     policy = teacher_of(env)
     head = head_of(env, policy)
     head.fit(torch.randn(200, WIDTH), torch.randn(200, env.num_observations))
-    assert not head.adopt(policy.network, view_tables(env)) and head.fitted
+    assert not head.adopt(policy.network, tables_of(env)) and head.fitted
     weights = dict(policy.weights) | {"mlp.0.bias": policy.weights["mlp.0.bias"] + 1.0}
-    assert head.adopt(TrainedPolicy(policy.spec, weights, task={}).network, view_tables(env))
+    assert head.adopt(TrainedPolicy(policy.spec, weights, task={}).network, tables_of(env))
     assert not head.fitted

@@ -62,6 +62,8 @@ def test_views_take_observations_apart_and_put_actions_together(device, data):
                                 max_size=views * width * terms))  # fmt: skip
     source = np.array(source).reshape(views, width, terms)
     factor = data.draw(floats((views, width, terms)))
+    offset = data.draw(floats((views, width)))
+    sign = np.sign(data.draw(floats((views, width))) + 0.5)
     view = np.array(data.draw(st.lists(st.integers(0, views - 1), min_size=count, max_size=count)))
     values = data.draw(floats((count, width)))
     seen, done = (unwritten((count, width), float, device) for _ in range(2))
@@ -71,6 +73,7 @@ def test_views_take_observations_apart_and_put_actions_together(device, data):
         inputs=[
             device_array(source, int, device),
             device_array(factor, float, device),
+            device_array(offset, float, device),
             device_array(view, int, device),
             device_array(values, float, device),
         ],
@@ -82,6 +85,7 @@ def test_views_take_observations_apart_and_put_actions_together(device, data):
         dim=(count, width),
         inputs=[
             device_array(source[:, :, 0], int, device),
+            device_array(sign, float, device),
             device_array(view, int, device),
             device_array(values, float, device),
         ],
@@ -89,6 +93,7 @@ def test_views_take_observations_apart_and_put_actions_together(device, data):
         device=device,
     )
     for world, k in enumerate(view):
-        expected = (factor[k].astype(float) * values[world][source[k]]).sum(axis=1)
+        expected = (factor[k].astype(float) * values[world][source[k]]).sum(axis=1) + offset[k]
         np.testing.assert_allclose(seen.numpy()[world], expected, atol=1e-5)
-        assert np.array_equal(done.numpy()[world], values[world][source[k, :, 0]])
+        wanted = sign[k] * values[world][source[k, :, 0]]
+        assert np.array_equal(done.numpy()[world], wanted.astype(np.float32))

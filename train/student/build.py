@@ -209,8 +209,8 @@ def head_of(teacher: "TrainedPolicy") -> "StateCfg":
     from vd.kernels.observations import JOINTS_PER_FINGER
     from vd.student.state import state_cfg
 
-    in_views = trained_task(teacher).observation.view == "goal"
-    return state_cfg(teacher.spec, views=teacher.num_actions // JOINTS_PER_FINGER if in_views else 0)
+    observation = trained_task(teacher).observation
+    return state_cfg(teacher.spec, views=observation.views(teacher.num_actions // JOINTS_PER_FINGER))
 
 
 def begin_from(path: Path, student: "Student", device: str) -> list[str]:
@@ -289,6 +289,7 @@ def _dagger(
 
     from vd.envs.reorient import ReorientEnv
     from vd.envs.symmetry import WorldOrder, view_tables
+    from vd.evaluate.agents import trained_task
     from vd.sim.scene import hand_mount
     from vd.student.views import EveryView
     from vd.train.student.dagger import Dagger
@@ -320,7 +321,8 @@ def _dagger(
     labels: Any = WorldOrder(teacher, simulation)
     state = student.state
     if state is not None:
-        tables = view_tables(simulation) if state.views is not None else None
+        mirrored = trained_task(teacher).observation.view == "mirrored"
+        tables = view_tables(simulation, mirrored=mirrored) if state.views is not None else None
         if fresh and state.adopt(teacher.network, tables):
             # What is added to the actions of another teacher's layers is of no use to these.
             student.forget_correction()

@@ -11,7 +11,9 @@ from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import is_saved_student, open_policy, open_teacher, policy_name
+from vd.envs.reorient import ReorientEnv
+from vd.envs.symmetry import view_tables
+from vd.evaluate.agents import is_saved_student, open_policy, open_teacher, policy_name, trained_task
 from vd.sim.scene import hand_mount
 from vd.student.network import Student
 from vd.student.saved import student_export
@@ -52,8 +54,8 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     hand = str(saved.task.get("hand", ""))
     if hand != policy.hand:
         raise ValueError(f"{student} moves {hand}, {teacher} {policy.hand}; give a teacher of the same hand")
-    own = network.cfg.state
-    if replace(head_of(policy), inside=own.inside, fingertips=own.fingertips) != own:
+    own, wanted = network.cfg.state, head_of(policy)
+    if replace(wanted, inside=own.inside, fingertips=own.fingertips, views=own.views) != own:
         raise ValueError(
             f"{teacher} observes other things than the teacher of {student}, or has other layers; train a "
             "student of it"
@@ -63,7 +65,11 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
             f"an action of {teacher} means {policy.task.get('action')}, one of {student} "
             f"{saved.task.get('action')}; train a student of it"
         )
-    other = network.state.follow(policy.network)
+    if wanted.views != own.views:
+        network = with_views(network, trained_task(policy))
+    head = network.state
+    assert head is not None
+    other = head.follow(policy.network)
     if other:
         network.forget_correction()
     if not own.fingertips and network.cfg.senses_joints:
@@ -80,6 +86,22 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     }
     save_checkpoint(output, student_export(state, small=True))
     return other
+
+
+def with_views(student: Student, task: ReorientCfg) -> Student:
+    """A student that sees its goals in other views: those of ``task``, its teacher's."""
+    cfg = student.cfg
+    one = replace(task, objects=("cube",), num_worlds=1)
+    env = ReorientEnv(one, "cpu")
+    views = one.observation.views(env.num_fingers)
+    network = Student(replace(cfg, state=replace(cfg.state, views=views)), student.num_actions)
+    weights = {name: w for name, w in student.state_dict().items() if not name.startswith("state.views.")}
+    network.load_state_dict(weights, strict=False)
+    head = network.state
+    if views:
+        assert head is not None and head.views is not None
+        head.views.adopt(view_tables(env, mirrored=one.observation.view == "mirrored"))
+    return network.eval().requires_grad_(False)
 
 
 def with_fingertips(student: Student, hand: HandModel) -> Student:

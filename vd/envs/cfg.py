@@ -86,10 +86,16 @@ class ObservationCfg:
     """none: nothing of the object's shape, as in the paper. full: the vector from each fingertip to the
     nearest point of the surface, and how far the object extends in 9 directions for each finger, up and
     down, now and at the goal; exact, privileged."""
-    view: Literal["world", "goal"] = "world"
+    view: Literal["world", "goal", "mirrored"] = "world"
     """world: one frame for all goals, as in the paper. goal: for each goal the scene is seen turned about the
     vertical from finger to finger, and the fingers renamed, so that the axis of the wanted rotation lies in
-    one sector: an F-th of the goals to learn. The fingers must be spaced evenly."""
+    one sector: an F-th of the goals to learn. The fingers must be spaced evenly. mirrored: turned, or in the
+    mirror, objects too: half of that. The hand must be its own mirror image, as dclaw3 is; of dclaw4 all
+    fingers lean the same way round."""
+
+    def views(self, fingers: int) -> int:
+        """Views in which a hand of so many fingers sees its goals; 0: it sees the world as it is."""
+        return {"world": 0, "goal": fingers, "mirrored": 2 * fingers}[self.view]
 
 
 @dataclass(frozen=True)

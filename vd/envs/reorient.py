@@ -151,7 +151,7 @@ class ReorientEnv:
         """Positions of the fingertips and torques of the joints."""
         self._body_com = wp.clone(self.sim.model.body_com[: self.scene.bodies_per_world])
         self._reset_q = array(np.tile(PAPER.scene.reset_joint_rad, f))
-        self.views = Views(self) if cfg.observation.view == "goal" else None
+        self.views = Views(self) if cfg.observation.view != "world" else None
         """The views in which the policy observes and acts; None where that is the world frame."""
         self.world_observation = self.observation if self.views is None else self.views.observation
         """Observation in the world frame, shape [N, O]."""

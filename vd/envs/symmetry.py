@@ -17,40 +17,63 @@ if TYPE_CHECKING:
 TERMS = 4
 """Most values that a turned value is made of: those of a quaternion."""
 TOLERANCE_M = 1e-4
-"""Farthest that a turned fingertip may be from the one whose place it takes."""
+"""Farthest that a turned fingertip may be from the one whose place it takes; of a mirrored one's axes
+likewise."""
 SECTOR = np.array([1.0, 0.0, 0.0])
 """Views turn the axis of the wanted rotation near to this direction, world frame; any would do."""
+MIRROR_SIGNS = np.array([-1.0, 1.0, 1.0])
+"""Factors on the angles of a finger in the mirror: it swings to the other side, and bends as before."""
+OBJECT_MIRROR = np.diag([1.0, -1.0, 1.0])
+"""What is mirrored has left-handed axes; its y axis is turned round, of fingertips and objects alike."""
+BENT = np.array([0.3, 0.5, -0.4])
+"""Angles [rad] of every finger, far from zero, at which a hand has to be its own mirror image."""
 
 
 @dataclass(frozen=True)
 class ViewTables:
-    """What the F views of a hand are made of."""
+    """What the views of a hand are made of: F with F fingers, and F more in the mirror."""
 
     source: np.ndarray
     """Values of the world frame that make each value of a view, int [F, O, T]."""
     factor: np.ndarray
     """Their factors [F, O, T]."""
+    offset: np.ndarray
+    """What is added to their sum [F, O]: limits about which a joint is observed may be uneven."""
     joints: np.ndarray
     """Joint of the view that is each joint of the world, int [F, D]."""
+    sign: np.ndarray
+    """-1 where that joint turns the other way, else 1 [F, D]."""
     sector: np.ndarray
     """The direction near which a view has the axis of the wanted rotation, as it is in the world [F, 3]."""
 
 
-def view_tables(env: "ReorientEnv") -> ViewTables:
+def view_tables(env: "ReorientEnv", *, mirrored: bool = False) -> ViewTables:
     """The views of an environment's hand and observation.
 
+    Args:
+        env: The environment.
+        mirrored: Whether to have those in the mirror too, after the others.
+
     Raises:
-        ValueError: The fingers are not spaced evenly about the vertical.
+        ValueError: The fingers are not spaced evenly about the vertical, or the hand is not its own mirror
+            image.
     """
-    fingers, tips = env.num_fingers, _tips(env)
-    maps = [_observation_map(tips, step, sees_shape=env.sees_shape) for step in range(fingers)]
-    source = np.stack([np.argsort(-np.abs(m), axis=1, kind="stable")[:, :TERMS] for m in maps])
+    fingers, tips = env.num_fingers, _tips(env, np.zeros(JOINTS_PER_FINGER))
     turns = [_turn(step, fingers) for step in range(fingers)]
+    if mirrored:
+        mirror = _mirror(env, tips)
+        turns += [turn @ mirror for turn in turns]
+    maps = np.stack([_observation_map(tips, turn, sees_shape=env.sees_shape) for turn in turns])
+    source = np.argsort(-np.abs(maps), axis=2, kind="stable")[:, :, :TERMS]
+    order = [_joint_source(_finger_source(tips, turn.T)) for turn in turns]
     return ViewTables(
         source=source,
-        factor=np.take_along_axis(np.stack(maps), source, axis=2),
-        joints=np.stack([_joint_source(_finger_source(tips, -step)) for step in range(fingers)]),
-        sector=np.stack([turn.inv().apply(SECTOR) for turn in turns]),
+        factor=np.take_along_axis(maps, source, axis=2),
+        offset=np.stack([_observation_offset(env, turn) for turn in turns]),
+        joints=np.stack(order),
+        sign=np.stack([_joint_signs(turn, fingers) for turn in turns]),
+        # An axis of rotation looks the other way in a mirror.
+        sector=np.stack([np.linalg.det(turn) * turn.T @ SECTOR for turn in turns]),
     )
 
 
@@ -58,7 +81,7 @@ class Views:
     """The view of each world of ``env``, and what the policy sees and does in it.
 
     Attributes:
-        view: View of each world, 0 to F - 1, shape [N].
+        view: View of each world, from 0, shape [N].
         observation: Observation in the world frame, shape [N, O]; views of it go to ``env.observation``.
     """
 
@@ -66,13 +89,16 @@ class Views:
         """Put the tables of the hand on the device.
 
         Raises:
-            ValueError: The fingers are not spaced evenly about the vertical.
+            ValueError: The hand has no such views, see :func:`view_tables`.
         """
         self._env = env
-        device, worlds, tables = env.device, env.num_worlds, view_tables(env)
+        device, worlds = env.device, env.num_worlds
+        tables = view_tables(env, mirrored=env.cfg.observation.view == "mirrored")
         self._source = wp.array(tables.source, dtype=wp.int32, device=device)
         self._factor = wp.array(tables.factor, dtype=float, device=device)
         self._joints = wp.array(tables.joints, dtype=wp.int32, device=device)
+        self._offset = wp.array(tables.offset, dtype=float, device=device)
+        self._sign = wp.array(tables.sign, dtype=float, device=device)
         self._sector = wp.array(tables.sector, dtype=wp.vec3, device=device)
         self._action = wp.zeros((worlds, env.num_actions), dtype=float, device=device)
         self.view = wp.zeros(worlds, dtype=wp.int32, device=device)
@@ -95,7 +121,7 @@ class Views:
         wp.launch(
             view_observation_kernel,
             dim=env.observation.shape,
-            inputs=[self._source, self._factor, self.view, self.observation],
+            inputs=[self._source, self._factor, self._offset, self.view, self.observation],
             outputs=[env.observation],
             device=env.device,
         )
@@ -106,7 +132,7 @@ class Views:
         wp.launch(
             world_action_kernel,
             dim=action.shape,
-            inputs=[self._joints, self.view, action],
+            inputs=[self._joints, self._sign, self.view, action],
             outputs=[out],
             device=self._env.device,
         )
@@ -130,12 +156,12 @@ class WorldOrder:
         return wp.to_torch(ordered).clone()
 
 
-def _tips(env: "ReorientEnv") -> np.ndarray:
-    """Fingertip poses of a hand with all angles zero, with the simulation's signs [F, 7]."""
+def _tips(env: "ReorientEnv", angles: np.ndarray) -> np.ndarray:
+    """Fingertip poses of a hand with these angles [3] in all fingers, with the simulation's signs [F, 7]."""
     joints = env.sim.joint_q.numpy().copy()
-    straight = joints.copy()
-    straight[:, : env.num_actions] = 0.0
-    env.sim.joint_q.assign(straight)
+    posed = joints.copy()
+    posed[:, : env.num_actions] = np.tile(angles, env.num_fingers)
+    env.sim.joint_q.assign(posed)
     env.sim.forward_kinematics()
     bodies = env.sim.body_q.numpy()[0].copy()
     env.sim.joint_q.assign(joints)
@@ -145,13 +171,36 @@ def _tips(env: "ReorientEnv") -> np.ndarray:
     return np.array([[tip[i] for i in range(7)] for tip in tips])
 
 
-def _turn(step: int, fingers: int) -> Rotation:
-    return Rotation.from_euler("z", 2.0 * np.pi * step / fingers)
+def _turn(step: int, fingers: int) -> np.ndarray:
+    """Turn about the vertical by ``step`` of so many fingers [3, 3]."""
+    return Rotation.from_euler("z", 2.0 * np.pi * step / fingers).as_matrix()
 
 
-def _finger_source(tips: np.ndarray, step: int) -> np.ndarray:
-    """The finger that takes the place of each after a turn by ``step`` fingers [F]."""
-    turned = _turn(step, len(tips)).apply(tips[:, :3])
+def _mirror(env: "ReorientEnv", tips: np.ndarray) -> np.ndarray:
+    """Reflection [3, 3] in the vertical plane through the first fingertip and the hand's axis.
+
+    Raises:
+        ValueError: The hand is not its own mirror image in it.
+    """
+    across = np.array([-tips[0, 1], tips[0, 0], 0.0]) / np.linalg.norm(tips[0, :2])
+    mirror = np.eye(3) - 2.0 * np.outer(across, across)
+    refusal = f"{env.cfg.hand} is not its own mirror image; set observation.view to goal, which turns it only"
+    try:
+        source = _finger_source(tips, mirror)
+    except ValueError as error:
+        raise ValueError(refusal) from error
+    bent, opposite = _tips(env, BENT)[source], _tips(env, MIRROR_SIGNS * BENT)
+    apart = np.linalg.norm(bent[:, :3] @ mirror.T - opposite[:, :3], axis=1)
+    axes = Rotation.from_quat(bent[:, 3:]).as_matrix()
+    twisted = np.abs(mirror @ axes @ OBJECT_MIRROR - Rotation.from_quat(opposite[:, 3:]).as_matrix())
+    if max(apart.max(), twisted.max()) > TOLERANCE_M:
+        raise ValueError(refusal)
+    return mirror
+
+
+def _finger_source(tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """The finger that takes the place of each after a turn or reflection ``turn`` [3, 3] of the hand [F]."""
+    turned = tips[:, :3] @ turn.T
     distance = np.linalg.norm(turned[:, None] - tips[None, :, :3], axis=2)
     source = np.argmin(distance, axis=0)
     if sorted(source) != list(range(len(tips))) or distance.min(axis=0).max() > TOLERANCE_M:
@@ -166,34 +215,53 @@ def _joint_source(fingers: np.ndarray) -> np.ndarray:
     return (JOINTS_PER_FINGER * fingers[:, None] + np.arange(JOINTS_PER_FINGER)).ravel()
 
 
-def _observation_map(tips: np.ndarray, step: int, *, sees_shape: bool) -> np.ndarray:
-    """Matrix [O, O] from an observation in the world frame to that of the view ``step``.
+def _joint_signs(turn: np.ndarray, fingers: int) -> np.ndarray:
+    """Factors on joints in a view [D]."""
+    return np.tile(MIRROR_SIGNS if np.linalg.det(turn) < 0.0 else np.ones(JOINTS_PER_FINGER), fingers)
+
+
+def _observation_offset(env: "ReorientEnv", turn: np.ndarray) -> np.ndarray:
+    """What is added in a view to what :func:`_observation_map` makes [O].
+
+    An angle is observed as it lies between its limits, from -1 to 1; of one that is turned round these are
+    the limits of the other side.
+    """
+    offset = np.zeros(env.num_observations)
+    lower, upper = np.asarray(env.hand.lower), np.asarray(env.hand.upper)
+    turned_round = _joint_signs(turn, env.num_fingers) < 0.0
+    columns = teacher_observation_slices(env.num_fingers)["joint_position"]
+    offset[columns] = np.where(turned_round, -2.0 * (upper + lower) / (upper - lower), 0.0)
+    return offset
+
+
+def _observation_map(tips: np.ndarray, turn: np.ndarray, *, sees_shape: bool) -> np.ndarray:
+    """Matrix [O, O] from an observation in the world frame to that of a view.
 
     Args:
-        tips: Fingertip poses with the same angles in all fingers, shape [F, 7].
-        step: Fingers by which the view is turned.
+        tips: Fingertip poses with all angles zero, shape [F, 7].
+        turn: Turn or reflection [3, 3] of the world that makes the view.
         sees_shape: Whether the object's shape is observed.
     """
-    count = len(tips)
-    turn, fingers = _turn(step, count), _finger_source(tips, step)
-    vector, quaternion = turn.as_matrix(), _left_product(turn.as_quat())
+    count, fingers = len(tips), _finger_source(tips, turn)
+    quaternion = _orientation_map(turn)
+    axial = np.linalg.det(turn) * turn  # rotations look the other way in a mirror
     conjugation = np.eye(4)
-    conjugation[:3, :3] = vector
-    joints = np.eye(JOINTS_PER_FINGER * count)[_joint_source(fingers)]
+    conjugation[:3, :3] = axial
+    joints = _joint_signs(turn, count)[:, None] * np.eye(JOINTS_PER_FINGER * count)[_joint_source(fingers)]
     tip_blocks = np.zeros((count, FINGERTIP_VALUES, count, FINGERTIP_VALUES))
     for finger, old in enumerate(fingers):
         # q and -q are the same orientation, but a fingertip never shows the other one.
         sign = np.sign(tips[finger, 3:] @ quaternion @ tips[old, 3:])
-        for begin, block in ((0, vector), (3, sign * quaternion), (7, vector), (10, vector)):
+        for begin, block in ((0, turn), (3, sign * quaternion), (7, turn), (10, axial)):
             end = begin + len(block)
             tip_blocks[finger, begin:end, old, begin:end] = block
     parts = {
         "joint_position": joints,
         "joint_velocity": joints,
-        "object_position": vector,
+        "object_position": turn,
         "object_orientation": quaternion,
-        "object_velocity": vector,
-        "object_spin": vector,
+        "object_velocity": turn,
+        "object_spin": axial,
         "goal_orientation": quaternion,
         "relative_orientation": conjugation,
         "fingertips": tip_blocks.reshape(count * FINGERTIP_VALUES, -1),
@@ -202,11 +270,11 @@ def _observation_map(tips: np.ndarray, step: int, *, sees_shape: bool) -> np.nda
     slices = teacher_observation_slices(count)
     if sees_shape:
         directions = np.array(extent_directions(count))
-        back = turn.inv().apply(directions)
+        back = directions @ turn
         same = np.argmin(np.linalg.norm(back[:, None] - directions[None], axis=2), axis=1)
         extents = np.eye(len(directions))[same]
         parts |= {
-            "surface": np.kron(np.eye(count)[fingers], vector),
+            "surface": np.kron(np.eye(count)[fingers], turn),
             "extent": extents,
             "goal_extent": extents,
         }
@@ -219,6 +287,15 @@ def _observation_map(tips: np.ndarray, step: int, *, sees_shape: bool) -> np.nda
         matrix[slices[name], slices[name]] = block
     matrix[np.abs(matrix) < np.finfo(np.float32).eps] = 0.0
     return matrix
+
+
+def _orientation_map(turn: np.ndarray) -> np.ndarray:
+    """Matrix [4, 4] from an orientation R, a quaternion xyzw, to ``turn`` R, in a mirror ``turn`` R M."""
+    if np.linalg.det(turn) > 0.0:
+        return _left_product(Rotation.from_matrix(turn).as_quat())
+    # turn R M = (turn M)(M R M), M = OBJECT_MIRROR: M R M turns about the mirrored axis, the other way.
+    mirrored = np.diag([*-np.diag(OBJECT_MIRROR), 1.0])
+    return _left_product(Rotation.from_matrix(turn @ OBJECT_MIRROR).as_quat()) @ mirrored
 
 
 def _left_product(q: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.observations import JOINTS_PER_FINGER, teacher_observation_slices
 from vd.policy import TrainedPolicy
 
 TERMS = 4
@@ -23,30 +23,35 @@ class ViewMaps(nn.Module):
     They map nothing to nothing until :meth:`adopt`.
 
     Args:
-        views: F, as many as the hand has fingers.
+        views: F, as many as the hand has fingers, or twice that with those in the mirror.
         values: O.
         num_actions: D.
     """
 
     source: torch.Tensor
     factor: torch.Tensor
+    offset: torch.Tensor
     joints: torch.Tensor
+    sign: torch.Tensor
     sector: torch.Tensor
 
     def __init__(self, views: int, values: int, num_actions: int) -> None:
         super().__init__()
         self.register_buffer("source", torch.zeros((views, values, TERMS), dtype=torch.long))
         self.register_buffer("factor", torch.zeros((views, values, TERMS)))
+        self.register_buffer("offset", torch.zeros((views, values)))
         self.register_buffer("joints", torch.zeros((views, num_actions), dtype=torch.long))
+        self.register_buffer("sign", torch.ones((views, num_actions)))
         self.register_buffer("sector", torch.zeros((views, 3)))
-        self._turn = teacher_observation_slices(views)["relative_orientation"]
+        self._turn = teacher_observation_slices(num_actions // JOINTS_PER_FINGER)["relative_orientation"]
+        self._register_load_state_dict_pre_hook(self._complete)
 
     def __len__(self) -> int:
         return len(self.sector)
 
     def adopt(self, tables: Any) -> None:
         """Take over the tables of a hand, a ``vd.envs.symmetry.ViewTables``: envs stand above this layer."""
-        for name in ("source", "factor", "joints", "sector"):
+        for name in ("source", "factor", "offset", "joints", "sign", "sector"):
             buffer = getattr(self, name)
             buffer.copy_(torch.as_tensor(getattr(tables, name), dtype=buffer.dtype))
 
@@ -60,11 +65,11 @@ class ViewMaps(nn.Module):
     def take(self, observation: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
         """Observations [.., O] as views [..] show them."""
         values = observation.gather(-1, self.source[view].flatten(-2)).unflatten(-1, (-1, TERMS))
-        return (self.factor[view] * values).sum(dim=-1)
+        return (self.factor[view] * values).sum(dim=-1) + self.offset[view]
 
     def world_action(self, action: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
         """Actions [.., D] of views [..] with the joints in the world's order."""
-        return action.gather(-1, self.joints[view])
+        return self.sign[view] * action.gather(-1, self.joints[view])
 
     def world_moments(self, mean: torch.Tensor, std: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and standard deviation of values in the world frame [O], from those in a view [O].
@@ -73,10 +78,16 @@ class ViewMaps(nn.Module):
         """
         views, values, _ = self.source.shape
         maps = mean.new_zeros((views, values, values)).scatter_add(2, self.source, self.factor)
-        means = torch.einsum("kvw,v->kw", maps, mean)  # maps are orthogonal
+        means = torch.einsum("kvw,kv->kw", maps, mean - self.offset)  # maps are orthogonal
         variance = torch.einsum("kvw,v->kw", maps.square(), std.square()) + means.square()
         centre = means.mean(dim=0)
         return centre, (variance.mean(dim=0) - centre.square()).clamp(min=0.0).sqrt()
+
+    def _complete(self, state: dict[str, Any], prefix: str, *_: Any) -> None:
+        """Students from before there were mirrors have neither signs nor offsets."""
+        if prefix + "joints" in state:
+            state.setdefault(prefix + "sign", torch.ones_like(self.sign))
+            state.setdefault(prefix + "offset", torch.zeros_like(self.offset))
 
 
 class EveryView:
