@@ -90,7 +90,7 @@ def shipped(policy: str) -> str:
 SERIES = (
     ("three fingers", shipped("dclaw3-table"), "#0072B2"),
     ("four fingers", shipped("dclaw4-table"), "#D55E00"),
-    ("three, procedural objects alone", "d3-own", "#009E73"),
+    ("three, our own objects alone", shipped("dclaw3-procedural"), "#009E73"),
 )
 
 
@@ -99,7 +99,7 @@ def main() -> None:
     figure, axes = plt.subplots(1, 2, figsize=(11, 4), sharey=True, layout="constrained")
     for axis, column, label in (
         (axes[0], "steps", "control steps [million]"),
-        (axes[1], "hours", "GPU hours (H200)"),
+        (axes[1], "hours", "GPU hours (H200, H100)"),
     ):
         for name, run, colour in SERIES:
             points = way(run).points

@@ -89,9 +89,9 @@ class ObservationCfg:
     view: Literal["world", "goal", "mirrored"] = "world"
     """world: one frame for all goals, as in the paper. goal: for each goal the scene is seen turned about the
     vertical from finger to finger, and the fingers renamed, so that the axis of the wanted rotation lies in
-    one sector: an F-th of the goals to learn. The fingers must be spaced evenly. mirrored: turned, or in the
-    mirror, objects too: half of that. The hand must be its own mirror image, as dclaw3 is; of dclaw4 all
-    fingers lean the same way round."""
+    one sector: an F-th of the goals to learn. The fingers must be spaced evenly. mirrored: in the mirror too,
+    where the wanted rotation would be clockwise from above: half of that. The hand must be its own mirror
+    image, as dclaw3 is; of dclaw4 all fingers lean the same way round."""
 
     def views(self, fingers: int) -> int:
         """Views in which a hand of so many fingers sees its goals; 0: it sees the world as it is."""

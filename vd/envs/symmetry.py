@@ -21,6 +21,9 @@ TOLERANCE_M = 1e-4
 likewise."""
 SECTOR = np.array([1.0, 0.0, 0.0])
 """Views turn the axis of the wanted rotation near to this direction, world frame; any would do."""
+UP = np.array([0.0, 0.0, 10.0])
+"""Added to it where there are mirrors, so that up counts before the sector does: seen from above, wanted
+rotations are counter-clockwise."""
 MIRROR_SIGNS = np.array([-1.0, 1.0, 1.0])
 """Factors on the angles of a finger in the mirror: it swings to the other side, and bends as before."""
 OBJECT_MIRROR = np.diag([1.0, -1.0, 1.0])
@@ -60,8 +63,9 @@ def view_tables(env: "ReorientEnv", *, mirrored: bool = False) -> ViewTables:
     """
     fingers, tips = env.num_fingers, _tips(env, np.zeros(JOINTS_PER_FINGER))
     turns = [_turn(step, fingers) for step in range(fingers)]
+    direction = SECTOR
     if mirrored:
-        mirror = _mirror(env, tips)
+        mirror, direction = _mirror(env, tips), SECTOR + UP
         turns += [turn @ mirror for turn in turns]
     maps = np.stack([_observation_map(tips, turn, sees_shape=env.sees_shape) for turn in turns])
     source = np.argsort(-np.abs(maps), axis=2, kind="stable")[:, :, :TERMS]
@@ -73,7 +77,7 @@ def view_tables(env: "ReorientEnv", *, mirrored: bool = False) -> ViewTables:
         joints=np.stack(order),
         sign=np.stack([_joint_signs(turn, fingers) for turn in turns]),
         # An axis of rotation looks the other way in a mirror.
-        sector=np.stack([np.linalg.det(turn) * turn.T @ SECTOR for turn in turns]),
+        sector=np.stack([np.linalg.det(turn) * turn.T @ direction for turn in turns]),
     )
 
 
