@@ -1,9 +1,9 @@
 """A hand with evenly spaced fingers looks the same after a turn from finger to finger: views of one world.
 
-World frame (z up), quaternions xyzw. F views: view k is the world turned about the vertical by k / F of a
-full turn, with the fingers renamed. A policy that always takes the view in which the axis of the wanted
-rotation lies in the same sector has an F-th of the goals to learn. A hand that is its own mirror image has F
-more views, in the mirror: half of that.
+World frame (z up), quaternions xyzw. V views: view k < F is the world turned about the vertical by k / F of a
+full turn, with the F fingers renamed. A policy that always takes the view in which the axis of the wanted
+rotation lies in the same sector has an F-th of the goals to learn. A hand that is its own mirror image has as
+many views in the mirror: half of that.
 """
 
 import warp as wp
@@ -33,7 +33,7 @@ def choose_view_kernel(
     for a goal: an axis of small rotations wanders, and fingers would change their parts with it.
 
     Args:
-        sector: The fixed direction as each view turns it back, unit vectors, shape [F].
+        sector: The fixed direction as each view turns it back, shape [V].
         object_column: Column of the object's position in ``joint_q_in``; its quaternion follows.
         reset_in: 1 where the world was reset, shape [N].
         new_goal_in: 1 where only the goal is new, shape [N].
@@ -70,9 +70,9 @@ def view_observation_kernel(
     """Observations as the worlds' views show them. Launch: [N, O].
 
     Args:
-        source: Values of the world frame that make each value of a view, shape [F, O, T].
-        factor: Their factors, shape [F, O, T].
-        offset: What is added to their sum, shape [F, O].
+        source: Values of the world frame that make each value of a view, shape [V, O, T].
+        factor: Their factors, shape [V, O, T].
+        offset: What is added to their sum, shape [V, O].
         view_in: View of each world, shape [N].
         world_in: Observation in the world frame, shape [N, O].
         observation_out: Observation in the view, shape [N, O].
@@ -99,8 +99,8 @@ def world_action_kernel(
     """Actions of views, by the fingers' names in the world. Launch: [N, D].
 
     Args:
-        source: Joint of the view that is each joint of the world, shape [F, D].
-        sign: -1 where that joint turns the other way, else 1, shape [F, D].
+        source: Joint of the view that is each joint of the world, shape [V, D].
+        sign: -1 where that joint turns the other way, else 1, shape [V, D].
         view_in: View of each world, shape [N].
         action_in: Action in the view, shape [N, D].
         action_out: Action in the world, shape [N, D]; not ``action_in``.

@@ -34,20 +34,20 @@ BENT = np.array([0.3, 0.5, -0.4])
 
 @dataclass(frozen=True)
 class ViewTables:
-    """What the views of a hand are made of: F with F fingers, and F more in the mirror."""
+    """What the V views of a hand are made of: one for each finger, and as many in the mirror, if any."""
 
     source: np.ndarray
-    """Values of the world frame that make each value of a view, int [F, O, T]."""
+    """Values of the world frame that make each value of a view, int [V, O, T]."""
     factor: np.ndarray
-    """Their factors [F, O, T]."""
+    """Their factors [V, O, T]."""
     offset: np.ndarray
-    """What is added to their sum [F, O]: limits about which a joint is observed may be uneven."""
+    """What is added to their sum [V, O]: limits about which a joint is observed may be uneven."""
     joints: np.ndarray
-    """Joint of the view that is each joint of the world, int [F, D]."""
+    """Joint of the view that is each joint of the world, int [V, D]."""
     sign: np.ndarray
-    """-1 where that joint turns the other way, else 1 [F, D]."""
+    """-1 where that joint turns the other way, else 1 [V, D]."""
     sector: np.ndarray
-    """The direction near which a view has the axis of the wanted rotation, as it is in the world [F, 3]."""
+    """The direction near which a view has the axis of the wanted rotation, as it is in the world [V, 3]."""
 
 
 def view_tables(env: "ReorientEnv", *, mirrored: bool = False) -> ViewTables:
