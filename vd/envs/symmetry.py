@@ -23,13 +23,14 @@ SECTOR = np.array([1.0, 0.0, 0.0])
 """Views turn the axis of the wanted rotation near to this direction, world frame; any would do."""
 UP = np.array([0.0, 0.0, 10.0])
 """Added to it where there are mirrors, so that up counts before the sector does: seen from above, wanted
-rotations are counter-clockwise."""
+rotations are counter-clockwise, but for axes within 2 degrees of level (ours)."""
 MIRROR_SIGNS = np.array([-1.0, 1.0, 1.0])
-"""Factors on the angles of a finger in the mirror: it swings to the other side, and bends as before."""
+"""Factors on the angles of a finger in the mirror: it swings to the other side, and bends as before.
+The first joint is the one that swings (hand's description, joint order)."""
 OBJECT_MIRROR = np.diag([1.0, -1.0, 1.0])
 """What is mirrored has left-handed axes; its y axis is turned round, of fingertips and objects alike."""
 BENT = np.array([0.3, 0.5, -0.4])
-"""Angles [rad] of every finger, far from zero, at which a hand has to be its own mirror image."""
+"""Angles [rad] of every finger, far from zero, at which a hand has to be its own mirror image (ours)."""
 
 
 @dataclass(frozen=True)
