@@ -210,6 +210,8 @@ def cpu_demo() -> TeacherCfg:
         ),
         env=ReorientCfg(
             num_worlds=256,
+            hand="dclaw3",  # its own mirror image, so that all goals are turns one way round
+            observation=ObservationCfg(view="mirrored"),
             reward=RewardCfg(
                 success=10.0,
                 fingertip=-10.0,
