@@ -129,6 +129,39 @@ def test_only_what_changed_is_run_again(tmp_path, asked, monkeypatch):
     assert len(asked) == before + 2 * once
 
 
+def test_side_by_side_the_same_is_measured_students_first(tmp_path, asked, monkeypatch):
+    asked_of = {}
+
+    def in_this_process(work, tasks, finished, *, jobs, limit_s, gpu):
+        asked_of.update(jobs=jobs, gpu=gpu)
+        for number, task in enumerate(tasks):
+            if number == 1:
+                finished(task, None, "its process died")
+            else:
+                finished(task, work(task), "")
+
+    monkeypatch.setattr(suite_run, "run_tasks", in_this_process)
+    together = run(suite(tmp_path, TEACHER, STUDENT, jobs=3))
+    assert asked_of == {"jobs": 3, "gpu": True}
+    students = [name == STUDENT for _, name in asked_for(asked)]
+    assert students == sorted(students, reverse=True) and not all(students)
+    assert list(together.failed.values()) == ["its process died"]
+    once = len(asked)
+    alone = run(suite(tmp_path, TEACHER, STUDENT))
+    assert asked_for(asked[once:]) == list(together.failed), "only what failed is measured again"
+    assert set(alone.found) == set(together.found) | set(together.failed)
+    assert (tmp_path / "out" / "training" / TEACHER / suite_run.LOG_FILE).is_file()
+
+
+def test_students_have_fewer_episodes(asked):
+    objects = suite_run.Objects(("x",), "x", False)
+    for condition in CONDITIONS:
+        episodes = [
+            suite_run.settings(EvalCfg(), condition, name, objects).episodes for name in (TEACHER, STUDENT)
+        ]
+        assert episodes == [condition.episodes, condition.student_episodes] and episodes[0] > episodes[1]
+
+
 def test_an_interruption_keeps_what_was_measured(tmp_path, asked, monkeypatch):
     whole = suite_run.compare
 
@@ -229,6 +262,8 @@ def test_installed_policies_are_taken_where_none_is_named():
         (["--suite", "paper", "--in-air"], "--in-air is decided by --suite paper"),
         (["--suite", "paper", "--episodes", "3"], "--episodes is decided by"),
         (["dclaw4-cube", "--quick"], "add --suite paper"),
+        (["dclaw4-cube", "--jobs", "2"], "--jobs is of a suite"),
+        (["--suite", "paper", "--jobs", "0"], "at least 1 is needed"),
         (["dclaw4-cube", "--table-friction", "0.1", "--randomise"], "exclude each other"),
         (["dclaw4-cube", "--table-friction", "-1"], "must not be negative"),
         (["nobody", "--suite", "paper"], "no policy at nobody"),
@@ -288,8 +323,8 @@ def test_the_papers_figures_are_written_as_it_gives_them():
 def test_on_a_table_of_other_friction_and_in_the_air(tmp_path, monkeypatch, capsys):
     chosen = tuple(c for c in CONDITIONS if c.name in ("symmetric", "friction-0.05", "air"))
     monkeypatch.setattr(suite_run, "CONDITIONS", chosen)
-    flags = ["dclaw4-cube", "--suite", "paper", "--quick", "--device", "cpu", "--objects", *SYMMETRIC]
-    assert main([*flags, "--output", str(tmp_path), "--json"]) == 0
+    flags = ["dclaw4-cube", "--suite", "paper", "--quick", "--jobs", "2", "--device", "cpu"]
+    assert main([*flags, "--objects", *SYMMETRIC, "--output", str(tmp_path), "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)["figures"]
     assert {figure["condition"] for figure in figures} == {c.name for c in chosen}
     friction = Comparison.read(tmp_path / "friction-0.05" / "dclaw4-cube" / "eval.json")

@@ -23,13 +23,13 @@ import numpy as np
 from vd.bench.gap_beside import beside
 from vd.bench.gap_rows import merged
 from vd.bench.gap_score import KINDS, Case, said, score
-from vd.bench.workers import run_tasks
 from vd.files import write_json
 from vd.gap.hidden_plant import OUTSIDE
 from vd.gap.hide import simulate_hidden, write_hidden
 from vd.gap.recording import BARE_MODELS
 from vd.gap.sizes import GAPS, showing
 from vd.versions import source_commit
+from vd.workers import run_tasks
 
 PAIR_SIZE = 2
 """Size of both effects of a pair, some six noise floors each: from there on single effects are told apart."""

@@ -69,6 +69,8 @@ class EvalCfg:
     held-out=FOLDER names the objects; without, our procedural sets stand for them."""
     quick: tyro.conf.FlagCreatePairsOff[bool] = False
     """Of the suite only a part, with few objects and episodes: minutes on two CPU cores."""
+    jobs: int = 1
+    """Of a suite, evaluations side by side, each in a process of its own, spread over the GPUs."""
     objects: tuple[str, ...] = ()
     """Object sets by name, folders or files (vd-assets makes them); cube by default. NAME=SET puts one into a
     group, which gets figures of its own: training=FOLDER held-out=FOLDER symmetric=symmetric."""
@@ -171,9 +173,13 @@ class EvalCfg:
             )
 
     def _validate_suite(self) -> None:
+        if self.jobs < 1:
+            raise ValueError(f"--jobs is {self.jobs}; at least 1 is needed")
         if self.suite is None:
             if self.quick:
                 raise ValueError("--quick is of a suite; add --suite paper, or lower --episodes")
+            if self.jobs > 1:
+                raise ValueError("--jobs is of a suite; add --suite paper, or leave it out")
             return
         default = EvalCfg()
         for name in OF_THE_SUITE:

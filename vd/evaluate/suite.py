@@ -43,6 +43,7 @@ class Condition:
         title: Of its section.
         objects: Group of objects.
         episodes: Starts and goals of every object.
+        student_episodes: The same for a student, whose clouds and fits take most of the time.
         paper: Where the paper shows the same.
         in_air: The table is taken away.
         table_friction: Of the table; None: nominal.
@@ -54,6 +55,7 @@ class Condition:
     title: str
     objects: Group
     episodes: int
+    student_episodes: int
     paper: str
     in_air: bool = False
     table_friction: float | None = None
@@ -63,7 +65,7 @@ class Condition:
     @property
     def flags(self) -> str:
         """What ``vd-eval`` is told to do the same, policy and objects apart."""
-        flags = [f"--episodes {self.episodes}", "--no-at-rest"]
+        flags = [f"--episodes {self.episodes} (students {self.student_episodes})", "--no-at-rest"]
         flags += ["--in-air"] if self.in_air else []
         flags += [] if self.table_friction is None else [f"--table-friction {self.table_friction:g}"]
         flags += ["--scanned-goals"] if self.scanned_goals else []
@@ -71,33 +73,43 @@ class Condition:
 
 
 CONDITIONS = (
-    Condition("training", "On the table, training objects", "training", 50, "Table 1, Figures 2D and 7D"),
-    Condition("held-out", "On the table, held-out objects", "held-out", 100, "Table 1, Figures 2D, 4E, 7E-G"),
-    Condition("symmetric", "On the table, symmetric solids", "symmetric", 100, "Figure 4F"),
+    Condition("training", "On the table, training objects", "training", 50, 8, "Table 1, Figures 2D and 7D"),
+    Condition(
+        "held-out", "On the table, held-out objects", "held-out", 100, 50, "Table 1, Figures 2D, 4E, 7E-G"
+    ),
+    Condition("symmetric", "On the table, symmetric solids", "symmetric", 100, 50, "Figure 4F"),
     *(
         Condition(
             f"friction-{friction:g}",
             f"On a table of friction {friction:g}, held-out objects",
             "held-out",
             100,
+            24,
             "Figures 2F and 2G (real materials)",
             table_friction=friction,
             quick=friction in PAPER.randomisation.table_friction,
         )
         for friction in sorted(FRICTIONS)
     ),
-    Condition("air", "In the air, held-out objects", "held-out", 100, "Figures S12 to S14", in_air=True),
+    Condition("air", "In the air, held-out objects", "held-out", 100, 50, "Figures S12 to S14", in_air=True),
     Condition(
         "air-training",
         "In the air, training objects",
         "training",
         20,
+        4,
         "Figures S12 to S14",
         in_air=True,
         quick=False,
     ),
     Condition(
-        "scanned-goals", "Goals from scans, held-out objects", "held-out", 100, "Figure 5", scanned_goals=True
+        "scanned-goals",
+        "Goals from scans, held-out objects",
+        "held-out",
+        100,
+        24,
+        "Figure 5",
+        scanned_goals=True,
     ),
 )
 """What the suite runs, in this order."""

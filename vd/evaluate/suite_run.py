@@ -7,7 +7,8 @@ import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,7 @@ from vd.evaluate.suite import (
 from vd.evaluate.suite_page import write_suite
 from vd.files import write_json
 from vd.paper import PAPER
+from vd.workers import run_tasks
 
 if TYPE_CHECKING:
     from vd.evaluate.cli import EvalCfg
@@ -39,8 +41,10 @@ if TYPE_CHECKING:
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
 RESULT_FILE, PAGE_FILE = "paper.json", "paper.html"
+LOG_FILE = "log.txt"
+"""Progress of an evaluation that ran beside others."""
 # Settings that say where and how an evaluation runs, not what it measures.
-_NOT_MEASURED = ("output", "device", "json", "num_worlds")
+_NOT_MEASURED = ("output", "device", "json", "num_worlds", "jobs")
 
 
 @dataclass(frozen=True)
@@ -149,31 +153,31 @@ def run_suite(cfg: "EvalCfg", *, say: Callable[[str], object] | None = None) -> 
     result = SuiteResult(cfg.agent_names, object_groups(cfg.objects, quick=cfg.quick), conditions, cfg.quick)
     prints = {name: fingerprint(name) for name in result.policies}  # every name, before anything slow
     short = labels(result.policies)
-    jobs = [
-        (condition, name)
-        for condition in conditions
-        for name in result.policies
-        if name in result.students or not condition.scanned_goals
-    ]
-    started = time.monotonic()
-    try:
-        for number, (condition, name) in enumerate(jobs, start=1):
+    tasks = []
+    for condition in conditions:
+        for name in result.policies:
+            if condition.scanned_goals and name not in result.students:
+                continue
             one = settings(cfg, condition, name, result.objects[condition.objects])
             one = replace(one, output=cfg.output / condition.name / short[name].replace("/", "-"))
-            wanted = {"policy": prints[name]} | {
-                key: value for key, value in to_dict(one).items() if key not in _NOT_MEASURED
-            }
-            there = _read(one.output, wanted)
-            note = "done before" if there else result.objects[condition.objects].text
-            minutes = (time.monotonic() - started) / 60.0
-            say(f"[{number}/{len(jobs)}, {minutes:.1f} min] {condition.title}: {short[name]} ({note})")
-            try:
-                result.found[condition.name, name] = there or compare(one)
-            except RuntimeError as error:  # one world that flies off must not cost the others
-                result.failed[condition.name, name] = str(error)
-                say(f"  failed: {error}")
+            text = f"{condition.title}: {short[name]} ({result.objects[condition.objects].text})"
+            tasks.append(_Task(condition.name, name, one, prints[name], text))
+    progress = _Progress(say, len(tasks))
+    try:
+        waiting = []
+        for task in tasks:
+            there = _read(task.cfg.output, task.wanted)
+            if there is None:
+                waiting.append(task)
             else:
-                write_json(one.output / SETTINGS_FILE, wanted)
+                result.found[task.condition, task.policy] = there
+                progress.say(f"{task.text}, done before")
+        if cfg.jobs > 1:
+            _run_together(waiting, cfg, result, progress)
+        else:
+            for task in waiting:
+                progress.say(task.text)
+                _keep(task, _measure(task), result, progress)
     finally:
         if result.found:
             write_json(cfg.output / RESULT_FILE, result.summary())
@@ -181,8 +185,89 @@ def run_suite(cfg: "EvalCfg", *, say: Callable[[str], object] | None = None) -> 
     return result
 
 
+@dataclass(frozen=True)
+class _Task:
+    """One policy under one condition."""
+
+    condition: str
+    policy: str
+    cfg: "EvalCfg"
+    weights: str
+    """Fingerprint of the policy."""
+    text: str
+
+    @property
+    def wanted(self) -> dict[str, Any]:
+        """What an evaluation that can stand for it was run with."""
+        settings = {key: value for key, value in to_dict(self.cfg).items() if key not in _NOT_MEASURED}
+        return {"policy": self.weights} | settings
+
+
+class _Progress:
+    """Lines with the number of the evaluation and the minutes since the beginning."""
+
+    def __init__(self, say: Callable[[str], object], total: int):
+        self.line, self._total, self._number = say, total, 0
+        self._started = time.monotonic()
+
+    def say(self, text: str) -> None:
+        self._number += 1
+        minutes = (time.monotonic() - self._started) / 60.0
+        self.line(f"[{self._number}/{self._total}, {minutes:.1f} min] {text}")
+
+
+def _measure(task: _Task) -> str:
+    """Evaluate into the task's folder; returns why that failed, or nothing."""
+    try:
+        compare(task.cfg)
+    except RuntimeError as error:  # one world that flies off must not cost the others
+        return str(error)
+    return ""
+
+
+def _measure_apart(task: _Task) -> str:
+    """The same in a process of its own, whose progress goes to a file: several would mix."""
+    task.cfg.output.mkdir(parents=True, exist_ok=True)
+    with (task.cfg.output / LOG_FILE).open("w") as log, redirect_stdout(log), redirect_stderr(log):
+        try:
+            return _measure(task)
+        except (ValueError, OSError) as error:
+            return str(error)
+
+
+def _keep(task: _Task, failure: str, result: SuiteResult, progress: _Progress) -> None:
+    """Take what an evaluation left, and mark it as whole."""
+    if failure:
+        result.failed[task.condition, task.policy] = failure
+        progress.line(f"  failed: {failure}")
+        return
+    result.found[task.condition, task.policy] = Comparison.read(task.cfg.output / "eval.json")
+    write_json(task.cfg.output / SETTINGS_FILE, task.wanted)
+
+
+def _run_together(tasks: Sequence[_Task], cfg: "EvalCfg", result: SuiteResult, progress: _Progress) -> None:
+    """Evaluate in processes side by side, those of students first, which take longest."""
+    import warp as wp
+
+    devices = [cfg.device]
+    if cfg.device == "auto" and wp.is_cuda_available():
+        devices = [device.alias for device in wp.get_cuda_devices()]
+    order = sorted(tasks, key=lambda task: task.policy not in result.students)
+    spread = [
+        replace(task, cfg=replace(task.cfg, device=devices[number % len(devices)]))
+        for number, task in enumerate(order)
+    ]
+
+    def finished(task: _Task, failure: str | None, died: str) -> None:
+        progress.say(task.text)
+        _keep(task, died if failure is None else failure, result, progress)
+
+    run_tasks(_measure_apart, spread, finished, jobs=cfg.jobs, limit_s=float("inf"), gpu=True)
+
+
 def settings(cfg: "EvalCfg", condition: Condition, policy: str, objects: Objects) -> "EvalCfg":
     """The evaluation of one policy under a condition: what ``vd-eval`` would be told."""
+    episodes = condition.student_episodes if sees_clouds(policy) else condition.episodes
     return replace(
         cfg,
         suite=None,
@@ -190,7 +275,7 @@ def settings(cfg: "EvalCfg", condition: Condition, policy: str, objects: Objects
         policies=() if policy in BUILT_IN else (policy,),
         agent=policy if policy in BUILT_IN else None,
         objects=tuple(f"{condition.objects}={item}" for item in objects.sets),
-        episodes=min(condition.episodes, QUICK_EPISODES) if cfg.quick else condition.episodes,
+        episodes=min(episodes, QUICK_EPISODES) if cfg.quick else episodes,
         at_rest=False,
         no_at_rest=True,  # the paper's objects fall into the hand, whatever a policy was trained with
         in_air=condition.in_air,

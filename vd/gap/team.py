@@ -2,7 +2,6 @@
 
 import copy
 import multiprocessing
-import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -10,7 +9,6 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPool
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import connection
 from typing import Any
 
 import warp as wp
@@ -22,6 +20,7 @@ from vd.gap.fit import JointProblem
 from vd.gap.jitter import CALLS
 from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
+from vd.workers import end_with_parent
 
 Call = tuple[str, dict[str, Any]]
 SHORT_S = 0.1
@@ -127,17 +126,9 @@ _bench: Bench | None = None
 
 def _start(bench: Bench) -> None:
     global _bench
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     wp.config.log_level = wp.LOG_WARNING
     _bench = bench
-
-
-def _end_with_parent() -> None:
-    """End this process once its parent has ended: one that is killed has no time to tell its workers."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
 
 
 def _work(spec: JointSpec, call: Call) -> Answer:

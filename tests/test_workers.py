@@ -5,7 +5,7 @@ import os
 import time
 from pathlib import Path
 
-from vd.bench.workers import SINGLE, run_tasks
+from vd.workers import SINGLE, run_tasks
 
 
 def work(task):

@@ -112,7 +112,7 @@ def run_tasks(
 
 def _serve(work: Callable[[Any], Any], pipe: connection.Connection) -> None:
     """A worker: tasks in, results out, until the other end closes."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=end_with_parent, daemon=True).start()
     try:
         while True:
             pipe.send(work(pipe.recv()))
@@ -120,8 +120,8 @@ def _serve(work: Callable[[Any], Any], pipe: connection.Connection) -> None:
         return
 
 
-def _end_with_parent() -> None:
-    """End this process in the middle of its task once its parent is gone: nobody waits for the result."""
+def end_with_parent() -> None:
+    """End this process once its parent is gone: one that is killed has no time to tell its workers."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
