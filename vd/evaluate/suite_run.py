@@ -272,6 +272,7 @@ def settings(cfg: "EvalCfg", condition: Condition, policy: str, objects: Objects
         cfg,
         suite=None,
         quick=False,
+        jobs=1,
         policies=() if policy in BUILT_IN else (policy,),
         agent=policy if policy in BUILT_IN else None,
         objects=tuple(f"{condition.objects}={item}" for item in objects.sets),
