@@ -3,7 +3,8 @@
 Reading a policy needs torch only, no simulator and no rsl-rl, and executes nothing in the file.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -90,6 +91,7 @@ class TrainedPolicy:
         iteration: Iterations it was trained for.
         env_steps: Control steps it was trained for.
         device: Torch device.
+        critic: State of rsl-rl's critic, which sees what the actor does; None: there is none.
 
     Attributes:
         hand: Name of the hand it moves, as ``task`` says ("" if it does not).
@@ -106,12 +108,32 @@ class TrainedPolicy:
         iteration: int = 0,
         env_steps: int = 0,
         device: str = "cpu",
+        critic: dict[str, torch.Tensor] | None = None,
     ) -> None:
         self.spec, self.task, self.iteration, self.env_steps = spec, task, iteration, env_steps
         self.hand = str(task.get("hand", ""))
         self.num_observations, self.num_actions = spec.num_observations, spec.num_actions
         self.weights = weights
         self.network = MeanAction(spec, weights).to(device)
+        self._critic, self._device = critic, device
+
+    @cached_property
+    def _value(self) -> MeanAction:
+        if self._critic is None:
+            raise ValueError(
+                "the policy has no critic; export it again from a checkpoint of its run (vd-train export)"
+            )
+        spec = replace(self.spec, num_actions=1, distribution="gaussian")
+        return MeanAction(spec, self._critic).to(self._device)
+
+    def value(self, observation: torch.Tensor) -> torch.Tensor:
+        """The return that the critic expects [N] from observations [N, O], in the training's rewards.
+
+        Raises:
+            ValueError: The file has no critic.
+        """
+        with torch.no_grad():
+            return self._value(observation)[:, 0]
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """Mean action.
@@ -202,6 +224,7 @@ def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
             iteration=int(state["iter"]),
             env_steps=int(state["env_steps"]),
             device=device,
+            critic=state.get("critic_state_dict"),
         )
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: the weights do not fit the network it describes ({error})") from error

@@ -8,6 +8,9 @@ from vd.aim import AimCfg
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
+View = Literal["world", "goal", "mirrored", "either"]
+"""What a policy sees its goals in, see :attr:`ObservationCfg.view`."""
+
 
 @dataclass(frozen=True)
 class ActionCfg:
@@ -86,16 +89,17 @@ class ObservationCfg:
     """none: nothing of the object's shape, as in the paper. full: the vector from each fingertip to the
     nearest point of the surface, and how far the object extends in 9 directions for each finger, up and
     down, now and at the goal; exact, privileged."""
-    view: Literal["world", "goal", "mirrored"] = "world"
+    view: View = "world"
     """world: one frame for all goals, as in the paper. goal: for each goal the scene is seen turned about the
     vertical from finger to finger, and the fingers renamed, so that the axis of the wanted rotation lies in
     one sector: an F-th of the goals to learn. The fingers must be spaced evenly. mirrored: in the mirror too,
     where the wanted rotation would be clockwise from above: half of that. The hand must be its own mirror
-    image, as dclaw3 is; of dclaw4 all fingers lean the same way round."""
+    image, as dclaw3 is; of dclaw4 all fingers lean the same way round. either: as goal, and the same views in
+    the mirror are there for who looks twice (vd-eval --second-view)."""
 
     def views(self, fingers: int) -> int:
         """Views in which a hand of so many fingers sees its goals; 0: it sees the world as it is."""
-        return {"world": 0, "goal": fingers, "mirrored": 2 * fingers}[self.view]
+        return {"world": 0, "goal": fingers, "mirrored": 2 * fingers, "either": 2 * fingers}[self.view]
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from vd.envs.cfg import ObservationCfg, View
 from vd.kernels.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER, teacher_observation_slices
 from vd.kernels.shapes import extent_directions, shape_observation_slices
 from vd.kernels.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
@@ -51,12 +52,12 @@ class ViewTables:
     """The direction near which a view has the axis of the wanted rotation, as it is in the world [V, 3]."""
 
 
-def view_tables(env: "ReorientEnv", *, mirrored: bool = False) -> ViewTables:
+def view_tables(env: "ReorientEnv", view: View) -> ViewTables:
     """The views of an environment's hand and observation.
 
     Args:
         env: The environment.
-        mirrored: Whether to have those in the mirror too, after the others.
+        view: What goals are seen in (``ObservationCfg.view``); views in the mirror come after the others.
 
     Raises:
         ValueError: The fingers are not spaced evenly about the vertical, or the hand is not its own mirror
@@ -64,10 +65,10 @@ def view_tables(env: "ReorientEnv", *, mirrored: bool = False) -> ViewTables:
     """
     fingers, tips = env.num_fingers, _tips(env, np.zeros(JOINTS_PER_FINGER))
     turns = [_turn(step, fingers) for step in range(fingers)]
-    direction = SECTOR
-    if mirrored:
-        mirror, direction = _mirror(env, tips), SECTOR + UP
+    if ObservationCfg(view=view).views(fingers) > fingers:
+        mirror = _mirror(env, tips)
         turns += [turn @ mirror for turn in turns]
+    direction = SECTOR + UP if view == "mirrored" else SECTOR
     maps = np.stack([_observation_map(tips, turn, sees_shape=env.sees_shape) for turn in turns])
     source = np.argsort(-np.abs(maps), axis=2, kind="stable")[:, :, :TERMS]
     order = [_joint_source(_finger_source(tips, turn.T)) for turn in turns]
@@ -86,6 +87,7 @@ class Views:
     """The view of each world of ``env``, and what the policy sees and does in it.
 
     Attributes:
+        tables: What they are made of.
         view: View of each world, from 0, shape [N].
         observation: Observation in the world frame, shape [N, O]; views of it go to ``env.observation``.
     """
@@ -98,13 +100,14 @@ class Views:
         """
         self._env = env
         device, worlds = env.device, env.num_worlds
-        tables = view_tables(env, mirrored=env.cfg.observation.view == "mirrored")
+        tables = self.tables = view_tables(env, env.cfg.observation.view)
+        chosen_from = env.num_fingers if env.cfg.observation.view == "either" else len(tables.sector)
         self._source = wp.array(tables.source, dtype=wp.int32, device=device)
         self._factor = wp.array(tables.factor, dtype=float, device=device)
         self._joints = wp.array(tables.joints, dtype=wp.int32, device=device)
         self._offset = wp.array(tables.offset, dtype=float, device=device)
         self._sign = wp.array(tables.sign, dtype=float, device=device)
-        self._sector = wp.array(tables.sector, dtype=wp.vec3, device=device)
+        self._sector = wp.array(tables.sector[:chosen_from], dtype=wp.vec3, device=device)
         self._action = wp.zeros((worlds, env.num_actions), dtype=float, device=device)
         self.view = wp.zeros(worlds, dtype=wp.int32, device=device)
         self.observation = wp.zeros((worlds, env.num_observations), dtype=float, device=device)
@@ -189,7 +192,10 @@ def _mirror(env: "ReorientEnv", tips: np.ndarray) -> np.ndarray:
     """
     across = np.array([-tips[0, 1], tips[0, 0], 0.0]) / np.linalg.norm(tips[0, :2])
     mirror = np.eye(3) - 2.0 * np.outer(across, across)
-    refusal = f"{env.cfg.hand} is not its own mirror image; set observation.view to goal, which turns it only"
+    refusal = (
+        f"{env.cfg.hand} is not its own mirror image; set observation.view to goal, which turns it only, "
+        "and do without --second-view"
+    )
     try:
         source = _finger_source(tips, mirror)
     except ValueError as error:

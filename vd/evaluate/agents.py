@@ -195,6 +195,7 @@ def task_for(
     nudge: bool = False,
     explore: bool = False,
     aim: bool = False,
+    second_view: bool = False,
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
 
@@ -219,11 +220,22 @@ def task_for(
         nudge: Whether hands that are stuck are nudged.
         explore: Whether actions have noise while the goal is far.
         aim: Whether it is told to turn past a goal that is near.
+        second_view: Whether a teacher looks twice at goals (:mod:`vd.evaluate.second_view`); others do not.
+
+    Raises:
+        ValueError: The teacher is not one of views that can be looked at in the mirror.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     if is_saved_student(policy):
         # A student, which does not look at its teacher's observation.
         base = replace(base, observation=ObservationCfg())
+    elif second_view and policy is not None:
+        if base.observation.view != "goal":
+            raise ValueError(
+                f"--second-view: this policy sees its goals in observation.view {base.observation.view}; "
+                "the second view is for policies of goal, such as dclaw3-table"
+            )
+        base = replace(base, observation=replace(base.observation, view="either"))
     return replace(
         base,
         hand=hand or base.hand,

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -32,6 +32,7 @@ OF_THE_SUITE = (
     "nudge",
     "explore",
     "aim",
+    "second_view",
     "table_friction",
     "scanned_goals",
     "sees",
@@ -102,6 +103,9 @@ class EvalCfg:
     """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
     """Aim past the goal while the object is near it: more come within 0.1 rad. Some students do so anyway."""
+    second_view: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Where a teacher has not come to its goal in 3 s, look at it in the mirror too, once a second, and go on
+    in the view of which its critic expects more. For hands that are their own mirror image: dclaw3."""
     scanned_goals: tyro.conf.FlagCreatePairsOff[bool] = False
     """Students know shapes by scans: points with 4 mm of noise, a fifth missing, a surface through them."""
     sees: Literal["auto", "complete", "rendered"] = "auto"
@@ -279,6 +283,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
     from vd.evaluate.report import write_report
     from vd.evaluate.result import Protocol, summarise
     from vd.evaluate.rollout import collect, collect_drawn, draw_starts_and_goals
+    from vd.evaluate.second_view import SecondView
 
     device = resolve_device(cfg.device)
     (name,) = cfg.agent_names
@@ -300,11 +305,14 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         nudge=cfg.nudge,
         explore=cfg.explore,
         aim=cfg.aim,
+        second_view=cfg.second_view,
     )
     check_bundle(name, task)
     print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
     env = ReorientEnv(task, device)
-    policy = trained or built_in(name, env.num_actions, seed=cfg.seed, device=device)
+    policy: Any = trained or built_in(name, env.num_actions, seed=cfg.seed, device=device)
+    if cfg.second_view and trained is not None:
+        policy = SecondView(env, trained)
     rounds = math.ceil(cfg.episodes / (env.num_worlds // count))
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
     with tqdm(total=rounds * env.max_episode_steps, unit="step", desc="vd-eval", mininterval=refresh) as bar:
@@ -343,6 +351,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         nudge=cfg.nudge,
         explore=cfg.explore,
         aim=cfg.aim,
+        second_view=cfg.second_view,
     )
     result = summarise(
         protocol,

@@ -107,6 +107,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             nudge=cfg.nudge,
             explore=cfg.explore,
             aim=cfg.aim or (is_saved_student(policy) and policy.spec.network.aim.enabled),
+            second_view=cfg.second_view and kind == "teacher",
         )
         index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
@@ -150,6 +151,7 @@ def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int
         nudge=cfg.nudge,
         explore=cfg.explore,
         aim=cfg.aim,
+        second_view=cfg.second_view,
     )
     if cfg.table_friction is not None:
         task = replace(task, table_friction=cfg.table_friction)
@@ -173,6 +175,10 @@ def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str)
     if name in BUILT_IN:
         return built_in(name, env.num_actions, seed=cfg.seed, device=device), name, "nothing", StoppingRule
     if isinstance(policy, TrainedPolicy):
+        if cfg.second_view:
+            from vd.evaluate.second_view import SecondView
+
+            return SecondView(env, policy), "teacher", "state", StoppingRule
         return policy, "teacher", "state", StoppingRule
     from vd.evaluate.student import StudentActor
 

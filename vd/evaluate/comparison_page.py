@@ -301,7 +301,8 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
         if row.stopped_by == "prediction" or row.kind == "teacher":
             rule = f"distance {row.rule.distance_rad:.3g} rad, action norm {row.rule.action_norm:.3g}"
             aims = ", aims past goals that are near" if row.result.protocol.aim else ""
-            rows.append((f"{row.policy}, {row.group}", f"sees {row.sees}, stops below {rule}{aims}"))
+            looks = ", looks twice" if row.result.protocol.second_view else ""
+            rows.append((f"{row.policy}, {row.group}", f"sees {row.sees}, stops below {rule}{aims}{looks}"))
     return rows + list(comparison.software.items())
 
 

@@ -74,6 +74,8 @@ class PlayCfg:
     """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
     """Aim past the goal while the object is near it: more come within 0.1 rad. Some students do so anyway."""
+    second_view: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Where a teacher has not come to its goal in 3 s, look at it in the mirror too (vd-eval --help)."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float | None = None
@@ -278,6 +280,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         nudge=cfg.nudge,
         explore=cfg.explore,
         aim=cfg.aim,
+        second_view=cfg.second_view,
     )
     if cfg.in_air:
         task = replace(task, table=TableCfg(away_share=1.0))
@@ -287,6 +290,10 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         from vd.evaluate.student import StudentActor
 
         return env, StudentActor(env, trained, seed=cfg.seed), device
+    if cfg.second_view and trained is not None:
+        from vd.evaluate.second_view import SecondView
+
+        return env, SecondView(env, trained), device
     return env, trained, device
 
 

@@ -57,10 +57,14 @@ class ViewMaps(nn.Module):
 
     def choose(self, observation: torch.Tensor) -> torch.Tensor:
         """Views [..] of observations [.., O]: the axis of the wanted rotation is in their sector."""
+        return self.nearness(observation).argmax(dim=-1)
+
+    def nearness(self, observation: torch.Tensor) -> torch.Tensor:
+        """How near to the middle of each view's sector that axis is [.., F], the larger the nearer."""
         turn = observation[..., self._turn]
         # Observed is the object from the goal; wanted is the other way, by less than half a turn.
         axis = torch.where(turn[..., 3:] < 0.0, turn[..., :3], -turn[..., :3])
-        return (axis @ self.sector.T).argmax(dim=-1)
+        return axis @ self.sector.T
 
     def take(self, observation: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
         """Observations [.., O] as views [..] show them."""
