@@ -321,8 +321,8 @@ def _dagger(
     labels: Any = WorldOrder(teacher, simulation)
     state = student.state
     if state is not None:
-        view = trained_task(teacher).observation.view
-        tables = view_tables(simulation, view) if state.views is not None else None
+        seen_in = trained_task(teacher).observation.view
+        tables = view_tables(simulation, seen_in) if state.views is not None else None
         if fresh and state.adopt(teacher.network, tables):
             # What is added to the actions of another teacher's layers is of no use to these.
             student.forget_correction()

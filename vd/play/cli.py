@@ -258,6 +258,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.agents import check_bundle, is_saved_student, open_policy, task_for
     from vd.evaluate.cli import resolve_device
+    from vd.policy import TrainedPolicy
 
     device = resolve_device(cfg.device)
     count = len(load_set(list(cfg.objects)))
@@ -290,7 +291,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         from vd.evaluate.student import StudentActor
 
         return env, StudentActor(env, trained, seed=cfg.seed), device
-    if cfg.second_view and trained is not None:
+    if cfg.second_view and isinstance(trained, TrainedPolicy):
         from vd.evaluate.second_view import SecondView
 
         return env, SecondView(env, trained), device
