@@ -95,11 +95,11 @@ class ObservationCfg:
     one sector: an F-th of the goals to learn. The fingers must be spaced evenly. mirrored: in the mirror too,
     where the wanted rotation would be clockwise from above: half of that. The hand must be its own mirror
     image, as dclaw3 is; of dclaw4 all fingers lean the same way round. either: as goal, and the same views in
-    the mirror are there for who looks twice (vd-eval --second-view)."""
+    the mirror, if the hand has them, are there for who looks twice (vd-eval --second-view)."""
 
     def views(self, fingers: int) -> int:
         """Views in which a hand of so many fingers sees its goals; 0: it sees the world as it is."""
-        return {"world": 0, "goal": fingers, "mirrored": 2 * fingers, "either": 2 * fingers}[self.view]
+        return {"world": 0, "goal": fingers, "mirrored": 2 * fingers, "either": fingers}[self.view]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from vd.envs.cfg import ObservationCfg, View
+from vd.envs.cfg import View
 from vd.kernels.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER, teacher_observation_slices
 from vd.kernels.shapes import extent_directions, shape_observation_slices
 from vd.kernels.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
@@ -65,8 +65,13 @@ def view_tables(env: "ReorientEnv", view: View) -> ViewTables:
     """
     fingers, tips = env.num_fingers, _tips(env, np.zeros(JOINTS_PER_FINGER))
     turns = [_turn(step, fingers) for step in range(fingers)]
-    if ObservationCfg(view=view).views(fingers) > fingers:
-        mirror = _mirror(env, tips)
+    try:
+        mirror = _mirror(env, tips) if view in ("mirrored", "either") else None
+    except ValueError:
+        if view == "mirrored":
+            raise
+        mirror = None  # either: those that there are
+    if mirror is not None:
         turns += [turn @ mirror for turn in turns]
     direction = SECTOR + UP if view == "mirrored" else SECTOR
     maps = np.stack([_observation_map(tips, turn, sees_shape=env.sees_shape) for turn in turns])
@@ -101,7 +106,7 @@ class Views:
         self._env = env
         device, worlds = env.device, env.num_worlds
         tables = self.tables = view_tables(env, env.cfg.observation.view)
-        chosen_from = env.num_fingers if env.cfg.observation.view == "either" else len(tables.sector)
+        chosen_from = env.cfg.observation.views(env.num_fingers)
         self._source = wp.array(tables.source, dtype=wp.int32, device=device)
         self._factor = wp.array(tables.factor, dtype=float, device=device)
         self._joints = wp.array(tables.joints, dtype=wp.int32, device=device)
@@ -192,10 +197,7 @@ def _mirror(env: "ReorientEnv", tips: np.ndarray) -> np.ndarray:
     """
     across = np.array([-tips[0, 1], tips[0, 0], 0.0]) / np.linalg.norm(tips[0, :2])
     mirror = np.eye(3) - 2.0 * np.outer(across, across)
-    refusal = (
-        f"{env.cfg.hand} is not its own mirror image; set observation.view to goal, which turns it only, "
-        "and do without --second-view"
-    )
+    refusal = f"{env.cfg.hand} is not its own mirror image; set observation.view to goal, which turns it only"
     try:
         source = _finger_source(tips, mirror)
     except ValueError as error:

@@ -223,7 +223,7 @@ def task_for(
         second_view: Whether a teacher looks twice at goals (:mod:`vd.evaluate.second_view`); others do not.
 
     Raises:
-        ValueError: The teacher is not one of views that can be looked at in the mirror.
+        ValueError: The teacher does not see its goals in views.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     if is_saved_student(policy):

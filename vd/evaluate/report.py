@@ -121,7 +121,7 @@ def task_line(result: EvalResult) -> str:
         + ("; stuck hands are nudged" if protocol.nudge else "")
         + ("; actions have noise far from the goal" if protocol.explore else "")
         + ("; aimed past goals that are near" if protocol.aim else "")
-        + ("; goals not reached are looked at in the mirror too" if protocol.second_view else "")
+        + ("; goals not reached are looked at in other views" if protocol.second_view else "")
     )
 
 

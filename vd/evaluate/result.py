@@ -106,7 +106,7 @@ class Protocol:
     aim: bool = False
     """The policy is told to turn past a goal that is near."""
     second_view: bool = False
-    """A goal that is not reached is looked at in the mirror too (:mod:`vd.evaluate.second_view`)."""
+    """A goal that is not reached is looked at in other views (:mod:`vd.evaluate.second_view`)."""
 
     @property
     def hand_name(self) -> str:

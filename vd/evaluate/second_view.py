@@ -1,7 +1,8 @@
-"""A teacher that has not come to its goal looks at it in the mirror too, and asks its critic which is better.
+"""A teacher that has not come to its goal looks at it from another side, and asks its critic which is better.
 
-A policy of views (``observation.view`` goal) knows a scene and its mirror image as two scenes: where it is
-stuck in one it may not be in the other, and what its critic expects of each says where to go on.
+A policy of views (``observation.view`` goal) knows a scene that is turned from finger to finger, or seen in
+the mirror, as another scene: where it is stuck in one it may not be in the other, and what its critic expects
+of each says where to go on.
 """
 
 from typing import TYPE_CHECKING
@@ -72,10 +73,14 @@ class SecondView:
     def _better(self, world: torch.Tensor) -> torch.Tensor:
         """Views [M] for observations in the world frame [M, O].
 
-        Of the hand's own views and of those in the mirror it is the one in whose sector the goal lies now.
+        To choose from are, of a hand that is its own mirror image, the view in whose sector the goal lies now
+        and that in the mirror; else all views.
         """
-        fingers = len(self._maps) // 2
-        own, mirrored = self._maps.nearness(world).unflatten(-1, (2, fingers)).argmax(dim=-1).unbind(dim=-1)
-        views = torch.stack((own, mirrored + fingers))
+        fingers = self._env.num_fingers
+        if len(self._maps) > fingers:
+            near = self._maps.nearness(world).unflatten(-1, (2, fingers)).argmax(dim=-1)
+            views = torch.stack((near[:, 0], near[:, 1] + fingers))
+        else:
+            views = torch.arange(fingers, device=world.device)[:, None].expand(-1, len(world))
         expected = torch.stack([self._policy.value(self._maps.take(world, view)) for view in views])
         return views.gather(0, expected.argmax(dim=0, keepdim=True))[0]

@@ -75,7 +75,7 @@ class PlayCfg:
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
     """Aim past the goal while the object is near it: more come within 0.1 rad. Some students do so anyway."""
     second_view: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Where a teacher has not come to its goal in 3 s, look at it in the mirror too (vd-eval --help)."""
+    """Where a teacher has not come to its goal in 3 s, look at it in other views (vd-eval --help)."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float | None = None
