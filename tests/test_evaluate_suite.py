@@ -102,6 +102,17 @@ def test_the_conditions_are_the_papers():
     assert cfg.stop_tolerance == PAPER.success.rotation_rad
 
 
+def test_a_second_view_is_for_teachers_of_views_alone():
+    condition, objects = CONDITIONS[0], suite_run.Objects(("x",), "x", False)
+    names = ("dclaw3-table", "dclaw3-student", "dclaw4-cube", "zero")
+    looks = [
+        suite_run.settings(EvalCfg(second_view=asked), condition, name, objects).second_view
+        for asked in (False, True)
+        for name in names
+    ]
+    assert looks == [False] * 4 + [True, False, False, False]
+
+
 def test_everything_is_run_once_and_a_second_call_runs_nothing(tmp_path, asked):
     first = run(suite(tmp_path))
     expected = [(c.name, TEACHER) for c in CONDITIONS if not c.scanned_goals]
@@ -267,6 +278,7 @@ def test_installed_policies_are_taken_where_none_is_named():
         (["dclaw4-cube", "--table-friction", "0.1", "--randomise"], "exclude each other"),
         (["dclaw4-cube", "--table-friction", "-1"], "must not be negative"),
         (["nobody", "--suite", "paper"], "no policy at nobody"),
+        (["dclaw3-student", "--second-view"], "--second-view is for teachers that see their goals in views"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(flags, message, capsys, tmp_path):

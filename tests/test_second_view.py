@@ -166,7 +166,7 @@ def test_a_policy_without_a_critic_or_an_environment_of_one_view_is_refused(env)
 
 def test_the_command_refuses_policies_that_have_no_second_view(tmp_path, capsys):
     assert cli.main(["dclaw4-cube", "--second-view", "--device", "cpu", "--output", str(tmp_path)]) == 1
-    assert "--second-view: this policy sees its goals in observation.view world" in capsys.readouterr().err
+    assert "dclaw4-cube has no other view" in capsys.readouterr().err
 
 
 def test_an_evaluation_says_that_it_looked_twice(tmp_path):

@@ -113,6 +113,18 @@ def sees_clouds(name: str) -> bool:
     return is_student(path)
 
 
+def has_second_view(name: str) -> bool:
+    """Whether :mod:`vd.evaluate.second_view` is for it: a teacher that sees its goals in views.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+        ValueError: The file is no policy.
+    """
+    if name in BUILT_IN or sees_clouds(name):
+        return False
+    return trained_task(open_policy(name, "cpu")).observation.view == "goal"
+
+
 def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
     """:func:`open_policy` where only a teacher, which sees the simulator's state, will do.
 

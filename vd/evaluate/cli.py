@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from vd.evaluate.agents import LAYER_HELP, SHIPPED_POLICIES, episode_limit_s, sees_clouds, start_at_rest
+from vd.evaluate.agents import (
+    LAYER_HELP,
+    SHIPPED_POLICIES,
+    episode_limit_s,
+    has_second_view,
+    sees_clouds,
+    start_at_rest,
+)
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -32,7 +39,6 @@ OF_THE_SUITE = (
     "nudge",
     "explore",
     "aim",
-    "second_view",
     "table_friction",
     "scanned_goals",
     "sees",
@@ -198,6 +204,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         cfg.validate()
         names = cfg.agent_names  # before anything slow is imported
+        if cfg.second_view and not any(map(has_second_view, names)):
+            raise ValueError(
+                "--second-view is for teachers that see their goals in views (observation.view goal), as "
+                f"dclaw3-table does; {', '.join(names)} has no other view, or no critic to ask"
+            )
         if cfg.suite is not None:
             return _run_suite(cfg)
         traced = cfg.in_air or cfg.table_friction is not None or cfg.scanned_goals

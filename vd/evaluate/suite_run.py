@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vd.config import to_dict
-from vd.evaluate.agents import BUILT_IN, find_policy, sees_clouds
+from vd.evaluate.agents import BUILT_IN, find_policy, has_second_view, sees_clouds
 from vd.evaluate.compare import compare, parse_groups
 from vd.evaluate.comparison import Comparison
 from vd.evaluate.comparison_page import labels
@@ -278,6 +278,7 @@ def settings(cfg: "EvalCfg", condition: Condition, policy: str, objects: Objects
         objects=tuple(f"{condition.objects}={item}" for item in objects.sets),
         episodes=min(episodes, QUICK_EPISODES) if cfg.quick else episodes,
         at_rest=False,
+        second_view=cfg.second_view and has_second_view(policy),
         no_at_rest=True,  # the paper's objects fall into the hand, whatever a policy was trained with
         in_air=condition.in_air,
         table_friction=condition.table_friction,
