@@ -169,6 +169,18 @@ def test_the_command_refuses_policies_that_have_no_second_view(tmp_path, capsys)
     assert "dclaw4-cube has no other view" in capsys.readouterr().err
 
 
+def test_neither_a_student_in_the_viewer_nor_a_training_looks_twice(tmp_path, capsys):
+    from vd.play.cli import main as play
+    from vd.train.cli import main as train
+
+    picture = ["--video", str(tmp_path / "one.png"), "--seconds", "0.2", "--device", "cpu"]
+    assert play(["dclaw3-student", "--second-view", *picture]) == 1
+    assert "--second-view is for teachers" in capsys.readouterr().err
+    flags = ["--preset", "cpu-demo", "--run-dir", str(tmp_path / "run"), "--device", "cpu"]
+    assert train(["teacher", *flags, "--env.observation.view", "either"]) == 1
+    assert "train with goal" in capsys.readouterr().err
+
+
 def test_an_evaluation_says_that_it_looked_twice(tmp_path):
     arguments = ["dclaw3-table", "--objects", "cuboid", "--episodes", "2", "--device", "cpu", "--second-view"]
     assert cli.main([*arguments, "--episode-s", "0.5", "--output", str(tmp_path)]) == 0

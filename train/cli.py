@@ -173,6 +173,8 @@ def parse_teacher(arguments: Sequence[str]) -> TeacherCfg:
     cfg = tyro.cli(
         TeacherCfg, args=arguments, default=base, prog="vd-train teacher", description=TEACHER_HELP
     )
+    if cfg.env.observation.view == "either":
+        raise ValueError("env.observation.view either is of evaluations; train with goal, which it looks at")
     if cfg.focus_on is None:
         return cfg
     # What the run needs of the file is kept with it.

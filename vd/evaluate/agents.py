@@ -1,5 +1,6 @@
 """Agents by name or file, and the task they act in: shared by vd-eval and vd-play."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -123,6 +124,20 @@ def has_second_view(name: str) -> bool:
     if name in BUILT_IN or sees_clouds(name):
         return False
     return trained_task(open_policy(name, "cpu")).observation.view == "goal"
+
+
+def check_second_view(names: Sequence[str]) -> None:
+    """Refuse ``--second-view`` where none of the policies has one.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+        ValueError: None has, or a file is no policy.
+    """
+    if not any(map(has_second_view, names)):
+        raise ValueError(
+            "--second-view is for teachers that see their goals in views (observation.view goal), as "
+            f"dclaw3-table does; {', '.join(names)} has no other view, or no critic to ask"
+        )
 
 
 def open_teacher(name: str, device: str) -> "TrainedPolicy | None":

@@ -13,8 +13,8 @@ import tyro
 from vd.evaluate.agents import (
     LAYER_HELP,
     SHIPPED_POLICIES,
+    check_second_view,
     episode_limit_s,
-    has_second_view,
     sees_clouds,
     start_at_rest,
 )
@@ -204,11 +204,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         cfg.validate()
         names = cfg.agent_names  # before anything slow is imported
-        if cfg.second_view and not any(map(has_second_view, names)):
-            raise ValueError(
-                "--second-view is for teachers that see their goals in views (observation.view goal), as "
-                f"dclaw3-table does; {', '.join(names)} has no other view, or no critic to ask"
-            )
+        if cfg.second_view:
+            check_second_view(names)
         if cfg.suite is not None:
             return _run_suite(cfg)
         traced = cfg.in_air or cfg.table_friction is not None or cfg.scanned_goals

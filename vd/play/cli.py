@@ -256,7 +256,13 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
     from vd.assets_usd.objects.model import load_set
     from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.agents import check_bundle, is_saved_student, open_policy, task_for
+    from vd.evaluate.agents import (
+        check_bundle,
+        check_second_view,
+        is_saved_student,
+        open_policy,
+        task_for,
+    )
     from vd.evaluate.cli import resolve_device
     from vd.policy import TrainedPolicy
 
@@ -264,6 +270,8 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
     count = len(load_set(list(cfg.objects)))
     if device == "cpu" and count > FAST_WORLDS_CPU:
         print(f"vd-play: {count} objects are {count} worlds, slow on a CPU; name fewer with --objects")
+    if cfg.second_view:
+        check_second_view([cfg.agent_name])
     trained = open_policy(cfg.agent_name, device)
     task = task_for(
         trained,
