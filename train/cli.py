@@ -214,6 +214,7 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     # A line for each of some hundred kernels would scroll the progress away.
     wp.config.log_level = wp.LOG_WARNING
     from vd.envs.reorient import ReorientEnv
+    from vd.evaluate.second_view import with_second_view
     from vd.sim.cfg import coarser
     from vd.train.runner import TeacherRunner
     from vd.train.vec_env import ReorientVecEnv
@@ -230,9 +231,12 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     # TF32 halves the update on a GPU; the simulator is not touched by it.
     torch.set_float32_matmul_precision("high")
     physics = coarser(cfg.env.sim) if cfg.run.coarse_physics else cfg.env.sim
-    simulation = ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank, sim=physics), device)
+    seen = with_second_view(cfg.env.observation) if cfg.second_view else cfg.env.observation
+    simulation = ReorientEnv(
+        replace(cfg.env, seed=cfg.env.seed + rank, sim=physics, observation=seen), device
+    )
     simulation.dump_dir = cfg.run.run_dir
-    env = ReorientVecEnv(simulation)
+    env = ReorientVecEnv(simulation, second_view=cfg.second_view)
     deadline = None
     if cfg.run.max_minutes is not None:
         deadline = (time.monotonic() if started is None else started) + 60.0 * cfg.run.max_minutes

@@ -34,7 +34,8 @@ class PrecompileCfg:
 
     All other flags are those of the training, vd-train teacher, with its own objects: kernels depend on
     them. On the machine that trains, with the same versions of Warp, Newton and this package, name the
-    folder: WARP_CACHE_PATH=FOLDER vd-train teacher ...
+    folder: WARP_CACHE_PATH=FOLDER vd-train teacher ... Kernels of one version of Warp lie in a folder of
+    its name.
     """
 
     output: Annotated[Path, tyro.conf.Positional]
@@ -73,7 +74,7 @@ def compiling(folder: Path, arch: int, *, ptx: bool = False) -> Iterator[list[st
         before = module.options["block_dim"]
         module.options["block_dim"] = block  # what is compiled, and its hash, depend on it
         try:
-            place = folder / module.get_module_identifier(block)
+            place = folder / wp.config.version / module.get_module_identifier(block)
             wp.compile_aot_module(module, arch=arch, module_dir=place, use_ptx=ptx)
         finally:
             module.options["block_dim"] = before

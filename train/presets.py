@@ -48,6 +48,10 @@ class TeacherCfg:
     """More worlds for the objects that a policy fails with: eval.json of a vd-eval on the objects
     trained on. Its success rates become --env.focus.success, so that the file is not needed again; see
     --env.focus.share."""
+    second_view: bool = False
+    """Look again at goals that are not reached in 3 s, once a second, in a view that is drawn, of those that
+    vd-eval --second-view chooses from: more is learned there of what is stuck. For policies that see their
+    goals in views (--env.observation.view goal or mirrored)."""
     smoke: bool = False
     """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)

@@ -9,6 +9,7 @@ from tensordict import TensorDict
 
 from vd.config import to_dict
 from vd.envs.state import saved_stage
+from vd.evaluate.second_view import OtherViews
 from vd.paper import PAPER
 
 OBSERVATION_GROUP = "policy"
@@ -33,6 +34,9 @@ class ReorientVecEnv(VecEnv):
 
     Args:
         env: The environment, already reset.
+        second_view: Look again at goals that are not reached in time, in a view that is drawn
+            (:mod:`vd.evaluate.second_view`, where the critic chooses): what is stuck in one view is then
+            learned from in the others too.
 
     Attributes:
         num_envs: Worlds N.
@@ -42,8 +46,9 @@ class ReorientVecEnv(VecEnv):
         cfg: The environment's configuration as a dictionary.
     """
 
-    def __init__(self, env: Any) -> None:
+    def __init__(self, env: Any, *, second_view: bool = False) -> None:
         self.env = env
+        self._others = OtherViews(env) if second_view else None
         self.num_envs = env.num_worlds
         self.num_actions = env.num_actions
         self.max_episode_length = env.max_episode_steps
@@ -98,6 +103,8 @@ class ReorientVecEnv(VecEnv):
         """
         self._action.copy_(actions)
         self.env.step(self.env.action)
+        if self._others is not None:
+            self._look_again(self._others)
         reached = self._success > 0
         dropped = (self._fell > 0) & ~reached
         timed_out = (self._timed_out > 0) & ~reached & ~dropped
@@ -120,6 +127,15 @@ class ReorientVecEnv(VecEnv):
             done.long(),
             {"time_outs": timed_out.float(), "log": log},
         )
+
+    def _look_again(self, others: OtherViews) -> None:
+        """Draw a view for the worlds that are due, and observe in it; nothing waits on the host."""
+        views = others.of(wp.to_torch(self.env.world_observation))
+        drawn = torch.randint(len(views), views.shape[1:], device=views.device)
+        view = wp.to_torch(self.env.views.view)
+        chosen = views.gather(0, drawn[None])[0].to(view.dtype)
+        view.copy_(torch.where(others.due(), chosen, view))
+        self.env.views.observe()
 
     def check(self) -> None:
         """Let the environment raise on NaN or on a contact capacity that overflowed. Copies to the host."""

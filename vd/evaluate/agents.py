@@ -123,7 +123,7 @@ def has_second_view(name: str) -> bool:
     """
     if name in BUILT_IN or sees_clouds(name):
         return False
-    return trained_task(open_policy(name, "cpu")).observation.view == "goal"
+    return trained_task(open_policy(name, "cpu")).observation.view != "world"
 
 
 def check_second_view(names: Sequence[str]) -> None:
@@ -135,8 +135,8 @@ def check_second_view(names: Sequence[str]) -> None:
     """
     if not any(map(has_second_view, names)):
         raise ValueError(
-            "--second-view is for teachers that see their goals in views (observation.view goal), as "
-            f"dclaw3-table does; {', '.join(names)} has no other view, or no critic to ask"
+            "--second-view is for teachers that see their goals in views (observation.view goal or "
+            f"mirrored), as dclaw3-table does; {', '.join(names)} has no other view, or no critic to ask"
         )
 
 
@@ -257,12 +257,9 @@ def task_for(
         # A student, which does not look at its teacher's observation.
         base = replace(base, observation=ObservationCfg())
     elif second_view and policy is not None:
-        if base.observation.view != "goal":
-            raise ValueError(
-                f"--second-view: this policy sees its goals in observation.view {base.observation.view}; "
-                "the second view is for policies of goal, such as dclaw3-table"
-            )
-        base = replace(base, observation=replace(base.observation, view="either"))
+        from vd.evaluate.second_view import with_second_view
+
+        base = replace(base, observation=with_second_view(base.observation))
     return replace(
         base,
         hand=hand or base.hand,
