@@ -1,5 +1,6 @@
 """A teacher's second view: what there is to choose from, when it is chosen, and by what."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,9 +11,10 @@ import warp as wp
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
-from vd.evaluate.second_view import AFTER_S, EVERY_S, SecondView
+from vd.evaluate.second_view import AFTER_S, EVERY_S, OtherViews, SecondView, view_maps
 from vd.kernels.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
+from vd.train.vec_env import ReorientVecEnv
 
 WORLDS = 8
 CFG = ReorientCfg(
@@ -24,9 +26,10 @@ CFG = ReorientCfg(
 )
 
 
-@pytest.fixture(scope="module", params=["dclaw3", "dclaw4"])
+@pytest.fixture(scope="module", params=["dclaw3 either", "dclaw4 either", "dclaw3 mirrored"])
 def env(request):
-    return ReorientEnv(replace(CFG, hand=request.param), "cpu")
+    hand, view = request.param.split()
+    return ReorientEnv(replace(CFG, hand=hand, observation=replace(CFG.observation, view=view)), "cpu")
 
 
 def as_goal(env: ReorientEnv) -> ReorientEnv:
@@ -60,22 +63,24 @@ def steps_with_new_views(env: ReorientEnv, actor: SecondView, steps: int, far: b
     """Steps, counted from the reset, at which views were chosen: what was shown and chosen there."""
     error = wp.to_torch(env.rotation_error)
     still, chosen, now = torch.zeros(WORLDS, env.num_actions), {}, [0]
-    better = actor._better
+    better = actor._others.better
 
-    def watched(world: torch.Tensor) -> torch.Tensor:
-        chosen[now[0]] = world.clone(), better(world)
+    def watched(world: torch.Tensor, value: Callable) -> torch.Tensor:
+        chosen[now[0]] = world.clone(), better(world, value)
         return chosen[now[0]][1]
 
-    actor._better = watched
+    actor._others.better = watched
     for now[0] in range(steps):
         error.fill_(2.0 if far else 0.1)
         actor.act(wp.to_torch(env.observation))
         env.step(wp.from_torch(still, dtype=wp.float32))
-    actor._better = better
+    actor._others.better = better
     return chosen
 
 
 def test_the_environment_chooses_the_views_of_goal_and_shows_the_same(env):
+    if env.cfg.observation.view == "mirrored":
+        pytest.skip("which views it chooses is asked in test_envs_symmetry.py")
     begin(env)
     other = as_goal(env)
     begin(other)
@@ -154,6 +159,29 @@ def test_actions_are_the_policys_in_the_view_that_was_taken(env):
     torch.testing.assert_close(action, policy.act(wp.to_torch(env.observation)))
 
 
+def test_a_training_draws_one_of_these_views(env):
+    after = round(AFTER_S * env.cfg.sim.control_hz)
+    still, drawn = torch.zeros(WORLDS, env.num_actions), set()
+    torch.manual_seed(0)
+    for seed in range(2):
+        begin(env, seed)
+        learner, first = ReorientVecEnv(env, second_view=True), env.views.view.numpy().copy()
+        for _ in range(after - 1):
+            learner.step(still)
+        np.testing.assert_array_equal(env.views.view.numpy(), first)
+        wp.to_torch(env.goals_reached)[0] += 1  # has come to a goal, and is not due
+        observed = learner.step(still)[0]["policy"]
+        view, others = env.views.view.numpy(), OtherViews(env, view_maps(env))
+        assert view[0] == first[0]
+        world = wp.to_torch(env.world_observation)
+        offered = others.of(world).numpy()
+        assert all(view[row] in offered[:, row] for row in range(1, WORLDS))
+        drawn |= {int(np.flatnonzero(offered[:, row] == view[row])[0]) for row in range(1, WORLDS)}
+        taken = others.maps.take(world, torch.tensor(view))
+        torch.testing.assert_close(observed, taken, atol=1e-5, rtol=1e-5)
+    assert drawn == set(range(len(offered))), "each of them"
+
+
 def test_a_policy_without_a_critic_or_an_environment_of_one_view_is_refused(env):
     policy = teacher_of(env)
     with pytest.raises(ValueError, match="no critic; export it again"):
@@ -169,16 +197,14 @@ def test_the_command_refuses_policies_that_have_no_second_view(tmp_path, capsys)
     assert "dclaw4-cube has no other view" in capsys.readouterr().err
 
 
-def test_neither_a_student_in_the_viewer_nor_a_training_looks_twice(tmp_path, capsys):
-    from vd.play.cli import main as play
+def test_a_training_has_its_views_from_the_task_and_looks_twice_by_its_own_flag(tmp_path, capsys):
     from vd.train.cli import main as train
 
-    picture = ["--video", str(tmp_path / "one.png"), "--seconds", "0.2", "--device", "cpu"]
-    assert play(["dclaw3-student", "--second-view", *picture]) == 1
-    assert "--second-view is for teachers" in capsys.readouterr().err
     flags = ["--preset", "cpu-demo", "--run-dir", str(tmp_path / "run"), "--device", "cpu"]
     assert train(["teacher", *flags, "--env.observation.view", "either"]) == 1
     assert "train with goal" in capsys.readouterr().err
+    assert train(["teacher", *flags, "--env.observation.view", "world", "--second-view"]) == 1
+    assert "observation.view world" in capsys.readouterr().err
 
 
 def test_an_evaluation_says_that_it_looked_twice(tmp_path):

@@ -1,5 +1,8 @@
 """Kernels compiled for a GPU while they are launched on the CPU."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +45,14 @@ def test_what_is_launched_on_the_cpu_is_compiled_for_the_gpu(tmp_path: Path):
     # As Warp looks them up: a folder for each module, named by the hash of what was compiled.
     module = double_kernel.module
     assert {file.parent.name for file in binaries} == {module.get_module_identifier(n) for n in (64, 256)}
+    looked_in = subprocess.run(
+        [sys.executable, "-c", "import warp as wp; wp.init(); print('in', wp.config.kernel_cache_dir)"],
+        env=os.environ | {"WARP_CACHE_PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.split("in ")[-1]
+    assert {file.parent.parent for file in binaries} == {Path(looked_in.strip())}
     assert module.options["block_dim"] == 256
     # What is there is not compiled again.
     before = [file.stat().st_mtime_ns for file in binaries]
@@ -70,7 +81,7 @@ def test_a_training_is_taken_through_all_that_it_launches(
     asked: list[str] = []
 
     def note(module: wp.Module, *, arch: int, module_dir: Path, use_ptx: bool) -> None:
-        assert arch == ARCH and not use_ptx and module_dir.parent == Path("kernels")
+        assert arch == ARCH and not use_ptx and module_dir.parent.parent == Path("kernels")
         asked.append(module.name)
 
     monkeypatch.setattr(wp, "compile_aot_module", note)  # NVRTC would take minutes

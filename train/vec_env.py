@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from vd.config import to_dict
 from vd.envs.state import saved_stage
-from vd.evaluate.second_view import OtherViews
+from vd.evaluate.second_view import OtherViews, view_maps
 from vd.paper import PAPER
 
 OBSERVATION_GROUP = "policy"
@@ -48,7 +48,7 @@ class ReorientVecEnv(VecEnv):
 
     def __init__(self, env: Any, *, second_view: bool = False) -> None:
         self.env = env
-        self._others = OtherViews(env) if second_view else None
+        self._others = OtherViews(env, view_maps(env)) if second_view else None
         self.num_envs = env.num_worlds
         self.num_actions = env.num_actions
         self.max_episode_length = env.max_episode_steps
@@ -134,7 +134,8 @@ class ReorientVecEnv(VecEnv):
         drawn = torch.randint(len(views), views.shape[1:], device=views.device)
         view = wp.to_torch(self.env.views.view)
         chosen = views.gather(0, drawn[None])[0].to(view.dtype)
-        view.copy_(torch.where(others.due(), chosen, view))
+        due = others.due() & (self._rotation_error > PAPER.success.rotation_rad)
+        view.copy_(torch.where(due, chosen, view))
         self.env.views.observe()
 
     def check(self) -> None:

@@ -395,7 +395,7 @@ class ReorientCfg:
     """Friction coefficient of the table where nothing is randomised; its contacts get the mean of the two."""
     failures_per_million: float = 0.0
     """Steps of worlds in a million that may leave the finite numbers or fly off: their episode ends like one
-    that times out. One more (two at first) stops the run, at 0 the first one does."""
+    that times out. Ten more (of few steps a rate says little) stop the run, at 0 the first one does."""
     sim: SimCfg = field(default_factory=SimCfg)
     action: ActionCfg = field(default_factory=ActionCfg)
     observation: ObservationCfg = field(default_factory=ObservationCfg)

@@ -115,14 +115,19 @@ def sees_clouds(name: str) -> bool:
 
 
 def has_second_view(name: str) -> bool:
-    """Whether :mod:`vd.evaluate.second_view` is for it: a teacher that sees its goals in views.
+    """Whether :mod:`vd.evaluate.second_view` is for it.
+
+    It is for teachers that see their goals in views, and students that act by the layers of one.
 
     Raises:
         FileNotFoundError: There is no such policy.
         ValueError: The file is no policy.
     """
-    if name in BUILT_IN or sees_clouds(name):
+    if name in BUILT_IN:
         return False
+    if sees_clouds(name):
+        policy = open_policy(name, "cpu")
+        return is_saved_student(policy) and policy.spec.network.state.views > 0
     return trained_task(open_policy(name, "cpu")).observation.view != "world"
 
 
@@ -136,8 +141,27 @@ def check_second_view(names: Sequence[str]) -> None:
     if not any(map(has_second_view, names)):
         raise ValueError(
             "--second-view is for teachers that see their goals in views (observation.view goal or "
-            f"mirrored), as dclaw3-table does; {', '.join(names)} has no other view, or no critic to ask"
+            f"mirrored), as dclaw3-table does, and their students; {', '.join(names)} has no other view, "
+            "or no critic to ask"
         )
+
+
+def open_critic(student: "SavedStudent", device: str) -> "TrainedPolicy":
+    """The teacher by whose layers a student acts, for its critic.
+
+    Raises:
+        ValueError: There is no such teacher here, or it is no teacher.
+    """
+    name = student.spec.teacher
+    try:
+        teacher = open_teacher(name, device)
+    except (FileNotFoundError, ValueError) as error:
+        raise ValueError(
+            f"--second-view asks the critic of the student's teacher, '{name}', which cannot be read: {error}"
+        ) from error
+    if teacher is None:
+        raise ValueError(f"--second-view asks the critic of the student's teacher; '{name}' has none")
+    return teacher
 
 
 def open_teacher(name: str, device: str) -> "TrainedPolicy | None":

@@ -110,8 +110,8 @@ class EvalCfg:
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
     """Aim past the goal while the object is near it: more come within 0.1 rad. Some students do so anyway."""
     second_view: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Where a teacher has not come to its goal in 3 s, look at it once a second from other fingers' sides, or
-    in the mirror, and go on in the view of which its critic expects most."""
+    """Where a policy has not come to its goal in 3 s, look at it once a second from other fingers' sides, or
+    in the mirror, and go on in the view of which its critic, or that of a student's teacher, expects most."""
     scanned_goals: tyro.conf.FlagCreatePairsOff[bool] = False
     """Students know shapes by scans: points with 4 mm of noise, a fifth missing, a surface through them."""
     sees: Literal["auto", "complete", "rendered"] = "auto"

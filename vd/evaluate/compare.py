@@ -12,6 +12,7 @@ from vd.evaluate.agents import (
     built_in,
     check_bundle,
     is_saved_student,
+    open_critic,
     open_policy,
     sees_clouds,
     start_at_rest,
@@ -107,7 +108,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             nudge=cfg.nudge,
             explore=cfg.explore,
             aim=cfg.aim or (is_saved_student(policy) and policy.spec.network.aim.enabled),
-            second_view=cfg.second_view and kind == "teacher",
+            second_view=cfg.second_view and name not in BUILT_IN,
         )
         index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
@@ -184,7 +185,14 @@ def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str)
 
     assert policy is not None
     rendered = None if cfg.sees == "auto" else cfg.sees == "rendered"
-    actor = StudentActor(env, policy, rendered=rendered, scanned_goals=cfg.scanned_goals, seed=cfg.seed)
+    actor = StudentActor(
+        env,
+        policy,
+        rendered=rendered,
+        scanned_goals=cfg.scanned_goals,
+        critic=open_critic(policy, device) if cfg.second_view else None,
+        seed=cfg.seed,
+    )
     sees = "rendered clouds" if actor.rendered else "complete clouds"
     return actor, f"student of stage {policy.spec.stage}", sees, policy.spec.rule_for
 

@@ -1,29 +1,32 @@
-"""A teacher that has not come to its goal looks at it from another side, and asks its critic which is better.
+"""A policy that has not come to its goal looks at it from another side, and asks a critic which is better.
 
 A policy of views (``observation.view`` goal) knows a scene that is turned from finger to finger, or seen in
 the mirror, as another scene: where it is stuck in one it may not be in the other, and what its critic expects
-of each says where to go on.
+of each says where to go on. A student, which acts by its teacher's layers, asks its teacher's critic.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import torch
 import warp as wp
 
 from vd.envs.cfg import ObservationCfg
+from vd.envs.reorient import ReorientEnv
+from vd.evaluate.agents import trained_task
+from vd.kernels.observations import teacher_observation_slices
 from vd.paper import PAPER
 from vd.policy import TrainedPolicy
+from vd.student.state import StateHead
 from vd.student.views import ViewMaps
-
-if TYPE_CHECKING:
-    from vd.envs.reorient import ReorientEnv
 
 AFTER_S = 3.0
 """Time after which a goal that is not reached is looked at again [s] (ours): four in five are by then."""
 EVERY_S = 1.0
 """Between two looks [s] (ours). Chosen with AFTER_S on 636 episodes, judged on others
 (docs/evaluation.md)."""
+NEAREST = -1
+"""In place of a view: that in whose sector the goal is believed to lie."""
 
 
 def with_second_view(seen: ObservationCfg) -> ObservationCfg:
@@ -40,27 +43,35 @@ def with_second_view(seen: ObservationCfg) -> ObservationCfg:
     return replace(seen, view="either") if seen.view == "goal" else seen
 
 
+def view_maps(env: ReorientEnv) -> ViewMaps:
+    """All views of an environment that has others than the first.
+
+    Raises:
+        ValueError: It has none.
+    """
+    if env.views is None or env.cfg.observation.view not in ("either", "mirrored"):
+        raise ValueError(
+            f"observation.view is {env.cfg.observation.view}; a second view is there with either or mirrored"
+        )
+    maps = ViewMaps(len(env.views.tables.sector), env.num_observations, env.num_actions)
+    maps.adopt(env.views.tables)
+    return maps.to(wp.device_to_torch(env.device))
+
+
 class OtherViews:
     """Which worlds look at their goals again, and in which views they may.
 
     Args:
-        env: The environment, which chooses a view for each goal: ``observation.view`` either or mirrored.
+        env: The environment; only its clock and its goals are looked at.
+        maps: The views of its hand, :func:`view_maps`.
 
-    Raises:
-        ValueError: The environment has no second view.
+    Attributes:
+        maps: These.
+        fingers: F of the hand.
     """
 
-    def __init__(self, env: "ReorientEnv") -> None:
-        if env.views is None or env.cfg.observation.view not in ("either", "mirrored"):
-            raise ValueError(
-                f"observation.view is {env.cfg.observation.view}; a second view is there with either or "
-                "mirrored"
-            )
-        self._fingers = env.num_fingers
-        self.maps = ViewMaps(len(env.views.tables.sector), env.num_observations, env.num_actions)
-        self.maps.adopt(env.views.tables)
-        self.maps.to(wp.device_to_torch(env.device))
-        self._error = wp.to_torch(env.rotation_error)
+    def __init__(self, env: ReorientEnv, maps: ViewMaps) -> None:
+        self.maps, self.fingers = maps, env.num_fingers
         self._steps, self._reached = wp.to_torch(env.step_count), wp.to_torch(env.goals_reached)
         self._counted = self._reached.clone()
         self._since = torch.zeros_like(self._steps)
@@ -68,12 +79,15 @@ class OtherViews:
         self._after, self._every = round(AFTER_S * hz), round(EVERY_S * hz)
 
     def due(self) -> torch.Tensor:
-        """Worlds that look again now, bool [N]; to be asked once in every control step."""
-        fresh = (self._steps == 0) | (self._reached != self._counted)
-        self._since = torch.where(fresh, 0, self._since + 1)
+        """Worlds that look again now if they are far, bool [N]; to be asked once in every control step."""
+        self._since = torch.where(self.fresh(), 0, self._since + 1)
         self._counted.copy_(self._reached)
         late = self._since - self._after
-        return (late >= 0) & (late % self._every == 0) & (self._error > PAPER.success.rotation_rad)
+        return (late >= 0) & (late % self._every == 0)
+
+    def fresh(self) -> torch.Tensor:
+        """Worlds whose goal is a new one since :meth:`due` was asked, bool [N]."""
+        return (self._steps == 0) | (self._reached != self._counted)
 
     def of(self, world: torch.Tensor) -> torch.Tensor:
         """Views to choose from [C, M] for observations in the world frame [M, O].
@@ -81,10 +95,16 @@ class OtherViews:
         They are, of a hand that is its own mirror image, the view in whose sector the goal lies now and that
         in the mirror; else all views.
         """
-        if len(self.maps) > self._fingers:
-            near = self.maps.nearness(world).unflatten(-1, (2, self._fingers)).argmax(dim=-1)
-            return torch.stack((near[:, 0], near[:, 1] + self._fingers))
-        return torch.arange(self._fingers, device=world.device)[:, None].expand(-1, len(world))
+        if len(self.maps) > self.fingers:
+            near = self.maps.nearness(world).unflatten(-1, (2, self.fingers)).argmax(dim=-1)
+            return torch.stack((near[:, 0], near[:, 1] + self.fingers))
+        return torch.arange(self.fingers, device=world.device)[:, None].expand(-1, len(world))
+
+    def better(self, world: torch.Tensor, value: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
+        """Views [M] of which most is expected; ``value`` [M] is that of observations as a view shows them."""
+        views = self.of(world)
+        expected = torch.stack([value(self.maps.take(world, view)) for view in views])
+        return views.gather(0, expected.argmax(dim=0, keepdim=True))[0]
 
 
 class SecondView:
@@ -101,24 +121,75 @@ class SecondView:
         ValueError: The environment has no second view, or the policy no critic.
     """
 
-    def __init__(self, env: "ReorientEnv", policy: TrainedPolicy) -> None:
-        self._others = OtherViews(env)
+    def __init__(self, env: ReorientEnv, policy: TrainedPolicy) -> None:
+        self._others = OtherViews(env, view_maps(env))
+        assert env.views is not None  # or there would be no maps
         self.num_actions = policy.num_actions
-        self._env, self._policy = env, policy
+        self._env, self._views, self._policy = env, env.views, policy
         self._world, self._view = wp.to_torch(env.world_observation), wp.to_torch(env.views.view)
+        self._error = wp.to_torch(env.rotation_error)
         policy.value(self._world[:1])  # refuses a policy without a critic, before anything slow
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] in the views, for the environment's observation [N, O]."""
-        again = self._others.due()
+        again = self._others.due() & (self._error > PAPER.success.rotation_rad)
         if bool(again.any()):
-            self._view[again] = self._better(self._world[again]).to(self._view.dtype)
-            self._env.views.observe()
+            view = self._others.better(self._world[again], self._policy.value)
+            self._view[again] = view.to(self._view.dtype)
+            self._views.observe()
             observation = wp.to_torch(self._env.observation)
         return self._policy.act(observation)
 
-    def _better(self, world: torch.Tensor) -> torch.Tensor:
-        """Views [M] of which the critic expects most, for observations in the world frame [M, O]."""
-        views = self._others.of(world)
-        expected = torch.stack([self._policy.value(self._others.maps.take(world, view)) for view in views])
-        return views.gather(0, expected.argmax(dim=0, keepdim=True))[0]
+
+class StudentSecondView:
+    """The views that a student acts in: the nearest, and where it does not come to its goal another.
+
+    It knows no state: how far the goal is, and what its teacher's critic would see, is what it estimates.
+
+    Args:
+        env: The student's environment.
+        head: Where it estimates its teacher's observation, in views; from now on they are chosen here.
+        critic: The teacher, with its critic.
+
+    Attributes:
+        rows: Worlds that the next estimates are of [M].
+
+    Raises:
+        ValueError: The student does not act in views, or the teacher has no critic.
+    """
+
+    def __init__(self, env: ReorientEnv, head: StateHead | None, critic: TrainedPolicy) -> None:
+        if head is None or head.views is None:
+            raise ValueError(
+                "--second-view: this student does not act by the layers of a teacher that sees its goals in "
+                "views (observation.view goal or mirrored)"
+            )
+        task = trained_task(critic)
+        seen = with_second_view(task.observation)
+        one = ReorientEnv(replace(task, objects=("cube",), num_worlds=1, observation=seen), env.device)
+        self._others = OtherViews(env, view_maps(one))
+        one.close()
+        self._head, self._critic, self._first = head, critic, head.views
+        critic.value(head.view_offset[None])  # refuses a policy without a critic
+        head.views, head.look = self._others.maps, self._views
+        self._again = torch.zeros(env.num_worlds, dtype=torch.bool, device=head.offset.device)
+        self._taken = torch.full((env.num_worlds,), NEAREST, device=head.offset.device)
+        self.rows = torch.arange(env.num_worlds, device=head.offset.device)
+
+    def begin_step(self) -> None:
+        """To be called once in every control step, before the student acts."""
+        self._taken[self._others.fresh()] = NEAREST
+        self._again = self._others.due()
+
+    def _views(self, world: torch.Tensor) -> torch.Tensor:
+        """Views [M] for estimates in the world frame [M, O], of the worlds ``rows``."""
+        head, rows = self._head, self.rows
+        turn = world[:, teacher_observation_slices(self._others.fingers)["relative_orientation"]]
+        angle = 2.0 * torch.atan2(turn[:, :3].norm(dim=-1), turn[:, 3].abs())
+        again = self._again[rows] & (angle > PAPER.success.rotation_rad)
+        if bool(again.any()):
+            self._taken[rows[again]] = self._others.better(
+                world[again], lambda seen: self._critic.value(head.guessed(seen))
+            )
+        taken = self._taken[rows]
+        return torch.where(taken == NEAREST, self._first.choose(world), taken)

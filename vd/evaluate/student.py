@@ -1,5 +1,6 @@
 """A student at work in an environment."""
 
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -8,6 +9,8 @@ import warp as wp
 
 from vd.config import from_dict
 from vd.evaluate.scanned import ScannedGoalView
+from vd.evaluate.second_view import StudentSecondView
+from vd.policy import TrainedPolicy
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.saved import SavedStudent
 from vd.vision import StudentView
@@ -35,6 +38,7 @@ class StudentActor:
         *,
         rendered: bool | None = None,
         scanned_goals: bool = False,
+        critic: TrainedPolicy | None = None,
         seed: int = 0,
     ):
         """Open its eyes in every world.
@@ -46,6 +50,7 @@ class StudentActor:
             student: The student.
             rendered: See by a depth camera, or complete clouds; as its stage was trained by default.
             scanned_goals: Show it goals with the errors of a scan, not exact ones.
+            critic: Its teacher, with its critic, to look twice at goals (:mod:`vd.evaluate.second_view`).
             seed: Of the errors of camera and scans.
 
         Raises:
@@ -74,6 +79,10 @@ class StudentActor:
             camera=spec.camera,
             seed=seed,
         )
+        self._second = None
+        if critic is not None:
+            self._student = deepcopy(self._student)  # its views are changed
+            self._second = StudentSecondView(env, self._student.state, critic)
         self._hidden = self._student.initial_hidden(env.num_worlds)
         self._steps = wp.to_torch(env.step_count)
         self.predicted = self._hidden.new_zeros(env.num_worlds)
@@ -89,7 +98,11 @@ class StudentActor:
         senses = self._student.senses(frame)
         mean = frame["action"].new_zeros(frame["action"].shape)
         with torch.no_grad():
+            if self._second is not None:
+                self._second.begin_step()
             for rows in self.active.nonzero().flatten().split(CLOUDS):
+                if self._second is not None:
+                    self._second.rows = rows
                 seen = {key: value[rows] for key, value in frame.items()}
                 sites = self._view.sites(seen, rows, augment=False)
                 output = self._student.act(sites[0], senses[rows], self._hidden[rows], *sites[1:])

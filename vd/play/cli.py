@@ -75,7 +75,7 @@ class PlayCfg:
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
     """Aim past the goal while the object is near it: more come within 0.1 rad. Some students do so anyway."""
     second_view: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Where a teacher has not come to its goal in 3 s, look at it in other views (vd-eval --help)."""
+    """Where a policy has not come to its goal in 3 s, look at it in other views (vd-eval --help)."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float | None = None
@@ -260,6 +260,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         check_bundle,
         check_second_view,
         is_saved_student,
+        open_critic,
         open_policy,
         task_for,
     )
@@ -298,7 +299,8 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
     if is_saved_student(trained):
         from vd.evaluate.student import StudentActor
 
-        return env, StudentActor(env, trained, seed=cfg.seed), device
+        critic = open_critic(trained, device) if cfg.second_view else None
+        return env, StudentActor(env, trained, critic=critic, seed=cfg.seed), device
     if cfg.second_view and isinstance(trained, TrainedPolicy):
         from vd.evaluate.second_view import SecondView
 

@@ -6,6 +6,7 @@ great many of them. Its layers do already, and they bear an estimate that is off
 estimate in the view that the estimate calls for. O values of the observation, D actions.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -86,6 +87,7 @@ class StateHead(nn.Module):
         self.register_buffer("scale", torch.ones(cfg.values))
         self.register_buffer("fitted", torch.tensor(False))
         self.views = ViewMaps(cfg.views, cfg.values, num_actions) if cfg.views else None
+        self.look: Callable[[torch.Tensor], torch.Tensor] | None = None
         if self.views is not None:
             self.register_buffer("view_offset", torch.zeros(cfg.values))
             self.register_buffer("view_scale", torch.ones(cfg.values))
@@ -188,9 +190,16 @@ class StateHead(nn.Module):
                 estimate.shape[:-1], dtype=torch.long
             )
         world = self.offset + self.scale * estimate
-        view = self.views.choose(world)
+        if self.look is None:
+            view = self.views.choose(world)
+        else:
+            view = self.look(world.flatten(0, -2)).reshape(world.shape[:-1])
         seen = (self.views.take(world, view) - self.view_offset) / self.view_scale
         return self.views.world_action(self.teacher(self.known * seen), view), view
+
+    def guessed(self, seen: torch.Tensor) -> torch.Tensor:
+        """Observations in a view [.., O] with the mean in place of what a student cannot see."""
+        return self.view_offset + self.known * (seen - self.view_offset)
 
     def fit(self, features: torch.Tensor, observation: torch.Tensor) -> None:
         """Begin with the estimate that is best in least squares: gradients would take long to what is exact.

@@ -1,0 +1,145 @@
+"""A student's second view: in which view it acts, from when on, and by which critic."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from vd.config import to_dict
+from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
+from vd.envs.reorient import ReorientEnv
+from vd.envs.symmetry import view_tables
+from vd.evaluate import cli
+from vd.evaluate.second_view import AFTER_S, EVERY_S, NEAREST, StudentSecondView, with_second_view
+from vd.kernels.observations import teacher_observation_slices
+from vd.policy import PolicySpec, TrainedPolicy, perceptron
+from vd.student.state import StateHead, state_cfg
+
+WORLDS, WIDTH = 12, 8
+
+
+@pytest.fixture(scope="module", params=[("dclaw3", "goal"), ("dclaw4", "goal"), ("dclaw3", "mirrored")])
+def env(request):
+    """What its teacher was trained in; it serves as the student's too, which looks at its clock only."""
+    hand, view = request.param
+    return ReorientEnv(
+        ReorientCfg(
+            hand=hand,
+            objects=("cuboid",),
+            num_worlds=WORLDS,
+            randomisation=RandomisationCfg(enabled=False),
+            observation=ObservationCfg(shape="full", view=view),
+        ),
+        "cpu",
+    )
+
+
+@pytest.fixture
+def teacher(env):
+    torch.manual_seed(0)
+    spec = PolicySpec(env.num_observations, env.num_actions, (16, 8), "elu", "gaussian", True)
+    actor, critic = (
+        {f"mlp.{name}": value for name, value in perceptron(part).state_dict().items()}
+        | {
+            "obs_normalizer._mean": torch.randn(1, env.num_observations),
+            "obs_normalizer._std": 0.5 + torch.rand(1, env.num_observations),
+        }
+        for part in (spec, replace(spec, num_actions=1))
+    )
+    return TrainedPolicy(spec, actor, task=to_dict(env.cfg), critic=critic)
+
+
+@pytest.fixture
+def head(env, teacher):
+    views = env.cfg.observation.views(env.num_fingers)
+    made = StateHead(state_cfg(teacher.spec, views=views), WIDTH, env.num_actions)
+    made.adopt(teacher.network, view_tables(env, env.cfg.observation.view))
+    return made
+
+
+def estimates(env: ReorientEnv, head: StateHead, angles: np.ndarray) -> torch.Tensor:
+    """Estimates, normalised [N, O], of random states that far from their goals [rad]."""
+    torch.manual_seed(1)
+    world = torch.randn(WORLDS, env.num_observations)
+    axis = torch.nn.functional.normalize(torch.randn(WORLDS, 3), dim=-1)
+    half = torch.tensor(angles / 2.0, dtype=torch.float32)[:, None]
+    turn = torch.cat([half.sin() * axis, half.cos()], dim=-1)
+    world[:, teacher_observation_slices(env.num_fingers)["relative_orientation"]] = turn
+    return (world - head.offset) / head.scale
+
+
+def at_step(env: ReorientEnv, step: int) -> None:
+    wp.to_torch(env.step_count).fill_(step)
+
+
+def wanted(env: ReorientEnv, head: StateHead, teacher: TrainedPolicy, estimate: torch.Tensor) -> list[int]:
+    """Views of which the critic expects most, from the simulator's own tables and one world at a time."""
+    tables = view_tables(env, with_second_view(env.cfg.observation).view)
+    fingers, chosen = env.num_fingers, []
+    for world in (head.offset + head.scale * estimate).double().numpy():
+        turn = world[teacher_observation_slices(fingers)["relative_orientation"]]
+        axis = -np.sign(turn[3]) * turn[:3]
+        near = (tables.sector @ axis).reshape(-1, fingers).argmax(axis=1)
+        offered = [near[0], near[1] + fingers] if len(near) == 2 else list(range(fingers))
+        values = []
+        for view in offered:
+            seen = (tables.factor[view] * world[tables.source[view]]).sum(axis=1) + tables.offset[view]
+            known = head.known.numpy() > 0
+            seen = np.where(known, seen, teacher.network.offset[0].numpy())
+            values.append(float(teacher.value(torch.tensor(seen, dtype=torch.float32)[None])[0]))
+        chosen.append(int(offered[int(np.argmax(values))]))
+    return chosen
+
+
+def test_it_takes_other_views_of_far_goals_after_a_while_and_keeps_them(env, teacher, head):
+    angles = np.where(np.arange(WORLDS) < 3, 0.3, 2.0)
+    estimate, hz = estimates(env, head, angles), env.cfg.sim.control_hz
+    _, nearest = head.act(estimate)
+    at_step(env, 0)
+    second = StudentSecondView(env, head, teacher)
+    better = wanted(env, head, teacher, estimate)
+    assert any(view != first for view, first in zip(better[3:], nearest[3:].tolist(), strict=True))
+    for step in range(round((AFTER_S + EVERY_S) * hz)):
+        at_step(env, step)
+        second.begin_step()
+        seen = []
+        for rows in torch.arange(WORLDS).split(5):  # as a network goes through its clouds
+            second.rows = rows
+            seen += head.act(estimate[rows])[1].tolist()
+        late = step >= round(AFTER_S * hz)
+        assert seen == nearest[:3].tolist() + (better if late else nearest.tolist())[3:]
+    # With a new goal it begins anew.
+    wp.to_torch(env.goals_reached)[4] += 1
+    at_step(env, step + 1)
+    second.begin_step()
+    assert second._taken[4] == NEAREST and (second._taken[5:] != NEAREST).all()
+
+
+def test_in_the_view_that_is_taken_it_acts_as_its_teacher(env, teacher, head):
+    estimate = estimates(env, head, np.full(WORLDS, 2.0))
+    at_step(env, 0)
+    second, after = StudentSecondView(env, head, teacher), round(AFTER_S * env.cfg.sim.control_hz)
+    for step in range(after + 1):
+        at_step(env, step)
+        second.begin_step()
+    action, view = head.act(estimate)
+    seen = head.guessed(head.views.take(head.offset + head.scale * estimate, view))
+    torch.testing.assert_close(action, head.views.world_action(teacher.act(seen), view), atol=1e-4, rtol=1e-4)
+
+
+def test_a_student_without_views_or_a_teacher_without_a_critic_is_refused(env, teacher, head):
+    with pytest.raises(ValueError, match="does not act by the layers of a teacher that sees its goals"):
+        StudentSecondView(env, None, teacher)
+    plain = StateHead(state_cfg(teacher.spec, views=0), WIDTH, env.num_actions)
+    with pytest.raises(ValueError, match="does not act by the layers of a teacher that sees its goals"):
+        StudentSecondView(env, plain, teacher)
+    with pytest.raises(ValueError, match="no critic; export it again"):
+        StudentSecondView(env, head, TrainedPolicy(teacher.spec, teacher.weights, task=teacher.task))
+
+
+def test_an_evaluation_of_a_student_says_that_it_looked_twice(tmp_path):
+    arguments = ["dclaw3-student", "--objects", "cuboid", "--episodes", "1", "--device", "cpu"]
+    assert cli.main([*arguments, "--second-view", "--episode-s", "0.3", "--output", str(tmp_path)]) == 0
+    assert "looks twice" in (tmp_path / "eval.html").read_text()
