@@ -60,7 +60,7 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(suite_run, "compare", compare)
     monkeypatch.setattr(suite_run, "sees_clouds", lambda name: name == STUDENT)
-    monkeypatch.setattr(suite_run, "fingerprint", lambda name: f"weights of {name}")
+    monkeypatch.setattr(suite_run, "fingerprint", lambda name, **_: f"weights of {name}")
     return asked
 
 
@@ -102,7 +102,7 @@ def test_the_conditions_are_the_papers():
     assert cfg.stop_tolerance == PAPER.success.rotation_rad
 
 
-def test_a_second_view_is_for_teachers_of_views_alone():
+def test_a_second_view_is_for_teachers_of_views_and_their_students():
     condition, objects = CONDITIONS[0], suite_run.Objects(("x",), "x", False)
     names = ("dclaw3-table", "dclaw3-student", "dclaw4-cube", "zero")
     looks = [
@@ -110,7 +110,7 @@ def test_a_second_view_is_for_teachers_of_views_alone():
         for asked in (False, True)
         for name in names
     ]
-    assert looks == [False] * 4 + [True, False, False, False]
+    assert looks == [False] * 4 + [True, True, False, False]
 
 
 def test_everything_is_run_once_and_a_second_call_runs_nothing(tmp_path, asked):
@@ -133,7 +133,7 @@ def test_only_what_changed_is_run_again(tmp_path, asked, monkeypatch):
     run(suite(tmp_path, TEACHER, STUDENT))
     assert {name for _, name in asked_for(asked[once + 1 :])} == {STUDENT}, "one more policy"
     before = len(asked)
-    monkeypatch.setattr(suite_run, "fingerprint", lambda name: "new weights")
+    monkeypatch.setattr(suite_run, "fingerprint", lambda name, **_: "new weights")
     run(suite(tmp_path))
     assert len(asked) == before + once
     run(suite(tmp_path, seed=1))
@@ -278,7 +278,7 @@ def test_installed_policies_are_taken_where_none_is_named():
         (["dclaw4-cube", "--table-friction", "0.1", "--randomise"], "exclude each other"),
         (["dclaw4-cube", "--table-friction", "-1"], "must not be negative"),
         (["nobody", "--suite", "paper"], "no policy at nobody"),
-        (["dclaw3-student", "--second-view"], "--second-view is for teachers that see their goals in views"),
+        (["dclaw4-cube", "--second-view"], "--second-view is for teachers that see their goals in views"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(flags, message, capsys, tmp_path):
@@ -287,6 +287,10 @@ def test_settings_that_cannot_be_are_refused(flags, message, capsys, tmp_path):
 
 
 def test_a_policy_is_known_by_its_weights(tmp_path):
+    student = suite_run.fingerprint("dclaw3-student")
+    assert suite_run.fingerprint("dclaw3-student", second_view=True) != student, "its teacher's critic too"
+    teacher = suite_run.fingerprint("dclaw3-table")
+    assert suite_run.fingerprint("dclaw3-table", second_view=True) == teacher
     path = tmp_path / "policy.pt"
     path.write_bytes(b"one")
     first = suite_run.fingerprint(str(path))

@@ -271,7 +271,8 @@ def task_for(
         nudge: Whether hands that are stuck are nudged.
         explore: Whether actions have noise while the goal is far.
         aim: Whether it is told to turn past a goal that is near.
-        second_view: Whether a teacher looks twice at goals (:mod:`vd.evaluate.second_view`); others do not.
+        second_view: Whether a teacher looks twice at goals (:mod:`vd.evaluate.second_view`); a student needs
+            nothing of the task for that.
 
     Raises:
         ValueError: The teacher does not see its goals in views.

@@ -167,11 +167,12 @@ class StudentSecondView:
         task = trained_task(critic)
         seen = with_second_view(task.observation)
         one = ReorientEnv(replace(task, objects=("cube",), num_worlds=1, observation=seen), env.device)
-        self._others = OtherViews(env, view_maps(one))
+        maps = view_maps(one).adopt_first(head.views)
+        self._others = OtherViews(env, maps)
         one.close()
         self._head, self._critic, self._first = head, critic, head.views
         critic.value(head.view_offset[None])  # refuses a policy without a critic
-        head.views, head.look = self._others.maps, self._views
+        head.views, head.look = maps, self._views
         self._again = torch.zeros(env.num_worlds, dtype=torch.bool, device=head.offset.device)
         self._taken = torch.full((env.num_worlds,), NEAREST, device=head.offset.device)
         self.rows = torch.arange(env.num_worlds, device=head.offset.device)

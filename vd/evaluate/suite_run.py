@@ -14,7 +14,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vd.config import to_dict
-from vd.evaluate.agents import BUILT_IN, find_policy, has_second_view, sees_clouds
+from vd.evaluate.agents import (
+    BUILT_IN,
+    find_policy,
+    has_second_view,
+    is_saved_student,
+    open_policy,
+    sees_clouds,
+)
 from vd.evaluate.compare import compare, parse_groups
 from vd.evaluate.comparison import Comparison
 from vd.evaluate.comparison_page import labels
@@ -151,7 +158,8 @@ def run_suite(cfg: "EvalCfg", *, say: Callable[[str], object] | None = None) -> 
     say = say or (lambda line: print(line, file=sys.stderr, flush=True))
     conditions = tuple(c for c in CONDITIONS if c.quick or not cfg.quick)
     result = SuiteResult(cfg.agent_names, object_groups(cfg.objects, quick=cfg.quick), conditions, cfg.quick)
-    prints = {name: fingerprint(name) for name in result.policies}  # every name, before anything slow
+    # Every name, before anything slow.
+    prints = {name: fingerprint(name, second_view=cfg.second_view) for name in result.policies}
     short = labels(result.policies)
     tasks = []
     for condition in conditions:
@@ -314,8 +322,10 @@ def object_groups(objects: tuple[str, ...], *, quick: bool) -> dict[Group, Objec
     return groups
 
 
-def fingerprint(name: str) -> str:
+def fingerprint(name: str, *, second_view: bool = False) -> str:
     """What tells the content of a policy from others: its file's SHA-256, or the name of a built-in agent.
+
+    Of a student that looks twice its teacher's file counts too, whose critic it asks.
 
     Raises:
         FileNotFoundError: There is no such policy.
@@ -327,6 +337,10 @@ def fingerprint(name: str) -> str:
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if file.is_file():
             digest.update(file.read_bytes())
+    if second_view and sees_clouds(name) and has_second_view(name):
+        student = open_policy(name, "cpu")
+        assert is_saved_student(student)  # or it would have no second view
+        digest.update(fingerprint(student.spec.teacher).encode())
     return digest.hexdigest()
 
 

@@ -15,6 +15,8 @@ from vd.policy import TrainedPolicy
 
 TERMS = 4
 """Most values that a value of a view is made of, those of a quaternion."""
+BUFFERS = ("source", "factor", "offset", "joints", "sign", "sector")
+"""What views are made of."""
 
 
 class ViewMaps(nn.Module):
@@ -51,9 +53,15 @@ class ViewMaps(nn.Module):
 
     def adopt(self, tables: Any) -> None:
         """Take over the tables of a hand, a ``vd.envs.symmetry.ViewTables``: envs stand above this layer."""
-        for name in ("source", "factor", "offset", "joints", "sign", "sector"):
+        for name in BUFFERS:
             buffer = getattr(self, name)
             buffer.copy_(torch.as_tensor(getattr(tables, name), dtype=buffer.dtype))
+
+    def adopt_first(self, others: "ViewMaps") -> "ViewMaps":
+        """Take over the first views from others of the same hand, to the last bit; returns itself."""
+        for name in BUFFERS:
+            getattr(self, name)[: len(others)] = getattr(others, name)
+        return self
 
     def choose(self, observation: torch.Tensor) -> torch.Tensor:
         """Views [..] of observations [.., O]: the axis of the wanted rotation is in their sector."""
