@@ -56,6 +56,10 @@ class StateHead(nn.Module):
             of the observation stands, and the estimate is added to it.
         joints: Columns of the features at which positions and velocities of the joints begin, as the senses
             give them; only where ``cfg.fingertips`` are to be computed from them.
+
+    Attributes:
+        views: The teacher's views, if it sees its goals in them.
+        look: What chooses views [M] for estimates in the world frame [M, O]; None: each is the nearest.
     """
 
     offset: torch.Tensor
