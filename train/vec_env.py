@@ -48,7 +48,10 @@ class ReorientVecEnv(VecEnv):
 
     def __init__(self, env: Any, *, second_view: bool = False) -> None:
         self.env = env
-        self._others = OtherViews(env, view_maps(env)) if second_view else None
+        self._others = None
+        if second_view:
+            self._others = OtherViews(env, view_maps(env))
+            self._world, self._view = wp.to_torch(env.world_observation), wp.to_torch(env.views.view)
         self.num_envs = env.num_worlds
         self.num_actions = env.num_actions
         self.max_episode_length = env.max_episode_steps
@@ -130,12 +133,11 @@ class ReorientVecEnv(VecEnv):
 
     def _look_again(self, others: OtherViews) -> None:
         """Draw a view for the worlds that are due, and observe in it; nothing waits on the host."""
-        views = others.of(wp.to_torch(self.env.world_observation))
+        views = others.of(self._world)
         drawn = torch.randint(len(views), views.shape[1:], device=views.device)
-        view = wp.to_torch(self.env.views.view)
-        chosen = views.gather(0, drawn[None])[0].to(view.dtype)
+        chosen = views.gather(0, drawn[None])[0].to(self._view.dtype)
         due = others.due() & (self._rotation_error > PAPER.success.rotation_rad)
-        view.copy_(torch.where(due, chosen, view))
+        self._view.copy_(torch.where(due, chosen, self._view))
         self.env.views.observe()
 
     def check(self) -> None:
