@@ -106,7 +106,7 @@ def test_a_new_goal_is_looked_at_anew(env):
     after = round(AFTER_S * env.cfg.sim.control_hz)
     begin(env)
     steps_with_new_views(env, actor, after - 1)
-    wp.to_torch(env.goals_reached)[0] += 1
+    wp.to_torch(env.goal_steps)[0] = 0
     ((world, view),) = steps_with_new_views(env, actor, 3).values()
     assert len(world) == len(view) == WORLDS - 1
 
@@ -169,7 +169,7 @@ def test_a_training_draws_one_of_these_views(env):
         for _ in range(after - 1):
             learner.step(still)
         np.testing.assert_array_equal(env.views.view.numpy(), first)
-        wp.to_torch(env.goals_reached)[0] += 1  # has come to a goal, and is not due
+        wp.to_torch(env.goal_steps)[0] = 0  # has come to a goal, and is not due
         observed = learner.step(still)[0]["policy"]
         view, others = env.views.view.numpy(), OtherViews(env, view_maps(env))
         assert view[0] == first[0]

@@ -71,7 +71,7 @@ def estimates(env: ReorientEnv, head: StateHead, angles: np.ndarray) -> torch.Te
 
 
 def at_step(env: ReorientEnv, step: int) -> None:
-    wp.to_torch(env.step_count).fill_(step)
+    wp.to_torch(env.goal_steps).fill_(step)
 
 
 def wanted(env: ReorientEnv, head: StateHead, teacher: TrainedPolicy, estimate: torch.Tensor) -> list[int]:
@@ -111,8 +111,8 @@ def test_it_takes_other_views_of_far_goals_after_a_while_and_keeps_them(env, tea
         late = step >= round(AFTER_S * hz)
         assert seen == nearest[:3].tolist() + (better if late else nearest.tolist())[3:]
     # With a new goal it begins anew.
-    wp.to_torch(env.goals_reached)[4] += 1
     at_step(env, step + 1)
+    wp.to_torch(env.goal_steps)[4] = 0
     second.begin_step()
     assert second._taken[4] == NEAREST and (second._taken[5:] != NEAREST).all()
 

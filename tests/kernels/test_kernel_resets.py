@@ -28,25 +28,74 @@ START = np.array(PAPER.scene.object_start_m)
 NOISE = PAPER.scene.object_start_noise_m
 
 
+CAUGHT_STEPS, CAUGHT_RAD = 4, 0.4
+
+
+def end_episodes(device, success, fell, before, *, age, error, hold=0, share=0.0, limit=10, seed=0):
+    """Launch; returns every array by name. Steps and age of the goal are ``before`` and ``age`` before it."""
+    count = len(before)
+    state = {
+        "steps": device_array(before, int, device),
+        "age": device_array(age, int, device),
+        "goals": device_array(np.full(count, 5), int, device),
+        "rng": streams(count, seed, device),
+    }
+    out = {n: unwritten(count, int, device) for n in ("timed_out", "done", "reset", "new_goal")}
+    masks = [device_array(success, int, device), device_array(fell, int, device)]
+    settings = [device_array(error, float, device), limit, hold, CAUGHT_STEPS, CAUGHT_RAD, share]
+    wp.launch(
+        episode_kernel,
+        dim=count,
+        inputs=[*masks, *settings, *state.values()],
+        outputs=list(out.values()),
+        device=device,
+    )
+    return {name: array.numpy() for name, array in (state | out).items()}
+
+
 @pytest.mark.parametrize("hold", [0, 1])
 def test_episode_ends_as_stated_in_every_case(device, hold):
     cases = list(itertools.product([0, 1], [0, 1], [3, 8, 9, 20]))  # success, fell, steps before; limit 10
     success, fell, before = (np.array(column) for column in zip(*cases, strict=True))
     count = len(cases)
-    steps, goals = device_array(before, int, device), device_array(np.full(count, 5), int, device)
-    names = ("timed_out", "done", "reset", "new_goal")
-    out = {name: unwritten(count, int, device) for name in names}
-    inputs = [device_array(success, int, device), device_array(fell, int, device), 10, hold, steps, goals]
-    wp.launch(episode_kernel, dim=count, inputs=inputs, outputs=list(out.values()), device=device)
-    np.testing.assert_array_equal(steps.numpy(), before + 1)
-    np.testing.assert_array_equal(goals.numpy(), 5 + success)
+    far = np.full(count, 3.0)
+    out = end_episodes(device, success, fell, before, age=np.full(count, 8), error=far, hold=hold)
+    np.testing.assert_array_equal(out["steps"], before + 1)
+    np.testing.assert_array_equal(out["age"], 9)
+    np.testing.assert_array_equal(out["goals"], 5 + success)
+    assert out["rng"].tobytes() == streams(count, 0, device).numpy().tobytes(), "nothing is drawn at share 0"
     for i, (s, f, b) in enumerate(cases):
         end = b + 1 >= 10
-        assert out["timed_out"].numpy()[i] == int(end and not s and not f)
-        assert out["done"].numpy()[i] == int(bool(s or f or end))
+        assert out["timed_out"][i] == int(end and not s and not f)
+        assert out["done"][i] == int(bool(s or f or end))
         reset = bool(f or end or (s and hold))
-        assert out["reset"].numpy()[i] == int(reset)
-        assert out["new_goal"].numpy()[i] == int(bool(s) and not reset)
+        assert out["reset"][i] == int(reset)
+        assert out["new_goal"][i] == int(bool(s) and not reset)
+
+
+@EXAMPLES
+@given(seed=st.integers(0, 2**31 - 1), hold=st.integers(0, 1))
+def test_what_is_caught_when_its_time_is_up_goes_on_and_nothing_else_does(device, seed, hold):
+    count, random = 64, np.random.default_rng(seed)
+    success, fell = (random.integers(0, 4, count) == 0 for _ in range(2))
+    before, age = random.integers(7, 12, count), random.integers(0, 9, count)
+    error = random.choice([0.2, 0.39, 0.41, 2.0], count)
+    # Of so high a share all go on: a draw is from 0 to below 1.
+    out = end_episodes(device, success, fell, before, age=age, error=error, hold=hold, share=1.0, seed=seed)
+    plain = end_episodes(device, success, fell, before, age=age, error=error, hold=hold, seed=seed)
+    on = (before + 1 >= 10) & (age + 1 >= CAUGHT_STEPS) & (error > CAUGHT_RAD) & ~success & ~fell
+    for name in ("timed_out", "done", "reset", "new_goal", "steps"):
+        assert not out[name][on].any(), f"{name} of a world that goes on"
+        np.testing.assert_array_equal(out[name][~on], plain[name][~on], err_msg=name)
+    np.testing.assert_array_equal(out["age"], age + 1, err_msg="the goal stays, and its age counts")
+    assert (out["rng"][~on] == plain["rng"][~on]).all() and (out["rng"][on] != plain["rng"][on]).all()
+
+
+def test_the_share_of_those_caught_goes_on(device):
+    ones = np.ones(4000, int)
+    out = end_episodes(device, 0 * ones, 0 * ones, 9 * ones, age=8 * ones, error=2.0 * ones, share=0.7)
+    assert 0.65 < 1.0 - out["reset"].mean() < 0.75
+    np.testing.assert_array_equal(out["timed_out"], out["reset"])
 
 
 class World:
@@ -66,6 +115,7 @@ class World:
             "qd": np.full((worlds, joints + 6), np.nan, np.float32),
             "smoothed": np.full((worlds, joints), np.nan, np.float32),
             "steps": np.full(worlds, SENTINEL, np.int32),
+            "age": np.full(worlds, SENTINEL, np.int32),
             "goals": np.full(worlds, SENTINEL, np.int32),
             "goal": np.full((worlds, 4), np.nan, np.float32),
             "error": np.full(worlds, np.nan, np.float32),
@@ -83,7 +133,7 @@ class World:
         rest=None,
     ):
         """Launch; returns every array by name."""
-        types = {"rng": wp.uint32, "steps": int, "goals": int, "goal": wp.quat}
+        types = {"rng": wp.uint32, "steps": int, "age": int, "goals": int, "goal": wp.quat}
         state = {n: device_array(a, types.get(n, float), self.device) for n, a in self.before.items()}
         none = np.zeros((0, 4), np.float32)
         rest = np.zeros((len(mask), 0, 7)) if rest is None else rest
@@ -106,7 +156,7 @@ class World:
                 state["q"],
                 state["rng"],
             ],
-            outputs=[state[n] for n in ("qd", "smoothed", "steps", "goals", "goal", "error")],
+            outputs=[state[n] for n in ("qd", "smoothed", "steps", "age", "goals", "goal", "error")],
             device=self.device,
         )
         return {name: array.numpy() for name, array in state.items()}
@@ -138,7 +188,7 @@ def test_only_masked_worlds_change_and_only_in_what_is_theirs(device, data, fing
     for name in ("qd", "steps", "goals"):
         assert not after[name][reset].any(), name
     changed = ~untouched
-    assert not after["smoothed"][changed].any()
+    assert not after["smoothed"][changed].any() and not after["age"][changed].any()
     assert np.all(after["rng"][changed] != world.before["rng"][changed])
     orientation = after["q"][:, joints + 3 :]
     np.testing.assert_allclose(np.linalg.norm(orientation[reset], axis=1), 1.0, atol=1e-6)

@@ -97,6 +97,10 @@ class ObservationCfg:
     image, as dclaw3 is; of dclaw4 all fingers lean the same way round. either: as goal, and the same views in
     the mirror, if the hand has them, are there for who looks twice (vd-eval --second-view)."""
 
+    goal_time: bool = False
+    """Ours: see for how long the present goal has been pursued. A policy that sees nothing but the state does
+    the same again where it is caught; one that knows the time can learn to try something else."""
+
     def views(self, fingers: int) -> int:
         """Views in which a hand of so many fingers sees its goals; 0: it sees the world as it is."""
         return {"world": 0, "goal": fingers, "mirrored": 2 * fingers, "either": fingers}[self.view]
@@ -145,6 +149,38 @@ class TableCfg:
         if not 0.0 < self.away_s[0] <= self.away_s[1]:
             raise ValueError(
                 f"table.away_s is {self.away_s[0]:g} {self.away_s[1]:g}; it has to rise, and be positive"
+            )
+
+
+@dataclass(frozen=True)
+class CaughtCfg:
+    """Ours: worlds that are caught, and go on when their episode's time is up. None by default.
+
+    Where a hand is caught an episode soon ends, and most of what is learned from is how hands that are not
+    do it. A goal that has been pursued for long is where more is to be learned.
+    """
+
+    after_s: float = 3.0
+    """Time for which a goal has to have been pursued [s]; four in five are reached by then."""
+    beyond_rad: float = PAPER.success.rotation_rad
+    """Distance from it above which the world is caught [rad]."""
+    go_on_share: float = 0.0
+    """Share of the time-outs of such worlds after which they go on as they are, with the time of another
+    episode."""
+
+    def after_steps(self, control_hz: float) -> int:
+        """The time in control steps."""
+        return round(self.after_s * control_hz)
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        for name in ("after_s", "beyond_rad"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"caught.{name} is {getattr(self, name):g}; it has to be positive")
+        if not 0.0 <= self.go_on_share < 1.0:
+            raise ValueError(
+                f"caught.go_on_share is {self.go_on_share:g}; it is from 0 to below 1: what cannot be freed "
+                "would never end"
             )
 
 
@@ -404,6 +440,7 @@ class ReorientCfg:
     start: StartCfg = field(default_factory=StartCfg)
     goal: GoalCfg = field(default_factory=GoalCfg)
     table: TableCfg = field(default_factory=TableCfg)
+    caught: CaughtCfg = field(default_factory=CaughtCfg)
     nudge: NudgeCfg = field(default_factory=NudgeCfg)
     explore: ExploreCfg = field(default_factory=ExploreCfg)
     aim: AimCfg = field(default_factory=AimCfg)
@@ -424,6 +461,13 @@ class ReorientCfg:
         self.curriculum.validate()
         self.focus.validate()
         self.table.validate()
+        self.caught.validate()
+        if self.caught.go_on_share > 0.0 and self.table.away_share > 0.0:
+            raise ValueError(
+                f"caught.go_on_share is {self.caught.go_on_share:g} and table.away_share "
+                f"{self.table.away_share:g}; a world that goes on would get its table back, so one of them "
+                "has to be 0"
+            )
         self.nudge.validate()
         self.explore.validate()
         self.aim.validate()

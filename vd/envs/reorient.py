@@ -30,7 +30,11 @@ from vd.envs.table import must_lift, table_array
 from vd.kernels.actions import apply_action_kernel
 from vd.kernels.aim import aim_kernel
 from vd.kernels.guard import void_step_kernel
-from vd.kernels.observations import teacher_observation_kernel, teacher_observation_size
+from vd.kernels.observations import (
+    goal_time_kernel,
+    teacher_observation_kernel,
+    teacher_observation_size,
+)
 from vd.kernels.resets import episode_kernel, reset_kernel
 from vd.kernels.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.rng import init_rng_kernel
@@ -97,7 +101,10 @@ class ReorientEnv:
         self.num_fingers = f = self.hand.num_fingers
         self.num_actions = d = self.hand.num_joints
         self.sees_shape = cfg.observation.shape != "none"
-        self.num_observations = teacher_observation_size(f) + self.sees_shape * shape_observation_size(f)
+        self.sees_goal_time = cfg.observation.goal_time
+        self.num_observations = (
+            teacher_observation_size(f) + self.sees_shape * shape_observation_size(f) + self.sees_goal_time
+        )
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
         self.reward_term_names = REWARD_TERMS
@@ -113,7 +120,7 @@ class ReorientEnv:
         self.smoothed = zeros(n, d)
         """Moving average of the applied actions, shape [N, D]."""
         self.observation = zeros(n, self.num_observations)
-        """Teacher observation, fresh after resets and new goals, shape [N, O]; the shape's values last."""
+        """Teacher observation, fresh after resets and new goals, shape [N, O]: state, shape, goal's time."""
         self.reward = zeros(n)
         """Reward of the present step, shape [N]."""
         self.reward_terms = zeros(n, len(REWARD_TERMS))
@@ -133,7 +140,9 @@ class ReorientEnv:
         self.aimed_quat = zeros(n, dtype=wp.quat) if cfg.aim.enabled else self.goal_quat
         """The same as it is observed, shape [N]."""
         self.step_count = zeros(n, dtype=wp.int32)
-        """Control steps since the world's reset, shape [N]."""
+        """Control steps since the world's reset, shape [N]; from 0 again where a caught world goes on."""
+        self.goal_steps = zeros(n, dtype=wp.int32)
+        """Control steps since the world's goal was given, shape [N]."""
         self.goals_reached = zeros(n, dtype=wp.int32)
         """Goals reached since the world's reset, shape [N]."""
         self.object_pose_end = zeros(n, dtype=wp.transform)
@@ -270,7 +279,7 @@ class ReorientEnv:
             sim.place_tables(self.step_count, self._table_steps)
         sim.step()
         if self.cfg.failures_per_million > 0.0:
-            sim.put_back(self.step_count, self.max_episode_steps - 1)
+            sim.put_back(self.step_count, self.goal_steps, self.max_episode_steps - 1)
         self.fingers.measure()
         if self._shapes is not None and self._lifts:
             self._shapes.measure_clearance()
@@ -308,10 +317,16 @@ class ReorientEnv:
             inputs=[
                 self.success,
                 self.fell,
+                self.rotation_error,
                 self.max_episode_steps,
                 int(self.cfg.success_ends_episode),
+                self.cfg.caught.after_steps(self.cfg.sim.control_hz),
+                self.cfg.caught.beyond_rad,
+                self.cfg.caught.go_on_share,
                 self.step_count,
+                self.goal_steps,
                 self.goals_reached,
+                self.rng,
             ],
             outputs=[self.timed_out, self.done, self._reset, self._new_goal],
             device=self.device,
@@ -358,6 +373,7 @@ class ReorientEnv:
                 sim.joint_qd,
                 self.smoothed,
                 self.step_count,
+                self.goal_steps,
                 self.goals_reached,
                 self.goal_quat,
                 self.previous_error,
@@ -422,6 +438,14 @@ class ReorientEnv:
         )
         if self._shapes is not None and self.sees_shape:
             self._shapes.launch()
+        if self.sees_goal_time:
+            wp.launch(
+                goal_time_kernel,
+                dim=self.num_worlds,
+                inputs=[self.goal_steps, 1.0 / self.cfg.sim.control_hz, self.num_observations - 1],
+                outputs=[self.world_observation],
+                device=self.device,
+            )
         if self.views is not None:
             self.views.observe()
 

@@ -45,14 +45,16 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
         ValueError: If it belongs to another number of worlds, other objects, another hand or servo model.
     """
     here = _arrays(env)
-    if state["arrays"].keys() != here.keys():
+    # Checkpoints from before goals had an age: no goal is older than its episode.
+    arrays = {"goal_steps": state["arrays"]["step_count"]} | state["arrays"]
+    if arrays.keys() != here.keys():
         raise ValueError(
             "the saved environment has other servos, views, contacts or nudges; resume with hand_layer, "
             "observation.view, nudge, explore, randomisation.effects and randomisation.restitution of the "
             "checkpoint, or from one without worlds (vd-train export --resumable)"
         )
     for name, array in here.items():
-        saved = state["arrays"][name]
+        saved = arrays[name]
         if saved.shape != array.numpy().shape:
             raise ValueError(
                 f"the saved environment has {name} of shape {saved.shape}, "
@@ -65,7 +67,7 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
             "checkpoint, or from one without worlds (vd-train export --resumable)"
         )
     for name, array in here.items():
-        array.assign(state["arrays"][name])
+        array.assign(arrays[name])
     env.steps = int(state["steps"])
     if env.nudges is not None:
         env.nudges.forget()
@@ -107,6 +109,7 @@ def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
         "smoothed": env.smoothed,
         "goal_quat": env.goal_quat,
         "step_count": env.step_count,
+        "goal_steps": env.goal_steps,
         "goals_reached": env.goals_reached,
         "previous_error": env.previous_error,
         "goal_counts": env.goal_counts,

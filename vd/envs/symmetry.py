@@ -74,7 +74,7 @@ def view_tables(env: "ReorientEnv", view: View) -> ViewTables:
     if mirror is not None:
         turns += [turn @ mirror for turn in turns]
     direction = SECTOR + UP if view == "mirrored" else SECTOR
-    maps = np.stack([_observation_map(tips, turn, sees_shape=env.sees_shape) for turn in turns])
+    maps = np.stack([_observation_map(env, tips, turn) for turn in turns])
     source = np.argsort(-np.abs(maps), axis=2, kind="stable")[:, :, :TERMS]
     order = [_joint_source(_finger_source(tips, turn.T)) for turn in turns]
     return ViewTables(
@@ -247,13 +247,13 @@ def _observation_offset(env: "ReorientEnv", turn: np.ndarray) -> np.ndarray:
     return offset
 
 
-def _observation_map(tips: np.ndarray, turn: np.ndarray, *, sees_shape: bool) -> np.ndarray:
+def _observation_map(env: "ReorientEnv", tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """Matrix [O, O] from an observation in the world frame to that of a view.
 
     Args:
+        env: The environment, for what is observed.
         tips: Fingertip poses with all angles zero, shape [F, 7].
         turn: Turn or reflection [3, 3] of the world that makes the view.
-        sees_shape: Whether the object's shape is observed.
     """
     count, fingers = len(tips), _finger_source(tips, turn)
     quaternion = _orientation_map(turn)
@@ -281,7 +281,7 @@ def _observation_map(tips: np.ndarray, turn: np.ndarray, *, sees_shape: bool) ->
         "previous_action": joints,
     }
     slices = teacher_observation_slices(count)
-    if sees_shape:
+    if env.sees_shape:
         directions = np.array(extent_directions(count))
         back = directions @ turn
         same = np.argmin(np.linalg.norm(back[:, None] - directions[None], axis=2), axis=1)
@@ -294,8 +294,10 @@ def _observation_map(tips: np.ndarray, turn: np.ndarray, *, sees_shape: bool) ->
         first = slices["previous_action"].stop
         for name, columns in shape_observation_slices(count).items():
             slices[name] = slice(first + columns.start, first + columns.stop)
-    size = max(columns.stop for columns in slices.values())
-    matrix = np.zeros((size, size))
+    # Columns of no direction, such as the goal's time, are the same in all views.
+    matrix = np.zeros((env.num_observations, env.num_observations))
+    last = max(columns.stop for columns in slices.values())
+    matrix[last:, last:] = np.eye(env.num_observations - last)
     for name, block in parts.items():
         matrix[slices[name], slices[name]] = block
     matrix[np.abs(matrix) < np.finfo(np.float32).eps] = 0.0

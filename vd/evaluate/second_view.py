@@ -72,22 +72,18 @@ class OtherViews:
 
     def __init__(self, env: ReorientEnv, maps: ViewMaps) -> None:
         self.maps, self.fingers = maps, env.num_fingers
-        self._steps, self._reached = wp.to_torch(env.step_count), wp.to_torch(env.goals_reached)
-        self._counted = self._reached.clone()
-        self._since = torch.zeros_like(self._steps)
+        self._goal_steps = wp.to_torch(env.goal_steps)
         hz = env.cfg.sim.control_hz
         self._after, self._every = round(AFTER_S * hz), round(EVERY_S * hz)
 
     def due(self) -> torch.Tensor:
-        """Worlds that look again now if they are far, bool [N]; to be asked once in every control step."""
-        self._since = torch.where(self.fresh(), 0, self._since + 1)
-        self._counted.copy_(self._reached)
-        late = self._since - self._after
+        """Worlds that look again now if they are far, bool [N]."""
+        late = self._goal_steps - self._after
         return (late >= 0) & (late % self._every == 0)
 
     def fresh(self) -> torch.Tensor:
-        """Worlds whose goal is a new one since :meth:`due` was asked, bool [N]."""
-        return (self._steps == 0) | (self._reached != self._counted)
+        """Worlds whose goal has just been given, bool [N]."""
+        return self._goal_steps == 0
 
     def of(self, world: torch.Tensor) -> torch.Tensor:
         """Views to choose from [C, M] for observations in the world frame [M, O].
