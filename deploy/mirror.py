@@ -25,8 +25,12 @@ class Mirror:
         self._goal: np.ndarray | None = None
         self._yes = wp.ones(1, dtype=wp.int32, device="cpu")
 
+    def begin(self) -> None:
+        """The next state is the first of its goal, also where that is the same as before."""
+        self._goal = None
+
     def take(self, sensed: Sensed) -> None:
-        """Take a state.
+        """Take a state, one in every control step: they are counted for the time of the goal.
 
         Args:
             sensed: The state, with that of the object.
@@ -50,8 +54,11 @@ class Mirror:
         if self._goal is None or not np.array_equal(self._goal, sensed.goal_quat):
             self._goal = sensed.goal_quat.copy()
             env.goal_quat.assign(self._goal[None].astype(np.float32))
+            env.goal_steps.zero_()
             if env.views is not None:
                 env.views.choose(self._yes, self._yes)
+        else:
+            env.goal_steps.fill_(int(env.goal_steps.numpy()[0]) + 1)
         env.sim.forward_kinematics()
         env.observe()
 

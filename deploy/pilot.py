@@ -120,10 +120,12 @@ class TeacherPilot:
         self._sight = TeacherSight(policy, mirror)
 
     def begin(self) -> None:
-        """A teacher remembers nothing."""
+        """A teacher remembers nothing; its goal is a new one."""
+        self.new_goal()
 
     def new_goal(self) -> None:
-        """A teacher remembers nothing."""
+        """The time of the goal is counted anew, for a teacher that sees it."""
+        self._sight.mirror.begin()
 
     def decide(self, sensed: Sensed) -> Decision:
         """Mean action and true distance."""

@@ -10,9 +10,10 @@ import warp as wp
 from vd.deploy.action import ActionFilter
 from vd.deploy.mirror import Mirror
 from vd.deploy.observation import Sensed, StudentSight, frame
-from vd.envs.cfg import RandomisationCfg, ReorientCfg
+from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_teacher, task_for
+from vd.kernels.observations import GOAL_TIME_UNIT_S
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import PRESETS
 from vd.student.network import Student
@@ -137,6 +138,33 @@ def test_a_teacher_sees_in_the_mirror_what_it_saw(hand):
         worst = max(worst, float(np.abs(mirror.env.observation.numpy() - env.observation.numpy()).max()))
         env.step(wp.from_torch(policy.act(wp.to_torch(env.observation)).contiguous()))
     assert worst < 1e-4
+
+
+def test_a_mirror_counts_the_time_of_a_goal_from_its_first_state_on():
+    seeing = ObservationCfg(view="goal", goal_time=True)
+    cfg = ReorientCfg(
+        hand="dclaw3",
+        objects=("cube",),
+        num_worlds=1,
+        randomisation=RandomisationCfg(enabled=False),
+        observation=seeing,
+    )
+    env, mirror = ReorientEnv(cfg, "cpu"), Mirror(cfg)
+
+    def times(count: int) -> list[float]:
+        seen = []
+        for _ in range(count):
+            mirror.take(state_of(env))
+            seen.append(float(mirror.env.observation.numpy()[0, -1]))
+        return seen
+
+    step = 1.0 / (cfg.sim.control_hz * GOAL_TIME_UNIT_S)
+    assert times(3) == pytest.approx([0.0, step, 2.0 * step])
+    goal = env.goal_quat.numpy()
+    env.goal_quat.assign(goal[:, [1, 0, 3, 2]])
+    assert times(2) == pytest.approx([0.0, step])
+    mirror.begin()
+    assert times(2) == pytest.approx([0.0, step]), "a new flight with the same goal"
 
 
 def test_a_mirror_wants_one_plain_world_and_the_truth():

@@ -103,7 +103,7 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
 
     # A line for each of some hundred kernels would scroll the progress away.
     wp.config.log_level = wp.LOG_WARNING
-    from vd.evaluate.agents import find_policy, policy_name
+    from vd.evaluate.agents import find_policy, policy_name, trained_task
     from vd.policy import load_policy
     from vd.student.network import Student
     from vd.student.saved import StudentSpec
@@ -112,6 +112,11 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
 
     device = cfg.run.device
     teacher = load_policy(find_policy(cfg.teacher), device)
+    if trained_task(teacher).observation.goal_time:
+        raise ValueError(
+            f"{cfg.teacher} sees for how long it has pursued its goal (observation.goal_time), which "
+            "students do not sense; give a teacher trained without it"
+        )
     task = student_task(teacher, cfg)
     if checkpoint is None:
         cfg = replace(cfg, network=replace(cfg.network, state=state_head(cfg, teacher)))
