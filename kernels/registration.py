@@ -20,6 +20,10 @@ DAMPING = wp.constant(0.01)
 """Curvature added to each direction, of one: what the points do not fix stays where it is."""
 LARGEST_TURN = wp.constant(0.5)
 """Largest turn of one step [rad]."""
+SETTLED_M = wp.constant(5.0e-5)
+"""A step that shifts a pose by less than this [m] ..."""
+SETTLED_RAD = wp.constant(1.0e-3)
+"""... and turns it by less than this [rad] is the last one."""
 SMALL = wp.constant(1.0e-7)
 """Lengths and angles below this have no direction."""
 ANYWHERE = wp.constant(1.0)
@@ -211,6 +215,46 @@ def standing_out(eye: Eye, place: wp.vec3, world: int, nearness: wp.array3d[floa
     return wp.clamp(1.0 / near - eye.margin - seen[2], 0.0, far)
 
 
+@wp.func
+def placed(
+    shapes: Shapes,
+    eye: Eye,
+    rendered: int,
+    every: int,
+    world: int,
+    turn: wp.quat,
+    seen: wp.array2d[wp.vec3],
+    count: wp.array[int],
+) -> wp.transform:
+    """The shape in a given rotation, what would be seen of it where points are.
+
+    The mean of the samples that lie nearer to the camera than their mean, of all without a camera, comes to
+    the mean of the seen points.
+    """
+    shape = shapes.world_shape[world]
+    middle = wp.vec3()
+    for i in range(count[world]):
+        middle += seen[world, i]
+    middle = middle / wp.max(float(count[world]), 1.0)
+    whole = wp.vec3()
+    for i in range(0, shapes.samples.shape[1], every):
+        whole += shapes.samples[shape, i]
+    samples = (shapes.samples.shape[1] + every - 1) // every
+    whole = whole / float(samples)
+    part = whole
+    if rendered != 0:
+        ray = wp.quat_rotate_inv(turn, middle - wp.transform_get_translation(eye.pose))
+        total = wp.vec3()
+        near = wp.float32(0.0)
+        for i in range(0, shapes.samples.shape[1], every):
+            sample = shapes.samples[shape, i]
+            if wp.dot(sample - whole, ray) <= 0.0:
+                total += sample
+                near += 1.0
+        part = total / wp.max(near, 1.0)
+    return wp.transform(middle - wp.quat_rotate(turn, shapes.world_scale[world] * part), turn)
+
+
 @wp.kernel
 def start_poses_kernel(
     # Model:
@@ -227,10 +271,7 @@ def start_poses_kernel(
     # Out:
     pose_out: wp.array2d[wp.transform],
 ):
-    """Place the shape in given rotations, what would be seen of it where points are. Launch: [M, C].
-
-    The mean of the samples that lie nearer to the camera than their mean, of all without a camera, comes to
-    the mean of the seen points.
+    """Place the shape in given rotations, as :func:`placed` does. Launch: [M, C].
 
     Args:
         shapes: The shapes.
@@ -248,30 +289,44 @@ def start_poses_kernel(
     world = world_in[row]
     if world < 0:
         return
-    shape = shapes.world_shape[world]
     turn = rotation_in[(first_in[row] + c) % rotation_in.shape[0]]
-    middle = wp.vec3()
-    for i in range(count_in[world]):
-        middle += seen_in[world, i]
-    middle = middle / wp.max(float(count_in[world]), 1.0)
-    whole = wp.vec3()
-    for i in range(0, shapes.samples.shape[1], every):
-        whole += shapes.samples[shape, i]
-    samples = (shapes.samples.shape[1] + every - 1) // every
-    whole = whole / float(samples)
-    part = whole
-    if rendered != 0:
-        ray = wp.quat_rotate_inv(turn, middle - wp.transform_get_translation(eye.pose))
-        total = wp.vec3()
-        near = wp.float32(0.0)
-        for i in range(0, shapes.samples.shape[1], every):
-            sample = shapes.samples[shape, i]
-            if wp.dot(sample - whole, ray) <= 0.0:
-                total += sample
-                near += 1.0
-        part = total / wp.max(near, 1.0)
-    place = middle - wp.quat_rotate(turn, shapes.world_scale[world] * part)
-    pose_out[row, c] = wp.transform(place, turn)
+    pose_out[row, c] = placed(shapes, eye, rendered, every, world, turn, seen_in, count_in)
+
+
+@wp.kernel
+def replace_poses_kernel(
+    # Model:
+    shapes: Shapes,
+    eye: Eye,
+    rendered: int,
+    every: int,
+    # In:
+    world_in: wp.array[int],
+    pose_in: wp.array2d[wp.transform],
+    seen_in: wp.array2d[wp.vec3],
+    count_in: wp.array[int],
+    # Out:
+    pose_out: wp.array2d[wp.transform],
+):
+    """Put poses where points are now, turned as they were: what falls is soon too far. Launch: [M, C].
+
+    Args:
+        shapes: The shapes.
+        eye: The camera.
+        rendered: 1 where a camera saw the points, 0 where they are of all sides.
+        every: Look at every so many-th sample.
+        world_in: World of each row, shape [M]; a row of -1 is left out.
+        pose_in: Poses before, object frame in the base frame, shape [M, C].
+        seen_in: Points seen of the object, base frame [m], shape [N, P].
+        count_in: How many there are, shape [N].
+        pose_out: Poses, shape [M, C].
+    """
+    row, c = wp.tid()
+    world = world_in[row]
+    if world < 0:
+        return
+    turn = wp.transform_get_rotation(pose_in[row, c])
+    pose_out[row, c] = placed(shapes, eye, rendered, every, world, turn, seen_in, count_in)
 
 
 @wp.func
@@ -344,13 +399,13 @@ def fit_poses_kernel(
     # Out:
     misfit_out: wp.array2d[float],
 ):
-    """Improve poses, and say how badly they fit. Launch: [M, C].
+    """Improve poses until they stay, and say how badly they fit. Launch: [M, C].
 
     Args:
         shapes: The shapes.
         eye: The camera.
         far: Length at which distances are cut off [m]; from about there on points count less.
-        steps: Steps of each pose.
+        steps: Steps of each pose at most.
         every: Look at every so many-th seen point.
         every_sample: Look at every so many-th sample for what stands out.
         world_in: World of each row, shape [M]; a row of -1 is left out.
@@ -366,7 +421,12 @@ def fit_poses_kernel(
         return
     best = pose[row, c]
     for _ in range(steps):
-        best = improved(shapes, world, best, far, every, seen_in, count_in)
+        before = best
+        best = improved(shapes, world, before, far, every, seen_in, count_in)
+        shift = wp.transform_get_translation(best) - wp.transform_get_translation(before)
+        turn = wp.transform_get_rotation(best) - wp.transform_get_rotation(before)  # half the angle, if small
+        if wp.length(shift) < SETTLED_M and 2.0 * wp.length(turn) < SETTLED_RAD:
+            break
     pose[row, c] = best
 
     shape = shapes.world_shape[world]
@@ -389,6 +449,33 @@ def fit_poses_kernel(
             out += length * length
             samples += 1.0
     misfit_out[row, c] = off / wp.max(points, 1.0) + out / wp.max(samples, 1.0)
+
+
+@wp.kernel
+def take_better_kernel(
+    # In:
+    world_in: wp.array[int],
+    known: int,
+    # In/Out:
+    pose: wp.array2d[wp.transform],
+    cost: wp.array2d[float],
+):
+    """Of each two attempts at the same pose take the better one. Launch: [M, K].
+
+    Args:
+        world_in: World of each row, shape [M]; a row of -1 is left out.
+        known: K.
+        pose: Poses, shape [M, >= 2 K]: attempt k + K is another one at what k is.
+        cost: Their misfits [m^2], likewise; NEVER of the second ones afterwards.
+    """
+    row, k = wp.tid()
+    if world_in[row] < 0:
+        return
+    again = known + k
+    if cost[row, again] < cost[row, k]:
+        pose[row, k] = pose[row, again]
+        cost[row, k] = cost[row, again]
+    cost[row, again] = NEVER
 
 
 @wp.kernel

@@ -112,6 +112,24 @@ def test_a_shape_is_found_and_followed(device, corner):
     assert found.looks.tolist() == [3, 4] * 4
 
 
+def test_what_falls_is_followed(device, corner):
+    """By 8 cm from look to look, and turning: farther than steps from where it was reach."""
+    worlds = 24
+    found, place = registration(corner, worlds, device), torch.device(wp.device_to_torch(device))
+    pose = poses(worlds)
+    pose[:, 2] += 0.2
+    rng = np.random.default_rng(1)
+    turn = Rotation.from_rotvec(0.3 * Rotation.random(worlds, rng=rng).apply([1.0, 0.0, 0.0]))
+    fresh = torch.ones(worlds, dtype=torch.bool, device=place)
+    for look in range(4):
+        seen, count = seen_of(corner, pose, seed=look)
+        found.look(seen.to(place), count.to(place), fresh=fresh)
+        assert errors(found.pose[:, 0].cpu(), pose).max() < CLOSE_RAD, f"look {look}"
+        pose[:, 3:] = (turn * Rotation.from_quat(pose[:, 3:])).as_quat()
+        pose[:, 2] -= 0.08
+        fresh = torch.zeros_like(fresh)
+
+
 def test_a_world_is_found_whatever_the_others_are(corner):
     """And twice the same, to the bit."""
     pose = poses(3)

@@ -17,8 +17,10 @@ from vd.kernels.registration import (
     keep_poses_kernel,
     nearness_kernel,
     off_mesh_kernel,
+    replace_poses_kernel,
     shape_distance_kernel,
     start_poses_kernel,
+    take_better_kernel,
 )
 
 GRID, SAMPLES, SEEN = 5, 9, 7
@@ -110,6 +112,16 @@ class Scene:
         """Row and column of the cell that shows a point, and its depth."""
         x, y, z = Rotation.from_quat(self.eye[3:]).inv().apply(place - self.eye[:3])
         return int(np.floor((250.0 * y / z + 24.0) / CELL)), int(np.floor((250.0 * x / z + 36.0) / CELL)), z
+
+    def placed(self, world: int, turn: Rotation, every: int, *, rendered: bool) -> np.ndarray:
+        """Where the near side of the shape in this rotation comes to the points."""
+        points = self.seen[world, : self.count[world]]
+        middle = points.mean(axis=0) if len(points) else np.zeros(3)
+        near = self.samples[self.world_shape[world], ::every]
+        if rendered:
+            depth = turn.apply(near) @ (middle - self.eye[:3])
+            near = near[depth <= depth.mean()]
+        return middle - self.world_scale[world] * turn.apply(near.mean(axis=0))
 
     def improved(self, world: int, pose: np.ndarray, every: int) -> np.ndarray:
         """One step by the whole system of six equations."""
@@ -220,18 +232,48 @@ def test_a_start_puts_the_near_side_where_the_points_are(device, seed, rendered,
     inputs += [device_array(first, int, device), device_array(rotations.as_quat(), wp.quat, device)]
     wp.launch(start_poses_kernel, dim=out.shape, inputs=[*inputs, seen, count], outputs=[out], device=device)
     for row, world in enumerate(scene.row_world):
-        points = scene.seen[world, : scene.count[world]]
-        middle = points.mean(axis=0) if len(points) else np.zeros(3)
-        samples = scene.samples[scene.world_shape[world], ::every]
         for c in range(4):
             turn = rotations[(first[row] + c) % 6]
-            near = samples
-            if rendered:
-                depth = turn.apply(samples) @ (middle - scene.eye[:3])
-                near = samples[depth <= depth.mean()]
-            place = middle - scene.world_scale[world] * turn.apply(near.mean(axis=0))
+            place = scene.placed(world, turn, every, rendered=rendered)
             np.testing.assert_allclose(out.numpy()[row, c, :3], place, atol=1e-5)
             np.testing.assert_allclose(out.numpy()[row, c, 3:], turn.as_quat(), atol=1e-6)
+
+
+@given(seed=seeds, rendered=st.booleans(), every=st.integers(1, 3))
+@EXAMPLES
+def test_poses_are_put_where_the_points_are_and_stay_turned_as_they_were(device, seed, rendered, every):
+    scene = Scene(seed)
+    row_world, seen, count = scene.inputs(device)
+    out = unwritten(scene.pose.shape[:2], wp.transform, device)
+    inputs = [scene.model(device), scene.camera(), int(rendered), every, row_world]
+    inputs += [device_array(scene.pose, wp.transform, device), seen, count]
+    wp.launch(replace_poses_kernel, dim=out.shape, inputs=inputs, outputs=[out], device=device)
+    for row, world in enumerate(scene.row_world):
+        for c in range(scene.poses):
+            turn = Rotation.from_quat(scene.pose[row, c, 3:])
+            place = scene.placed(world, turn, every, rendered=rendered)
+            np.testing.assert_allclose(out.numpy()[row, c, :3], place, atol=1e-5)
+            np.testing.assert_allclose(out.numpy()[row, c, 3:], scene.pose[row, c, 3:], atol=1e-6)
+
+
+@given(seed=seeds)
+@EXAMPLES
+def test_of_two_attempts_the_better_one_is_taken(device, seed):
+    scene = Scene(seed)
+    rows, kept, candidates = len(scene.row_world), 3, 8
+    found, cost = scene.random_poses(rows, candidates), scene.rng.uniform(0.1, 1.0, (rows, candidates))
+    arrays = [device_array(found, wp.transform, device), device_array(cost, float, device)]
+    row_world = np.where(np.arange(rows) == 1, -1, scene.row_world)
+    inputs = [device_array(row_world, int, device), kept]
+    wp.launch(take_better_kernel, dim=(rows, kept), inputs=inputs, outputs=arrays, device=device)
+    expected, poses = cost.copy(), found.copy()
+    for row in np.flatnonzero(row_world >= 0):
+        for k in range(kept):
+            best = min((k, k + kept), key=lambda c, row=row: cost[row, c])
+            expected[row, k], poses[row, k] = cost[row, best], found[row, best]
+        expected[row, kept : 2 * kept] = NEVER
+    np.testing.assert_allclose(arrays[1].numpy(), expected, rtol=1e-6)
+    np.testing.assert_allclose(arrays[0].numpy(), poses, atol=1e-6)
 
 
 @given(

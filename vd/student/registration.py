@@ -24,8 +24,10 @@ from vd.kernels.registration import (
     keep_poses_kernel,
     nearness_kernel,
     off_mesh_kernel,
+    replace_poses_kernel,
     shape_distance_kernel,
     start_poses_kernel,
+    take_better_kernel,
 )
 
 POINTS = 256
@@ -56,7 +58,9 @@ OTHERS = 10
 STRIDE = 370
 """How far along the spiral of rotations those of the next step are: all come in turn."""
 STEPS = 5
-"""Steps of each pose in a later look."""
+"""Steps of each of these at most."""
+KEPT_STEPS = 8
+"""Steps of each pose that was kept, at most; most stay after two or three."""
 EVERY_SAMPLE = 2
 """Every so many-th surface sample is looked at for what stands out."""
 APART_RAD = 0.3
@@ -156,8 +160,8 @@ class Registration:
         self.looks = torch.zeros(worlds, dtype=torch.int32, device=place)
         self._kept = [wp.from_torch(self.pose, dtype=wp.transform), wp.from_torch(self.misfit)]
         self._worlds = torch.arange(worlds, dtype=torch.int32, device=place)
-        # What a later look fits: poses kept before, and others.
-        self._found = wp.empty((worlds, KEPT + OTHERS), dtype=wp.transform, device=device)
+        # What a later look fits: poses kept before, the same where points are now, and others.
+        self._found = wp.empty((worlds, 2 * KEPT + OTHERS), dtype=wp.transform, device=device)
         self._cost = wp.empty(self._found.shape, dtype=float, device=device)
 
     def look(
@@ -237,10 +241,17 @@ class Registration:
 
     def _follow(self, worlds: wp.array, inputs: list[wp.array]) -> None:
         """Go on from the kept poses, and try a few others; a row for each world, -1 where it is left out."""
+        known, others = slice(2 * KEPT), slice(2 * KEPT, None)
         wp.copy(self._found[:, :KEPT], self._kept[0])
+        # What falls is 4 cm farther at the next look: no step finds it there from where it was.
+        model = [self._shapes, self._eye, int(self._rendered), EVERY_SAMPLE, worlds]
+        again = self._found[:, KEPT : 2 * KEPT]
+        self._launch(replace_poses_kernel, again.shape, [*model, self._kept[0], *inputs], [again])
         first = wp.from_torch((self.looks * STRIDE) % ROTATIONS)
-        self._start(self._found[:, KEPT:], worlds, first, inputs)
-        self._fit(self._found, self._cost, worlds, STEPS, 1, inputs)
+        self._start(self._found[:, others], worlds, first, inputs)
+        for part, steps in ((known, KEPT_STEPS), (others, STEPS)):
+            self._fit(self._found[:, part], self._cost[:, part], worlds, steps, 1, inputs)
+        self._launch(take_better_kernel, (len(worlds), KEPT), [worlds, KEPT], [self._found, self._cost])
         self._keep(KEPT, worlds, self._found, self._cost)
 
     def _start(self, pose: wp.array, worlds: wp.array, first: wp.array, inputs: list[wp.array]) -> None:
