@@ -21,9 +21,9 @@ DAMPING = wp.constant(0.01)
 LARGEST_TURN = wp.constant(0.5)
 """Largest turn of one step [rad]."""
 SETTLED_M = wp.constant(5.0e-5)
-"""A step that shifts a pose by less than this [m] ..."""
+"""A step that shifts a pose by less than this [m] (ours, far below what is seen) ..."""
 SETTLED_RAD = wp.constant(1.0e-3)
-"""... and turns it by less than this [rad] is the last one."""
+"""... and turns it by less than this [rad] is the last one (ours)."""
 SMALL = wp.constant(1.0e-7)
 """Lengths and angles below this have no direction."""
 ANYWHERE = wp.constant(1.0)

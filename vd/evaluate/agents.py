@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 from vd.aim import AimCfg
 from vd.bundle import is_bundle
 from vd.config import from_dict
-from vd.envs.cfg import CurriculumCfg, ExploreCfg, NudgeCfg, ObservationCfg, ReorientCfg, SuccessCfg, TableCfg
+from vd.envs.cfg import (
+    CaughtCfg,
+    CurriculumCfg,
+    ExploreCfg,
+    NudgeCfg,
+    ObservationCfg,
+    ReorientCfg,
+    SuccessCfg,
+    TableCfg,
+)
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -301,6 +310,7 @@ def task_for(
         else replace(base.goal, max_angle_rad=max_goal_angle_rad),
         curriculum=CurriculumCfg(),
         table=TableCfg(),
+        caught=CaughtCfg(),  # time is up for those that are caught, too
         nudge=NudgeCfg(enabled=nudge),
         explore=ExploreCfg(enabled=explore),
         aim=AimCfg(enabled=aim),

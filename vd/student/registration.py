@@ -60,7 +60,7 @@ STRIDE = 370
 STEPS = 5
 """Steps of each of these at most."""
 KEPT_STEPS = 8
-"""Steps of each pose that was kept, at most; most stay after two or three."""
+"""Steps of each pose that was kept, at most (ours, docs/results/student.md: What falls is followed)."""
 EVERY_SAMPLE = 2
 """Every so many-th surface sample is looked at for what stands out."""
 APART_RAD = 0.3
@@ -243,7 +243,7 @@ class Registration:
         """Go on from the kept poses, and try a few others; a row for each world, -1 where it is left out."""
         known, others = slice(2 * KEPT), slice(2 * KEPT, None)
         wp.copy(self._found[:, :KEPT], self._kept[0])
-        # What falls is 4 cm farther at the next look: no step finds it there from where it was.
+        # What falls is 4 cm farther at the next look, and steps look FAR_M far.
         model = [self._shapes, self._eye, int(self._rendered), EVERY_SAMPLE, worlds]
         again = self._found[:, KEPT : 2 * KEPT]
         self._launch(replace_poses_kernel, again.shape, [*model, self._kept[0], *inputs], [again])
