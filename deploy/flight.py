@@ -19,7 +19,14 @@ from vd.deploy.observation import Sensed
 from vd.deploy.pilot import Pilot, StillPilot, StudentPilot, TeacherPilot
 from vd.deploy.twin_link import TwinLink
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import check_bundle, is_saved_student, open_policy, task_for, trained_task
+from vd.evaluate.agents import (
+    check_bundle,
+    is_saved_student,
+    open_critic,
+    open_policy,
+    task_for,
+    trained_task,
+)
 from vd.evaluate.rollout import draw_goals
 from vd.paper import PAPER
 
@@ -59,6 +66,7 @@ def make_flight(
     item: ObjectModel,
     *,
     tolerance_rad: float = PAPER.success.rotation_rad,
+    second_view: bool = False,
     seed: int = 0,
 ) -> Flight:
     """Load a policy, and make it ready.
@@ -70,12 +78,16 @@ def make_flight(
         hand: The hand.
         item: The object.
         tolerance_rad: How near to the goal it is to stop [rad].
+        second_view: Whether goals that are not reached are looked at in other views
+            (:mod:`vd.evaluate.second_view`).
         seed: Of the choice of camera points.
 
     Raises:
-        ValueError: It is for another hand, or cannot act.
+        ValueError: It is for another hand, or cannot act, or has no second view.
     """
     if name == STILL:
+        if second_view:
+            raise ValueError(f"--second-view is for policies; {STILL} does nothing")
         return Flight(name, STILL, StillPilot(hand.num_joints), ReorientCfg(hand=hand_name))
     policy: Any = open_policy(name, "cpu")
     if policy is None:
@@ -86,7 +98,8 @@ def make_flight(
         raise ValueError(f"{name} moves {moves} joints, the hand {hand.name} has {hand.num_joints}")
     check_bundle(name, replace(trained_task(policy), hand=hand_name))
     if student:
-        pilot = StudentPilot(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
+        critic = open_critic(policy, "cpu") if second_view else None
+        pilot = StudentPilot(policy, hand, item, tolerance_rad=tolerance_rad, critic=critic, seed=seed)
         camera = pilot.camera
         return Flight(
             name,
@@ -97,12 +110,12 @@ def make_flight(
             needs_truth=camera is None,
             calibrated=policy.spec.calibrated_for(tolerance_rad),
         )
-    task = mirror_task(policy, hand_name, item_name)
-    teacher = TeacherPilot(policy, Mirror(task), tolerance_rad)
+    task = mirror_task(policy, hand_name, item_name, second_view=second_view)
+    teacher = TeacherPilot(policy, Mirror(task), tolerance_rad, second_view=second_view)
     return Flight(name, "teacher", teacher, task, needs_truth=True)
 
 
-def mirror_task(policy: Any, hand_name: str, item_name: str) -> ReorientCfg:
+def mirror_task(policy: Any, hand_name: str, item_name: str, *, second_view: bool = False) -> ReorientCfg:
     """The environment of a policy's training as a mirror takes it: one world, not randomised."""
     return task_for(
         policy,
@@ -116,6 +129,7 @@ def mirror_task(policy: Any, hand_name: str, item_name: str) -> ReorientCfg:
         randomised=False,
         success_ends_episode=False,
         at_rest=False,
+        second_view=second_view,
     )
 
 

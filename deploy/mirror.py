@@ -9,6 +9,7 @@ import warp as wp
 from vd.deploy.observation import Sensed
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
+from vd.evaluate.statistics import rotation_angle
 
 
 class Mirror:
@@ -59,6 +60,7 @@ class Mirror:
                 env.views.choose(self._yes, self._yes)
         else:
             env.goal_steps.fill_(int(env.goal_steps.numpy()[0]) + 1)
+        env.rotation_error.fill_(float(rotation_angle(pose[None, 3:].astype(float), self._goal[None])[0]))
         env.sim.forward_kinematics()
         env.observe()
 

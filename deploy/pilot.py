@@ -1,8 +1,9 @@
 """Policies as the loop flies them: from what is sensed to an action and the distance to the goal."""
 
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -12,9 +13,12 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict
 from vd.deploy.mirror import Mirror, TeacherSight
 from vd.deploy.observation import Sensed, StudentSight
+from vd.evaluate.agents import trained_task
+from vd.evaluate.second_view import GoalClock, SecondView, StudentSecondView
 from vd.evaluate.statistics import rotation_angle
 from vd.evaluate.student import PRETRAINED, RENDERED
 from vd.paper import PAPER
+from vd.policy import TrainedPolicy
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.saved import SavedStudent
 from vd.student.stopping import StoppingRule
@@ -54,10 +58,14 @@ class StudentPilot:
         hand: The hand.
         item: The object.
         tolerance_rad: How near to the goal it is to stop [rad].
+        critic: Its teacher, with its critic, to look twice at goals (:mod:`vd.evaluate.second_view`).
         seed: Of the choice of camera points.
 
     Attributes:
         camera: Where its camera has to be; None: it sees complete clouds, which only a twin has.
+
+    Raises:
+        ValueError: It is one of stage 0, which cannot act, or has no second view and is to take one.
     """
 
     def __init__(
@@ -67,6 +75,7 @@ class StudentPilot:
         item: ObjectModel,
         *,
         tolerance_rad: float = PAPER.success.rotation_rad,
+        critic: TrainedPolicy | None = None,
         seed: int = 0,
     ):
         spec = student.spec
@@ -80,6 +89,11 @@ class StudentPilot:
         self._make_sight = partial(StudentSight, hand, item, spec.network, depth=depth, seed=seed)
         self.sight = self._make_sight(camera=self.camera)
         self._hidden = self._network.initial_hidden(1)
+        self._clock = GoalClock(torch.zeros(1, dtype=torch.int32), trained_task(student).sim.control_hz)
+        self._second = None
+        if critic is not None:
+            self._network = deepcopy(self._network)  # its views are changed
+            self._second = StudentSecondView(self._clock, self._network.state, critic)
 
     def look_by(self, camera: CameraModel) -> None:
         """See by a camera with this lens at this place, in place of the one of the training."""
@@ -94,6 +108,7 @@ class StudentPilot:
     def new_goal(self) -> None:
         """A new goal: the memory starts empty, as in training; the object is followed on."""
         self._hidden = self._network.initial_hidden(1)
+        self._clock.steps.zero_()
 
     def decide(self, sensed: Sensed) -> Decision:
         """Mean action and predicted distance."""
@@ -101,8 +116,11 @@ class StudentPilot:
             points = self.sight.points(sensed)
             sites = self.sight.sites(points)
             senses = self._network.senses(self.sight.frame(sensed, points, sites))
+            if self._second is not None:
+                self._second.begin_step()
             output = self._network.act(sites[0], senses, self._hidden, *sites[1:])
         self._hidden = output.hidden
+        self._clock.steps.add_(1)
         return Decision(output.mean[0].numpy().copy(), float(output.distance[0, -1]))
 
 
@@ -113,11 +131,22 @@ class TeacherPilot:
         policy: The teacher.
         mirror: A world of its training.
         tolerance_rad: How near to the goal it is to stop [rad].
+        second_view: Look twice at goals (:mod:`vd.evaluate.second_view`), in a mirror that has other views.
+
+    Raises:
+        ValueError: It is to look twice, and has no critic, or its mirror no other view.
     """
 
-    def __init__(self, policy: Any, mirror: Mirror, tolerance_rad: float = PAPER.success.rotation_rad):
+    def __init__(
+        self,
+        policy: TrainedPolicy,
+        mirror: Mirror,
+        tolerance_rad: float = PAPER.success.rotation_rad,
+        *,
+        second_view: bool = False,
+    ):
         self.rule = StoppingRule(tolerance_rad)
-        self._sight = TeacherSight(policy, mirror)
+        self._sight = TeacherSight(SecondView(mirror.env, policy) if second_view else policy, mirror)
 
     def begin(self) -> None:
         """A teacher remembers nothing; its goal is a new one."""

@@ -72,6 +72,8 @@ class RunCfg(HandOptions):
     """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
     explore: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
+    second_view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Where a goal is not reached in 3 s, look at it in other views (vd-eval --help): more goals."""
     air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Take the twin's table away after 2 s, as the paper's test in the air does."""
     realistic: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -134,6 +136,7 @@ def run(cfg: RunCfg) -> int:
         hand,
         item,
         tolerance_rad=PAPER.success.precise_rad if cfg.precise else PAPER.success.rotation_rad,
+        second_view=cfg.second_view,
         seed=cfg.seed,
     )
     if cfg.precise and not flight.calibrated:
@@ -210,6 +213,7 @@ def _fly(
                 "goals": [[float(value) for value in goal] for goal in goals],
                 "control_hz": flight.task.sim.control_hz,
                 "stopping": vars(pilot.rule),
+                "second_view": cfg.second_view,
                 "nudge": vars(chance.nudge) if cfg.nudge else None,
                 "explore": vars(chance.explore) if cfg.explore else None,
                 "action": vars(flight.task.action),

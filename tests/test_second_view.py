@@ -11,7 +11,7 @@ import warp as wp
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
-from vd.evaluate.second_view import AFTER_S, EVERY_S, OtherViews, SecondView, view_maps
+from vd.evaluate.second_view import AFTER_S, EVERY_S, GoalClock, OtherViews, SecondView, view_maps
 from vd.kernels.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
 from vd.train.vec_env import ReorientVecEnv
@@ -171,7 +171,7 @@ def test_a_training_draws_one_of_these_views(env):
         np.testing.assert_array_equal(env.views.view.numpy(), first)
         wp.to_torch(env.goal_steps)[0] = 0  # has come to a goal, and is not due
         observed = learner.step(still)[0]["policy"]
-        view, others = env.views.view.numpy(), OtherViews(env, view_maps(env))
+        view, others = env.views.view.numpy(), OtherViews(GoalClock.of(env), view_maps(env))
         assert view[0] == first[0]
         world = wp.to_torch(env.world_observation)
         offered = others.of(world).numpy()

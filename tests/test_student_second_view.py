@@ -12,7 +12,14 @@ from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.envs.symmetry import view_tables
 from vd.evaluate import cli
-from vd.evaluate.second_view import AFTER_S, EVERY_S, NEAREST, StudentSecondView, with_second_view
+from vd.evaluate.second_view import (
+    AFTER_S,
+    EVERY_S,
+    NEAREST,
+    GoalClock,
+    StudentSecondView,
+    with_second_view,
+)
 from vd.kernels.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
 from vd.student.state import StateHead, state_cfg
@@ -98,7 +105,7 @@ def test_it_takes_other_views_of_far_goals_after_a_while_and_keeps_them(env, tea
     estimate, hz = estimates(env, head, angles), env.cfg.sim.control_hz
     _, nearest = head.act(estimate)
     at_step(env, 0)
-    second = StudentSecondView(env, head, teacher)
+    second = StudentSecondView(GoalClock.of(env), head, teacher)
     better = wanted(env, head, teacher, estimate)
     assert any(view != first for view, first in zip(better[3:], nearest[3:].tolist(), strict=True))
     for step in range(round((AFTER_S + EVERY_S) * hz)):
@@ -120,7 +127,10 @@ def test_it_takes_other_views_of_far_goals_after_a_while_and_keeps_them(env, tea
 def test_in_the_view_that_is_taken_it_acts_as_its_teacher(env, teacher, head):
     estimate = estimates(env, head, np.full(WORLDS, 2.0))
     at_step(env, 0)
-    second, after = StudentSecondView(env, head, teacher), round(AFTER_S * env.cfg.sim.control_hz)
+    second, after = (
+        StudentSecondView(GoalClock.of(env), head, teacher),
+        round(AFTER_S * env.cfg.sim.control_hz),
+    )
     for step in range(after + 1):
         at_step(env, step)
         second.begin_step()
@@ -131,12 +141,14 @@ def test_in_the_view_that_is_taken_it_acts_as_its_teacher(env, teacher, head):
 
 def test_a_student_without_views_or_a_teacher_without_a_critic_is_refused(env, teacher, head):
     with pytest.raises(ValueError, match="does not act by the layers of a teacher that sees its goals"):
-        StudentSecondView(env, None, teacher)
+        StudentSecondView(GoalClock.of(env), None, teacher)
     plain = StateHead(state_cfg(teacher.spec, views=0), WIDTH, env.num_actions)
     with pytest.raises(ValueError, match="does not act by the layers of a teacher that sees its goals"):
-        StudentSecondView(env, plain, teacher)
+        StudentSecondView(GoalClock.of(env), plain, teacher)
     with pytest.raises(ValueError, match="no critic; export it again"):
-        StudentSecondView(env, head, TrainedPolicy(teacher.spec, teacher.weights, task=teacher.task))
+        StudentSecondView(
+            GoalClock.of(env), head, TrainedPolicy(teacher.spec, teacher.weights, task=teacher.task)
+        )
 
 
 def test_an_evaluation_of_a_student_says_that_it_looked_twice(tmp_path):

@@ -9,7 +9,7 @@ from tensordict import TensorDict
 
 from vd.config import to_dict
 from vd.envs.state import saved_stage
-from vd.evaluate.second_view import OtherViews, view_maps
+from vd.evaluate.second_view import GoalClock, OtherViews, view_maps
 from vd.paper import PAPER
 
 OBSERVATION_GROUP = "policy"
@@ -50,7 +50,7 @@ class ReorientVecEnv(VecEnv):
         self.env = env
         self._others = None
         if second_view:
-            self._others = OtherViews(env, view_maps(env))
+            self._others = OtherViews(GoalClock.of(env), view_maps(env))
             self._world, self._view = wp.to_torch(env.world_observation), wp.to_torch(env.views.view)
         self.num_envs = env.num_worlds
         self.num_actions = env.num_actions

@@ -6,7 +6,7 @@ of each says where to go on. A student, which acts by its teacher's layers, asks
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 import warp as wp
@@ -14,7 +14,7 @@ import warp as wp
 from vd.envs.cfg import ObservationCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import trained_task
-from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.observations import JOINTS_PER_FINGER, teacher_observation_slices
 from vd.paper import PAPER
 from vd.policy import TrainedPolicy
 from vd.student.state import StateHead
@@ -58,22 +58,37 @@ def view_maps(env: ReorientEnv) -> ViewMaps:
     return maps.to(wp.device_to_torch(env.device))
 
 
+@dataclass(frozen=True)
+class GoalClock:
+    """For how long each world has pursued its goal: a simulator's clock, or that of a hand."""
+
+    steps: torch.Tensor
+    """Control steps, 0 in the first, shape [N]; kept up to date by who owns them."""
+    control_hz: float
+    """How many of them there are in a second."""
+
+    @classmethod
+    def of(cls, env: ReorientEnv) -> "GoalClock":
+        """That of an environment."""
+        return cls(wp.to_torch(env.goal_steps), env.cfg.sim.control_hz)
+
+
 class OtherViews:
     """Which worlds look at their goals again, and in which views they may.
 
     Args:
-        env: The environment; only its clock and its goals are looked at.
-        maps: The views of its hand, :func:`view_maps`.
+        clock: The time of their goals.
+        maps: The views of their hand, :func:`view_maps`.
 
     Attributes:
         maps: These.
         fingers: F of the hand.
     """
 
-    def __init__(self, env: ReorientEnv, maps: ViewMaps) -> None:
-        self.maps, self.fingers = maps, env.num_fingers
-        self._goal_steps = wp.to_torch(env.goal_steps)
-        hz = env.cfg.sim.control_hz
+    def __init__(self, clock: GoalClock, maps: ViewMaps) -> None:
+        self.maps, self.fingers = maps, maps.joints.shape[1] // JOINTS_PER_FINGER
+        self._goal_steps = clock.steps
+        hz = clock.control_hz
         self._after, self._every = round(AFTER_S * hz), round(EVERY_S * hz)
 
     def due(self) -> torch.Tensor:
@@ -118,7 +133,7 @@ class SecondView:
     """
 
     def __init__(self, env: ReorientEnv, policy: TrainedPolicy) -> None:
-        self._others = OtherViews(env, view_maps(env))
+        self._others = OtherViews(GoalClock.of(env), view_maps(env))
         assert env.views is not None  # or there would be no maps
         self.num_actions = policy.num_actions
         self._env, self._views, self._policy = env, env.views, policy
@@ -143,7 +158,7 @@ class StudentSecondView:
     It knows no state: how far the goal is, and what its teacher's critic would see, is what it estimates.
 
     Args:
-        env: The student's environment.
+        clock: The time of its goals.
         head: Where it estimates its teacher's observation, in views; from now on they are chosen here.
         critic: The teacher, with its critic.
 
@@ -154,7 +169,7 @@ class StudentSecondView:
         ValueError: The student does not act in views, or the teacher has no critic.
     """
 
-    def __init__(self, env: ReorientEnv, head: StateHead | None, critic: TrainedPolicy) -> None:
+    def __init__(self, clock: GoalClock, head: StateHead | None, critic: TrainedPolicy) -> None:
         if head is None or head.views is None:
             raise ValueError(
                 "--second-view: this student does not act by the layers of a teacher that sees its goals in "
@@ -162,16 +177,17 @@ class StudentSecondView:
             )
         task = trained_task(critic)
         seen = with_second_view(task.observation)
-        one = ReorientEnv(replace(task, objects=("cube",), num_worlds=1, observation=seen), env.device)
+        device, worlds = clock.steps.device, len(clock.steps)
+        one = ReorientEnv(replace(task, objects=("cube",), num_worlds=1, observation=seen), str(device))
         maps = view_maps(one).adopt_first(head.views)
-        self._others = OtherViews(env, maps)
+        self._others = OtherViews(clock, maps)
         one.close()
         self._head, self._critic, self._first = head, critic, head.views
         critic.value(head.view_offset[None])  # refuses a policy without a critic
         head.views, head.look = maps, self._views
-        self._again = torch.zeros(env.num_worlds, dtype=torch.bool, device=head.offset.device)
-        self._taken = torch.full((env.num_worlds,), NEAREST, device=head.offset.device)
-        self.rows = torch.arange(env.num_worlds, device=head.offset.device)
+        self._again = torch.zeros(worlds, dtype=torch.bool, device=device)
+        self._taken = torch.full((worlds,), NEAREST, device=device)
+        self.rows = torch.arange(worlds, device=device)
 
     def begin_step(self) -> None:
         """To be called once in every control step, before the student acts."""

@@ -9,7 +9,7 @@ import warp as wp
 
 from vd.config import from_dict
 from vd.evaluate.scanned import ScannedGoalView
-from vd.evaluate.second_view import StudentSecondView
+from vd.evaluate.second_view import GoalClock, StudentSecondView
 from vd.policy import TrainedPolicy
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.saved import SavedStudent
@@ -82,7 +82,7 @@ class StudentActor:
         self._second = None
         if critic is not None:
             self._student = deepcopy(self._student)  # its views are changed
-            self._second = StudentSecondView(env, self._student.state, critic)
+            self._second = StudentSecondView(GoalClock.of(env), self._student.state, critic)
         self._hidden = self._student.initial_hidden(env.num_worlds)
         self._steps = wp.to_torch(env.step_count)
         self.predicted = self._hidden.new_zeros(env.num_worlds)

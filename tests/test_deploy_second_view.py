@@ -1,0 +1,99 @@
+"""Second views on a hand: when a goal is looked at again, and that it is as in the simulator."""
+
+import numpy as np
+import pytest
+import warp as wp
+
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.model import load_set
+from vd.deploy.flight import make_flight, mirror_task
+from vd.deploy.mirror import Mirror
+from vd.deploy.observation import Sensed
+from vd.deploy.pilot import StudentPilot, TeacherPilot
+from vd.envs.reorient import ReorientEnv
+from vd.evaluate.agents import open_critic, open_policy
+from vd.evaluate.second_view import AFTER_S, EVERY_S, NEAREST, SecondView
+
+HZ = 12
+AFTER, EVERY = round(AFTER_S * HZ), round(EVERY_S * HZ)
+
+
+def state_of(env: ReorientEnv) -> Sensed:
+    """What a hand and its twin would report of a world."""
+    d = env.num_actions
+    q, qd = env.sim.joint_q.numpy()[0], env.sim.joint_qd.numpy()[0]
+    return Sensed(
+        joint_q=env.measured_q.numpy()[0, :d].copy(),
+        joint_qd=env.measured_qd.numpy()[0, :d].copy(),
+        smoothed=env.smoothed.numpy()[0].copy(),
+        goal_quat=env.goal_quat.numpy()[0].copy(),
+        object_pose=q[d:].copy(),
+        object_velocity=qd[d:].copy(),
+    )
+
+
+@pytest.mark.parametrize("hand", ["dclaw3", "dclaw4"])
+def test_a_teacher_takes_the_views_on_a_twin_that_it_takes_in_the_simulator(hand):
+    """The hand does nothing, so that no goal is reached, and the critic says the contrary: views change."""
+    policy = open_policy(f"{hand}-table", "cpu")
+    last = max(name for name in policy._critic if name.startswith("mlp.") and name.endswith(".weight"))
+    policy._critic[last] = -policy._critic[last]
+    task = mirror_task(policy, hand, "cuboid", second_view=True)
+    env = ReorientEnv(task, "cpu")
+    actor, pilot = SecondView(env, policy), TeacherPilot(policy, Mirror(task), second_view=True)
+    mirror, seen = pilot._sight.mirror.env, set()
+    for goal in range(2):
+        env.reset()
+        pilot.new_goal()
+        for step in range(AFTER + EVERY + 2):
+            ours = pilot.decide(state_of(env)).action
+            theirs = actor.act(wp.to_torch(env.observation)).contiguous()
+            view = int(env.views.view.numpy()[0])
+            assert int(mirror.views.view.numpy()[0]) == view
+            np.testing.assert_allclose(
+                ours, env.views.world_action(wp.from_torch(theirs)).numpy()[0], atol=1e-3
+            )
+            seen.add((goal, step >= AFTER, view))
+            env.step(wp.zeros((1, env.num_actions), dtype=float, device="cpu"))
+    first, later = ({(number, view) for number, at, view in seen if at is late} for late in (False, True))
+    assert later - first, "some goal is looked at in another view"
+
+
+def test_a_student_looks_again_after_a_while_and_begins_anew_with_a_new_goal():
+    student, hand, (item,) = open_policy("dclaw3-student", "cpu"), load_hand("dclaw3"), load_set("cube")
+    plain, pilot = (
+        StudentPilot(student, hand, item, critic=critic) for critic in (None, open_critic(student, "cpu"))
+    )
+    zero = np.zeros(9)
+    image = np.full((hand.camera.height, hand.camera.width), 0.6, dtype=np.float32)
+    sensed = Sensed(zero, zero, zero, np.array([np.sin(1.0), 0.0, 0.0, np.cos(1.0)]), depth=image)
+
+    def flown(steps: int) -> tuple[list[bool], list[int]]:
+        """Whether both pilots act alike in each of so many steps, and the views that were taken."""
+        alike, taken = [], []
+        for _ in range(steps):
+            one, other = plain.decide(sensed).action, pilot.decide(sensed).action
+            alike.append(np.allclose(one, other, atol=1e-5))
+            taken.append(int(pilot._second._taken[0]))
+        return alike, taken
+
+    for begin in ("begin", "new_goal"):
+        for each in (plain, pilot):
+            getattr(each, begin)()
+        alike, taken = flown(AFTER + 1)
+        assert all(alike[:AFTER]) and set(taken[:AFTER]) == {NEAREST}
+        assert taken[AFTER] != NEAREST
+    assert plain._network.state.look is None, "the file's student stays as it was"
+
+
+def test_what_has_no_second_view_is_refused():
+    hand, (item,) = load_hand("dclaw4"), load_set("cube")
+    with pytest.raises(ValueError, match="still does nothing"):
+        make_flight("still", "dclaw4", "cube", hand, item, second_view=True)
+    with pytest.raises(ValueError, match=r"observation\.view world"):
+        make_flight("dclaw4-cube", "dclaw4", "cube", hand, item, second_view=True)
+    student = open_policy("dclaw4-student", "cpu")
+    blind = open_critic(student, "cpu")
+    blind._critic = None
+    with pytest.raises(ValueError, match="no critic; export it again"):
+        StudentPilot(student, hand, item, critic=blind)
