@@ -1,5 +1,6 @@
 """Policies as the loop flies them: from what is sensed to an action and the distance to the goal."""
 
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -58,7 +59,8 @@ class StudentPilot:
         hand: The hand.
         item: The object.
         tolerance_rad: How near to the goal it is to stop [rad].
-        critic: Its teacher, with its critic, to look twice at goals (:mod:`vd.evaluate.second_view`).
+        critic: What its teacher's critic expects (:func:`vd.evaluate.agents.open_critic`), to look twice at
+            goals (:mod:`vd.evaluate.second_view`).
         seed: Of the choice of camera points.
 
     Attributes:
@@ -75,7 +77,7 @@ class StudentPilot:
         item: ObjectModel,
         *,
         tolerance_rad: float = PAPER.success.rotation_rad,
-        critic: TrainedPolicy | None = None,
+        critic: Callable[[torch.Tensor], torch.Tensor] | None = None,
         seed: int = 0,
     ):
         spec = student.spec
@@ -89,11 +91,12 @@ class StudentPilot:
         self._make_sight = partial(StudentSight, hand, item, spec.network, depth=depth, seed=seed)
         self.sight = self._make_sight(camera=self.camera)
         self._hidden = self._network.initial_hidden(1)
-        self._clock = GoalClock(torch.zeros(1, dtype=torch.int32), trained_task(student).sim.control_hz)
+        task = trained_task(student)
+        self._clock = GoalClock(torch.zeros(1, dtype=torch.int32), task.sim.control_hz)
         self._second = None
         if critic is not None:
             self._network = deepcopy(self._network)  # its views are changed
-            self._second = StudentSecondView(self._clock, self._network.state, critic)
+            self._second = StudentSecondView(self._clock, self._network.state, task, critic)
 
     def look_by(self, camera: CameraModel) -> None:
         """See by a camera with this lens at this place, in place of the one of the training."""

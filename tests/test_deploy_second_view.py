@@ -92,8 +92,3 @@ def test_what_has_no_second_view_is_refused():
         make_flight("still", "dclaw4", "cube", hand, item, second_view=True)
     with pytest.raises(ValueError, match=r"observation\.view world"):
         make_flight("dclaw4-cube", "dclaw4", "cube", hand, item, second_view=True)
-    student = open_policy("dclaw4-student", "cpu")
-    blind = open_critic(student, "cpu")
-    blind._critic = None
-    with pytest.raises(ValueError, match="no critic; export it again"):
-        StudentPilot(student, hand, item, critic=blind)

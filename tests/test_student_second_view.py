@@ -12,6 +12,7 @@ from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.envs.symmetry import view_tables
 from vd.evaluate import cli
+from vd.evaluate.agents import find_policy, open_critic, open_policy
 from vd.evaluate.second_view import (
     AFTER_S,
     EVERY_S,
@@ -22,7 +23,9 @@ from vd.evaluate.second_view import (
 )
 from vd.kernels.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
+from vd.student.saved import SavedStudent, load_student
 from vd.student.state import StateHead, state_cfg
+from vd.train.student.follow import follow_teacher
 
 WORLDS, WIDTH = 12, 8
 
@@ -105,7 +108,7 @@ def test_it_takes_other_views_of_far_goals_after_a_while_and_keeps_them(env, tea
     estimate, hz = estimates(env, head, angles), env.cfg.sim.control_hz
     _, nearest = head.act(estimate)
     at_step(env, 0)
-    second = StudentSecondView(GoalClock.of(env), head, teacher)
+    second = StudentSecondView(GoalClock.of(env), head, env.cfg, teacher.value)
     better = wanted(env, head, teacher, estimate)
     assert any(view != first for view, first in zip(better[3:], nearest[3:].tolist(), strict=True))
     for step in range(round((AFTER_S + EVERY_S) * hz)):
@@ -128,7 +131,7 @@ def test_in_the_view_that_is_taken_it_acts_as_its_teacher(env, teacher, head):
     estimate = estimates(env, head, np.full(WORLDS, 2.0))
     at_step(env, 0)
     second, after = (
-        StudentSecondView(GoalClock.of(env), head, teacher),
+        StudentSecondView(GoalClock.of(env), head, env.cfg, teacher.value),
         round(AFTER_S * env.cfg.sim.control_hz),
     )
     for step in range(after + 1):
@@ -139,16 +142,39 @@ def test_in_the_view_that_is_taken_it_acts_as_its_teacher(env, teacher, head):
     torch.testing.assert_close(action, head.views.world_action(teacher.act(seen), view), atol=1e-4, rtol=1e-4)
 
 
-def test_a_student_without_views_or_a_teacher_without_a_critic_is_refused(env, teacher, head):
+def test_a_student_without_views_is_refused(env, teacher, head):
     with pytest.raises(ValueError, match="does not act by the layers of a teacher that sees its goals"):
-        StudentSecondView(GoalClock.of(env), None, teacher)
+        StudentSecondView(GoalClock.of(env), None, env.cfg, teacher.value)
     plain = StateHead(state_cfg(teacher.spec, views=0), WIDTH, env.num_actions)
     with pytest.raises(ValueError, match="does not act by the layers of a teacher that sees its goals"):
-        StudentSecondView(GoalClock.of(env), plain, teacher)
+        StudentSecondView(GoalClock.of(env), plain, env.cfg, teacher.value)
+
+
+def renamed(student: SavedStudent, teacher: str) -> SavedStudent:
+    return replace(student, spec=replace(student.spec, teacher=teacher))
+
+
+def test_a_student_asks_its_own_critic_or_that_of_its_teacher_by_name(tmp_path):
+    policy, student = open_policy("dclaw4-table", "cpu"), open_policy("dclaw4-student", "cpu")
+    seen = torch.randn(5, policy.num_observations)
+    torch.testing.assert_close(open_critic(student, "cpu")(seen), policy.value(seen))
+    with pytest.raises(ValueError, match="'lost', which cannot be read"):
+        open_critic(renamed(student, "lost"), "cpu")
+    with pytest.raises(ValueError, match="'dclaw3-table' observes other things"):
+        open_critic(renamed(student, "dclaw3-table"), "cpu")
+    blind = torch.load(find_policy("dclaw4-table"), weights_only=True)
+    del blind["critic_state_dict"]
+    torch.save(blind, tmp_path / "blind.pt")
     with pytest.raises(ValueError, match="no critic; export it again"):
-        StudentSecondView(
-            GoalClock.of(env), head, TrainedPolicy(teacher.spec, teacher.weights, task=teacher.task)
-        )
+        open_critic(renamed(student, str(tmp_path / "blind.pt")), "cpu")
+
+    # From now on it needs no other file.
+    follow_teacher("dclaw4-student", "dclaw4-table", tmp_path / "student.pt")
+    alone = load_student(tmp_path / "student.pt")
+    assert open_critic(alone, "cpu")(seen).equal(policy.value(seen)), "to the last bit, though stored small"
+    torch.testing.assert_close(open_critic(renamed(alone, "lost"), "cpu")(seen), policy.value(seen))
+    follow_teacher(str(tmp_path / "student.pt"), str(tmp_path / "blind.pt"), tmp_path / "other.pt")
+    assert load_student(tmp_path / "other.pt").network.state.critic is None, "not that of another teacher"
 
 
 def test_an_evaluation_of_a_student_says_that_it_looked_twice(tmp_path):

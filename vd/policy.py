@@ -117,8 +117,18 @@ class TrainedPolicy:
         self.network = MeanAction(spec, weights).to(device)
         self._critic, self._device = critic, device
 
+    @property
+    def has_critic(self) -> bool:
+        """Whether the file has one."""
+        return self._critic is not None
+
     @cached_property
-    def _value(self) -> MeanAction:
+    def critic(self) -> MeanAction:
+        """What it expects: from observations [N, O] to values [N, 1].
+
+        Raises:
+            ValueError: The file has no critic.
+        """
         if self._critic is None:
             raise ValueError(
                 "the policy has no critic; export it again from a checkpoint of its run (vd-train export)"
@@ -133,7 +143,7 @@ class TrainedPolicy:
             ValueError: The file has no critic.
         """
         with torch.no_grad():
-            return self._value(observation)[:, 0]
+            return self.critic(observation)[:, 0]
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """Mean action.

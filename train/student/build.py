@@ -242,7 +242,7 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
         )
     other = to_dict(replace(spec.network, state=student.cfg.state)) != to_dict(student.cfg)
     own, theirs = student.state_dict(), state["student_state_dict"]
-    if spec.network.state != student.cfg.state:
+    if replace(spec.network.state, critic=False) != replace(student.cfg.state, critic=False):
         # Actions were read from the memory alone, or added to those of another teacher.
         theirs = {name: value for name, value in theirs.items() if not name.startswith(("state.", "mean."))}
     if ("object" in spec.network.senses) != ("object" in student.cfg.senses):

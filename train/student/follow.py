@@ -14,6 +14,7 @@ from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.envs.symmetry import view_tables
 from vd.evaluate.agents import is_saved_student, open_policy, open_teacher, policy_name, trained_task
+from vd.policy import TrainedPolicy
 from vd.sim.scene import hand_mount
 from vd.student.network import Student
 from vd.student.saved import student_export
@@ -24,8 +25,8 @@ from vd.train.student.build import head_of
 def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     """Write a student with the layers of a newer version of its teacher.
 
-    Its stopping rules stay, to be calibrated anew. One that estimated its fingertips computes them from then
-    on.
+    It gets its critic too, for second views. Its stopping rules stay, to be calibrated anew. One that
+    estimated its fingertips computes them from then on.
 
     Args:
         student: student.pt, a run's folder, a bundle, or the name of an installed student.
@@ -55,7 +56,8 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     if hand != policy.hand:
         raise ValueError(f"{student} moves {hand}, {teacher} {policy.hand}; give a teacher of the same hand")
     own, wanted = network.cfg.state, head_of(policy)
-    if replace(wanted, inside=own.inside, fingertips=own.fingertips, views=own.views) != own:
+    kept = replace(wanted, inside=own.inside, fingertips=own.fingertips, views=own.views, critic=own.critic)
+    if kept != own:
         raise ValueError(
             f"{teacher} observes other things than the teacher of {student}, or has other layers; train a "
             "student of it"
@@ -75,6 +77,7 @@ def follow_teacher(student: str, teacher: str, output: Path) -> bool:
     if not own.fingertips and network.cfg.senses_joints:
         task = from_dict(ReorientCfg, saved.task, where="task of the student")
         network = with_fingertips(network, load_hand(task.hand, task.fingertip, task.hand_layer))
+    network = with_critic(network, policy)
     spec = replace(saved.spec, network=network.cfg, teacher=policy_name(teacher), calibrated_on="")
     state = {
         "spec": to_dict(spec),
@@ -101,6 +104,18 @@ def with_views(student: Student, task: ReorientCfg) -> Student:
     if views:
         assert head is not None and head.views is not None
         head.views.adopt(view_tables(env, one.observation.view))
+    return network.eval().requires_grad_(False)
+
+
+def with_critic(student: Student, teacher: TrainedPolicy) -> Student:
+    """A student with the critic of its teacher, if that has one, so that it needs no other file to ask."""
+    cfg = student.cfg
+    network = Student(replace(cfg, state=replace(cfg.state, critic=teacher.has_critic)), student.num_actions)
+    weights = {name: w for name, w in student.state_dict().items() if not name.startswith("state.critic.")}
+    network.load_state_dict(weights, strict=False)
+    if teacher.has_critic:
+        assert network.state is not None and network.state.critic is not None
+        network.state.critic.load_state_dict(teacher.critic.state_dict())
     return network.eval().requires_grad_(False)
 
 

@@ -1,6 +1,6 @@
 """Agents by name or file, and the task they act in: shared by vd-eval and vd-play."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -21,6 +21,8 @@ from vd.envs.cfg import (
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
+    import torch
+
     from vd.policy import TrainedPolicy
     from vd.student.saved import SavedStudent
 
@@ -155,13 +157,18 @@ def check_second_view(names: Sequence[str]) -> None:
         )
 
 
-def open_critic(student: "SavedStudent", device: str) -> "TrainedPolicy":
-    """The teacher by whose layers a student acts, for its critic.
+def open_critic(student: "SavedStudent", device: str) -> "Callable[[torch.Tensor], torch.Tensor]":
+    """What a student's teacher expects [N] of observations as a view shows them [N, O].
+
+    The student may have that critic itself; else it is its teacher's, found by its name.
 
     Raises:
-        ValueError: There is no such teacher here, or it is no teacher.
+        ValueError: There is no such teacher here, or it is no teacher, has no critic, or observes other
+            things.
     """
-    name = student.spec.teacher
+    head, name = student.network.state, student.spec.teacher
+    if head is not None and head.critic is not None:
+        return head.value
     try:
         teacher = open_teacher(name, device)
     except (FileNotFoundError, ValueError) as error:
@@ -170,7 +177,13 @@ def open_critic(student: "SavedStudent", device: str) -> "TrainedPolicy":
         ) from error
     if teacher is None:
         raise ValueError(f"--second-view asks the critic of the student's teacher; '{name}' has none")
-    return teacher
+    if teacher.num_observations != student.spec.network.state.values:
+        raise ValueError(
+            f"--second-view asks the critic of the student's teacher; '{name}' observes other things than "
+            "that. Give the student its critic: vd-train follow STUDENT TEACHER"
+        )
+    _ = teacher.critic  # refuses a file without one
+    return teacher.value
 
 
 def open_teacher(name: str, device: str) -> "TrainedPolicy | None":

@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 import torch
 import warp as wp
 
-from vd.envs.cfg import ObservationCfg
+from vd.envs.cfg import ObservationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import trained_task
 from vd.kernels.observations import JOINTS_PER_FINGER, teacher_observation_slices
 from vd.paper import PAPER
 from vd.policy import TrainedPolicy
@@ -160,30 +159,37 @@ class StudentSecondView:
     Args:
         clock: The time of its goals.
         head: Where it estimates its teacher's observation, in views; from now on they are chosen here.
-        critic: The teacher, with its critic.
+        task: Its task: that of its hand, with its teacher's observation.
+        value: What its teacher's critic expects [M] of observations as a view shows them [M, O]
+            (:func:`vd.evaluate.agents.open_critic`).
 
     Attributes:
         rows: Worlds that the next estimates are of [M].
 
     Raises:
-        ValueError: The student does not act in views, or the teacher has no critic.
+        ValueError: The student does not act in views.
     """
 
-    def __init__(self, clock: GoalClock, head: StateHead | None, critic: TrainedPolicy) -> None:
+    def __init__(
+        self,
+        clock: GoalClock,
+        head: StateHead | None,
+        task: ReorientCfg,
+        value: Callable[[torch.Tensor], torch.Tensor],
+    ) -> None:
         if head is None or head.views is None:
             raise ValueError(
                 "--second-view: this student does not act by the layers of a teacher that sees its goals in "
                 "views (observation.view goal or mirrored)"
             )
-        task = trained_task(critic)
-        seen = with_second_view(task.observation)
+        fingers = head.views.joints.shape[1] // JOINTS_PER_FINGER
+        seen = replace(task.observation, view="either" if len(head.views) == fingers else "mirrored")
         device, worlds = clock.steps.device, len(clock.steps)
         one = ReorientEnv(replace(task, objects=("cube",), num_worlds=1, observation=seen), str(device))
         maps = view_maps(one).adopt_first(head.views)
         self._others = OtherViews(clock, maps)
         one.close()
-        self._head, self._critic, self._first = head, critic, head.views
-        critic.value(head.view_offset[None])  # refuses a policy without a critic
+        self._head, self._value, self._first = head, value, head.views
         head.views, head.look = maps, self._views
         self._again = torch.zeros(worlds, dtype=torch.bool, device=device)
         self._taken = torch.full((worlds,), NEAREST, device=device)
@@ -202,7 +208,7 @@ class StudentSecondView:
         again = self._again[rows] & (angle > PAPER.success.rotation_rad)
         if bool(again.any()):
             self._taken[rows[again]] = self._others.better(
-                world[again], lambda seen: self._critic.value(head.guessed(seen))
+                world[again], lambda seen: self._value(head.guessed(seen))
             )
         taken = self._taken[rows]
         return torch.where(taken == NEAREST, self._first.choose(world), taken)

@@ -1,5 +1,6 @@
 """A student at work in an environment."""
 
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -8,9 +9,9 @@ import torch
 import warp as wp
 
 from vd.config import from_dict
+from vd.envs.cfg import ReorientCfg
 from vd.evaluate.scanned import ScannedGoalView
 from vd.evaluate.second_view import GoalClock, StudentSecondView
-from vd.policy import TrainedPolicy
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.saved import SavedStudent
 from vd.vision import StudentView
@@ -38,7 +39,7 @@ class StudentActor:
         *,
         rendered: bool | None = None,
         scanned_goals: bool = False,
-        critic: TrainedPolicy | None = None,
+        critic: Callable[[torch.Tensor], torch.Tensor] | None = None,
         seed: int = 0,
     ):
         """Open its eyes in every world.
@@ -50,7 +51,8 @@ class StudentActor:
             student: The student.
             rendered: See by a depth camera, or complete clouds; as its stage was trained by default.
             scanned_goals: Show it goals with the errors of a scan, not exact ones.
-            critic: Its teacher, with its critic, to look twice at goals (:mod:`vd.evaluate.second_view`).
+            critic: What its teacher's critic expects (:func:`vd.evaluate.agents.open_critic`), to look twice
+                at goals (:mod:`vd.evaluate.second_view`).
             seed: Of the errors of camera and scans.
 
         Raises:
@@ -82,7 +84,8 @@ class StudentActor:
         self._second = None
         if critic is not None:
             self._student = deepcopy(self._student)  # its views are changed
-            self._second = StudentSecondView(GoalClock.of(env), self._student.state, critic)
+            task = from_dict(ReorientCfg, student.task, where="task of the student")
+            self._second = StudentSecondView(GoalClock.of(env), self._student.state, task, critic)
         self._hidden = self._student.initial_hidden(env.num_worlds)
         self._steps = wp.to_torch(env.step_count)
         self.predicted = self._hidden.new_zeros(env.num_worlds)

@@ -325,7 +325,7 @@ def object_groups(objects: tuple[str, ...], *, quick: bool) -> dict[Group, Objec
 def fingerprint(name: str, *, second_view: bool = False) -> str:
     """What tells the content of a policy from others: its file's SHA-256, or the name of a built-in agent.
 
-    Of a student that looks twice its teacher's file counts too, whose critic it asks.
+    Of a student that looks twice its teacher's file counts too, if it asks the critic there.
 
     Raises:
         FileNotFoundError: There is no such policy.
@@ -339,8 +339,9 @@ def fingerprint(name: str, *, second_view: bool = False) -> str:
             digest.update(file.read_bytes())
     if second_view and sees_clouds(name) and has_second_view(name):
         student = open_policy(name, "cpu")
-        assert is_saved_student(student)  # or it would have no second view
-        digest.update(fingerprint(student.spec.teacher).encode())
+        assert is_saved_student(student) and student.network.state is not None  # or it has no second view
+        if student.network.state.critic is None:
+            digest.update(fingerprint(student.spec.teacher).encode())
     return digest.hexdigest()
 
 

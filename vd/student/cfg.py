@@ -116,6 +116,8 @@ class StateCfg:
     """Views in which the teacher sees its goals, one for each finger; 0: it sees the world as it is."""
     fingertips: bool = False
     """Compute where the fingertips are, and how they move, from the joints, in place of an estimate."""
+    critic: bool = False
+    """Keep the teacher's critic, which a second view of a goal asks (:mod:`vd.evaluate.second_view`)."""
 
     def validate(self) -> None:
         """Raise ``ValueError`` for sizes that make no network, naming the field."""

@@ -1,8 +1,8 @@
 """Weights of a student in a third of the space, to ship or to carry to another machine.
 
 Convolutions, three quarters of a student, are kept in 8 bits with a scale for each output channel, other
-matrices in half precision. Vectors (scales, statistics) stay as they are, and so do the teacher's layers, by
-which a student knows its teacher again, and the geometry of its hand.
+matrices in half precision. Vectors (scales, statistics) stay as they are, and so do the layers of the teacher
+and its critic, by which a student knows its teacher again, and the geometry of its hand.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ import torch
 
 LEVELS = 127
 """Steps of 8 bits on each side of zero."""
-EXACT = ("state.teacher.", "state.fingertips.")
+EXACT = ("state.teacher.", "state.critic.", "state.fingertips.")
 """Prefixes of the weights that nothing may be lost of."""
 
 Packed = dict[str, Any]

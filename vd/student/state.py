@@ -7,6 +7,7 @@ estimate in the view that the estimate calls for. O values of the observation, D
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -58,6 +59,7 @@ class StateHead(nn.Module):
             give them; only where ``cfg.fingertips`` are to be computed from them.
 
     Attributes:
+        critic: The teacher's critic, if it is kept.
         views: The teacher's views, if it sees its goals in them.
         look: What chooses views [M] for estimates in the world frame [M, O]; None: each is the nearest.
     """
@@ -84,9 +86,13 @@ class StateHead(nn.Module):
         super().__init__()
         self.inside = nn.Sequential(nn.Linear(width, cfg.inside), nn.GELU())
         self.estimate = nn.Linear(width + cfg.inside, cfg.values)
-        self.teacher = perceptron(
-            PolicySpec(cfg.values, num_actions, cfg.hidden, cfg.activation, "gaussian", False)
-        ).requires_grad_(False)
+        acts = PolicySpec(cfg.values, num_actions, cfg.hidden, cfg.activation, "gaussian", False)
+        self.teacher = perceptron(acts).requires_grad_(False)
+        self.critic: MeanAction | None = None
+        if cfg.critic:
+            expects = replace(acts, num_actions=1)
+            layers = perceptron(expects).state_dict(prefix="mlp.")
+            self.critic = MeanAction(expects, layers)
         self.register_buffer("offset", torch.zeros(cfg.values))
         self.register_buffer("scale", torch.ones(cfg.values))
         self.register_buffer("fitted", torch.tensor(False))
@@ -200,6 +206,12 @@ class StateHead(nn.Module):
             view = self.look(world.flatten(0, -2)).reshape(world.shape[:-1])
         seen = (self.views.take(world, view) - self.view_offset) / self.view_scale
         return self.views.world_action(self.teacher(self.known * seen), view), view
+
+    def value(self, seen: torch.Tensor) -> torch.Tensor:
+        """The return that the critic expects [N] of observations in a view [N, O]."""
+        assert self.critic is not None
+        with torch.no_grad():
+            return self.critic(seen)[:, 0]
 
     def guessed(self, seen: torch.Tensor) -> torch.Tensor:
         """Observations in a view [.., O] with the mean in place of what a student cannot see."""
