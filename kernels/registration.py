@@ -12,6 +12,8 @@ with C poses each.
 
 import warp as wp
 
+from vd.kernels.shape_grids import Shapes, surface_distance
+
 wp.set_module_options({"enable_backward": False})
 
 LEVER_M = wp.constant(0.03)
@@ -26,28 +28,8 @@ SETTLED_RAD = wp.constant(1.0e-3)
 """... and turns it by less than this [rad] is the last one (ours)."""
 SMALL = wp.constant(1.0e-7)
 """Lengths and angles below this have no direction."""
-ANYWHERE = wp.constant(1.0)
-"""Farthest that the surface is looked for [m]."""
 NEVER = wp.constant(1.0e9)
 """Misfit of a pose that is not to be taken."""
-
-
-@wp.struct
-class Shapes:
-    """Shapes that can be looked for, and which one each world holds.
-
-    samples: Surface samples in the object frame, unscaled [O, S] [m].
-    distance: Distance to the surface [O, E, E, E] [m], on grids about the origin; negative inside.
-    half: Half the side of each grid [O] [m].
-    world_shape: Shape of each world [N].
-    world_scale: Factor on its size [N].
-    """
-
-    samples: wp.array2d[wp.vec3]
-    distance: wp.array4d[float]
-    half: wp.array[float]
-    world_shape: wp.array[int]
-    world_scale: wp.array[float]
 
 
 @wp.struct
@@ -66,105 +48,6 @@ class Eye:
     pose: wp.transform
     cell: float
     margin: float
-
-
-@wp.kernel
-def off_mesh_kernel(
-    # Model:
-    samples: wp.array2d[wp.vec3],
-    mesh: wp.array[wp.uint64],
-    # Out:
-    distance_out: wp.array2d[float],
-):
-    """Distance of each sample from the mesh of its shape. Launch: [O, S].
-
-    Args:
-        samples: Surface samples in the object frame [m], shape [O, S].
-        mesh: Mesh of each shape, shape [O].
-        distance_out: Distances [m], shape [O, S].
-    """
-    shape, sample = wp.tid()
-    place = samples[shape, sample]
-    found = wp.mesh_query_point_no_sign(mesh[shape], place, ANYWHERE)
-    distance_out[shape, sample] = wp.length(
-        wp.mesh_eval_position(mesh[shape], found.face, found.u, found.v) - place
-    )
-
-
-@wp.kernel
-def shape_distance_kernel(
-    # Model:
-    samples: wp.array2d[wp.vec3],
-    mesh: wp.array[wp.uint64],
-    half: wp.array[float],
-    # In:
-    meshed_in: wp.array[int],
-    # Out:
-    distance_out: wp.array4d[float],
-):
-    """Distance from each point of a grid to the surface. Launch: [O, E, E, E].
-
-    Args:
-        samples: Surface samples in the object frame [m], shape [O, S].
-        mesh: Mesh of each shape, with winding numbers, shape [O].
-        half: Half the side of each grid [m], shape [O].
-        meshed_in: 1 where the surface is the mesh, 0 where it is the samples, shape [O].
-        distance_out: Distances [m], negative inside of a mesh, shape [O, E, E, E].
-    """
-    shape, i, j, k = wp.tid()
-    side = 2.0 * half[shape] / float(distance_out.shape[1] - 1)
-    corner = wp.vec3(half[shape], half[shape], half[shape])
-    place = side * wp.vec3(float(i), float(j), float(k)) - corner
-    if meshed_in[shape] != 0:
-        found = wp.mesh_query_point_sign_winding_number(mesh[shape], place, ANYWHERE)
-        nearest = wp.mesh_eval_position(mesh[shape], found.face, found.u, found.v)
-        distance_out[shape, i, j, k] = found.sign * wp.length(nearest - place)
-        return
-    least = wp.length_sq(samples[shape, 0] - place)
-    for sample in range(1, samples.shape[1]):
-        least = wp.min(least, wp.length_sq(samples[shape, sample] - place))
-    distance_out[shape, i, j, k] = wp.sqrt(least)
-
-
-@wp.func
-def surface_distance(shapes: Shapes, shape: int, place: wp.vec3):
-    """Distance of a point of the object frame (unscaled) from the surface, as in the grid, and its gradient.
-
-    Between grid points it is interpolated; outside of the grid it grows by the distance from the grid.
-    """
-    last = shapes.distance.shape[1] - 1
-    half = shapes.half[shape]
-    per_metre = float(last) / (2.0 * half)
-    grid = (place + wp.vec3(half, half, half)) * per_metre
-    top = float(last) - 1.0e-3
-    inside = wp.vec3(wp.clamp(grid[0], 0.0, top), wp.clamp(grid[1], 0.0, top), wp.clamp(grid[2], 0.0, top))
-    i = int(inside[0])
-    j = int(inside[1])
-    k = int(inside[2])
-    u = inside[0] - float(i)
-    v = inside[1] - float(j)
-    w = inside[2] - float(k)
-    d000 = shapes.distance[shape, i, j, k]
-    d001 = shapes.distance[shape, i, j, k + 1]
-    d010 = shapes.distance[shape, i, j + 1, k]
-    d011 = shapes.distance[shape, i, j + 1, k + 1]
-    d100 = shapes.distance[shape, i + 1, j, k]
-    d101 = shapes.distance[shape, i + 1, j, k + 1]
-    d110 = shapes.distance[shape, i + 1, j + 1, k]
-    d111 = shapes.distance[shape, i + 1, j + 1, k + 1]
-    low = wp.lerp(wp.lerp(d000, d001, w), wp.lerp(d010, d011, w), v)
-    high = wp.lerp(wp.lerp(d100, d101, w), wp.lerp(d110, d111, w), v)
-    along_x = high - low
-    along_y = wp.lerp(wp.lerp(d010 - d000, d011 - d001, w), wp.lerp(d110 - d100, d111 - d101, w), u)
-    along_z = wp.lerp(wp.lerp(d001 - d000, d011 - d010, v), wp.lerp(d101 - d100, d111 - d110, v), u)
-    distance = wp.lerp(low, high, u)
-    gradient = per_metre * wp.vec3(along_x, along_y, along_z)
-    outside = (grid - inside) / per_metre
-    beyond = wp.length(outside)
-    if beyond > 2.0e-3 / per_metre:
-        distance += beyond
-        gradient = outside / beyond
-    return distance, gradient
 
 
 @wp.func
@@ -302,13 +185,19 @@ def replace_poses_kernel(
     every: int,
     # In:
     world_in: wp.array[int],
+    worse: float,
     pose_in: wp.array2d[wp.transform],
+    misfit_in: wp.array2d[float],
+    cost_in: wp.array2d[float],
     seen_in: wp.array2d[wp.vec3],
     count_in: wp.array[int],
     # Out:
     pose_out: wp.array2d[wp.transform],
+    cost_out: wp.array2d[float],
 ):
     """Put poses where points are now, turned as they were: what falls is soon too far. Launch: [M, C].
+
+    Only those that do not fit any more as they did.
 
     Args:
         shapes: The shapes.
@@ -316,16 +205,24 @@ def replace_poses_kernel(
         rendered: 1 where a camera saw the points, 0 where they are of all sides.
         every: Look at every so many-th sample.
         world_in: World of each row, shape [M]; a row of -1 is left out.
-        pose_in: Poses before, object frame in the base frame, shape [M, C].
+        worse: A pose fits as it did if its misfit is no more than so many times that before.
+        pose_in: Poses before, object frame in the base frame, shape [N, C].
+        misfit_in: Their misfits, averaged over time [m^2], shape [N, C].
+        cost_in: Misfits of what became of them now [m^2], shape [M, C].
         seen_in: Points seen of the object, base frame [m], shape [N, P].
         count_in: How many there are, shape [N].
         pose_out: Poses, shape [M, C].
+        cost_out: NEVER where a pose fits as it did and none is written, else 0, shape [M, C].
     """
     row, c = wp.tid()
     world = world_in[row]
     if world < 0:
         return
-    turn = wp.transform_get_rotation(pose_in[row, c])
+    cost_out[row, c] = 0.0
+    if cost_in[row, c] <= worse * misfit_in[world, c]:
+        cost_out[row, c] = NEVER
+        return
+    turn = wp.transform_get_rotation(pose_in[world, c])
     pose_out[row, c] = placed(shapes, eye, rendered, every, world, turn, seen_in, count_in)
 
 
@@ -396,8 +293,7 @@ def fit_poses_kernel(
     nearness_in: wp.array3d[float],
     # In/Out:
     pose: wp.array2d[wp.transform],
-    # Out:
-    misfit_out: wp.array2d[float],
+    misfit: wp.array2d[float],
 ):
     """Improve poses until they stay, and say how badly they fit. Launch: [M, C].
 
@@ -413,11 +309,11 @@ def fit_poses_kernel(
         count_in: How many there are, shape [N].
         nearness_in: From ``nearness_kernel``, shape [N, Y, X]; [N, 0, 0] without a camera.
         pose: Object frame in the base frame, shape [M, C].
-        misfit_out: Mean squares of both lengths, together [m^2], shape [M, C].
+        misfit: Mean squares of both lengths, together [m^2], shape [M, C]; NEVER where nothing is to be done.
     """
     row, c = wp.tid()
     world = world_in[row]
-    if world < 0:
+    if world < 0 or misfit[row, c] >= NEVER:
         return
     best = pose[row, c]
     for _ in range(steps):
@@ -448,7 +344,7 @@ def fit_poses_kernel(
             length = standing_out(eye, place, world, nearness_in, far)
             out += length * length
             samples += 1.0
-    misfit_out[row, c] = off / wp.max(points, 1.0) + out / wp.max(samples, 1.0)
+    misfit[row, c] = off / wp.max(points, 1.0) + out / wp.max(samples, 1.0)
 
 
 @wp.kernel

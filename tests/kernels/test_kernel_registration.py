@@ -12,16 +12,14 @@ from vd.kernels.registration import (
     LEVER_M,
     NEVER,
     Eye,
-    Shapes,
     fit_poses_kernel,
     keep_poses_kernel,
     nearness_kernel,
-    off_mesh_kernel,
     replace_poses_kernel,
-    shape_distance_kernel,
     start_poses_kernel,
     take_better_kernel,
 )
+from vd.kernels.shape_grids import Shapes, off_mesh_kernel, shape_distance_kernel
 
 GRID, SAMPLES, SEEN = 5, 9, 7
 FAR, CELL, MARGIN = 0.02, 8.0, 0.004
@@ -241,19 +239,32 @@ def test_a_start_puts_the_near_side_where_the_points_are(device, seed, rendered,
 
 @given(seed=seeds, rendered=st.booleans(), every=st.integers(1, 3))
 @EXAMPLES
-def test_poses_are_put_where_the_points_are_and_stay_turned_as_they_were(device, seed, rendered, every):
-    scene = Scene(seed)
+def test_poses_that_fit_no_more_are_put_where_the_points_are_and_stay_turned(device, seed, rendered, every):
+    scene, worse, poses = Scene(seed), 1.5, 3
     row_world, seen, count = scene.inputs(device)
-    out = unwritten(scene.pose.shape[:2], wp.transform, device)
-    inputs = [scene.model(device), scene.camera(), int(rendered), every, row_world]
-    inputs += [device_array(scene.pose, wp.transform, device), seen, count]
-    wp.launch(replace_poses_kernel, dim=out.shape, inputs=inputs, outputs=[out], device=device)
+    rows = len(scene.row_world)
+    before, misfit = (
+        scene.random_poses(scene.worlds, poses),
+        scene.rng.uniform(0.1, 1.0, (scene.worlds, poses)),
+    )
+    now = scene.rng.uniform(0.1, 1.0, (rows, poses))
+    out, cost = unwritten((rows, poses), wp.transform, device), unwritten((rows, poses), float, device)
+    inputs = [scene.model(device), scene.camera(), int(rendered), every, row_world, worse]
+    inputs += [device_array(before, wp.transform, device)]
+    inputs += [device_array(values, float, device) for values in (misfit, now)]
+    inputs += [seen, count]
+    wp.launch(replace_poses_kernel, dim=out.shape, inputs=inputs, outputs=[out, cost], device=device)
     for row, world in enumerate(scene.row_world):
-        for c in range(scene.poses):
-            turn = Rotation.from_quat(scene.pose[row, c, 3:])
+        for c in range(poses):
+            fits = now[row, c] <= worse * misfit[world, c]
+            assert cost.numpy()[row, c] == (np.float32(NEVER) if fits else 0.0)
+            if fits:
+                assert np.isnan(out.numpy()[row, c]).all()
+                continue
+            turn = Rotation.from_quat(before[world, c, 3:])
             place = scene.placed(world, turn, every, rendered=rendered)
             np.testing.assert_allclose(out.numpy()[row, c, :3], place, atol=1e-5)
-            np.testing.assert_allclose(out.numpy()[row, c, 3:], scene.pose[row, c, 3:], atol=1e-6)
+            np.testing.assert_allclose(out.numpy()[row, c, 3:], before[world, c, 3:], atol=1e-6)
 
 
 @given(seed=seeds)
@@ -367,6 +378,21 @@ def test_the_best_poses_that_differ_are_kept(device, seed, known):
     np.testing.assert_allclose(arrays[1].numpy(), np.minimum(expected, NEVER), rtol=1e-5)
     there = np.isfinite(expected_pose)
     np.testing.assert_allclose(arrays[0].numpy()[there], expected_pose[there], atol=1e-6)
+
+
+def test_a_pose_that_is_not_to_be_looked_at_stays(device):
+    scene = Scene(0)
+    row_world, seen, count = scene.inputs(device)
+    rows = scene.pose.shape[:2]
+    pose, misfit = device_array(scene.pose, wp.transform, device), np.zeros(rows)
+    misfit[:, 1] = NEVER
+    left = device_array(misfit, float, device)
+    nearness = device_array(scene.nearness, float, device)
+    inputs = [scene.model(device), scene.camera(), FAR, 3, 1, 1, row_world, seen, count, nearness]
+    wp.launch(fit_poses_kernel, dim=rows, inputs=inputs, outputs=[pose, left], device=device)
+    stays = np.abs(pose.numpy() - scene.pose).max(axis=(0, 2)) < 1e-6
+    assert stays[1] and not stays[0]
+    assert (left.numpy()[:, 1] == np.float32(NEVER)).all() and (left.numpy()[:, 0] < 1.0).all()
 
 
 def test_rows_of_no_world_are_left_out(device):

@@ -19,16 +19,14 @@ from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.kernels.registration import (
     Eye,
-    Shapes,
     fit_poses_kernel,
     keep_poses_kernel,
     nearness_kernel,
-    off_mesh_kernel,
     replace_poses_kernel,
-    shape_distance_kernel,
     start_poses_kernel,
     take_better_kernel,
 )
+from vd.kernels.shape_grids import Shapes, off_mesh_kernel, shape_distance_kernel
 
 POINTS = 256
 """Points seen of the object that are looked at, at most."""
@@ -53,20 +51,20 @@ CHOSEN, CHOSEN_STEPS = 64, 8
 """How many of them are improved further, and steps of these."""
 KEPT = 6
 """Poses that are followed."""
-OTHERS = 10
+OTHERS = 6
 """Other rotations that are tried in each step."""
 STRIDE = 370
 """How far along the spiral of rotations those of the next step are: all come in turn."""
-STEPS = 5
-"""Steps of each of these at most."""
-KEPT_STEPS = 8
-"""Steps of each pose that was kept, at most (ours, docs/results/student.md: What falls is followed)."""
+STEPS = 8
+"""Steps of these and of those kept, at most (ours, docs/results/student.md: What falls is followed)."""
 EVERY_SAMPLE = 2
 """Every so many-th surface sample is looked at for what stands out."""
 APART_RAD = 0.3
 """Least angle between two kept poses."""
 STAY = 0.8
 """Another pose must fit better by a fifth to be believed."""
+WORSE = 1.5
+"""A pose of which the misfit has grown by no more than this factor has not been left behind (ours)."""
 SHARE = 0.1
 """Share of the latest misfit in the average: some ten looks count."""
 
@@ -162,7 +160,7 @@ class Registration:
         self._worlds = torch.arange(worlds, dtype=torch.int32, device=place)
         # What a later look fits: poses kept before, the same where points are now, and others.
         self._found = wp.empty((worlds, 2 * KEPT + OTHERS), dtype=wp.transform, device=device)
-        self._cost = wp.empty(self._found.shape, dtype=float, device=device)
+        self._cost = wp.zeros(self._found.shape, dtype=float, device=device)
 
     def look(
         self,
@@ -222,7 +220,7 @@ class Registration:
         """Poses in all rotations [M, H], improved, and their misfits."""
         first = wp.zeros(len(worlds), dtype=int, device=self.device)
         poses = wp.empty((len(worlds), ROTATIONS), dtype=wp.transform, device=self.device)
-        cost = wp.empty(poses.shape, dtype=float, device=self.device)
+        cost = wp.zeros(poses.shape, dtype=float, device=self.device)
         self._start(poses, worlds, first, inputs)
         self._fit(poses, cost, worlds, steps, every, inputs)
         return poses, cost
@@ -235,22 +233,37 @@ class Registration:
         chosen = wp.from_torch(
             poses.gather(1, best[..., None].expand(-1, -1, poses.shape[-1])), dtype=wp.transform
         )
-        cost = wp.empty(chosen.shape, dtype=float, device=self.device)
+        cost = wp.zeros(chosen.shape, dtype=float, device=self.device)
         self._fit(chosen, cost, worlds, CHOSEN_STEPS, 1, inputs)
         self._keep(0, worlds, chosen, cost)
 
     def _follow(self, worlds: wp.array, inputs: list[wp.array]) -> None:
         """Go on from the kept poses, and try a few others; a row for each world, -1 where it is left out."""
-        known, others = slice(2 * KEPT), slice(2 * KEPT, None)
-        wp.copy(self._found[:, :KEPT], self._kept[0])
+        known, again, others = slice(KEPT), slice(KEPT, 2 * KEPT), slice(2 * KEPT, None)
+        self._cost.zero_()
+        wp.copy(self._found[:, known], self._kept[0])
+        self._fit(self._found[:, known], self._cost[:, known], worlds, STEPS, 1, inputs)
         # What falls is 4 cm farther at the next look, and steps look FAR_M far.
-        model = [self._shapes, self._eye, int(self._rendered), EVERY_SAMPLE, worlds]
-        again = self._found[:, KEPT : 2 * KEPT]
-        self._launch(replace_poses_kernel, again.shape, [*model, self._kept[0], *inputs], [again])
+        self._launch(
+            replace_poses_kernel,
+            (len(worlds), KEPT),
+            [
+                self._shapes,
+                self._eye,
+                int(self._rendered),
+                EVERY_SAMPLE,
+                worlds,
+                WORSE,
+                *self._kept,
+                self._cost[:, known],
+                *inputs,
+            ],
+            [self._found[:, again], self._cost[:, again]],
+        )
+        self._fit(self._found[:, again], self._cost[:, again], worlds, STEPS, 1, inputs)
         first = wp.from_torch((self.looks * STRIDE) % ROTATIONS)
         self._start(self._found[:, others], worlds, first, inputs)
-        for part, steps in ((known, KEPT_STEPS), (others, STEPS)):
-            self._fit(self._found[:, part], self._cost[:, part], worlds, steps, 1, inputs)
+        self._fit(self._found[:, others], self._cost[:, others], worlds, STEPS, 1, inputs)
         self._launch(take_better_kernel, (len(worlds), KEPT), [worlds, KEPT], [self._found, self._cost])
         self._keep(KEPT, worlds, self._found, self._cost)
 
