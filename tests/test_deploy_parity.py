@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from sensed_world import state_of
 
 from vd.deploy.action import ActionFilter
 from vd.deploy.mirror import Mirror
-from vd.deploy.observation import Sensed, StudentSight, frame
+from vd.deploy.observation import StudentSight, frame
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_teacher, task_for
@@ -28,20 +29,6 @@ FOUND_RAD = 1e-3
 COMPARED = 0.5
 """Least share of steps in which actions are compared: until rounding first decides about a voxel or a pose.
 Where it was counted it never did, in all 192 steps."""
-
-
-def state_of(env: ReorientEnv) -> Sensed:
-    """What a hand and its twin would report of a world."""
-    d = env.num_actions
-    q, qd = env.sim.joint_q.numpy()[0], env.sim.joint_qd.numpy()[0]
-    return Sensed(
-        joint_q=env.measured_q.numpy()[0, :d].copy(),
-        joint_qd=env.measured_qd.numpy()[0, :d].copy(),
-        smoothed=env.smoothed.numpy()[0].copy(),
-        goal_quat=env.goal_quat.numpy()[0].copy(),
-        object_pose=q[d:].copy(),
-        object_velocity=qd[d:].copy(),
-    )
 
 
 def keys(sites) -> set[tuple[int, ...]]:

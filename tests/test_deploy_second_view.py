@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import warp as wp
+from sensed_world import state_of
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
@@ -16,20 +17,6 @@ from vd.evaluate.second_view import AFTER_S, EVERY_S, NEAREST, SecondView
 
 HZ = 12
 AFTER, EVERY = round(AFTER_S * HZ), round(EVERY_S * HZ)
-
-
-def state_of(env: ReorientEnv) -> Sensed:
-    """What a hand and its twin would report of a world."""
-    d = env.num_actions
-    q, qd = env.sim.joint_q.numpy()[0], env.sim.joint_qd.numpy()[0]
-    return Sensed(
-        joint_q=env.measured_q.numpy()[0, :d].copy(),
-        joint_qd=env.measured_qd.numpy()[0, :d].copy(),
-        smoothed=env.smoothed.numpy()[0].copy(),
-        goal_quat=env.goal_quat.numpy()[0].copy(),
-        object_pose=q[d:].copy(),
-        object_velocity=qd[d:].copy(),
-    )
 
 
 @pytest.mark.parametrize("hand", ["dclaw3", "dclaw4"])
