@@ -16,7 +16,6 @@ from vd.deploy.mirror import Mirror, TeacherSight
 from vd.deploy.observation import Sensed, StudentSight
 from vd.evaluate.agents import trained_task
 from vd.evaluate.second_view import GoalClock, SecondView, StudentSecondView
-from vd.evaluate.statistics import rotation_angle
 from vd.evaluate.student import PRETRAINED, RENDERED
 from vd.paper import PAPER
 from vd.policy import TrainedPolicy
@@ -161,9 +160,8 @@ class TeacherPilot:
 
     def decide(self, sensed: Sensed) -> Decision:
         """Mean action and true distance."""
-        assert sensed.object_pose is not None
-        distance = rotation_angle(sensed.object_pose[None, 3:].astype(float), sensed.goal_quat[None])[0]
-        return Decision(self._sight.act(sensed), float(distance))
+        action = self._sight.act(sensed)
+        return Decision(action, float(self._sight.mirror.env.rotation_error.numpy()[0]))
 
 
 class StillPilot:

@@ -4,18 +4,23 @@ import numpy as np
 import pytest
 import warp as wp
 from sensed_world import state_of
+from student_dummy import TINY
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
+from vd.config import to_dict
 from vd.deploy.flight import make_flight, mirror_task
 from vd.deploy.mirror import Mirror
 from vd.deploy.observation import Sensed
 from vd.deploy.pilot import StudentPilot, TeacherPilot
+from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_critic, open_policy
 from vd.evaluate.second_view import AFTER_S, EVERY_S, NEAREST, SecondView
+from vd.student.network import Student
+from vd.student.saved import SavedStudent, StudentSpec
 
-HZ = 12
+HZ = ReorientCfg().sim.control_hz
 AFTER, EVERY = round(AFTER_S * HZ), round(EVERY_S * HZ)
 
 
@@ -79,3 +84,13 @@ def test_what_has_no_second_view_is_refused():
         make_flight("still", "dclaw4", "cube", hand, item, second_view=True)
     with pytest.raises(ValueError, match=r"observation\.view world"):
         make_flight("dclaw4-cube", "dclaw4", "cube", hand, item, second_view=True)
+    other = SavedStudent(
+        StudentSpec(TINY, hand.num_joints, 1, teacher="dclaw4-table"),
+        Student(TINY, hand.num_joints).eval(),
+        to_dict(ReorientCfg(hand="dclaw4")),
+        {},
+        1,
+        1,
+    )
+    with pytest.raises(ValueError, match="does not act by the layers of a teacher"):
+        StudentPilot(other, hand, item, critic=open_critic(other, "cpu"))

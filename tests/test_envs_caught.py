@@ -6,12 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
-from vd.config import to_dict
 from vd.envs.cfg import CaughtCfg, ObservationCfg, RandomisationCfg, ReorientCfg, SuccessCfg, TableCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import task_for
 from vd.kernels.observations import GOAL_TIME_UNIT_S
-from vd.policy import PolicySpec, TrainedPolicy, perceptron
 
 WORLDS = 4
 LOOSE = SuccessCfg(
@@ -109,25 +106,6 @@ def test_caught_worlds_go_on_as_they_are_with_the_time_of_another_episode():
     begin(young)
     rest(young, 12)
     assert young.timed_out.numpy().all(), "goals that are not that old are not caught"
-
-
-def test_an_evaluation_ends_where_a_training_went_on():
-    trained = dataclasses.replace(CFG, caught=CaughtCfg(go_on_share=0.9))
-    spec = PolicySpec(8, 9, (4,), "elu", "gaussian", False)
-    weights = {f"mlp.{name}": value for name, value in perceptron(spec).state_dict().items()}
-    task = task_for(
-        TrainedPolicy(spec, weights, task=to_dict(trained)),
-        hand=None,
-        objects=("cube",),
-        num_worlds=1,
-        seed=0,
-        stop_tolerance_rad=0.4,
-        max_goal_angle_rad=None,
-        episode_s=10.0,
-        randomised=False,
-        success_ends_episode=True,
-    )
-    assert task.caught.go_on_share == 0.0 and task.observation.goal_time
 
 
 def test_a_step_that_failed_ends_its_episode_also_where_it_was_caught():

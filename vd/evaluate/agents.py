@@ -177,7 +177,7 @@ def open_critic(student: "SavedStudent", device: str) -> "Callable[[torch.Tensor
         ) from error
     if teacher is None:
         raise ValueError(f"--second-view asks the critic of the student's teacher; '{name}' has none")
-    if teacher.num_observations != student.spec.network.state.values:
+    if head is not None and teacher.num_observations != student.spec.network.state.values:
         raise ValueError(
             f"--second-view asks the critic of the student's teacher; '{name}' observes other things than "
             "that. Give the student its critic: vd-train follow STUDENT TEACHER"

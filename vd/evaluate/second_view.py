@@ -13,7 +13,7 @@ import warp as wp
 
 from vd.envs.cfg import ObservationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.kernels.observations import JOINTS_PER_FINGER, teacher_observation_slices
+from vd.kernels.observations import teacher_observation_slices
 from vd.paper import PAPER
 from vd.policy import TrainedPolicy
 from vd.student.state import StateHead
@@ -81,11 +81,10 @@ class OtherViews:
 
     Attributes:
         maps: These.
-        fingers: F of the hand.
     """
 
     def __init__(self, clock: GoalClock, maps: ViewMaps) -> None:
-        self.maps, self.fingers = maps, maps.joints.shape[1] // JOINTS_PER_FINGER
+        self.maps = maps
         self._goal_steps = clock.steps
         hz = clock.control_hz
         self._after, self._every = round(AFTER_S * hz), round(EVERY_S * hz)
@@ -105,10 +104,11 @@ class OtherViews:
         They are, of a hand that is its own mirror image, the view in whose sector the goal lies now and that
         in the mirror; else all views.
         """
-        if len(self.maps) > self.fingers:
-            near = self.maps.nearness(world).unflatten(-1, (2, self.fingers)).argmax(dim=-1)
-            return torch.stack((near[:, 0], near[:, 1] + self.fingers))
-        return torch.arange(self.fingers, device=world.device)[:, None].expand(-1, len(world))
+        fingers = self.maps.fingers
+        if len(self.maps) > fingers:
+            near = self.maps.nearness(world).unflatten(-1, (2, fingers)).argmax(dim=-1)
+            return torch.stack((near[:, 0], near[:, 1] + fingers))
+        return torch.arange(fingers, device=world.device)[:, None].expand(-1, len(world))
 
     def better(self, world: torch.Tensor, value: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
         """Views [M] of which most is expected; ``value`` [M] is that of observations as a view shows them."""
@@ -182,8 +182,8 @@ class StudentSecondView:
                 "--second-view: this student does not act by the layers of a teacher that sees its goals in "
                 "views (observation.view goal or mirrored)"
             )
-        fingers = head.views.joints.shape[1] // JOINTS_PER_FINGER
-        seen = replace(task.observation, view="either" if len(head.views) == fingers else "mirrored")
+        mirrored = len(head.views) > head.views.fingers
+        seen = replace(task.observation, view="mirrored" if mirrored else "either")
         device, worlds = clock.steps.device, len(clock.steps)
         one = ReorientEnv(replace(task, objects=("cube",), num_worlds=1, observation=seen), str(device))
         maps = view_maps(one).adopt_first(head.views)
@@ -203,7 +203,7 @@ class StudentSecondView:
     def _views(self, world: torch.Tensor) -> torch.Tensor:
         """Views [M] for estimates in the world frame [M, O], of the worlds ``rows``."""
         head, rows = self._head, self.rows
-        turn = world[:, teacher_observation_slices(self._others.fingers)["relative_orientation"]]
+        turn = world[:, teacher_observation_slices(self._first.fingers)["relative_orientation"]]
         angle = 2.0 * torch.atan2(turn[:, :3].norm(dim=-1), turn[:, 3].abs())
         again = self._again[rows] & (angle > PAPER.success.rotation_rad)
         if bool(again.any()):

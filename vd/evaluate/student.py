@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 from vd.config import from_dict
-from vd.envs.cfg import ReorientCfg
+from vd.evaluate.agents import trained_task
 from vd.evaluate.scanned import ScannedGoalView
 from vd.evaluate.second_view import GoalClock, StudentSecondView
 from vd.sensors.cfg import DepthCameraCfg
@@ -84,8 +84,9 @@ class StudentActor:
         self._second = None
         if critic is not None:
             self._student = deepcopy(self._student)  # its views are changed
-            task = from_dict(ReorientCfg, student.task, where="task of the student")
-            self._second = StudentSecondView(GoalClock.of(env), self._student.state, task, critic)
+            self._second = StudentSecondView(
+                GoalClock.of(env), self._student.state, trained_task(student), critic
+            )
         self._hidden = self._student.initial_hidden(env.num_worlds)
         self._steps = wp.to_torch(env.step_count)
         self.predicted = self._hidden.new_zeros(env.num_worlds)

@@ -52,11 +52,11 @@ CHOSEN, CHOSEN_STEPS = 64, 8
 KEPT = 6
 """Poses that are followed."""
 OTHERS = 6
-"""Other rotations that are tried in each step."""
+"""Other rotations that are tried in each step (ours, docs/results/student.md: What falls is followed)."""
 STRIDE = 370
 """How far along the spiral of rotations those of the next step are: all come in turn."""
 STEPS = 8
-"""Steps of these and of those kept, at most (ours, docs/results/student.md: What falls is followed)."""
+"""Steps of these and of those kept, at most (ours, likewise)."""
 EVERY_SAMPLE = 2
 """Every so many-th surface sample is looked at for what stands out."""
 APART_RAD = 0.3
@@ -64,7 +64,8 @@ APART_RAD = 0.3
 STAY = 0.8
 """Another pose must fit better by a fifth to be believed."""
 WORSE = 1.5
-"""A pose of which the misfit has grown by no more than this factor has not been left behind (ours)."""
+"""A pose of which the misfit has grown by no more than this factor has not been left behind (ours, likewise;
+1.2 errs as little, 2 a little more)."""
 SHARE = 0.1
 """Share of the latest misfit in the average: some ten looks count."""
 
@@ -150,6 +151,7 @@ class Registration:
             self._eye.pose = wp.transform(*camera.position.tolist(), *camera.quaternion.tolist())
             self._eye.cell, self._eye.margin = CELL_PX, MARGIN_M
             cells = (math.ceil(camera.height / CELL_PX), math.ceil(camera.width / CELL_PX))
+        self._placing = [shapes, self._eye, int(self._rendered), EVERY_SAMPLE]
         self._nearness = wp.zeros((worlds, *cells), dtype=float, device=device)
         self._rotations = array(even_rotations(ROTATIONS), wp.quat)
         self.pose = torch.zeros((worlds, KEPT, 7), device=place)
@@ -247,17 +249,7 @@ class Registration:
         self._launch(
             replace_poses_kernel,
             (len(worlds), KEPT),
-            [
-                self._shapes,
-                self._eye,
-                int(self._rendered),
-                EVERY_SAMPLE,
-                worlds,
-                WORSE,
-                *self._kept,
-                self._cost[:, known],
-                *inputs,
-            ],
+            [*self._placing, worlds, WORSE, *self._kept, self._cost[:, known], *inputs],
             [self._found[:, again], self._cost[:, again]],
         )
         self._fit(self._found[:, again], self._cost[:, again], worlds, STEPS, 1, inputs)
@@ -269,8 +261,8 @@ class Registration:
 
     def _start(self, pose: wp.array, worlds: wp.array, first: wp.array, inputs: list[wp.array]) -> None:
         """Write poses [M, C] in so many rotations, from the given ones on."""
-        model = [self._shapes, self._eye, int(self._rendered), EVERY_SAMPLE, worlds, first]
-        self._launch(start_poses_kernel, pose.shape, [*model, self._rotations, *inputs], [pose])
+        given = [*self._placing, worlds, first, self._rotations]
+        self._launch(start_poses_kernel, pose.shape, [*given, *inputs], [pose])
 
     def _fit(
         self, pose: wp.array, cost: wp.array, worlds: wp.array, steps: int, every: int, inputs: list[wp.array]

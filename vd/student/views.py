@@ -51,6 +51,11 @@ class ViewMaps(nn.Module):
     def __len__(self) -> int:
         return len(self.sector)
 
+    @property
+    def fingers(self) -> int:
+        """Fingers of the hand: as many as there are views without those in the mirror."""
+        return self.joints.shape[1] // JOINTS_PER_FINGER
+
     def adopt(self, tables: Any) -> None:
         """Take over the tables of a hand, a ``vd.envs.symmetry.ViewTables``: envs stand above this layer."""
         for name in BUFFERS:
