@@ -36,6 +36,7 @@ commands:
   profile    where a student's time goes          vd-train profile --stage 1 --teacher dclaw3-table
   calibrate  choose when a student stops          vd-train calibrate student.pt --objects SET
   follow     give a student a newer teacher       vd-train follow dclaw4-student runs/more student.pt
+  average    mean weights of several teachers     vd-train average runs/a runs/b --output policy.pt
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
@@ -123,6 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "calibrate": _calibrate,
         "follow": _follow,
         "profile": _profile,
+        "average": _average,
         "export": _export,
         "bundle": _bundle,
         "curves": _curves,
@@ -331,6 +333,12 @@ def _profile(arguments: list[str], started: float) -> int:
     from vd.train.student.cli import profile_command
 
     return profile_command(arguments, started)
+
+
+def _average(arguments: list[str], _started: float) -> int:
+    from vd.train.average import average_command
+
+    return average_command(arguments)
 
 
 def _export(arguments: list[str], _started: float) -> int:
