@@ -232,6 +232,13 @@ def test_step_means_and_window_ratios():
     assert window.add(row | {"task/timed_out": 0.6})["success_per_goal"] == pytest.approx(0.25)
 
 
+def test_goals_that_end_their_episode_count_as_episodes():
+    row = {"task/reached": 0.6, "task/dropped": 0.1, "task/timed_out": 0.3, "reward/total": 1.0}
+    result = GoalWindow(1, success_ends=True).add(row)
+    assert result["goals_per_episode"] == result["success_per_goal"] == pytest.approx(0.6)
+    assert result["drop_rate"] == pytest.approx(0.1)
+
+
 def test_minibatches_are_never_larger_than_asked():
     assert minibatches(PpoCfg(rollout_steps=8, minibatch_size=64000), 32000) == 4
     assert minibatches(PpoCfg(rollout_steps=8, minibatch_size=64000), 100) == 1

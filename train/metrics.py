@@ -52,9 +52,11 @@ class GoalWindow:
 
     Args:
         length: Iterations in the window.
+        success_ends: Whether a goal that is reached ends its episode (``success_ends_episode``).
     """
 
-    def __init__(self, length: int) -> None:
+    def __init__(self, length: int, *, success_ends: bool = False) -> None:
+        self._success_ends = success_ends
         self._rows: deque[tuple[float, float, float, float]] = deque(maxlen=max(1, length))
 
     def add(self, means: dict[str, float]) -> dict[str, float | None]:
@@ -68,7 +70,8 @@ class GoalWindow:
             (means["task/reached"], means["task/dropped"], means["task/timed_out"], means["reward/total"])
         )
         reached, dropped, timed_out, reward = (math.fsum(column) for column in zip(*self._rows, strict=True))
-        goals, episodes = reached + dropped + timed_out, dropped + timed_out
+        goals = reached + dropped + timed_out
+        episodes = goals if self._success_ends else dropped + timed_out
         return {
             "success_per_goal": reached / goals if goals > 0 else None,
             "goals_per_episode": reached / episodes if episodes > 0 else None,

@@ -94,7 +94,7 @@ class TeacherRunner(OnPolicyRunner):
         self._means = StepMeans()
         # Two episodes, so that a window never misses the time-outs of worlds that run in step.
         self._window_length = math.ceil(2 * env.max_episode_length / ppo.rollout_steps)
-        self._window = GoalWindow(self._window_length)
+        self._window = self._new_window()
         self._score = (0.0, 0.0, -math.inf)
         self._best: tuple[float, ...] | None = None
         self._end = EndRequest(deadline, device=device, distributed=self.is_distributed)
@@ -104,6 +104,10 @@ class TeacherRunner(OnPolicyRunner):
         self.critic_warmup = ppo.critic_warmup_iterations or 0
         self.begun = False
         self.unlike: list[str] = []
+
+    def _new_window(self) -> GoalWindow:
+        ends = bool(self.task.get("success_ends_episode", False))
+        return GoalWindow(self._window_length, success_ends=ends)
 
     @property
     def num_observations(self) -> int:
@@ -299,7 +303,7 @@ class TeacherRunner(OnPolicyRunner):
         self.begun, self.new_episodes = True, "it is of another run"
         self.critic_warmup = warmup
         self._best = None
-        self._window = GoalWindow(self._window_length)
+        self._window = self._new_window()
 
     def _restore(self, state: dict[str, Any], path: str, load_cfg: dict | None, strict: bool) -> dict:
         """Take over a checkpoint that was read; see :meth:`load`."""
