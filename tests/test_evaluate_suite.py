@@ -287,8 +287,11 @@ def test_settings_that_cannot_be_are_refused(flags, message, capsys, tmp_path):
 
 
 def test_a_policy_is_known_by_its_weights(tmp_path):
-    student = suite_run.fingerprint("dclaw3-student")
-    assert suite_run.fingerprint("dclaw3-student", second_view=True) != student, "its teacher's critic too"
+    student = suite_run.fingerprint("dclaw4-table-student")
+    seen_twice = suite_run.fingerprint("dclaw4-table-student", second_view=True)
+    assert seen_twice != student, "its teacher's critic too, which its file does not have"
+    own = suite_run.fingerprint("dclaw3-student")
+    assert suite_run.fingerprint("dclaw3-student", second_view=True) == own, "that is in its file"
     teacher = suite_run.fingerprint("dclaw3-table")
     assert suite_run.fingerprint("dclaw3-table", second_view=True) == teacher
     path = tmp_path / "policy.pt"

@@ -155,7 +155,7 @@ def renamed(student: SavedStudent, teacher: str) -> SavedStudent:
 
 
 def test_a_student_asks_its_own_critic_or_that_of_its_teacher_by_name(tmp_path):
-    policy, student = open_policy("dclaw4-table", "cpu"), open_policy("dclaw4-student", "cpu")
+    policy, student = open_policy("dclaw4-table", "cpu"), open_policy("dclaw4-table-student", "cpu")
     seen = torch.randn(5, policy.num_observations)
     torch.testing.assert_close(open_critic(student, "cpu")(seen), policy.value(seen))
     with pytest.raises(ValueError, match="'lost', which cannot be read"):
@@ -169,7 +169,7 @@ def test_a_student_asks_its_own_critic_or_that_of_its_teacher_by_name(tmp_path):
         open_critic(renamed(student, str(tmp_path / "blind.pt")), "cpu")
 
     # From now on it needs no other file.
-    follow_teacher("dclaw4-student", "dclaw4-table", tmp_path / "student.pt")
+    follow_teacher("dclaw4-table-student", "dclaw4-table", tmp_path / "student.pt")
     alone = load_student(tmp_path / "student.pt")
     assert open_critic(alone, "cpu")(seen).equal(policy.value(seen)), "to the last bit, though stored small"
     torch.testing.assert_close(open_critic(renamed(alone, "lost"), "cpu")(seen), policy.value(seen))

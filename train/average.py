@@ -8,14 +8,14 @@ alike, and their mean is nothing; so it has to be judged, like any policy.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import torch
 import tyro
 
-from vd.policy import policy_export
 from vd.train.begin import find_start, unlike
-from vd.train.checkpoint import load_checkpoint, save_checkpoint
+
+if TYPE_CHECKING:
+    import torch
 
 NETWORKS = ("actor_state_dict", "critic_state_dict")
 
@@ -54,6 +54,9 @@ def average_policies(policies: Sequence[str], output: Path) -> None:
         ValueError: There are fewer than two, or one is no teacher, or has other networks, observations or
             actions than the first.
     """
+    from vd.policy import policy_export
+    from vd.train.checkpoint import load_checkpoint, save_checkpoint
+
     if len(policies) < 2:
         raise ValueError("a mean is of two policies at least; give more of them")
     paths = [find_start(name, flag="vd-train average") for name in policies]
@@ -91,8 +94,10 @@ def _check_alike(first_name: str, first: dict[str, Any], name: str, state: dict[
         )
 
 
-def _mean(weights: Sequence[dict[str, torch.Tensor]]) -> dict[str, torch.Tensor]:
+def _mean(weights: "Sequence[dict[str, torch.Tensor]]") -> "dict[str, torch.Tensor]":
     """Means of the numbers, shape by shape; counts, which are no weights, are those of the first."""
+    import torch
+
     return {
         name: torch.stack([one[name] for one in weights]).mean(dim=0) if value.is_floating_point() else value
         for name, value in weights[0].items()
