@@ -1,5 +1,6 @@
 """A student's second view: in which view it acts, from when on, and by which critic."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -21,10 +22,12 @@ from vd.evaluate.second_view import (
     StudentSecondView,
     with_second_view,
 )
+from vd.evaluate.trace import Trace
 from vd.kernels.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
 from vd.student.saved import SavedStudent, load_student
 from vd.student.state import StateHead, state_cfg
+from vd.train.cli import main as vd_train
 from vd.train.student.follow import follow_teacher
 
 WORLDS, WIDTH = 12, 8
@@ -181,3 +184,21 @@ def test_an_evaluation_of_a_student_says_that_it_looked_twice(tmp_path):
     arguments = ["dclaw3-student", "--objects", "cuboid", "--episodes", "1", "--device", "cpu"]
     assert cli.main([*arguments, "--second-view", "--episode-s", "0.3", "--output", str(tmp_path)]) == 0
     assert "looks twice" in (tmp_path / "eval.html").read_text()
+
+
+def test_a_stopping_rule_is_chosen_of_a_student_that_looks_twice_if_it_is_to(tmp_path, monkeypatch):
+    """The rule is that of what will fly, and the file says so."""
+    asked = []
+
+    def spy(env, actor, episodes, **_others):
+        asked.append(actor.looks_twice)
+        seen = np.zeros((1, 1, 4))
+        norms, quat = np.array([[[0.0, 0.5, 0.4, 0.3]]]), np.zeros((1, 1, 4))
+        return Trace(quat, quat, seen, seen, norms, seen, np.full((1, 1), 4), np.zeros((1, 1), bool))
+
+    monkeypatch.setattr("vd.train.student.calibrate.record", spy)
+    shutil.copy(find_policy("dclaw3-student"), path := tmp_path / "student.pt")
+    once = ["calibrate", str(path), "--objects", "cube", "--episodes", "1", "--device", "cpu"]
+    for arguments, twice in ((once, False), ([*once, "--second-view"], True)):
+        assert vd_train(arguments) == 0
+        assert asked[-1] == twice == ("looked at twice" in load_student(path).spec.calibrated_on)

@@ -14,7 +14,7 @@ from vd.assets_usd.objects.model import load_set
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import episode_limit_s
+from vd.evaluate.agents import episode_limit_s, open_critic
 from vd.evaluate.cli import LOG_EVERY_S
 from vd.evaluate.result import air_table_steps
 from vd.evaluate.student import StudentActor
@@ -54,6 +54,7 @@ def calibrate_student(
     randomise: bool = False,
     in_air: bool = False,
     aim: bool | None = None,
+    second_view: bool = False,
     seed: int = 0,
     device: str,
 ) -> tuple[Calibration, Calibration | None]:
@@ -70,6 +71,7 @@ def calibrate_student(
         randomise: Domain randomisation.
         in_air: Episodes of the paper's in-air test, in which the table is taken away.
         aim: Whether it aims past near goals, from now on; None: as it does.
+        second_view: It looks at goals again (:mod:`vd.evaluate.second_view`): the rule of one that is to.
         seed: Of starts, goals and sensor errors.
         device: Warp and torch device.
 
@@ -78,7 +80,8 @@ def calibrate_student(
 
     Raises:
         ValueError: The student is one of stage 0, which cannot act, or is to aim and does not look for its
-            object, or no rule stops any episode within the tolerance.
+            object, or has no second view and is to look twice, or no rule stops any episode within the
+            tolerance.
     """
     wp.config.log_level = wp.LOG_WARNING
     saved = load_student(path, device)
@@ -102,7 +105,9 @@ def calibrate_student(
     env = ReorientEnv(task, device)
     env.objects = with_symmetries(env.objects, device)
     table_steps = air_table_steps(task.sim.control_hz) if in_air else None
-    actor, refresh = StudentActor(env, saved, seed=seed), 0.5 if sys.stderr.isatty() else LOG_EVERY_S
+    critic = open_critic(saved, device) if second_view else None
+    actor = StudentActor(env, saved, critic=critic, seed=seed)
+    refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
     with tqdm(total=env.max_episode_steps, unit="step", desc=path.name, mininterval=refresh) as bar:
         trace = record(env, actor, each, table_steps=table_steps, on_step=bar.update)
     env.check()
@@ -115,6 +120,7 @@ def calibrate_student(
     state = read_student(path, as_stored=True)
     what = f"{', '.join(sets)}: {result.episodes} episodes{' in the air' if in_air else ''}, "
     what += "aimed past near goals, " if network.aim.enabled else ""
+    what += "looked at twice, " if second_view else ""
     what += f"tolerance {tolerance_rad:g} rad, seed {seed}"
     spec = replace(
         saved_spec(state, path),

@@ -45,6 +45,9 @@ class CalibrateCfg:
     """Take the table away, as vd-eval --in-air does: the rule of a student that is to hold its object."""
     aim: Literal["kept", "on", "off"] = "kept"
     """Whether it aims past the goal while the object is near it, from now on: more stops within 0.1 rad."""
+    second_view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Look again at goals that are not reached in 3 s, as vd-eval --second-view does: the rule of a student
+    that is to fly so."""
     seed: int = 1000
     """Of starts, goals and sensor errors."""
     device: str = "auto"
@@ -166,6 +169,7 @@ def calibrate_command(arguments: list[str], _started: float) -> int:
             randomise=cfg.randomise,
             in_air=cfg.in_air,
             aim=None if cfg.aim == "kept" else cfg.aim == "on",
+            second_view=cfg.second_view,
             seed=cfg.seed,
             device=resolve_device(cfg.device),
         )

@@ -92,6 +92,11 @@ class StudentActor:
         self.predicted = self._hidden.new_zeros(env.num_worlds)
         self.active = torch.ones(env.num_worlds, dtype=torch.bool, device=self._hidden.device)
 
+    @property
+    def looks_twice(self) -> bool:
+        """Whether it has a second view of goals that it does not reach."""
+        return self._second is not None
+
     def act(self, _observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] for what is seen now; the teacher's observation is not looked at.
 
