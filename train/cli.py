@@ -279,6 +279,7 @@ def _teacher(arguments: list[str], started: float) -> int:
 
     from vd.train.ending import finished
     from vd.train.progress import waiting
+    from vd.train.runner import POLICY_NAME
 
     main_process = os.environ.get("RANK", "0") == "0"
     with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):
@@ -306,8 +307,13 @@ def _teacher(arguments: list[str], started: float) -> int:
         if main_process:
             print(f"saved in {folder}; go on with: vd-train teacher --run-dir {folder} --resume")
         return INTERRUPTED
-    if main_process:
-        print(f"done: {folder}/policy.pt is the best policy, vd-train curves {folder} draws the curves")
+    if main_process and not (folder / POLICY_NAME).exists():
+        print(
+            f"done: nothing was trained, so {folder} has no {POLICY_NAME}: the {runner.env_steps} steps "
+            f"done before are more than --max-steps {cfg.run.max_steps}; raise it"
+        )
+    elif main_process:
+        print(f"done: {folder}/{POLICY_NAME} is the best policy, vd-train curves {folder} draws the curves")
     return 0
 
 
