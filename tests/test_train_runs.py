@@ -23,6 +23,7 @@ from vd.train.checkpoint import (
     set_random_state,
     without_worlds,
 )
+from vd.train.config import RunCfg
 from vd.train.ending import Interrupted, TrainingDivergedError
 from vd.train.metrics import GoalWindow, read_progress
 
@@ -87,6 +88,14 @@ def test_keeps_the_last_few_and_the_best_since_two_episodes_are_over(tmp_path):
     ]
     assert best["iter"] == 2 + scores[1:].index(max(scores[1:]))
     assert load_policy(tmp_path / "policy.pt").iteration == best["iter"]
+
+
+def test_keeps_some_for_good_of_which_a_mean_can_be_taken(tmp_path):
+    make_runner(tmp_path, save_every=1, keep_last=1, keep_every=2).learn(5)
+    kept = [p.name for p in list_checkpoints(tmp_path)]
+    assert kept == ["model_0000002.pt", "model_0000004.pt", "model_0000005.pt"]
+    with pytest.raises(ValueError, match="--keep-every is 150; give a multiple of --save-every 100"):
+        RunCfg(keep_every=150).check_kept()
 
 
 def test_before_two_episodes_are_over_the_latest_is_the_best(tmp_path):

@@ -50,10 +50,17 @@ def find_checkpoint(run_dir: Path, which: str) -> Path:
     return path
 
 
-def prune_checkpoints(run_dir: Path, keep: int) -> None:
-    """Delete all but the newest ``keep`` periodic checkpoints, and what a killed run left half-written."""
+def prune_checkpoints(run_dir: Path, keep: int, every: int | None = None) -> None:
+    """Delete old periodic checkpoints, and what a killed run left half-written.
+
+    Args:
+        run_dir: Folder of the run.
+        keep: How many of the newest to keep.
+        every: Keep those after every so many iterations too; None: no others.
+    """
     for path in list_checkpoints(run_dir)[:-keep]:
-        path.unlink(missing_ok=True)
+        if every is None or _iteration_of(path) % every:
+            path.unlink(missing_ok=True)
     for path in (run_dir / CHECKPOINT_FOLDER).glob(".*.pt"):
         path.unlink(missing_ok=True)
 

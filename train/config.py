@@ -95,10 +95,24 @@ class RunCfg:
     """Iterations between checkpoints."""
     keep_last: int = 3
     """Periodic checkpoints to keep besides the best."""
+    keep_every: int | None = None
+    """Keep those after every so many iterations too, for good, a multiple of --save-every: vd-train average
+    takes their mean."""
     stagger: bool = True
     """Start worlds at random times of their first episode, so that time-outs do not come all at once."""
     tensorboard: bool = True
     """Write TensorBoard files (tensorboard --logdir RUN-DIR)."""
+
+    def check_kept(self) -> None:
+        """Refuse checkpoints to be kept that are never written.
+
+        Raises:
+            ValueError: ``keep_every`` is no multiple of ``save_every``.
+        """
+        if self.keep_every is not None and (self.keep_every < 1 or self.keep_every % self.save_every):
+            raise ValueError(
+                f"--keep-every is {self.keep_every}; give a multiple of --save-every {self.save_every}"
+            )
 
 
 @dataclass
@@ -162,6 +176,7 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
     for flag, value in positive.items():
         if not value > 0:
             raise ValueError(f"{flag} is {value}; it has to be positive")
+    run.check_kept()
     if ppo.critic_warmup_iterations is not None and ppo.critic_warmup_iterations < 0:
         raise ValueError(
             f"--ppo.critic-warmup-iterations is {ppo.critic_warmup_iterations}; it has to be zero or positive"

@@ -412,7 +412,7 @@ class TeacherRunner(OnPolicyRunner):
             save_checkpoint(path.with_name(BEST_NAME), state)
         if better or not (self.run.run_dir / POLICY_NAME).exists():
             save_checkpoint(self.run.run_dir / POLICY_NAME, policy_export(state))
-        prune_checkpoints(self.run.run_dir, self.run.keep_last)
+        prune_checkpoints(self.run.run_dir, self.run.keep_last, self.run.keep_every)
 
     def _check_rollout(self, latest: TensorDict) -> None:
         """Stop before an update on values that are not finite. One wait for the device an iteration."""

@@ -343,6 +343,7 @@ def validate(cfg: StudentTrainCfg) -> None:
     for flag, value in positive.items():
         if not value > 0:
             raise ValueError(f"{flag} is {value}; it has to be positive")
+    run.check_kept()
     weights = {
         "--dagger.distance-weight": dagger.distance_weight,
         "--dagger.pose-weight": dagger.pose_weight,
