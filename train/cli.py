@@ -279,7 +279,6 @@ def _teacher(arguments: list[str], started: float) -> int:
 
     from vd.train.ending import finished
     from vd.train.progress import waiting
-    from vd.train.runner import POLICY_NAME
 
     main_process = os.environ.get("RANK", "0") == "0"
     with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):
@@ -307,6 +306,8 @@ def _teacher(arguments: list[str], started: float) -> int:
         if main_process:
             print(f"saved in {folder}; go on with: vd-train teacher --run-dir {folder} --resume")
         return INTERRUPTED
+    from vd.train.runner import POLICY_NAME  # loads torch, which the first message should not wait for
+
     if main_process and not (folder / POLICY_NAME).exists():
         print(
             f"done: nothing was trained, so {folder} has no {POLICY_NAME}: the {runner.env_steps} steps "
