@@ -120,7 +120,7 @@ def calibrate_student(
     state = read_student(path, as_stored=True)
     what = f"{', '.join(sets)}: {result.episodes} episodes{' in the air' if in_air else ''}, "
     what += "aimed past near goals, " if network.aim.enabled else ""
-    what += "looked at twice, " if second_view else ""
+    what += "looked at twice, " if actor.looks_twice else ""
     what += f"tolerance {tolerance_rad:g} rad, seed {seed}"
     spec = replace(
         saved_spec(state, path),
