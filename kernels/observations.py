@@ -55,11 +55,13 @@ class ObservationParams:
     velocity_scale: Factor on joint velocities and on the object's angular velocity.
     noise_mean: Mean of the noise on measured values, in their units.
     noise_std: Standard deviation of that noise, independent in every value and step.
+    file_axes: Whether orientations in the axes of the object's file are seen: 1, or 0 for zeros.
     """
 
     velocity_scale: float
     noise_mean: float
     noise_std: float
+    file_axes: float
 
 
 @wp.func
@@ -119,7 +121,8 @@ def teacher_observation_kernel(
 
     Joint positions are mapped from [lower, upper] to [-1, 1]; the relative orientation is
     q_object * conj(q_goal). Every measured value gets N(noise_mean, noise_std) + offset; the goal and
-    the previous action are known exactly and get neither.
+    the previous action are known exactly and get neither. Without ``file_axes`` the orientations of object
+    and goal are zeros, without noise.
 
     Args:
         joint_lower: Lower joint limits [rad], shape [D].
@@ -158,6 +161,7 @@ def teacher_observation_kernel(
     goal = goal_quat_in[world]
 
     column = write_vec3(world, 2 * joints, position, observation_out)
+    object_begin = column
     column = write_quat(world, column, orientation, observation_out)
     column = write_vec3(world, column, velocity, observation_out)
     column = write_vec3(world, column, settings.velocity_scale * spin, observation_out)
@@ -191,6 +195,9 @@ def teacher_observation_kernel(
             if settings.noise_std > 0.0:
                 error += settings.noise_std * wp.randn(state)
             observation_out[world, i] = observation_out[world, i] + error
+    if settings.file_axes == 0.0:
+        write_quat(world, object_begin, wp.quat(0.0, 0.0, 0.0, 0.0), observation_out)
+        write_quat(world, goal_begin, wp.quat(0.0, 0.0, 0.0, 0.0), observation_out)
     rng[world] = next_stream(state, world)
 
 

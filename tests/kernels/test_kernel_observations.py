@@ -57,7 +57,7 @@ def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
     }
 
 
-def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0):
+def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=True):
     """Launch the kernel on a scene; returns observation and streams."""
     worlds = len(scene["q"])
     out = unwritten((worlds, teacher_observation_size(len(scene["tip_body"]))), float, device)
@@ -67,6 +67,7 @@ def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0):
         velocity_scale=PAPER.observation.velocity_scale,
         noise_mean=noise_mean,
         noise_std=noise_std,
+        file_axes=float(file_axes),
     )
     rng = streams(worlds, seed, device)
     wp.launch(
@@ -156,6 +157,19 @@ def test_observation_matches_the_oracle(device, scene):
     mask = measured(len(scene["tip_body"]))
     expected[:, mask] += scene["offset"][:, mask]
     np.testing.assert_allclose(out, expected, rtol=1e-5, atol=1e-5)
+
+
+@EXAMPLES
+@given(scene=scenes(), seed=st.integers(0, 2**31 - 1))
+def test_without_the_axes_of_the_file_their_orientations_alone_are_zeros(device, scene, seed):
+    noise = {"noise_mean": 0.1, "noise_std": 0.2, "seed": seed}
+    full, stream = observe(device, scene, **noise)
+    out, same_stream = observe(device, scene, **noise, file_axes=False)
+    slices = teacher_observation_slices(len(scene["tip_body"]))
+    for name in ("object_orientation", "goal_orientation"):
+        full[:, slices[name]] = 0.0
+    np.testing.assert_array_equal(out, full)
+    np.testing.assert_array_equal(same_stream, stream)
 
 
 @EXAMPLES

@@ -80,6 +80,8 @@ class ObservationPart:
     """Factor on joint velocities and the object's angular velocity."""
     view: str = "world"
     """Frame of observation and action: the world's, or goal: the turn of the hand that the goal asks for."""
+    file_axes: bool = True
+    """Whether orientations of object and goal are shown in the axes of the object's file; else zeros are."""
 
 
 @dataclass(frozen=True)
@@ -250,7 +252,7 @@ def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
     if task.observation.goal_time:
         end = max(stop for _, stop in parts.values())
         parts["goal_time"] = (end, end + 1)
-    return ObservationPart(parts, view=task.observation.view)
+    return ObservationPart(parts, view=task.observation.view, file_axes=task.observation.file_axes)
 
 
 def _camera(hand: HandModel, depth: DepthCameraCfg, pose: tuple[float, ...] | None) -> CameraPart:

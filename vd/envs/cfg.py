@@ -100,6 +100,10 @@ class ObservationCfg:
     goal_time: bool = False
     """Ours: see for how long the present goal has been pursued. A policy that sees nothing but the state does
     the same again where it is caught; one that knows the time can learn to try something else."""
+    file_axes: bool = True
+    """See how the axes of the object's file lie, now and at the goal, as in the paper. No cloud shows which
+    they are; students know the rotation from one to the other alone. Ours: without them a teacher sees zeros
+    in their place, and knows no more of them than its students."""
 
     def views(self, fingers: int) -> int:
         """Views in which a hand of so many fingers sees its goals; 0: it sees the world as it is."""

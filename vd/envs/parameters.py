@@ -45,6 +45,7 @@ class TaskParameters:
             velocity_scale=PAPER.observation.velocity_scale,
             noise_mean=on * random.observation_noise_mean,
             noise_std=on * random.observation_noise_std,
+            file_axes=float(cfg.observation.file_axes),
         )
         self.start = array(
             StartParams, position=wp.vec3(*scene.object_start_m), noise=scene.object_start_noise_m
