@@ -237,6 +237,11 @@ def test_what_observations_and_actions_mean_is_compared():
         "env.observation.view goal, here world" in found and "env.observation.shape full, here none" in found
     )
     assert "env.action.ema_alpha 0.8, here 0.5" in found and len(found) == 3, "rewards are the run's own"
+    older, other = to_dict(PRESETS["gpu"]().env), to_dict(PRESETS["gpu"]().env)
+    del older["observation"]["file_axes"]  # a file from before there was a choice
+    assert unlike(older, other) == []
+    other["observation"]["file_axes"] = False
+    assert unlike(older, other) == ["env.observation.file_axes True, here False"]
 
 
 def test_policies_keep_their_critic_when_they_are_exported_and_are_small(tmp_path):

@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vd.config import from_dict
+from vd.config import from_dict, to_dict
 
 if TYPE_CHECKING:
     from vd.policy import PolicySpec
@@ -195,8 +195,15 @@ def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
     """Settings that change what observations and actions mean to a policy, each with what it was and is.
 
     Such as ``env.observation.view goal, here world``. A run may want them changed; so they are no errors.
+    What is younger than the policy's file counts as it is by default, as it does where the file is read.
     """
-    before, now = (dict(_leaves({k: t[k] for k in _SENSES if k in t}, "env")) for t in (trained, task))
+    from vd.envs.cfg import ReorientCfg
+
+    default, before, now = (
+        dict(_leaves({k: t[k] for k in _SENSES if k in t}, "env"))
+        for t in (to_dict(ReorientCfg()), trained, task)
+    )
+    before = {k: default[k] for k in now if k in default} | before
     return [f"{k} {before[k]}, here {now[k]}" for k in before if k in now and before[k] != now[k]]
 
 
