@@ -4,6 +4,9 @@ import os
 from collections import Counter
 from pathlib import Path
 
+if "PYTEST_XDIST_WORKER" in os.environ:  # before anything reads it: of shared cores each gets one thread
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import pytest
 import warp as wp
 

@@ -19,6 +19,18 @@ GRACE_S = 5.0
 """Time for an idle worker to end by itself [s]."""
 
 
+def one_thread_without_gpu(device: str) -> None:
+    """Keep torch to one thread where it computes on a CPU, unless OMP_NUM_THREADS says how many.
+
+    A second thread gains networks as small as ours little. Where cores are shared it costs them up to
+    tenfold: all threads wait for the one that has no core.
+    """
+    import torch
+
+    if device == "cpu" and SINGLE[0] not in os.environ:
+        torch.set_num_threads(1)
+
+
 @dataclass
 class _Worker:
     process: Any

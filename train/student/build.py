@@ -109,6 +109,7 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     from vd.student.saved import StudentSpec
     from vd.train.distributed import Processes, join_processes
     from vd.train.student.runner import StudentRunner
+    from vd.workers import one_thread_without_gpu
 
     device = cfg.run.device
     teacher = load_policy(find_policy(cfg.teacher), device)
@@ -128,9 +129,7 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         saved = to_dict(replace(cfg, resume=None))
         saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
         write_json(folder / CONFIG_NAME, saved)
-    if device == "cpu" and "OMP_NUM_THREADS" not in os.environ:
-        # A second thread gains small networks little, and where cores are shared it costs them tenfold.
-        torch.set_num_threads(1)
+    one_thread_without_gpu(device)
     # The network is the same in all processes, what they draw is not.
     torch.manual_seed(cfg.task.seed)
     torch.set_float32_matmul_precision("high")

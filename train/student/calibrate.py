@@ -24,6 +24,7 @@ from vd.student.saved import load_student, read_student, saved_spec
 from vd.student.stopping import Calibration, calibrate
 from vd.student.symmetry import with_symmetries
 from vd.train.checkpoint import save_checkpoint
+from vd.workers import one_thread_without_gpu
 
 
 def calibrate_trace(trace: Trace, *, tolerance_rad: float = PAPER.success.rotation_rad) -> Calibration:
@@ -84,6 +85,7 @@ def calibrate_student(
             tolerance.
     """
     wp.config.log_level = wp.LOG_WARNING
+    one_thread_without_gpu(device)
     saved = load_student(path, device)
     network = saved.spec.network
     if aim is not None:

@@ -182,8 +182,10 @@ def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str)
             return SecondView(env, policy), "teacher", "state", StoppingRule
         return policy, "teacher", "state", StoppingRule
     from vd.evaluate.student import StudentActor
+    from vd.workers import one_thread_without_gpu
 
     assert policy is not None
+    one_thread_without_gpu(device)
     rendered = None if cfg.sees == "auto" else cfg.sees == "rendered"
     actor = StudentActor(
         env,
