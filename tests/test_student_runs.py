@@ -310,12 +310,7 @@ def test_a_teacher_of_views_is_imitated_in_those_that_the_student_chooses(tmp_pa
     head = saved.network.state
     assert teacher is not None and head is not None and head.views is not None and head.fitted
     assert len(head.views) == 3 and torch.equal(head.view_offset, teacher.network.offset[0])
-    assert saved.task["observation"] == {
-        "shape": "full",
-        "view": "world",
-        "goal_time": False,
-        "file_axes": True,
-    }
+    assert saved.task["observation"] == teacher.task["observation"] | {"view": "world"}
     (row,) = read_progress(folder / "progress.jsonl")
     assert row["loss/state"] > 0.0
 
