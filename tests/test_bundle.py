@@ -149,6 +149,7 @@ def test_another_camera_is_refused_unless_the_policy_has_its_own(tmp_path, hand)
         ),
         (("interface", "action", "scale_rad_s"), 2.0, "action.scale_rad_s is 3.5 here, but 2 in"),
         (("interface", "observation", "velocity_scale"), 1.0, "observation.velocity_scale is 0.2 here"),
+        (("interface", "observation", "file_axes"), True, "observation.file_axes is False here"),
     ],
 )
 def test_a_contract_of_other_conventions_is_refused(teacher_bundle, hand, field, value, message):

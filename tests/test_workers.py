@@ -5,8 +5,6 @@ import os
 import time
 from pathlib import Path
 
-import torch
-
 from vd.workers import SINGLE, one_thread_without_gpu, run_tasks
 
 
@@ -70,6 +68,8 @@ def wait_for(condition):
 
 
 def test_torch_has_one_thread_on_a_cpu_unless_told_otherwise(monkeypatch):
+    import torch  # here, since workers import this module
+
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(2)
