@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from student_dummy import asks_its_teacher
 
 from vd.config import to_dict
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
@@ -158,7 +159,8 @@ def renamed(student: SavedStudent, teacher: str) -> SavedStudent:
 
 
 def test_a_student_asks_its_own_critic_or_that_of_its_teacher_by_name(tmp_path):
-    policy, student = open_policy("dclaw4-table", "cpu"), open_policy("dclaw4-table-student", "cpu")
+    student = load_student(asks_its_teacher("dclaw4-table-student", tmp_path / "asking.pt"))
+    policy = open_policy("dclaw4-table", "cpu")
     seen = torch.randn(5, policy.num_observations)
     torch.testing.assert_close(open_critic(student, "cpu")(seen), policy.value(seen))
     with pytest.raises(ValueError, match="'lost', which cannot be read"):
@@ -172,7 +174,7 @@ def test_a_student_asks_its_own_critic_or_that_of_its_teacher_by_name(tmp_path):
         open_critic(renamed(student, str(tmp_path / "blind.pt")), "cpu")
 
     # From now on it needs no other file.
-    follow_teacher("dclaw4-table-student", "dclaw4-table", tmp_path / "student.pt")
+    follow_teacher(str(tmp_path / "asking.pt"), "dclaw4-table", tmp_path / "student.pt")
     alone = load_student(tmp_path / "student.pt")
     assert open_critic(alone, "cpu")(seen).equal(policy.value(seen)), "to the last bit, though stored small"
     torch.testing.assert_close(open_critic(renamed(alone, "lost"), "cpu")(seen), policy.value(seen))
