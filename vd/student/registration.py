@@ -30,9 +30,8 @@ from vd.kernels.shape_grids import Shapes, off_mesh_kernel, shape_distance_kerne
 
 POINTS = 256
 """Points seen of the object that are looked at, at most."""
-GRID = 64
-"""Grid points along a side of a shape's distances: some 2.5 mm apart, or the walls of a box are lost between
-them (ours, docs/results/student.md: Thin walls)."""
+GRID = 32
+"""Grid points along a side of a shape's distances: some 5 mm apart."""
 BEYOND_M = 0.02
 """How far that grid reaches beyond the shape [m]."""
 ON_MESH_M = 1e-3
