@@ -31,7 +31,8 @@ from vd.kernels.shape_grids import Shapes, off_mesh_kernel, shape_distance_kerne
 POINTS = 256
 """Points seen of the object that are looked at, at most."""
 GRID = 32
-"""Grid points along a side of a shape's distances: some 5 mm apart."""
+"""Grid points along a side of a shape's distances: some 5 mm apart. Symmetries are found on it too
+(vd/student/symmetry.py), so that another one also changes what counts as the same."""
 BEYOND_M = 0.02
 """How far that grid reaches beyond the shape [m]."""
 ON_MESH_M = 1e-3
