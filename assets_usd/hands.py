@@ -1,14 +1,30 @@
 """Hands by name, as the rest of the project asks for them."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from vd.assets_usd.hand_author import hand_usd
-from vd.assets_usd.hand_model import HandModel, read_hand
+from vd.assets_usd.hand_spec import HANDS
+
+if TYPE_CHECKING:
+    from vd.assets_usd.hand_model import HandModel
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 
 
-def load_hand(name: str, fingertip: str = "rigid", layer: str | Path | None = None) -> HandModel:
+def check_hand_name(name: str) -> None:
+    """Refuse a hand that :func:`load_hand` would not find, without reading or writing anything.
+
+    Raises:
+        ValueError: No hand has this name, or there is no such file.
+    """
+    if name in HANDS or (name.endswith(USD_SUFFIXES) and Path(name).is_file()):
+        return
+    raise ValueError(
+        f"no hand is called {name!r}: choose one of {', '.join(HANDS)}, or give a hand's USD file"
+    )
+
+
+def load_hand(name: str, fingertip: str = "rigid", layer: str | Path | None = None) -> "HandModel":
     """Read a hand by name (authored on demand) or by the path of its USD.
 
     Args:
@@ -19,5 +35,8 @@ def load_hand(name: str, fingertip: str = "rigid", layer: str | Path | None = No
     Raises:
         HandError: The file is not a hand, or the layer not one of it.
     """
+    from vd.assets_usd.hand_author import hand_usd
+    from vd.assets_usd.hand_model import read_hand
+
     path = Path(name) if name.endswith(USD_SUFFIXES) else hand_usd(name)
     return read_hand(path, fingertip=fingertip, layer=None if layer is None else Path(layer))

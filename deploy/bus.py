@@ -105,7 +105,7 @@ def _sdk() -> Any:
     try:
         import dynamixel_sdk
     except ImportError as error:
-        raise BusError("motors need dynamixel-sdk: pip install 'visual-dexterity[hardware]'") from error
+        raise BusError("motors need dynamixel-sdk: pip install -e '.[hardware]'") from error
     return dynamixel_sdk
 
 

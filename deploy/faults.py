@@ -31,6 +31,7 @@ from vd.deploy.plant import Drive, FirstOrderPlant, Plant
 from vd.deploy.safety import FINISHED, SafeHand, StoppedError
 from vd.deploy.twin import Twin
 from vd.files import write_json
+from vd.warp_quiet import quiet_warp
 
 PUSH_RAD = 0.29
 """Distance of the goals from the joints: what the policy asks for at most."""
@@ -427,9 +428,7 @@ class FaultsCommand:
 
     def run(self) -> int:
         """Try all; 1 if one did not end as it has to."""
-        import warp as wp
-
-        wp.config.log_level = wp.LOG_WARNING
+        quiet_warp()
         hand = load_hand(self.hand)
         joints = uncalibrated(hand)
         trials: list[tuple[str, Callable[[], Outcome]]] = [

@@ -38,9 +38,7 @@ def opencv() -> ModuleType:
     try:
         import cv2
     except ImportError as error:
-        raise CameraError(
-            f"OpenCV cannot be imported ({error}); pip install 'visual-dexterity[hardware]'"
-        ) from error
+        raise CameraError(f"OpenCV cannot be imported ({error}); pip install -e '.[hardware]'") from error
     return cv2
 
 

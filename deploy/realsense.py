@@ -33,7 +33,7 @@ HOLE_MODES: dict[HoleFilling, int] = {"left": 0, "farthest": 1, "nearest": 2}
 CLOCK_WINDOW = 300
 """Frames from which the offset between two clocks is found: ten seconds, in which crystals part by 0.2 ms."""
 MILLISECOND = 1e-3
-INSTALL = "pip install 'visual-dexterity[hardware]'"
+INSTALL = "pip install -e '.[hardware]'"
 
 
 @dataclass(frozen=True)

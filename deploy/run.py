@@ -28,7 +28,9 @@ from vd.deploy.motion import MOVE_S, move, reset_pose
 from vd.deploy.realsense import RealSenseCfg
 from vd.deploy.safety import SafeHand
 from vd.deploy.timely import Priority, real_time, undisturbed
+from vd.evaluate.agents import check_names
 from vd.paper import PAPER
+from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.assets_usd.objects.model import ObjectModel
@@ -100,6 +102,7 @@ class RunCfg(HandOptions):
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
+        check_names([self.policy] if self.policy else [], [self.object], self.hand)
         from vd.deploy.goals import SCAN_SUFFIXES
 
         if self.random_goals < 1:
@@ -118,14 +121,13 @@ def run(cfg: RunCfg) -> int:
     """Fly the policy; 0 if all goals were pursued, 1 if the object was lost."""
     cfg.validate()
     import torch
-    import warp as wp
 
     from vd.deploy.connect import read_hand_and_joints
     from vd.deploy.flight import make_flight
     from vd.deploy.goals import one_object
     from vd.deploy.twin_link import TwinLink
 
-    wp.config.log_level = wp.LOG_WARNING  # a line for each kernel would scroll the preflight away
+    quiet_warp()
     torch.set_num_threads(1)  # of several, some would wait for one that has no core
     hand, _ = read_hand_and_joints(cfg)
     item = one_object(cfg.object)

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
+from vd.warp_quiet import quiet_warp
+
 if TYPE_CHECKING:
     import torch
 
@@ -210,9 +212,7 @@ class Shadow:
 
 def shadow(cfg: ShadowCfg) -> int:
     """Compare, and print what was found; 1 if more than rounding tells the two apart."""
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
+    quiet_warp()
     if cfg.every < 1:
         raise ValueError(f"--every is {cfg.every}; it has to be at least 1")
     found = []

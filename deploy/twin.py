@@ -29,6 +29,7 @@ from vd.deploy.packets import MAX_ID
 from vd.deploy.plant import Plant
 from vd.deploy.timely import Priority, real_time, undisturbed
 from vd.paper import PAPER
+from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.assets_usd.objects.model import ObjectModel
@@ -223,14 +224,12 @@ class TwinCommand:
         )
         ids, plant, side = self.ids, None, None
         if self.hand is not None:
-            import warp as wp
-
             from vd.assets_usd.hands import load_hand
             from vd.deploy.joints import read_joints, uncalibrated
             from vd.deploy.newton_hand import NewtonHand
             from vd.sim.cfg import SimCfg
 
-            wp.config.log_level = wp.LOG_WARNING  # what is printed is the path
+            quiet_warp()
             hand = load_hand(self.hand, layer=self.hand_layer)
             joints = uncalibrated(hand) if self.calibration is None else read_joints(self.calibration, hand)
             ids, plant = (

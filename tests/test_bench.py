@@ -78,13 +78,18 @@ def test_kernels_add_up_and_the_longest_is_first(device):
 
 @pytest.fixture
 def offline(monkeypatch):
-    def fetch(*_args: object, **_kwargs: object) -> None:
+    """Whatever asks for Newton's asset is noted, and finds no network."""
+    asked = []
+
+    def fetch(*args: object, **_kwargs: object) -> None:
+        asked.append(args)
         raise OSError("no network")
 
     monkeypatch.setattr("newton.utils.download_asset", fetch)
+    return asked
 
 
-def test_the_allegro_example_runs_with_a_hand_of_boxes_where_its_own_cannot_be_fetched(offline, tmp_path):
+def test_the_allegro_example_runs_with_a_hand_of_boxes_and_without_the_network(offline, tmp_path):
     out = tmp_path / "rows.json"
     SimCommand(worlds=(2,), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
     (row,) = json.loads(out.read_text())["rows"]
@@ -93,6 +98,12 @@ def test_the_allegro_example_runs_with_a_hand_of_boxes_where_its_own_cannot_be_f
     assert row["physics_steps_over_allegro"] == pytest.approx(
         row["physics_only"] * 10 / row["allegro_physics_steps_s"]
     )
+    assert offline == [], "nothing is fetched unasked"
+    from vd.bench.allegro import allegro_rate
+
+    with pytest.raises(RuntimeError, match="no network"):
+        allegro_rate(1, "cpu", fetch=True)
+    assert offline
 
 
 def test_the_hand_of_boxes_passes_the_examples_own_test():

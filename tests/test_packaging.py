@@ -2,6 +2,7 @@
 
 import configparser
 import importlib.metadata
+import re
 import shutil
 import subprocess
 import sys
@@ -154,3 +155,13 @@ def test_constraints_pin_everything():
         n for n in required_distributions() - pinned if not n.startswith(("nvidia-", "cuda-", "triton"))
     }
     assert not missing, f"add to constraints.txt: {sorted(missing)}"
+
+
+def test_what_messages_and_pages_tell_to_install_exists():
+    told = set()
+    for folder in (*PACKAGE_DIRS.values(), "docs"):
+        for path in (ROOT / folder).rglob("*.*"):
+            if path.suffix in (".py", ".md"):
+                told |= set(re.findall(r"pip install [^\n`]*?'([^'\n]*\[[^'\n]*)'", path.read_text()))
+    assert told == {f".[{extra}]" for extra in ("hardware", "export")}
+    assert {"hardware", "export"} <= PROJECT["project"]["optional-dependencies"].keys()

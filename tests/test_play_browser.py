@@ -147,7 +147,7 @@ class Still:
 @pytest.fixture
 def player():
     from vd.assets_usd.hands import load_hand
-    from vd.play.viewer import PlayViewer
+    from vd.play.viewer import PlayViewer, open_page
 
     objects = [box("brick", [0.09, 0.05, 0.03]), box("stick", [0.14, 0.02, 0.02])]
     env = FakeEnv(objects, num_worlds=2, max_episode_steps=10_000, tolerance=-1.0, hand=load_hand("dclaw3"))
@@ -155,7 +155,7 @@ def player():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    viewer = PlayViewer(session, port=port, verbose=False)
+    viewer = PlayViewer(session, open_page(port=port, verbose=False))
     yield viewer
     viewer.close()
 

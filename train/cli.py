@@ -17,6 +17,7 @@ from vd.train.begin import find_start, settings_of
 from vd.train.config import NoiseCfg
 from vd.train.focus import read_success, worlds_text
 from vd.train.presets import PRESETS, TeacherCfg, smoke
+from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.train.runner import TeacherRunner
@@ -211,10 +212,9 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
         )
 
     import torch
-    import warp as wp
 
     # A line for each of some hundred kernels would scroll the progress away.
-    wp.config.log_level = wp.LOG_WARNING
+    quiet_warp()
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.second_view import with_second_view
     from vd.sim.cfg import coarser
@@ -277,6 +277,9 @@ def resolve_device(name: str) -> str:
 def _teacher(arguments: list[str], started: float) -> int:
     cfg = parse_teacher(arguments)
 
+    from vd.evaluate.agents import check_names
+
+    check_names((), cfg.env.objects, cfg.env.hand)
     from vd.train.ending import finished
     from vd.train.progress import waiting
 
@@ -383,7 +386,7 @@ def _export_onnx(cfg: ExportCfg) -> int:
     export_onnx(policy, cfg.output)
     worst = onnx_difference(policy, cfg.output)
     if worst is None:
-        print("onnxruntime is not installed: not checked (pip install 'visual-dexterity[export]')")
+        print("onnxruntime is not installed: not checked (pip install -e '.[export]')")
     else:
         print(f"onnxruntime gives the same actions within {worst:.1e}")
     print(cfg.output)

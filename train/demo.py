@@ -33,6 +33,7 @@ from vd.train.demo_gap import find_hidden_gap, gap_commands, gap_report
 from vd.train.demo_import import IMPORT_SEARCH, IMPORT_SHARE, import_for
 from vd.train.demo_stages import Budget, Stages
 from vd.train.demo_student import student_commands, student_files, train_students
+from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.evaluate.result import EvalResult
@@ -353,7 +354,7 @@ def run_demo(cfg: DemoCfg, *, started: float | None = None) -> Path:
     """
     import warp as wp
 
-    wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would hide the rest
+    quiet_warp()
     cfg.validate()
     budget = Budget(cfg.minutes) if started is None else Budget(cfg.minutes, started=started)
     gpu = wp.is_cuda_available()

@@ -73,7 +73,7 @@ def fly_twins(folder: Path, seed: int, *, minutes: float) -> None:
     if minutes < LEAST_FLIGHT_MIN:
         raise TimeUp
     if find_spec(DRIVER) is None:
-        raise RuntimeError(f"{DRIVER} is not installed: pip install 'visual-dexterity[hardware]'")
+        raise RuntimeError(f"{DRIVER} is not installed: pip install -e '.[hardware]'")
     for hand in HANDS:  # of a call before this one that was ended
         shutil.rmtree(deploy_log(folder, hand), ignore_errors=True)
     statuses = _together(deploy_commands(folder, seed))

@@ -30,7 +30,7 @@ def export_onnx(policy: TrainedPolicy, path: Path) -> None:
         RuntimeError: What the export needs is not installed.
     """
     if find_spec("onnxscript") is None:
-        raise RuntimeError("ONNX export needs onnxscript: pip install 'visual-dexterity[export]'")
+        raise RuntimeError("ONNX export needs onnxscript: pip install -e '.[export]'")
     example = torch.zeros(2, policy.num_observations)
     # It warns of libraries that this network does not need, and of its own future.
     logger = logging.getLogger("torch.onnx")

@@ -3,10 +3,9 @@
 import re
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from vd.assets_usd.objects import procedural
 from vd.assets_usd.objects.model import ObjectError, ObjectModel, object_files, read_hash, write_object
 
 HELD_OUT_COUNT = 30
@@ -15,6 +14,8 @@ HELD_OUT_COUNT = 30
 BUILT_IN = ("cube", "cuboid", "symmetric", "procedural-150-seed0", "procedural-heldout")
 """Sets named in help texts; ``procedural-<count>-seed<seed>`` and ``procedural-heldout-<count>-seed<seed>``
 take any numbers."""
+
+_PROCEDURAL = re.compile(r"procedural-(heldout-)?([1-9]\d*)-seed(\d+)")
 
 
 def objects_dir() -> Path:
@@ -26,6 +27,8 @@ def objects_dir() -> Path:
 
 def built_in_models(name: str) -> Callable[[], list[ObjectModel]] | None:
     """The function that makes a built-in set, or None if the name is no built-in one."""
+    from vd.assets_usd.objects import procedural
+
     if name == "cube":
         return lambda: [procedural.cube()]
     if name == "cuboid":
@@ -34,7 +37,7 @@ def built_in_models(name: str) -> Callable[[], list[ObjectModel]] | None:
         return lambda: [procedural.cube(), procedural.cuboid()]
     if name == "procedural-heldout":
         return lambda: procedural.procedural_set(HELD_OUT_COUNT, 0, held_out=True)
-    match = re.fullmatch(r"procedural-(heldout-)?([1-9]\d*)-seed(\d+)", name)
+    match = _PROCEDURAL.fullmatch(name)
     if match is None:
         return None
     count, seed, held_out = int(match.group(2)), int(match.group(3)), match.group(1) is not None
@@ -46,6 +49,42 @@ def write_set(folder: Path, models: list[ObjectModel]) -> list[Path]:
     return [write_object(Path(folder) / f"{model.name}.usd", model) for model in models]
 
 
+def check_sets(names_or_paths: Iterable[str | Path]) -> None:
+    """Refuse what :func:`vd.assets_usd.objects.model.load_set` would not find, without reading or making it.
+
+    Raises:
+        ObjectError: An entry is neither a path nor a set; the message lists the sets there are.
+    """
+    for entry in names_or_paths:
+        name, built_in = str(entry), entry in BUILT_IN or _PROCEDURAL.fullmatch(str(entry))
+        if not built_in and not Path(entry).expanduser().exists() and not _is_there(name):
+            raise _no_such_set(name)
+
+
+def _is_plain(name: str) -> bool:
+    """Whether it can be a folder's name in the cache."""
+    return re.fullmatch(r"[\w.-]+", name) is not None and name not in (".", "..")
+
+
+def _is_there(name: str) -> bool:
+    """Whether the cache has a set of this name."""
+    folder = objects_dir() / name
+    return _is_plain(name) and folder.is_dir() and bool(object_files(folder))
+
+
+def _no_such_set(name: str) -> ObjectError:
+    root = objects_dir()
+    out = root / name if _is_plain(name) else root
+    there = sorted(p.name for p in root.iterdir() if p.is_dir() and object_files(p)) if root.is_dir() else []
+    return ObjectError(
+        f"no object set or path {name!r}.\n"
+        f"  built in: {', '.join(BUILT_IN)}\n"
+        f"  in {root}: {', '.join(there) or 'none'}\n"
+        f"  import meshes as a set: vd-assets import MESHES --out {out}\n"
+        "  author our own: vd-assets objects --procedural 150 --seed 0"
+    )
+
+
 def set_folder(name: str) -> Path:
     """Folder of a named set, authored first if it is a built-in one that is not there yet.
 
@@ -55,25 +94,17 @@ def set_folder(name: str) -> Path:
     Raises:
         ObjectError: No such set; the message lists those there are and the commands that make more.
     """
+    from vd.assets_usd.objects import procedural
+
     root = objects_dir()
-    plain = re.fullmatch(r"[\w.-]+", name) is not None and name not in (".", "..")
     folder = root / name
-    make = built_in_models(name) if plain else None
-    if plain and folder.is_dir() and (files := object_files(folder)):
-        if make is None or procedural.is_current(read_hash(files[0])):
+    make = built_in_models(name) if _is_plain(name) else None
+    if _is_there(name):
+        if make is None or procedural.is_current(read_hash(object_files(folder)[0])):
             return folder
         shutil.rmtree(folder)  # of an older version of our families
     if make is None:
-        there = (
-            sorted(p.name for p in root.iterdir() if p.is_dir() and object_files(p)) if root.is_dir() else []
-        )
-        raise ObjectError(
-            f"no object set or path {name!r}.\n"
-            f"  built in: {', '.join(BUILT_IN)}\n"
-            f"  in {root}: {', '.join(there) or 'none'}\n"
-            f"  import meshes as a set: vd-assets import MESHES --out {root / name if plain else root}\n"
-            "  author our own: vd-assets objects --procedural 150 --seed 0"
-        )
+        raise _no_such_set(name)
     root.mkdir(parents=True, exist_ok=True)
     # Several ranks may ask at once: each writes aside, and the first to finish moves it into place.
     aside = Path(tempfile.mkdtemp(prefix=f".{name}.", dir=root))

@@ -19,6 +19,7 @@ from vd.train.student.config import (
     StudentTrainCfg,
     validate,
 )
+from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -99,10 +100,9 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         check_start(cfg)
 
     import torch
-    import warp as wp
 
     # A line for each of some hundred kernels would scroll the progress away.
-    wp.config.log_level = wp.LOG_WARNING
+    quiet_warp()
     from vd.evaluate.agents import find_policy, policy_name, trained_task
     from vd.policy import load_policy
     from vd.student.network import Student

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import warp as wp
 from tqdm import tqdm
 
 from vd.aim import AimCfg
@@ -24,6 +23,7 @@ from vd.student.saved import load_student, read_student, saved_spec
 from vd.student.stopping import Calibration, calibrate
 from vd.student.symmetry import with_symmetries
 from vd.train.checkpoint import save_checkpoint
+from vd.warp_quiet import quiet_warp
 from vd.workers import one_thread_without_gpu
 
 
@@ -84,7 +84,7 @@ def calibrate_student(
             object, or has no second view and is to look twice, or no rule stops any episode within the
             tolerance.
     """
-    wp.config.log_level = wp.LOG_WARNING
+    quiet_warp()
     one_thread_without_gpu(device)
     saved = load_student(path, device)
     network = saved.spec.network

@@ -99,6 +99,9 @@ def student_command(arguments: list[str], started: float) -> int:
     """``vd-train student``; the exit status."""
     cfg = parse_student(arguments)
 
+    from vd.evaluate.agents import check_names
+
+    check_names([] if cfg.teacher is None else [cfg.teacher], cfg.task.objects)
     from vd.train.cli import INTERRUPTED
     from vd.train.ending import finished
     from vd.train.progress import waiting

@@ -1,8 +1,8 @@
 """Newton's own Allegro example, stepped with its own settings, as the yardstick of ``vd-bench sim``.
 
 Always the example's code: its solver, contact numbers, drives, motion, substeps and CUDA graph. Its hand is
-an asset of 17.8 MB that Newton fetches; where it cannot, the example gets a person's file of the hand, or
-else one made of boxes, of the Allegro's size. SI units, quaternions xyzw.
+one of boxes, of the Allegro's size, a person's file of the hand, or, where that is asked for, the example's
+own asset of 17.8 MB, which Newton downloads. SI units, quaternions xyzw.
 """
 
 import sys
@@ -82,13 +82,14 @@ class AllegroRate:
     """Which hand it had: :data:`FROM_NEWTON`, a file's name or :data:`OF_BOXES`."""
 
 
-def allegro_rate(worlds: int, device: str, *, file: Path | None = None) -> AllegroRate:
+def allegro_rate(worlds: int, device: str, *, file: Path | None = None, fetch: bool = False) -> AllegroRate:
     """Physics steps per second of the example over all worlds.
 
     Args:
         worlds: World count.
         device: Warp device.
-        file: URDF of an Allegro hand, in its maker's frame, in place of the example's asset.
+        file: URDF of an Allegro hand, in its maker's frame, in place of the boxes.
+        fetch: Let Newton download the example's asset, which is then the hand.
 
     Raises:
         RuntimeError: The example cannot run here: it is not installed, or fails on this device.
@@ -102,8 +103,9 @@ def allegro_rate(worlds: int, device: str, *, file: Path | None = None) -> Alleg
             if file is not None:
                 with _in_place_of_the_asset(lambda builder: _add_file(builder, file)):
                     return _measure(worlds, device, file.name)
-            if _asset_is_here():
-                return _measure(worlds, device, FROM_NEWTON)
+            if fetch:
+                with redirect_stdout(sys.stderr):  # standard output is for the rows
+                    return _measure(worlds, device, FROM_NEWTON)
             with _in_place_of_the_asset(add_hand_of_boxes):
                 return _measure(worlds, device, OF_BOXES)
     except Exception as error:
@@ -130,16 +132,6 @@ def make_example(worlds: int) -> Any:
     arguments = Example.create_parser().parse_args(["--viewer", "null", "--world-count", str(worlds)])
     viewer: Any = newton.viewer.ViewerNull(num_frames=FRAMES)
     return Example(viewer, arguments)
-
-
-def _asset_is_here() -> bool:
-    """Whether Newton has, or can fetch, the example's hand."""
-    try:
-        with redirect_stdout(sys.stderr):  # it tells of its attempts; standard output is for the rows
-            newton.utils.download_asset("wonik_allegro")
-    except Exception:  # no network, no git, a cache that cannot be written: all mean no
-        return False
-    return True
 
 
 @contextmanager

@@ -11,6 +11,8 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from vd.warp_quiet import quiet_warp
+
 
 @dataclass(frozen=True)
 class SimCommand:
@@ -35,8 +37,9 @@ class SimCommand:
     kernels: int = 0
     """On a GPU list as many kernels, those that take the most time of a control step."""
     allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Also step Newton's own Allegro example at the same world counts; where its asset cannot be fetched,
-    with a hand of boxes of that size."""
+    """Also step Newton's own Allegro example at the same world counts, with a hand of boxes of that size."""
+    fetch_allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Let Newton download that example's own hand (17.8 MB) in place of the boxes."""
     allegro_file: Path | None = None
     """URDF of an Allegro hand for that example in place of its asset."""
     json: Path | None = None
@@ -51,7 +54,7 @@ class SimCommand:
         from vd.evaluate.agents import find_policy
         from vd.policy import load_policy
 
-        wp.config.log_level = wp.LOG_WARNING
+        quiet_warp()
         device = choose_device(self.device)
         teacher = None if self.policy is None else load_policy(find_policy(self.policy), device)
         rows: list[dict[str, Any]] = []
@@ -67,7 +70,7 @@ class SimCommand:
             substeps = cfg.sim.substeps
             if self.allegro:
                 try:
-                    beside = allegro_rate(worlds, device, file=self.allegro_file)
+                    beside = allegro_rate(worlds, device, file=self.allegro_file, fetch=self.fetch_allegro)
                     record["allegro_hand"] = beside.hand
                     record["allegro_physics_steps_s"] = beside.physics_steps_s
                     record["allegro_dt_s"] = beside.dt_s
@@ -104,13 +107,11 @@ class PhysicsCommand:
 
     def run(self) -> int:
         """Measure and print."""
-        import warp as wp
-
         from vd.assets_usd.objects.model import load_set
         from vd.bench.physics import bounce, pinch, rest, slide
         from vd.sim.cfg import SimCfg
 
-        wp.config.log_level = wp.LOG_WARNING
+        quiet_warp()
         cfg = SimCfg()
         results = rest(load_set(list(self.objects)), cfg, device=self.device, seed=self.seed)
         moving = [r for r in results if not r.rests]
@@ -160,7 +161,7 @@ class DepthCommand:
         from vd.bench.depth import measure
         from vd.files import write_json
 
-        wp.config.log_level = wp.LOG_WARNING
+        quiet_warp()
         device = choose_device(self.device)
         objects = load_set(list(self.objects))
         rows: list[dict[str, Any]] = []
@@ -218,7 +219,7 @@ class StudentCommand:
                     f"--networks {name}: no such preset or student; choose of {', '.join(PRESETS)}, or give "
                     "a student.pt"
                 )
-        wp.config.log_level = wp.LOG_WARNING
+        quiet_warp()
         device = choose_device(self.device)
         objects = load_set(list(self.objects))
         rows: dict[str, list[dict[str, Any]]] = {"latency": [], "training": []}
@@ -264,11 +265,9 @@ class ReplayCommand:
 
     def run(self) -> int:
         """Replay and print."""
-        import warp as wp
-
         from vd.sim.replay import replay
 
-        wp.config.log_level = wp.LOG_WARNING
+        quiet_warp()
         for line in replay(self.dump, device=self.device):
             print(line)
         return 0

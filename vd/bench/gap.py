@@ -29,6 +29,7 @@ from vd.gap.hide import simulate_hidden, write_hidden
 from vd.gap.recording import BARE_MODELS
 from vd.gap.sizes import GAPS, showing
 from vd.versions import source_commit
+from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
 
 PAIR_SIZE = 2
@@ -119,12 +120,10 @@ def run_case(case: Case, folder: Path, device: str = "cpu", keep: bool = False) 
         What :func:`score` returns, or the traceback under ``error``; with the commit and the processor time
         of this process ``cpu_s`` [s].
     """
-    import warp as wp
-
     from vd.assets_usd.hands import load_hand
     from vd.gap import workflow
 
-    wp.config.log_level = wp.LOG_WARNING
+    quiet_warp()
     work, begin = folder / "work" / case.name, time.process_time()
     try:
         (hidden,) = simulate_hidden([case.hiding()])
@@ -219,7 +218,7 @@ def _prepare(device: str, models: set[str]) -> None:
     for model in models - set(BARE_MODELS):
         load_hand(model)
 
-    wp.config.log_level = wp.LOG_WARNING
+    quiet_warp()
     wp.load_module(vd.kernels.chains, device=device)
 
 

@@ -78,14 +78,19 @@ class SimRow:
     """Every kernel of a control step, the longest first; none on the CPU, not measured."""
 
 
-def seconds_per_call(function: Any, calls: int, device: str) -> float:
-    """Mean wall time of ``calls`` calls [s], device work included."""
-    wp.synchronize_device(device)
-    start = time.perf_counter()
+def seconds_per_call(
+    function: Any, calls: int, device: str, *, before: Callable[[], object] = lambda: None
+) -> float:
+    """Mean wall time of ``calls`` calls [s], device work included; ``before`` each of them is not timed."""
+    elapsed = 0.0
     for _ in range(calls):
+        before()
+        wp.synchronize_device(device)
+        start = time.perf_counter()
         function()
-    wp.synchronize_device(device)
-    return (time.perf_counter() - start) / calls
+        wp.synchronize_device(device)
+        elapsed += time.perf_counter() - start
+    return elapsed / calls
 
 
 def captured(function: Any, device: str) -> Any:
@@ -210,22 +215,12 @@ def measure(
         env.step(env.action)
     env.check()
 
-    def with_policy() -> None:
-        policy()
-        env.step(env.action)
-
     def physics_seconds() -> float:
-        physics = captured(env.launch_physics, device)
+        return seconds_per_call(captured(env.launch_physics, device), calls, device, before=policy)
 
-        def policy_and_physics() -> None:
-            policy()
-            physics()
-
-        return seconds_per_call(policy_and_physics, calls, device) - policy_s
-
-    # The same policy acts in all three, so that the hand moves and pushes alike; its own time is taken off.
+    # The same policy acts in all of them, so that the hand moves and pushes alike.
     policy_s = seconds_per_call(policy, calls, device)
-    whole_s = seconds_per_call(with_policy, calls, device)
+    step_s = seconds_per_call(lambda: env.step(env.action), calls, device, before=policy)
     physics_s, unsorted_s, solver = physics_seconds(), 0.0, env.sim.solver
     if on_gpu:
         leave_pairs(solver.mjw_data)
@@ -241,8 +236,8 @@ def measure(
         worlds=n,
         jacobian=cfg.sim.jacobian,
         physics_only=n / physics_s,
-        whole_step=n / (whole_s - policy_s),
-        with_policy=n / whole_s,
+        whole_step=n / step_s,
+        with_policy=n / (policy_s + step_s),
         pair_order_gain=unsorted_s / physics_s,
         own_kernels=own_share(kernels),
         memory_gb=memory,

@@ -1,11 +1,13 @@
 """Agents by name or file, and the task they act in: shared by vd-eval and vd-play."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from vd.aim import AimCfg
+from vd.assets_usd.hands import check_hand_name
+from vd.assets_usd.objects.sets import check_sets
 from vd.bundle import is_bundle
 from vd.config import from_dict
 from vd.envs.cfg import (
@@ -68,6 +70,21 @@ def find_policy(name: str | Path) -> Path:
         if (path / candidate).is_file():
             return path / candidate
     raise FileNotFoundError(f"{path} holds no {' or '.join(_RUN_FILES)}; give a policy.pt or a checkpoint")
+
+
+def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None = None) -> None:
+    """Refuse agents, object sets and a hand that are not there, before anything slow is imported.
+
+    Raises:
+        FileNotFoundError: There is no such policy.
+        ValueError: There is no such object set or hand.
+    """
+    for name in agents:
+        if name not in BUILT_IN:
+            find_policy(name)
+    check_sets(objects)
+    if hand is not None:
+        check_hand_name(hand)
 
 
 def policy_name(name: str | Path) -> str:

@@ -5,6 +5,7 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,12 +14,15 @@ import tyro
 from vd.evaluate.agents import (
     LAYER_HELP,
     SHIPPED_POLICIES,
+    check_names,
     check_second_view,
     episode_limit_s,
     sees_clouds,
     start_at_rest,
 )
+from vd.evaluate.compare import parse_groups
 from vd.paper import PAPER
+from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.evaluate.result import EvalResult
@@ -203,7 +207,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cfg = tyro.cli(EvalCfg, args=arguments, prog="vd-eval")
     try:
         cfg.validate()
-        names = cfg.agent_names  # before anything slow is imported
+        names = cfg.agent_names
+        check_names(names, chain(*parse_groups(cfg.object_sets).values()), cfg.hand)
+        print(f"vd-eval: {', '.join(names)}; loading", file=sys.stderr, flush=True)
         if cfg.second_view:
             check_second_view(names)
         if cfg.suite is not None:
@@ -279,10 +285,9 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         FileNotFoundError: There is no such policy.
         vd.sim.simulator.SimulationError: Contacts were lost, or a world left the finite numbers.
     """
-    import warp as wp
     from tqdm import tqdm
 
-    wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would scroll the rest away
+    quiet_warp()
     import numpy as np
 
     from vd.assets_usd.objects.model import load_set

@@ -18,6 +18,7 @@ from vd.evaluate.agents import (
     start_at_rest,
     task_for,
 )
+from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
@@ -53,9 +54,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
         FileNotFoundError: There is no such policy.
         vd.sim.simulator.SimulationError: Contacts were lost, or a world left the finite numbers.
     """
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would scroll the rest away
+    quiet_warp()
     from vd.assets_usd.objects.model import load_set
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.cli import resolve_device, software, worlds_for

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vd.warp_quiet import quiet_warp
+
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
 
@@ -45,11 +47,9 @@ class _Step:
 
     def analysis(self) -> "Analysis":
         """The analysis in DIR with these settings."""
-        import warp as wp
-
         from vd.gap.steps import Analysis
 
-        wp.config.log_level = wp.LOG_WARNING
+        quiet_warp()
         if self.hand is not None and self.model is not None:
             raise ValueError("--hand and --model both name the hand; give one of them")
         return Analysis.open(
@@ -223,12 +223,10 @@ class Identify:
         """Search, and write the layer."""
         import dataclasses
 
-        import warp as wp
-
         from vd.gap.identify import identify, write_drives
         from vd.gap.steps import Analysis, Settings
 
-        wp.config.log_level = wp.LOG_WARNING
+        quiet_warp()
         analysis = Analysis(Settings(self.recording, self.hand), self.out.parent)
         recording, hand = analysis.recording, analysis.hand
         if hand is None:

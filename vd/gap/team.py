@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import warp as wp
-
 from vd.gap.answers import Answers, digest_of
 from vd.gap.chain import Chain
 from vd.gap.crowd import Crowd
@@ -20,6 +18,7 @@ from vd.gap.fit import JointProblem
 from vd.gap.jitter import CALLS
 from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
+from vd.warp_quiet import quiet_warp
 from vd.workers import end_with_parent
 
 Call = tuple[str, dict[str, Any]]
@@ -127,7 +126,7 @@ _bench: Bench | None = None
 def _start(bench: Bench) -> None:
     global _bench
     threading.Thread(target=end_with_parent, daemon=True).start()
-    wp.config.log_level = wp.LOG_WARNING
+    quiet_warp()
     _bench = bench
 
 

@@ -5,7 +5,7 @@
 
 import math
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
-from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, episode_limit_s, start_at_rest
+from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, check_names, episode_limit_s, start_at_rest
 from vd.evaluate.cli import POLICY_HELP
 from vd.hand_log import is_log
 from vd.paper import PAPER
+from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.play.replay import ReplaySession
@@ -127,7 +128,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cfg.validate()
         if is_log(cfg.agent_name):
             return replay(cfg)
-        print(f"vd-play: {cfg.agent_name}; building the worlds (the first start compiles kernels: minutes)")
+        check_names([cfg.agent_name], cfg.objects, cfg.hand)
+        print(f"vd-play: {cfg.agent_name}; building the scene (the first start compiles kernels: minutes)")
         if cfg.video is not None:
             frames = record_video(cfg, cfg.video)
             print(f"{cfg.video} ({frames} frames)")
@@ -147,15 +149,13 @@ def replay(cfg: PlayCfg) -> int:
     Raises:
         LogError: The log cannot be used.
     """
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING
+    quiet_warp()
     from vd.hand_log import read_log
     from vd.play.replay import Replay, ReplaySession
 
     shown = Replay(read_log(cfg.agent_name))
     if cfg.video is None:
-        _serve(ReplaySession(shown), cfg)
+        _serve(lambda: ReplaySession(shown), cfg)
         return 0
     from vd.play.video import write_frames
     from vd.render import Renderer
@@ -213,20 +213,23 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
 
 
 def serve(cfg: PlayCfg) -> None:
-    """Serve the viewer until Ctrl-C."""
-    _serve(open_session(cfg), cfg)
+    """Serve the viewer until Ctrl-C; the page is there, and says so, while the scene is being built."""
+    _serve(lambda: open_session(cfg), cfg)
 
 
-def _serve(session: "Session | ReplaySession", cfg: PlayCfg) -> None:
-    from vd.play.viewer import PlayViewer
+def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> None:
+    from vd.play.viewer import PlayViewer, open_page
 
-    viewer = PlayViewer(session, host=cfg.host, port=cfg.port)
-    print(f"open {viewer.url} in a browser; Ctrl-C ends it")
+    page = open_page(host=cfg.host, port=cfg.port)
+    print(f"open {page.viewer.url} in a browser; Ctrl-C ends it", flush=True)
     try:
-        viewer.run()
+        session = open_it()
+        try:
+            PlayViewer(session, page).run()
+        finally:
+            session.env.close()
     finally:
-        viewer.close()
-        viewer.session.env.close()
+        page.viewer.close()
 
 
 def open_session(cfg: PlayCfg) -> "Session":
@@ -250,9 +253,7 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
 
 def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
     """Environment with at least one world for each object, trained agent if one is named, device."""
-    import warp as wp
-
-    wp.config.log_level = wp.LOG_WARNING  # a line for each of some hundred kernels would scroll the rest away
+    quiet_warp()
     from vd.assets_usd.objects.model import load_set
     from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv

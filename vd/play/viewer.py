@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from functools import partial
 from html import escape
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
@@ -26,8 +26,28 @@ from vd.render import OUT_OF_SIGHT, Camera, PictureModel
 GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
 # The viewer's camera stands this much farther than that of videos: a browser window has panels around it.
 CAMERA_DISTANCE = 1.25
+WAITING = "**Compiling kernels and building the scene.** The first start takes minutes."
 BESIDE, ON_OBJECT, HIDDEN = "beside the hand", "on the object", "hidden"
 POSITIVE, NEGATIVE, GROUND = "#3b82f6", "#e2683c", "rgba(128,128,128,.18)"
+
+
+class Page(NamedTuple):
+    """Where a viewer draws, and what it says there before."""
+
+    viewer: ViewerViser
+    notice: Any
+
+
+def open_page(*, host: str = "127.0.0.1", port: int = 8080, verbose: bool = True) -> Page:
+    """A page that says what is being waited for, until a :class:`PlayViewer` shows something on it.
+
+    Args:
+        host: Address to serve on; ``127.0.0.1`` keeps it on this machine.
+        port: Port to serve on; the next free one is taken if it is in use.
+        verbose: Print the address.
+    """
+    viewer = ViewerViser(host=host, port=port, label="vd-play", verbose=verbose)
+    return Page(viewer, viewer.server.gui.add_markdown(WAITING, order=-2.0))
 
 
 class PlayViewer:
@@ -35,23 +55,12 @@ class PlayViewer:
 
     Args:
         session: What runs.
-        host: Address to serve on; ``127.0.0.1`` keeps it on this machine.
-        port: Port to serve on; the next free one is taken if it is in use.
-        paused: Start paused.
-        verbose: Print the address.
+        page: Where, of :func:`open_page`.
     """
 
-    def __init__(
-        self,
-        session: Session | ReplaySession,
-        *,
-        host: str = "127.0.0.1",
-        port: int = 8080,
-        paused: bool = False,
-        verbose: bool = True,
-    ):
+    def __init__(self, session: Session | ReplaySession, page: Page):
         self.session = session
-        self.viewer = ViewerViser(host=host, port=port, paused=paused, label="vd-play", verbose=verbose)
+        self.viewer = page.viewer
         self.camera = Camera.for_hand(session.env.hand)
         self._events: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._models: dict[str, PictureModel] = {}
@@ -62,6 +71,7 @@ class PlayViewer:
         self._build_panel()
         self.viewer.set_reset_callback(self.session.reset)
         self.draw()
+        page.notice.remove()
 
     @property
     def url(self) -> str:

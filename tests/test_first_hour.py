@@ -1,0 +1,94 @@
+"""What a newcomer meets first: names that are wrong, quiet starts, and command lines of the documentation."""
+
+import importlib
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import warp as wp
+
+ROOT = Path(__file__).resolve().parents[1]
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+PAGES = (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md")))
+HEAVY = ("torch", "newton", "warp", "pxr", "mujoco", "matplotlib", "viser")
+RUN = """
+import importlib, sys
+status = importlib.import_module(sys.argv[1]).main(sys.argv[2:])
+print("imported:", *(name for name in {heavy} if name in sys.modules))
+sys.exit(status)
+"""
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("vd-play nosuch", "no policy at nosuch"),
+        ("vd-play --objects nosuchset", "no object set or path 'nosuchset'"),
+        ("vd-eval nosuch", "no policy at nosuch"),
+        ("vd-eval dclaw4-cube --objects held-out=nosuchset", "no object set or path 'nosuchset'"),
+        ("vd-eval zero --hand dclaw9", "no hand is called 'dclaw9'"),
+        ("vd-deploy --hand dclaw9 --twin", "no hand is called 'dclaw9'"),
+        ("vd-deploy --hand dclaw3 --twin --object nosuchset", "no object set or path 'nosuchset'"),
+        ("vd-train teacher --env.objects nosuchset", "no object set or path 'nosuchset'"),
+        ("vd-train student --stage 1 --teacher nosuch", "no policy at nosuch"),
+    ],
+)
+def test_a_wrong_name_is_refused_before_anything_slow_is_imported(line, said, tmp_path):
+    command, *arguments = shlex.split(line)
+    module = SCRIPTS[command].partition(":")[0]
+    done = subprocess.run(
+        [sys.executable, "-c", RUN.format(heavy=HEAVY), module, *arguments],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert said in done.stderr and done.returncode == 1, done.stderr
+    assert done.stdout.splitlines()[-1].split() == ["imported:"]
+    assert not list(tmp_path.iterdir()), "a command that is refused leaves nothing behind"
+
+
+@pytest.mark.skipif(wp.is_cuda_available(), reason="this machine has a GPU driver")
+def test_warp_does_not_warn_of_the_gpu_that_a_cpu_machine_lacks():
+    code = "import warp, os, vd.warp_quiet as w; w.quiet_warp(); warp.init(); os.write(2, b'ours')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "ours"
+
+
+class ParsedError(Exception):
+    """Raised in place of running a command, once its line was understood."""
+
+
+def documented_lines():
+    """Every command line of the pages: those of code blocks, and those in running text."""
+    for page in PAGES:
+        text = page.read_text()
+        for block in re.findall(r"^ *```(?:bash|sh|console)?\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE):
+            for line in block.replace("\\\n", " ").splitlines():
+                if re.match(r"\s*vd-\w+(\s|$)", line):
+                    yield page.name, shlex.join(shlex.split(line, comments=True))
+        running = re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE)
+        for code in re.findall(r"`(vd-[^`]* --[^`]+)`", running):
+            yield page.name, " ".join(code.split())
+
+
+@pytest.mark.parametrize(("page", "line"), sorted(set(documented_lines())))
+def test_command_lines_of_the_documentation_are_understood(page, line, monkeypatch):
+    import tyro
+
+    parse = tyro.cli
+
+    def only_parse(*args, **kwargs):
+        parse(*args, **kwargs)
+        raise ParsedError
+
+    monkeypatch.setattr(tyro, "cli", only_parse)
+    command, *arguments = shlex.split(line)
+    monkeypatch.setattr(sys, "argv", [command, *arguments])
+    try:
+        importlib.import_module(SCRIPTS[command].partition(":")[0]).main()
+    except (ParsedError, SystemExit) as end:
+        assert isinstance(end, ParsedError) or end.code == 0, f"{page}: {line}"

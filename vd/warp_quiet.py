@@ -1,0 +1,47 @@
+"""Warp without the lines that would scroll everything else away."""
+
+import ctypes
+import os
+import sys
+import tempfile
+
+_NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
+"""What Warp's library writes to standard error, past Python, on a machine without a GPU."""
+
+
+def quiet_warp() -> None:
+    """Keep Warp to warnings; where there is no GPU driver, start it without its warning of that.
+
+    Without a driver there is no CUDA context that an early start could spoil. With one Warp starts when it
+    is first used, as ever.
+    """
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_WARNING
+    if _has_driver():
+        return
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with tempfile.TemporaryFile() as said:
+        os.dup2(said.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            said.seek(0)
+            lines = [
+                line for line in said.read().splitlines(keepends=True) if not line.startswith(_NO_DRIVER)
+            ]
+            os.write(2, b"".join(lines))
+
+
+def _has_driver() -> bool:
+    """Whether the CUDA driver's library loads, by the names that Warp tries."""
+    for name in ("libcuda.so", "libcuda.so.1"):
+        try:
+            ctypes.CDLL(name)
+        except OSError:
+            continue
+        return True
+    return False
