@@ -127,9 +127,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         cfg.validate()
         if is_log(cfg.agent_name):
+            quiet_warp()
             return replay(cfg)
         check_names([cfg.agent_name], cfg.objects, cfg.hand)
-        print(f"vd-play: {cfg.agent_name}; building the scene (the first start compiles kernels: minutes)")
+        print(
+            f"vd-play: {cfg.agent_name}; building the scene (the first start compiles kernels: minutes)",
+            flush=True,
+        )
+        quiet_warp()
         if cfg.video is not None:
             frames = record_video(cfg, cfg.video)
             print(f"{cfg.video} ({frames} frames)")
@@ -149,7 +154,6 @@ def replay(cfg: PlayCfg) -> int:
     Raises:
         LogError: The log cannot be used.
     """
-    quiet_warp()
     from vd.hand_log import read_log
     from vd.play.replay import Replay, ReplaySession
 
