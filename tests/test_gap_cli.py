@@ -4,6 +4,9 @@ import csv
 import dataclasses
 import json
 import re
+import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -43,6 +46,22 @@ def recording(tmp_path_factory):
     folder = tmp_path_factory.mktemp("recordings") / "servo"
     hide("servo", {"coulomb_friction": {"tau_c_nm": FRICTION}}, folder, seed=3, base_spread=0.0)
     return folder
+
+
+@pytest.mark.parametrize("command", ["run", "identify"])
+def test_a_recording_that_cannot_be_used_is_refused_before_warp_is_imported(recording, tmp_path, command):
+    folder = shutil.copytree(recording, tmp_path / "r")
+    table = sorted(folder.glob("*.csv"))[0]
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join(lines[:200] + lines[300:]) + "\n")
+    script = (
+        "import sys; from vd.gap.cli import main; status = main(sys.argv[1:]); "
+        "print(status, 'warp' in sys.modules, file=sys.stderr)"
+    )
+    arguments = [sys.executable, "-c", script, command, str(folder), "--out", str(tmp_path / "out")]
+    said = subprocess.run(arguments, capture_output=True, text=True, timeout=120).stderr
+    assert "cut the file there" in said and table.name in said
+    assert said.endswith("2 False\n") and not (tmp_path / "out").exists()
 
 
 def servo_curves(folder, rows):

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vd.gap.cautions import cautions
+from vd.gap.hide import Hiding, simulate_hidden
 from vd.gap.recording import Recording, RecordingError, Trajectory, read_recording, write_recording
 
 SAMPLES = 200
@@ -96,9 +98,10 @@ def test_commands_may_be_sent_at_other_times_than_the_stamps(tmp_path):
     (read,) = read_recording(folder).trajectories
     np.testing.assert_allclose(read.sent, sent, atol=1e-6)
     np.testing.assert_array_equal(read.piece(50, 90).sent, read.sent[50:90])
-    edit_table(folder, set_cells("t", lambda t: f"{5.0 + t:.6f}"))
-    np.testing.assert_allclose(read_recording(folder).trajectories[0].sent, sent - 5.0, atol=1e-6)
-    edit_table(folder, set_cells("t_command", "0.1", [7]))
+    for column in ("t", "t_command"):
+        edit_table(folder, set_cells(column, lambda t: f"{5.0 + t:.6f}"))
+    np.testing.assert_allclose(read_recording(folder).trajectories[0].sent, sent, atol=1e-6)
+    edit_table(folder, set_cells("t_command", "5.1", [7]))
     refused(folder, "a.csv", "row 9", "'t_command'", "before")
 
 
@@ -209,7 +212,7 @@ def test_an_encoder_that_only_flickers_is_dead(tmp_path):
     (trajectory,) = recording.trajectories
     trajectory.position[:, 1] = COUNT * np.random.default_rng(0).integers(-1, 2, SAMPLES)
     refused(write_recording(recording, tmp_path / "r"), "a.csv", "position.f0_j2", "flickers", "dead encoder")
-    moves = replace(trajectory, file="b.csv", position=trajectory.command.copy())
+    moves = replace(trajectory, file="b.csv", position=0.9 * trajectory.command)
     whole = replace(recording, trajectories=(trajectory, moves))
     read_recording(write_recording(whole, tmp_path / "sticks"))  # it may stick in one motion
 
@@ -232,9 +235,110 @@ def test_small_motions_in_degrees_show_in_the_encoder_counts(tmp_path):
     refused(write_recording(small, tmp_path / "r"), "degrees", "encoder_resolution_rad", "position.f0_j1")
 
 
-def test_telemetry_out_of_range_is_refused(tmp_path):
-    pwm = np.full((SAMPLES, 2), 400.0)
-    refused(write_recording(example(pwm=pwm), tmp_path / "r"), "pwm.f0_j1", "full scale")
+@pytest.mark.parametrize(
+    ("channel", "value", "remedy"),
+    [
+        ("pwm", 400.0, "full scale"),
+        ("voltage", 120.0, "write V"),
+        ("current", 180.0, "write A"),
+        ("temperature", 300.0, "write deg C"),
+        ("velocity", 400.0, "write rad/s"),
+    ],
+)
+def test_telemetry_out_of_range_is_refused(tmp_path, channel, value, remedy):
+    values = np.full((SAMPLES, 2), value)
+    refused(
+        write_recording(example(**{channel: values}), tmp_path / "r"), f"{channel}.f0_j1", "row 2", remedy
+    )
+
+
+LAG_S = 0.08
+AT_100_HZ = np.arange(1000) / 100.0
+
+
+def servo(amplitude=0.05, middle=0.0, **channels) -> Recording:
+    """Ten seconds of a servo that follows two sines 80 ms late, with noise in place of counts."""
+
+    def moves(time):
+        return middle + amplitude * (np.sin(2.0 * time) + 0.5 * np.sin(5.0 * time))
+
+    noise = 1e-4 * np.random.default_rng(0).normal(size=len(AT_100_HZ))
+    arrays = {
+        "time": AT_100_HZ,
+        "command": moves(AT_100_HZ)[:, None],
+        "position": (moves(AT_100_HZ - LAG_S) + noise)[:, None],
+        "enabled": np.ones((len(AT_100_HZ), 1), dtype=bool),
+        **channels,
+    }
+    whole = example(("joint",), "servo")
+    return replace(whole, trajectories=(replace(whole.trajectories[0], **arrays),))
+
+
+SOUND = servo().trajectories[0]
+SPEED = np.gradient(SOUND.position, AT_100_HZ, axis=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"command": SOUND.position, "position": SOUND.command}, ("swapped", "before its command")),
+        ({"position": np.roll(SOUND.command, -20, axis=0)}, ("200 ms before its command", "two clocks")),
+        ({"position": SOUND.command}, ("position.joint", "copy of its command")),
+        ({"position": np.roll(SOUND.command, 1, axis=0)}, ("position.joint", "copy of its command")),
+        ({"position": np.degrees(SOUND.position)}, ("position.joint", "degrees")),
+        ({"command_time": 1e3 * AT_100_HZ}, ("t_command", "1e+03 times as fast", "milliseconds")),
+        ({"command_time": AT_100_HZ + 3.0}, ("t_command", "3 s off", "another clock")),
+        ({"time": AT_100_HZ + 5.0 * (AT_100_HZ > 4.0)}, ("row 403", "'t'", "5.01 s without", "cut the file")),
+        ({"velocity": SPEED * 30.0 / np.pi}, ("velocity.joint", "9.55 times", "rpm")),
+        ({"velocity": -SPEED}, ("velocity.joint", "-1 times")),
+    ],
+)
+def test_a_recording_of_other_clocks_units_or_columns_is_refused_by_its_cause(tmp_path, change, words):
+    change = {name: np.array(values) for name, values in change.items()}
+    refused(write_recording(servo(**change), tmp_path / "r"), *words)
+
+
+def test_a_servo_that_lags_and_tells_its_speed_is_read(tmp_path):
+    read_recording(write_recording(servo(velocity=SPEED, command_time=AT_100_HZ - 0.004), tmp_path / "r"))
+
+
+def wrapped(angle):
+    return (angle + np.pi) % (2.0 * np.pi) - np.pi
+
+
+@pytest.mark.parametrize("channels", [("position",), ("command",), ("position", "command")])
+def test_angles_wrapped_at_pi_are_unwrapped_and_said_so(tmp_path, channels):
+    true = servo(amplitude=0.8, middle=np.pi)
+    (t,) = true.trajectories
+    jumps = replace(t, **{name: wrapped(getattr(t, name)) for name in channels})
+    read = read_recording(write_recording(replace(true, trajectories=(jumps,)), tmp_path / "r"))
+    (got,) = read.trajectories
+    turns = (got.position - t.position) / (2.0 * np.pi)
+    np.testing.assert_allclose(turns, np.round(turns[0, 0]), atol=1e-6)
+    np.testing.assert_allclose(got.command - got.position, t.command - t.position, atol=3e-6)
+    assert any("joint jumped by whole turns" in line for line in cautions(read))
+    sound = read_recording(write_recording(servo(amplitude=0.8), tmp_path / "sound"))
+    assert not any("turns" in line for line in cautions(sound))
+
+
+def test_a_wrapped_position_beside_steps_too_large_to_tell_the_turn_is_refused(tmp_path):
+    true = servo(amplitude=1.2, middle=np.pi)
+    (t,) = true.trajectories
+    t.command[:] = np.where(np.sin(AT_100_HZ) > 0, np.pi + 1.8, np.pi - 1.8)[:, None]
+    t.position[:] = wrapped(t.position)
+    refused(write_recording(true, tmp_path / "r"), "a.csv", "position.joint", "wrapped at a turn", "unwrap")
+
+
+def test_large_effects_of_real_servos_are_no_faults_of_the_recording(tmp_path):
+    effects = {
+        "command_delay": {"delay_s": 0.3},
+        "stribeck_friction": {"tau_s_nm": 0.9, "tau_c_nm": 0.5, "v_s_rad_s": 0.3},
+        "encoder_bias": {"bias_rad": 0.3},
+        "backlash": {"width_rad": 0.1},
+    }
+    (hidden,) = simulate_hidden([Hiding("servo", effects=effects)])
+    read = read_recording(write_recording(hidden.recording, tmp_path / "r"))
+    assert not any(t.unwrapped for t in read.trajectories)
 
 
 def test_a_file_that_is_none_is_refused(tmp_path, folder):

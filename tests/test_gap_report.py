@@ -311,6 +311,15 @@ def test_every_verdict_has_its_sentence_and_its_page(curves, tmp_path, verdict):
     assert all(step in page for step in steps) and steps[0].endswith(".")
 
 
+def test_an_encoder_bias_is_said_to_be_a_difference_of_zeros_first(curves):
+    size = Estimate(0.3, (0.298, 0.302), "rad")
+    bias = NamedEffect("encoder_bias", JOINTS[:1], 0.99, {"bias_rad": size}, ())
+    said = words.verdict_sentence(sample_report(curves, effects=(bias,)))
+    assert "common zero of command and reading (encoder bias) on f0_j1 (300 mrad)" in said
+    assert "first of all a difference of zeros" in said and "compare the zeros" in said
+    assert "zero" not in words.verdict_sentence(sample_report(curves))
+
+
 def test_many_open_sets_are_a_list_by_joint(curves, tmp_path):
     friction, limits = ("coulomb_friction", "dead_zone"), ("torque_limit", "supply_sag", "torque_saturation")
     other = ("elastic_transmission", "command_filter")

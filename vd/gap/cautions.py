@@ -17,6 +17,12 @@ MIN_LEVELS = 20
 def cautions(recording: Recording) -> tuple[str, ...]:
     """Plain sentences about what the recording cannot show well, joints together where they share one."""
     found: list[str] = []
+    jumped = {joint: None for t in recording.trajectories for joint in t.unwrapped}
+    if jumped:
+        found.append(
+            f"Command or position of {', '.join(jumped)} jumped by whole turns, as angles wrapped at pi do: "
+            "they are analysed unwrapped."
+        )
     kinds = {joint: _kinds(recording, joint) for joint in recording.joints}
     idle = [joint for joint, names in kinds.items() if not names]
     few = [joint for joint, names in kinds.items() if 0 < len(names) < MIN_KINDS]

@@ -46,13 +46,16 @@ class _Step:
     """Print what the step wrote as JSON."""
 
     def analysis(self) -> "Analysis":
-        """The analysis in DIR with these settings."""
+        """The analysis in DIR with these settings; a recording is checked before anything slow begins."""
+        from vd.gap.recording import read_recording
+
+        recording = None if self.recording is None else read_recording(self.recording)
         from vd.gap.steps import Analysis
 
         quiet_warp()
         if self.hand is not None and self.model is not None:
             raise ValueError("--hand and --model both name the hand; give one of them")
-        return Analysis.open(
+        analysis = Analysis.open(
             self.out,
             {
                 "recording": self.recording,
@@ -63,6 +66,9 @@ class _Step:
                 "device": None if self.device is None else _device(self.device),
             },
         )
+        if recording is not None:
+            analysis.recording = recording
+        return analysis
 
 
 @dataclass(frozen=True)
@@ -223,12 +229,15 @@ class Identify:
         """Search, and write the layer."""
         import dataclasses
 
+        from vd.gap.recording import read_recording
+
+        recording = read_recording(self.recording)
         from vd.gap.identify import identify, write_drives
         from vd.gap.steps import Analysis, Settings
 
         quiet_warp()
         analysis = Analysis(Settings(self.recording, self.hand), self.out.parent)
-        recording, hand = analysis.recording, analysis.hand
+        analysis.recording, hand = recording, analysis.hand
         if hand is None:
             raise ValueError(f"{self.recording}: a bare {recording.model} is no hand; use vd-gap run")
 

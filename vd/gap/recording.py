@@ -23,6 +23,7 @@ from vd.gap.recording_checks import (
     check_motion,
     check_units,
     check_values,
+    unwrapped,
 )
 
 FORMAT = "vd-recording/1"
@@ -37,6 +38,8 @@ MIN_SAMPLES = 20
 """Samples of a trajectory below which no motion can be told from noise."""
 COARSEST_RAD = 2.0 * math.pi / 256
 """Largest encoder count [rad]: eight bits a turn. Twelve bits a turn are 0.088 if written in degrees."""
+WRAP_RAD = 1.5 * math.pi
+"""Jump of a position between two samples [rad] that is no motion: half a turn and what a wrap may hide."""
 POSITIVE = ("p_gain", "payload_kg", "arm_length_m")
 """Conditions that the model computes with: numbers, not negative."""
 STIFFNESS = "kp_nm_rad"
@@ -64,6 +67,7 @@ class Trajectory:
         voltage: Supply voltages [T, J] [V], or None.
         temperature: Motor temperatures [T, J] [deg C], or None.
         command_time: When the commands were sent [T] [s], in the time of ``time``; None: at the time stamps.
+        unwrapped: Joints whose command and position jumped by whole turns in the file, and here do not.
         enabled: Whether the servo's torque is on [T, J] bool; all true where not recorded.
     """
 
@@ -81,6 +85,7 @@ class Trajectory:
     voltage: np.ndarray | None = None
     temperature: np.ndarray | None = None
     command_time: np.ndarray | None = None
+    unwrapped: tuple[str, ...] = ()
 
     @property
     def sent(self) -> np.ndarray:
@@ -319,7 +324,8 @@ def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...
         if any(values is not None for values in found):
             blank = np.full(len(time), np.nan)
             channels[channel] = np.stack([blank if v is None else v for v in found], axis=1)
-    enabled = channels.pop("enabled", np.ones((len(time), len(joints))))
+    enabled = np.nan_to_num(channels.pop("enabled", np.ones((len(time), len(joints)))), nan=1.0) > 0.5
+    jumped = _unwrap(table, joints, channels["command"], channels["position"], enabled)
     return Trajectory(
         file=name,
         excitation=str(entry.get("excitation", Path(name).stem)),
@@ -327,9 +333,30 @@ def _read_trajectory(file: Path, number: int, entry: Any, joints: tuple[str, ...
         conditions=conditions,
         time=time - time[0],
         command_time=None if sent is None else sent - time[0],
-        enabled=np.nan_to_num(enabled, nan=1.0) > 0.5,
+        enabled=enabled,
+        unwrapped=jumped,
         **channels,
     )
+
+
+def _unwrap(
+    file: Path, joints: tuple[str, ...], command: np.ndarray, position: np.ndarray, enabled: np.ndarray
+) -> tuple[str, ...]:
+    """Take jumps by whole turns out of commands and positions [T, J], in place; returns the joints."""
+    jumped = []
+    for j, joint in enumerate(joints):
+        whole = unwrapped(command[:, j], position[:, j], enabled[:, j])
+        if whole is not None:
+            command[:, j], position[:, j] = whole
+            jumped.append(joint)
+            continue
+        steps = np.abs(np.diff(position[:, j]))
+        if steps.max() > WRAP_RAD:
+            raise RecordingError(
+                f"{file}: row {int(np.argmax(steps)) + 3}, column 'position.{joint}' jumps by "
+                f"{steps.max():.3g} rad: wrapped at a turn; unwrap it beside its command (numpy.unwrap)"
+            )
+    return tuple(jumped)
 
 
 def _read_csv(file: Path, joints: tuple[str, ...]) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""What a recording must be to be analysed: possible values, something that moves, radians and seconds.
+"""What a recording must be to be analysed: possible values, one clock, one unit, an answer to the command.
 
 The checks of :mod:`vd.gap.recording` on values, beside those on the form of the files.
 """
@@ -11,12 +11,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from vd.gap.recording import Recording
+    from vd.gap.recording import Recording, Trajectory
 
 COMMAND_TIME = "t_command"
 """Optional column: when the commands of a row were sent [s], if not at the row's time stamp."""
-PLAUSIBLE_RAD = 2.2 * math.pi
+TURN = 2.0 * math.pi
+PLAUSIBLE_RAD = 1.1 * TURN
 """Largest position or command [rad] of a servo in position mode: one turn, and a tenth for offsets."""
+RADIANS = "more than a turn, so these look like degrees or counts; write radians"
+RANGES = {
+    "command": (-PLAUSIBLE_RAD, PLAUSIBLE_RAD, RADIANS),
+    "position": (-PLAUSIBLE_RAD, PLAUSIBLE_RAD, RADIANS),
+    "velocity": (-100.0, 100.0, "no servo is that fast, so these look like rpm or deg/s; write rad/s"),
+    "current": (-50.0, 50.0, "no servo draws that much, so these look like mA or counts; write A"),
+    "pwm": (-1.0, 1.0, "a duty cycle lies in [-1, 1]; divide by the full scale"),
+    "voltage": (0.0, 60.0, "servos run on 4 to 48 V, so these look like tenths of a volt or mV; write V"),
+    "temperature": (-40.0, 150.0, "no motor survives that, so these look like kelvin or counts; write deg C"),
+}
+"""Least and largest value that a channel can have, and what one outside looks like."""
 MOVING_COUNTS = 20.0
 """Encoder counts by which a command must move before the position has to answer."""
 MIN_DISTINCT = 50
@@ -26,9 +38,21 @@ FLICKER_COUNTS = 3.0
 AGAINST = -0.5
 """Correlation of command and position below which a joint turns the other way; lag alone spares slow ones."""
 SLOWEST_S = 0.5
-"""Median time between samples [s] that shows nothing of a servo; 2 ms are 2.0 if written in milliseconds."""
+"""Time between samples [s] that shows nothing of a servo; 2 ms are 2.0 if written in milliseconds."""
 DEGREES_RATIO = 20.0
 """A smallest step above this many encoder counts is in another unit (degrees are 57 times radians)."""
+TRAVEL_RATIO = 10.0
+"""A position that travels so many times as far as its command is in another unit, not overshoot."""
+COPY_ROWS = 3
+"""Rows within which an echo of the command comes back."""
+LEAD_S = 0.5
+"""Longest lead of the position that is looked for [s]; a longer one of a sine may be its next period."""
+LEAD_SAMPLES = 2.0
+"""Samples by which stamps alone may let a position lead."""
+SPEED_RATIO = 2.0
+"""How many times too fast or slow a velocity must be for its unit to be another (rpm are 9.5 rad/s)."""
+FOLLOWS = 0.9
+"""Correlation above which two curves tell the ratio of their units."""
 
 
 class RecordingError(ValueError):
@@ -36,9 +60,10 @@ class RecordingError(ValueError):
 
 
 def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
-    """Time runs forward, and every value can be what its column says."""
+    """Time runs forward without gaps, and every value can be what its column says."""
     time = columns["t"]
-    bad = np.flatnonzero(np.diff(time) <= 0.0)
+    between = np.diff(time)
+    bad = np.flatnonzero(between <= 0.0)
     if len(bad):
         i = int(bad[0]) + 1
         how = "repeats" if time[i] == time[i - 1] else "runs backward"
@@ -46,74 +71,155 @@ def check_values(file: Path, columns: Mapping[str, np.ndarray]) -> None:
             f"{file}: row {i + 2}, column 't': time {how} ({time[i - 1]:g} s, then {time[i]:g} s); "
             "sort the rows and keep one per stamp"
         )
-    if (between := float(np.median(np.diff(time)))) > SLOWEST_S:
+    if (typical := float(np.median(between))) > SLOWEST_S:
         raise RecordingError(
-            f"{file}: column 't': {between:g} s between samples: these look like milliseconds, and as "
+            f"{file}: column 't': {typical:g} s between samples: these look like milliseconds, and as "
             "seconds would show nothing of a servo; write seconds"
         )
-    back = np.flatnonzero(np.diff(columns.get(COMMAND_TIME, time)) < 0.0)
+    longest = int(np.argmax(between))
+    if between[longest] > SLOWEST_S:
+        raise RecordingError(
+            f"{file}: row {longest + 3}, column 't': {between[longest]:.3g} s without a sample, in which the "
+            "motion is not known; cut the file there into two trajectories"
+        )
+    _check_sent(file, time, columns.get(COMMAND_TIME, time))
+    for name, values in columns.items():
+        channel = name.partition(".")[0]
+        if channel == "enabled":
+            wrong, why = ~np.isin(values, (0.0, 1.0)), "it must be 0 or 1; correct it"
+        elif channel in RANGES:
+            low, high, why = RANGES[channel]
+            wrong = (values < low) | (values > high)
+        else:
+            continue
+        if wrong.any():
+            i = int(np.argmax(np.where(wrong, np.abs(values), -1.0)))
+            raise RecordingError(f"{file}: row {i + 2}, column {name!r}: {values[i]:g}: {why}")
+
+
+def _check_sent(file: Path, time: np.ndarray, sent: np.ndarray) -> None:
+    """Commands went out in the order of the rows, on the clock of the rows."""
+    back = np.flatnonzero(np.diff(sent) < 0.0)
     if len(back):
         raise RecordingError(
             f"{file}: row {int(back[0]) + 3}, column {COMMAND_TIME!r}: sent before the commands of the row "
             "before; commands go out in the order of the rows: correct it"
         )
-    for name, values in columns.items():
-        channel = name.partition(".")[0]
-        if channel in ("command", "position"):
-            i, limit = int(np.argmax(np.abs(values))), PLAUSIBLE_RAD
-            why = "more than a turn, so these look like degrees or counts; write radians"
-        elif channel == "pwm":
-            i, limit = int(np.argmax(np.abs(values))), 1.0
-            why = "a duty cycle lies in [-1, 1]; divide by the full scale"
-        elif channel == "enabled":
-            i, limit = int(np.argmax(~np.isin(values, (0.0, 1.0)))), 0.0
-            why = "it must be 0 or 1; correct it"
-            if values[i] in (0.0, 1.0):
-                continue
-        else:
-            continue
-        if abs(values[i]) > limit:
-            raise RecordingError(f"{file}: row {i + 2}, column {name!r}: {values[i]:g}: {why}")
+    apart = float(np.median(sent - time))
+    if abs(apart) > SLOWEST_S:
+        rate = np.ptp(sent) / np.ptp(time)
+        why = f"runs {rate:.3g} times as fast as 't'" if rate > 2.0 else f"is {apart:.3g} s off from 't'"
+        unit = "these look like milliseconds" if rate > 2.0 else "it is of another clock"
+        raise RecordingError(
+            f"{file}: column {COMMAND_TIME!r} {why}: {unit}; write seconds on the clock of 't', or drop the "
+            "column"
+        )
+
+
+def unwrapped(
+    command: np.ndarray, position: np.ndarray, on: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Command and position without jumps by a whole turn, the position beside its command.
+
+    Args:
+        command: Commands of one joint [T] [rad].
+        position: Its positions [T] [rad].
+        on: Where its torque is on [T] bool.
+
+    Returns:
+        Both [T], or None where nothing jumps or what is right is not certain.
+    """
+    if not on.any() or np.abs(command - position)[on].max() <= math.pi >= np.abs(np.diff(position)).max():
+        return None
+    whole = np.unwrap(position)
+    whole += TURN * np.round(np.median((command - whole)[on]) / TURN)
+    apart = command - whole
+    if np.abs(apart[on]).max() > math.pi:
+        apart -= TURN * np.round(apart / TURN)
+        if np.abs(apart[on]).max() > math.pi / 2.0:  # a large step of the command, or one over the edge
+            return None
+    return whole + apart, whole
 
 
 def check_motion(recording: "Recording") -> None:
-    """Some command moves, and where a command moves the encoder answers, in the same direction."""
-    count = recording.encoder_resolution_rad
-    moved = False
-    for j, joint in enumerate(recording.joints):
-        told = []
-        for trajectory in recording.trajectories:
-            travel = float(np.ptp(trajectory.command[:, j]))
-            moved |= travel > 0.0
-            if travel > MOVING_COUNTS * count and trajectory.enabled[:, j].all():
-                told.append((trajectory, travel, float(np.ptp(trajectory.position[:, j]))))
-        still = [each for each in told if each[2] == 0.0]
-        if told and all(answer <= FLICKER_COUNTS * count for _, _, answer in told):
-            still = told  # too little to be an answer in any motion
-        if still:
-            trajectory, travel, answer = still[0]
-            how = "never changes" if answer == 0.0 else f"only flickers, by {answer:.2g} rad,"
-            raise RecordingError(
-                f"{recording.path / trajectory.file}: column 'position.{joint}' {how} while "
-                f"'command.{joint}' moves by {travel:.3g} rad: a dead encoder, or a servo that is off; "
-                "record it again"
-            )
-        against = [np.corrcoef(t.command[:, j], t.position[:, j])[0, 1] for t, _, _ in told]
-        if told and max(against) < AGAINST:
-            raise RecordingError(
-                f"{recording.path}: column 'position.{joint}' moves against 'command.{joint}' in every "
-                "motion: the sign of one of them is wrong; turn it round"
-            )
-    if not moved:
+    """Some command moves, and where one does the position answers it: not dead, not before it, not a copy."""
+    if not any(np.ptp(t.command, axis=0).any() for t in recording.trajectories):
         raise RecordingError(
             f"{recording.path / 'recording.json'}: no 'command.' column moves in any trajectory, so nothing "
             "can be identified; record steps and sines"
         )
+    count = recording.encoder_resolution_rad
+    for j, joint in enumerate(recording.joints):
+        told = [
+            t
+            for t in recording.trajectories
+            if np.ptp(t.command[:, j]) > MOVING_COUNTS * count and t.enabled[:, j].all()
+        ]
+        if told:
+            _check_alive(recording, told, j)
+            if why := _answer_fault(told, j, count):
+                raise RecordingError(f"{recording.path}: column 'position.{joint}' {why}")
+
+
+def _check_alive(recording: "Recording", told: "list[Trajectory]", j: int) -> None:
+    """The encoder of a joint answers commands that move."""
+    count, joint = recording.encoder_resolution_rad, recording.joints[j]
+    answers = np.array([np.ptp(t.position[:, j]) for t in told])
+    if answers.max() > FLICKER_COUNTS * count and answers.min() > 0.0:
+        return
+    first = int(np.argmin(answers))
+    t, answer = told[first], answers[first]
+    how = "never changes" if answer == 0.0 else f"only flickers, by {answer:.2g} rad,"
+    raise RecordingError(
+        f"{recording.path / t.file}: column 'position.{joint}' {how} while 'command.{joint}' moves by "
+        f"{np.ptp(t.command[:, j]):.3g} rad: a dead encoder, or a servo that is off; record it again"
+    )
+
+
+def _answer_fault(told: "list[Trajectory]", j: int, count: float) -> str:
+    """What is wrong with a joint's positions as an answer to its commands, in every motion; or nothing."""
+    pairs = [(t.command[:, j], t.position[:, j]) for t in told]
+    if any(all(np.abs(p[k:] - c[: len(c) - k]).max() <= count for c, p in pairs) for k in range(COPY_ROWS)):
+        return "is a copy of its command in every motion: record the position that is measured"
+    if max(np.corrcoef(c, p)[0, 1] for c, p in pairs) < AGAINST:
+        return "moves against its command in every motion: the sign of one of them is wrong; turn it round"
+    ratios = [float(np.ptp(p) / np.ptp(c)) for c, p in pairs]
+    if (ratio := float(np.median(ratios))) > TRAVEL_RATIO:
+        return f"travels {ratio:.3g} times as far as its command: these look like degrees; write radians"
+    if (lead := _lead(told, j)) > 0.0:
+        return (
+            f"moves {1e3 * lead:.0f} ms before its command: the two columns are swapped, or their stamps are "
+            "of two clocks; rename the columns, or correct the stamps"
+        )
+    return ""
+
+
+def _lead(told: "list[Trajectory]", j: int) -> float:
+    """By how much the positions of a joint come before its commands [s]; 0 if they do not, clearly."""
+    step = max(float(np.median(np.concatenate([np.diff(t.time) for t in told]))), 1e-3)
+    reach = int(LEAD_S / step)
+    lags = np.arange(-reach, reach + 1)
+    products = np.zeros((3, len(lags)))
+    for t in told:
+        when = np.arange(0.0, t.time[-1], step)
+        if len(when) < 4 * reach:
+            continue
+        c = np.interp(when, t.sent, t.command[:, j])[reach:-reach]
+        p = np.lib.stride_tricks.sliding_window_view(np.interp(when, t.time, t.position[:, j]), len(c))
+        c, p = c - c.mean(), p - p.mean(axis=1, keepdims=True)
+        products += np.stack([p @ c, np.sum(p**2, axis=1), np.full(len(lags), c @ c)])
+    if not products[1:].all():
+        return 0.0
+    miss = 1.0 - products[0] / np.sqrt(products[1] * products[2])
+    best = int(np.argmin(miss))
+    clear = miss[best] < 0.5 * miss[reach] and -lags[best] > LEAD_SAMPLES
+    return -float(lags[best]) * step if clear else 0.0
 
 
 def check_units(recording: "Recording") -> None:
-    """Small motions in degrees show in the size of an encoder count."""
+    """Small motions in degrees show in the size of a count, other units of speed in the positions."""
     for j, joint in enumerate(recording.joints):
+        _check_speed(recording, j)
         levels = np.unique(np.concatenate([t.position[:, j] for t in recording.trajectories]))
         if len(levels) < MIN_DISTINCT:
             continue
@@ -125,3 +231,25 @@ def check_units(recording: "Recording") -> None:
                 f"'encoder_resolution_rad' is {recording.encoder_resolution_rad:g}: these look like degrees "
                 "or counts; write radians"
             )
+
+
+def _check_speed(recording: "Recording", j: int) -> None:
+    """The recorded velocity of a joint adds up to its motion."""
+    sums, moved = [np.zeros(0)], [np.zeros(0)]
+    for t in recording.trajectories:
+        if t.velocity is None or np.isnan(t.velocity[:, j]).any():
+            continue
+        v = t.velocity[:, j]
+        total = np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t.time))])
+        for values, kept in ((total, sums), (t.position[:, j], moved)):
+            kept.append(values - np.polyval(np.polyfit(t.time, values, 1), t.time))
+    total, motion = np.concatenate(sums), np.concatenate(moved)
+    size = float(np.linalg.norm(total) * np.linalg.norm(motion))
+    if size == 0.0 or abs(total @ motion) < FOLLOWS * size:
+        return
+    ratio = float(total @ motion / (motion @ motion))
+    if not 1.0 / SPEED_RATIO < ratio < SPEED_RATIO:
+        raise RecordingError(
+            f"{recording.path}: column 'velocity.{recording.joints[j]}' is {ratio:.3g} times the speed of "
+            "its position (rpm are 9.55 times, deg/s 57.3 times): write rad/s, or drop the column"
+        )

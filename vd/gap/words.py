@@ -12,6 +12,13 @@ MAX_SETS = 2
 """More sets than this are counted in a sentence and listed after it."""
 MAX_PLACES = 6
 """Decimals of an estimate at most."""
+CALLED = {"encoder_bias": "a common zero of command and reading (encoder bias)"}
+"""Effects that are first of all something else: an offset in all motions looks the same as a wrong zero."""
+ZEROS = (
+    " An offset that is the same in all motions is first of all a difference of zeros between command and "
+    "reading (homing, calibration): compare the zeros before you use the model."
+)
+"""What is said where an encoder bias is named."""
 MILLI = 1e3
 """Errors are shown in mrad."""
 
@@ -95,7 +102,9 @@ def where_text(finding: Finding) -> str:
 def effect_sentence(effect: NamedEffect) -> str:
     """``command delay on f0_j1 (40.2 ms)``."""
     sizes = ", ".join(amount(p.value, p.unit) for p in effect.parameters.values())
-    return f"{plain(effect.name)} on {joints_text(effect.joints)}" + (f" ({sizes})" if sizes else "")
+    return f"{CALLED.get(effect.name, plain(effect.name))} on {joints_text(effect.joints)}" + (
+        f" ({sizes})" if sizes else ""
+    )
 
 
 def verdict_sentence(report: Report) -> str:
@@ -106,6 +115,7 @@ def verdict_sentence(report: Report) -> str:
     if report.verdict == "effects":
         missing = listing([effect_sentence(effect) for effect in report.effects])
         text = f"The simulation lacks {missing}. {_shrinks(report)}"
+        text += ZEROS if any(effect.name == "encoder_bias" for effect in report.effects) else ""
         text += _equivalents(report)
         if many:
             text += f" More is missing, for which this recording leaves {many}, listed under what to do next."
