@@ -64,8 +64,8 @@ def write_page(path: Path, result: Score, symmetry: np.ndarray) -> None:
     page.table(("goal", "ended at [s]", "outcome", "error [rad]", "predicted [rad]"), rows, words=(2,))
     page.text(
         f"Clocks: {result.offset_s:.3f} s of the motion capture is the beginning of the log. Intervals are "
-        "95 % (bootstrap over the trials; exact binomial where all agree). Trials that did not stop count as "
-        "failures in the shares.",
+        "95 % (t on the log odds over the trials; exact binomial where all agree). Trials that did not stop "
+        "count as failures in the shares.",
         small=True,
     )
     page.write(path)

@@ -420,7 +420,7 @@ _MEANINGS = (
     "reset. Some goals are reached by luck, since a new goal may lie within the tolerance at once: "
     "compare with the random agent.",
     "Dropped: the object left the workspace, farther than the fall distance from the hand's centre.",
-    "Intervals: 95 %, bias-corrected accelerated bootstrap over the episodes. They say how far a rate "
+    "Intervals: 95 %, t intervals on the log odds, over the episodes. They say how far a rate "
     "would move with other starts and goals, not with another training seed.",
     "Control step: one action at 12 Hz in one world, ten physics steps at 120 Hz.",
 )

@@ -123,7 +123,7 @@ class EvalCfg:
     randomise: bool = False
     """Randomise dynamics and add noise and disturbances as in training."""
     resample: Literal["auto", "object", "episode"] = "auto"
-    """What the bootstrap intervals resample: objects (from 8 of them) or episodes within objects."""
+    """What intervals speak about: objects (from 8 of them) or episodes within objects."""
     num_worlds: int | None = None
     """Worlds simulated at once; by default as many as episodes, up to 64 on a CPU and 8192 on a GPU (1024 in
     a comparison)."""

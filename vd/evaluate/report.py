@@ -10,12 +10,11 @@ from vd.evaluate.statistics import CHANCE_MEAN_RAD, Interval
 from vd.page import Page
 
 _UNIT_NOTE = {
-    "object": "Intervals over all objects are 95 % bias-corrected accelerated (BCa) bootstrap intervals that "
-    "resample whole objects with all their episodes: they speak about objects of this kind, not only about "
-    "these.",
-    "episode": "Intervals over all objects are 95 % bias-corrected accelerated (BCa) bootstrap intervals "
-    "that resample the episodes of each object: they speak about these very objects under new starts and "
-    "goals. With so few objects nothing can be said about others.",
+    "object": "Intervals over all objects are 95 % t intervals on the log odds, with the jackknife's "
+    "standard error over whole objects: they speak about objects of this kind, not only about these.",
+    "episode": "Intervals over all objects are 95 % t intervals on the log odds, with the jackknife's "
+    "standard error over the episodes of each object: they speak about these very objects under new starts "
+    "and goals. With so few objects nothing can be said about others.",
 }
 
 
@@ -151,7 +150,7 @@ def method_note(result: EvalResult) -> str:
         "way. A dropped object fails at every tolerance. Chance is an "
         f"orientation drawn uniformly from SO(3): mean error {CHANCE_MEAN_RAD:.2f} rad for an asymmetric "
         f"object; the mean measured here, drops included, is {result.overall.mean_error_rad:.2f} rad. "
-        f"{_UNIT_NOTE[result.overall.unit]} Those of a single object resample its episodes. Where all "
+        f"{_UNIT_NOTE[result.overall.unit]} Those of a single object are over its episodes. Where all "
         "outcomes agree the interval is Clopper and Pearson's exact one, which takes episodes as "
         "independent. Times have distribution-free intervals between order statistics."
     )

@@ -123,7 +123,7 @@ class Summary:
     episodes: int
     """Number of episodes behind it."""
     unit: Unit
-    """What was resampled for the intervals."""
+    """What the intervals speak about."""
     success: dict[str, Interval]
     """By tolerance [rad] (as text): share of episodes that ended within it, not dropped."""
     stop_rate: Interval
@@ -205,7 +205,7 @@ def summarise(
         object_names: K names.
         symmetries: For each object its symmetry rotations xyzw, shapes [S, 4].
         episodes: K x M episodes, object by object.
-        resample: What the bootstrap draws anew: ``object``, ``episode``, or by the number of objects.
+        resample: What intervals speak about: ``object``, ``episode``, or by the number of objects.
         software: Versions to record.
     """
     chances = [chance_cdf(np.array(TOLERANCES_RAD), symmetry) for symmetry in symmetries]

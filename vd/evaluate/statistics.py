@@ -2,31 +2,28 @@
 
 Angles are radians in [0, pi], quaternions xyzw (unit), rotations world from body.
 
-Intervals are bias-corrected and accelerated (BCa) bootstrap intervals (Efron 1987, as implemented by
-``scipy.stats.bootstrap``). What is resampled decides what they speak about:
+Rates have t intervals on the log odds, with the jackknife's standard error (Efron and Stein 1981). Medians
+have the intervals of the share below them, turned into quantiles (Woodruff 1952). What the jackknife leaves
+out one at a time decides what they speak about:
 
-* ``object``: whole objects, each with all of its episodes (a cluster bootstrap). Episodes of one object
-  are alike, so this is the honest choice for statements about objects of this kind; it needs some objects.
-* ``episode``: episodes within each object (a stratified bootstrap). The statement is then about these
+* ``object``: whole objects, each with all of its episodes. Episodes of one object are alike, so this is the
+  honest choice for statements about objects of this kind; it needs some objects.
+* ``episode``: episodes within each object (the objects are strata). The statement is then about these
   very objects, under new starts and goals.
 """
 
-import warnings
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
+from scipy.special import expit, logit
 
 Unit = Literal["object", "episode"]
 
 CONFIDENCE = 0.95
-RESAMPLES = 9999
-# Resampled values held at once: keeps the bootstrap of a large set under a few hundred megabytes.
-RESAMPLE_BATCH_VALUES = 8_000_000
-# A cluster bootstrap over fewer clusters than this has too few distinct resamples for a 95 % interval.
+# How much objects differ is not known from fewer than this.
 MIN_CLUSTERS = 8
 # Draws for chance on a symmetric object, for which no closed form is used: 0.5 % at a rate of one half.
 CHANCE_DRAWS = 40_000
@@ -43,7 +40,7 @@ class Interval:
     low: float
     high: float
     method: str
-    """``bca``, ``clopper-pearson``, ``order-statistics``: which of them gave ``low`` and ``high``."""
+    """``logit-t``, ``clopper-pearson``, ``woodruff`` or ``order-statistics``: what gave the bounds."""
 
 
 def rotation_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -106,64 +103,78 @@ def chance_cdf(angle: np.ndarray | float, symmetry: np.ndarray | None = None) ->
 
 
 def choose_unit(num_objects: int, requested: Literal["auto", "object", "episode"] = "auto") -> Unit:
-    """Resample objects where there are enough of them, else episodes within each object."""
+    """Objects where there are enough of them, else episodes within each object."""
     if requested != "auto":
         return requested
     return "object" if num_objects >= MIN_CLUSTERS else "episode"
 
 
-def rate_intervals(outcomes: np.ndarray, unit: Unit, *, seed: int = 0) -> list[Interval]:
+def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:
     """Rates of yes/no outcomes with 95 % intervals.
 
-    Where the bootstrap cannot say anything, since every resample is equal (no success at all, say), nothing
-    is known of how objects differ, and the interval is Clopper and Pearson's exact binomial one over all
-    episodes, taken as independent.
+    Where all units are equal (no success at all, say), nothing is known of how they differ, and the interval
+    is Clopper and Pearson's exact binomial one over all episodes, taken as independent.
 
     Args:
-        outcomes: Booleans, shape [R, K, M]: R rates, K objects, M episodes each.
-        unit: What is resampled.
-        seed: Of the bootstrap.
+        outcomes: Booleans, or shares in [0, 1], shape [R, K, M]: R rates, K objects, M episodes each.
+        unit: What the statement is about.
 
     Returns:
         R intervals.
     """
     outcomes = np.asarray(outcomes, dtype=float)
-    units = outcomes.mean(axis=2)[:, None, :] if unit == "object" else outcomes
-    low, high = _bca(units, _mean, seed)
     intervals = []
-    for group, lower, upper in zip(outcomes, low, high, strict=True):
-        rate = group.mean()
-        if np.isfinite(lower) and np.isfinite(upper):
-            intervals.append(Interval(float(rate), float(lower), float(upper), "bca"))
+    for group, low, high in zip(outcomes, *_logit_t(outcomes, unit), strict=True):
+        rate = float(group.mean())
+        if np.isfinite(low):
+            intervals.append(Interval(rate, min(float(low), rate), max(float(high), rate), "logit-t"))
         else:
             exact = stats.binomtest(round(group.sum()), group.size).proportion_ci(CONFIDENCE, "exact")
-            intervals.append(Interval(float(rate), float(exact.low), float(exact.high), "clopper-pearson"))
+            intervals.append(Interval(rate, float(exact.low), float(exact.high), "clopper-pearson"))
     return intervals
 
 
-def median_interval(values: np.ndarray, unit: Unit, *, seed: int = 0) -> Interval:
+def _logit_t(outcomes: np.ndarray, unit: Unit) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds [R] of t intervals on the log odds of rates [R, K, M]; NaN where all units are equal.
+
+    The jackknife sees how the log odds bend: with 13 objects, few failures and objects that differ the plain
+    standard error is too small. Half a success and half a failure are added, which keeps the odds finite.
+    """
+    rates, objects, episodes = outcomes.shape
+    units = outcomes.mean(axis=2)[:, None] if unit == "object" else outcomes
+    if unit == "episode" and episodes == 1:  # the episodes of all objects are one sample
+        units = outcomes.reshape(rates, 1, objects)
+    strata, n = units.shape[1:]
+    if n < 2:
+        return np.full(rates, np.nan), np.full(rates, np.nan)
+
+    def odds(share: np.ndarray) -> np.ndarray:
+        return np.asarray(logit((share * objects * episodes + 0.5) / (objects * episodes + 1.0)))
+
+    total = units.mean(axis=(1, 2))
+    without = total[:, None, None] + (units.mean(axis=2, keepdims=True) - units) / ((n - 1) * strata)
+    moved = odds(without)
+    variance = (n - 1) * moved.var(axis=2).sum(axis=1)
+    half = stats.t.ppf((1 + CONFIDENCE) / 2, strata * (n - 1)) * np.sqrt(variance)
+    half[np.ptp(units, axis=2).max(axis=1) == 0.0] = np.nan
+    return expit(odds(total) - half), expit(odds(total) + half)
+
+
+def median_interval(values: np.ndarray, unit: Unit) -> Interval:
     """Median over all objects and episodes with its 95 % interval.
 
     Args:
         values: Shape [K, M]: K objects, M episodes each; finite.
-        unit: What is resampled.
-        seed: Of the bootstrap.
+        unit: What the statement is about.
     """
     values = np.asarray(values, dtype=float)
-    if unit == "object":
-        # Resample indices of objects: the statistic is the median over all episodes of the drawn objects.
-        def of_objects(index: np.ndarray, axis: int = -1) -> np.ndarray:
-            drawn = values[index.astype(int)]
-            return np.median(drawn.reshape(*drawn.shape[:-2], -1), axis=-1)
-
-        low, high = _bca(
-            np.arange(len(values), dtype=float)[None, None, :], of_objects, seed, values.shape[1]
-        )
-    else:
-        low, high = _bca(values[None], _median, seed)
-    if np.isfinite(low[0]) and np.isfinite(high[0]):
-        return Interval(float(np.median(values)), float(low[0]), float(high[0]), "bca")
-    return order_interval(values.ravel())
+    median = float(np.median(values))
+    below = (values < median) + 0.5 * (values == median)
+    (share,) = rate_intervals(below[None], unit)
+    if share.method != "logit-t":
+        return order_interval(values.ravel())
+    low, high = np.quantile(values, (share.low, share.high))
+    return Interval(median, min(float(low), median), max(float(high), median), "woodruff")
 
 
 def order_interval(values: np.ndarray) -> Interval:
@@ -179,56 +190,3 @@ def order_interval(values: np.ndarray) -> Interval:
     return Interval(
         float(np.median(ordered)), float(ordered[rank - 1]), float(ordered[-rank]), "order-statistics"
     )
-
-
-def _mean(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
-    return _joined(samples).mean(axis=axis)
-
-
-def _median(*samples: np.ndarray, axis: int = -1) -> np.ndarray:
-    return np.median(_joined(samples), axis=axis)
-
-
-def _joined(samples: Sequence[np.ndarray]) -> np.ndarray:
-    """Concatenate strata on the last axis; the jackknife hands over strata that only broadcast."""
-    shape = np.broadcast_shapes(*(s.shape[:-1] for s in samples))
-    return np.concatenate([np.broadcast_to(s, (*shape, s.shape[-1])) for s in samples], axis=-1)
-
-
-def _bca(
-    values: np.ndarray, statistic: Callable[..., np.ndarray], seed: int, values_per_unit: int = 1
-) -> tuple[np.ndarray, np.ndarray]:
-    """BCa bounds of ``statistic`` for values [R, strata, n]: two arrays [R], NaN where degenerate.
-
-    Args:
-        values: R samples, each of ``strata`` groups that are resampled separately.
-        statistic: Called with one array per stratum and ``axis=-1``.
-        seed: Of the resampling.
-        values_per_unit: Numbers behind each resampled unit, to bound the memory.
-    """
-    rates, strata, n = values.shape
-    if n < 2:  # one episode of each object: the episodes of all objects are one sample
-        values = values.reshape(rates, 1, strata * n)
-        strata, n = 1, strata * n
-    nothing = np.full(rates, np.nan)
-    if n < 2:
-        return nothing, nothing
-    batch = max(1, RESAMPLE_BATCH_VALUES // (rates * strata * n * values_per_unit))
-    with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
-        warnings.simplefilter("ignore", stats.DegenerateDataWarning)
-        result: Any = stats.bootstrap(
-            tuple(values[:, s] for s in range(strata)),
-            statistic,
-            n_resamples=RESAMPLES,
-            batch=batch,
-            vectorized=True,
-            axis=-1,
-            confidence_level=CONFIDENCE,
-            method="BCa",
-            rng=np.random.default_rng(seed),
-        )
-    low = np.atleast_1d(result.confidence_interval.low)
-    high = np.atleast_1d(result.confidence_interval.high)
-    # Equal bounds are the sign of a sample without spread; NaN, of a failed correction.
-    degenerate = ~(high > low)
-    return np.where(degenerate, np.nan, low), np.where(degenerate, np.nan, high)
