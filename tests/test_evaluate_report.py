@@ -71,7 +71,7 @@ def test_report_prints_rates_with_their_intervals_and_escapes_names(tmp_path, re
     assert f"{100 * drop.value:.1f} % ({100 * drop.low:.1f} to {100 * drop.high:.1f})" in text
     assert "b&lt;i&gt;" in text and "<i>" not in text
     assert f"chance {100 * result.overall.chance['0.4']:.2f}" in text
-    assert "resample the episodes of each object" in text
+    assert "over the episodes of each object" in text
 
 
 def test_report_says_which_task_it_was(tmp_path, result):

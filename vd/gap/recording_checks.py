@@ -47,6 +47,8 @@ COPY_ROWS = 3
 """Rows within which an echo of the command comes back."""
 LEAD_S = 0.5
 """Longest lead of the position that is looked for [s]; a longer one of a sine may be its next period."""
+LEAD_STEP_S = 5e-3
+"""Finest step at which a lead is looked for [s]: a fraction of any that matters, and cheap at 1 kHz."""
 LEAD_SAMPLES = 2.0
 """Samples by which stamps alone may let a position lead."""
 SPEED_RATIO = 2.0
@@ -196,7 +198,7 @@ def _answer_fault(told: "list[Trajectory]", j: int, count: float) -> str:
 
 def _lead(told: "list[Trajectory]", j: int) -> float:
     """By how much the positions of a joint come before its commands [s]; 0 if they do not, clearly."""
-    step = max(float(np.median(np.concatenate([np.diff(t.time) for t in told]))), 1e-3)
+    step = max(float(np.median(np.concatenate([np.diff(t.time) for t in told]))), LEAD_STEP_S)
     reach = int(LEAD_S / step)
     lags = np.arange(-reach, reach + 1)
     products = np.zeros((3, len(lags)))
