@@ -10,6 +10,7 @@ import pytest
 from vd.gap.cautions import cautions
 from vd.gap.hide import Hiding, simulate_hidden
 from vd.gap.recording import Recording, RecordingError, Trajectory, read_recording, write_recording
+from vd.gap.recording_checks import check_motion
 
 SAMPLES = 200
 COUNT = 2.0 * np.pi / 4096
@@ -321,12 +322,27 @@ def test_angles_wrapped_at_pi_are_unwrapped_and_said_so(tmp_path, channels):
     assert not any("turns" in line for line in cautions(sound))
 
 
-def test_a_wrapped_position_beside_steps_too_large_to_tell_the_turn_is_refused(tmp_path):
-    true = servo(amplitude=1.2, middle=np.pi)
-    (t,) = true.trajectories
-    t.command[:] = np.where(np.sin(AT_100_HZ) > 0, np.pi + 1.8, np.pi - 1.8)[:, None]
-    t.position[:] = wrapped(t.position)
-    refused(write_recording(true, tmp_path / "r"), "a.csv", "position.joint", "wrapped at a turn", "unwrap")
+def stepping(size):
+    """A servo that approaches each step of a square wave about pi with a time constant of 0.2 s."""
+    command = np.where(np.sin(AT_100_HZ) > 0, np.pi + size / 2, np.pi - size / 2)
+    position = np.full_like(command, np.pi)
+    for i in range(1, len(command)):
+        position[i] = position[i - 1] + 0.05 * (command[i - 1] - position[i - 1])
+    return servo(command=command[:, None], position=position[:, None])
+
+
+def test_a_position_wrapped_beside_large_steps_is_unwrapped_and_a_command_refused(tmp_path):
+    read_recording(write_recording(stepping(3.6), tmp_path / "sound"))
+    for size in (1.8, 3.6):
+        true = stepping(size)
+        (t,) = true.trajectories
+        jumps = replace(t, position=wrapped(t.position))
+        read = read_recording(write_recording(replace(true, trajectories=(jumps,)), tmp_path / f"p{size}"))
+        np.testing.assert_allclose(read.trajectories[0].position, t.position, atol=2e-6)
+        np.testing.assert_allclose(read.trajectories[0].command, t.command, atol=2e-6)
+    jumps = replace(t, command=wrapped(t.command))
+    folder = write_recording(replace(true, trajectories=(jumps,)), tmp_path / "c")
+    refused(folder, "a.csv", "'joint'", "wrapped at a turn", "unwrap it")
 
 
 def test_large_effects_of_real_servos_are_no_faults_of_the_recording(tmp_path):
@@ -364,3 +380,9 @@ def test_real_recordings_are_read(shared_dir, name, model, joints, trajectories)
     assert (len(recording.joints), len(recording.trajectories)) == (joints, trajectories)
     released = [t.excitation for t in recording.trajectories if not t.enabled.all()]
     assert set(released) == ({"lift_and_drop"} if model == "pendulum" else set())
+    swapped = [replace(t, command=t.position, position=t.command) for t in recording.trajectories]
+    with pytest.raises(RecordingError, match="swapped"):
+        check_motion(replace(recording, trajectories=tuple(swapped)))
+    for trajectory in recording.trajectories:  # one motion alone tells less
+        if np.ptp(trajectory.command, axis=0).any():
+            check_motion(replace(recording, trajectories=(trajectory,)))

@@ -38,8 +38,6 @@ MIN_SAMPLES = 20
 """Samples of a trajectory below which no motion can be told from noise."""
 COARSEST_RAD = 2.0 * math.pi / 256
 """Largest encoder count [rad]: eight bits a turn. Twelve bits a turn are 0.088 if written in degrees."""
-WRAP_RAD = 1.5 * math.pi
-"""Jump of a position between two samples [rad] that is no motion: half a turn and what a wrap may hide."""
 POSITIVE = ("p_gain", "payload_kg", "arm_length_m")
 """Conditions that the model computes with: numbers, not negative."""
 STIFFNESS = "kp_nm_rad"
@@ -345,17 +343,10 @@ def _unwrap(
     """Take jumps by whole turns out of commands and positions [T, J], in place; returns the joints."""
     jumped = []
     for j, joint in enumerate(joints):
-        whole = unwrapped(command[:, j], position[:, j], enabled[:, j])
-        if whole is not None:
+        where = f"{file}: joint {joint!r}"
+        if whole := unwrapped(where, command[:, j], position[:, j], enabled[:, j]):
             command[:, j], position[:, j] = whole
             jumped.append(joint)
-            continue
-        steps = np.abs(np.diff(position[:, j]))
-        if steps.max() > WRAP_RAD:
-            raise RecordingError(
-                f"{file}: row {int(np.argmax(steps)) + 3}, column 'position.{joint}' jumps by "
-                f"{steps.max():.3g} rad: wrapped at a turn; unwrap it beside its command (numpy.unwrap)"
-            )
     return tuple(jumped)
 
 

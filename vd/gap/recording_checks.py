@@ -41,6 +41,8 @@ SLOWEST_S = 0.5
 """Time between samples [s] that shows nothing of a servo; 2 ms are 2.0 if written in milliseconds."""
 DEGREES_RATIO = 20.0
 """A smallest step above this many encoder counts is in another unit (degrees are 57 times radians)."""
+ARRIVED_RAD = math.pi / 4.0
+"""Distance within which a position is at its command, or at one a turn away."""
 TRAVEL_RATIO = 10.0
 """A position that travels so many times as far as its command is in another unit, not overshoot."""
 COPY_ROWS = 3
@@ -51,6 +53,8 @@ LEAD_STEP_S = 5e-3
 """Finest step at which a lead is looked for [s]: a fraction of any that matters, and cheap at 1 kHz."""
 LEAD_SAMPLES = 2.0
 """Samples by which stamps alone may let a position lead."""
+LEAD_MISS = 0.5
+"""What a lead must leave of one less the correlation, in that of any lag: chance leaves 0.7."""
 SPEED_RATIO = 2.0
 """How many times too fast or slow a velocity must be for its unit to be another (rpm are 9.5 rad/s)."""
 FOLLOWS = 0.9
@@ -119,28 +123,39 @@ def _check_sent(file: Path, time: np.ndarray, sent: np.ndarray) -> None:
 
 
 def unwrapped(
-    command: np.ndarray, position: np.ndarray, on: np.ndarray
+    where: str, command: np.ndarray, position: np.ndarray, on: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Command and position without jumps by a whole turn, the position beside its command.
 
     Args:
-        command: Commands of one joint [T] [rad].
+        where: File and joint, for the error.
+        command: Commands of the joint [T] [rad].
         position: Its positions [T] [rad].
         on: Where its torque is on [T] bool.
 
     Returns:
-        Both [T], or None where nothing jumps or what is right is not certain.
+        Both [T], or None where nothing jumps.
+
+    Raises:
+        RecordingError: The commands are wrapped, but their steps are too large to tell the turn.
     """
     if not on.any() or np.abs(command - position)[on].max() <= math.pi >= np.abs(np.diff(position)).max():
         return None
     whole = np.unwrap(position)
     whole += TURN * np.round(np.median((command - whole)[on]) / TURN)
     apart = command - whole
-    if np.abs(apart[on]).max() > math.pi:
-        apart -= TURN * np.round(apart / TURN)
-        if np.abs(apart[on]).max() > math.pi / 2.0:  # a large step of the command, or one over the edge
-            return None
-    return whole + apart, whole
+    near = apart - TURN * np.round(apart / TURN)
+    far = on & (np.abs(apart) > math.pi)
+    # A large step is far from its position for a moment, a wrapped command where it has arrived, too.
+    if far.any() and np.median(np.abs(near[far])) < ARRIVED_RAD:
+        if np.abs(near[on]).max() > math.pi - ARRIVED_RAD:
+            raise RecordingError(
+                f"{where}: the command is wrapped at a turn, and its steps are too large to tell which; "
+                "unwrap it beside the position (numpy.unwrap)"
+            )
+        apart = near
+    moved = whole - position, apart + whole - command
+    return (whole + apart, whole) if max(np.abs(shift).max() for shift in moved) > math.pi else None
 
 
 def check_motion(recording: "Recording") -> None:
@@ -188,7 +203,7 @@ def _answer_fault(told: "list[Trajectory]", j: int, count: float) -> str:
     ratios = [float(np.ptp(p) / np.ptp(c)) for c, p in pairs]
     if (ratio := float(np.median(ratios))) > TRAVEL_RATIO:
         return f"travels {ratio:.3g} times as far as its command: these look like degrees; write radians"
-    if (lead := _lead(told, j)) > 0.0:
+    if (lead := float(np.median([_lead(t, j) for t in told]))) > 0.0:
         return (
             f"moves {1e3 * lead:.0f} ms before its command: the two columns are swapped, or their stamps are "
             "of two clocks; rename the columns, or correct the stamps"
@@ -196,26 +211,23 @@ def _answer_fault(told: "list[Trajectory]", j: int, count: float) -> str:
     return ""
 
 
-def _lead(told: "list[Trajectory]", j: int) -> float:
+def _lead(t: "Trajectory", j: int) -> float:
     """By how much the positions of a joint come before its commands [s]; 0 if they do not, clearly."""
-    step = max(float(np.median(np.concatenate([np.diff(t.time) for t in told]))), LEAD_STEP_S)
+    step = max(float(np.median(np.diff(t.time))), LEAD_STEP_S)
     reach = int(LEAD_S / step)
-    lags = np.arange(-reach, reach + 1)
-    products = np.zeros((3, len(lags)))
-    for t in told:
-        when = np.arange(0.0, t.time[-1], step)
-        if len(when) < 4 * reach:
-            continue
-        c = np.interp(when, t.sent, t.command[:, j])[reach:-reach]
-        p = np.lib.stride_tricks.sliding_window_view(np.interp(when, t.time, t.position[:, j]), len(c))
-        c, p = c - c.mean(), p - p.mean(axis=1, keepdims=True)
-        products += np.stack([p @ c, np.sum(p**2, axis=1), np.full(len(lags), c @ c)])
-    if not products[1:].all():
+    when = np.arange(0.0, t.time[-1], step)
+    if len(when) < 4 * reach:
         return 0.0
-    miss = 1.0 - products[0] / np.sqrt(products[1] * products[2])
+    c = np.interp(when, t.sent, t.command[:, j])[reach:-reach]
+    p = np.lib.stride_tricks.sliding_window_view(np.interp(when, t.time, t.position[:, j]), len(c))
+    c, p = c - c.mean(), p - p.mean(axis=1, keepdims=True)
+    size = np.linalg.norm(c) * np.linalg.norm(p, axis=1)
+    if not size.all():
+        return 0.0
+    miss = 1.0 - p @ c / size
     best = int(np.argmin(miss))
-    clear = miss[best] < 0.5 * miss[reach] and -lags[best] > LEAD_SAMPLES
-    return -float(lags[best]) * step if clear else 0.0
+    lead = reach - best
+    return lead * step if lead > LEAD_SAMPLES and miss[best] < LEAD_MISS * miss[reach:].min() else 0.0
 
 
 def check_units(recording: "Recording") -> None:
