@@ -3,13 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.geometry import surface_points
 from vd.assets_usd.objects.model import IDENTITY, ObjectModel, load_set
-from vd.student.symmetry import APART_RAD, nearest_goal, symmetries
+from vd.student.symmetry import APART_RAD, CLOSED_RAD, nearest_goal, symmetries
 
 NEAR_RAD = 0.05
 """A symmetry that was found, from its true rotation."""
@@ -40,6 +41,33 @@ def test_symmetries_of_solids_are_found(device):
     for turn in Rotation.from_rotvec(np.outer(spin, [0.0, 0.0, 1.0])):
         assert (Rotation.from_quat(found[1]) * turn.inv()).magnitude().min() < 2.0 * APART_RAD
     np.testing.assert_array_equal(found[2], IDENTITY)
+
+
+def test_a_shape_that_differs_by_a_part_of_its_surface_is_not_symmetric(device):
+    """A remote control with a block of 6 mm on a twentieth of it, which lies elsewhere when it is turned."""
+    remote = trimesh.creation.box((0.16, 0.05, 0.02))
+    block = trimesh.creation.box(
+        (0.02, 0.05, 0.006), trimesh.transformations.translation_matrix((0.05, 0, 0.013))
+    )
+    (found,) = symmetries([shape(trimesh.util.concatenate([remote, block]))], device)
+    (mirrored,) = symmetries([shape(remote)], device)
+    assert len(mirrored) == 4
+    np.testing.assert_array_equal(found, IDENTITY)
+
+
+@pytest.mark.parametrize(
+    ("name", "order"),
+    [("train/remote_controller_1.ply", 1), ("train/poker_1.ply", 4), ("test/waterbottle.stl", 5)],
+)
+def test_groups_of_scanned_objects_are_groups(shared_dir, name, order):
+    mesh = trimesh.load(shared_dir / "objects" / name, force="mesh")
+    mesh.apply_translation(-mesh.center_mass)
+    mesh.apply_scale(0.16 / mesh.extents.max())
+    (found,) = symmetries([shape(mesh)], "cpu")
+    turns = Rotation.from_quat(found)
+    assert len(turns) == order
+    for turn in turns:
+        assert max(((turn * turns).inv() * other).magnitude().min() for other in turns) < CLOSED_RAD
 
 
 def test_declared_symmetries_stand():

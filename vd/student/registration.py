@@ -31,8 +31,7 @@ from vd.kernels.shape_grids import Shapes, off_mesh_kernel, shape_distance_kerne
 POINTS = 256
 """Points seen of the object that are looked at, at most."""
 GRID = 32
-"""Grid points along a side of a shape's distances: some 5 mm apart. Symmetries are found on it too
-(vd/student/symmetry.py), so that another one also changes what counts as the same."""
+"""Grid points along a side of a shape's distances: some 5 mm apart."""
 BEYOND_M = 0.02
 """How far that grid reaches beyond the shape [m]."""
 ON_MESH_M = 1e-3
@@ -106,6 +105,7 @@ class Registration:
         world_scale: np.ndarray,
         camera: CameraModel | None,
         device: str,
+        grid: int = GRID,
     ):
         """Measure the shapes.
 
@@ -115,6 +115,7 @@ class Registration:
             world_scale: Size factor of each world's object, shape [N].
             camera: What sees it, posed in the base frame; None where points are of all sides.
             device: Warp device.
+            grid: Grid points along a side of a shape's distances.
         """
         self.device, worlds = device, len(world_object)
         place = torch.device(wp.device_to_torch(device))
@@ -126,7 +127,7 @@ class Registration:
         self._shapes = shapes = Shapes()
         shapes.samples = array(samples, wp.vec3)
         shapes.half = array(np.abs(samples).max(axis=(1, 2)) + BEYOND_M, float)
-        shapes.distance = wp.empty((len(objects), GRID, GRID, GRID), dtype=float, device=device)
+        shapes.distance = wp.empty((len(objects), grid, grid, grid), dtype=float, device=device)
         shapes.world_shape, shapes.world_scale = array(world_object, wp.int32), array(world_scale, float)
         meshes = [
             wp.Mesh(
