@@ -83,8 +83,9 @@ def test_a_setting_that_is_refused_leaves_a_run_that_can_go_on(tmp_path, monkeyp
     assert "resumed after iteration 2 of 4" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("resume", [["--resume"], ["--resume", "auto"]])
-@pytest.mark.parametrize("how", DAMAGES)
+@pytest.mark.parametrize(
+    ("how", "resume"), zip(DAMAGES, 2 * [["--resume"], ["--resume", "auto"]], strict=True)
+)
 def test_a_run_goes_on_from_its_newest_sound_checkpoint(tmp_path, monkeypatch, capsys, how, resume):
     simulating_the_dummy(monkeypatch)
     run = ["--run-dir", str(tmp_path)]
@@ -117,9 +118,9 @@ def test_checkpoints_of_a_run_that_went_on_from_an_older_one_are_kept(tmp_path):
 @pytest.mark.parametrize(
     ("limit", "tensorboard", "named"),
     [
-        (60_000, False, r"progress\.jsonl"),
-        (60_000, True, "tensorboard"),
-        (30_000, False, "model_0000010"),
+        (45_000, False, r"progress\.jsonl"),
+        (45_000, True, "tensorboard"),
+        (30_000, False, r"model_0000010\.pt"),
     ],
 )
 def test_a_full_disk_ends_a_run_in_words_and_it_can_go_on(tmp_path, capfd, limit, tensorboard, named):
