@@ -125,8 +125,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
             yield temporary
         except Exception as error:
             # Writers in other languages lose the reason, so the disk is asked.
-            known = isinstance(error, OSError) and error.errno in _NO_SPACE
-            refusal = error if known else _refusal(temporary)
+            if isinstance(error, OSError) and error.errno in _NO_SPACE:
+                raise output_error(path, error) from error
+            refusal = _refusal(temporary)
             if refusal is not None:
                 raise output_error(path, refusal) from error
             raise

@@ -391,7 +391,7 @@ def main() -> None:
     try:
         if isinstance(command, GapCommand):
             check_folder(command.out)
-        elif getattr(command, "json", None) is not None:
+        elif not isinstance(command, ReplayCommand) and command.json is not None:
             check_file(command.json)
         sys.exit(command.run())
     except (ValueError, OSError) as error:
