@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from vd.files import check_file, check_folder
+
 if TYPE_CHECKING:
     from vd.assets_usd.objects.importer import ImportResult
 
@@ -270,12 +272,16 @@ def main() -> None:
     """Entry point of ``vd-assets``."""
     command = tyro.cli(Command, prog="vd-assets", description=__doc__)
     try:
+        if isinstance(command, Show):
+            check_file(command.out)
+        elif command.out is not None:
+            check_folder(command.out)
         if isinstance(command, Hand):
             sys.exit(run_hand(command))
         if isinstance(command, Objects):
             sys.exit(run_objects(command))
         sys.exit(run_import(command) if isinstance(command, Import) else run_show(command))
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         print(error, file=sys.stderr)
         sys.exit(2)
 

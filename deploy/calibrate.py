@@ -29,7 +29,7 @@ from vd.deploy.markers import CELLS, MARGIN_CELLS, MarkerFinder, save_marker
 from vd.deploy.motion import move, reset_pose
 from vd.deploy.realsense import RealSenseCfg, RealSenseInfrared, find_device
 from vd.deploy.safety import SafeHand
-from vd.files import atomic_path, write_json
+from vd.files import atomic_path, make_folder, write_json
 from vd.paper import PAPER
 from vd.sensors.depth_cloud import BASE_IN_WORLD
 
@@ -248,7 +248,7 @@ def save_views(folder: Path, hand: HandModel, lens: Intrinsics, side_m: float, s
     """Keep the pictures and the joints."""
     from PIL import Image
 
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     rows = []
     for number, shot in enumerate(shots):
         name = f"view-{number:03d}.png"

@@ -17,7 +17,7 @@ from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hand_spec import HANDS
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.control_table import RAD_PER_COUNT
-from vd.files import write_json
+from vd.files import make_folder, write_json, writing
 from vd.gap.recording import COMMAND_TIME
 from vd.gap.recording import FORMAT as RECORDING_FORMAT
 from vd.hand_log import (
@@ -62,7 +62,7 @@ class LogWriter:
     ):
         if (folder / RUN_FILE).exists():
             raise FileExistsError(f"{folder} holds a log; choose another folder")
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         self.folder, self._joints = folder, hand.joint_names
         self._clock, self.started_s = clock, clock.now()
         self._run = {
@@ -158,7 +158,8 @@ class LogWriter:
     def _check(self) -> None:
         """Raise what went wrong in writing: a run without its log is not worth going on with."""
         if self._written is not None and self._written.done():
-            self._written.result()
+            with writing(self.folder):
+                self._written.result()
 
 
 def _save(file: Path, values: np.ndarray) -> None:

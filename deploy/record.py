@@ -24,6 +24,7 @@ from vd.deploy.motion import move
 from vd.deploy.motor_time import measured_at
 from vd.deploy.safety import SafeHand
 from vd.deploy.timely import Priority, real_time, undisturbed
+from vd.files import check_folder
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
@@ -285,6 +286,7 @@ def record(cfg: RecordCfg) -> int:
 
     if not cfg.rate_hz > 0.0:
         raise ValueError(f"--rate-hz is {cfg.rate_hz}; it has to be above 0")
+    check_folder(cfg.out)
     twin_args = f"{TWIN_ARGS} --realtime {cfg.realtime} {cfg.twin_args}"
     with (
         connect(replace(cfg, twin_args=twin_args)) as connection,

@@ -29,6 +29,7 @@ from vd.deploy.realsense import RealSenseCfg
 from vd.deploy.safety import SafeHand
 from vd.deploy.timely import Priority, real_time, undisturbed
 from vd.evaluate.agents import check_names
+from vd.files import check_folder
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
 
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
     from vd.deploy.log import LogWriter
     from vd.deploy.twin_link import TwinLink
 
+LOGS = Path("runs/deploy")
+"""Folder of the logs that are not named."""
 HOME_RAD_S = 0.5
 """Speed of the way to the start [rad/s]."""
 SETTLE_S = 1.5
@@ -120,6 +123,7 @@ class RunCfg(HandOptions):
 def run(cfg: RunCfg) -> int:
     """Fly the policy; 0 if all goals were pursued, 1 if the object was lost."""
     cfg.validate()
+    check_folder(cfg.log or LOGS)
     import torch
 
     from vd.deploy.connect import read_hand_and_joints
@@ -203,7 +207,7 @@ def _fly(
         stack.enter_context(real_time(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals."
         ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=seen)
-        folder = cfg.log or Path("runs/deploy") / datetime.now().strftime("%Y%m%d-%H%M%S")
+        folder = cfg.log or LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
         log = LogWriter(
             folder,
             hand,

@@ -73,7 +73,7 @@ def test_shapes_and_ranges(device):
 
 def test_the_table_costs_while_the_object_touches_it():
     """Equation 7: c6 in every step of contact, none while the object falls or is held."""
-    env = make(reward=RewardCfg(table_contact=-3.0), success=SuccessCfg(no_table_contact=True))
+    env = make(reward=RewardCfg(table_contact=-3.0), table=TableCfg(lift_share=1.0))
     column = env.reward_term_names.index("table_contact")
     seen, heights = [], []
     for _ in range(24):
@@ -145,7 +145,7 @@ def test_worlds_that_must_lift_are_those_that_lose_their_table_first():
     away, lift = table_steps(cfg) < ALWAYS, must_lift(cfg) == 1
     assert away.sum() == 300 and lift.sum() == 500 and lift[away].all()
     assert not must_lift(dataclasses.replace(cfg, table=TableCfg(away_share=0.3))).any()
-    assert must_lift(dataclasses.replace(cfg, success=SuccessCfg(no_table_contact=True))).all()
+    assert must_lift(dataclasses.replace(cfg, table=TableCfg(lift_share=1.0))).all()
     with pytest.raises(ValueError, match=r"table\.lift_share"):
         ReorientCfg(table=TableCfg(lift_share=-0.1)).validate()
 

@@ -214,6 +214,7 @@ def test_another_network_or_no_teacher_is_explained(tmp_path, stage, capsys):
     base = ["student", "--preset", "cpu-demo", "--run-dir", str(tmp_path / "run"), "--device", "cpu"]
     assert main([*base, "--init", str(path), "--network.memory", "32"]) == 1
     assert "moves 2 joints" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
     assert main(["student", "--device", "cpu", "--run-dir", str(tmp_path / "x")]) == 1
     assert "--teacher is missing" in capsys.readouterr().err
     seeing = load_checkpoint(find_policy("dclaw3-table"))

@@ -1,7 +1,11 @@
 """Presets, flags and the configuration file of training."""
 
+import ast
 import dataclasses
+import inspect
+import itertools
 import json
+import textwrap
 import types
 import typing
 from pathlib import Path
@@ -11,9 +15,11 @@ import pytest
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import CurriculumCfg, SuccessCfg
 from vd.paper import PAPER
-from vd.train.cli import main, parse_teacher, resolve_device
+from vd.train.cli import main
 from vd.train.config import minibatches, validate
+from vd.train.flags import parse_teacher, resolve_device
 from vd.train.presets import PRESETS, PresetName, TeacherCfg, smoke
+from vd.train.student.config import StudentTrainCfg
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
@@ -32,7 +38,6 @@ def test_presets_are_the_choices_of_the_flag():
 
 def test_paper_preset_is_the_paper():
     cfg, paper = PRESETS["paper"](), PAPER.teacher
-    assert parse_teacher([]) == cfg, "the paper's preset is the default"
     assert cfg.env.num_worlds == paper.num_worlds == 32000
     assert (cfg.ppo.rollout_steps, cfg.ppo.epochs) == (8, 12)
     assert minibatches(cfg.ppo, cfg.env.num_worlds) == 4
@@ -45,6 +50,39 @@ def test_paper_preset_is_the_paper():
     assert cfg.env == type(cfg.env)(num_worlds=32000, objects=("procedural-150-seed0",)), (
         "the task is the paper's, by the environment's defaults, on as many objects"
     )
+
+
+@pytest.mark.parametrize(
+    ("gpus", "processes", "flags", "name"),
+    [
+        (0, 1, [], "cpu-demo"),
+        (0, 2, [], "cpu-demo"),
+        (1, 1, [], "gpu"),
+        (1, 1, ["--device", "cpu"], "cpu-demo"),
+        (2, 1, ["--device", "cuda:1"], "gpu"),
+        (2, 2, [], "multi-gpu"),
+    ],
+)
+def test_the_machine_decides_where_no_preset_is_named(monkeypatch, gpus, processes, flags, name):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: gpus > 0)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: gpus)
+    monkeypatch.setenv("WORLD_SIZE", str(processes))
+    said: list[str] = []
+    cfg = parse_teacher([*flags, "--seed", "5"], say=said.append)
+    assert cfg.preset == name and cfg.env.seed == 5
+    assert cfg.ppo == PRESETS[name]().ppo and cfg.run.run_dir == PRESETS[name]().run.run_dir
+    assert len(said) == 1 and f"preset {name}, since none is named" in said[0]
+    assert parse_teacher(["--preset", "paper"], say=said.append).ppo == PRESETS["paper"]().ppo
+    assert parse_teacher(["--smoke"], say=said.append).smoke and len(said) == 1
+
+
+def test_a_preset_for_a_hand_of_its_own_serves_the_other():
+    """dclaw4 is not its own mirror image, so that nothing can be seen in the mirror."""
+    for start in (["--smoke"], ["--preset", "cpu-demo"]):
+        assert parse_teacher(start).env.observation.view == "mirrored"
+        assert parse_teacher([*start, "--hand", "dclaw4"]).env.observation.view == "goal"
+        flags = [*start, "--hand", "dclaw4", "--env.observation.view", "world"]
+        assert parse_teacher(flags).env.observation.view == "world"
 
 
 def test_our_presets_bound_a_state_dependent_std():
@@ -109,12 +147,50 @@ def test_help_lists_every_nested_field(capsys):
     assert [flag for flag in flags if flag not in text] == []
 
 
+def _undescribed(cls: type, prefix: str = "") -> list[str]:
+    """Fields of the nested dataclass ``cls`` that no docstring follows."""
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+    assert isinstance(tree, ast.ClassDef)
+    described = {
+        line.target.id
+        for line, after in itertools.pairwise(tree.body)
+        if isinstance(line, ast.AnnAssign)
+        and isinstance(line.target, ast.Name)
+        and isinstance(after, ast.Expr)
+        and isinstance(after.value, ast.Constant)
+    }
+    hints, missing = typing.get_type_hints(cls), []
+    for field in dataclasses.fields(cls):
+        if dataclasses.is_dataclass(hints[field.name]):
+            missing += _undescribed(hints[field.name], f"{prefix}{field.name}.")
+        elif field.name not in described:
+            missing.append(prefix + field.name)
+    return missing
+
+
+@pytest.mark.parametrize("cls", [TeacherCfg, StudentTrainCfg])
+def test_every_flag_is_described(cls):
+    assert _undescribed(cls) == []
+    assert not [flag for flag in _flags(cls) if ".no-" in flag], "--no-no- would be its other side"
+
+
+def test_a_command_names_itself_in_its_help(capsys):
+    for command in ("teacher", "student", "profile", "calibrate", "follow", "average", "export", "noise"):
+        with pytest.raises(SystemExit):
+            main([command, "--help"])
+        text = capsys.readouterr().out
+        assert text.startswith(f"usage: vd-train {command} ")
+    with pytest.raises(SystemExit):
+        main(["profile", "--help"])
+    assert "Where the time of a student's training goes" in capsys.readouterr().out
+
+
 def test_help_needs_neither_torch_nor_the_simulator():
     import subprocess
     import sys
 
     code = (
-        "import sys; from vd.train.cli import parse_teacher; parse_teacher(['--preset', 'gpu']);"
+        "import sys; from vd.train.flags import parse_teacher; parse_teacher(['--preset', 'gpu']);"
         "heavy = {'torch', 'warp', 'newton', 'matplotlib', 'rsl_rl'} & set(sys.modules);"
         "assert not heavy, heavy"
     )
@@ -148,6 +224,18 @@ def test_smoke_is_small_and_short():
     cfg = parse_teacher(["--smoke", "--num-worlds", "8"])
     assert cfg.smoke and cfg.run.device == "cpu" and cfg.run.max_minutes == 1.0 and cfg.env.num_worlds == 8
     assert smoke().env.num_worlds * smoke().ppo.rollout_steps * 20 > smoke().run.max_steps
+
+
+def test_a_smoke_test_leaves_nothing_and_can_be_done_again(tmp_path, monkeypatch, capsys):
+    from train_dummy import simulating_the_dummy
+
+    simulating_the_dummy(monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        assert main(["teacher", "--smoke", "--max-steps", "128"]) == 0
+        text = capsys.readouterr().out
+        assert "done: everything runs" in text and "of no use" in text and "best policy" not in text
+    assert not list(tmp_path.iterdir())
 
 
 def test_resume_starts_from_the_runs_own_configuration(tmp_path):
@@ -219,6 +307,16 @@ def test_export_and_curves_commands(tmp_path, capsys):
     assert "not a checkpoint" in capsys.readouterr().err
     assert main(["curves", str(tmp_path)]) == 0
     assert (tmp_path / "curves.png").is_file()
+
+
+def test_files_from_before_a_field_went_are_read_if_it_was_off():
+    """success.no_table_contact asked of all worlds what table.lift_share asks of a share of them."""
+    before = to_dict(PRESETS["gpu"]())
+    before["env"]["success"]["no_table_contact"] = False
+    assert from_dict(TeacherCfg, before) == PRESETS["gpu"]()
+    before["env"]["success"]["no_table_contact"] = True
+    with pytest.raises(ValueError, match=r"env\.success\.no_table_contact is True, and this version has"):
+        from_dict(TeacherCfg, before)
 
 
 def test_configuration_errors_name_the_path_of_the_field():

@@ -13,7 +13,8 @@ from vd.evaluate.agents import SHIPPED_POLICIES, trained_task
 from vd.policy import load_policy, policy_export
 from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start, unlike
 from vd.train.checkpoint import BEST_NAME, find_checkpoint, load_checkpoint, save_checkpoint
-from vd.train.cli import main, parse_teacher
+from vd.train.cli import main
+from vd.train.flags import parse_teacher
 from vd.train.metrics import read_progress
 from vd.train.presets import PRESETS
 

@@ -143,6 +143,25 @@ class DummyEnv:
         self.closed = True
 
 
+def simulating_the_dummy(monkeypatch) -> None:
+    """Let vd-train teacher simulate the dummy."""
+
+    class Env(DummyEnv):
+        def __init__(self, cfg, device):
+            super().__init__(num_worlds=cfg.num_worlds, seed=cfg.seed)
+            self.objects = list(cfg.objects)
+
+        def state_dict(self):
+            return super().state_dict() | {"objects": self.objects}
+
+        def load_state_dict(self, state):
+            if state["objects"] != self.objects:
+                raise ValueError("the worlds of the saved environment hold other objects")
+            super().load_state_dict(state)
+
+    monkeypatch.setattr("vd.envs.reorient.ReorientEnv", Env)
+
+
 SMALL_PPO = PpoCfg(
     rollout_steps=8,
     minibatch_size=64,

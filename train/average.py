@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from vd.files import check_file
 from vd.train.begin import find_start, unlike
 
 if TYPE_CHECKING:
@@ -34,9 +35,10 @@ class AverageCfg:
     """File to write."""
 
 
-def average_command(arguments: list[str]) -> int:
+def average_command(arguments: list[str], _started: float) -> int:
     """``vd-train average``; the exit status."""
     cfg = tyro.cli(AverageCfg, args=arguments, prog="vd-train average")
+    check_file(cfg.output)
     average_policies(cfg.policies, cfg.output)
     print(f"{cfg.output}: the mean of {len(cfg.policies)} policies; next, judge it: vd-eval {cfg.output}")
     return 0

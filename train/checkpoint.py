@@ -9,10 +9,15 @@ from typing import Any
 import numpy as np
 import torch
 
-from vd.files import atomic_path
+from vd.files import atomic_path, writing
+from vd.policy import read_state
 
 CHECKPOINT_FOLDER = "checkpoints"
 BEST_NAME = "best.pt"
+AUTO = "auto"
+"""``--resume auto`` goes on with a run where there is one, and starts it otherwise."""
+_NEEDED = {"actor": ("policy", "task", "iter", "env_steps"), "student": ("spec", "task", "iter", "env_steps")}
+"""What belongs to the weights of a teacher or a student. Other projects' files have an actor too."""
 _NAME = re.compile(r"model_(\d+)\.pt")
 _ARRAY = "__numpy__"
 # Key in the environment's state under which that of its worlds lies.
@@ -30,35 +35,85 @@ def list_checkpoints(run_dir: Path) -> list[Path]:
     return sorted(files, key=_iteration_of)
 
 
-def find_checkpoint(run_dir: Path, which: str) -> Path:
-    """The checkpoint that ``--resume`` names: ``latest``, ``best`` or a file.
+def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") -> Path | None:
+    """The checkpoint that ``--resume`` names; None for a new run.
+
+    Args:
+        run_dir: Folder of the run.
+        which: ``latest``: the newest that is sound. ``auto``: the same, or none in a folder without any.
+            ``best``, or a file. None: a new run.
+        network: What has to be in it, as in :func:`load_checkpoint`.
 
     Raises:
+        FileExistsError: A new run is asked for in a folder that holds one.
         FileNotFoundError: There is none; the message says what is there.
+        ValueError: None is sound.
     """
-    files = list_checkpoints(run_dir)
-    if which == "latest":
-        if files:
-            return files[-1]
-        raise FileNotFoundError(
-            f"--resume: no checkpoint in {run_dir / CHECKPOINT_FOLDER}; leave --resume out to start"
+    files, folder = list_checkpoints(run_dir), run_dir / CHECKPOINT_FOLDER
+    if which is None and files:
+        raise FileExistsError(
+            f"{run_dir} holds a run; add --resume to go on with it, or choose another --run-dir"
         )
-    path = run_dir / CHECKPOINT_FOLDER / BEST_NAME if which == "best" else Path(which)
+    if which is None or (which == AUTO and not files):
+        return None
+    if which in (AUTO, "latest"):
+        if not files:
+            raise FileNotFoundError(f"--resume: no checkpoint in {folder}; leave --resume out to start")
+        return _newest_sound(files, folder / BEST_NAME, network)
+    path = folder / BEST_NAME if which == "best" else Path(which)
     if not path.is_file():
         found = ", ".join(p.name for p in files) or "none"
         raise FileNotFoundError(f"--resume: no file {path}; checkpoints of {run_dir}: {found}")
     return path
 
 
-def prune_checkpoints(run_dir: Path, keep: int, every: int | None = None) -> None:
+def _newest_sound(files: list[Path], best: Path, network: str) -> Path:
+    """The newest of ``files`` that can be read, or else ``best``."""
+    reasons = []
+    for path in [*reversed(files), *([best] if best.is_file() else [])]:
+        reason = damage(path, network)
+        if not reason:
+            return path
+        reasons.append(reason)
+    raise ValueError(
+        f"--resume: no checkpoint is sound ({', '.join(reasons)}); start anew with another --run-dir"
+    )
+
+
+def damage(path: Path, network: str = "actor") -> str:
+    """What is wrong with a checkpoint; empty if it is sound."""
+    try:
+        load_checkpoint(path, network=network)
+    except ValueError as error:
+        return str(error).partition(";")[0]
+    return ""
+
+
+def damaged_after(run_dir: Path, checkpoint: Path | None, network: str = "actor") -> dict[Path, str]:
+    """Damaged checkpoints that are newer than the one a run goes on from, and what is wrong with each."""
+    if checkpoint is None:
+        return {}
+    newer = [path for path in list_checkpoints(run_dir) if _iteration_of(path) > _iteration_of(checkpoint)]
+    return {path: reason for path in newer if (reason := damage(path, network))}
+
+
+def set_aside(damaged: dict[Path, str]) -> None:
+    """Rename damaged checkpoints, so that they are no longer taken for the latest."""
+    for path in damaged:
+        with writing(path):
+            path.rename(path.with_name(f"{path.name}.damaged"))
+
+
+def prune_checkpoints(run_dir: Path, newest: int, keep: int, every: int | None = None) -> None:
     """Delete old periodic checkpoints, and what a killed run left half-written.
 
     Args:
         run_dir: Folder of the run.
+        newest: Iteration of the newest; what a run that went on from an older one finds after it, stays.
         keep: How many of the newest to keep.
         every: Keep those after every so many iterations too; None: no others.
     """
-    for path in list_checkpoints(run_dir)[:-keep]:
+    for path in [path for path in list_checkpoints(run_dir) if _iteration_of(path) <= newest][:-keep]:
         if every is None or _iteration_of(path) % every:
             path.unlink(missing_ok=True)
     for path in (run_dir / CHECKPOINT_FOLDER).glob(".*.pt"):
@@ -88,16 +143,8 @@ def load_checkpoint(
     Raises:
         ValueError: The file is damaged or not a checkpoint.
     """
-    try:
-        state = torch.load(path, map_location=device, weights_only=True)
-    except FileNotFoundError:
-        raise
-    except Exception as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(
-            f"{path} is damaged or no checkpoint ({reason}); give {flag} another file of its folder"
-        ) from error
-    if not isinstance(state, dict) or f"{network}_state_dict" not in state:
+    state = read_state(path, device, remedy=f"give {flag} another file of its folder")
+    if not {f"{network}_state_dict", *_NEEDED[network]} <= state.keys():
         raise ValueError(
             f"{path} holds no {network}; give {flag} a file that vd-train wrote in {CHECKPOINT_FOLDER}/"
         )

@@ -1,22 +1,26 @@
 """Command line of training: ``vd-train`` and its commands."""
 
+import importlib
 import os
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from vd.config import from_dict, to_dict
+from vd.config import to_dict
 from vd.envs.cfg import FocusCfg
-from vd.files import write_json
-from vd.train.begin import find_start, settings_of
+from vd.files import check_file, check_folder, write_json
+from vd.train.begin import find_start
 from vd.train.config import NoiseCfg
-from vd.train.focus import read_success, worlds_text
-from vd.train.presets import PRESETS, TeacherCfg, smoke
+from vd.train.flags import CONFIG_NAME, parse_teacher, resolve_device
+from vd.train.focus import worlds_text
+from vd.train.presets import SMOKE_RUN, TeacherCfg
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -24,10 +28,6 @@ if TYPE_CHECKING:
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C or SIGTERM: 128 and the number of SIGINT, as shells do."""
-AUTO = "auto"
-"""``--resume auto`` goes on with a run where there is one, and starts it otherwise."""
-CONFIG_NAME = "config.json"
-"""The resolved configuration, in the run's folder, written before training."""
 
 USAGE = """usage: vd-train COMMAND [flags]
 
@@ -56,14 +56,6 @@ A run goes on with any number of GPUs and worlds (--resume); on another machine 
 checkpoint, progress.jsonl for the curve so far: vd-train teacher --run-dir FOLDER --resume small.pt
 
 vd-train COMMAND --help lists the flags of a command."""
-
-TEACHER_HELP = """Train the teacher: PPO on the simulator's state.
-
-Flags start from --preset, or with --resume from the run's config.json. Short forms: --hand, --hand-layer,
---objects, --num-worlds and --seed stand for --env.hand and so on. Ctrl-C saves."""
-
-SHORT_FORMS = ("hand", "hand-layer", "objects", "num-worlds", "seed")
-"""Fields of the environment that are common enough to be flags without the ``--env.`` prefix."""
 
 
 @dataclass
@@ -121,11 +113,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     commands = {
         "teacher": _teacher,
-        "student": _student,
-        "calibrate": _calibrate,
-        "follow": _follow,
-        "profile": _profile,
-        "average": _average,
+        "student": _elsewhere("vd.train.student.cli", "student_command"),
+        "calibrate": _elsewhere("vd.train.student.cli", "calibrate_command"),
+        "follow": _elsewhere("vd.train.student.cli", "follow_command"),
+        "profile": _elsewhere("vd.train.student.cli", "profile_command"),
+        "average": _elsewhere("vd.train.average", "average_command"),
         "export": _export,
         "bundle": _bundle,
         "curves": _curves,
@@ -142,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     try:
         return commands[arguments[0]](arguments[1:], started)
-    except (ValueError, FileNotFoundError, FileExistsError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         if os.environ.get("VD_DEBUG"):
             raise
         print(f"vd-train: {error}\n(VD_DEBUG=1 shows where)", file=sys.stderr)
@@ -152,37 +144,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return INTERRUPTED
 
 
-def parse_teacher(arguments: Sequence[str]) -> TeacherCfg:
-    """The configuration that command-line flags ask for.
-
-    The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins from, or the
-    run's own configuration with ``--resume``), the second reads every flag with those values as defaults.
-
-    Raises:
-        FileNotFoundError: ``--resume`` names a run without a configuration, or
-            ``--focus-on`` no file.
-        ValueError: The run's configuration is not one of this version, ``--init`` is no teacher, or
-            ``--focus-on`` no evaluation.
-    """
-    arguments = normalise(arguments, SHORT_FORMS, "env")
-    preset, init = value_of(arguments, "--preset"), value_of(arguments, "--init")
-    if "--smoke" in arguments:
-        start = smoke()
-    elif preset is None and init is not None:
-        start = settings_of(init, PRESETS["gpu"]())
-    else:  # the second pass refuses an unknown name
-        start = PRESETS.get(preset or "paper", PRESETS["paper"])()
-    base = _saved_config(arguments, start) if "--resume" in arguments else start
-    cfg = tyro.cli(
-        TeacherCfg, args=arguments, default=base, prog="vd-train teacher", description=TEACHER_HELP
-    )
-    if cfg.env.observation.view == "either":
-        raise ValueError("env.observation.view either is of evaluations; train with goal, which it looks at")
-    if cfg.focus_on is None:
-        return cfg
-    # What the run needs of the file is kept with it.
-    success = read_success(cfg.focus_on)
-    return replace(cfg, focus_on=None, env=replace(cfg.env, focus=replace(cfg.env.focus, success=success)))
+def _elsewhere(module: str, function: str) -> Callable[[list[str], float], int]:
+    """A command of another module, which is imported when it is called."""
+    return lambda arguments, started: getattr(importlib.import_module(module), function)(arguments, started)
 
 
 def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherRunner":
@@ -196,20 +160,17 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
         FileExistsError: The run folder holds another run and ``resume`` is not set.
         FileNotFoundError: There is nothing to resume or to begin from.
     """
-    from vd.train.checkpoint import find_checkpoint, list_checkpoints
+    from vd.train.checkpoint import damaged_after, find_checkpoint, load_checkpoint, set_aside
 
+    check_folder(cfg.run.run_dir)
     rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
     cfg = replace(cfg, run=replace(cfg.run, device=device))
-    present = list_checkpoints(cfg.run.run_dir)
-    resume = cfg.resume if cfg.resume != AUTO else "latest" if present else None
-    checkpoint = find_checkpoint(cfg.run.run_dir, resume) if resume else None
+    checkpoint = find_checkpoint(cfg.run.run_dir, cfg.resume)
     init = find_start(cfg.init) if checkpoint is None and cfg.init is not None else None
+    if init is not None:
+        load_checkpoint(init, flag="--init")  # a damaged one is refused before anything is built
     if cfg.init is None and cfg.init_stage is not None:
         raise ValueError("--init-stage says where a run with --init begins; leave it out, or give --init")
-    if checkpoint is None and present:
-        raise FileExistsError(
-            f"{cfg.run.run_dir} holds a run; add --resume to go on with it, or choose another --run-dir"
-        )
 
     import torch
 
@@ -223,11 +184,6 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
 
     # How worlds were shared out is this run's alone: its config.json says it, and its policies do not.
     task = to_dict(replace(cfg.env, focus=FocusCfg()))
-    if rank == 0:
-        # Before anything is built: a run that fails at once still says what it was.
-        saved = to_dict(replace(cfg, resume=None))
-        saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
-        write_json(cfg.run.run_dir / CONFIG_NAME, saved)
     # Actions of different processes have to differ; parameters are broadcast from the first.
     torch.manual_seed(cfg.env.seed + rank)
     # TF32 halves the update on a GPU; the simulator is not touched by it.
@@ -247,71 +203,59 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
         runner.load(str(checkpoint))
     elif init is not None:
         runner.begin_from(str(init), cfg.init_stage)
+    if rank == 0:
+        # After all that can refuse: settings that a run cannot have must not take the place of its own.
+        saved = to_dict(replace(cfg, resume=None))
+        saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
+        write_json(cfg.run.run_dir / CONFIG_NAME, saved)
+        runner.damaged = damaged_after(cfg.run.run_dir, checkpoint)
+        set_aside(runner.damaged)
     return runner
 
 
-def resolve_device(name: str) -> str:
-    """The torch device for ``--device``: ``auto`` is this process's GPU (torchrun), the first, or the CPU.
-
-    Raises:
-        ValueError: The device does not exist here.
-    """
-    import torch
-
-    if name == "auto":
-        name = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
-    if name == "cuda":
-        name = "cuda:0"
-    if name == "cpu":
-        return name
-    index = name.removeprefix("cuda:")
-    if not name.startswith("cuda:") or not index.isdigit():
-        raise ValueError(f"--device is '{name}'; it has to be auto, cpu, or cuda:N")
-    if int(index) >= torch.cuda.device_count():
-        raise ValueError(
-            f"--device is '{name}', but torch finds {torch.cuda.device_count()} GPUs; use auto or cpu"
-        )
-    return name
+def print_damaged(damaged: dict[Path, str]) -> None:
+    """Say which checkpoints were passed over, and why."""
+    for path, reason in damaged.items():
+        print(f"{reason}; it is {path.name}.damaged now, and the newest sound checkpoint takes its place")
 
 
 def _teacher(arguments: list[str], started: float) -> int:
-    cfg = parse_teacher(arguments)
+    main_process = os.environ.get("RANK", "0") == "0"
+    cfg = parse_teacher(arguments, say=print if main_process else None)
+    if not cfg.smoke or cfg.run.run_dir != SMOKE_RUN:
+        return _train_teacher(cfg, main_process, started)
+    with TemporaryDirectory(prefix="vd-smoke-") as folder:  # nobody needs what is in it, twice least of all
+        return _train_teacher(replace(cfg, run=replace(cfg.run, run_dir=Path(folder))), main_process, started)
 
+
+def _train_teacher(cfg: TeacherCfg, main_process: bool, started: float) -> int:
     from vd.evaluate.agents import check_names
 
     check_names((), cfg.env.objects, cfg.env.hand)
     from vd.train.ending import finished
     from vd.train.progress import waiting
 
-    main_process = os.environ.get("RANK", "0") == "0"
     with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):
         runner = build_teacher(cfg, started=started)
     folder = cfg.run.run_dir
     if cfg.env.focus.success and main_process:
         simulation = runner.env.env
         print(worlds_text([item.name for item in simulation.objects], simulation.world_object))
+    if main_process:
+        print_damaged(runner.damaged)
     if runner.current_learning_iteration and main_process:
-        how = f"begins from {cfg.init}" if runner.begun else "resumed"
-        print(f"{how} after iteration {runner.current_learning_iteration} of {runner.total_iterations}")
-        if runner.new_episodes and not runner.begun:
-            print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
-        if runner.new_inputs:
-            print(f"{runner.new_inputs} observed values are new to the networks and start without effect")
-        if runner.new_units:
-            print(f"{runner.new_units} hidden units are new to each network and start without effect")
-        if runner.critic_warmup:
-            print(f"the critic learns alone for {runner.critic_warmup} iterations, the actor stays as it is")
-        for difference in runner.unlike:
-            print(f"the policy was trained with other observations or actions: {difference}")
+        _print_begin(cfg, runner)
     whole = finished(runner.learn, runner.env.close, distributed=runner.is_distributed)
     runner.shutdown()
     if not whole:
-        if main_process:
+        if main_process and not cfg.smoke:
             print(f"saved in {folder}; go on with: vd-train teacher --run-dir {folder} --resume")
         return INTERRUPTED
     from vd.train.runner import POLICY_NAME  # loads torch, which the first message should not wait for
 
-    if main_process and not (folder / POLICY_NAME).exists():
+    if main_process and cfg.smoke:
+        print(f"done: everything runs. {runner.env_steps} steps are a test, and the policy is of no use")
+    elif main_process and not (folder / POLICY_NAME).exists():
         print(
             f"done: nothing was trained, so {folder} has no {POLICY_NAME}: the {runner.env_steps} steps "
             f"done before are more than --max-steps {cfg.run.max_steps}; raise it"
@@ -321,38 +265,25 @@ def _teacher(arguments: list[str], started: float) -> int:
     return 0
 
 
-def _student(arguments: list[str], started: float) -> int:
-    from vd.train.student.cli import student_command
-
-    return student_command(arguments, started)
-
-
-def _calibrate(arguments: list[str], started: float) -> int:
-    from vd.train.student.cli import calibrate_command
-
-    return calibrate_command(arguments, started)
-
-
-def _follow(arguments: list[str], started: float) -> int:
-    from vd.train.student.cli import follow_command
-
-    return follow_command(arguments, started)
-
-
-def _profile(arguments: list[str], started: float) -> int:
-    from vd.train.student.cli import profile_command
-
-    return profile_command(arguments, started)
-
-
-def _average(arguments: list[str], _started: float) -> int:
-    from vd.train.average import average_command
-
-    return average_command(arguments)
+def _print_begin(cfg: TeacherCfg, runner: "TeacherRunner") -> None:
+    """What a run that does not begin from nothing begins with."""
+    how = f"begins from {cfg.init}" if runner.begun else "resumed"
+    print(f"{how} after iteration {runner.current_learning_iteration} of {runner.total_iterations}")
+    if runner.new_episodes and not runner.begun:
+        print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
+    if runner.new_inputs:
+        print(f"{runner.new_inputs} observed values are new to the networks and start without effect")
+    if runner.new_units:
+        print(f"{runner.new_units} hidden units are new to each network and start without effect")
+    if runner.critic_warmup:
+        print(f"the critic learns alone for {runner.critic_warmup} iterations, the actor stays as it is")
+    for difference in runner.unlike:
+        print(f"the policy was trained with other observations or actions: {difference}")
 
 
 def _export(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(ExportCfg, args=arguments, prog="vd-train export")
+    check_file(cfg.output)
 
     from vd.policy import policy_export
     from vd.student.saved import is_student, read_student, student_export
@@ -368,7 +299,7 @@ def _export(arguments: list[str], _started: float) -> int:
         return 0
     if cfg.output.suffix == ".onnx":
         return _export_onnx(cfg)
-    state = load_checkpoint(cfg.checkpoint)
+    state = load_checkpoint(cfg.checkpoint, flag="vd-train export")
     if cfg.resumable and "optimizer_state_dict" not in state:
         raise ValueError(f"{cfg.checkpoint} is a policy, not a checkpoint; nothing can go on from it")
     save_checkpoint(cfg.output, without_worlds(state) if cfg.resumable else policy_export(state))
@@ -397,6 +328,7 @@ def _bundle(arguments: list[str], _started: float) -> int:
     import json
 
     cfg = tyro.cli(BundleCfg, args=arguments, prog="vd-train bundle")
+    check_folder(cfg.output.parent)
 
     from vd.bundle.write import write_bundle
 
@@ -418,6 +350,7 @@ def _curves(arguments: list[str], _started: float) -> int:
 
     files = [run / PROGRESS_FILE if run.is_dir() else run for run in cfg.runs]
     output = cfg.output or files[0].with_name("curves.png")
+    check_file(output)
     first = next(iter(read_runs(files).values()))[0]
     plot = plot_student_curves if any(key.startswith("student/") for key in first) else plot_curves
     plot(files, output)
@@ -438,51 +371,7 @@ def _noise(arguments: list[str], _started: float) -> int:
 def _precompile(arguments: list[str], _started: float) -> int:
     from vd.train.precompile import precompile_command
 
-    return precompile_command(arguments, parse_teacher, build_teacher)
-
-
-def normalise(arguments: Sequence[str], short_forms: Sequence[str], group: str) -> list[str]:
-    """Spell out flags of ``group`` in their short forms, ``--flag=value``, and a bare ``--resume``."""
-    result: list[str] = []
-    for argument in arguments:
-        flag, equals, value = argument.partition("=")
-        if argument.startswith("--"):
-            flag = flag.replace("_", "-")
-            if flag.removeprefix("--") in short_forms:
-                flag = f"--{group}.{flag.removeprefix('--')}"
-            result += [flag, value] if equals else [flag]
-        else:
-            result.append(argument)
-    for index, argument in enumerate(result):
-        if argument == "--resume" and (index + 1 == len(result) or result[index + 1].startswith("--")):
-            result[index + 1 : index + 1] = ["latest"]
-            break
-    return result
-
-
-def value_of(arguments: list[str], flag: str) -> str | None:
-    """Value after the last ``flag``, or ``None``."""
-    places = [index for index, argument in enumerate(arguments[:-1]) if argument == flag]
-    return arguments[places[-1] + 1] if places else None
-
-
-def _saved_config(arguments: list[str], start: TeacherCfg) -> TeacherCfg:
-    """Configuration of the run that ``--resume`` goes on with; ``start`` is that of a new one."""
-    import json
-
-    run_dir = Path(value_of(arguments, "--run-dir") or start.run.run_dir)
-    path = run_dir / CONFIG_NAME
-    if not path.is_file():
-        if value_of(arguments, "--resume") == AUTO:
-            return start
-        raise FileNotFoundError(f"--resume: no {path}; give the --run-dir of the run to go on with")
-    try:
-        cfg = from_dict(TeacherCfg, json.loads(path.read_text()))
-    except ValueError as error:
-        raise ValueError(
-            f"{path}: {error}; it was written by another version, start anew or edit it"
-        ) from error
-    return replace(cfg, run=replace(cfg.run, run_dir=run_dir))
+    return precompile_command(arguments, partial(parse_teacher, unnamed="gpu"), build_teacher)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import torch
 from torch.distributed import PrefixStore
 from torch.distributed.rendezvous import rendezvous
 
+from vd.files import OutputError
 from vd.train import watchdog
 
 START_TIMEOUT = timedelta(minutes=20)
@@ -118,7 +119,10 @@ def _abandon(error: BaseException) -> NoReturn:
     """Print the error and end without any clean-up that could wait for other processes."""
     rank = os.environ.get("RANK", "0")
     print(f"vd-train: process {rank} failed and ends the run", file=sys.stderr)
-    traceback.print_exception(error)
+    if isinstance(error, OutputError):
+        print(error, file=sys.stderr)
+    else:
+        traceback.print_exception(error)
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()

@@ -2,15 +2,17 @@
 
 import json
 import math
+import threading
 from collections import deque
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from vd.files import write_text
+from vd.files import make_folder, write_text, writing
 
 PROGRESS_FILE = "progress.jsonl"
+BOARD_FOLDER = "tensorboard"
 
 
 class StepMeans:
@@ -105,32 +107,61 @@ class ProgressFile:
     """
 
     def __init__(self, run_dir: Path, *, tensorboard: bool = True, done: int = 0) -> None:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        path = run_dir / PROGRESS_FILE
+        make_folder(run_dir)
+        path = self._path = run_dir / PROGRESS_FILE
         kept = [row for row in read_progress(path) if row["iteration"] <= done] if path.is_file() else []
         write_text(path, "".join(json.dumps(row) + "\n" for row in kept))
-        self._file = path.open("a", encoding="utf-8")
+        with writing(path):
+            self._file = path.open("ab", buffering=0)
         self._board: Any = None
         if tensorboard:
             from torch.utils.tensorboard import SummaryWriter  # heavy, and optional
 
-            self._board = SummaryWriter(str(run_dir / "tensorboard"), purge_step=done + 1, flush_secs=10)
+            threading.excepthook = _report_thread
+            self._board = SummaryWriter(str(run_dir / BOARD_FOLDER), purge_step=done + 1, flush_secs=10)
 
     def write(self, row: dict[str, Any]) -> None:
-        """Add an iteration. Values that are not finite become ``null``."""
+        """Add an iteration. Values that are not finite become ``null``.
+
+        Raises:
+            OutputError: The disk is full; the file is as it was.
+        """
         row = {key: None if isinstance(v, float) and not math.isfinite(v) else v for key, v in row.items()}
-        self._file.write(json.dumps(row) + "\n")
-        self._file.flush()
-        if self._board is not None:
-            for key, value in row.items():
-                if value is not None:
-                    self._board.add_scalar(key if "/" in key else f"run/{key}", value, row["iteration"])
+        try:
+            self._append(json.dumps(row).encode() + b"\n")
+            if self._board is not None:
+                with writing(self._path.with_name(BOARD_FOLDER)):
+                    for key, value in row.items():
+                        if value is not None:
+                            self._board.add_scalar(
+                                key if "/" in key else f"run/{key}", value, row["iteration"]
+                            )
+        except OSError:
+            self._board = None  # closing it would only say so again
+            raise
+
+    def _append(self, line: bytes) -> None:
+        """Add a line, whole or not at all."""
+        size = self._file.tell()
+        try:
+            with writing(self._path):
+                while line:
+                    line = line[self._file.write(line) :]
+        except OSError:
+            self._file.truncate(size)
+            raise
 
     def close(self) -> None:
         """Flush and close both."""
         self._file.close()
         if self._board is not None:
             self._board.close()
+
+
+def _report_thread(args: threading.ExceptHookArgs) -> None:
+    """Report what ended a thread, but for the ``OSError`` of TensorBoard's: its caller is told anyway."""
+    if not issubclass(args.exc_type, OSError):
+        threading.__excepthook__(args)
 
 
 def read_progress(path: Path) -> list[dict[str, Any]]:

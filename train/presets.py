@@ -32,7 +32,8 @@ class TeacherCfg:
     """Train the teacher: PPO on the simulator's state."""
 
     preset: PresetName = "paper"
-    """Settings to start from; every other flag overrides one of them."""
+    """Settings to start from; every other flag overrides one of them. By default what learns on this
+    machine."""
     resume: str | None = None
     """Go on from a checkpoint of --run-dir: latest (a bare --resume), best, a file, or auto: the latest, and
     a new run where there is none."""
@@ -53,7 +54,8 @@ class TeacherCfg:
     vd-eval --second-view chooses from: more is learned there of what is stuck. For policies that see their
     goals in views (--env.observation.view goal or mirrored)."""
     smoke: bool = False
-    """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute."""
+    """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute. It learns nothing,
+    and keeps nothing unless --run-dir is given."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     ppo: PpoCfg = field(default_factory=PpoCfg)
     policy: PolicyCfg = field(default_factory=PolicyCfg)
@@ -247,15 +249,26 @@ PRESETS: dict[str, Callable[[], TeacherCfg]] = {
 """Presets by name."""
 
 
+SMOKE_RUN = Path("runs/smoke")
+"""Where no other folder is named, nothing is left of a smoke test."""
+
+
+def for_hand(cfg: TeacherCfg, hand: str | None) -> TeacherCfg:
+    """``cfg``, seen as ``hand`` can see it: a preset knows of its own hand that it is its mirror image."""
+    if hand in (None, cfg.env.hand) or cfg.env.observation.view != "mirrored":
+        return cfg
+    return replace(cfg, env=replace(cfg.env, observation=replace(cfg.env.observation, view="goal")))
+
+
 def smoke() -> TeacherCfg:
-    """The cpu-demo preset shrunk to run through everything in at most a minute."""
+    """The cpu-demo preset shrunk to run through everything in at most a minute. It learns nothing."""
     cfg = cpu_demo()
     return replace(
         cfg,
         smoke=True,
         run=replace(
             cfg.run,
-            run_dir=Path("runs/smoke"),
+            run_dir=SMOKE_RUN,
             max_steps=2048,
             max_minutes=1.0,
             save_every=1,

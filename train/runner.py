@@ -67,6 +67,7 @@ class TeacherRunner(OnPolicyRunner):
         critic_warmup: Iterations left in which the critic learns alone (``PpoCfg.critic_warmup_iterations``).
         begun: Whether this run began from another one's networks, in this process.
         unlike: What observations and actions mean otherwise than to the policy that the run began from.
+        damaged: Newer checkpoints than the one that was loaded, and what is wrong with them.
     """
 
     alg: TeacherPPO
@@ -104,6 +105,7 @@ class TeacherRunner(OnPolicyRunner):
         self.critic_warmup = ppo.critic_warmup_iterations or 0
         self.begun = False
         self.unlike: list[str] = []
+        self.damaged: dict[Path, str] = {}
 
     def _new_window(self) -> GoalWindow:
         ends = bool(self.task.get("success_ends_episode", False))
@@ -412,7 +414,9 @@ class TeacherRunner(OnPolicyRunner):
             save_checkpoint(path.with_name(BEST_NAME), state)
         if better or not (self.run.run_dir / POLICY_NAME).exists():
             save_checkpoint(self.run.run_dir / POLICY_NAME, policy_export(state))
-        prune_checkpoints(self.run.run_dir, self.run.keep_last, self.run.keep_every)
+        prune_checkpoints(
+            self.run.run_dir, self.current_learning_iteration, self.run.keep_last, self.run.keep_every
+        )
 
     def _check_rollout(self, latest: TensorDict) -> None:
         """Stop before an update on values that are not finite. One wait for the device an iteration."""

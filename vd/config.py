@@ -40,9 +40,12 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
         values: Field values by name.
         where: Dotted path of ``values``, for error messages.
 
+    A class that lost a field says so in ``RETIRED``: by name the value that means what is now always so.
+
     Raises:
         ValueError: A field that ``cls`` does not have, or a value of the wrong type, named by its path.
     """
+    values = _without_retired(values, getattr(cls, "RETIRED", {}), where or cls.__name__)
     hints = typing.get_type_hints(cls)
     names = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
     unknown = sorted(set(values) - names)
@@ -52,6 +55,17 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
         )
     prefix = f"{where}." if where else ""
     return cls(**{name: _convert(hints[name], item, prefix + name) for name, item in values.items()})
+
+
+def _without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """``values`` without fields that are no more."""
+    for name in retired.keys() & values.keys():
+        if values[name] != retired[name]:
+            raise ValueError(
+                f"{where}.{name} is {values[name]!r}, and this version has only {retired[name]!r}; take the "
+                "version that wrote it"
+            )
+    return {name: value for name, value in values.items() if name not in retired}
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:

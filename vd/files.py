@@ -1,5 +1,6 @@
-"""Atomic writing: a reader sees the old file or the whole new one, never a part."""
+"""Writing files: a reader sees the old file or the whole new one; what cannot be written is said."""
 
+import errno
 import json
 import os
 import tempfile
@@ -8,25 +9,130 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+ELSEWHERE = "choose another folder"
+_NO_SPACE = {
+    errno.ENOSPC: ("its disk is full", f"free some space, or {ELSEWHERE}"),
+    errno.EDQUOT: ("your quota of its disk is used up", f"free some space, or {ELSEWHERE}"),
+    errno.EFBIG: (
+        "the file would be larger than is allowed here",
+        f"raise the limit (ulimit -f), or {ELSEWHERE}",
+    ),
+    errno.EIO: ("its disk fails", ELSEWHERE),
+}
+"""What can go wrong while a file grows, and the remedy."""
+_REASONS = _NO_SPACE | {
+    errno.EROFS: ("it is on a disk that is read-only", ELSEWHERE),
+    errno.EACCES: ("you may not write there", f"{ELSEWHERE}, or change its permissions"),
+    errno.EPERM: ("you may not write there", f"{ELSEWHERE}, or change its permissions"),
+    errno.EISDIR: ("it is a folder", "name a file"),
+    errno.EEXIST: ("it is a file", ELSEWHERE),
+    errno.ENAMETOOLONG: ("its name is too long", "choose a shorter one"),
+}
+PROBE_BYTES = 1 << 20
+"""What is written to ask whether a disk still takes something. Writers give up within a block of the end."""
+
+
+class OutputError(OSError):
+    """Something cannot be written; the message says what, why, and the remedy."""
+
+
+def output_error(path: Path, error: OSError) -> OutputError:
+    """``error``, met while ``path`` was to be written, in words."""
+    path = Path(path)
+    there = _nearest(path)
+    if there != path and not there.is_dir():
+        reason, remedy = f"{there} is a file", ELSEWHERE
+    else:
+        unknown = (error.strerror or str(error) or type(error).__name__, ELSEWHERE)
+        reason, remedy = _REASONS.get(error.errno or 0, unknown)
+    result = OutputError(f"cannot write {path}: {reason}; {remedy}")
+    result.errno = error.errno
+    return result
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turn an ``OSError`` of the block into an :class:`OutputError` that names ``path``."""
+    try:
+        yield
+    except OSError as error:
+        raise output_error(path, error) from error
+
+
+def make_folder(folder: Path) -> Path:
+    """``folder``, made if it is not there.
+
+    Raises:
+        OutputError: It cannot be made.
+    """
+    with writing(folder):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    return Path(folder)
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that can be neither written to nor made; nothing is written.
+
+    Raises:
+        OutputError: It names the folder and the remedy.
+    """
+    folder = Path(folder)
+    there = _nearest(folder)
+    code = 0
+    if not there.is_dir():
+        code = errno.EEXIST
+    elif not os.access(there, os.W_OK | os.X_OK, effective_ids=True):
+        code = errno.EROFS if os.statvfs(there).f_flag & os.ST_RDONLY else errno.EACCES
+    if code:
+        raise output_error(folder, OSError(code, os.strerror(code)))
+
+
+def check_file(path: Path) -> None:
+    """Refuse a file that cannot be written to, as :func:`check_folder` does.
+
+    Raises:
+        OutputError: It names the file and the remedy.
+    """
+    if Path(path).is_dir():
+        raise output_error(path, IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR)))
+    try:
+        check_folder(Path(path).parent)
+    except OutputError as error:
+        raise output_error(path, error) from error
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; move it over ``path`` if the block succeeds.
 
     The temporary name keeps the suffix, since writers such as matplotlib choose a format by it.
+
+    Raises:
+        OutputError: The folder cannot be made or written to, or its disk took no more.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    # mkstemp makes files for the owner's eyes only; give them the permissions of any new file.
-    umask = os.umask(0)
-    os.umask(umask)
-    temporary.chmod(0o666 & ~umask)
+    make_folder(path.parent)
+    with writing(path):
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.parent)
+        os.close(handle)
+        temporary = Path(name)
+        # mkstemp makes files for the owner's eyes only; give them the permissions of any new file.
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
     try:
-        yield temporary
-        temporary.replace(path)
+        try:
+            yield temporary
+        except Exception as error:
+            # Writers in other languages lose the reason, so the disk is asked.
+            if isinstance(error, OSError) and error.errno in _NO_SPACE:
+                raise output_error(path, error) from error
+            refusal = _refusal(temporary)
+            if refusal is not None:
+                raise output_error(path, refusal) from error
+            raise
+        with writing(path):
+            temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -40,3 +146,21 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any, default: Callable[[Any], Any] | None = None) -> None:
     """Write ``value`` as indented JSON to ``path`` atomically. NaN and infinity are refused."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False, default=default) + "\n")
+
+
+def _nearest(path: Path) -> Path:
+    """``path``, or the nearest of its parents that is there."""
+    return next(place for place in (path, *path.parents) if os.path.lexists(place))
+
+
+def _refusal(file: Path) -> OSError | None:
+    """Why ``file`` cannot grow any more; ``None`` if it can."""
+    try:
+        with file.open("ab", buffering=0) as grown:
+            left = PROBE_BYTES
+            while left:
+                left -= grown.write(bytes(left)) or 0
+            os.fsync(grown.fileno())
+    except OSError as error:
+        return error
+    return None

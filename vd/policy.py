@@ -3,6 +3,7 @@
 Reading a policy needs torch only, no simulator and no rsl-rl, and executes nothing in the file.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,10 @@ POLICY_FORMAT = "visual-dexterity policy 1"
 _ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh, "gelu": nn.GELU}
 _STAGE = ("difficulty", "tightness", "tightening")
 """What says how far the curriculum has come, in the state of an environment."""
+_WEIGHTS = "_state_dict"
+"""How the names of what holds weights end."""
+_POINTER = b"version https://git-lfs"
+"""How a file begins that git has put in the place of a large one."""
 _NORMALISER_EPSILON = 1e-2
 """Added to the running std by the normaliser that trained the actor (rsl-rl's EmpiricalNormalization)."""
 
@@ -200,6 +205,56 @@ class RandomPolicy:
         return torch.rand(shape, generator=self._generator, device=observation.device) * 2.0 - 1.0
 
 
+def read_state(path: str | Path, device: str = "cpu", *, remedy: str) -> dict[str, Any]:
+    """What torch saved in a file, its weights whole. Nothing in it is executed.
+
+    Args:
+        path: The file.
+        device: Torch device of its tensors.
+        remedy: What to do about a damaged file, for the message.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It cannot be read, or has weights that are not finite.
+    """
+    path = Path(path)
+    try:
+        state = torch.load(path, map_location=device, weights_only=True)
+    except FileNotFoundError:
+        raise
+    except Exception as error:
+        raise ValueError(f"{path} {_damage(path, error)}; {remedy}") from error
+    if not isinstance(state, dict):
+        raise ValueError(f"{path} is no file that vd-train wrote; {remedy}")
+    for part, weights in state.items():
+        if str(part).endswith(_WEIGHTS) and not all(_tensors_finite(weights)):
+            raise ValueError(f"{path} is damaged: {part} has weights that are not finite; {remedy}")
+    return state
+
+
+def _damage(path: Path, error: Exception) -> str:
+    """What is wrong with a file that torch cannot read."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(_POINTER))
+    except OSError as reason:
+        return f"cannot be read ({reason.strerror})"
+    if not head:
+        return "is damaged: it is empty"
+    if head == _POINTER:
+        return "is a pointer of Git LFS, not the file itself ('git lfs pull' fetches that)"
+    return f"is damaged, or is no file of torch ({(str(error) or type(error).__name__).splitlines()[0]})"
+
+
+def _tensors_finite(value: Any) -> Iterator[bool]:
+    """Whether each tensor in nested dictionaries and lists is finite."""
+    if isinstance(value, torch.Tensor):
+        yield bool(torch.isfinite(value).all()) if value.is_floating_point() else True
+    elif isinstance(value, (dict, list, tuple)):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _tensors_finite(item)
+
+
 def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
     """Rebuild the actor from a checkpoint of ``vd-train`` or from an exported ``policy.pt``.
 
@@ -216,14 +271,8 @@ def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
         raise FileNotFoundError(
             f"no policy at {path}; give a policy.pt or a file of a run's checkpoints folder"
         )
-    try:
-        state = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(
-            f"{path} is damaged or no policy ({reason}); export it again with vd-train export"
-        ) from error
-    if not isinstance(state, dict) or not {"policy", "actor_state_dict", "task"} <= state.keys():
+    state = read_state(path, device, remedy="copy it again, or give another file of its run")
+    if not {"policy", "actor_state_dict", "task"} <= state.keys():
         raise ValueError(f"{path} holds no policy; give a file that vd-train wrote")
     try:
         spec = from_dict(PolicySpec, state["policy"], where="policy")

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from vd.assets_usd.objects.decompose import DecomposeSettings
 from vd.assets_usd.objects.importer import ImportResult, ImportSettings, Job, import_mesh
 from vd.assets_usd.objects.meshes import MeshError
+from vd.files import OutputError
 
 
 def main() -> None:
@@ -17,7 +18,7 @@ def main() -> None:
     job = Job(**request["job"])
     try:
         result = import_mesh(job, settings)
-    except MeshError as error:
+    except (MeshError, OutputError) as error:
         result = ImportResult(job.source, job.name, "refused", str(error))
     print(json.dumps(asdict(result)))
 

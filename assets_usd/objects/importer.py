@@ -31,7 +31,7 @@ from vd.assets_usd.objects.meshes import (
     solid_of,
 )
 from vd.assets_usd.objects.model import SURFACE_POINTS, build_model, read_hash, read_object, write_object
-from vd.files import atomic_path
+from vd.files import atomic_path, make_folder
 
 IMPORT_VERSION = 4
 """Part of every content hash: raise it when the import computes something else."""
@@ -379,7 +379,7 @@ def import_meshes(
     """
     settings = settings or ImportSettings()
     out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
+    make_folder(out)
     plan = plan_jobs(find_meshes([Path(p) for p in paths]), out, settings)
     cores = os.cpu_count() or 1
     workers = min(jobs or cores, len(plan))

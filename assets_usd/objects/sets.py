@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from vd.assets_usd.objects.model import ObjectError, ObjectModel, object_files, read_hash, write_object
+from vd.files import make_folder, writing
 
 HELD_OUT_COUNT = 30
 """Objects of ``procedural-heldout``: a dozen worlds each in an evaluation of a few hundred."""
@@ -105,11 +106,13 @@ def set_folder(name: str) -> Path:
         shutil.rmtree(folder)  # of an older version of our families
     if make is None:
         raise _no_such_set(name)
-    root.mkdir(parents=True, exist_ok=True)
+    make_folder(root)
     # Several ranks may ask at once: each writes aside, and the first to finish moves it into place.
-    aside = Path(tempfile.mkdtemp(prefix=f".{name}.", dir=root))
+    with writing(folder):
+        aside = Path(tempfile.mkdtemp(prefix=f".{name}.", dir=root))
     try:
-        write_set(aside, make())
+        with writing(folder):
+            write_set(aside, make())
         aside.chmod(0o755)
         try:
             aside.replace(folder)

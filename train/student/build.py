@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from vd.aim import AimCfg
 from vd.config import to_dict
 from vd.envs.cfg import ReorientCfg
-from vd.files import write_json
+from vd.files import check_folder, write_json
 from vd.paper import PAPER
 from vd.train.student.config import (
     PRETRAINING,
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from vd.train.student.runner import Learner, StudentRunner
 
 CONFIG_NAME = "config.json"
-"""The resolved configuration, in the run's folder, written before training."""
+"""The resolved configuration, in the run's folder, written before the first iteration."""
 
 
 def default_init(stage: int, run_dir: Path) -> Path | None:
@@ -79,19 +79,14 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         FileNotFoundError: There is no such teacher, student or checkpoint.
         ValueError: The settings do not fit each other, or the student to begin from.
     """
-    from vd.train.checkpoint import find_checkpoint, list_checkpoints
-    from vd.train.cli import AUTO, resolve_device
+    from vd.train.checkpoint import damaged_after, find_checkpoint, set_aside
+    from vd.train.flags import resolve_device
 
     validate(cfg)
     rank, folder = int(os.environ.get("RANK", "0")), cfg.run.run_dir
+    check_folder(folder)
     cfg = replace(cfg, run=replace(cfg.run, device=resolve_device(cfg.run.device)))
-    present = list_checkpoints(folder)
-    resume = cfg.resume if cfg.resume != AUTO else "latest" if present else None
-    checkpoint = find_checkpoint(folder, resume) if resume else None
-    if checkpoint is None and present:
-        raise FileExistsError(
-            f"{folder} holds a run; add --resume to go on with it, or choose another --run-dir"
-        )
+    checkpoint = find_checkpoint(folder, cfg.resume, "student")
     if cfg.teacher is None:
         raise ValueError(
             "--teacher is missing; give the policy to imitate: a policy.pt, a run's folder, or a name"
@@ -124,11 +119,6 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     if cfg.network.state.views:
         # The teacher's views are the student's to choose.
         task = replace(task, observation=replace(task.observation, view="world"))
-    if rank == 0:
-        # Before anything is built: a run that fails at once still says what it was.
-        saved = to_dict(replace(cfg, resume=None))
-        saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
-        write_json(folder / CONFIG_NAME, saved)
     one_thread_without_gpu(device)
     # The network is the same in all processes, what they draw is not.
     torch.manual_seed(cfg.task.seed)
@@ -167,6 +157,13 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     )
     if checkpoint is not None:
         runner.load(checkpoint)
+    if rank == 0:
+        # After all that can refuse: settings that a run cannot have must not take the place of its own.
+        saved = to_dict(replace(cfg, resume=None))
+        saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
+        write_json(folder / CONFIG_NAME, saved)
+        runner.damaged = damaged_after(folder, checkpoint, "student")
+        set_aside(runner.damaged)
     return runner
 
 

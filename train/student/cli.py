@@ -10,6 +10,7 @@ from typing import Annotated, Literal, cast
 import tyro
 
 from vd.config import from_dict
+from vd.files import check_file
 from vd.paper import PAPER
 from vd.train.student.build import CONFIG_NAME, build_student, default_init
 from vd.train.student.config import PRESETS, PRETRAINING, Stage, StudentTrainCfg
@@ -20,6 +21,10 @@ Stage 0 pre-trains the encoder on random scenes, stage 1 imitates on complete sy
 those of a depth camera. Flags start from --preset and --stage, or with --resume from the run's config.json;
 the network from --init. Short forms: --objects, --num-worlds and --seed stand for --task.objects and so on.
 Ctrl-C saves."""
+
+PROFILE_HELP = """Where the time of a student's training goes: two iterations, of which nothing is kept.
+
+Flags are those of vd-train student."""
 
 SHORT_FORMS = ("objects", "num-worlds", "seed")
 """Fields of the task that are flags without the ``--task.`` prefix too."""
@@ -71,7 +76,9 @@ class FollowCfg:
     """File to write."""
 
 
-def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
+def parse_student(
+    arguments: Sequence[str], *, prog: str = "vd-train student", description: str = HELP
+) -> StudentTrainCfg:
     """The configuration that command-line flags ask for.
 
     The first pass finds where to start from (``--preset`` and ``--stage``, the run's own configuration with
@@ -81,7 +88,7 @@ def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
         FileNotFoundError: ``--resume`` or ``--init`` name what is not there.
         ValueError: What they name is not of this version.
     """
-    from vd.train.cli import normalise, value_of
+    from vd.train.flags import normalise, value_of
 
     arguments = normalise(arguments, SHORT_FORMS, "task")
     preset, stage = value_of(arguments, "--preset") or "gpu", value_of(arguments, "--stage") or "1"
@@ -92,7 +99,7 @@ def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
         base = _saved_config(arguments, base)
     elif "--help" not in arguments and "-h" not in arguments:
         base = _with_init(arguments, base)
-    return tyro.cli(StudentTrainCfg, args=arguments, default=base, prog="vd-train student", description=HELP)
+    return tyro.cli(StudentTrainCfg, args=arguments, default=base, prog=prog, description=description)
 
 
 def student_command(arguments: list[str], started: float) -> int:
@@ -102,7 +109,7 @@ def student_command(arguments: list[str], started: float) -> int:
     from vd.evaluate.agents import check_names
 
     check_names([] if cfg.teacher is None else [cfg.teacher], cfg.task.objects)
-    from vd.train.cli import INTERRUPTED
+    from vd.train.cli import INTERRUPTED, print_damaged
     from vd.train.ending import finished
     from vd.train.progress import waiting
 
@@ -110,6 +117,8 @@ def student_command(arguments: list[str], started: float) -> int:
     with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):
         runner = build_student(cfg, started=started)
     folder = cfg.run.run_dir
+    if main_process:
+        print_damaged(runner.damaged)
     if main_process and runner.iteration:
         print(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
         if runner.new_episodes:
@@ -132,7 +141,11 @@ def profile_command(arguments: list[str], _started: float) -> int:
     from tempfile import TemporaryDirectory
 
     with TemporaryDirectory() as folder:
-        cfg = parse_student(["--from-scratch", *arguments, "--run-dir", folder])
+        cfg = parse_student(
+            ["--from-scratch", *arguments, "--run-dir", folder],
+            prog="vd-train profile",
+            description=PROFILE_HELP,
+        )
 
         from vd.train.progress import waiting
         from vd.train.student.dagger import Dagger
@@ -156,9 +169,10 @@ def profile_command(arguments: list[str], _started: float) -> int:
 def calibrate_command(arguments: list[str], _started: float) -> int:
     """``vd-train calibrate``; the exit status."""
     cfg = tyro.cli(CalibrateCfg, args=arguments, prog="vd-train calibrate")
+    check_file(cfg.student)
 
     from vd.config import to_dict
-    from vd.train.cli import resolve_device
+    from vd.train.flags import resolve_device
     from vd.train.progress import waiting
     from vd.train.student.calibrate import calibrate_student
 
@@ -195,6 +209,7 @@ def calibrate_command(arguments: list[str], _started: float) -> int:
 def follow_command(arguments: list[str], _started: float) -> int:
     """``vd-train follow``; the exit status."""
     cfg = tyro.cli(FollowCfg, args=arguments, prog="vd-train follow")
+    check_file(cfg.output)
 
     from vd.train.student.follow import follow_teacher
 
@@ -212,7 +227,7 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
 
     A pre-trained one has an encoder to give, whatever else it needed to be trained.
     """
-    from vd.train.cli import value_of
+    from vd.train.flags import value_of
 
     given, run_dir = value_of(arguments, "--init"), value_of(arguments, "--run-dir")
     if given is None and "--from-scratch" in arguments:
@@ -236,12 +251,12 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
 
 def _saved_config(arguments: list[str], start: StudentTrainCfg) -> StudentTrainCfg:
     """Configuration of the run that ``--resume`` goes on with; ``start`` is that of a new one."""
-    from vd.train.cli import AUTO, value_of
+    from vd.train.flags import value_of
 
     run_dir = Path(value_of(arguments, "--run-dir") or start.run.run_dir)
     path = run_dir / CONFIG_NAME
     if not path.is_file():
-        if value_of(arguments, "--resume") == AUTO:
+        if value_of(arguments, "--resume") == "auto":
             return _with_init(arguments, start)
         raise FileNotFoundError(f"--resume: no {path}; give the --run-dir of the run to go on with")
     try:

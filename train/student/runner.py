@@ -87,6 +87,7 @@ class StudentRunner:
         iteration: Iterations completed, over all resumed runs.
         env_steps: Control steps (clouds in stage 0) completed, over all worlds and processes.
         new_episodes: Why the checkpoint could not restore the worlds; empty if it did.
+        damaged: Newer checkpoints than the one that was loaded, and what is wrong with them.
     """
 
     def __init__(
@@ -106,6 +107,7 @@ class StudentRunner:
         self.processes = processes or Processes(0, 0, 1)
         self.iteration, self.env_steps, self.elapsed_s = 0, 0, 0.0
         self.new_episodes = ""
+        self.damaged: dict[Path, str] = {}
         self._end = EndRequest(deadline, device=device, distributed=self.is_distributed)
 
     @property
@@ -182,7 +184,7 @@ class StudentRunner:
         folder = self.run.run_dir
         save_checkpoint(checkpoint_path(folder, self.iteration), state)
         save_checkpoint(folder / STUDENT_NAME, student_export(state))
-        prune_checkpoints(folder, self.run.keep_last, self.run.keep_every)
+        prune_checkpoints(folder, self.iteration, self.run.keep_last, self.run.keep_every)
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint: exactly, with its processes and worlds; else with new episodes.

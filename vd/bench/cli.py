@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
 
 
@@ -325,7 +326,7 @@ class GapCommand:
         from vd.bench.gap import battery, collect, parse_shard, run_battery, take_over
         from vd.bench.gap_rows import write_rows
         from vd.bench.gap_score import markdown, summary
-        from vd.files import write_json, write_text
+        from vd.files import make_folder, write_json, write_text
 
         cases = battery(
             self.model,
@@ -339,7 +340,7 @@ class GapCommand:
             pair_size=self.pair_size,
         )
         if self.merge:
-            self.out.mkdir(parents=True, exist_ok=True)
+            make_folder(self.out)
             print(f"{take_over(self.merge, self.out)} results taken over")
         if not self.collect:
             device = choose_device(self.device)
@@ -388,6 +389,10 @@ def main() -> None:
     """Entry point of ``vd-bench``."""
     command = tyro.cli(Command, prog="vd-bench", description=__doc__)
     try:
+        if isinstance(command, GapCommand):
+            check_folder(command.out)
+        elif not isinstance(command, ReplayCommand) and command.json is not None:
+            check_file(command.json)
         sys.exit(command.run())
     except (ValueError, OSError) as error:
         sys.exit(f"vd-bench: {error}")

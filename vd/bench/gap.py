@@ -23,7 +23,7 @@ import numpy as np
 from vd.bench.gap_beside import beside
 from vd.bench.gap_rows import merged
 from vd.bench.gap_score import KINDS, Case, said, score
-from vd.files import write_json
+from vd.files import make_folder, write_json
 from vd.gap.hidden_plant import OUTSIDE
 from vd.gap.hide import simulate_hidden, write_hidden
 from vd.gap.recording import BARE_MODELS
@@ -174,7 +174,7 @@ def run_battery(
     Returns:
         The results of the shard's cases, in order.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     mine = list(cases[shard[0] :: shard[1]])[:: -1 if backwards else 1]
     done = {case: read_result(folder / f"{case.name}.json") for case in mine}
     failed = [case for case in mine if "error" in (done[case] or {})]

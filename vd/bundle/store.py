@@ -31,7 +31,7 @@ from vd.bundle.golden import (
 )
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
-from vd.files import write_json
+from vd.files import atomic_path, make_folder, write_json, writing
 from vd.policy import PolicySpec, TrainedPolicy
 from vd.sensors.cfg import DepthCameraCfg
 from vd.versions import installed_versions
@@ -237,26 +237,34 @@ def _provenance(
 
 def _write(folder: Path, contract: Contract, weights: dict[str, Any], golden: Golden) -> None:
     """Write the files beside the place of the bundle, then put them there at once."""
-    from safetensors.torch import save_file
-
     folder = Path(folder)
     if folder.exists() and not is_bundle(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} exists and is no bundle; choose another name")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    make_folder(folder.parent)
+    with writing(folder):
+        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
-        temporary.chmod(FOLDER_MODE)
-        for name, tensors in ((WEIGHTS_FILE, weights), (GOLDEN_FILE, golden)):
-            plain = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
-            save_file(plain, temporary / name)
-            (temporary / name).chmod(FILE_MODE)  # the library writes for the owner's eyes only
-        digests = {name: _digest(temporary / name) for name in (WEIGHTS_FILE, GOLDEN_FILE)}
-        write_json(temporary / CONTRACT_FILE, to_dict(replace(contract, files=digests)))
-        if folder.exists():
-            shutil.rmtree(folder)
-        temporary.replace(folder)
+        with writing(folder):
+            _write_into(temporary, contract, weights, golden)
+            if folder.exists():
+                shutil.rmtree(folder)
+            temporary.replace(folder)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _write_into(folder: Path, contract: Contract, weights: dict[str, Any], golden: Golden) -> None:
+    """Write the files of a bundle into an empty folder."""
+    from safetensors.torch import save_file
+
+    folder.chmod(FOLDER_MODE)
+    for name, tensors in ((WEIGHTS_FILE, weights), (GOLDEN_FILE, golden)):
+        plain = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
+        with atomic_path(folder / name) as file:
+            save_file(plain, file)
+        (folder / name).chmod(FILE_MODE)  # the library writes for the owner's eyes only
+    digests = {name: _digest(folder / name) for name in (WEIGHTS_FILE, GOLDEN_FILE)}
+    write_json(folder / CONTRACT_FILE, to_dict(replace(contract, files=digests)))
 
 
 def _tensors(path: Path, contract: Contract, device: str) -> dict[str, torch.Tensor]:

@@ -26,8 +26,7 @@ def must_lift(cfg: ReorientCfg) -> np.ndarray:
 
     Worlds are chosen in the order of :func:`table_steps`: of two shares the smaller is a part of the larger.
     """
-    n = cfg.num_worlds
-    share = 1.0 if cfg.success.no_table_contact else cfg.table.lift_share
+    n, share = cfg.num_worlds, cfg.table.lift_share
     return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
 
 

@@ -21,6 +21,7 @@ from vd.evaluate.agents import (
     start_at_rest,
 )
 from vd.evaluate.compare import parse_groups
+from vd.files import check_folder
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
 
@@ -209,6 +210,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cfg.validate()
         names = cfg.agent_names
         check_names(names, chain(*parse_groups(cfg.object_sets).values()), cfg.hand)
+        check_folder(cfg.output)
         print(f"vd-eval: {', '.join(names)}; loading", file=sys.stderr, flush=True)
         if cfg.second_view:
             check_second_view(names)
@@ -218,7 +220,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if len(names) > 1 or traced or "=" in "".join(cfg.objects) or sees_clouds(names[0]):
             return _compare(cfg)
         return _evaluate(cfg)
-    except (ValueError, FileNotFoundError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         print(f"vd-eval: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -38,7 +38,7 @@ from vd.evaluate.suite import (
     Group,
 )
 from vd.evaluate.suite_page import write_suite
-from vd.files import write_json
+from vd.files import make_folder, write_json
 from vd.paper import PAPER
 from vd.workers import run_tasks
 
@@ -235,7 +235,7 @@ def _measure(task: _Task) -> str:
 
 def _measure_apart(task: _Task) -> str:
     """The same in a process of its own, whose progress goes to a file: several would mix."""
-    task.cfg.output.mkdir(parents=True, exist_ok=True)
+    make_folder(task.cfg.output)
     with (task.cfg.output / LOG_FILE).open("w") as log, redirect_stdout(log), redirect_stderr(log):
         try:
             return _measure(task)

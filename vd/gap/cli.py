@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -292,6 +293,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from vd.gap.recording import RecordingError
 
     try:
+        (check_file if isinstance(command, Identify) else check_folder)(command.out)
         return command.run()
     except RecordingError as error:
         print(f"vd-gap: this recording cannot be used: {error}", file=sys.stderr)

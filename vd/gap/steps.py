@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vd.config import from_dict, to_dict
-from vd.files import write_json
+from vd.files import make_folder, write_json
 from vd.gap.answers import FOLDER
 from vd.gap.recording import BARE_MODELS, Recording, read_recording
 from vd.gap.result import LAYER, Closing, Predictions, Report
@@ -182,7 +182,7 @@ class Analysis:
             file.unlink(missing_ok=True)
         if fresh:
             shutil.rmtree(self.out / FOLDER, ignore_errors=True)
-        self.out.mkdir(parents=True, exist_ok=True)
+        make_folder(self.out)
         record["settings"] = to_dict(self.settings)
         write_json(self.out / RUN, record)
         print(f"{name}: {_DOES[name]}", file=sys.stderr)

@@ -15,6 +15,7 @@ import tyro
 
 from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, check_names, episode_limit_s, start_at_rest
 from vd.evaluate.cli import POLICY_HELP
+from vd.files import check_file
 from vd.hand_log import is_log
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
@@ -126,6 +127,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cfg = tyro.cli(PlayCfg, args=arguments, prog="vd-play")
     try:
         cfg.validate()
+        if cfg.video is not None:
+            check_file(cfg.video)
         if is_log(cfg.agent_name):
             quiet_warp()
             return replay(cfg)
@@ -140,7 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{cfg.video} ({frames} frames)")
         else:
             serve(cfg)
-    except (ValueError, FileNotFoundError, RuntimeError) as error:
+    except (ValueError, OSError, RuntimeError) as error:
         print(f"vd-play: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -322,6 +322,9 @@ def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
         count += 1
     if writer is not None:
         writer.close()
+        written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))  # the writer does not say if it failed
+        if written != count:
+            raise RuntimeError(f"{path}: {written} of {count} frames were written")
     return count
 
 

@@ -8,6 +8,7 @@ import torch
 
 from vd.config import from_dict
 from vd.paper import PAPER
+from vd.policy import read_state
 from vd.student.cfg import StudentCfg
 from vd.student.network import Student
 from vd.student.packed import pack, unpack
@@ -108,12 +109,8 @@ def read_student(path: Path, device: str = "cpu", *, as_stored: bool = False) ->
         raise FileNotFoundError(
             f"no student at {path}; give a student.pt or a checkpoint of vd-train student"
         )
-    try:
-        state = torch.load(path, map_location=device, weights_only=True)
-    except Exception as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"{path} is damaged or no student ({reason}); copy it again") from error
-    if not isinstance(state, dict) or not {"spec", "student_state_dict", "task", "depth"} <= state.keys():
+    state = read_state(path, device, remedy="copy it again, or give another file of its run")
+    if not {"spec", "student_state_dict", "task", "depth"} <= state.keys():
         raise ValueError(f"{path} holds no student; give a file that vd-train student wrote")
     return state if as_stored else state | {"student_state_dict": unpack(state["student_state_dict"])}
 

@@ -1,0 +1,154 @@
+"""What cannot be written: a plain message with path and remedy, and nothing left half-written."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from full_disk import small_files, somebody_else
+
+from vd.files import OutputError, atomic_path, check_file, check_folder, make_folder, write_text
+
+LIMIT = 1 << 16
+
+
+def noise(*shape: int) -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, shape, dtype=np.uint8)
+
+
+def _text(path: Path) -> None:
+    write_text(path, "x" * 2 * LIMIT)
+
+
+def _checkpoint(path: Path) -> None:
+    import torch
+
+    from vd.train.checkpoint import save_checkpoint
+
+    save_checkpoint(path, {"weights": torch.zeros(LIMIT)})
+
+
+def _arrays(path: Path) -> None:
+    with atomic_path(path) as temporary:
+        np.savez(temporary, values=noise(2 * LIMIT))
+
+
+def _picture(path: Path) -> None:
+    from vd.play.video import write_frames
+
+    write_frames(path, list(noise(8, 200, 200, 3)), 12.0)
+
+
+def _object(path: Path) -> None:
+    from dataclasses import replace
+
+    from vd.assets_usd.objects.model import write_object
+    from vd.assets_usd.objects.procedural import cube
+
+    write_object(path, replace(cube(), notes=("x" * 2 * LIMIT,)))
+
+
+WRITERS = {
+    "page.html": _text,
+    "model.pt": _checkpoint,
+    "cache.npz": _arrays,
+    "film.gif": _picture,
+    "film.mp4": _picture,
+    "cube.usda": _object,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_file_that_cannot_grow_is_named_and_the_old_one_stays(tmp_path, name):
+    """Whatever writes it, and however that reports it."""
+    path = tmp_path / name
+    path.write_bytes(b"old")
+    with (
+        small_files(LIMIT),
+        pytest.raises(OutputError, match=rf"cannot write .*{name}: the file would be"),
+    ):
+        WRITERS[name](path)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_an_error_of_the_writer_itself_stays_what_it_is(tmp_path):
+    with pytest.raises(ZeroDivisionError), atomic_path(tmp_path / "a.txt") as temporary:
+        temporary.write_text(str(1 / 0))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_bundle_that_does_not_fit_is_not_there(tmp_path):
+    from vd.assets_usd.hands import load_hand
+    from vd.bundle.write import write_bundle
+
+    load_hand("dclaw4")  # authored on first use
+    with small_files(LIMIT), pytest.raises(OutputError, match=r"cannot write .*first: the file would be"):
+        write_bundle("dclaw4-cube", tmp_path / "first")
+    assert not list(tmp_path.iterdir())
+
+
+def test_folders_that_cannot_be_made_are_refused_before_anything_is_written(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OutputError, match=r"cannot write .*file/a/b: .*file is a file; choose another"):
+        check_folder(tmp_path / "file" / "a" / "b")
+    with pytest.raises(OutputError, match=r"file: it is a file; choose another folder"):
+        check_folder(tmp_path / "file")
+    with pytest.raises(OutputError, match=r"file: it is a file"):
+        make_folder(tmp_path / "file")
+    with pytest.raises(OutputError, match=r": it is a folder; name a file"):
+        check_file(tmp_path)
+    with pytest.raises(OutputError, match=r"file/a.png: .*file is a file"):
+        check_file(tmp_path / "file" / "a.png")
+    with somebody_else() as folder:
+        with pytest.raises(OutputError, match=r"run/a: you may not write there; choose another folder, or"):
+            check_folder(folder / "run" / "a")
+        with pytest.raises(OutputError, match=r"run: you may not write there"):
+            make_folder(folder / "run")
+        with pytest.raises(OutputError, match=r"a\.txt: you may not write there"):
+            write_text(folder / "a.txt", "")
+    check_folder(tmp_path / "new" / "folder")
+    check_file(tmp_path / "new.txt")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def commands(taken: str) -> dict[str, list[str]]:
+    """Command lines whose output would lie below a file."""
+    return {
+        "vd-train": ["teacher", "--preset", "gpu", "--run-dir", taken],
+        "vd-train ": ["student", "--teacher", "dclaw4-cube", "--run-dir", taken],
+        "vd-train  ": ["export", "x.pt", f"{taken}/x.pt"],
+        "vd-train   ": ["average", "a", "b", "--output", f"{taken}/x.pt"],
+        "vd-train    ": ["bundle", "dclaw4-cube", f"{taken}/x"],
+        "vd-train     ": ["follow", "dclaw4-student", "dclaw4-table", f"{taken}/x.pt"],
+        "vd-eval": ["--agent", "zero", "--output", taken],
+        "vd-play": ["--agent", "zero", "--video", f"{taken}/x.mp4"],
+        "vd-gap": ["run", "recording", "--out", taken],
+        "vd-gap ": ["identify", "recording", "--out", f"{taken}/x.usda"],
+        "vd-deploy": ["record", "--twin", "--hand", "dclaw3", "--out", taken],
+        "vd-deploy ": ["--twin", "--hand", "dclaw3", "--log", taken],
+        "vd-assets": ["objects", "--procedural", "1", "--out", taken],
+        "vd-assets ": ["import", "mesh.obj", "--out", taken],
+        "vd-assets  ": ["hand", "dclaw3", "--out", taken],
+        "vd-assets   ": ["show", "cube", "--out", f"{taken}/x.png"],
+        "vd-bench": ["sim", "--json", f"{taken}/x.json"],
+    }
+
+
+@pytest.mark.parametrize("command", commands(""))
+def test_every_command_says_so_at_once(tmp_path, command, monkeypatch, capsys):
+    import importlib
+    import tomllib
+
+    scripts = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]["scripts"]
+    module, _, function = scripts[command.strip()].partition(":")
+    (tmp_path / "file").touch()
+    arguments = commands(str(tmp_path / "file" / "out"))[command]
+    monkeypatch.setattr("sys.argv", [command.strip(), *arguments])
+    try:
+        status = getattr(importlib.import_module(module), function)()
+    except SystemExit as end:  # what a script's exit status is made from: a number, or a message
+        status = end.code
+    text = capsys.readouterr().err + str(status)
+    assert status
+    assert "cannot write" in text and "file is a file; choose another folder" in text
+    assert "Traceback" not in text and not list(tmp_path.glob("file/*"))

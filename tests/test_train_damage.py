@@ -1,0 +1,151 @@
+"""Runs that meet damaged files, refused settings and full disks: nothing is lost, and it is said."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from full_disk import small_files
+from student_dummy import make_student_runner
+from train_dummy import make_runner, simulating_the_dummy
+
+from vd.files import OutputError
+from vd.policy import read_state
+from vd.train.checkpoint import checkpoint_path, damaged_after, find_checkpoint, list_checkpoints
+from vd.train.metrics import read_progress
+
+
+def iterations(folder: Path) -> list[int]:
+    return [row["iteration"] for row in read_progress(folder / "progress.jsonl")]
+
+
+DAMAGES = {
+    "empty": "is damaged: it is empty",
+    "cut short": "is damaged, or is no file of torch",
+    "not finite": "is damaged: actor_state_dict has weights that are not finite",
+    "a pointer": "is a pointer of Git LFS",
+}
+
+
+def spoil(path: Path, how: str, network: str = "actor") -> None:
+    """Damage a file."""
+    if how == "not finite":
+        state = read_state(path, remedy="")
+        next(iter(state[f"{network}_state_dict"].values())).view(-1)[0] = float("nan")
+        torch.save(state, path)
+        return
+    whole = path.read_bytes()
+    pointer = b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n"
+    path.write_bytes({"empty": b"", "cut short": whole[: len(whole) // 2], "a pointer": pointer}[how])
+
+
+@pytest.mark.parametrize("how", DAMAGES)
+def test_damaged_policies_are_refused_in_words(tmp_path, how, capsys):
+    from vd.evaluate.cli import main as evaluate
+    from vd.play.cli import main as play
+    from vd.train.cli import main as train
+
+    make_runner(tmp_path / "run").learn(1)
+    policy = tmp_path / "run" / "policy.pt"
+    spoil(policy, how)
+    new = ["--run-dir", str(tmp_path / "new")]
+    for command in (
+        lambda: evaluate([str(policy), "--output", str(tmp_path / "eval")]),
+        lambda: play([str(policy), "--video", str(tmp_path / "film.mp4")]),
+        lambda: train(["teacher", "--init", str(policy), *new]),
+        lambda: train(["teacher", "--preset", "gpu", "--init", str(policy), *new]),
+        lambda: train(["student", "--teacher", str(policy), *new]),
+        lambda: train(["student", "--teacher", "dclaw4-cube", "--init", str(policy), *new]),
+        lambda: train(["export", str(policy), str(tmp_path / "out.pt")]),
+        lambda: train(["bundle", str(policy), str(tmp_path / "bundle")]),
+    ):
+        assert command() == 1
+        error = capsys.readouterr().err
+        assert f"{policy} {DAMAGES[how]}" in error and "Traceback" not in error
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def teacher(*flags: str) -> int:
+    from vd.train.cli import main
+
+    return main(["teacher", *flags])
+
+
+def test_a_setting_that_is_refused_leaves_a_run_that_can_go_on(tmp_path, monkeypatch, capsys):
+    simulating_the_dummy(monkeypatch)
+    run = ["--run-dir", str(tmp_path)]
+    assert teacher("--smoke", *run, "--max-steps", "256") == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    for how in (["--resume"], ["--resume", "auto"]):
+        assert teacher(*run, *how, "--objects", "cuboid") == 1
+        assert "other objects" in capsys.readouterr().err
+        assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    assert teacher(*run, "--resume", "--max-steps", "512") == 0
+    assert "resumed after iteration 2 of 4" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("how", "resume"), zip(DAMAGES, 2 * [["--resume"], ["--resume", "auto"]], strict=True)
+)
+def test_a_run_goes_on_from_its_newest_sound_checkpoint(tmp_path, monkeypatch, capsys, how, resume):
+    simulating_the_dummy(monkeypatch)
+    run = ["--run-dir", str(tmp_path)]
+    assert teacher("--smoke", *run, "--max-steps", "384") == 0  # 128 an iteration, a checkpoint each
+    newest = checkpoint_path(tmp_path, 3)
+    spoil(newest, how)
+    assert teacher(*run, *resume, "--max-steps", "512") == 0
+    text = capsys.readouterr().out
+    assert f"{newest} {DAMAGES[how]}" in text and "resumed after iteration 2 of 4" in text
+    assert newest.with_name("model_0000003.pt.damaged").is_file()
+    assert iterations(tmp_path) == [1, 2, 3, 4]
+    assert [path.name for path in list_checkpoints(tmp_path)][-2:] == ["model_0000003.pt", "model_0000004.pt"]
+    for path in (tmp_path / "checkpoints").iterdir():
+        path.write_bytes(b"")
+    assert teacher(*run, *resume) == 1
+    error = capsys.readouterr().err
+    assert "no checkpoint is sound" in error and "start anew with another --run-dir" in error
+
+
+def test_checkpoints_of_a_run_that_went_on_from_an_older_one_are_kept(tmp_path):
+    make_runner(tmp_path, save_every=1, keep_last=3).learn(5)
+    resumed = make_runner(tmp_path, save_every=1, keep_last=1)
+    resumed.load(str(checkpoint_path(tmp_path, 3)))
+    (tmp_path / "checkpoints" / "model_0000009.pt").touch()
+    resumed.learn(1)
+    kept = [path.name for path in list_checkpoints(tmp_path)]
+    assert kept == ["model_0000004.pt", "model_0000005.pt", "model_0000009.pt"]
+
+
+@pytest.mark.parametrize(
+    ("limit", "tensorboard", "named"),
+    [
+        (45_000, False, r"progress\.jsonl"),
+        (45_000, True, "tensorboard"),
+        (30_000, False, r"model_0000010\.pt"),
+    ],
+)
+def test_a_full_disk_ends_a_run_in_words_and_it_can_go_on(tmp_path, capfd, limit, tensorboard, named):
+    make_runner(tmp_path).learn(1)
+    runner = make_runner(tmp_path, save_every=10, tensorboard=tensorboard)
+    runner.load(str(find_checkpoint(tmp_path, "latest")))
+    with small_files(limit), pytest.raises(OutputError, match=rf"cannot write .*{named}: the file would be"):
+        runner.learn(100)
+    assert "Traceback" not in capfd.readouterr().err
+    assert (tmp_path / "progress.jsonl").read_text().endswith("}\n")
+    assert not list((tmp_path / "checkpoints").glob(".*"))
+    resumed = make_runner(tmp_path)
+    resumed.load(str(find_checkpoint(tmp_path, "latest")))
+    resumed.learn(1)
+    assert iterations(tmp_path) == list(range(1, len(iterations(tmp_path)) + 1))
+
+
+@pytest.mark.parametrize("how", DAMAGES)
+def test_a_students_newest_sound_checkpoint_is_found(tmp_path, how):
+    runner = make_student_runner(tmp_path)
+    for runner.iteration in (1, 2, 3):
+        runner.save()
+    newest = checkpoint_path(tmp_path, 3)
+    spoil(newest, how, "student")
+    found = find_checkpoint(tmp_path, "auto", "student")
+    assert found == checkpoint_path(tmp_path, 2)
+    (reason,) = damaged_after(tmp_path, found, "student").values()
+    assert DAMAGES[how].replace("actor", "student") in reason

@@ -1,0 +1,171 @@
+"""Flags of the teacher's training, and what they start from."""
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import tyro
+
+from vd.config import from_dict
+from vd.evaluate.agents import check_names
+from vd.train.begin import settings_of
+from vd.train.focus import read_success
+from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
+
+CONFIG_NAME = "config.json"
+"""The resolved configuration, in the run's folder, written before the first iteration."""
+
+TEACHER_HELP = """Train the teacher: PPO on the simulator's state.
+
+Flags start from --preset, or with --resume from the run's config.json. Without either the machine decides:
+gpu, under torchrun multi-gpu, and cpu-demo where there is no GPU. Short forms: --hand, --hand-layer,
+--objects, --num-worlds and --seed stand for --env.hand and so on. Ctrl-C saves."""
+
+SHORT_FORMS = ("hand", "hand-layer", "objects", "num-worlds", "seed")
+"""Fields of the environment that are common enough to be flags without the ``--env.`` prefix."""
+
+
+def parse_teacher(
+    arguments: Sequence[str], *, unnamed: str | None = None, say: Callable[[str], object] | None = None
+) -> TeacherCfg:
+    """The configuration that command-line flags ask for.
+
+    The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins from, or the
+    run's own configuration with ``--resume``), the second reads every flag with those values as defaults.
+
+    Args:
+        arguments: Flags.
+        unnamed: Preset where nothing says another; None: that of the machine.
+        say: Is told which preset the machine decided.
+
+    Raises:
+        FileNotFoundError: ``--resume`` names a run without a configuration, or
+            ``--focus-on`` no file.
+        ValueError: The run's configuration is not one of this version, ``--init`` is no teacher, or
+            ``--focus-on`` no evaluation.
+    """
+    arguments = normalise(arguments, SHORT_FORMS, "env")
+    preset, init, resume = (value_of(arguments, flag) for flag in ("--preset", "--init", "--resume"))
+    saved = resume is not None and _has_config(arguments)
+    if "--smoke" in arguments:
+        start = smoke()
+    elif preset is None and init is not None:
+        start = settings_of(init, PRESETS["gpu"]())
+    elif preset is None and unnamed is None and not saved:
+        # Wrong flags and names, and --help, do not wait for torch.
+        given = _parsed(arguments, PRESETS["gpu"]()).env
+        check_names((), given.objects, given.hand)
+        preset, reason = machine_preset(value_of(arguments, "--device"))
+        start = PRESETS[preset]()
+        if say is not None:
+            say(f"preset {preset}, since none is named: {reason}")
+    else:  # the second pass refuses an unknown name
+        start = PRESETS.get(preset or unnamed or "gpu", PRESETS["gpu"])()
+    if init is None:
+        start = for_hand(start, value_of(arguments, "--env.hand"))
+    base = _saved_config(arguments, start) if resume is not None else start
+    cfg = _parsed(arguments, base)
+    if cfg.env.observation.view == "either":
+        raise ValueError("env.observation.view either is of evaluations; train with goal, which it looks at")
+    if cfg.focus_on is None:
+        return cfg
+    # What the run needs of the file is kept with it.
+    success = read_success(cfg.focus_on)
+    return replace(cfg, focus_on=None, env=replace(cfg.env, focus=replace(cfg.env.focus, success=success)))
+
+
+def resolve_device(name: str) -> str:
+    """The torch device for ``--device``: ``auto`` is this process's GPU (torchrun), the first, or the CPU.
+
+    Raises:
+        ValueError: The device does not exist here.
+    """
+    import torch
+
+    if name == "auto":
+        name = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
+    if name == "cuda":
+        name = "cuda:0"
+    if name == "cpu":
+        return name
+    index = name.removeprefix("cuda:")
+    if not name.startswith("cuda:") or not index.isdigit():
+        raise ValueError(f"--device is '{name}'; it has to be auto, cpu, or cuda:N")
+    if int(index) >= torch.cuda.device_count():
+        raise ValueError(
+            f"--device is '{name}', but torch finds {torch.cuda.device_count()} GPUs; use auto or cpu"
+        )
+    return name
+
+
+def machine_preset(device: str | None) -> tuple[str, str]:
+    """The preset that learns on this machine, and why it is that.
+
+    Args:
+        device: What ``--device`` asks for; None and ``auto``: the GPU, if torch finds one.
+    """
+    if resolve_device(device or "auto") == "cpu":
+        return "cpu-demo", (
+            "there is no GPU. It learns an easier task, turns of one object about the vertical, in minutes; "
+            "the whole task is --preset gpu"
+        )
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        return "multi-gpu", "the recipe that learns, on several GPUs; Ctrl-C or --max-minutes ends it"
+    return "gpu", "the recipe that learns, on one GPU; Ctrl-C or --max-minutes ends it"
+
+
+def normalise(arguments: Sequence[str], short_forms: Sequence[str], group: str) -> list[str]:
+    """Spell out flags of ``group`` in their short forms, ``--flag=value``, and a bare ``--resume``."""
+    result: list[str] = []
+    for argument in arguments:
+        flag, equals, value = argument.partition("=")
+        if argument.startswith("--"):
+            flag = flag.replace("_", "-")
+            if flag.removeprefix("--") in short_forms:
+                flag = f"--{group}.{flag.removeprefix('--')}"
+            result += [flag, value] if equals else [flag]
+        else:
+            result.append(argument)
+    for index, argument in enumerate(result):
+        if argument == "--resume" and (index + 1 == len(result) or result[index + 1].startswith("--")):
+            result[index + 1 : index + 1] = ["latest"]
+            break
+    return result
+
+
+def value_of(arguments: list[str], flag: str) -> str | None:
+    """Value after the last ``flag``, or ``None``."""
+    places = [index for index, argument in enumerate(arguments[:-1]) if argument == flag]
+    return arguments[places[-1] + 1] if places else None
+
+
+def _parsed(arguments: list[str], default: TeacherCfg) -> TeacherCfg:
+    """Every flag, with the values of ``default`` for those that are not given."""
+    return tyro.cli(
+        TeacherCfg, args=arguments, default=default, prog="vd-train teacher", description=TEACHER_HELP
+    )
+
+
+def _has_config(arguments: list[str]) -> bool:
+    """Whether the run's folder is named and has a configuration."""
+    folder = value_of(arguments, "--run-dir")
+    return folder is not None and (Path(folder) / CONFIG_NAME).is_file()
+
+
+def _saved_config(arguments: list[str], start: TeacherCfg) -> TeacherCfg:
+    """Configuration of the run that ``--resume`` goes on with; ``start`` is that of a new one."""
+    run_dir = Path(value_of(arguments, "--run-dir") or start.run.run_dir)
+    path = run_dir / CONFIG_NAME
+    if not path.is_file():
+        if value_of(arguments, "--resume") == "auto":
+            return start
+        raise FileNotFoundError(f"--resume: no {path}; give the --run-dir of the run to go on with")
+    try:
+        cfg = from_dict(TeacherCfg, json.loads(path.read_text()))
+    except ValueError as error:
+        raise ValueError(
+            f"{path}: {error}; it was written by another version, start anew or edit it"
+        ) from error
+    return replace(cfg, run=replace(cfg.run, run_dir=run_dir))
