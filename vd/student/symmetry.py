@@ -24,7 +24,7 @@ from vd.student.registration import POINTS, Registration
 OFF_M, OFF_SHARE = 0.003, 0.01
 """A turned shape looks the same if at most this share of its surface is farther than this from where the
 surface was [m]: a depth camera's points are off by 2 to 3 mm, and a hundredth is the edge of a lid. Of 159
-imported training meshes 71 have a symmetry then, with half of the distance 28, with twice 83."""
+imported training meshes 72 have a symmetry then, with half of the distance 28, with twice 83."""
 DENSE = 2000
 """Points of the surface that this is measured on: the share is then known to 0.4 % (two standard errors)."""
 GRID = 32
