@@ -263,7 +263,9 @@ class Recorder:
         measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
         # A goal arrives with the question for its state, unless that was asked again.
         sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
-        measured = {name: column([getattr(state, name) for state in states]) for name in STATE_CHANNELS}
+        measured: dict[str, Any] = {
+            name: column([getattr(state, name) for state in states]) for name in STATE_CHANNELS
+        }
         excitation = motion.excitation
         return Trajectory(
             file=motion.file,
