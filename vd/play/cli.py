@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from vd import interrupt
 from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, check_names, episode_limit_s, start_at_rest
 from vd.evaluate.cli import POLICY_HELP
 from vd.files import check_file
@@ -122,6 +123,7 @@ class PlayCfg:
             raise ValueError(f"--video is {self.video}; use a name that ends in .mp4, .gif or .png")
 
 
+@interrupt.command("vd-play")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-play``; returns the exit status."""
     cfg = tyro.cli(PlayCfg, args=arguments, prog="vd-play")
@@ -146,8 +148,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, RuntimeError) as error:
         print(f"vd-play: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print()
     return 0
 
 
