@@ -32,6 +32,7 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.deploy.answers import BusError, HandState, LateError, SilentError
 from vd.deploy.bus import MotorBus
+from vd.deploy.camera import AHEAD_S
 from vd.deploy.finding import NAMED
 from vd.deploy.joints import Joints
 from vd.deploy.limits import PERIOD_S, Limits, SafetyCfg
@@ -247,7 +248,16 @@ class SafeHand:
             raise self._stop(f"{self._misses} deadlines missed in a row")
 
     def image_at(self, time_s: float) -> None:
-        """The newest image is of this time [s], by the monotonic clock."""
+        """The newest image is of this time [s], by the monotonic clock.
+
+        Raises:
+            StoppedError: It is from the future, so its age is not known.
+        """
+        ahead = time_s - self.bus.clock.now()
+        if ahead > AHEAD_S:
+            raise self._stop(
+                f"the newest image is {ahead:.2f} s from the future: its clock is not the monotonic one"
+            )
         self._image_s = time_s
 
     def stop(self, reason: str) -> None:

@@ -186,6 +186,10 @@ def test_deadlines_and_images_stop_the_hand(bus, hand, joints):
         safe.image_at(shown)
         assert "image is" in run_until_stopped(safe, reset_pose(3))
         assert 0.0 < safe.report.detected_s - shown - QUICK.stale_s < 2 * WATCH_S
+    with SafeHand(bus, joints, hand, QUICK) as safe:
+        safe.arm()
+        with pytest.raises(StoppedError, match=r"3\.00 s from the future"):
+            safe.image_at(bus.clock.now() + 3.0)
 
 
 def test_a_loop_that_stands_is_stopped_by_the_watchdog(bus, hand, joints):
