@@ -135,13 +135,13 @@ def read_joints(path: Path, hand: HandModel) -> Joints:
     for motor in motors:
         if motor.sign not in (-1.0, 1.0):
             raise CalibrationError(
-                f"{path}: motors.sign of {motor.joint} is {motor.sign:g}; it is 1, or -1 where the motor turns "
-                "the other way"
+                f"{path}: motors.sign of {motor.joint} is {motor.sign:g}; it is 1, or -1 where the motor "
+                "turns the other way"
             )
         if not np.isfinite(motor.offset_rad):
             raise CalibrationError(
-                f"{path}: motors.offset_rad of {motor.joint} is {motor.offset_rad}; give the motor's angle [rad] "
-                "where the joint is at zero"
+                f"{path}: motors.offset_rad of {motor.joint} is {motor.offset_rad}; give the motor's angle "
+                "[rad] where the joint is at zero"
             )
     sign = np.array([motor.sign for motor in motors])
     return Joints(tuple(hand.joint_names), tuple(ids), sign, np.array([motor.offset_rad for motor in motors]))

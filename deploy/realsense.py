@@ -288,8 +288,8 @@ class _Stream:
         if time_s > arrival + AHEAD_S:
             raise CameraError(
                 f"an image is stamped {time_s - arrival:.2f} s later than it came, by the camera's clock "
-                f"{domain.name}, so nobody knows its age: let the computer's clock be set (NTP) before the start, "
-                "then plug the camera in again"
+                f"{domain.name}, so nobody knows its age: wait until the computer's clock is set (NTP), then "
+                "plug the camera in again"
             )
         return frame, min(time_s, arrival)
 

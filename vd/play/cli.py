@@ -25,10 +25,6 @@ if TYPE_CHECKING:
     from vd.play.replay import ReplaySession
     from vd.play.session import Session
 
-# Size of a cell's picture in a video [pixel]: alone, and in a grid.
-SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)
-# Side of the goal's picture, as a share of the cell's height.
-GOAL_SHARE = 0.36
 VIDEO_SECONDS = 10.0
 # A CPU simulates this many worlds about in real time.
 FAST_WORLDS_CPU = 16
@@ -158,25 +154,13 @@ def replay(cfg: PlayCfg) -> int:
         LogError: The log cannot be used.
     """
     from vd.hand_log import read_log
-    from vd.play.replay import Replay, ReplaySession
+    from vd.play.replay import Replay, ReplaySession, film
 
-    shown = Replay(read_log(cfg.agent_name))
+    log = read_log(cfg.agent_name)
     if cfg.video is None:
-        _serve(lambda: ReplaySession(shown), cfg)
+        _serve(lambda: ReplaySession(Replay(log)), cfg)
         return 0
-    from vd.play.video import write_frames
-    from vd.render import Renderer
-
-    width, height = SINGLE_CELL
-    renderer = Renderer(
-        shown.hand,
-        [shown.item],
-        width=width,
-        height=height,
-        goal_size=round(GOAL_SHARE * height),
-        samples=cfg.samples,
-    )
-    frames = write_frames(cfg.video, shown.frames(renderer), shown.control_hz)
+    frames = film(log, cfg.video, samples=cfg.samples)
     print(f"{cfg.video} ({frames} frames)")
     return 0
 
@@ -192,7 +176,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
 
     from vd.evaluate.agents import built_in
     from vd.evaluate.cli import LOG_EVERY_S
-    from vd.play.video import record, write_frames
+    from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
     env, trained, device = _open(cfg, num_worlds=cfg.cells)
