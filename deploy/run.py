@@ -229,6 +229,7 @@ def _fly(
                 "goals": [[float(value) for value in goal] for goal in goals],
                 "control_hz": flight.task.sim.control_hz,
                 "stopping": vars(pilot.rule),
+                "tolerance_rad": cfg.tolerance_rad,
                 "second_view": cfg.second_view,
                 "nudge": vars(chance.nudge) if cfg.nudge else None,
                 "explore": vars(chance.explore) if cfg.explore else None,
@@ -272,7 +273,7 @@ def _fly(
             times = {} if loop is None else summary(loop.times)
             steps = 0 if loop is None else len(loop.times)
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
-            results = report(folder, cfg.tolerance_rad, steps, pacer.missed, times)
+            results = report(folder, steps, pacer.missed, times)
     return read_log(folder), results, int(reason == "lost")
 
 
@@ -324,14 +325,12 @@ class StatusLine:
             print(file=sys.stderr)
 
 
-def report(
-    folder: Path, tolerance_rad: float, steps: int, missed: int, times: dict[str, Any]
-) -> list[GoalResult]:
+def report(folder: Path, steps: int, missed: int, times: dict[str, Any]) -> list[GoalResult]:
     """Print what came of it, in a few lines; what came of each goal."""
     results: list[GoalResult] = []
     if steps:
         log = read_log(folder)
-        results = goal_results(log, tolerance_rad)
+        results = goal_results(log)
         print("\n".join([*map(str, results), summary_line(results, len(log.goals))]))
     print(f"{steps} control steps, {missed} deadlines missed")
     for name, title in (

@@ -39,13 +39,8 @@ class GoalResult:
         return f"goal {self.goal + 1}: {words}: {self.outcome} after {self.seconds:.1f} s{far}{said}"
 
 
-def goal_results(log: HandLog, tolerance_rad: float) -> list[GoalResult]:
-    """How each goal ended that was pursued.
-
-    Args:
-        log: The run.
-        tolerance_rad: Largest angle at which a goal is reached [rad].
-    """
+def goal_results(log: HandLog) -> list[GoalResult]:
+    """How each goal ended that was pursued."""
     columns, stops = log.columns, {stop.goal: stop for stop in log.stops}
     results = []
     for goal in np.unique(columns["goal"][columns["acting"] > 0.0]).astype(int):
@@ -60,7 +55,7 @@ def goal_results(log: HandLog, tolerance_rad: float) -> list[GoalResult]:
                 seconds=float(columns["t"][rows[-1]] - columns["t"][rows[0]]),
                 predicted_rad=None if np.isnan(predicted) else predicted,
                 error_rad=error,
-                success=None if error is None else outcome == "stopped" and error <= tolerance_rad,
+                success=None if error is None else outcome == "stopped" and error <= log.tolerance_rad,
             )
         )
     return results

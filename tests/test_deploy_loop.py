@@ -171,7 +171,7 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
         [GOAL]
     )
     log.finish("done")
-    results = goal_results(read_log(log.folder), PAPER.success.rotation_rad)
+    results = goal_results(read_log(log.folder))
     assert [str(one) for one in results] == [said]
     expected = "1 of 2 goals stopped" if turned is None else f"{int(': reached' in said)} of 2 goals reached"
     assert summary_line(results, 2).startswith(expected)

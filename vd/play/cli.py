@@ -158,7 +158,8 @@ def replay(cfg: PlayCfg) -> int:
 
     log = read_log(cfg.agent_name)
     if cfg.video is None:
-        _serve(lambda: ReplaySession(Replay(log)), cfg)
+        shown = Replay(log)
+        _serve(lambda: ReplaySession(shown), cfg)
         return 0
     frames = film(log, cfg.video, samples=cfg.samples)
     print(f"{cfg.video} ({frames} frames)")

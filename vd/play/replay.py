@@ -70,7 +70,8 @@ class Replay:
             # Events have the time of their writing: the last step before it is the one that ended the goal.
             over = stop is not None and columns["t"][step] <= stop.time_s
             last = step + 1 == steps or columns["t"][step + 1] > (stop.time_s if stop else np.inf)
-            success = bool(stop and over and last and stop.outcome == "stopped")
+            near = "error" not in columns or error[step] <= log.tolerance_rad
+            success = bool(stop and over and last and near and stop.outcome == "stopped")
             fell = bool(stop and over and last and stop.outcome == "lost")
             reached, lost = reached + success, lost + fell
             yield Snapshot(
