@@ -112,7 +112,8 @@ class RunCfg(HandOptions):
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
-        check_names([self.policy] if self.policy else [], [self.object], self.hand)
+        policies = [] if self.policy in (None, "still") else [self.policy]
+        check_names(policies, [self.object], self.hand)
         from vd.deploy.goals import SCAN_SUFFIXES
 
         if self.random_goals < 1:
