@@ -136,6 +136,6 @@ def connect(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[
 def _check_twin() -> str:
     """What to try where a twin is silent: it has no cable, but this computer's processors."""
     return (
-        f"the twin is a program on this computer, which is busy (load {os.getloadavg()[0]:.1f} on "
-        f"{os.cpu_count()} cores), or its --twin-args have it be silent"
+        f"the twin is a program on this computer (load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores): "
+        "others may keep it from answering, or its --twin-args have it be silent"
     )
