@@ -91,6 +91,7 @@ def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_pa
         ({"offset_rad": "0.1"}, r"motors\[1\]\.offset_rad: expected float, got '0\.1'"),
         ({"offset_rad": float("nan")}, r"motors\.offset_rad of f0_j2 is nan"),
         ({"offset": 0.1}, r"motors\[1\] has no field offset; it has id, joint, offset_rad, sign"),
+        ({"sign": None}, r"motors\[1\] has no sign; name it"),
         ({"joint": "f0_j1"}, "motors has 2 entries of f0_j1"),
         ({"joint": "thumb"}, "motors has no entries of f0_j2"),
     ],
@@ -100,6 +101,7 @@ def test_what_is_no_calibration_is_refused_with_file_and_field(hand, turned, tmp
     turned.save(path, hand.name)
     record = json.loads(path.read_text())
     record["motors"][1] |= change
+    record["motors"][1] = {name: value for name, value in record["motors"][1].items() if value is not None}
     path.write_text(json.dumps(record))
     with pytest.raises(CalibrationError, match=rf"motors\.json.*{reason}"):
         read_joints(path, hand)

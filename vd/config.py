@@ -48,13 +48,15 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
     """
     values = _without_retired(values, getattr(cls, "RETIRED", {}), where or cls.__name__)
     hints = typing.get_type_hints(cls)
-    names = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    names = {field.name for field in fields}
     unknown = sorted(set(values) - names)
     if unknown:
         raise ValueError(
             f"{where or cls.__name__} has no field {', '.join(unknown)}; it has {', '.join(sorted(names))}"
         )
-    left_out = [name for name in names - set(values) if not _has_default(cls, name)]
+    needed = [field for field in fields if field.default is field.default_factory is dataclasses.MISSING]
+    left_out = {field.name for field in needed} - set(values)
     if left_out:
         raise ValueError(f"{where or cls.__name__} has no {', '.join(sorted(left_out))}; name it")
     prefix = f"{where}." if where else ""
@@ -70,11 +72,6 @@ def _without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], wher
                 "version that wrote it"
             )
     return {name: value for name, value in values.items() if name not in retired}
-
-
-def _has_default(cls: type, name: str) -> bool:
-    field = cls.__dataclass_fields__[name]
-    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING
 
 
 def _convert(hint: Any, value: Any, where: str) -> Any:
