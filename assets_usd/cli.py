@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from vd import interrupt
 from vd.files import check_file, check_folder
 
 if TYPE_CHECKING:
@@ -268,6 +269,7 @@ def run_show(command: Show) -> int:
     return 0
 
 
+@interrupt.command("vd-assets")
 def main() -> None:
     """Entry point of ``vd-assets``."""
     command = tyro.cli(Command, prog="vd-assets", description=__doc__)

@@ -39,6 +39,14 @@ class BusError(RuntimeError):
     """The bus or a motor did not do what was asked; says which, and what to try."""
 
 
+class SilentError(BusError):
+    """A motor did not answer, though this program listened."""
+
+
+class LateError(BusError):
+    """This program did not run in time to hear the motors: no fault of theirs, or of their cables."""
+
+
 @dataclass(frozen=True)
 class HandState:
     """State at one reading of all motors, or by :meth:`vd.deploy.joints.Joints.state` of their joints.
@@ -116,22 +124,16 @@ class StateCheck:
         """The next state follows none: motors were configured, or restarted."""
         self._last = None
 
-    def accept(self, time_s: float, answers: Sequence[Answer], length: int = STATE_BYTES) -> HandState:
+    def accept(self, time_s: float, answers: Sequence[Answer]) -> HandState:
         """The state in the motors' answers.
 
         Args:
             time_s: When it was read [s].
-            answers: One of each motor, in their order.
-            length: How many bytes were asked for.
+            answers: One of each motor, in their order, of STATE_BYTES or OTHER_BYTES.
 
         Raises:
-            BusError: A motor refused, sent something else, or a state that cannot be.
+            BusError: A state that cannot be.
         """
-        for answer in answers:
-            if answer.refused:
-                raise BusError(f"motor {answer.id}: {answer.refused}")
-            if len(answer.data) != length:
-                raise BusError(f"motor {answer.id}: {len(answer.data)} bytes of state came, not {length}")
         columns = [answer.data for answer in answers]
 
         def column(name: str) -> np.ndarray:

@@ -21,6 +21,8 @@ from vd.deploy.answers import (
     Answer,
     BusError,
     HandState,
+    LateError,
+    SilentError,
     StateCheck,
     read_answer,
 )
@@ -36,13 +38,15 @@ from vd.deploy.control_table import (
     to_counts,
 )
 from vd.deploy.packets import MAX_ID
+from vd.deploy.port import BAUD_RATE, WAIT_S, open_port, sdk
 
-BAUD_RATE = 1_000_000
 P_GAIN, D_GAIN = 200, 10
 """Position gains of the paper's motors, in their units."""
-WAIT_S = 0.002
-"""How long a read of the port sleeps at most until its bytes are there. The SDK's own does not sleep but asks
-again and again, which takes a core, and keeps whatever shares it from answering."""
+STARVED_S = 0.02
+"""A read of the port that returns so much too late may have missed an answer: motors answer within 5 ms, and
+the SDK, once it runs again, finds that its 34 ms are over."""
+BUSY = "this computer is busy; end other programs, or give this one real-time priority (ulimit -r 1)"
+TORQUE_BYTES = 1
 LATE_S = 0.02
 """Pause after a question that was asked in vain or again; what arrives meanwhile is dropped."""
 
@@ -78,37 +82,6 @@ class MotorSettings:
         }
 
 
-def open_port(path: str, baud_rate: int = BAUD_RATE) -> Any:
-    """A serial port as the SDK takes it.
-
-    Args:
-        path: Device, such as /dev/ttyUSB0.
-        baud_rate: Of the port; the motors' own has to be the same.
-
-    Raises:
-        BusError: It cannot be opened, or there is no SDK.
-    """
-    port = _sdk().PortHandler(path)
-    try:
-        opened = port.setBaudRate(baud_rate)
-    except OSError as error:  # the SDK lets errors of the serial port through
-        raise BusError(
-            f"cannot open {path}: {error}; is the adapter plugged in, and yours to use?"
-        ) from error
-    if not opened:
-        raise BusError(f"{path}: no baud rate {baud_rate}")
-    port.ser.timeout = WAIT_S
-    return port
-
-
-def _sdk() -> Any:
-    try:
-        import dynamixel_sdk
-    except ImportError as error:
-        raise BusError("motors need dynamixel-sdk: pip install -e '.[hardware]'") from error
-    return dynamixel_sdk
-
-
 class _Kept:
     """A port that keeps the packet that the SDK makes."""
 
@@ -128,6 +101,11 @@ class _Kept:
         self.answer_bytes = packet_length
 
 
+def check_wiring() -> str:
+    """What to try where a motor is silent."""
+    return "check its cable, power, ID and baud rate"
+
+
 class MotorBus:
     """Motors of one model on one serial port.
 
@@ -138,9 +116,10 @@ class MotorBus:
         baud_rate: To open the device with.
         retries: How often to ask again where no sound answer came.
         clock: Time.
+        remedy: What to try where a motor is silent though this program listened, in words.
 
     Raises:
-        BusError: The port cannot be opened.
+        BusError: The port cannot be opened, or another program has it.
         ValueError: IDs or model that cannot be.
     """
 
@@ -153,6 +132,7 @@ class MotorBus:
         baud_rate: int = BAUD_RATE,
         retries: int = 1,
         clock: Clock = MONOTONIC,
+        remedy: Callable[[], str] = check_wiring,
     ):
         """Open the port."""
         if model not in MODELS:
@@ -160,8 +140,9 @@ class MotorBus:
         if not ids or len(set(ids)) != len(ids) or not all(0 <= id <= MAX_ID for id in ids):
             raise ValueError(f"ids are {list(ids)}; give each motor's own, within 0 and {MAX_ID}")
         self.ids, self.model, self.retries, self.clock = tuple(ids), MODELS[model], retries, clock
+        self._remedy = remedy
         self._items = table(self.model)
-        self._sdk = _sdk()
+        self._sdk = sdk()
         self._lock = threading.RLock()
         self._packets = self._sdk.PacketHandler(2.0)
         self._states = StateCheck(self.ids, self.model)
@@ -170,6 +151,8 @@ class MotorBus:
         self.rejected = 0
         """States that were not accepted."""
         self._port = open_port(port, baud_rate) if isinstance(port, str) else port
+        self._late_s = self._listened_s = 0.0
+        self._hear, self._port.readPort = self._port.readPort, self._listen
 
     def __enter__(self) -> "MotorBus":
         return self
@@ -183,10 +166,19 @@ class MotorBus:
             if self._port.is_open:
                 self._port.closePort()
 
+    def _listen(self, length: int) -> bytes:
+        """Read the port, and keep by how much this program was later at it than it has to be."""
+        data: bytes = self._hear(length)
+        now = self.clock.now()
+        self._late_s = max(self._late_s, now - self._listened_s - WAIT_S)
+        self._listened_s = now
+        return data
+
     @contextlib.contextmanager
     def _line(self) -> Iterator[None]:
         """The bus for one exchange. What the serial port raises becomes a BusError."""
         with self._lock:
+            self._late_s, self._listened_s = 0.0, self.clock.now()
             try:
                 yield
             except (OSError, termios.error, TypeError) as error:  # a closed port raises TypeError
@@ -228,7 +220,7 @@ class MotorBus:
         for id in self.ids:
             number = self.ping(id)
             if number is None:
-                wrong[id] = "does not answer: check its cable, power, ID and baud rate"
+                wrong[id] = str(self._silence("does not answer"))
             elif number != self.model.number:
                 names = {model.number: name for name, model in MODELS.items()}
                 wrong[id] = f"is {names.get(number, f'model {number}')}, not {self.model.name}"
@@ -409,37 +401,70 @@ class MotorBus:
         raise AssertionError("retries are not negative")
 
     def _read_state(self) -> HandState:
-        ids = list(self.ids)
         with self._line():
             asked = self.clock.now()
-            question = _Kept()
-            self._packets.syncReadTx(question, STATE_ADDRESS, self._length, ids, len(ids), fast_option=False)
-            packets, self._goals = self._goals + question.packet, b""
-            self._port.clearPort()
-            if self._port.writePort(packets) != len(packets):
-                raise BusError("states were not asked for: the port did not take the packet")
-            self._port.setPacketTimeout(question.answer_bytes)
-            # One time for all: the SDK counts no time for the answers' bytes.
-            heard = self.clock.now()
-            answers = [self._answer(id) for id in ids]
+            goals, self._goals = self._goals, b""
+            heard, answers = self._ask_all(STATE_ADDRESS, self._length, before=goals)
             took = self.clock.now() - asked
             if took > CLOCK_TOLERANCE_S:
                 # This process did not run: whose time is not known is nothing to compare later ones with.
-                raise BusError(f"the state took {took:.3f} s")
+                raise LateError(f"the state took {took:.3f} s: {BUSY}")
             # Motors measure when they have heard it, or not before they answer. A later time than theirs
             # would look like a delay of the goals, which has a name; an earlier one does not.
-            return self._states.accept(heard, answers, self._length)
+            return self._states.accept(heard, answers)
 
-    def _answer(self, id: int) -> Answer:
+    def read_torque(self) -> np.ndarray:
+        """Whether each motor has its torque on, shape [D] bool.
+
+        Raises:
+            BusError: A motor did not answer, also not when asked again.
+        """
+        item = self._items["torque_enable"]
+        for attempt in range(self.retries + 1):
+            try:
+                with self._line():
+                    _, answers = self._ask_all(item.address, item.size)
+                break
+            except BusError:
+                if attempt == self.retries:
+                    raise
+        return np.array([bool(item.from_bytes(answer.data)) for answer in answers])
+
+    def _ask_all(self, address: int, length: int, before: bytes = b"") -> tuple[float, list[Answer]]:
+        """Ask all motors for the same bytes with one packet: when they heard it [s], and what each answers.
+
+        Args:
+            address: First byte.
+            length: How many.
+            before: Packets to send in one piece with it.
+        """
+        ids, question = list(self.ids), _Kept()
+        self._packets.syncReadTx(question, address, length, ids, len(ids), fast_option=False)
+        packets = before + question.packet
+        self._port.clearPort()
+        if self._port.writePort(packets) != len(packets):
+            raise BusError("the motors were not asked: the port did not take the packet")
+        self._port.setPacketTimeout(question.answer_bytes)
+        # One time for all: the SDK counts no time for the answers' bytes.
+        heard = self._listened_s = self.clock.now()
+        answers = [self._answer(id, length) for id in ids]
+        for answer in answers:
+            if answer.refused:
+                raise BusError(f"motor {answer.id}: {answer.refused}")
+            if len(answer.data) != length:
+                raise BusError(f"motor {answer.id}: {len(answer.data)} bytes came, not {length}")
+        return heard, answers
+
+    def _answer(self, id: int, length: int) -> Answer:
         """This motor's next answer."""
         while True:
             frame, result = self._packets.rxPacket(self._port, False)
             if result != self._sdk.COMM_SUCCESS:
-                raise BusError(f"motor {id}: no state: {self._words(result)}")
+                raise self._failure(f"motor {id}", result)
             answer = read_answer(bytes(frame))
             if answer is None:
                 raise BusError(f"motor {id}: what answered is no status packet")
-            late = len(answer.data) in {STATE_BYTES, OTHER_BYTES} - {self._length}
+            late = len(answer.data) in {STATE_BYTES, OTHER_BYTES, TORQUE_BYTES} - {length}
             if answer.id == id and not late:
                 return answer  # others come late from an exchange before; the time limit is one for all
 
@@ -447,8 +472,20 @@ class MotorBus:
         """What went wrong in an exchange, in the SDK's words."""
         return str(self._packets.getTxRxResult(result)).removeprefix("[TxRxResult] ").rstrip("!.")
 
+    def _silence(self, what: str) -> BusError:
+        """Nobody was heard in the last exchange: by this program's own fault, or the motor's."""
+        if self._late_s > STARVED_S:
+            return LateError(f"{what}: this program was {self._late_s:.3f} s late to listen: {BUSY}")
+        return SilentError(f"{what}: {self._remedy()}")
+
+    def _failure(self, what: str, result: int) -> BusError:
+        """What went wrong in the last exchange."""
+        if result == self._sdk.COMM_RX_TIMEOUT or self._late_s > STARVED_S:
+            return self._silence(f"{what} does not answer")
+        return BusError(f"{what}: {self._words(result)}")
+
     def _check(self, id: int, what: str, result: int, error: int) -> None:
         if result != self._sdk.COMM_SUCCESS:
-            raise BusError(f"motor {id}: {what}: {self._words(result)}")
+            raise self._failure(f"{what}: motor {id}", result)
         if refused := Answer(id, error, b"").refused:
             raise BusError(f"motor {id}: {what}: {refused}")

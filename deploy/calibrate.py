@@ -18,6 +18,7 @@ import tyro
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert
+from vd.config import from_dict
 from vd.deploy.calibration_poses import plan
 from vd.deploy.calibration_twin import CalibrationTwin
 from vd.deploy.camera import GrayFrame, StaleCamera
@@ -102,6 +103,25 @@ class Shot:
     """Angles [rad] [D]."""
     image: np.ndarray
     """Brightness, uint8 [H, W]."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """An entry of the file of the views."""
+
+    image: str
+    joint_q: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _ViewsFile:
+    """The file of the views."""
+
+    format: str
+    hand: str
+    side_m: float
+    lens: Intrinsics
+    views: tuple[_View, ...]
 
 
 def calibrate(cfg: CalibrateCfg) -> int:
@@ -269,23 +289,20 @@ def read_views(folder: Path, hand: HandModel) -> tuple[Intrinsics, float, list[S
 
     file = Path(folder) / VIEWS_FILE
     try:
-        record = json.loads(file.read_text())
-        if record["format"] != FORMAT:
-            raise KeyError(f"format {FORMAT}")
-        if record["hand"] != hand.name:
-            raise ValueError(f"it is of {record['hand']}, not of {hand.name}; give --hand {record['hand']}")
-        lens = Intrinsics(**record["lens"])
-        shots = []
-        for row in record["views"]:
-            with Image.open(Path(folder) / row["image"]) as picture:
+        record = from_dict(_ViewsFile, json.loads(file.read_text()), where="the file")
+        if record.format != FORMAT:
+            raise ValueError(f"its format is {record.format!r}, not {FORMAT!r}")
+        if record.hand != hand.name:
+            raise ValueError(f"it is of {record.hand}, not of {hand.name}; give --hand {record.hand}")
+        lens, shots = record.lens, []
+        for row in record.views:
+            with Image.open(Path(folder) / row.image) as picture:
                 image = np.array(picture.convert("L"))
-            if image.shape != (lens.height, lens.width) or len(row["joint_q"]) != hand.num_joints:
-                raise ValueError(
-                    f"{row['image']} has another size than the lens, or other joints than the hand"
-                )
-            shots.append(Shot(np.array(row["joint_q"], dtype=float), image))
-        return lens, float(record["side_m"]), shots
-    except (OSError, KeyError, TypeError, ValueError, UnidentifiedImageError) as error:
+            if image.shape != (lens.height, lens.width) or len(row.joint_q) != hand.num_joints:
+                raise ValueError(f"{row.image} has another size than the lens, or other joints than the hand")
+            shots.append(Shot(np.array(row.joint_q), image))
+        return lens, record.side_m, shots
+    except (OSError, TypeError, ValueError, UnidentifiedImageError) as error:
         raise ValueError(f"{file} holds no views to solve ({error}); take them again") from error
 
 

@@ -16,6 +16,10 @@ MAX_AGE_S = 0.25
 """Age from which an image is stale [s]: three control periods. The latency of a D415 is below 0.1 s."""
 
 
+AHEAD_S = 0.02
+"""An image cannot be newer than the moment it came [s]; what the SDK makes of its clock is off by some ms."""
+
+
 class CameraError(RuntimeError):
     """A camera that cannot be used as asked; names the remedy."""
 

@@ -22,13 +22,16 @@ LARGEST = np.iinfo(np.uint16).max
 class CameraTwin:
     """A RealSense with a depth stream and a left infrared stream, both of the same lens."""
 
-    def __init__(self, intrinsics: Intrinsics, *, fps: int = 30, serial: str = "twin"):
+    def __init__(
+        self, intrinsics: Intrinsics, *, fps: int = 30, serial: str = "twin", projector: bool = True
+    ):
         """Make the device.
 
         Args:
             intrinsics: Of the images, before filters.
             fps: Images a second, as the device says; how often it sends is up to ``show``.
             serial: Its serial number.
+            projector: Whether it has one; a D405 has none.
 
         Raises:
             CameraError: The SDK is not installed.
@@ -49,6 +52,8 @@ class CameraTwin:
             (rs.option.emitter_enabled, 1.0, 1.0, 1.0),
             (rs.option.visual_preset, 6.0, 1.0, 0.0),
         ):
+            if option == rs.option.emitter_enabled and not projector:
+                continue
             choices = rs.option_range()
             choices.min, choices.max, choices.step, choices.default = 0.0, largest, step, value
             self._sensor.add_option(option, choices, True)

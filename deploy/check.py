@@ -49,7 +49,7 @@ FOLLOW_RAD = 0.25
 
 @dataclass(frozen=True)
 class CheckCfg(HandOptions):
-    """Look at everything that must be right before the hand moves."""
+    """Look at everything that must be right before the hand moves; without --range nothing is written."""
 
     camera: RealSenseCfg = field(default_factory=RealSenseCfg)
     """The depth camera."""
@@ -66,7 +66,7 @@ class CheckCfg(HandOptions):
 
 
 def preflight(connection: Connection) -> Iterator[Finding]:
-    """Look at motors, settings, state and bus; writes the settings, with the torque off.
+    """Look at motors, items, state and bus. Nothing is written: a motor that holds something goes on to.
 
     What could not be looked at because of what came before is not in the findings.
     """
@@ -85,16 +85,56 @@ def preflight(connection: Connection) -> Iterator[Finding]:
             "none",
         )
         yield finding("factory items", _not_plain(connection), "as they should be")
-        try:
-            bus.configure(connection.joints.settings(connection.hand, bus.model.name))
-        except (BusError, CalibrationError) as error:
-            yield Finding("gains and limits", False, str(error))
-            return
-        yield Finding("gains and limits", True, "written and read back")
+        yield _settings(connection)
+        yield Finding("torque", True, holding(connection) or "off")
         yield from _state(connection)
         yield _cycles(connection)
     except BusError as error:
         yield Finding("bus", False, str(error))
+
+
+def _settings(connection: Connection) -> Finding:
+    """Whether the gains and limits can be those of the hand, and how many motors have them already."""
+    bus, what = connection.bus, "gains and limits"
+    try:
+        wanted = connection.joints.settings(connection.hand, bus.model.name)
+    except CalibrationError as error:
+        return Finding(what, False, str(error))
+    other = [
+        id
+        for id in bus.ids
+        if any(bus.read(id, name) != value for name, value in wanted[id].values(bus.model).items())
+    ]
+    return Finding(
+        what,
+        True,
+        f"to be written to motors {', '.join(map(str, other))}" if other else "those of the hand",
+    )
+
+
+def holding(connection: Connection) -> str:
+    """Which motors hold what the hand has, in words; empty where none has its torque on.
+
+    Raises:
+        BusError: A motor does not answer.
+    """
+    bus = connection.bus
+    on = bus.read_torque()
+    if not on.any():
+        return ""
+    ids = ", ".join(str(id) for id, one in zip(bus.ids, on, strict=True) if one)
+    current = float(np.abs(bus.read_state().current[on]).max())
+    return f"motors {ids} hold, with up to {current:.2f} A: they let go when their settings are written"
+
+
+def write_settings(connection: Connection) -> Finding:
+    """Write gains and limits, with the torque off, and read them back."""
+    bus, what = connection.bus, "settings"
+    try:
+        bus.configure(connection.joints.settings(connection.hand, bus.model.name))
+    except BusError as error:
+        return Finding(what, False, str(error))
+    return Finding(what, True, "gains and limits written and read back, torque off")
 
 
 def _not_plain(connection: Connection) -> list[str]:
@@ -141,19 +181,19 @@ def _state(connection: Connection) -> Iterator[Finding]:
 def _cycles(connection: Connection) -> Finding:
     """Time that a reading takes, at the control rate."""
     bus, clock = connection.bus, connection.bus.clock
-    rejected, took, failed = bus.rejected, [], 0
+    rejected, took, failed, why = bus.rejected, [], 0, ""
     begin = clock.now()
     for cycle in range(CYCLES):
         clock.sleep(begin + cycle * PERIOD_S - clock.now())
         start = clock.now()
         try:
             bus.read_state()
-        except BusError:
-            failed += 1
+        except BusError as error:
+            failed, why = failed + 1, f"; {error}"
         took.append(clock.now() - start)
     found = (
         f"{1e3 * float(np.median(took)):.1f} ms a reading, longest {1e3 * max(took):.1f}; "
-        f"{bus.rejected - rejected} of {CYCLES} asked again, {failed} failed"
+        f"{bus.rejected - rejected} of {CYCLES} asked again, {failed} failed{why}"
     )
     right = failed == 0 and float(np.median(took)) < BUS_SHARE * PERIOD_S
     remedy = (
@@ -190,17 +230,35 @@ def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
 def ready(
     connection: Connection, question: str, *, yes: bool, quiet: bool = False, more: Iterable[Finding] = ()
 ) -> list[Finding]:
-    """Preflight, and ``more`` of it, then have the person confirm.
+    """Preflight, and ``more`` of it, have the person confirm, and only then write the settings.
 
     Raises:
         RuntimeError: Something is wrong, or the person did not say yes.
     """
     findings = show(itertools.chain(preflight(connection), more), quiet=quiet)
+    _stop_at_wrong(findings)
+    return findings + agreed(connection, question, yes=yes, quiet=quiet)
+
+
+def agreed(connection: Connection, question: str, *, yes: bool, quiet: bool = False) -> list[Finding]:
+    """Have the person confirm, say what the hand holds, and write the settings.
+
+    Raises:
+        RuntimeError: The person did not say yes, or a motor does not keep a setting.
+    """
+    if held := holding(connection):
+        held = f"{held[:1].upper()}{held[1:]}; support what the hand carries. "
+        print(held, file=sys.stderr, flush=True)
+    confirm(question, yes=yes)
+    written = show([write_settings(connection)], quiet=quiet)
+    _stop_at_wrong(written)
+    return written
+
+
+def _stop_at_wrong(findings: Iterable[Finding]) -> None:
     wrong = [one for one in findings if not one.ok]
     if wrong:
         raise RuntimeError(f"nothing moves: {wrong[0].what}: {wrong[0].found}")
-    confirm(question, yes=yes)
-    return findings
 
 
 def confirm(question: str, *, yes: bool) -> None:
@@ -255,7 +313,8 @@ def check(cfg: CheckCfg) -> int:
         if not cfg.no_camera:
             findings += show(camera_preflight(cfg, connection.hand, side), quiet=cfg.json)
         if cfg.range and all(one.ok for one in findings):
-            confirm("Every joint will move slowly through its range.", yes=cfg.yes)
+            question = "Every joint will move slowly through its range."
+            findings += agreed(connection, question, yes=cfg.yes, quiet=cfg.json)
             limits = replace(SafetyCfg(), then="off")
             safe = stack.enter_context(SafeHand(connection.bus, connection.joints, connection.hand, limits))
             findings += show(sweep(connection, safe), quiet=cfg.json)

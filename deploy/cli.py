@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-OK, FAILED, INTERRUPTED = 0, 1, 130
-"""Exit statuses: done, or not, with the reason; Ctrl-C."""
+from vd import interrupt
+
+OK, FAILED = 0, 1
+"""Exit statuses: done, or not, with the reason; after a signal 128 and its number."""
 
 
 class Entry(NamedTuple):
@@ -70,6 +72,7 @@ def _is_policy(text: str) -> bool:
     return text in SHIPPED_POLICIES
 
 
+@interrupt.command("vd-deploy")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-deploy``; returns the exit status."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
@@ -97,11 +100,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     try:
         return int(getattr(module, entry.function)(options))
-    except KeyboardInterrupt:
-        return INTERRUPTED
     except (ValueError, OSError, RuntimeError) as error:  # BusError and StoppedError among them
         print(f"vd-deploy: {error}", file=sys.stderr)
-        return FAILED
+        asked = int(getattr(error, "signal", 0))  # a moving hand is stopped first
+        return 128 + asked if asked else FAILED
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """From options to a hand: its model, its motors' calibration, and the bus, to real motors or to a twin."""
 
 import contextlib
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -115,10 +116,26 @@ def connect(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[
         TwinError: The twin did not start.
         BusError: The port cannot be opened.
     """
-    from vd.deploy.bus import MotorBus
+    from vd.deploy.bus import MotorBus, check_wiring
 
     hand, joints = read_hand_and_joints(options)
     retries = TWIN_RETRIES if options.twin else RETRIES
     with open_port(options, twin_options) as port:
-        with MotorBus(port, joints.ids, options.motor, baud_rate=options.baud_rate, retries=retries) as bus:
+        bus = MotorBus(
+            port,
+            joints.ids,
+            options.motor,
+            baud_rate=options.baud_rate,
+            retries=retries,
+            remedy=_check_twin if options.twin else check_wiring,
+        )
+        with bus:
             yield Connection(hand, joints, bus)
+
+
+def _check_twin() -> str:
+    """What to try where a twin is silent: it has no cable, but this computer's processors."""
+    return (
+        f"the twin is a program on this computer (load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores): "
+        "others may keep it from answering, or its --twin-args have it be silent"
+    )

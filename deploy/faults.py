@@ -19,7 +19,7 @@ import numpy as np
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.deploy.bus import MotorBus
-from vd.deploy.check import preflight
+from vd.deploy.check import preflight, write_settings
 from vd.deploy.connect import MOTOR, Connection
 from vd.deploy.control_table import MODELS, HardwareError
 from vd.deploy.joints import Joints, uncalibrated
@@ -357,7 +357,10 @@ def try_preflight(name: str, hand: HandModel, joints: Joints) -> Outcome:
         scene.bus.release()
         BEFORE[name](scene.twin)
         time.sleep(0.1)
-        wrong = [finding for finding in preflight(Connection(hand, joints, scene.bus)) if not finding.ok]
+        connection = Connection(hand, joints, scene.bus)
+        wrong = [finding for finding in preflight(connection) if not finding.ok]
+        if not wrong and not (written := write_settings(connection)).ok:
+            wrong = [written]
         happened = f"nothing moves: {wrong[0].what}: {wrong[0].found}" if wrong else "was not found"
         return _outcome(name, happened, witness, joints, right=bool(wrong) and not witness.left())
 
@@ -365,6 +368,7 @@ def try_preflight(name: str, hand: HandModel, joints: Joints) -> Outcome:
 def try_process(name: str, number: signal.Signals, hand: HandModel, joints: Joints) -> Outcome:
     """Send a signal to `vd-deploy home` while it moves the twin."""
     with scene_of(hand, joints) as (scene, witness):
+        scene.bus.close()  # one program at a time has the port
         command = [sys.executable, "-m", "vd.deploy.cli", "home", "--port", scene.twin.path, "--yes"]
         command += ["--hand", hand.name, "--speed", "0.2"]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)

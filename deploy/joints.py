@@ -6,11 +6,11 @@ A motor's angle is ``sign * q + offset`` of its joint's angle q [rad].
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
+from vd.config import from_dict
 from vd.deploy.answers import HandState
 from vd.deploy.bus import MotorSettings
 from vd.deploy.control_table import MODELS, RAD_S_PER_COUNT, to_angle
@@ -20,6 +20,25 @@ from vd.files import write_json
 FORMAT = "vd-motors/1"
 LARGEST_VELOCITY_LIMIT = 1023
 """Counts that the velocity limit of a motor can hold."""
+
+
+@dataclass(frozen=True)
+class _Motor:
+    """An entry of a calibration file."""
+
+    joint: str
+    id: int
+    sign: float
+    offset_rad: float
+
+
+@dataclass(frozen=True)
+class _File:
+    """A calibration file."""
+
+    format: str
+    motors: tuple[_Motor, ...]
+    hand: str = ""
 
 
 class CalibrationError(ValueError):
@@ -106,20 +125,40 @@ def read_joints(path: Path, hand: HandModel) -> Joints:
         CalibrationError: It is no calibration, or not one of this hand.
     """
     try:
-        record: dict[str, Any] = json.loads(Path(path).read_text())
-        if record["format"] != FORMAT:
-            raise KeyError(f"format {FORMAT}")
-        rows = {row["joint"]: row for row in record["motors"]}
-        ids = [int(rows[name]["id"]) for name in hand.joint_names]
-        sign = np.array([int(rows[name]["sign"]) for name in hand.joint_names])
-        offset = np.array([float(rows[name]["offset_rad"]) for name in hand.joint_names])
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError, UnicodeDecodeError) as error:
+        file = from_dict(_File, json.loads(Path(path).read_text()), where="the file")
+        motors = _by_joint(file, hand)
+    except (OSError, TypeError, ValueError) as error:  # of JSON, text and fields too
         raise CalibrationError(f"{path} is not a calibration of {hand.name}: {error}") from error
-    extra = sorted(set(rows) - set(hand.joint_names))
-    if extra:
-        raise CalibrationError(f"{path}: {extra[0]} is no joint of {hand.name}")
+    ids = [motor.id for motor in motors]
     if len(set(ids)) != len(ids) or not all(0 <= id <= MAX_ID for id in ids):
         raise CalibrationError(f"{path}: motors.id are {ids}; give each motor its own, within 0 and {MAX_ID}")
-    if not np.isin(sign, (-1, 1)).all() or not np.isfinite(offset).all():
-        raise CalibrationError(f"{path}: motors.sign has to be 1 or -1, motors.offset_rad a number")
-    return Joints(tuple(hand.joint_names), tuple(ids), sign.astype(float), offset)
+    for motor in motors:
+        if motor.sign not in (-1.0, 1.0):
+            raise CalibrationError(
+                f"{path}: motors.sign of {motor.joint} is {motor.sign:g}; it is 1, or -1 where the motor "
+                "turns the other way"
+            )
+        if not np.isfinite(motor.offset_rad):
+            raise CalibrationError(
+                f"{path}: motors.offset_rad of {motor.joint} is {motor.offset_rad}; give the motor's angle "
+                "[rad] where the joint is at zero"
+            )
+    sign = np.array([motor.sign for motor in motors])
+    return Joints(tuple(hand.joint_names), tuple(ids), sign, np.array([motor.offset_rad for motor in motors]))
+
+
+def _by_joint(file: _File, hand: HandModel) -> list[_Motor]:
+    """The entries of a file in the order of a hand's joints.
+
+    Raises:
+        ValueError: Its format is another, or its entries are not one for each joint.
+    """
+    if file.format != FORMAT:
+        raise ValueError(f"its format is {file.format!r}, not {FORMAT!r}")
+    named = [motor.joint for motor in file.motors]
+    for name in hand.joint_names:
+        if named.count(name) != 1:
+            raise ValueError(f"motors has {named.count(name) or 'no'} entries of {name}; give one")
+    if extra := sorted(set(named) - set(hand.joint_names)):
+        raise ValueError(f"{extra[0]} is no joint of {hand.name}")
+    return [file.motors[named.index(name)] for name in hand.joint_names]

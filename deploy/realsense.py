@@ -5,6 +5,7 @@ SDKs), or its software device, behind which :mod:`vd.deploy.camera_twin` puts ou
 image is that of the left infrared imager, so both have the same optical frame.
 """
 
+import sys
 import threading
 import time
 from collections import deque
@@ -17,6 +18,7 @@ import numpy as np
 
 from vd.assets_usd.hand_data import Intrinsics
 from vd.deploy.camera import (
+    AHEAD_S,
     MAX_AGE_S,
     CameraError,
     DepthFrame,
@@ -252,6 +254,9 @@ class _Stream:
         ):
             if value is None:
                 continue
+            if not self._sensor.supports(option):  # a D405 has no projector
+                print(f"{describe(self._device)} has no {name}: it is left out", file=sys.stderr, flush=True)
+                continue
             try:
                 self._sensor.set_option(option, float(value))
             except RuntimeError as error:
@@ -268,6 +273,7 @@ class _Stream:
 
         Raises:
             StaleCamera: None came in time.
+            CameraError: It is from the future: its clock is not to be relied on.
         """
         with self._arrived:
             if not self._arrived.wait_for(lambda: self._newest is not None, timeout_s):
@@ -276,8 +282,16 @@ class _Stream:
             assert self._newest is not None
             frame, arrival = self._newest
             self._newest = None
-        host_clock = frame.get_frame_timestamp_domain() != self._rs.timestamp_domain.hardware_clock
-        return frame, self._clock(frame.get_timestamp() * MILLISECOND, arrival, host_clock=host_clock)
+        domain = frame.get_frame_timestamp_domain()
+        host_clock = domain != self._rs.timestamp_domain.hardware_clock
+        time_s = self._clock(frame.get_timestamp() * MILLISECOND, arrival, host_clock=host_clock)
+        if time_s > arrival + AHEAD_S:
+            raise CameraError(
+                f"an image is stamped {time_s - arrival:.2f} s later than it came, by the camera's clock "
+                f"{domain.name}, so nobody knows its age: wait until the computer's clock is set (NTP), then "
+                "plug the camera in again"
+            )
+        return frame, min(time_s, arrival)
 
     def close(self) -> None:
         """Stop the stream; a recording is whole from here on."""

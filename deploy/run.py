@@ -26,10 +26,12 @@ from vd.deploy.finding import Finding
 from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import MOVE_S, move, reset_pose
 from vd.deploy.realsense import RealSenseCfg
+from vd.deploy.run_page import GoalResult, goal_results, summary_line, write_page
 from vd.deploy.safety import SafeHand
 from vd.deploy.timely import Priority, real_time, undisturbed
 from vd.evaluate.agents import check_names
 from vd.files import check_folder
+from vd.hand_log import HandLog, read_log
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
 
@@ -103,9 +105,15 @@ class RunCfg(HandOptions):
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves; a twin is not asked for."""
 
+    @property
+    def tolerance_rad(self) -> float:
+        """Largest angle at which a goal is reached [rad]."""
+        return PAPER.success.precise_rad if self.precise else PAPER.success.rotation_rad
+
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
-        check_names([self.policy] if self.policy else [], [self.object], self.hand)
+        policies = [] if self.policy in (None, "still") else [self.policy]
+        check_names(policies, [self.object], self.hand)
         from vd.deploy.goals import SCAN_SUFFIXES
 
         if self.random_goals < 1:
@@ -141,7 +149,7 @@ def run(cfg: RunCfg) -> int:
         cfg.object,
         hand,
         item,
-        tolerance_rad=PAPER.success.precise_rad if cfg.precise else PAPER.success.rotation_rad,
+        tolerance_rad=cfg.tolerance_rad,
         second_view=cfg.second_view,
         seed=cfg.seed,
     )
@@ -166,13 +174,16 @@ def run(cfg: RunCfg) -> int:
             twin_options += ["--realtime", cfg.realtime]
         connection = stack.enter_context(connect(cfg, twin_options))
         link = stack.enter_context(TwinLink(side)) if cfg.twin else None
-        return _fly(cfg, flight, connection, item, link)
+        log, results, status = _fly(cfg, flight, connection, item, link)
+    print("drawing the film (the first one compiles its kernels) ...", file=sys.stderr, flush=True)
+    print(f"page: {write_page(log, results)}")
+    return status
 
 
 def _fly(
     cfg: RunCfg, flight: "Flight", connection: Connection, item: "ObjectModel", link: "TwinLink | None"
-) -> int:
-    """Preflight, way to the start, the loop, and its log."""
+) -> tuple[HandLog, list[GoalResult], int]:
+    """Preflight, way to the start, the loop, and its log: that, what came of the goals, and the status."""
     from vd.deploy.action import ActionFilter
     from vd.deploy.check import ready
     from vd.deploy.check_camera import camera_findings
@@ -219,6 +230,7 @@ def _fly(
                 "goals": [[float(value) for value in goal] for goal in goals],
                 "control_hz": flight.task.sim.control_hz,
                 "stopping": vars(pilot.rule),
+                "tolerance_rad": cfg.tolerance_rad,
                 "second_view": cfg.second_view,
                 "nudge": vars(chance.nudge) if cfg.nudge else None,
                 "explore": vars(chance.explore) if cfg.explore else None,
@@ -262,8 +274,8 @@ def _fly(
             times = {} if loop is None else summary(loop.times)
             steps = 0 if loop is None else len(loop.times)
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
-            print(report(folder, outcomes, steps, pacer.missed, times))
-    return int(reason == "lost")
+            results = report(folder, steps, pacer.missed, times)
+    return read_log(folder), results, int(reason == "lost")
 
 
 def place(safe: SafeHand, pose: np.ndarray, link: "TwinLink | None", *, yes: bool) -> None:
@@ -314,10 +326,14 @@ class StatusLine:
             print(file=sys.stderr)
 
 
-def report(folder: Path, outcomes: list[str], steps: int, missed: int, times: dict[str, Any]) -> str:
-    """What came of it, in a few lines."""
-    lines = [f"{outcome}: goal {number + 1}" for number, outcome in enumerate(outcomes)]
-    lines.append(f"{steps} control steps, {missed} deadlines missed")
+def report(folder: Path, steps: int, missed: int, times: dict[str, Any]) -> list[GoalResult]:
+    """Print what came of it, in a few lines; what came of each goal."""
+    results: list[GoalResult] = []
+    if steps:
+        log = read_log(folder)
+        results = goal_results(log)
+        print("\n".join([*map(str, results), summary_line(results, len(log.goals))]))
+    print(f"{steps} control steps, {missed} deadlines missed")
     for name, title in (
         ("late_ms", "began late by"),
         ("sent_ms", "goals sent after"),
@@ -325,5 +341,6 @@ def report(folder: Path, outcomes: list[str], steps: int, missed: int, times: di
     ):
         if name in times:
             t = times[name]
-            lines.append(f"{title:<17} {t['median']:.1f} ms, 99 % {t['p99']:.1f}, most {t['max']:.1f}")
-    return "\n".join([*lines, f"log: {folder}"])
+            print(f"{title:<17} {t['median']:.1f} ms, 99 % {t['p99']:.1f}, most {t['max']:.1f}")
+    print(f"log: {folder}")
+    return results

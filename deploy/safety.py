@@ -30,13 +30,19 @@ from typing import Any
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.deploy.answers import BusError, HandState
+from vd.deploy.answers import BusError, HandState, LateError, SilentError
 from vd.deploy.bus import MotorBus
+from vd.deploy.camera import AHEAD_S
+from vd.deploy.finding import NAMED
 from vd.deploy.joints import Joints
 from vd.deploy.limits import PERIOD_S, Limits, SafetyCfg
 
 WATCH_S = 0.01
 """How often the watchdog looks."""
+TORQUE_S = PERIOD_S / 3.0
+"""Age of what is known of the motors' torque from which it is asked for again, in a packet of its own, since
+its register lies far from the state's: with each reading of a control loop, each third of a recording."""
+TORQUE_GONE = "another program on the line switched it off, or it restarted"
 OFF_S = 1.0
 """How long switching off is tried on a bus that does not answer soundly."""
 FINISHED = "finished"
@@ -46,7 +52,19 @@ SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "asked to end", signal.SIGHU
 
 
 class StoppedError(RuntimeError):
-    """The hand was stopped; the message says why."""
+    """The hand was stopped; the message says why.
+
+    Args:
+        reason: Why.
+        number: Signal that asked for it; 0 for another reason.
+
+    Attributes:
+        signal: The same.
+    """
+
+    def __init__(self, reason: str, number: int = 0):
+        super().__init__(reason)
+        self.signal = number
 
 
 @dataclass(frozen=True)
@@ -61,6 +79,13 @@ class StopReport:
     """When the hand was told to hold where it is [s]; None if that could not be sent."""
     unreleased: dict[int, str] = field(default_factory=dict)
     """Motors of which it is not known that their torque is off, by ID."""
+    signal: int = 0
+    """Number of the signal that asked for it; 0 for another reason."""
+
+
+def unheard(error: BusError) -> str:
+    """Why no state came: by this computer's fault, or the bus'."""
+    return f"heard no motor: {error}" if isinstance(error, LateError) else f"lost the bus: {error}"
 
 
 class SafeHand:
@@ -84,8 +109,8 @@ class SafeHand:
     ):
         """Nothing is sent before :meth:`arm`."""
         self.bus, self.joints, self.hand, self.cfg, self._say = bus, joints, hand, cfg or SafetyCfg(), say
-        names = [f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)]
-        self.limits = Limits(hand, bus.model, names, self.cfg)
+        self._names = [f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)]
+        self.limits = Limits(hand, bus.model, self._names, self.cfg)
         self.limited = 0
         """Goals that were limited."""
         self.missed = 0
@@ -95,9 +120,9 @@ class SafeHand:
         self.report: StopReport | None = None
         """How the stop went, once there was one."""
         self._state: HandState | None = None
-        self._misses = 0
+        self._misses = self._signal = 0
         self._beat_s = self._image_s = np.inf
-        self._signal = ""
+        self._torque_s = -np.inf
         self._armed = False
         self._on = np.ones(len(joints.ids), dtype=bool)
         self._loop = threading.get_ident()
@@ -153,7 +178,7 @@ class SafeHand:
         except BusError as error:
             last = self._state
             if last is None or self.bus.clock.now() - last.time_s > self.cfg.lost_s:
-                raise self._stop(f"lost the bus: {error}", lost=True) from error
+                raise self._stop(unheard(error), lost=True) from error
             self.repeated += 1
             self._check()
             return last
@@ -187,7 +212,7 @@ class SafeHand:
             try:
                 self.bus.write_goals(self.joints.to_motor(goal), with_state=with_state)
             except BusError as error:
-                raise self._stop(f"lost the bus: {error}", lost=True) from error
+                raise self._stop(unheard(error), lost=True) from error
         return goal
 
     def switch(self, on: np.ndarray) -> None:
@@ -223,7 +248,16 @@ class SafeHand:
             raise self._stop(f"{self._misses} deadlines missed in a row")
 
     def image_at(self, time_s: float) -> None:
-        """The newest image is of this time [s], by the monotonic clock."""
+        """The newest image is of this time [s], by the monotonic clock.
+
+        Raises:
+            StoppedError: It is from the future, so its age is not known.
+        """
+        ahead = time_s - self.bus.clock.now()
+        if ahead > AHEAD_S:
+            raise self._stop(
+                f"the newest image is {ahead:.2f} s from the future: its clock is not the monotonic one"
+            )
         self._image_s = time_s
 
     def stop(self, reason: str) -> None:
@@ -235,26 +269,44 @@ class SafeHand:
         raise self._stop(reason)
 
     def _read(self) -> HandState:
-        raw = self.bus.read_state()
+        try:
+            raw = self.bus.read_state()
+        except (LateError, SilentError):
+            raise  # they would not be heard either
+        except BusError:
+            self._check_torque()  # a motor that restarted answers, but no state of it is accepted
+            raise
         state = self.joints.state(raw)
         if raw.alert.any():
-            raise self._stop(self._errors(raw))
+            raise self._stop(self._errors(raw.alert, "a hardware error"))
+        self._check_torque()
         if passed := self.limits.passed(state):
             raise self._stop(passed)
         return state
 
-    def _errors(self, raw: HandState) -> str:
-        """What the motors with an alert report."""
+    def _check_torque(self) -> None:
+        """Stop where a motor that was switched on is so no more; every TORQUE_S once the hand is armed."""
+        now = self.bus.clock.now()
+        if not self._armed or now - self._torque_s < TORQUE_S:
+            return
+        gone = self._on & ~self.bus.read_torque()
+        self._torque_s = now
+        if gone.any():
+            raise self._stop(f"torque went off: {self._errors(gone, TORQUE_GONE)}")
+
+    def _errors(self, which: np.ndarray, otherwise: str) -> str:
+        """What some motors [D] bool report as their errors, and what is said of one that reports none."""
         try:
             errors = self.bus.hardware_errors()
         except BusError:
             errors = {}
-        alerted = [id for id, alert in zip(self.bus.ids, raw.alert, strict=True) if alert]
-        return "; ".join(f"motor {id}: {errors.get(id, 'a hardware error')}" for id in alerted)
+        axes = np.flatnonzero(which)
+        words = [self._names[a] + ": " + errors.get(self.bus.ids[a], otherwise) for a in axes[:NAMED]]
+        return "; ".join(words) + (f"; and {len(axes) - NAMED} more" if len(axes) > NAMED else "")
 
     def _check(self) -> None:
         if self.report is not None:
-            raise StoppedError(self.report.reason)
+            raise self._error()
         due = self._due()
         if due:
             raise self._stop(due)
@@ -264,7 +316,7 @@ class SafeHand:
         now = self.bus.clock.now()
         silent, age = now - self._beat_s, now - self._image_s
         if self._signal:
-            return self._signal
+            return SIGNALS[signal.Signals(self._signal)]
         if silent > self.cfg.misses * PERIOD_S:
             return f"the loop stands: no step ended for {silent:.2f} s{self._place()}"
         if age > self.cfg.stale_s:
@@ -288,8 +340,12 @@ class SafeHand:
             lost: Whether the bus is not to be relied on.
         """
         self._hold(reason, lost=lost)
+        return self._error()
+
+    def _error(self) -> StoppedError:
+        """What to raise once the hand is stopped."""
         assert self.report is not None
-        return StoppedError(self.report.reason)
+        return StoppedError(self.report.reason, self.report.signal)
 
     def _hold(self, reason: str, *, lost: bool = False) -> None:
         """Have every joint stay where it is, once; what fails is told, not raised."""
@@ -297,7 +353,7 @@ class SafeHand:
         with self._stopping:
             if self.report is not None:
                 return
-            self.report = StopReport(reason, detected)
+            self.report = StopReport(reason, detected, signal=self._signal)
             if not self._armed:
                 return
             try:
@@ -333,7 +389,7 @@ class SafeHand:
             self._say(f"{why}the hand holds, its torque is on")
             return
         end = self.bus.clock.now() + self.cfg.hold_s
-        self._signal = ""
+        self._signal = 0
         while self.bus.clock.now() < end and not self._signal:  # a signal: at once
             self.bus.clock.sleep(WATCH_S)
         left = self._release()
@@ -360,7 +416,7 @@ class SafeHand:
 
     def _on_signal(self, number: int, _: FrameType | None) -> None:
         """Note a signal; the watchdog acts on it. A second one is not caught any more."""
-        self._signal = SIGNALS[signal.Signals(number)]
+        self._signal = number
         if self.report is not None:
             signal.signal(number, signal.default_int_handler)
 

@@ -34,6 +34,8 @@ class SimulatedPort(dynamixel_sdk.PortHandler):
         super().__init__("simulated")
         self.clock, self.line = clock, None
         self.is_open, self.tx_time_per_byte = True, 1e3 * BYTE_S
+        self.starved_s = 0.0
+        """How long this program does not run, whenever it waits for what has not come."""
         self.lag_s = 0.0
         """How much later than that bytes of the motors arrive."""
         self._coming: list[tuple[float, int]] = []
@@ -60,7 +62,7 @@ class SimulatedPort(dynamixel_sdk.PortHandler):
         """What has come; waits a little for the first byte."""
         self._check()
         if not self._coming or self._coming[0][0] > self.clock.now():
-            self.clock.sleep(POLL_S)
+            self.clock.sleep(POLL_S + self.starved_s)
         here = [byte for at, byte in self._coming[:length] if at <= self.clock.now()]
         del self._coming[: len(here)]
         return bytes(here)

@@ -20,12 +20,13 @@ PACKAGE_DIRS: dict[str, str] = PROJECT["tool"]["setuptools"]["package-dir"]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
 
 MAX_LINES = 600
-LEAVES = ("vd.paper", "vd.files", "vd.aim")
+LEAVES = ("vd.paper", "vd.files", "vd.aim", "vd.interrupt")
 # What each part may import of this project; the longest prefix of a module's name decides.
 ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.paper": (),
     "vd.files": (),
     "vd.aim": (),
+    "vd.interrupt": (),
     "vd.kernels": ("vd.kernels",),
     "vd.assets_usd": (*LEAVES, "vd.kernels", "vd.assets_usd"),
     "vd.sim": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim"),

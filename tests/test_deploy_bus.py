@@ -17,7 +17,15 @@ from simulated_clock import SimulatedClock  # noqa: E402
 from simulated_hand import simulated_bus  # noqa: E402
 
 from vd.assets_usd.hands import load_hand  # noqa: E402
-from vd.deploy.answers import STATE_ADDRESS, STATE_BYTES, Answer, BusError, StateCheck  # noqa: E402
+from vd.deploy.answers import (  # noqa: E402
+    STATE_ADDRESS,
+    STATE_BYTES,
+    Answer,
+    BusError,
+    LateError,
+    SilentError,
+    StateCheck,
+)
 from vd.deploy.bus import MotorBus, MotorSettings  # noqa: E402
 from vd.deploy.control_table import MODELS, HardwareError, table, to_angle, to_counts  # noqa: E402
 from vd.deploy.joints import uncalibrated  # noqa: E402
@@ -243,6 +251,21 @@ def test_a_twin_is_spoilt_on_request():
     for put, heat in (("99:id=1", "10=1"), ("10:none=1", "10=1"), ("10:id=x", "10=1"), ("10:id=1", "10:1")):
         with pytest.raises(ValueError, match="such as"):
             spoil(motors, [put], [heat])
+
+
+@pytest.mark.parametrize("starved_s", [0.0, 0.05])
+def test_a_program_that_did_not_run_is_not_called_a_lost_cable(starved_s):
+    hand = load_hand("dclaw3")
+    with simulated_bus(hand, uncalibrated(hand)) as (line, bus):
+        bus._port.starved_s = starved_s
+        line.faults.cut_off.add(11)
+        ask = (lambda: bus.read(11, "led"), bus.read_state, bus.read_torque)
+        for one in ask:
+            with pytest.raises(LateError if starved_s else SilentError) as caught:
+                one()
+            assert ("this computer is busy" in str(caught.value)) == bool(starved_s)
+            assert ("cable" in str(caught.value)) != bool(starved_s)
+        assert ("cable" in bus.missing()[11]) != bool(starved_s)
 
 
 def test_a_lost_port_is_an_error_of_the_bus(bus, twin):

@@ -2,7 +2,9 @@
 
 import contextlib
 import json
+import os
 import re
+import signal
 import subprocess
 import sys
 from dataclasses import replace
@@ -26,6 +28,7 @@ from vd.deploy.motor import Motor
 from vd.deploy.newton_hand import NewtonHand
 from vd.deploy.plant import Drive
 from vd.deploy.realsense import RealSenseCfg
+from vd.deploy.safety import StoppedError
 from vd.deploy.scan import FoundMotor, differences, find
 from vd.deploy.twin import Twin
 from vd.gap.recording import read_recording
@@ -33,6 +36,8 @@ from vd.sim.cfg import SimCfg
 
 PORT = "/dev/simulated"
 QUICK = SafetyCfg(step_rad=4.0, hold_s=0.05)
+PRESENT = 120
+"""Where in a motor's memory what it measures begins; what is before is written by others."""
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +83,9 @@ def test_what_differs_is_named(hand):
 def test_check_finds_nothing_wrong_and_leaves_the_torque_off(line, capsys):
     assert check.check(check.CheckCfg(port=PORT, json=True, no_camera=True)) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["ok"] and {"gains and limits", "loop rate"} < {f["what"] for f in report["findings"]}
+    assert report["ok"] and {"gains and limits", "torque", "loop rate"} < {
+        f["what"] for f in report["findings"]
+    }
     assert not any(motor.get("torque_enable") for motor in line.motors)
     assert line.motors[0].get("position_p_gain") == 200
 
@@ -112,6 +119,61 @@ def test_nothing_moves_unasked(line, monkeypatch):
     with pytest.raises(RuntimeError, match="motor 20: overload"):
         home.home(home.HomeCfg(port=PORT, yes=True))
     np.testing.assert_array_equal(line.plant.position, before)
+
+
+@pytest.mark.parametrize("torque", [True, False])
+def test_nothing_is_written_before_the_person_agreed(line, torque, capsys):
+    """A hand that holds an object goes on to, and the person is told before the question."""
+    for motor in line.motors:  # as another program left them
+        motor.put("position_p_gain", 900)
+    if torque:
+        line.plant.blocked[:2] = True
+        for motor in line.motors[:2]:
+            motor.put("torque_enable", 1)
+            motor.put("goal_position", motor.get("present_position") + 100)
+    settings = [bytes(motor.memory[:PRESENT]) for motor in line.motors]
+    assert check.check(check.CheckCfg(port=PORT, no_camera=True)) == 0
+    said = capsys.readouterr().out
+    assert ("motors 10, 11 hold" in said) == torque and "to be written to motors 10, 11, 12" in said
+    with pytest.raises(RuntimeError, match="Nobody is there to ask"):
+        home.home(home.HomeCfg(port=PORT))
+    assert ("Motors 10, 11 hold, with up to 0." in capsys.readouterr().err) == torque
+    assert [bytes(motor.memory[:PRESENT]) for motor in line.motors] == settings
+
+
+@pytest.fixture
+def on_the_way(line):
+    """Have something done while the hand moves: the preflight takes two seconds."""
+    clock, stops = line._clock, []
+
+    def schedule(do):
+        def once():
+            stops.pop()()
+            do()
+
+        stops.append(clock.every(4.0, once))
+
+    return schedule
+
+
+def test_torque_that_goes_off_stops_every_command_that_moves(line, on_the_way, plan, tmp_path):
+    settings = {"port": PORT, "yes": True, "safety": QUICK}
+    on_the_way(lambda: line.motors[3].put("torque_enable", 0))
+    with pytest.raises(StoppedError, match="torque went off: f1_j1, motor 20"):
+        home.home(home.HomeCfg(**settings, speed=0.02))
+    on_the_way(lambda: [motor.put("torque_enable", 0) for motor in line.motors])
+    motions = {"out": tmp_path / "rec", "plan": plan / "f0_j1.json", "realtime": "off"}
+    with pytest.raises(StoppedError, match=r"f0_j1, motor 10: another program .*; and 6 more"):
+        record.record(record.RecordCfg(**settings, **motions))
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_hand_stopped_by_a_signal_ends_its_command_so(line, on_the_way, number, status, capsys):
+    on_the_way(lambda: os.kill(os.getpid(), number))
+    flags = ["--port", PORT, "--yes", "--speed", "0.02", "--safety.hold-s", "0.05"]
+    assert cli.main(["home", *flags]) == status
+    assert "stopped: " in capsys.readouterr().err
+    assert not any(motor.get("torque_enable") for motor in line.motors)
 
 
 def test_home_comes_to_the_reset_pose(line, capsys):

@@ -75,17 +75,36 @@ def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_pa
     again = read_joints(path, hand)
     assert again.ids == turned.ids
     np.testing.assert_array_equal(again.offset, turned.offset)
-    record = json.loads(path.read_text())
-    record["motors"][1]["sign"] = 2
-    path.write_text(json.dumps(record))
-    with pytest.raises(CalibrationError, match=r"motors\.sign"):
-        read_joints(path, hand)
-    record["motors"][1] |= {"sign": 1, "id": 10}
-    path.write_text(json.dumps(record))
-    with pytest.raises(CalibrationError, match=r"motors\.id"):
-        read_joints(path, hand)
     with pytest.raises(CalibrationError, match="f3_j1"):
         read_joints(path, load_hand("dclaw4"))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"sign": 2}, r"motors\.sign of f0_j2 is 2; it is 1, or -1"),
+        ({"sign": -1.9}, r"motors\.sign of f0_j2 is -1\.9"),
+        ({"sign": True}, r"motors\[1\]\.sign: expected float, got True"),
+        ({"id": 10}, r"motors\.id are \[10, 10, 12.*give each motor its own"),
+        ({"id": 11.7}, r"motors\[1\]\.id: expected int, got 11\.7"),
+        ({"id": "11"}, r"motors\[1\]\.id: expected int, got '11'"),
+        ({"offset_rad": "0.1"}, r"motors\[1\]\.offset_rad: expected float, got '0\.1'"),
+        ({"offset_rad": float("nan")}, r"motors\.offset_rad of f0_j2 is nan"),
+        ({"offset": 0.1}, r"motors\[1\] has no field offset; it has id, joint, offset_rad, sign"),
+        ({"sign": None}, r"motors\[1\] has no sign; name it"),
+        ({"joint": "f0_j1"}, "motors has 2 entries of f0_j1"),
+        ({"joint": "thumb"}, "motors has no entries of f0_j2"),
+    ],
+)
+def test_what_is_no_calibration_is_refused_with_file_and_field(hand, turned, tmp_path, change, reason):
+    path = tmp_path / "motors.json"
+    turned.save(path, hand.name)
+    record = json.loads(path.read_text())
+    record["motors"][1] |= change
+    record["motors"][1] = {name: value for name, value in record["motors"][1].items() if value is not None}
+    path.write_text(json.dumps(record))
+    with pytest.raises(CalibrationError, match=rf"motors\.json.*{reason}"):
+        read_joints(path, hand)
 
 
 def test_the_simulated_hand_moves_through_the_bus(hand, turned):

@@ -19,6 +19,7 @@ from vd.deploy.clock import Pacer
 from vd.deploy.log import LogWriter
 from vd.deploy.loop import ControlLoop, LoopCfg
 from vd.deploy.pilot import Decision
+from vd.deploy.run_page import FILM_FILE, PAGE_FILE, goal_results, summary_line
 from vd.deploy.twin_link import TwinState
 from vd.envs.cfg import ReorientCfg
 from vd.hand_log import read_log
@@ -102,10 +103,11 @@ class Truth:
     """An object that lies still, somewhere."""
 
     position: tuple[float, float, float] = (0.0, 0.0, 0.03)
+    quat: tuple[float, ...] = tuple(GOAL)
 
     def state(self) -> TwinState:
         """Where it lies."""
-        pose = np.array([*self.position, *GOAL])
+        pose = np.array([*self.position, *self.quat])
         return TwinState(0.0, 0.0, np.zeros(9), np.zeros(9), pose, np.zeros(6))
 
 
@@ -147,6 +149,32 @@ def test_it_acts_until_the_policy_has_arrived_then_holds_and_goes_on(parts):
     assert read.stops[0].distance == pytest.approx(0.3)
     assert np.diff(read.columns["t"]) == pytest.approx(np.full(len(acting) - 1, 1.0 / HZ), abs=1e-5)
     np.testing.assert_allclose(read.columns["error"], 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("turned", "limit_s", "said"),
+    [
+        (0.0, 10.0, "goal 1: reached: stopped after 0.5 s, 0.00 rad from it, predicted 0.30"),
+        (1.0, 10.0, "goal 1: not reached: stopped after 0.5 s, 1.00 rad from it, predicted 0.30"),
+        (0.0, 0.25, "goal 1: not reached: time limit after 0.2 s, 0.00 rad from it, predicted 0.70"),
+        (None, 10.0, "goal 1: error not known: stopped after 0.5 s, predicted 0.30"),
+    ],
+)
+def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
+    """By the truth, not by what the policy says: only a goal at which it stopped is reached."""
+    hand, pilot, actions, pacer, log = parts
+    quat = np.array([0.0, 0.0, np.sin(0.5 * (turned or 0.0)), np.cos(0.5 * (turned or 0.0))])
+    truth = None if turned is None else Truth(quat=tuple(quat))
+    if truth is None:
+        log = LogWriter(log.folder / "real", load_hand("dclaw3"), log._run, servo={}, clock=hand.clock)
+    ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=limit_s, hold_s=0.2), truth=truth).run(
+        [GOAL]
+    )
+    log.finish("done")
+    results = goal_results(read_log(log.folder))
+    assert [str(one) for one in results] == [said]
+    expected = "1 of 2 goals stopped" if turned is None else f"{int(': reached' in said)} of 2 goals reached"
+    assert summary_line(results, 2).startswith(expected)
 
 
 def test_a_goal_that_is_not_reached_ends_by_its_time_and_a_lost_object_the_run(parts):
@@ -215,7 +243,7 @@ def test_a_teacher_flies_a_twin(hand, tmp_path, capsys, patient):
     folder = tmp_path / "log"
     flags = ["--hand", hand, "--twin", "--goal-s", "2", "--hold-s", "0.2", "--log", str(folder)]
     goals = ["--goal", "0,0,0,1", "0,0,0.84147,0.5403"]  # the second 2 rad away, so that it takes a while
-    status, words = cli.main([*flags, *patient, *goals]), capsys.readouterr().err
+    status, (out, words) = cli.main([*flags, *patient, *goals]), capsys.readouterr()
     if "loop rate" in words or "asked again" in words:
         pytest.skip(f"this machine is too busy: {words.splitlines()[-1]}")
     assert status == 0, words
@@ -228,6 +256,8 @@ def test_a_teacher_flies_a_twin(hand, tmp_path, capsys, patient):
     step = PAPER.action.scale_rad_s / HZ
     assert np.abs(log.channel("command") - log.channel("position")).max() < step + 0.3
     assert np.isfinite(log.object_pose).all() and log.object_pose[:, 2].max() < 0.2
+    assert "of 2 goals reached" in out and f"page: {folder / PAGE_FILE}" in out
+    assert "<video" in (folder / PAGE_FILE).read_text() and (folder / FILM_FILE).stat().st_size > 1000
 
 
 @pytest.mark.slow

@@ -159,6 +159,31 @@ def test_frames_of_the_cameras_own_clock_become_stale_too(twin):
     camera.close()
 
 
+@pytest.mark.parametrize("ahead_s", [0.005, 3.0])
+def test_an_image_from_the_future_is_refused_with_the_name_of_its_clock(twin, ahead_s):
+    """What the SDK's guess of a clock is off by apart; that counts as of now."""
+    camera = RealSense(twin.device, cfg())
+    twin.show(plane(), time.monotonic() + ahead_s)
+    if ahead_s < 1.0:
+        assert camera.read(PATIENCE_S).time_s <= time.monotonic()
+    else:
+        with pytest.raises(CameraError, match=r"stamped (2\.9|3\.0)\d s later .* clock global_time"):
+            camera.read(PATIENCE_S)
+    camera.close()
+
+
+def test_a_camera_without_projector_can_be_used_and_calibrated(capsys):
+    """A D405: what it lacks is left out, and said."""
+    twin = CameraTwin(LENS, projector=False)
+    camera = RealSenseInfrared(twin.device, cfg())
+    twin.show_infrared(np.zeros((360, 640), dtype=np.uint8))
+    assert camera.read(PATIENCE_S).image.shape == (360, 640)
+    camera.close()
+    camera = RealSense(twin.device, cfg(emitter=True))
+    assert "twin of a RealSense, twin has no emitter: it is left out" in capsys.readouterr().err
+    camera.close()
+
+
 def test_a_recording_plays_back_what_was_sent(twin, tmp_path):
     path = tmp_path / "hand.db3"
     camera = RealSense(twin.device, cfg(record=path))

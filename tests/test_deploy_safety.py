@@ -115,11 +115,18 @@ def run_until_stopped(safe: SafeHand, target: np.ndarray, seconds: float = 5.0) 
         (lambda line: line.faults.cut_off.add(11), "lost the bus: motor 11", 0.25 + STEP_S),
         # 40 degrees to go at 400 a second, and a step.
         (lambda line: setattr(line.motors[4], "heat_c_per_s", 400.0), "motor 21", 0.102 + STEP_S),
-        (lambda line: line.motors[8].reboot(), "motor 32: its clock differs", 0.25 + STEP_S),
+        (lambda line: line.motors[8].reboot(), "f2_j3, motor 32: another program on the line", STEP_S),
+        (lambda line: line.motors[3].put("torque_enable", 0), "torque went off: f1_j1, motor 20", STEP_S),
+        # No cable: nobody listens for 50 ms. The last sound state is older than 0.25 s, as above.
+        (
+            lambda line: setattr(line.put.__self__, "starved_s", 0.05),
+            "heard no motor: the st",
+            0.25 + 2 * STEP_S,
+        ),
         (lambda line: os.kill(os.getpid(), signal.SIGINT), "Ctrl-C", 2 * WATCH_S),
         (lambda line: os.kill(os.getpid(), signal.SIGHUP), "the terminal is gone", 2 * WATCH_S),
     ],
-    ids=["cable", "heat", "restart", "ctrl-c", "hangup"],
+    ids=["cable", "heat", "restart", "torque", "starved", "ctrl-c", "hangup"],
 )
 def test_faults_stop_the_hand_in_time_and_are_named(bus, line, hand, joints, fault, reason, found_s):
     target = reset_pose(3) + 0.3
@@ -179,6 +186,10 @@ def test_deadlines_and_images_stop_the_hand(bus, hand, joints):
         safe.image_at(shown)
         assert "image is" in run_until_stopped(safe, reset_pose(3))
         assert 0.0 < safe.report.detected_s - shown - QUICK.stale_s < 2 * WATCH_S
+    with SafeHand(bus, joints, hand, QUICK) as safe:
+        safe.arm()
+        with pytest.raises(StoppedError, match=r"3\.00 s from the future"):
+            safe.image_at(bus.clock.now() + 3.0)
 
 
 def test_a_loop_that_stands_is_stopped_by_the_watchdog(bus, hand, joints):

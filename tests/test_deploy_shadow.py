@@ -24,11 +24,17 @@ STEPS = 24
 GOALS = [[0.0, 0.0, 0.0, 1.0], [0.0, 0.6, 0.0, 0.8]]
 
 
-def write(folder, *, truth=True, spoil=0.0):
+def write(folder, *, truth=True, spoil=0.0, tolerance_rad=1.2):
     """A log of joints that swing and an object that turns; goals are sent as in training, ``spoil`` apart."""
     hand = load_hand("dclaw3")
     task = ReorientCfg(hand="dclaw3")
-    run = {"policy": "still", "object": {"name": "cube", "set": "cube"}, "goals": GOALS, "control_hz": 12.0}
+    run = {
+        "tolerance_rad": tolerance_rad,
+        "policy": "still",
+        "object": {"name": "cube", "set": "cube"},
+        "goals": GOALS,
+        "control_hz": 12.0,
+    }
     log = LogWriter(folder, hand, run, servo={}, truth=truth)
     actions = ActionFilter(hand, task)
     rng = np.random.default_rng(0)
@@ -148,6 +154,8 @@ def test_a_log_is_shown(tmp_path, capsys):
     assert len(replay.snapshots) == STEPS
     np.testing.assert_allclose(replay.snapshots[5].joint_q[:9], read_log(folder).channel("position")[5])
     assert [shot.success for shot in replay.snapshots].index(True) == 11
+    far = Replay(read_log(write(tmp_path / "far", tolerance_rad=1.0))).snapshots  # stopped at 1.1 rad
+    assert not any(shot.success for shot in far)
     assert [shot.fell for shot in replay.snapshots].index(True) == STEPS - 1
     assert replay.snapshots[-1].goals == 1 and replay.snapshots[-1].drops == 1
     np.testing.assert_allclose(replay.snapshots[12].goal_quat, GOALS[1])

@@ -130,7 +130,7 @@ def test_the_command_trains_saves_on_sigterm_and_resumes(tmp_path):
         assert run.poll() is None, "training ended by itself"
         time.sleep(0.2)
     run.send_signal(signal.SIGTERM)
-    assert run.wait(timeout=300) == 130
+    assert run.wait(timeout=300) == 143
     done = read_progress(progress)[-1]["iteration"]
     config = json.loads((tmp_path / "config.json").read_text())
     assert config["env"]["num_worlds"] == 4

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vd import interrupt
 from vd.config import to_dict
 from vd.envs.cfg import FocusCfg
 from vd.files import check_file, check_folder, write_json
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from vd.train.runner import TeacherRunner
 
 INTERRUPTED = 130
-"""Exit status after Ctrl-C or SIGTERM: 128 and the number of SIGINT, as shells do."""
+"""Exit status after an interruption; ``vd.interrupt`` makes 143 of it where SIGTERM was the reason."""
 
 USAGE = """usage: vd-train COMMAND [flags]
 
@@ -103,11 +104,12 @@ class CurvesCfg:
     """PNG to write; curves.png beside the first run's progress by default."""
 
 
+@interrupt.command("vd-train")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-train``.
 
     Returns:
-        Exit status: 0 at the end, 1 on an error, 130 if interrupted and saved.
+        Exit status: 0 at the end, 1 on an error, 130 after Ctrl-C and 143 after SIGTERM, if saved.
     """
     started = time.monotonic()
     arguments = list(sys.argv[1:] if arguments is None else arguments)

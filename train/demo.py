@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
+from vd import interrupt
 from vd.config import to_dict
 from vd.files import write_json
 from vd.train.demo_agents import AGENTS, GoalCount, compare_agents, record_training_task
@@ -199,7 +200,7 @@ class _Demo:
                 return
             resume = ["--resume"] if list_checkpoints(run_dir) else []
             status = cli.main(["teacher", *flags, "--max-minutes", f"{minutes:.2f}", *resume])
-            if status == EXIT_INTERRUPTED:
+            if status in (interrupt.INTERRUPTED, interrupt.TERMINATED):
                 raise KeyboardInterrupt
             if status != 0 or not (run_dir / "policy.pt").is_file():
                 raise DemoError(f"the training in {run_dir} failed; the reason is above")

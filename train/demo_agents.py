@@ -194,8 +194,8 @@ def record_training_task(
         device: ``cpu`` or ``cuda``.
     """
     from vd.assets_usd.objects.model import load_set
-    from vd.play.cli import GOAL_SHARE, GRID_CELL, spread
-    from vd.play.video import record, write_frames
+    from vd.play.cli import spread
+    from vd.play.video import GOAL_SHARE, GRID_CELL, record, write_frames
     from vd.render import Renderer
 
     worlds = max(VIDEO_CELLS, len(load_set(list(objects))))

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vd import interrupt
 from vd.page import Page
 from vd.train.demo_stages import TimeUp
 from vd.train.metrics import PROGRESS_FILE, read_progress
@@ -19,7 +20,6 @@ ONE_SCENE_SHARE = 0.35
 """Share of it for the scene to be learned by heart."""
 BEGUN = 0.95
 """Share of doing nothing's error below which a student has begun to imitate."""
-INTERRUPTED = 130
 
 
 def student_commands(folder: Path, seed: int) -> list[list[str]]:
@@ -66,7 +66,7 @@ def train_students(folder: Path, seed: int, *, minutes: float) -> None:
     shares = (ONE_SCENE_SHARE, 1.0 - ONE_SCENE_SHARE)
     for arguments, share in zip(student_commands(folder, seed), shares, strict=True):
         status = cli.main([*arguments, "--max-minutes", f"{share * minutes:.2f}", "--no-tensorboard"])
-        if status == INTERRUPTED:
+        if status in (interrupt.INTERRUPTED, interrupt.TERMINATED):
             raise KeyboardInterrupt
         if status != 0:
             raise RuntimeError(f"vd-train {' '.join(arguments)} failed; the reason is above")

@@ -8,6 +8,7 @@ from types import FrameType
 
 import torch
 
+from vd import interrupt
 from vd.train.distributed import ending_together
 
 
@@ -45,6 +46,7 @@ class EndRequest:
             if self.signal:
                 raise KeyboardInterrupt
             self.signal = number
+            interrupt.note(number)
             note("stopping: saving a checkpoint (again to stop at once, without saving)")
 
         previous = {}
@@ -65,6 +67,7 @@ class EndRequest:
         wishes = torch.tensor([float(self.signal), float(late)], device=self._device)
         torch.distributed.all_reduce(wishes, op=torch.distributed.ReduceOp.MAX)
         self.signal = int(wishes[0])
+        interrupt.note(self.signal)
         return bool(self.signal) or bool(wishes[1])
 
     def time_left(self, done: int, left: int) -> float | None:

@@ -43,16 +43,22 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
     A class that lost a field says so in ``RETIRED``: by name the value that means what is now always so.
 
     Raises:
-        ValueError: A field that ``cls`` does not have, or a value of the wrong type, named by its path.
+        ValueError: A field that ``cls`` does not have, one that is needed and absent, or a value of the wrong
+            type, named by its path.
     """
     values = _without_retired(values, getattr(cls, "RETIRED", {}), where or cls.__name__)
     hints = typing.get_type_hints(cls)
-    names = {field.name for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+    names = {field.name for field in fields}
     unknown = sorted(set(values) - names)
     if unknown:
         raise ValueError(
             f"{where or cls.__name__} has no field {', '.join(unknown)}; it has {', '.join(sorted(names))}"
         )
+    needed = [field for field in fields if field.default is field.default_factory is dataclasses.MISSING]
+    left_out = {field.name for field in needed} - set(values)
+    if left_out:
+        raise ValueError(f"{where or cls.__name__} has no {', '.join(sorted(left_out))}; name it")
     prefix = f"{where}." if where else ""
     return cls(**{name: _convert(hints[name], item, prefix + name) for name, item in values.items()})
 
@@ -85,7 +91,8 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         inner = [args[0]] * len(value) if origin is list or args[-1:] == (Ellipsis,) else list(args)
         if len(inner) != len(value):
             raise ValueError(f"{where}: expected {len(inner)} values, got {len(value)}")
-        return origin(_convert(kind, item, where) for kind, item in zip(inner, value, strict=True))
+        pairs = enumerate(zip(inner, value, strict=True))
+        return origin(_convert(kind, item, f"{where}[{i}]") for i, (kind, item) in pairs)
     if origin is dict:
         if not isinstance(value, Mapping):
             raise ValueError(f"{where}: expected values by name, got {value!r}")

@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from vd.paper import PAPER
+
 LOG_FORMAT = "vd-hand-log/1"
 RUN_FILE, STEPS_FILE, EVENTS_FILE, RECORDING_FILE = "run.json", "steps.csv", "events.jsonl", "recording.json"
 IMAGES = "images"
@@ -86,6 +88,11 @@ class HandLog:
     def goals(self) -> np.ndarray:
         """Wanted orientations [G, 4]."""
         return np.array(self.run["goals"], dtype=float).reshape(-1, 4)
+
+    @property
+    def tolerance_rad(self) -> float:
+        """Largest angle at which a goal is reached [rad]."""
+        return float(self.run.get("tolerance_rad", PAPER.success.rotation_rad))
 
     @property
     def stops(self) -> list[Stop]:

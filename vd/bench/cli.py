@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
+from vd import interrupt
 from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
 
@@ -385,6 +386,7 @@ Command = (
 )
 
 
+@interrupt.command("vd-bench")
 def main() -> None:
     """Entry point of ``vd-bench``."""
     command = tyro.cli(Command, prog="vd-bench", description=__doc__)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from vd import interrupt
 from vd.evaluate.agents import (
     LAYER_HELP,
     SHIPPED_POLICIES,
@@ -203,6 +204,7 @@ class EvalCfg:
                 raise ValueError(f"--{flag} is decided by --suite {self.suite}; leave it out")
 
 
+@interrupt.command("vd-eval")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-eval``; returns the exit status."""
     cfg = tyro.cli(EvalCfg, args=arguments, prog="vd-eval")

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from vd import interrupt
 from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
 
@@ -282,6 +283,7 @@ Command = (
 )
 
 
+@interrupt.command("vd-gap")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-gap``; returns the exit status."""
     command: Run | Find | Explain | Close | Report | Plan | Identify | Hide = tyro.cli(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from vd import interrupt
 from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, check_names, episode_limit_s, start_at_rest
 from vd.evaluate.cli import POLICY_HELP
 from vd.files import check_file
@@ -24,10 +25,6 @@ if TYPE_CHECKING:
     from vd.play.replay import ReplaySession
     from vd.play.session import Session
 
-# Size of a cell's picture in a video [pixel]: alone, and in a grid.
-SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)
-# Side of the goal's picture, as a share of the cell's height.
-GOAL_SHARE = 0.36
 VIDEO_SECONDS = 10.0
 # A CPU simulates this many worlds about in real time.
 FAST_WORLDS_CPU = 16
@@ -122,6 +119,7 @@ class PlayCfg:
             raise ValueError(f"--video is {self.video}; use a name that ends in .mp4, .gif or .png")
 
 
+@interrupt.command("vd-play")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``vd-play``; returns the exit status."""
     cfg = tyro.cli(PlayCfg, args=arguments, prog="vd-play")
@@ -146,8 +144,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError, RuntimeError) as error:
         print(f"vd-play: {error}", file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print()
     return 0
 
 
@@ -158,25 +154,14 @@ def replay(cfg: PlayCfg) -> int:
         LogError: The log cannot be used.
     """
     from vd.hand_log import read_log
-    from vd.play.replay import Replay, ReplaySession
+    from vd.play.replay import Replay, ReplaySession, film
 
-    shown = Replay(read_log(cfg.agent_name))
+    log = read_log(cfg.agent_name)
     if cfg.video is None:
+        shown = Replay(log)
         _serve(lambda: ReplaySession(shown), cfg)
         return 0
-    from vd.play.video import write_frames
-    from vd.render import Renderer
-
-    width, height = SINGLE_CELL
-    renderer = Renderer(
-        shown.hand,
-        [shown.item],
-        width=width,
-        height=height,
-        goal_size=round(GOAL_SHARE * height),
-        samples=cfg.samples,
-    )
-    frames = write_frames(cfg.video, shown.frames(renderer), shown.control_hz)
+    frames = film(log, cfg.video, samples=cfg.samples)
     print(f"{cfg.video} ({frames} frames)")
     return 0
 
@@ -192,7 +177,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
 
     from vd.evaluate.agents import built_in
     from vd.evaluate.cli import LOG_EVERY_S
-    from vd.play.video import record, write_frames
+    from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
     env, trained, device = _open(cfg, num_worlds=cfg.cells)

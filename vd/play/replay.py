@@ -1,6 +1,7 @@
 """Replaying the log of a run on a hand: the same pictures as of a simulation, from what was measured."""
 
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,7 +10,7 @@ from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.hand_log import HandLog, LogError
-from vd.play.video import Composer, Snapshot
+from vd.play.video import GOAL_SHARE, SINGLE_CELL, Composer, Snapshot, write_frames
 from vd.render import OUT_OF_SIGHT, Renderer
 
 BARS = ("loop_time", "lateness", "largest_current", "largest_speed")
@@ -69,7 +70,8 @@ class Replay:
             # Events have the time of their writing: the last step before it is the one that ended the goal.
             over = stop is not None and columns["t"][step] <= stop.time_s
             last = step + 1 == steps or columns["t"][step + 1] > (stop.time_s if stop else np.inf)
-            success = bool(stop and over and last and stop.outcome == "stopped")
+            near = "error" not in columns or error[step] <= log.tolerance_rad
+            success = bool(stop and over and last and near and stop.outcome == "stopped")
             fell = bool(stop and over and last and stop.outcome == "lost")
             reached, lost = reached + success, lost + fell
             yield Snapshot(
@@ -90,6 +92,29 @@ class Replay:
         composer = Composer(BARS, 1)
         for shot in self.snapshots:
             yield composer.frame(renderer.render(shot.joint_q[None], shot.goal_quat[None]), [shot])
+
+
+def film(log: HandLog, path: Path, *, samples: int = 1) -> int:
+    """Write the film of a log; returns the number of frames.
+
+    Args:
+        log: The log.
+        path: .mp4, .gif, or .png for six moments.
+        samples: Rays a pixel; 4 smooths edges.
+
+    Raises:
+        LogError: Hand or object are not here.
+    """
+    shown, (width, height) = Replay(log), SINGLE_CELL
+    renderer = Renderer(
+        shown.hand,
+        [shown.item],
+        width=width,
+        height=height,
+        goal_size=round(GOAL_SHARE * height),
+        samples=samples,
+    )
+    return write_frames(path, shown.frames(renderer), shown.control_hz)
 
 
 class ReplaySession:

@@ -16,6 +16,10 @@ from vd.files import atomic_path
 from vd.paper import PAPER
 from vd.render import Picture, Renderer
 
+# Size of a cell's picture [pixel]: alone, and in a grid.
+SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)
+# Side of the goal's picture, as a share of the cell's height.
+GOAL_SHARE = 0.36
 STRIP_HEIGHT = 80
 MARGIN = 10
 # Share of a column of reward terms that their names take, and its width [pixel] from which 11 points fit.

@@ -1,0 +1,105 @@
+"""What came of each goal of a run, from its log: in lines, and as a page with the film."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vd.hand_log import HandLog
+from vd.page import Page
+
+FILM_FILE, PAGE_FILE = "run.mp4", "run.html"
+ABORTED = "aborted"
+"""Outcome of a goal that was still pursued when the run ended."""
+
+
+@dataclass(frozen=True)
+class GoalResult:
+    """How the pursuit of a goal ended."""
+
+    goal: int
+    """Number of the goal."""
+    outcome: str
+    """``stopped`` by the policy, ``time limit``, ``lost`` or ``aborted``."""
+    seconds: float
+    """How long it was pursued [s]."""
+    predicted_rad: float | None
+    """Distance to the goal that the policy stopped by [rad]; None where it has none."""
+    error_rad: float | None
+    """True angle to the goal at the end, up to symmetry [rad]; None where nobody knows: on a real hand."""
+    success: bool | None
+    """Whether the policy stopped within the tolerance; None where nobody knows."""
+
+    def __str__(self) -> str:
+        """In one line."""
+        words = {True: "reached", False: "not reached", None: "error not known"}[self.success]
+        far = "" if self.error_rad is None else f", {self.error_rad:.2f} rad from it"
+        said = "" if self.predicted_rad is None else f", predicted {self.predicted_rad:.2f}"
+        return f"goal {self.goal + 1}: {words}: {self.outcome} after {self.seconds:.1f} s{far}{said}"
+
+
+def goal_results(log: HandLog) -> list[GoalResult]:
+    """How each goal ended that was pursued."""
+    columns, stops = log.columns, {stop.goal: stop for stop in log.stops}
+    results = []
+    for goal in np.unique(columns["goal"][columns["acting"] > 0.0]).astype(int):
+        rows = np.flatnonzero((columns["goal"] == goal) & (columns["acting"] > 0.0))
+        outcome = stops[goal].outcome if goal in stops else ABORTED
+        predicted = float(columns["distance"][rows[-1]])
+        error = float(columns["error"][rows[-1]]) if "error" in columns else None
+        results.append(
+            GoalResult(
+                goal=int(goal),
+                outcome=outcome,
+                seconds=float(columns["t"][rows[-1]] - columns["t"][rows[0]]),
+                predicted_rad=None if np.isnan(predicted) else predicted,
+                error_rad=error,
+                success=None if error is None else outcome == "stopped" and error <= log.tolerance_rad,
+            )
+        )
+    return results
+
+
+def summary_line(results: Sequence[GoalResult], goals: int) -> str:
+    """How many goals were reached of those that were to be pursued."""
+    if any(one.success is None for one in results):
+        stopped = sum(one.outcome == "stopped" for one in results)
+        return f"{stopped} of {goals} goals stopped; vd-deploy score tells the errors, by motion capture"
+    return f"{sum(bool(one.success) for one in results)} of {goals} goals reached"
+
+
+def write_page(log: HandLog, results: Sequence[GoalResult]) -> Path:
+    """Write the film of a run and the page that shows it, into its folder.
+
+    Returns:
+        The page.
+
+    Raises:
+        LogError: Hand or object are not here any more.
+    """
+    from vd.play.replay import film
+
+    film(log, log.path / FILM_FILE)
+    run = log.run
+    where = f"the twin of {run['hand']}" if run["twin"] else run["hand"]
+    page = Page(f"{run['policy']} on {where}", f"{run['object']['name']}: {len(log.goals)} goals.")
+    page.text(summary_line(results, len(log.goals)))
+    page.video(log.path / FILM_FILE, "The run, from its log.")
+    page.table(
+        ("goal", "outcome", "time [s]", "predicted [rad]", "error [rad]", "reached"),
+        [
+            (
+                one.goal + 1,
+                one.outcome,
+                f"{one.seconds:.1f}",
+                "" if one.predicted_rad is None else f"{one.predicted_rad:.2f}",
+                "" if one.error_rad is None else f"{one.error_rad:.2f}",
+                {True: "yes", False: "no", None: ""}[one.success],
+            )
+            for one in results
+        ],
+        words=(1,),
+    )
+    page.write(log.path / PAGE_FILE)
+    return log.path / PAGE_FILE

@@ -1,0 +1,60 @@
+"""How commands end by a signal: every entry point, whatever it was doing."""
+
+import importlib
+import os
+import signal
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import tyro
+
+from vd import interrupt
+
+PROJECT = tomllib.loads((Path(__file__).resolve().parents[1] / "pyproject.toml").read_text())
+SCRIPTS: dict[str, str] = PROJECT["project"]["scripts"]
+FIRST = {"vd-train": "teacher", "vd-deploy": "home"}
+"""A command of those that have commands, before its options are read."""
+STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
+
+
+@pytest.mark.parametrize("number", STATUS)
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_command_ends_with_128_and_the_signals_number(script, number, monkeypatch, capsys):
+    module, function = SCRIPTS[script].split(":")
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(tyro, "cli", lambda *_, **__: os.kill(os.getpid(), number))
+    monkeypatch.setattr(sys, "argv", [script, *([FIRST[script]] if script in FIRST else [])])
+    assert getattr(importlib.import_module(module), function)() == STATUS[number]
+    said = capsys.readouterr().err
+    assert "stopped" in said or "interrupted" in said
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.parametrize("number", STATUS)
+def test_a_command_that_only_knows_that_it_was_interrupted_ends_so_too(number):
+    @interrupt.command("vd-some")
+    def exits() -> None:
+        try:
+            os.kill(os.getpid(), number)
+        except KeyboardInterrupt:  # what is finished is kept
+            sys.exit(interrupt.INTERRUPTED)
+
+    with pytest.raises(SystemExit) as end:
+        exits()
+    assert end.value.code == STATUS[number]
+
+
+def test_what_a_command_forks_ends_by_the_signal_itself():
+    """A pool ends its workers with SIGTERM; they have nothing to say about it."""
+
+    @interrupt.command("vd-some")
+    def forks() -> int:
+        child = os.fork()
+        if not child:
+            os.kill(os.getpid(), signal.SIGTERM)
+            os._exit(0)
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+    assert forks() == -signal.SIGTERM

@@ -1,0 +1,83 @@
+"""How commands end by a signal: with 128 and its number, 130 after Ctrl-C and 143 after SIGTERM."""
+
+import functools
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any, ParamSpec
+
+INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
+"""Exit statuses."""
+
+P = ParamSpec("P")
+
+_last = 0
+"""The signal that came last; whoever handles one by itself says so with :func:`note`."""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM. What is tidied up after Ctrl-C is tidied up after this too."""
+
+
+def note(number: int) -> None:
+    """A signal came, and is handled elsewhere."""
+    global _last
+    _last = number
+
+
+def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
+    """Have the entry point of a command end by signals as all commands do.
+
+    Args:
+        name: What the command is called.
+    """
+
+    def wrap(main: Callable[P, Any]) -> Callable[P, Any]:
+        @functools.wraps(main)
+        def run(*args: P.args, **kwargs: P.kwargs) -> Any:
+            with _sigterm():
+                try:
+                    status = main(*args, **kwargs)
+                except SystemExit as end:
+                    end.code = _status(end.code)
+                    raise
+                except KeyboardInterrupt as error:
+                    print(f"\n{name}: stopped", file=sys.stderr)
+                    return TERMINATED if isinstance(error, Terminated) else INTERRUPTED
+            return _status(status)
+
+        return run
+
+    return wrap
+
+
+def _status(status: Any) -> Any:
+    """An exit status; where a command only knows that it was interrupted, by which signal."""
+    return TERMINATED if status == INTERRUPTED and _last == signal.SIGTERM else status
+
+
+@contextmanager
+def _sigterm() -> Iterator[None]:
+    """Have SIGTERM raise :class:`Terminated` in this process; what it forks ends at once, as without this."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # signals belong to the main thread
+        return
+    owner = os.getpid()
+
+    def terminate(number: int, _: FrameType | None) -> None:
+        if os.getpid() != owner:
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        note(number)
+        raise Terminated
+
+    note(0)
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
