@@ -1,11 +1,14 @@
-"""How commands end by a signal: with 128 and its number, 130 after Ctrl-C and 143 after SIGTERM."""
+"""What all commands do: say at once that they start, and end by a signal with 128 and its number.
+
+That is 130 after Ctrl-C and 143 after SIGTERM.
+"""
 
 import functools
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any, ParamSpec
@@ -30,7 +33,7 @@ def note(number: int) -> None:
 
 
 def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
-    """Have the entry point of a command end by signals as all commands do.
+    """Have the entry point of a command start and end as all commands do.
 
     Args:
         name: What the command is called.
@@ -39,6 +42,9 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
     def wrap(main: Callable[P, Any]) -> Callable[P, Any]:
         @functools.wraps(main)
         def run(*args: P.args, **kwargs: P.kwargs) -> Any:
+            given = args[0] if args and isinstance(args[0], Sequence) else sys.argv[1:]
+            if given and not {"-h", "--help"} & set(given):
+                print(f"{name}: starting", file=sys.stderr, flush=True)  # what it imports takes seconds
             with _sigterm():
                 try:
                     status = main(*args, **kwargs)

@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from vd.aim import AimCfg
-from vd.assets_usd.hands import check_hand_name
-from vd.assets_usd.objects.sets import check_sets
 from vd.bundle import is_bundle
 from vd.config import from_dict
 from vd.envs.cfg import (
@@ -79,6 +77,9 @@ def check_names(agents: Iterable[str], objects: Iterable[str], hand: str | None 
         FileNotFoundError: There is no such policy.
         ValueError: There is no such object set or hand.
     """
+    from vd.assets_usd.hands import check_hand_name
+    from vd.assets_usd.objects.sets import check_sets
+
     for name in agents:
         if name not in BUILT_IN:
             find_policy(name)

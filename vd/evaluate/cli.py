@@ -213,7 +213,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         names = cfg.agent_names
         check_names(names, chain(*parse_groups(cfg.object_sets).values()), cfg.hand)
         check_folder(cfg.output)
-        print(f"vd-eval: {', '.join(names)}; loading", file=sys.stderr, flush=True)
         if cfg.second_view:
             check_second_view(names)
         if cfg.suite is not None:
