@@ -327,6 +327,7 @@ def _put(item: str, value: int, *motors: int) -> Callable[[Twin], None]:
 def _stubborn(twin: Twin) -> None:
     """A motor that does not keep a limit."""
     motor = twin.motors[4]
+    motor.put("max_position_limit", 4000)
     accept = motor._accept
     motor._accept = lambda name, value: accept(name, 4000 if name == "max_position_limit" else value)  # type: ignore[method-assign]
 
