@@ -105,7 +105,7 @@ class _Kept:
 
 def check_wiring() -> str:
     """What to try where a motor is silent."""
-    return "check its cable, power, ID and baud rate"
+    return "check its cable, power, baud rate and ID, which may be that of another motor"
 
 
 class MotorBus:

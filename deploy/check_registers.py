@@ -41,8 +41,9 @@ def register_findings(connection: Connection, tables: Tables) -> Iterator[Findin
         for id, value, wanted in motors:
             mend = one.remedy.format(reboot=bus.command(f"reboot {id}"), wanted=wanted)
             values.append(f"motor {id}: {value}; {mend or f'it will be set to {wanted}'}")
-        where = " (kept without power)" if kept(bus.model, one) and not one.remedy else ""
-        yield Finding(one.name, not one.remedy, f"{one.why}: {listed(values)}{where}")
+        where = " (kept without power)" if kept(bus.model, one) else ""
+        found = f"{one.why}: {listed(values)}" if one.remedy else f"{listed(values)}{where}; else {one.why}"
+        yield Finding(one.name, not one.remedy, found)
     if not rows:
         yield Finding(what, True, "as the hand needs them")
 

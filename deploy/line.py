@@ -104,8 +104,8 @@ class MotorLine:
                 frames = [encode(answer) for answer in self._answers(motor, packet)]
                 answers.setdefault(motor.id, []).append((motor, frames))
         for same in answers.values():
-            for frames in itertools.zip_longest(*(frames for _, frames in same), fillvalue=b""):
-                self._send(same[0][0], collide(frames))
+            for at_once in itertools.zip_longest(*(frames for _, frames in same), fillvalue=b""):
+                self._send(same[0][0], collide(at_once))
 
     def _answers(self, motor: Motor, packet: Packet) -> list[Packet]:
         """What one motor makes of a packet on the bus."""

@@ -3,8 +3,6 @@
 import math
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from vd.deploy.control_table import (
     COUNTS_PER_TURN,
     EEPROM_END,
@@ -40,10 +38,22 @@ CONTROL_S = 1e-3
 P_UNIT, I_UNIT, FEEDFORWARD_UNIT = 128.0, 65536.0, 4.0
 """What the gains are divided by (e-manual): a count of error, or of the trajectory's speed or acceleration,
 gives so many counts of PWM."""
-MODE_ITEMS = ("position_p_gain", "position_i_gain", "position_d_gain", "feedforward_1st_gain")
-MODE_ITEMS += ("feedforward_2nd_gain", "profile_velocity", "profile_acceleration", "goal_pwm")
+MODE_ITEMS = (
+    "position_p_gain",
+    "position_i_gain",
+    "position_d_gain",
+    "feedforward_1st_gain",
+    "feedforward_2nd_gain",
+    "profile_velocity",
+    "profile_acceleration",
+    "goal_pwm",
+)
 """What another operating mode brings back to its initial value."""
 GOALS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
+
+
+def _clip(value: float, largest: float) -> float:
+    return max(-largest, min(largest, value))
 
 
 @dataclass
@@ -213,7 +223,7 @@ class Motor:
         left, before = goal - self._path, self._speed
         wanted = math.copysign(min(fastest, math.sqrt(2.0 * hardest * abs(left))), left)
         change = hardest * seconds
-        self._speed += float(np.clip(wanted - self._speed, -change, change))
+        self._speed += _clip(wanted - self._speed, change)
         step = self._speed * seconds
         if abs(step) >= abs(left) and step * left >= 0.0:
             step, self._speed = left, 0.0
@@ -228,11 +238,11 @@ class Motor:
         i_gain = self.get("position_i_gain") / I_UNIT
         largest = power * FULL_PWM / p_gain * RAD_PER_COUNT
         self._summed += i_gain / p_gain * (self._path - self._where) * seconds / CONTROL_S
-        self._summed = float(np.clip(self._summed, -largest, largest))  # else it would wind up
+        self._summed = _clip(self._summed, largest)  # else it would wind up
         speed = self.get("feedforward_1st_gain") * self._speed / RAD_S_PER_COUNT
         acceleration = self.get("feedforward_2nd_gain") * self._acceleration / RAD_S2_PER_COUNT
         forward = (speed + acceleration) / FEEDFORWARD_UNIT / p_gain * RAD_PER_COUNT
-        return float(np.clip(self._summed + forward, -largest, largest))
+        return _clip(self._summed + forward, largest)
 
     def sense(self, seconds: float, position: float, velocity: float, torque: float) -> None:
         """Take in the state of the axis after ``seconds`` more, and protect the motor.

@@ -4,6 +4,7 @@ import dataclasses
 import re
 import shlex
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -291,6 +292,13 @@ def test_two_motors_with_one_id_are_thought_of(rig, port):
             run([*words, "--port", PORT])
     rig.line.faults.cut_off = set()
     assert [motor.id for motor in rig.line.motors[:2]] == [10, 10]
+
+
+def test_the_commands_of_the_troubleshooting_parse():
+    text = (Path(__file__).parents[1] / "docs" / "deploy.md").read_text()
+    rows = commands(text[text.index("### Troubleshooting") : text.index("## Flying")])
+    assert {"reboot", "set-id", "set-baud", "scan", "record"} == {words[0] for words in rows}
+    assert all(parse(words).port == "/dev/ttyUSB0" for words in rows)
 
 
 def test_an_error_comes_with_the_command_that_clears_it(rig, port):
