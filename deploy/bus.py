@@ -8,7 +8,6 @@ import contextlib
 import termios
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,10 +29,8 @@ from vd.deploy.answers import (
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.control_table import (
     MODELS,
-    RAD_S_PER_COUNT,
     SIZE,
     WATCHDOG_UNIT_S,
-    Model,
     describe_hardware_error,
     table,
     to_counts,
@@ -41,10 +38,8 @@ from vd.deploy.control_table import (
 from vd.deploy.finding import BAUD_RATE, command
 from vd.deploy.packets import MAX_ID
 from vd.deploy.port import WAIT_S, open_port, sdk
-from vd.deploy.registers import different
+from vd.deploy.registers import MotorSettings, different
 
-P_GAIN, D_GAIN = 200, 10
-"""Position gains of the paper's motors, in their units."""
 STARVED_S = 0.02
 """A read of the port that returns so much too late may have missed an answer: motors answer within 5 ms, and
 the SDK, once it runs again, finds that its 34 ms are over."""
@@ -52,36 +47,6 @@ BUSY = "this computer is busy; end other programs, or give this one real-time pr
 TORQUE_BYTES = 1
 LATE_S = 0.02
 """Pause after a question that was asked in vain or again; what arrives meanwhile is dropped."""
-
-
-@dataclass(frozen=True)
-class MotorSettings:
-    """What is written to a motor at start, and read back."""
-
-    current_limit_a: float
-    """Largest current [A]."""
-    velocity_limit_rad_s: float
-    """Largest speed [rad/s]."""
-    lower_rad: float
-    """Least angle [rad]."""
-    upper_rad: float
-    """Largest angle [rad]."""
-    p_gain: int = P_GAIN
-    d_gain: int = D_GAIN
-    return_delay_us: int = 0
-    """Wait before an answer [us]; 500 from the factory."""
-
-    def values(self, model: Model) -> dict[str, int]:
-        """Values of the control table that are the joint's own, by item."""
-        return {
-            "return_delay_time": self.return_delay_us // 2,
-            "current_limit": int(self.current_limit_a / model.current_unit_a),
-            "velocity_limit": int(self.velocity_limit_rad_s / RAD_S_PER_COUNT),
-            "min_position_limit": to_counts(self.lower_rad),
-            "max_position_limit": to_counts(self.upper_rad),
-            "position_p_gain": self.p_gain,
-            "position_d_gain": self.d_gain,
-        }
 
 
 class _Kept:
@@ -319,12 +284,11 @@ class MotorBus:
         """
         wrong = []
         for id in self.ids:
-            own = settings[id].values(self.model)
             self.write(id, "torque_enable", 0)
             for _ in range(2):  # another operating mode changes the gains
-                for one, (_, wanted) in different(self.read_table(id), self.model, own).items():
+                for one, (_, wanted) in different(self.read_table(id), self.model, settings[id]).items():
                     self.write(id, one.name, wanted)
-            for one, (found, wanted) in different(self.read_table(id), self.model, own).items():
+            for one, (found, wanted) in different(self.read_table(id), self.model, settings[id]).items():
                 wrong.append(f"motor {id}: {one.name} is {found}, not {wanted}")
         if wrong:
             raise BusError("; ".join(wrong))

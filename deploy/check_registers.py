@@ -72,6 +72,6 @@ def _different(
     settings = connection.joints.settings(connection.hand, model.name)
     rows: dict[Register, list[tuple[int, int, int]]] = {}
     for id, found in tables.items():
-        for one, values in different(found, model, settings[id].values(model), ours=ours).items():
+        for one, values in different(found, model, settings[id], ours=ours).items():
             rows.setdefault(one, []).append((id, *values))
     return rows

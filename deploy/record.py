@@ -14,7 +14,6 @@ import numpy as np
 import tyro
 
 from vd.deploy.answers import HandState
-from vd.deploy.bus import D_GAIN, P_GAIN
 from vd.deploy.check import ready
 from vd.deploy.clock import Pacer
 from vd.deploy.connect import Connection, HandOptions, connect
@@ -22,6 +21,7 @@ from vd.deploy.control_table import RAD_PER_COUNT
 from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import move
 from vd.deploy.motor_time import measured_at
+from vd.deploy.registers import D_GAIN, P_GAIN
 from vd.deploy.safety import SafeHand
 from vd.deploy.timely import Priority, real_time, undisturbed
 from vd.files import check_folder

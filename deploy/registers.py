@@ -8,8 +8,10 @@ operating modes alone: velocity gains, goal current, goal velocity.
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from vd.deploy.control_table import EEPROM_END, Model, table
+from vd.deploy.control_table import EEPROM_END, RAD_S_PER_COUNT, Model, table, to_counts
 
+P_GAIN, D_GAIN = 200, 10
+"""Position gains of the paper's motors, in their units."""
 WIZARD = "set it to {wanted} with ROBOTIS' DYNAMIXEL Wizard 2.0"
 
 
@@ -64,18 +66,48 @@ REGISTERS = (
 """The table."""
 
 
+@dataclass(frozen=True)
+class MotorSettings:
+    """What is written to a motor at start, and read back."""
+
+    current_limit_a: float
+    """Largest current [A]."""
+    velocity_limit_rad_s: float
+    """Largest speed [rad/s]."""
+    lower_rad: float
+    """Least angle [rad]."""
+    upper_rad: float
+    """Largest angle [rad]."""
+    p_gain: int = P_GAIN
+    d_gain: int = D_GAIN
+    return_delay_us: int = 0
+    """Wait before an answer [us]; 500 from the factory."""
+
+    def values(self, model: Model) -> dict[str, int]:
+        """Values of the control table that are the joint's own, by item."""
+        return {
+            "return_delay_time": self.return_delay_us // 2,
+            "current_limit": int(self.current_limit_a / model.current_unit_a),
+            "velocity_limit": int(self.velocity_limit_rad_s / RAD_S_PER_COUNT),
+            "min_position_limit": to_counts(self.lower_rad),
+            "max_position_limit": to_counts(self.upper_rad),
+            "position_p_gain": self.p_gain,
+            "position_d_gain": self.d_gain,
+        }
+
+
 def different(
-    found: Mapping[str, int], model: Model, own: Mapping[str, int], *, ours: bool = True
+    found: Mapping[str, int], model: Model, settings: MotorSettings, *, ours: bool = True
 ) -> dict[Register, tuple[int, int]]:
     """Registers that are not as they should be: the value of each, and the wanted one.
 
     Args:
         found: Control table of a motor.
         model: Its model.
-        own: What its joint wants, by item; the factory's values otherwise.
+        settings: What its joint wants; the factory's values otherwise.
         ours: Those that we set, else those that only a person can.
     """
-    items = table(model)
+    items, own = table(model), settings.values(model)
     wanted = {
         one: own.get(one.name, items[one.name].initial) for one in REGISTERS if ours != bool(one.remedy)
     }

@@ -93,30 +93,33 @@ def differences(
     """What differs from what the hand needs, a sentence for each, with the remedy."""
     from vd.deploy.control_table import MODELS
 
-    known = ", ".join(MODELS)
     wrong = []
     by_id: dict[int, list[FoundMotor]] = {}
     for motor in found:
         by_id.setdefault(motor.id, []).append(motor)
     spare = sorted(set(by_id) - set(joints.ids))
+    # Where they are all of another model that we know, it is the option that is wrong.
+    models = {motor.model for motor in found}
+    other = models.pop() if len(models) == 1 and models <= set(MODELS) else ""
+    remedy = f"give --motor {other}" if other else f"a hand has motors of one model of {', '.join(MODELS)}"
     for name, id in zip(joints.names, joints.ids, strict=True):
         if id not in by_id:
             guess = f"; is it {', '.join(f'ID {s}' for s in spare)}?" if spare else ""
             wrong.append(f"{name}: no motor {id} answers: check its cable, power and ID{guess}")
-            continue
-        for motor in by_id[id]:
+        for motor in by_id.get(id, []):
             if motor.baud_rate != baud_rate:
-                wrong.append(
-                    f"{name}: motor {id} is at {motor.baud_rate} baud, not {baud_rate}: "
-                    + command(f"set-baud {id} {baud_rate}", port, motor.baud_rate)
-                )
+                mend = command(f"set-baud {id} {baud_rate}", port, motor.baud_rate)
+                wrong.append(f"{name}: motor {id} is at {motor.baud_rate} baud, not {baud_rate}: {mend}")
             if motor.model != model:
-                # Where they are all of another model that we know, it is the option that is wrong.
-                same = motor.model in MODELS and {one.model for one in found} == {motor.model}
-                remedy = (
-                    f"give --motor {motor.model}" if same else f"a hand has motors of one model of {known}"
-                )
                 wrong.append(f"{name}: motor {id} is {motor.model}, not {model}: {remedy}")
+    return wrong + _strangers(found, spare, by_id, port)
+
+
+def _strangers(
+    found: Sequence[FoundMotor], spare: Sequence[int], by_id: dict[int, list[FoundMotor]], port: str
+) -> list[str]:
+    """Motors that share an ID, are none of the hand's, or have another firmware than the rest."""
+    wrong = []
     for motor in found:
         if motor.garbled:
             mend = command(f"set-id {motor.id} NEW", port, motor.baud_rate)

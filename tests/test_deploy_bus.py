@@ -26,13 +26,14 @@ from vd.deploy.answers import (  # noqa: E402
     SilentError,
     StateCheck,
 )
-from vd.deploy.bus import MotorBus, MotorSettings  # noqa: E402
+from vd.deploy.bus import MotorBus  # noqa: E402
 from vd.deploy.control_table import MODELS, HardwareError, table, to_angle, to_counts  # noqa: E402
 from vd.deploy.joints import uncalibrated  # noqa: E402
 from vd.deploy.line import Faults, MotorLine  # noqa: E402
 from vd.deploy.motor import Motor  # noqa: E402
 from vd.deploy.packets import ALERT, Failure, Instruction, Packet, PacketReader, encode  # noqa: E402
 from vd.deploy.plant import FirstOrderPlant  # noqa: E402
+from vd.deploy.registers import MotorSettings  # noqa: E402
 from vd.deploy.twin import Twin, spoil  # noqa: E402
 
 IDS = (10, 11, 12)
