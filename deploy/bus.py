@@ -32,6 +32,7 @@ from vd.deploy.control_table import (
     SIZE,
     WATCHDOG_UNIT_S,
     describe_hardware_error,
+    model_name,
     table,
     to_counts,
 )
@@ -218,8 +219,7 @@ class MotorBus:
             if number is None:
                 wrong[id] = str(self._silence("does not answer"))
             elif number != self.model.number:
-                names = {model.number: name for name, model in MODELS.items()}
-                wrong[id] = f"is {names.get(number, f'model {number}')}, not {self.model.name}"
+                wrong[id] = f"is {model_name(number)}, not {self.model.name}"
         return wrong
 
     def read(self, id: int, name: str) -> int:

@@ -90,6 +90,12 @@ MODELS = {
 """The motors, by name."""
 
 
+def model_name(number: int) -> str:
+    """The name of a motor's model; its number where it is none of ours."""
+    names = {model.number: name for name, model in MODELS.items()}
+    return names.get(number, f"model {number}")
+
+
 class HardwareError(IntFlag):
     """Bits of the hardware error status and of the shutdown mask."""
 

@@ -6,18 +6,26 @@ from typing import Annotated
 
 import tyro
 
-from vd.deploy.answers import BusError, GarbledError, LateError
+from vd.deploy.answers import CLOCK_TOLERANCE_S, BusError, GarbledError, LateError
 from vd.deploy.bus import MotorBus
 from vd.deploy.check import confirm
 from vd.deploy.connect import BAUD_RATE
-from vd.deploy.control_table import BAUD_RATES, MODELS, describe_hardware_error, to_angle
+from vd.deploy.control_table import (
+    BAUD_RATES,
+    MODELS,
+    TICK_MODULUS,
+    describe_hardware_error,
+    model_name,
+    to_angle,
+)
 from vd.deploy.finding import command
 from vd.deploy.packets import MAX_ID
 
 RESTART_S = 5.0
 """Longest time that a motor takes to answer after a restart; they need about half a second."""
 ASK_AGAIN_S = 0.2
-NAMES = {model.number: name for name, model in MODELS.items()}
+CLOCK_S = TICK_MODULUS / 1000.0
+"""After which a motor's clock begins anew by itself."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,7 +94,7 @@ def _look(bus: MotorBus, cfg: MotorOptions) -> tuple[str, dict[str, int]]:
             f"motor {cfg.id} has its torque on: end the program that moves it; support what it holds, and "
             f"{bus.command('home')} ends with the torque off"
         )
-    return NAMES.get(number, f"model {number}"), table
+    return model_name(number), table
 
 
 def reboot(cfg: RebootCfg) -> int:
@@ -98,6 +106,7 @@ def reboot(cfg: RebootCfg) -> int:
     _check_id("reboot", cfg.id)
     with open_bus(cfg, cfg.baud_rate) as bus:
         model, table = _look(bus, cfg)
+        looked = bus.clock.now()
         if table:
             error = describe_hardware_error(table["hardware_error_status"])
             state = f"its torque is off, its hardware error is: {error}"
@@ -106,33 +115,41 @@ def reboot(cfg: RebootCfg) -> int:
         confirm(
             f"Motor {cfg.id}, {model}, will restart, with the gains of the factory; {state}.", yes=cfg.yes
         )
-        asked = bus.clock.now()
         with contextlib.suppress(BusError):  # a status_return_level of 0 leaves it unanswered
             bus.reboot(cfg.id)
-        table = _wait(bus, cfg.id, asked)
+        table = _wait(bus, cfg.id, table.get("realtime_tick"), looked)
     error = describe_hardware_error(table["hardware_error_status"])
     angle = to_angle(table["present_position"])
     print(f"motor {cfg.id} has restarted: at {angle:.2f} rad, hardware error: {error}")
     return 1 if table["hardware_error_status"] else 0
 
 
-def _wait(bus: MotorBus, id: int, asked: float) -> dict[str, int]:
-    """The control table of a motor that has restarted: its clock began anew since it was asked to [s].
+def _wait(bus: MotorBus, id: int, tick: int | None, looked: float) -> dict[str, int]:
+    """The control table of a motor that has restarted: its clock began anew.
+
+    Args:
+        bus: The bus.
+        id: The motor.
+        tick: What its clock said before [ms]; None where it could not be read.
+        looked: When [s].
 
     Raises:
         BusError: It has not.
     """
-    why = "its clock went on"
-    while (gone := bus.clock.now() - asked) < RESTART_S:
+    why, asked = "its clock went on", bus.clock.now()
+    while bus.clock.now() - asked < RESTART_S:
         bus.clock.sleep(ASK_AGAIN_S)
         try:
             table = bus.read_table(id)
         except BusError as error:
             why = str(error)
             continue
-        if table["realtime_tick"] <= 1000.0 * (bus.clock.now() - asked):
+        if tick is None:
             return table
-    raise BusError(f"motor {id} did not restart within {gone:.0f} s ({why}): switch its power off and on")
+        ahead = (table["realtime_tick"] - tick) / 1000.0 - (bus.clock.now() - looked)
+        if abs((ahead + 0.5 * CLOCK_S) % CLOCK_S - 0.5 * CLOCK_S) > CLOCK_TOLERANCE_S:
+            return table
+    raise BusError(f"motor {id} did not restart within {RESTART_S:g} s ({why}): switch its power off and on")
 
 
 def set_id(cfg: SetIdCfg) -> int:

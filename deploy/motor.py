@@ -228,7 +228,7 @@ class Motor:
         if abs(step) >= abs(left) and step * left >= 0.0:
             step, self._speed = left, 0.0
         self._path += step
-        self._acceleration = (self._speed - before) / seconds if seconds > 0.0 else 0.0
+        self._acceleration = (self._speed - before) / seconds
 
     def _push(self, seconds: float, power: float) -> float:
         """What I gain and feed-forward add to the error of position [rad], no more than the full PWM."""

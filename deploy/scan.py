@@ -52,9 +52,8 @@ def find(port: str, baud_rates: Sequence[int], say: Callable[[str], None]) -> li
     """
     from vd.deploy.answers import BusError
     from vd.deploy.bus import MotorBus
-    from vd.deploy.control_table import MODELS
+    from vd.deploy.control_table import MODELS, model_name
 
-    names = {model.number: name for name, model in MODELS.items()}
     found, refused = [], []
     for rate in baud_rates:
         try:
@@ -68,7 +67,7 @@ def find(port: str, baud_rates: Sequence[int], say: Callable[[str], None]) -> li
             continue
         say(f"{port} at {rate}: {len(answers)} motors")
         found += [
-            FoundMotor(id, rate, names.get(number, f"model {number}"), firmware, id in garbled)
+            FoundMotor(id, rate, model_name(number), firmware, id in garbled)
             for id, (number, firmware) in sorted(answers.items())
         ]
     return found

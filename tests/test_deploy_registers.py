@@ -352,8 +352,10 @@ def test_nothing_is_written_to_a_motor_unasked(rig, port, words):
     assert bytes(rig.motor.memory[:71]) == before
 
 
-def test_a_motor_that_does_not_restart_is_not_said_to_have(rig, port, monkeypatch):
+@pytest.mark.parametrize("waited", [0.0, 29.5])  # its clock begins anew after 32.8 s by itself
+def test_a_motor_that_does_not_restart_is_not_said_to_have(rig, port, monkeypatch, waited):
     monkeypatch.setattr(type(rig.motor), "reboot", lambda motor: None)
+    rig.motor._clock = waited
     with pytest.raises(BusError, match="did not restart"):
         run(["reboot", "10", "--port", PORT])
 
