@@ -47,6 +47,10 @@ class LateError(BusError):
     """This program did not run in time to hear the motors: no fault of theirs, or of their cables."""
 
 
+class GarbledError(BusError):
+    """Something answered, but no sound packet came, also not when asked again."""
+
+
 @dataclass(frozen=True)
 class HandState:
     """State at one reading of all motors, or by :meth:`vd.deploy.joints.Joints.state` of their joints.

@@ -8,7 +8,6 @@ import contextlib
 import termios
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from vd.deploy.answers import (
     STATE_BYTES,
     Answer,
     BusError,
+    GarbledError,
     HandState,
     LateError,
     SilentError,
@@ -29,19 +29,18 @@ from vd.deploy.answers import (
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.control_table import (
     MODELS,
-    POSITION_MODE,
-    RAD_S_PER_COUNT,
+    SIZE,
     WATCHDOG_UNIT_S,
-    Model,
     describe_hardware_error,
+    model_name,
     table,
     to_counts,
 )
+from vd.deploy.finding import BAUD_RATE, command
 from vd.deploy.packets import MAX_ID
-from vd.deploy.port import BAUD_RATE, WAIT_S, open_port, sdk
+from vd.deploy.port import WAIT_S, open_port, sdk
+from vd.deploy.registers import MotorSettings, different
 
-P_GAIN, D_GAIN = 200, 10
-"""Position gains of the paper's motors, in their units."""
 STARVED_S = 0.02
 """A read of the port that returns so much too late may have missed an answer: motors answer within 5 ms, and
 the SDK, once it runs again, finds that its 34 ms are over."""
@@ -49,37 +48,6 @@ BUSY = "this computer is busy; end other programs, or give this one real-time pr
 TORQUE_BYTES = 1
 LATE_S = 0.02
 """Pause after a question that was asked in vain or again; what arrives meanwhile is dropped."""
-
-
-@dataclass(frozen=True)
-class MotorSettings:
-    """What is written to a motor at start, and read back."""
-
-    current_limit_a: float
-    """Largest current [A]."""
-    velocity_limit_rad_s: float
-    """Largest speed [rad/s]."""
-    lower_rad: float
-    """Least angle [rad]."""
-    upper_rad: float
-    """Largest angle [rad]."""
-    p_gain: int = P_GAIN
-    d_gain: int = D_GAIN
-    return_delay_us: int = 0
-    """Wait before an answer [us]; 500 from the factory."""
-
-    def values(self, model: Model) -> dict[str, int]:
-        """Values of the control table, by item, in the order to write them."""
-        return {
-            "operating_mode": POSITION_MODE,
-            "return_delay_time": self.return_delay_us // 2,
-            "current_limit": int(self.current_limit_a / model.current_unit_a),
-            "velocity_limit": int(self.velocity_limit_rad_s / RAD_S_PER_COUNT),
-            "min_position_limit": to_counts(self.lower_rad),
-            "max_position_limit": to_counts(self.upper_rad),
-            "position_p_gain": self.p_gain,
-            "position_d_gain": self.d_gain,
-        }
 
 
 class _Kept:
@@ -103,7 +71,7 @@ class _Kept:
 
 def check_wiring() -> str:
     """What to try where a motor is silent."""
-    return "check its cable, power, ID and baud rate"
+    return "check its cable, power, baud rate and ID, which may be that of another motor"
 
 
 class MotorBus:
@@ -160,6 +128,26 @@ class MotorBus:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @property
+    def port(self) -> str:
+        """Name of the port."""
+        return str(self._port.getPortName())
+
+    def command(self, words: str) -> str:
+        """A command of vd-deploy for these motors, as a person can enter it."""
+        return command(words, self.port, self._port.getBaudRate())
+
+    def _garbled(self, result: int) -> bool:
+        """Whether what answered the last exchange is no sound packet, though this program listened."""
+        return bool(result == self._sdk.COMM_RX_CORRUPT) and self._late_s <= STARVED_S
+
+    def _twice(self, id: int) -> str:
+        """What garbled answers mean."""
+        return (
+            f"its answers are garbled: two motors have the ID {id} (unplug one, then "
+            f"{self.command(f'set-id {id} NEW')} for the other), or a cable is bad"
+        )
+
     def close(self) -> None:
         """Close the port. Torque stays as it is."""
         with self._lock:
@@ -182,8 +170,7 @@ class MotorBus:
             try:
                 yield
             except (OSError, termios.error, TypeError) as error:  # a closed port raises TypeError
-                name = self._port.getPortName()
-                raise BusError(f"{name} is lost: {error}; is its adapter still there?") from error
+                raise BusError(f"{self.port} is lost: {error}; is its adapter still there?") from error
             finally:
                 self._port.is_using = False  # else no packet could follow an exchange that was interrupted
 
@@ -204,8 +191,14 @@ class MotorBus:
         return answer, result, error
 
     def ping(self, id: int) -> int | None:
-        """Model number of a motor, or None if it does not answer."""
+        """Model number of a motor, or None if it does not answer.
+
+        Raises:
+            GarbledError: Something answers, but not soundly.
+        """
         number, result, _ = self._ask(self._packets.ping, id)
+        if self._garbled(result):
+            raise GarbledError(self._twice(id))
         return int(number) if result == self._sdk.COMM_SUCCESS else None
 
     def ping_all(self) -> dict[int, tuple[int, int]]:
@@ -218,12 +211,15 @@ class MotorBus:
         """What is wrong with the motors that do not answer, or are of another model, by ID."""
         wrong = {}
         for id in self.ids:
-            number = self.ping(id)
+            try:
+                number = self.ping(id)
+            except GarbledError as error:
+                wrong[id] = str(error)
+                continue
             if number is None:
                 wrong[id] = str(self._silence("does not answer"))
             elif number != self.model.number:
-                names = {model.number: name for name, model in MODELS.items()}
-                wrong[id] = f"is {names.get(number, f'model {number}')}, not {self.model.name}"
+                wrong[id] = f"is {model_name(number)}, not {self.model.name}"
         return wrong
 
     def read(self, id: int, name: str) -> int:
@@ -233,6 +229,22 @@ class MotorBus:
             BusError: No sound answer.
         """
         item = self._items[name]
+        return item.from_bytes(self._read(id, name, item.address, item.size))
+
+    def read_table(self, id: int) -> dict[str, int]:
+        """The whole control table of a motor, with one packet: values by item.
+
+        Raises:
+            BusError: No sound answer; GarbledError where answers came that were none.
+        """
+        data = self._read(id, "the control table", 0, SIZE)
+        return {
+            name: item.from_bytes(data[item.address : item.address + item.size])
+            for name, item in self._items.items()
+        }
+
+    def _read(self, id: int, what: str, address: int, size: int) -> bytes:
+        """Bytes of the control table of a motor."""
 
         def receive(_: Any, motor: int, address: int, size: int) -> tuple[bytes, int, int]:
             result = self._packets.readTx(self._port, motor, address, size)
@@ -245,9 +257,9 @@ class MotorBus:
                 return b"", result if result != self._sdk.COMM_SUCCESS else self._sdk.COMM_RX_CORRUPT, 0
             return answer.data, result, answer.error
 
-        data, result, error = self._ask(receive, id, item.address, item.size)
-        self._check(id, f"read {name}", result, error)
-        return item.from_bytes(data)
+        data, result, error = self._ask(receive, id, address, size)
+        self._check(id, f"read {what}", result, error)
+        return bytes(data)
 
     def write(self, id: int, name: str, value: int) -> None:
         """Write one item of the control table.
@@ -265,21 +277,19 @@ class MotorBus:
         self._check(id, f"write {value} to {name}", result, error)
 
     def configure(self, settings: Mapping[int, MotorSettings]) -> None:
-        """Torque off, write gains, limits and mode, and read all of it back.
+        """Torque off, write what differs of the registers that are ours to set, and read all of it back.
 
         Raises:
             BusError: A motor did not answer, refused, or kept another value; names each.
         """
         wrong = []
         for id in self.ids:
-            values = settings[id].values(self.model)
             self.write(id, "torque_enable", 0)
-            for name, value in values.items():
-                self.write(id, name, value)
-            for name, value in values.items():
-                found = self.read(id, name)
-                if found != value:
-                    wrong.append(f"motor {id}: {name} is {found}, not {value}")
+            for _ in range(2):  # another operating mode changes the gains
+                for one, (_, wanted) in different(self.read_table(id), self.model, settings[id]).items():
+                    self.write(id, one.name, wanted)
+            for one, (found, wanted) in different(self.read_table(id), self.model, settings[id]).items():
+                wrong.append(f"motor {id}: {one.name} is {found}, not {wanted}")
         if wrong:
             raise BusError("; ".join(wrong))
         with self._lock:
@@ -485,6 +495,8 @@ class MotorBus:
         return BusError(f"{what}: {self._words(result)}")
 
     def _check(self, id: int, what: str, result: int, error: int) -> None:
+        if self._garbled(result):
+            raise GarbledError(f"motor {id}: {what}: {self._words(result)}: {self._twice(id)}")
         if result != self._sdk.COMM_SUCCESS:
             raise self._failure(f"{what}: motor {id}", result)
         if refused := Answer(id, error, b"").refused:

@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 import tyro
 
+from vd.deploy.adapter import adapter_findings
 from vd.deploy.answers import BusError
+from vd.deploy.check_registers import read_tables, register_findings, to_be_set
 from vd.deploy.child import TwinError
 from vd.deploy.connect import Connection, HandOptions, connect
 from vd.deploy.finding import Finding, finding, show
-from vd.deploy.joints import CalibrationError
 from vd.deploy.limits import PERIOD_S, SafetyCfg
 from vd.deploy.motion import move
 from vd.deploy.realsense import RealSenseCfg
@@ -37,8 +38,6 @@ VOLTAGE_SHARE = 0.1
 """Deviation from the supply's nominal voltage that is normal."""
 OUTSIDE_RAD = 0.1
 """How far a joint may hang out of its range and still be brought back slowly."""
-PLAIN = {"drive_mode": 0, "homing_offset": 0, "protocol_type": 2, "status_return_level": 2}
-"""Items that have to be as from the factory: turned drives and offsets belong in the calibration."""
 RANGE_SHARE = 0.8
 """Share of a joint's range that --range moves it through."""
 RANGE_SPEED_RAD_S = 0.7
@@ -72,44 +71,28 @@ def preflight(connection: Connection) -> Iterator[Finding]:
     """
     bus = connection.bus
     try:
+        yield from adapter_findings(bus.port)
         missing = bus.missing()
-        yield finding(
-            "motors answer", [f"motor {id} {why}" for id, why in missing.items()], f"all {len(bus.ids)}"
-        )
-        if missing:
+        tables, deaf = read_tables(bus, [id for id in bus.ids if id not in missing])
+        wrong = [f"motor {id} {why}" for id, why in missing.items()] + deaf
+        yield finding("motors answer", wrong, f"all {len(bus.ids)}")
+        if wrong:
             return
         errors = bus.hardware_errors()
         yield finding(
             "no hardware error",
-            [f"motor {id}: {why}; reboot it once it is mended" for id, why in errors.items()],
+            [
+                f"motor {id}: {why}; once it is mended {bus.command(f'reboot {id}')} clears it"
+                for id, why in errors.items()
+            ],
             "none",
         )
-        yield finding("factory items", _not_plain(connection), "as they should be")
-        yield _settings(connection)
+        yield from register_findings(connection, tables)
         yield Finding("torque", True, holding(connection) or "off")
         yield from _state(connection)
         yield _cycles(connection)
     except BusError as error:
         yield Finding("bus", False, str(error))
-
-
-def _settings(connection: Connection) -> Finding:
-    """Whether the gains and limits can be those of the hand, and how many motors have them already."""
-    bus, what = connection.bus, "gains and limits"
-    try:
-        wanted = connection.joints.settings(connection.hand, bus.model.name)
-    except CalibrationError as error:
-        return Finding(what, False, str(error))
-    other = [
-        id
-        for id in bus.ids
-        if any(bus.read(id, name) != value for name, value in wanted[id].values(bus.model).items())
-    ]
-    return Finding(
-        what,
-        True,
-        f"to be written to motors {', '.join(map(str, other))}" if other else "those of the hand",
-    )
 
 
 def holding(connection: Connection) -> str:
@@ -128,26 +111,13 @@ def holding(connection: Connection) -> str:
 
 
 def write_settings(connection: Connection) -> Finding:
-    """Write gains and limits, with the torque off, and read them back."""
+    """Write the registers that differ, with the torque off, and read them back."""
     bus, what = connection.bus, "settings"
     try:
         bus.configure(connection.joints.settings(connection.hand, bus.model.name))
     except BusError as error:
         return Finding(what, False, str(error))
-    return Finding(what, True, "gains and limits written and read back, torque off")
-
-
-def _not_plain(connection: Connection) -> list[str]:
-    bus = connection.bus
-    wrong = []
-    for id in bus.ids:
-        for name, value in PLAIN.items():
-            found = bus.read(id, name)
-            if found != value:
-                wrong.append(
-                    f"motor {id}: {name} is {found}, not {value}: write it with the motors' own tool"
-                )
-    return wrong
+    return Finding(what, True, "registers written and read back, torque off")
 
 
 def _state(connection: Connection) -> Iterator[Finding]:
@@ -170,11 +140,14 @@ def _state(connection: Connection) -> Iterator[Finding]:
     yield finding("voltage", weak, f"{state.voltage.min():.1f} to {state.voltage.max():.1f} V")
     q = joints.to_joint(state.position)
     out = np.maximum(hand.lower - q, q - hand.upper)
-    outside = [
-        f"{name}: {angle:.2f} rad, out of {low:.2f} to {high:.2f}: move it by hand, or mend its calibration"
-        for name, angle, low, high, by in zip(joints.names, q, hand.lower, hand.upper, out, strict=True)
-        if by > OUTSIDE_RAD
-    ]
+    turns = np.round((q - 0.5 * (hand.lower + hand.upper)) / (2.0 * np.pi))
+    outside = []
+    for axis in np.flatnonzero(out > OUTSIDE_RAD):
+        # Turned by hand without torque a motor counts on; one that starts counts within one turn.
+        mend = f"it was turned round; {bus.command(f'reboot {bus.ids[axis]}')}"
+        mend = mend if turns[axis] else "move it by hand, or mend its calibration"
+        where = f"{q[axis]:.2f} rad, out of {hand.lower[axis]:.2f} to {hand.upper[axis]:.2f}"
+        outside.append(f"{joints.names[axis]}: {where}: {mend}")
     yield finding("pose within limits", outside, "every joint")
 
 
@@ -249,7 +222,7 @@ def agreed(connection: Connection, question: str, *, yes: bool, quiet: bool = Fa
     if held := holding(connection):
         held = f"{held[:1].upper()}{held[1:]}; support what the hand carries. "
         print(held, file=sys.stderr, flush=True)
-    confirm(question, yes=yes)
+    confirm(f"{to_be_set(connection)}{question}", yes=yes)
     written = show([write_settings(connection)], quiet=quiet)
     _stop_at_wrong(written)
     return written

@@ -35,6 +35,14 @@ COMMANDS = {
         "calibrate",
         "find where the camera is, by markers on fingertips",
     ),
+    "reboot": Entry(
+        "vd.deploy.maintain",
+        "RebootCfg",
+        "reboot",
+        "restart a motor: clears its error, and its count of turns",
+    ),
+    "set-id": Entry("vd.deploy.maintain", "SetIdCfg", "set_id", "give a motor another ID"),
+    "set-baud": Entry("vd.deploy.maintain", "SetBaudCfg", "set_baud", "give a motor another baud rate"),
     "home": Entry("vd.deploy.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"),
     "record": Entry("vd.deploy.record", "RecordCfg", "record", "record motions for vd-gap"),
     "shadow": Entry(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from vd.deploy.child import TwinChild
+from vd.deploy.finding import BAUD_RATE
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
 MOTOR = "XH430-V210"
 """The motors whose stall torque is the hand's effort limit."""
-BAUD_RATE = 1_000_000
 RETRIES, TWIN_RETRIES = 1, 3
 """The twin is a process among others, which may not run for longer than the SDK waits for an answer."""
 
@@ -62,11 +62,14 @@ def read_hand_and_joints(options: HandOptions) -> tuple["HandModel", "Joints"]:
     """The hand of the options and its motors.
 
     Raises:
-        ValueError: Hand, layer or calibration cannot be used.
+        ValueError: Motor, hand, layer or calibration cannot be used.
     """
     from vd.assets_usd.hands import load_hand
+    from vd.deploy.control_table import MODELS
     from vd.deploy.joints import read_joints, uncalibrated
 
+    if options.motor not in MODELS:
+        raise ValueError(f"--motor {options.motor}: no such motor; choose of {', '.join(MODELS)}")
     hand = load_hand(options.hand, layer=options.hand_layer)
     if options.calibration is None:
         return hand, uncalibrated(hand)

@@ -14,11 +14,17 @@ FARTHEST_COUNTS = 256 * COUNTS_PER_TURN
 """Range of the extended position mode, 256 turns either way: no sound position lies beyond."""
 RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
 RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
+RAD_S2_PER_COUNT = 214.577 * 2.0 * math.pi / 3600.0
+"""Unit of the profile acceleration: 214.577 rev/min^2."""
 SIZE = 148
 """Bytes that are simulated: all but the indirect addresses behind."""
 EEPROM_END = 64
 """Items below are kept without power, and cannot be written while torque is on."""
 POSITION_MODE = 3
+LAST_SECONDARY_ID = 252
+"""Values above switch the secondary ID off."""
+BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
+"""Baud rates by the value of their item."""
 FULL_PWM = 885.0
 """Counts of the whole supply voltage."""
 WATCHDOG_UNIT_S = 0.02
@@ -84,6 +90,12 @@ MODELS = {
 """The motors, by name."""
 
 
+def model_name(number: int) -> str:
+    """The name of a motor's model; its number where it is none of ours."""
+    names = {model.number: name for name, model in MODELS.items()}
+    return names.get(number, f"model {number}")
+
+
 class HardwareError(IntFlag):
     """Bits of the hardware error status and of the shutdown mask."""
 
@@ -125,6 +137,7 @@ def table(model: Model) -> dict[str, Item]:
         "velocity_limit": Item(44, 4, True, model.velocity_limit, 0, 1023),
         "max_position_limit": Item(48, 4, True, 4095, 0, 4095),
         "min_position_limit": Item(52, 4, True, 0, 0, 4095),
+        "startup_configuration": Item(60, 1, True, 0, 0, 3),
         "shutdown": Item(63, 1, True, 0b110100, 0, 255),
         "torque_enable": Item(64, 1, True, 0, 0, 1),
         "led": Item(65, 1, True, 0, 0, 1),
@@ -139,9 +152,9 @@ def table(model: Model) -> dict[str, Item]:
         "feedforward_2nd_gain": Item(88, 2, True, 0, **gain),
         "feedforward_1st_gain": Item(90, 2, True, 0, **gain),
         "bus_watchdog": Item(98, 1, True, 0, -1, 127),
-        "goal_pwm": Item(100, 2),
-        "goal_current": Item(102, 2),
-        "goal_velocity": Item(104, 4),
+        "goal_pwm": Item(100, 2, True, int(FULL_PWM)),
+        "goal_current": Item(102, 2, True, model.current_limit),
+        "goal_velocity": Item(104, 4, True, model.velocity_limit),
         "profile_acceleration": Item(108, 4, True, 0, 0, 32767),
         "profile_velocity": Item(112, 4, True, 0, 0, 32767),
         "goal_position": Item(116, 4),

@@ -327,25 +327,38 @@ def _put(item: str, value: int, *motors: int) -> Callable[[Twin], None]:
 def _stubborn(twin: Twin) -> None:
     """A motor that does not keep a limit."""
     motor = twin.motors[4]
+    motor.put("max_position_limit", 4000)
     accept = motor._accept
     motor._accept = lambda name, value: accept(name, 4000 if name == "max_position_limit" else value)  # type: ignore[method-assign]
 
 
-def _outside(twin: Twin) -> None:
-    plant = twin.plant
-    assert isinstance(plant, Witness) and isinstance(plant.plant, FirstOrderPlant)
-    plant.plant.position[5] = 2.6
+def _at(axis: int, angle: float) -> Callable[[Twin], None]:
+    """A motor at an angle [rad]."""
+
+    def spoil(twin: Twin) -> None:
+        plant = twin.plant
+        assert isinstance(plant, Witness) and isinstance(plant.plant, FirstOrderPlant)
+        plant.plant.position[axis] = angle
+
+    return spoil
+
+
+def _twice(twin: Twin) -> None:
+    """Two motors with one ID, at different angles as any two are."""
+    _put("id", 11, 12)(twin)
+    _at(2, 0.4)(twin)
 
 
 BEFORE: dict[str, Callable[[Twin], None]] = {
     "a motor has a wrong ID": _put("id", 13, 11),
-    "two motors have the same ID": _put("id", 11, 12),
+    "two motors have the same ID": _twice,
     "a motor does not keep its limit": _stubborn,
     "a motor's direction was reversed": _put("drive_mode", 1, 20),
     "a motor has an overload": _put("hardware_error_status", HardwareError.OVERLOAD, 22),
     "a motor is hot": lambda twin: setattr(twin.motors[0], "temperature", 66.0),
     "the supply is low": _put("present_input_voltage", 190),
-    "a joint is out of its range": _outside,
+    "a joint is out of its range": _at(5, 2.6),
+    "a joint was turned round": _at(5, 2.0 * np.pi),
     "a cable is loose": lambda twin: twin.faults.cut_off.add(32),
 }
 """What the preflight has to find."""

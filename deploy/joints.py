@@ -12,9 +12,9 @@ import numpy as np
 from vd.assets_usd.hand_data import HandModel
 from vd.config import from_dict
 from vd.deploy.answers import HandState
-from vd.deploy.bus import MotorSettings
 from vd.deploy.control_table import MODELS, RAD_S_PER_COUNT, to_angle
 from vd.deploy.packets import MAX_ID
+from vd.deploy.registers import MotorSettings
 from vd.files import write_json
 
 FORMAT = "vd-motors/1"

@@ -4,6 +4,9 @@ Where the bytes come from and how time goes on is for others: :mod:`vd.deploy.tw
 the computer's clock around it. Faults can be injected.
 """
 
+import functools
+import itertools
+import operator
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -78,7 +81,7 @@ class MotorLine:
         now = max(self._clock.now() if at is None else at, self._then)
         seconds, self._then = now - self._then, now
         if seconds > 0.0:
-            self.plant.advance(seconds, [motor.drive for motor in self.motors])
+            self.plant.advance(seconds, [motor.drive(seconds) for motor in self.motors])
             self._sense(seconds)
         packets: list[Packet] = []
         if heard:
@@ -95,18 +98,31 @@ class MotorLine:
         """Carry out one instruction and send what the motors answer."""
         named = list(ORDER[packet.instruction](packet.parameters)) if packet.instruction in ORDER else []
         # Motors that a packet names answer in its order; each waits for the one before.
+        answers: dict[int, list[tuple[Motor, list[bytes]]]] = {}
         for motor in sorted(self.motors, key=lambda m: named.index(m.id) if m.id in named else len(named)):
             if motor.id not in self.faults.cut_off:
-                for answer in self._answers(motor, packet):
-                    self._send(motor, answer)
+                frames = [encode(answer) for answer in self._answers(motor, packet)]
+                answers.setdefault(motor.id, []).append((motor, frames))
+        for same in answers.values():
+            for at_once in itertools.zip_longest(*(frames for _, frames in same), fillvalue=b""):
+                self._send(same[0][0], collide(at_once))
 
     def _answers(self, motor: Motor, packet: Packet) -> list[Packet]:
         """What one motor makes of a packet on the bus."""
+        level = motor.get("status_return_level")
         shared = SHARED.get(packet.instruction)
         if packet.id == BROADCAST and shared is not None:
             motor.heard()
-            return shared(motor, packet.parameters)
-        if packet.id not in (motor.id, BROADCAST) or packet.instruction == Instruction.STATUS:
+            answers = shared(motor, packet.parameters)
+            return answers if level else []
+        if packet.instruction == Instruction.STATUS:
+            return []
+        if packet.id == motor.secondary_id:
+            motor.heard()
+            if packet.instruction == Instruction.WRITE:
+                motor.write(_word(packet.parameters), packet.parameters[2:], secondary=True)
+            return []
+        if packet.id not in (motor.id, BROADCAST):
             return []
         motor.heard()
         single = SINGLE.get(packet.instruction)
@@ -114,15 +130,14 @@ class MotorLine:
             failure, data = int(Failure.INSTRUCTION), b""
         else:
             failure, data = single(motor, packet.parameters)
-        level = motor.get("status_return_level")
         quiet = level == 0 or (level == 1 and packet.instruction != Instruction.READ)
         if packet.instruction != Instruction.PING and (quiet or packet.id == BROADCAST):
             return []
         return [status(motor.id, failure | motor.alert, data)]
 
-    def _send(self, motor: Motor, packet: Packet) -> None:
+    def _send(self, motor: Motor, frame: bytes) -> None:
         self._clock.sleep(motor.get("return_delay_time") * RETURN_DELAY_UNIT_S)
-        data, draw, faults = bytearray(encode(packet)), self._random.random, self.faults
+        data, draw, faults = bytearray(frame), self._random.random, self.faults
         if draw() < faults.lose:
             return
         if draw() < faults.corrupt:
@@ -138,6 +153,16 @@ class MotorLine:
         state = zip(*self.plant.read(), strict=True)
         for motor, (position, velocity, torque) in zip(self.motors, state, strict=True):
             motor.sense(seconds, float(position), float(velocity), float(torque))
+
+
+def collide(frames: Sequence[bytes]) -> bytes:
+    """What is on the line when motors of one ID answer at once: a zero of any of them pulls it down.
+
+    Equal answers, such as those to a ping, are not told from one.
+    """
+    return bytes(
+        functools.reduce(operator.and_, column) for column in itertools.zip_longest(*frames, fillvalue=0xFF)
+    )
 
 
 Result = tuple[int, bytes]
@@ -197,8 +222,9 @@ def _sync_write(motor: Motor, parameters: bytes) -> list[Packet]:
     rows = parameters[4:]
     if length and len(rows) % (length + 1) == 0:
         for start in range(0, len(rows), length + 1):
-            if rows[start] == motor.id:
-                motor.write(address, rows[start + 1 : start + 1 + length])
+            if rows[start] in (motor.id, motor.secondary_id):
+                row = rows[start + 1 : start + 1 + length]
+                motor.write(address, row, secondary=rows[start] != motor.id)
     return []
 
 

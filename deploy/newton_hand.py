@@ -75,7 +75,8 @@ class NewtonHand:
         self._pair_s, self._rest = 2.0 * cfg.physics_dt, 0.0
         self._pulled = np.zeros(self._axes)
         self._stiffness, self._damping = np.zeros(self._axes), np.zeros(self._axes)
-        self._gains: tuple[tuple[float, float], ...] = ()
+        self._strongest = hand.effort
+        self._gains: tuple[tuple[float, float, float], ...] = ()
         self._write(self._state.joint_q, self._target)
         if item is not None:
             self.place_object((0.0, 0.0, 0.0, 1.0))
@@ -173,7 +174,8 @@ class NewtonHand:
         self._set_gains(drives)
         goals = np.array([np.nan if drive.goal_rad is None else drive.goal_rad for drive in drives])
         self._target = np.where(np.isnan(goals), self._target, self.joints.to_joint(goals))
-        self._limits.assign(np.minimum([drive.velocity_limit for drive in drives], self.hand.velocity_limit))
+        fastest = [drive.power * drive.velocity_limit for drive in drives]
+        self._limits.assign(np.minimum(fastest, self.hand.velocity_limit))
         seconds = min(seconds, LONGEST_S)
         while self._rest + seconds >= self._pair_s:
             share = self._pair_s - self._rest
@@ -205,7 +207,7 @@ class NewtonHand:
         q, qd = self.joint_q[: self._axes].astype(float), self.joint_qd[: self._axes].astype(float)
         reference = self._held if self._servo is None else self._servo.reference.numpy()[0]
         torque = self._stiffness * (reference - q) - self._damping * qd
-        torque = np.clip(torque, -self.hand.effort, self.hand.effort)
+        torque = np.clip(torque, -self._strongest, self._strongest)
         if self._servo is not None:  # late, or with an offset
             q = self._servo.measured_q.numpy()[0].astype(float)
             qd = self._servo.measured_qd.numpy()[0].astype(float)
@@ -215,17 +217,19 @@ class NewtonHand:
         return self.joints.to_motor(q), sign * qd, sign * torque
 
     def _set_gains(self, drives: Sequence[Drive]) -> None:
-        """Tell the solver of gains that changed, and of torque switched on or off."""
-        gains = tuple((drive.p_gain, float(drive.goal_rad is not None)) for drive in drives)
+        """Tell the solver of gains and limits of torque that changed, and of torque switched on or off."""
+        gains = tuple((drive.p_gain, float(drive.goal_rad is not None), drive.power) for drive in drives)
         if gains == self._gains:
             return
         self._gains = gains
-        on = np.array([switched for _, switched in gains])
-        scale = on * np.array([p_gain for p_gain, _ in gains]) / P_GAIN_UNIT
+        p_gain, on, power = np.array(gains).T
+        scale = on * p_gain / P_GAIN_UNIT
+        self._strongest = self.hand.effort * power
+        self._write(self._model.joint_effort_limit, self._strongest)
         self._stiffness, self._damping = self.hand.kp * scale, self.hand.kd * on
         if self._servo is not None:
             self._servo.power.assign(scale[None].astype(np.float32))
-            return
-        self._write(self._model.joint_target_ke, self._stiffness)
-        self._write(self._model.joint_target_kd, self._damping)
+        else:
+            self._write(self._model.joint_target_ke, self._stiffness)
+            self._write(self._model.joint_target_kd, self._damping)
         self._solver.notify_model_changed(newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES)

@@ -30,6 +30,8 @@ class Drive:
     """Largest speed [rad/s]."""
     torque_limit: float
     """Largest torque [N m]."""
+    power: float = 1.0
+    """Share of the supply's voltage that it may use, and so of the torque and the speed that it can give."""
 
 
 class Plant(Protocol):
@@ -44,7 +46,7 @@ class Plant(Protocol):
 
 @dataclass
 class FirstOrderPlant:
-    """Axes without mass that approach their goals exponentially, within the limits of speed."""
+    """Axes without mass that approach their goals exponentially, within the limits of torque and speed."""
 
     axes: int
     """D."""
@@ -67,11 +69,13 @@ class FirstOrderPlant:
                 self._velocity[axis] = self._torque[axis] = 0.0
                 continue
             error = drive.goal_rad - self.position[axis]
-            pull = STIFFNESS_NM * drive.p_gain / P_GAIN_UNIT * error
-            self._torque[axis] = np.clip(pull, -drive.torque_limit, drive.torque_limit)
+            stiffness = STIFFNESS_NM * drive.p_gain / P_GAIN_UNIT
+            largest = drive.power * drive.torque_limit
+            self._torque[axis] = np.clip(stiffness * error, -largest, largest)
             lag = max(SHORTEST_LAG_S, LAG_S * P_GAIN_UNIT / drive.p_gain)
-            step = 0.0 if self.blocked[axis] else error * -np.expm1(-seconds / lag)
-            furthest = drive.velocity_limit * seconds
+            pull = self._torque[axis] / stiffness
+            step = 0.0 if self.blocked[axis] else pull * -np.expm1(-seconds / lag)
+            furthest = drive.power * drive.velocity_limit * seconds
             step = float(np.clip(step, -furthest, furthest))
             self._velocity[axis] = step / seconds if seconds > 0.0 else 0.0
             self.position[axis] += step

@@ -12,8 +12,8 @@ from types import ModuleType
 from typing import Any
 
 from vd.deploy.answers import BusError
+from vd.deploy.finding import BAUD_RATE
 
-BAUD_RATE = 1_000_000
 WAIT_S = 0.002
 """How long a read of the port sleeps at most until its bytes are there. The SDK's own does not sleep but asks
 again and again, which takes a core, and keeps whatever shares it from answering."""

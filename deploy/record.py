@@ -14,7 +14,6 @@ import numpy as np
 import tyro
 
 from vd.deploy.answers import HandState
-from vd.deploy.bus import D_GAIN, P_GAIN
 from vd.deploy.check import ready
 from vd.deploy.clock import Pacer
 from vd.deploy.connect import Connection, HandOptions, connect
@@ -22,6 +21,7 @@ from vd.deploy.control_table import RAD_PER_COUNT
 from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import move
 from vd.deploy.motor_time import measured_at
+from vd.deploy.registers import D_GAIN, P_GAIN
 from vd.deploy.safety import SafeHand
 from vd.deploy.timely import Priority, real_time, undisturbed
 from vd.files import check_folder
@@ -46,6 +46,8 @@ WIDE = SafetyCfg(step_rad=4.0)
 TWIN_ARGS = "--physics-hz 3840"
 """Steps of the twin so short that its integrator is as exact as vd-gap's: at 960 Hz it is off by 0.3 mrad
 (median of a moving hand; up to 0.9), two thirds of what the encoders round."""
+RATE_SHARE = 0.95
+"""Share of the rate that is wanted below which a recording says that it missed it."""
 AGAIN_S = 0.01
 """A state that was asked for so long after its goal was sent was asked for again."""
 STATE_CHANNELS = ("velocity", "current", "pwm", "voltage", "temperature")
@@ -351,8 +353,21 @@ def _session(
             trajectory = recorder.play(safe, motion)
             rate = (len(trajectory.time) - 1) / trajectory.time[-1]
             what = f"{number}/{len(motions)} {Path(motion.file).stem}"
-            print(f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz", file=sys.stderr, flush=True)
+            missed = _missed(rate, cfg.rate_hz)
+            print(
+                f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz{missed}", file=sys.stderr, flush=True
+            )
             keep(trajectory)
+
+
+def _missed(rate_hz: float, wanted_hz: float) -> str:
+    """What to say of a rate below the one that is wanted [Hz]; empty for one that is kept."""
+    if rate_hz >= RATE_SHARE * wanted_hz:
+        return ""
+    return (
+        f", not {wanted_hz:g}: a sample takes {1e3 / rate_hz:.1f} ms; look at the adapter's latency timer, "
+        f"the baud rate, end other programs, or ask for --rate-hz {rate_hz:.0f}"
+    )
 
 
 def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":

@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from vd.deploy.bus import D_GAIN, P_GAIN
 from vd.deploy.camera import DepthSource
 from vd.deploy.connect import Connection, HandOptions, connect
 from vd.deploy.finding import Finding
 from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import MOVE_S, move, reset_pose
 from vd.deploy.realsense import RealSenseCfg
+from vd.deploy.registers import D_GAIN, P_GAIN
 from vd.deploy.run_page import GoalResult, goal_results, summary_line, write_page
 from vd.deploy.safety import SafeHand
 from vd.deploy.timely import Priority, real_time, undisturbed

@@ -124,7 +124,7 @@ def subcommands() -> list[tuple[str, str]]:
     text = "\n".join(path.read_text() for path in DOCUMENTS)
     pairs = {(script, "") for script in SCRIPTS}
     for script in SCRIPTS:
-        pairs |= {(script, name) for name in re.findall(rf"\b{script} ([a-z]+)\b", text)}
+        pairs |= {(script, name) for name in re.findall(rf"\b{script} ([a-z][a-z-]*[a-z])\b", text)}
     return sorted(pairs)
 
 

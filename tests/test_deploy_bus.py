@@ -26,13 +26,14 @@ from vd.deploy.answers import (  # noqa: E402
     SilentError,
     StateCheck,
 )
-from vd.deploy.bus import MotorBus, MotorSettings  # noqa: E402
+from vd.deploy.bus import MotorBus  # noqa: E402
 from vd.deploy.control_table import MODELS, HardwareError, table, to_angle, to_counts  # noqa: E402
 from vd.deploy.joints import uncalibrated  # noqa: E402
 from vd.deploy.line import Faults, MotorLine  # noqa: E402
 from vd.deploy.motor import Motor  # noqa: E402
 from vd.deploy.packets import ALERT, Failure, Instruction, Packet, PacketReader, encode  # noqa: E402
 from vd.deploy.plant import FirstOrderPlant  # noqa: E402
+from vd.deploy.registers import MotorSettings  # noqa: E402
 from vd.deploy.twin import Twin, spoil  # noqa: E402
 
 IDS = (10, 11, 12)
@@ -73,7 +74,7 @@ def test_items_do_not_overlap_and_hold_their_initial_values():
             assert item.address + item.size <= following.address
         motor = Motor(model, 7)
         assert motor.get("model_number") == model.number and motor.get("id") == 7
-        assert motor.get("goal_pwm") == 0 and motor.get("position_p_gain") == 800
+        assert motor.get("goal_pwm") == 885 and motor.get("position_p_gain") == 800
 
 
 @pytest.mark.parametrize("angle", [-3.0, -0.0007, 0.0, 1.0, 3.1])
@@ -393,7 +394,7 @@ def test_a_position_that_no_motor_can_count_is_refused_before_any_other_is_known
     far[start : start + 4] = counts.to_bytes(4, "little", signed=True)
     with pytest.raises(BusError, match=f"motor 11: its position came as {counts} counts"):
         check.accept(0.0, [Answer(11, 0, bytes(far))])
-    assert check.accept(0.0, [Answer(11, 0, sound)]).position[0] == to_angle(0)
+    assert check.accept(0.0, [Answer(11, 0, sound)]).position[0] == 0.0
 
 
 @pytest.mark.slow

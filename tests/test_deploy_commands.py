@@ -62,30 +62,39 @@ def line(hand, monkeypatch):
 
 
 def test_find_lists_the_motors(hand):
-    with Twin([Motor(MODELS[MOTOR], id) for id in uncalibrated(hand).ids]) as twin:
+    joints = uncalibrated(hand)
+    with Twin([Motor(MODELS[MOTOR], id) for id in (*joints.ids, 22)]) as twin:
+        twin.plant.position[-1] = 0.5
         found = find(twin.path, [1_000_000], lambda text: None)
-        assert found == [FoundMotor(motor.id, 1_000_000, MOTOR, 45) for motor in twin.motors]
+    assert found == [FoundMotor(id, 1_000_000, MOTOR, 45, garbled=id == 22) for id in joints.ids]
+    (wrong,) = differences(found, joints, MOTOR, 1_000_000, PORT)
+    assert f"several have this ID: unplug one, then `vd-deploy set-id 22 NEW --port {PORT}`" in wrong
 
 
 def test_what_differs_is_named(hand):
     joints = uncalibrated(hand)
     found = [FoundMotor(id, 1_000_000, MOTOR, 45) for id in joints.ids]
-    assert differences(found, joints, MOTOR, 1_000_000) == []
+    assert differences(found, joints, MOTOR, 1_000_000, PORT) == []
     found[1] = FoundMotor(1, 57_600, MOTOR, 45)
     found[2] = FoundMotor(12, 1_000_000, "XM430-W210", 44)
-    wrong = "\n".join(differences(found, joints, MOTOR, 1_000_000))
+    wrong = "\n".join(differences(found, joints, MOTOR, 1_000_000, PORT))
     assert "f0_j2: no motor 11 answers" in wrong and "is it ID 1?" in wrong
     assert "motor 12 is XM430-W210, not XH430-V210" in wrong and "firmware 44, 45" in wrong
     found[1] = FoundMotor(11, 57_600, MOTOR, 45)
-    assert "motor 11 is at 57600 baud" in "\n".join(differences(found, joints, MOTOR, 1_000_000))
+    (wrong,) = [text for text in differences(found, joints, MOTOR, 1_000_000, PORT) if "baud" in text]
+    assert "motor 11 is at 57600 baud" in wrong
+    assert f"`vd-deploy set-baud 11 1000000 --port {PORT} --baud-rate 57600`" in wrong
+    found = [FoundMotor(id, 1_000_000, "XM430-W210", 45) for id in joints.ids]
+    assert "give --motor XM430-W210" in differences(found, joints, MOTOR, 1_000_000, PORT)[0]
+    assert differences(found, joints, "XM430-W210", 1_000_000, PORT) == []
+    found = [FoundMotor(id, 1_000_000, "model 1060", 45) for id in joints.ids]
+    assert "--motor" not in differences(found, joints, MOTOR, 1_000_000, PORT)[0]
 
 
 def test_check_finds_nothing_wrong_and_leaves_the_torque_off(line, capsys):
     assert check.check(check.CheckCfg(port=PORT, json=True, no_camera=True)) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["ok"] and {"gains and limits", "torque", "loop rate"} < {
-        f["what"] for f in report["findings"]
-    }
+    assert report["ok"] and {"registers", "torque", "loop rate"} < {f["what"] for f in report["findings"]}
     assert not any(motor.get("torque_enable") for motor in line.motors)
     assert line.motors[0].get("position_p_gain") == 200
 
@@ -134,8 +143,8 @@ def test_nothing_is_written_before_the_person_agreed(line, torque, capsys):
     settings = [bytes(motor.memory[:PRESENT]) for motor in line.motors]
     assert check.check(check.CheckCfg(port=PORT, no_camera=True)) == 0
     said = capsys.readouterr().out
-    assert ("motors 10, 11 hold" in said) == torque and "to be written to motors 10, 11, 12" in said
-    with pytest.raises(RuntimeError, match="Nobody is there to ask"):
+    assert ("motors 10, 11 hold" in said) == torque and "motor 10: 900; it will be set to 200" in said
+    with pytest.raises(RuntimeError, match=r"position_p_gain will be set\. .*Nobody is there to ask"):
         home.home(home.HomeCfg(port=PORT))
     assert ("Motors 10, 11 hold, with up to 0." in capsys.readouterr().err) == torque
     assert [bytes(motor.memory[:PRESENT]) for motor in line.motors] == settings
@@ -215,12 +224,13 @@ def plan(tmp_path, hand):
     return folder
 
 
-def test_a_plan_is_recorded_and_gone_on_with(line, plan, hand, tmp_path):
+def test_a_plan_is_recorded_and_gone_on_with(line, plan, hand, tmp_path, capsys):
     out = tmp_path / "rec"
     first = record.RecordCfg(
         port=PORT, out=out, fingers=(0,), plan=plan / "f0_j1.json", yes=True, safety=QUICK, realtime="off"
     )
     assert record.record(first) == 0
+    assert re.search(r"at (100|99) Hz\n", capsys.readouterr().err)
     before = (out / "plan_000_f0_j1_wave.csv").read_bytes()
     second = record.RecordCfg(
         port=PORT, out=out, fingers=(0,), plan=plan / "f0_j2.json", yes=True, safety=QUICK, realtime="off"
@@ -239,6 +249,19 @@ def test_a_plan_is_recorded_and_gone_on_with(line, plan, hand, tmp_path):
     assert not any(motor.get("torque_enable") for motor in line.motors)
     with pytest.raises(record.RecordError, match="choose another"):
         record.record(replace(first, fingers=(1,)))
+
+
+def test_a_recording_says_that_it_missed_its_rate(line, plan, tmp_path, capsys):
+    """An adapter that keeps answers for 16 ms leaves about 50 of 100 samples a second."""
+    motion = plan / "f0_j1.json"
+    cfg = record.RecordCfg(
+        port=PORT, out=tmp_path, fingers=(0,), plan=motion, yes=True, safety=QUICK, realtime="off"
+    )
+    with record.connect(cfg) as connection:
+        connection.bus._port.lag_s = 0.016
+    assert record.record(cfg) == 0
+    rate = re.search(r"at (\d+) Hz, not 100: .*latency timer.* --rate-hz \1", capsys.readouterr().err)
+    assert rate and int(rate[1]) < 60
 
 
 def test_motions_go_finger_by_finger(hand):
@@ -286,8 +309,12 @@ def test_a_fault_of_the_table_ends_safely(name, hand):
 
 
 def test_options_and_commands_that_cannot_be_are_refused(capsys):
-    with pytest.raises(ValueError, match="--port"), connect(HandOptions()):
-        pass
+    for options, error in (
+        (HandOptions(), "--port"),
+        (HandOptions(port=PORT, motor="XL430"), "--motor XL430: no such"),
+    ):
+        with pytest.raises(ValueError, match=error), connect(options):
+            pass
     assert cli.main(["fly"]) == cli.FAILED and "no policy 'fly'" in capsys.readouterr().err
     assert cli.main([]) == cli.OK and "vd-deploy COMMAND" in capsys.readouterr().out
 

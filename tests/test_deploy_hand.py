@@ -57,6 +57,22 @@ def test_the_hand_goes_where_its_motors_drive_and_falls_without_them(hand, turne
     assert np.abs(plant.read()[2]).max() == 0.0
 
 
+def test_a_hand_with_little_voltage_is_weak_and_slow(hand, turned):
+    plant = NewtonHand(hand, turned)
+    start = turned.to_joint(plant.read()[0])
+    goal = start + np.tile([0.3, 0.3, 0.3], 3)
+    weak = [replace(drive, power=0.02) for drive in drives(turned, goal)]
+    fastest = 0.0
+    for _ in range(30):
+        plant.advance(0.02, weak)
+        fastest = max(fastest, float(np.abs(plant.read()[1]).max()))
+    assert np.abs(plant.read()[2]).max() == pytest.approx(0.02 * hand.effort.max(), rel=1e-6)
+    assert fastest <= 0.02 * 6.0 + 1e-6
+    for _ in range(60):
+        plant.advance(0.02, drives(turned, goal))
+    np.testing.assert_allclose(turned.to_joint(plant.read()[0]), goal, atol=0.1)
+
+
 def test_limits_are_the_hands_in_the_motors_frame(hand, turned):
     settings = turned.settings(hand, MODEL)
     for axis, id in enumerate(turned.ids):
