@@ -219,7 +219,7 @@ def test_page_and_file(tmp_path):
     assert Comparison.read(tmp_path / "eval.json") == comparison
     write_comparison(comparison, tmp_path / "eval.html")
     html = (tmp_path / "eval.html").read_text()
-    for word in ("object falls", "stopped by", "near and seen so", "complete clouds", "training"):
+    for word in ("object falls", "stopped by", "near and seen so", "training", "parts are off"):
         assert word in html
     assert html.count("<img") == 3 and "http" not in html.replace("http://www.w3.org", "")
     assert "orientation error" in terminal_table(comparison)

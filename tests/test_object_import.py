@@ -17,7 +17,7 @@ import trimesh
 
 from vd.assets_usd.objects import decompose as d
 from vd.assets_usd.objects import meshes as m
-from vd.assets_usd.objects.bodies import body_of, parts_error
+from vd.assets_usd.objects.bodies import PartsError, body_of
 from vd.assets_usd.objects.geometry import Hull, hull_depth, mesh_volume, union_depth
 from vd.assets_usd.objects.importer import (
     ImportSettings,
@@ -344,13 +344,13 @@ def test_a_cavity_counts_in_mass_properties_and_is_said(tmp_path: Path, inward: 
 
 def test_the_error_of_parts_counts_what_they_lack_and_what_they_have_too_much():
     cube = trimesh.creation.box((0.1, 0.1, 0.1))
-    body = body_of(repair_mesh(cube))
-    moved = Hull(cube.vertices + np.array([0.01, 0.0, 0.0]), cube.faces)
-    assert parts_error([moved], body, cube.vertices) == pytest.approx(0.2, rel=0.02)
+    error_of = PartsError(body_of(repair_mesh(cube)), cube.vertices)
+    moved = Hull(cube.vertices + np.array([0.005, 0.0, 0.0]), cube.faces)
+    assert error_of([moved]) == pytest.approx(0.1, rel=0.02)
     # As large as the cube, but no cube: what is outside at each end is missing at the sides.
-    longer = Hull(cube.vertices * [1.25, 1.0, 0.8], cube.faces)
-    assert parts_error([longer], body, cube.vertices) == pytest.approx(0.4, rel=0.02)
-    assert parts_error([Hull(cube.vertices, cube.faces)], body, cube.vertices) < 1e-3
+    longer = Hull(cube.vertices * [1.1, 1.0, 1.0 / 1.1], cube.faces)
+    assert error_of([longer]) == pytest.approx(2.0 * (1.0 - 1.0 / 1.1), rel=0.02)
+    assert error_of([Hull(cube.vertices, cube.faces)]) < 1e-3
 
 
 def test_parts_are_merged_where_that_fills_least():
@@ -366,12 +366,9 @@ def test_parts_are_merged_where_that_fills_least():
 
 def test_a_ring_gets_more_parts_and_a_bracket_does_not(imported):
     ring = repair_mesh(trimesh.creation.annulus(0.05, 0.058, 0.02, sections=24))
-    body = body_of(ring)
+    settings = d.DecomposeSettings(mcts_iterations=5)
     found = d.best_decomposition(
-        ring.vertices,
-        ring.faces,
-        d.DecomposeSettings(mcts_iterations=5),
-        lambda hulls: parts_error(hulls, body, ring.vertices),
+        ring.vertices, ring.faces, settings, PartsError(body_of(ring), ring.vertices)
     )
     assert found.error <= d.GOOD_ERROR and found.fallback == ()
     assert 8 < len(found.hulls) <= 24

@@ -83,7 +83,7 @@ class Decomposition:
         hulls: The parts.
         method: ``coacd``, ``coacd, remeshed`` or ``one hull``.
         fallback: What fell back, and why; empty for a full result.
-        error: :func:`vd.assets_usd.objects.bodies.parts_error`.
+        error: :func:`vd.assets_usd.objects.bodies.PartsError`.
     """
 
     hulls: tuple[Hull, ...]

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vd.assets_usd.objects.bodies import body_of, cavity_share, parts_error
+from vd.assets_usd.objects.bodies import PartsError, body_of, cavity_share
 from vd.assets_usd.objects.decompose import (
     GOOD_ERROR,
     HANG_S,
@@ -266,9 +266,7 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     if not body.solid.volume > 0.0:
         raise MeshError("degenerate: encloses no volume")
 
-    def error_of(hulls: Sequence[Hull]) -> float:
-        return parts_error(hulls, body, mesh.vertices)
-
+    error_of = PartsError(body, mesh.vertices)
     key = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes())
     key.update(json.dumps([DECOMPOSITION_VERSION, asdict(settings.decompose)], sort_keys=True).encode())
     cache = Path(settings.cache) / f"{key.hexdigest()}.npz" if settings.cache else None
