@@ -57,7 +57,9 @@ def test_import_then_show(
     assert run(monkeypatch, "import", folder) == 1
     out = capsys.readouterr().out
     assert "1 refused" in out and "broken.obj: " in out and "volume error" in out
-    assert "warning dirty: left out 1 piece apart from the largest body" in out  # unchanged, and still said
+    assert (
+        "warning dirty: removed 1 stray piece of surface, which made it" in out
+    )  # unchanged, and still said
 
     sheet = tmp_path / "sheet.png"
     assert run(monkeypatch, "show", "things", "cube", "--out", sheet, "--tile", 80) == 0

@@ -288,16 +288,17 @@ def test_a_small_hole_is_filled_and_a_large_opening_is_said():
     assert not large.closed
     sheet = body_of(large)
     assert "open: the surface encloses nothing" in sheet.warnings[0]
-    # Not half a ball but its shell: area times thickness, and the inertia of that.
-    thickness = 0.12 / 96
-    assert sheet.solid.volume == pytest.approx(2 * np.pi * 0.06**2 * thickness, rel=0.1)
+    # Not half a ball but its shell: of the thickness that is said, and with the inertia of that.
+    said = float(sheet.warnings[0].partition("a sheet ")[2].partition(" mm")[0])
+    assert 0.5 < said < 1e3 * 0.12 / 96
+    assert sheet.solid.volume == pytest.approx(2 * np.pi * 0.06**2 * said * 1e-3, rel=0.1)
     about_axis = sheet.solid.inertia[2, 2] / sheet.solid.volume
     assert about_axis == pytest.approx(2.0 / 3.0 * 0.06**2, rel=0.05)
 
 
 def test_debris_does_not_set_the_scale(tmp_path: Path):
     speck = trimesh.Trimesh([[2.0, 0, 0], [2.001, 0, 0], [2.0, 0.001, 0]], [[0, 1, 2]], process=False)
-    crumb = trimesh.creation.box((0.005, 0.005, 0.005)).apply_translation([0.0, 2.0, 0.0])
+    crumb = trimesh.creation.box((0.008, 0.008, 0.008)).apply_translation([0.0, 2.0, 0.0])
     for debris in (speck, crumb):
         repaired = repair_mesh(trimesh.util.concatenate([l_shape(), debris]))
         assert np.ptp(repaired.vertices, axis=0) == pytest.approx([0.12, 0.08, 0.03])
@@ -365,13 +366,13 @@ def test_parts_are_merged_where_that_fills_least():
 
 
 def test_a_ring_gets_more_parts_and_a_bracket_does_not(imported):
-    ring = repair_mesh(trimesh.creation.annulus(0.05, 0.058, 0.02, sections=24))
+    ring = repair_mesh(trimesh.creation.annulus(0.05, 0.058, 0.02, sections=16))
     settings = d.DecomposeSettings(mcts_iterations=5)
     found = d.best_decomposition(
         ring.vertices, ring.faces, settings, PartsError(body_of(ring), ring.vertices)
     )
     assert found.error <= d.GOOD_ERROR and found.fallback == ()
-    assert 8 < len(found.hulls) <= 24
+    assert 8 < len(found.hulls) <= 16
     assert imported[3]["bracket"].hulls <= 8
 
 
@@ -382,8 +383,8 @@ def stuck(*_: object) -> list[np.ndarray]:
 
 
 def waiting(vertices: np.ndarray, *_: object) -> list[np.ndarray]:
-    """Stands for CoACD on a machine with other things to do: 2 s for no work."""
-    time.sleep(2.0)
+    """Stands for CoACD on a machine with other things to do: 1.5 s for no work."""
+    time.sleep(1.5)
     return [vertices]
 
 
@@ -399,7 +400,7 @@ def test_only_processor_time_makes_a_decomposition_fall_back(monkeypatch: pytest
     assert "exit code 11" in d.decompose(mesh.vertices, mesh.faces, limits).fallback[0]
     monkeypatch.setattr(d, "_coacd_parts", waiting)
     assert d.decompose(mesh.vertices, mesh.faces, limits).fallback == ()
-    monkeypatch.setattr(d, "HANG_S", 1.0)
+    monkeypatch.setattr(d, "HANG_S", 0.5)
     with pytest.raises(m.MeshError, match=r"CoACD hangs.*import it again"):
         d.decompose(mesh.vertices, mesh.faces, limits)
 

@@ -9,6 +9,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.geometry import Hull
 from vd.assets_usd.objects.model import load_set
 from vd.bench.physics import GRAVITY, SmallScene, bounce, pinch, rest, slide
 from vd.paper import PAPER
@@ -58,6 +59,23 @@ def inertia_about(hand, q: np.ndarray, joint: int) -> float:
 
 
 @pytest.mark.parametrize("joint", [0, 1, 2])
+@pytest.mark.parametrize(("parts", "contacts"), [(1, 32), (8, 32), (12, 48)])
+def test_room_for_contacts_grows_with_convex_parts(cube, parts, contacts):
+    """Half of the worlds have a cube, the others one cut into slabs: room is for their mean."""
+    (hull,) = cube.hulls
+    low, high = hull.vertices.min(axis=0), hull.vertices.max(axis=0)
+    slabs = []
+    for k in range(2 * parts - 1):
+        ends = low[0] + (high[0] - low[0]) * np.array([k, k + 1]) / (2 * parts - 1)
+        slabs.append(Hull(np.where(hull.vertices > 0, [ends[1], *high[1:]], [ends[0], *low[1:]]), hull.faces))
+    builder = new_builder()
+    for item in (cube, dataclasses.replace(cube, hulls=tuple(slabs))):
+        world = new_builder()
+        add_object(world, item, CFG, scale=1.0, visuals=False)
+        builder.add_world(world)
+    assert SmallScene(builder, CFG, "cpu").solver.mjw_data.naconmax == 2 * contacts
+
+
 def test_step_response_of_a_joint_is_the_pd_closed_form(joint):
     """A joint with inertia J follows J q'' + kd q' + kp q = kp target; gravity off, the others hold."""
     hand = load_hand("dclaw4")

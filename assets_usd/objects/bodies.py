@@ -15,6 +15,7 @@ from vd.assets_usd.objects.geometry import (
     solid_of_hulls,
     solid_of_mesh,
     solid_of_voxels,
+    triangle_areas,
     union_depth,
     voxelise_surface,
 )
@@ -84,7 +85,7 @@ def inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, level: f
 def body_of(mesh: RepairedMesh) -> Body:
     """The solid that a mesh bounds: exact if it is closed, by winding numbers if it has holes.
 
-    A surface that has no inside is a sheet: the solid is its voxels, 1 % of the longest side thick.
+    A surface that has no inside is a sheet: the solid is its voxels, below 1 % of the longest side thick.
     """
     body = _outer_body(mesh)
     hollow = [solid_of_mesh(*cavity) for cavity in mesh.cavities]
@@ -107,8 +108,9 @@ def _outer_body(mesh: RepairedMesh) -> Body:
         return Body(within, solid.volume, solid, "winding numbers")
     grid = voxelise_surface(vertices, faces)
     solid = solid_of_voxels(*grid)
+    thickness = solid.volume / float(triangle_areas(vertices, faces).sum())
     warning = (
-        f"open: the surface encloses nothing, and is taken as a sheet {1e3 * grid[2]:.1f} mm thick, empty "
+        f"open: the surface encloses nothing, and is taken as a sheet {1e3 * thickness:.1f} mm thick, empty "
         "inside; close it, or give it thickness"
     )
     return Body(partial(_in_voxels, *grid), solid.volume, solid, "voxelised sheet", (warning,))

@@ -312,7 +312,8 @@ def _filled_holes(mesh: Any, notes: list[str]) -> Any:
     if not len(rim):
         return mesh
     after = dict(rim.tolist())
-    centres, fans = [], []
+    centres: list[np.ndarray] = []
+    fans: list[tuple[int, int, int]] = []
     while after:
         start, corner = after.popitem()
         loop = [start]
