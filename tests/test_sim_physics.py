@@ -58,7 +58,6 @@ def inertia_about(hand, q: np.ndarray, joint: int) -> float:
     return total
 
 
-@pytest.mark.parametrize("joint", [0, 1, 2])
 @pytest.mark.parametrize(("parts", "contacts"), [(1, 32), (8, 32), (12, 48)])
 def test_room_for_contacts_grows_with_convex_parts(cube, parts, contacts):
     """Half of the worlds have a cube, the others one cut into slabs: room is for their mean."""
@@ -76,6 +75,7 @@ def test_room_for_contacts_grows_with_convex_parts(cube, parts, contacts):
     assert SmallScene(builder, CFG, "cpu").solver.mjw_data.naconmax == 2 * contacts
 
 
+@pytest.mark.parametrize("joint", [0, 1, 2])
 def test_step_response_of_a_joint_is_the_pd_closed_form(joint):
     """A joint with inertia J follows J q'' + kd q' + kp q = kp target; gravity off, the others hold."""
     hand = load_hand("dclaw4")
