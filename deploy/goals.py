@@ -25,8 +25,9 @@ from vd.assets_usd.objects.geometry import (
     solid_of_mesh,
     surface_points,
 )
-from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, UNITS_M, MeshError, check_file, repair_mesh
+from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, UNITS_M, MeshError, check_file
 from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectError, ObjectModel, build_model, load_set
+from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.scans import Surface, surface_of_scan
 from vd.paper import PAPER
 from vd.sensors.depth_cloud import BASE_IN_WORLD

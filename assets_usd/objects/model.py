@@ -56,10 +56,11 @@ class ObjectModel:
         family: Kind of object (procedural family, or ``imported``).
         split: ``train``, ``test`` or empty.
         scale: Factor from the source's units to metres in this file.
-        volume_error: |volume of the union of hulls - volume of the solid| / volume of the solid.
+        volume_error: Volume in which the union of hulls and the solid differ / volume of the solid.
         volume_method: How that was estimated.
         content_hash: Hash of what the file was made from; equal hashes need no new work.
         notes: What was repaired or assumed.
+        warnings: What may be wrong with the object: reports on it repeat them.
     """
 
     name: str
@@ -80,6 +81,7 @@ class ObjectModel:
     volume_method: str = ""
     content_hash: str = ""
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     @property
     def com(self) -> np.ndarray:
@@ -236,6 +238,7 @@ def write_object(path: Path, model: ObjectModel) -> Path:
             "volumeMethod": model.volume_method,
             "contentHash": model.content_hash,
             "notes": "\n".join(model.notes),
+            "warnings": "\n".join(model.warnings),
             "symmetry": Vt.DoubleArray.FromNumpy(
                 np.ascontiguousarray(model.symmetry, np.float64).reshape(-1)
             ),
@@ -334,7 +337,8 @@ def read_object(path: Path) -> ObjectModel:
         volume_error=float(data["volumeError"]),
         volume_method=str(data["volumeMethod"]),
         content_hash=str(data["contentHash"]),
-        notes=tuple(notes.split("\n")) if notes else (),
+        notes=tuple(notes.splitlines()),
+        warnings=tuple(str(data.get("warnings", "")).splitlines()),
     )
 
 
