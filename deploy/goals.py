@@ -24,9 +24,10 @@ from vd.assets_usd.objects.geometry import (
     solid_of_mesh,
     surface_points,
 )
-from vd.assets_usd.objects.meshes import GUESSED_UNITS, LONGEST_SIDE_M, UNITS_M, MeshError, repair_mesh
+from vd.assets_usd.objects.meshes import GUESSED_UNITS, LONGEST_SIDE_M, UNITS_M, MeshError
 from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectError, ObjectModel, build_model, load_set
 from vd.assets_usd.objects.reading import load_points
+from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.scans import Surface, surface_of_scan
 from vd.paper import PAPER
 from vd.sensors.depth_cloud import BASE_IN_WORLD

@@ -4,6 +4,12 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
+FAR = wp.constant(1e6)
+"""Distance within which a mesh of size 1 has a nearest point: any."""
+
+ACCURACY = wp.constant(2.0)
+"""Clusters of triangles farther than so many of their radii count by their moment: Warp's default."""
+
 
 @wp.kernel
 def winding_kernel(
@@ -38,3 +44,29 @@ def winding_kernel(
         distance = wp.max(wp.length(away), width)
         total += wp.dot(away, areas[sample]) / (distance * distance * distance)
     winding_out[i, j, k] = total / (4.0 * wp.PI)
+
+
+@wp.kernel
+def inside_kernel(
+    # Model:
+    mesh: wp.uint64,
+    level: float,
+    # In:
+    points: wp.array[wp.vec3],
+    # Out:
+    inside_out: wp.array[wp.bool],
+):
+    """Whether the generalised winding number of a mesh exceeds a level at points. Launch: [K].
+
+    Far triangles count by clusters of the mesh's tree (Barill et al. 2018, Fast Winding Numbers for Soups and
+    Clouds), as in Warp's query, which wants a mesh made with ``support_winding_number``.
+
+    Args:
+        mesh: The mesh.
+        level: Least winding number of the inside; a half for a closed mesh.
+        points: Places in the mesh's frame, shape [K].
+        inside_out: Whether each is inside, shape [K].
+    """
+    i = wp.tid()
+    query = wp.mesh_query_point_sign_winding_number(mesh, points[i], FAR, ACCURACY, level)
+    inside_out[i] = query.sign < 0.0

@@ -19,6 +19,7 @@ IDENTITY = np.array([[0.0, 0.0, 0.0, 1.0]])
 class FakeObject:
     name: str = "thing"
     symmetry: np.ndarray = field(default_factory=IDENTITY.copy)
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass

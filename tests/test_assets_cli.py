@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import trimesh
 
 from vd.assets_usd import cli
 from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sheet import WARNING, contact_sheet
 
 
 @pytest.fixture(autouse=True)
@@ -40,19 +42,24 @@ def test_import_then_show(
     folder.mkdir()
     trimesh.creation.box((0.12, 0.05, 0.03)).export(folder / "brick.stl")
     (folder / "broken.obj").write_text("v 0 0 0\n")
+    crumb = trimesh.creation.box((0.005, 0.005, 0.005)).apply_translation([0.0, 1.0, 0.0])
+    trimesh.util.concatenate([trimesh.creation.box((0.12, 0.05, 0.03)), crumb]).export(folder / "dirty.stl")
     assert run(monkeypatch, "import", folder, "--json") == 1
     record = json.loads(capsys.readouterr().out)
     status = {o["name"]: (o["status"], o["reason"]) for o in record["objects"]}
     assert status["brick"] == ("imported", "")
     assert status["broken"][0] == "refused" and status["broken"][1]
     # Without --out, the set lies in the cache under the folder's name and can be loaded by it.
-    assert [m.name for m in load_set("things")] == ["brick"]
+    assert [m.name for m in load_set("things")] == ["brick", "dirty"]
 
     assert run(monkeypatch, "import", folder / "brick.stl", "--out", record["out"]) == 0
     assert "0 imported, 1 unchanged, 0 refused" in capsys.readouterr().out
     assert run(monkeypatch, "import", folder) == 1
     out = capsys.readouterr().out
     assert "1 refused" in out and "broken.obj: " in out and "volume error" in out
+    assert (
+        "warning dirty: removed 1 stray piece of surface, which made it" in out
+    )  # unchanged, and still said
 
     sheet = tmp_path / "sheet.png"
     assert run(monkeypatch, "show", "things", "cube", "--out", sheet, "--tile", 80) == 0
@@ -61,6 +68,14 @@ def test_import_then_show(
     assert 0.05 < drawn.mean() < 0.7
     saturation = image.max(axis=2) - image.min(axis=2)
     assert (saturation > 0.3).mean() > 0.02, "the coloured parts are missing"
+
+
+@pytest.mark.parametrize("warnings", [(), ("off by a lot",)])
+def test_the_sheet_marks_objects_with_warnings(tmp_path: Path, warnings: tuple[str, ...]):
+    cube = replace(load_set("cube")[0], warnings=warnings)
+    image = picture(contact_sheet([cube], tmp_path / "sheet.png"))
+    marked = (np.abs(image - np.array(WARNING) / 255.0).max(axis=2) < 0.02).any()
+    assert marked == bool(warnings)
 
 
 def test_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from test_evaluate_rollout import CUBE, result_of
 
 from vd.evaluate.plots import MAX_OBJECTS_DRAWN, ecdf_figure, violin_figure
-from vd.evaluate.report import terminal_table, write_report
+from vd.evaluate.report import terminal_table, warning_lines, write_report
+from vd.evaluate.result import EvalResult
 from vd.page import Page
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -50,6 +51,17 @@ def result():
     return result_of(
         [FakeObject("a"), FakeObject("b<i>", CUBE), FakeObject("c")], episodes=12, fall_at={0: 1}
     )
+
+
+def test_objects_with_warnings_are_listed(tmp_path, result):
+    doubtful = replace(result, warnings={"b<i>": "open: a sheet"})
+    doubtful.write(tmp_path / "eval.json")
+    write_report(EvalResult.read(tmp_path / "eval.json"), tmp_path / "report.html")
+    text, _ = read_page(tmp_path / "report.html")
+    assert "Objects with warnings" in text and "b&lt;i&gt;" in text and "open: a sheet" in text
+    assert warning_lines(doubtful.warnings) == ["warning b<i>: open: a sheet"]
+    write_report(result, tmp_path / "report.html")
+    assert "with warnings" not in read_page(tmp_path / "report.html")[0]
 
 
 def test_report_is_one_offline_file_with_three_figures(tmp_path, result):

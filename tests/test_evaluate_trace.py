@@ -158,7 +158,7 @@ def protocol(name, episodes, **changes):
 
 
 def compared(offset=-0.3, fall_at=None, rules=lambda _: StoppingRule(0.2, 2.0)):
-    objects = (FakeObject("a"), FakeObject("b"))
+    objects = (FakeObject("a"), FakeObject("b", warnings=("open", "parts are off")))
     trace = traced(objects=objects, episodes=4, policy={"offset": offset}, fall_at=fall_at)
     return judge(
         trace,
@@ -174,6 +174,7 @@ def compared(offset=-0.3, fall_at=None, rules=lambda _: StoppingRule(0.2, 2.0)):
 def test_every_episode_is_in_one_class():
     rows, _ = compared(fall_at={1: 2, 5: 12})
     assert [row.stopped_by for row in rows] == ["prediction", "true distance"]
+    assert Comparison(tuple(rows), ()).warnings == {"b": "open; parts are off"}
     by_prediction, by_truth = ({k: v.value for k, v in row.outcomes.items()} for row in rows)
     assert tuple(by_prediction) == OUTCOMES
     # It stops at 0.45 rad by its prediction, and at 0.35 by the truth; one fell before, one long after.
@@ -218,7 +219,7 @@ def test_page_and_file(tmp_path):
     assert Comparison.read(tmp_path / "eval.json") == comparison
     write_comparison(comparison, tmp_path / "eval.html")
     html = (tmp_path / "eval.html").read_text()
-    for word in ("object falls", "stopped by", "near and seen so", "complete clouds", "training"):
+    for word in ("object falls", "stopped by", "near and seen so", "training", "parts are off"):
         assert word in html
     assert html.count("<img") == 3 and "http" not in html.replace("http://www.w3.org", "")
     assert "orientation error" in terminal_table(comparison)

@@ -19,7 +19,7 @@ def example() -> procedural.ObjectModel:
         symmetry=procedural.brick_rotations(),
         licence="CC0-1.0",
         notes=("one", "two"),
-        warnings=("three",),
+        warnings=("three", "four"),
         file="/home/me/x.stl",
         volume_error=0.125,
     )

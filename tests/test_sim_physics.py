@@ -9,6 +9,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.geometry import Hull
 from vd.assets_usd.objects.model import load_set
 from vd.bench.physics import GRAVITY, SmallScene, bounce, pinch, rest, slide
 from vd.paper import PAPER
@@ -55,6 +56,23 @@ def inertia_about(hand, q: np.ndarray, joint: int) -> float:
         total += local_axis @ hand.link_inertia[link] @ local_axis
         total += hand.link_mass[link] * np.sum(np.cross(axis, arm) ** 2)
     return total
+
+
+@pytest.mark.parametrize(("parts", "contacts"), [(1, 32), (8, 32), (12, 48)])
+def test_room_for_contacts_grows_with_convex_parts(cube, parts, contacts):
+    """Half of the worlds have a cube, the others one cut into slabs: room is for their mean."""
+    (hull,) = cube.hulls
+    low, high = hull.vertices.min(axis=0), hull.vertices.max(axis=0)
+    slabs = []
+    for k in range(2 * parts - 1):
+        ends = low[0] + (high[0] - low[0]) * np.array([k, k + 1]) / (2 * parts - 1)
+        slabs.append(Hull(np.where(hull.vertices > 0, [ends[1], *high[1:]], [ends[0], *low[1:]]), hull.faces))
+    builder = new_builder()
+    for item in (cube, dataclasses.replace(cube, hulls=tuple(slabs))):
+        world = new_builder()
+        add_object(world, item, CFG, scale=1.0, visuals=False)
+        builder.add_world(world)
+    assert SmallScene(builder, CFG, "cpu").solver.mjw_data.naconmax == 2 * contacts
 
 
 @pytest.mark.parametrize("joint", [0, 1, 2])

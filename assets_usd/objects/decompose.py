@@ -1,28 +1,56 @@
-"""Convex decomposition of a mesh: CoACD in a child process, with a time limit and fallbacks."""
+"""Convex decomposition of a mesh: CoACD in a child process with a limit of processor time."""
 
 import multiprocessing
 import os
 import queue
+import resource
 import signal
-from collections.abc import Sequence
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
 from vd.assets_usd.objects.geometry import (
+    SLIVER_THICKNESS,
     Hull,
     convex_hull,
     mesh_volume,
     simplify_hull,
-    solid_of_hulls,
 )
+from vd.assets_usd.objects.meshes import MeshError
+
+FINEST_THRESHOLD = 0.01
+"""CoACD takes no smaller one."""
 
 SLIVER_VOLUME = 1e-3
 """A part smaller than this share of all parts is dropped: it costs a collision shape and holds nothing."""
 
-SLIVER_THICKNESS = 2e-3
-"""So is a part thinner than this share of the object's longest side (0.25 mm of 12 cm)."""
+GOOD_ERROR = 0.15
+"""Parts that differ from the mesh by at most this share of its volume are good: most shapes meet it with few
+parts, and simplifying each part to 32 vertices alone takes 5 %."""
+
+USUAL_HULLS = 8
+"""Parts tried first: enough for most shapes, and each part is a collision shape in every world."""
+
+FINE_THRESHOLD, FINE_HULLS = 0.4, 96
+"""Factor on the threshold, and most parts, of the fine decomposition from which parts are merged where the
+first is not good."""
+
+MERGED_HULLS = (8, 12, 16, 24, 32)
+"""Numbers of parts to which a fine decomposition is merged. What is thin or a ring needs 16 and more."""
+
+NEARLY = 1.1
+"""More parts are not taken for an error less than a tenth smaller, unless it becomes good."""
+
+RUNS = 4
+"""Most runs of CoACD for one mesh: two decompositions, each also on a remeshed copy."""
+
+HANG_S = 20.0
+"""Wall-clock time, per second of processor time allowed, after which a child is taken to hang: a busy machine
+gives it a twentieth of a core at least."""
 
 
 @dataclass(frozen=True)
@@ -30,15 +58,16 @@ class DecomposeSettings:
     """Settings of the convex decomposition.
 
     Attributes:
-        max_hulls: Most convex parts per object; each is a collision shape in every world.
+        max_hulls: Most convex parts per object; 8 are tried first, and more where these are not good.
         threshold: CoACD's concavity threshold (0.01-1; smaller is finer and slower).
         mcts_iterations: CoACD's search effort; its default of 150 is several times slower.
         max_hull_vertices: Most vertices per part.
-        time_limit_s: After this, a mesh falls back to a coarser decomposition.
+        time_limit_s: Processor time of one run of CoACD, after which a mesh falls back to a coarser
+            decomposition, on an idle machine as on a busy one.
         seed: Seed of CoACD's search.
     """
 
-    max_hulls: int = 8
+    max_hulls: int = 32
     threshold: float = 0.08
     mcts_iterations: int = 20
     max_hull_vertices: int = 32
@@ -53,36 +82,48 @@ class Decomposition:
     Attributes:
         hulls: The parts.
         method: ``coacd``, ``coacd, remeshed`` or ``one hull``.
-        notes: What fell back, and why.
+        fallback: What fell back, and why; empty for a full result.
+        error: :func:`vd.assets_usd.objects.bodies.PartsError`.
     """
 
     hulls: tuple[Hull, ...]
     method: str
-    notes: tuple[str, ...]
+    fallback: tuple[str, ...] = ()
+    error: float = 0.0
 
 
-def _coacd_child(
-    answer: Any, vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings, preprocess: str
-) -> None:
-    """Run CoACD and put its parts, or the reason for none, into ``answer``."""
-    # The parent may be gone (killed, interrupted): never outlive the time limit.
+def _coacd_parts(
+    vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings, preprocess: str
+) -> list[np.ndarray]:
+    """Vertices of CoACD's parts."""
+    import coacd
+
+    coacd.set_log_level("off")
+    parts = coacd.run_coacd(
+        coacd.Mesh(vertices.astype(np.float64), faces.astype(np.int32)),
+        threshold=settings.threshold,
+        max_convex_hull=settings.max_hulls,
+        preprocess_mode=preprocess,
+        mcts_iterations=settings.mcts_iterations,
+        max_ch_vertex=settings.max_hull_vertices,
+        seed=settings.seed,
+    )
+    return [np.asarray(v, dtype=np.float64) for v, _ in parts]
+
+
+def _child(answer: Any, *arguments: Any) -> None:
+    """Run CoACD within its limits and put its parts, or the reason for none, into ``answer``."""
+    limit_s = arguments[2].time_limit_s
+    # The parent may be gone (killed, interrupted): never outlive its wait.
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.alarm(int(settings.time_limit_s) + 1)
+    signal.alarm(int(HANG_S * limit_s) + 1)
+    seconds = int(time.process_time()) + max(1, round(limit_s))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    os.environ["OMP_WAIT_POLICY"] = "passive"  # threads that wait for each other take no processor time
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
-        import coacd
-
-        coacd.set_log_level("off")
-        parts = coacd.run_coacd(
-            coacd.Mesh(vertices, faces),
-            threshold=settings.threshold,
-            max_convex_hull=settings.max_hulls,
-            preprocess_mode=preprocess,
-            mcts_iterations=settings.mcts_iterations,
-            max_ch_vertex=settings.max_hull_vertices,
-            seed=settings.seed,
-        )
-        answer.put([np.asarray(v, dtype=np.float64) for v, _ in parts])
+        answer.put(_coacd_parts(*arguments))
     except Exception as error:  # the reason travels to the parent
         answer.put(f"{type(error).__name__}: {error}")
 
@@ -100,32 +141,40 @@ def run_coacd(
 
     Returns:
         The vertices of each part, or the reason why there are none.
+
+    Raises:
+        MeshError: The child hangs.
     """
     context = multiprocessing.get_context("fork")
     answer = context.Queue()
-    arguments = (answer, vertices.astype(np.float64), faces.astype(np.int32), settings, preprocess)
-    child = context.Process(target=_coacd_child, args=arguments, daemon=True)
+    child = context.Process(target=_child, args=(answer, vertices, faces, settings, preprocess), daemon=True)
     child.start()
-    waited = 0.0
-    step = 0.2
-    result: list[np.ndarray] | str
+    deadline = time.monotonic() + HANG_S * settings.time_limit_s
+    result: list[np.ndarray] | str | None = None
     try:
-        while True:
+        while result is None:
+            alive = child.is_alive()  # asked first: what it answered before its end is then in the queue
             try:
-                result = answer.get(timeout=step)
-                break
+                result = answer.get(timeout=0.2)
             except queue.Empty:
-                waited += step
-                if waited > settings.time_limit_s:
-                    return f"no result after {settings.time_limit_s:g} s"
-                if not child.is_alive() and answer.empty():
-                    return f"CoACD ended with exit code {child.exitcode}"
+                if time.monotonic() > deadline:
+                    raise MeshError(
+                        f"CoACD hangs: no result within {HANG_S * settings.time_limit_s:g} s, though allowed "
+                        f"only {settings.time_limit_s:g} s of processor time; import it again"
+                    ) from None
+                if not alive:
+                    result = _end_of(child.exitcode, settings)
     finally:
         child.kill()
         child.join()
-    if not isinstance(result, str) and not result:
-        return "CoACD returned no part"
-    return result
+    return result or "CoACD returned no part"
+
+
+def _end_of(code: int | None, settings: DecomposeSettings) -> str:
+    """Why a child ended without an answer."""
+    if code == -signal.SIGXCPU:
+        return f"no result after {settings.time_limit_s:g} s of processor time (--time-limit)"
+    return f"CoACD ended with exit code {code}"
 
 
 def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ...]:
@@ -150,28 +199,103 @@ def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ..
 def decompose(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings) -> Decomposition:
     """Split a mesh into convex parts.
 
-    CoACD as the mesh is; then CoACD on a remeshed copy; then the convex hull alone. Each fallback is
-    noted.
+    CoACD as the mesh is; then CoACD on a remeshed copy; then the convex hull alone.
 
     Args:
         vertices: [V, 3], m.
         faces: [T, 3].
         settings: Limits.
+
+    Raises:
+        MeshError: CoACD hangs.
     """
-    notes = []
+    fallback = []
     for preprocess, method in (("auto", "coacd"), ("on", "coacd, remeshed")):
         parts = run_coacd(vertices, faces, settings, preprocess)
         if isinstance(parts, str):
-            notes.append(f"{method} failed: {parts}")
+            fallback.append(f"{method} failed: {parts}")
             continue
         hulls = tidy_hulls(parts, settings.max_hull_vertices)
         if hulls:
-            return Decomposition(hulls, method, tuple(notes))
-        notes.append(f"{method} gave only slivers")
+            return Decomposition(hulls, method, tuple(fallback))
+        fallback.append(f"{method} gave only slivers")
     hull = simplify_hull(convex_hull(vertices), settings.max_hull_vertices)
-    return Decomposition((hull,), "one hull", (*notes, "one convex hull stands for the whole mesh"))
+    return Decomposition((hull,), "one hull", (*fallback, "one convex hull stands for the whole mesh"))
 
 
-def relative_volume_error(hulls: Sequence[Hull], volume: float) -> float:
-    """|volume of the union of hulls - volume| / volume; the union by voxels (:func:`solid_of_hulls`)."""
-    return abs(solid_of_hulls(hulls).volume - volume) / volume
+def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:
+    """Parts [V, 3] merged to at most ``most``, each time the two whose common hull adds the least volume.
+
+    CoACD merges by the depth of concavities, and fills thin walls and rings more than it has to.
+    """
+    corners = dict(enumerate(parts))
+    volume = {i: _hull_volume(part) for i, part in corners.items()}
+    together: dict[tuple[int, int], float] = {}
+
+    def pair(i: int, j: int) -> None:
+        together[i, j] = _hull_volume(np.concatenate([corners[i], corners[j]]))
+
+    for i in corners:
+        for j in range(i):
+            pair(i, j)
+    while len(corners) > most:
+        i, j = min(together, key=lambda key: together[key] - volume[key[0]] - volume[key[1]])
+        new = max(corners) + 1
+        volume[new] = together[i, j]
+        both = np.concatenate([corners.pop(i), corners.pop(j)])
+        for key in [key for key in together if i in key or j in key]:
+            del together[key]
+        others = list(corners)
+        corners[new] = both[ConvexHull(both).vertices]
+        for other in others:
+            pair(new, other)
+    return list(corners.values())
+
+
+def _hull_volume(points: np.ndarray) -> float:
+    """Volume of the convex hull of points [N, 3]; 0 if they are flat."""
+    try:
+        return float(ConvexHull(points).volume)
+    except QhullError:
+        return 0.0
+
+
+def best_decomposition(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    settings: DecomposeSettings,
+    error_of: Callable[[Sequence[Hull]], float],
+) -> Decomposition:
+    """Few parts if these are good; else parts merged from a fine decomposition, as many as are needed.
+
+    Args:
+        vertices: [V, 3], m.
+        faces: [T, 3].
+        settings: Limits; its threshold is that of the first decomposition.
+        error_of: Error of parts.
+
+    Raises:
+        MeshError: CoACD hangs.
+    """
+    few = min(USUAL_HULLS, settings.max_hulls)
+    first = decompose(vertices, faces, replace(settings, max_hulls=few))
+    first = replace(first, error=error_of(first.hulls))
+    if first.error <= GOOD_ERROR or first.fallback:
+        return first
+    threshold = max(FINE_THRESHOLD * settings.threshold, FINEST_THRESHOLD)
+    limits = replace(
+        settings, max_hulls=FINE_HULLS, threshold=threshold, max_hull_vertices=2 * settings.max_hull_vertices
+    )
+    fine = decompose(vertices, faces, limits)
+    if fine.fallback:
+        return replace(first, fallback=("no finer parts", *fine.fallback))
+    found = [first]
+    parts = [hull.vertices for hull in fine.hulls]
+    for most in sorted((n for n in MERGED_HULLS if n <= settings.max_hulls), reverse=True):
+        parts = merge_parts(parts, most)
+        hulls = tidy_hulls(parts, settings.max_hull_vertices)
+        found.append(Decomposition(hulls, f"{fine.method}, merged", error=error_of(hulls)))
+    enough = max(GOOD_ERROR, NEARLY * min(each.error for each in found))
+    return min(
+        (each for each in found if each.error <= enough), key=lambda each: (len(each.hulls), each.error)
+    )

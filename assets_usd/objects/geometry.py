@@ -29,6 +29,10 @@ FINEST_GRID, COARSEST_GRID, GRID_BISECTIONS = 512.0, 8.0, 12
 """Grids tried when a mesh is coarsened: cells along its longest side, and bisection steps."""
 
 
+SLIVER_THICKNESS = 2e-3
+"""A part thinner than this share of the longest side (0.25 mm of 12 cm) is no solid to collide with."""
+
+
 class Hull(NamedTuple):
     """A convex polyhedron: ``vertices`` [V, 3] and outward triangles ``faces`` [T, 3]."""
 
@@ -97,6 +101,22 @@ def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     """Signed volume enclosed by a closed mesh, m^3 (divergence theorem)."""
     a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, i]] for i in range(3))
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+
+
+def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Generalised winding numbers [n] of a mesh at points [n, 3]: 1 inside, 0 outside of a closed one.
+
+    The solid angles of all triangles over 4 pi (van Oosterom and Strackee 1983), n x T of them: for a few
+    points. For many there is :func:`vd.assets_usd.objects.bodies.inside`.
+    """
+    total = np.zeros(len(points))
+    for i, point in enumerate(np.asarray(points, dtype=np.float64)):
+        a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, k]] - point for k in range(3))
+        la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+        dots = [np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (b, c), (c, a))]
+        spread = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
+        total[i] = np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), spread).sum() / (2.0 * np.pi)
+    return total
 
 
 def simplify_hull(hull: Hull, max_vertices: int) -> Hull:

@@ -15,9 +15,17 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vd.assets_usd.objects.decompose import DecomposeSettings, decompose, relative_volume_error, tidy_hulls
-from vd.assets_usd.objects.geometry import Hull, cluster_vertices, surface_points
-from vd.assets_usd.objects.meshes import MeshError, RepairedMesh, repair_mesh, solid_of
+from vd.assets_usd.objects.bodies import PartsError, body_of, cavity_share
+from vd.assets_usd.objects.decompose import (
+    GOOD_ERROR,
+    HANG_S,
+    RUNS,
+    Decomposition,
+    best_decomposition,
+    tidy_hulls,
+)
+from vd.assets_usd.objects.geometry import Hull, cluster_vertices, surface_points, triangle_areas
+from vd.assets_usd.objects.meshes import MeshError
 from vd.assets_usd.objects.model import (
     SURFACE_POINTS,
     ObjectModel,
@@ -35,22 +43,25 @@ from vd.assets_usd.objects.plan import (
     plan_jobs,
 )
 from vd.assets_usd.objects.reading import declared_unit, load_mesh, mesh_kind
+from vd.assets_usd.objects.repair import repair_mesh
 from vd.files import atomic_path, make_folder
 
-IMPORT_VERSION = 4
+IMPORT_VERSION = 5
 """Part of every content hash: raise it when the import computes something else."""
 
-DECOMPOSITION_VERSION = 3
+DECOMPOSITION_VERSION = 4
 """Part of the key of every cached decomposition: raise it when the parts of the same scaled mesh differ."""
 
 MAX_VISUAL_FACES = 3000
 """Faces of the visual mesh: files stay below 40 kB, and no picture here shows more."""
 
-FINER_ABOVE, FINER_THRESHOLD = 0.25, 0.4
-"""Above this volume error (thin walls, mostly), CoACD runs again with its threshold times this factor."""
+MAX_ERROR, MAX_OFFSET = 1.0, 0.03
+"""Parts are refused if they differ from the mesh by more than its volume, and are farther from its surface,
+on average, than this share of the longest side: 4 mm of 13 cm, where fingertips have a radius of 10 mm. Of
+thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as parts differs by its volume."""
 
-WORKER_ATTEMPTS, WORKER_OVERHEAD_S = 4, 120.0
-"""Runs of CoACD a child may need, and the time it gets beside them before it is killed."""
+WORKER_OVERHEAD_S = 600.0
+"""Wall-clock time that a child gets beside its runs of CoACD before it is taken to hang."""
 
 ENDING_S = 5.0
 """Time for a child to leave things in order before it is killed."""
@@ -71,7 +82,7 @@ class ImportResult:
         target: USD file, empty if refused.
         seconds: Time of the import.
         hulls: Number of convex parts.
-        volume_error: Relative volume error of the parts.
+        volume_error: Volume in which parts and object differ, as a share of the object's.
         longest_side_m: Longest side.
         mass_kg: Mass.
         decomposed: Whether CoACD ran.
@@ -108,28 +119,41 @@ def content_hash(job: Job, settings: ImportSettings) -> str:
     return digest.hexdigest()
 
 
-def _cached_hulls(path: Path) -> tuple[tuple[Hull, ...], str, tuple[str, ...]] | None:
-    """Hulls, method and notes of an earlier decomposition."""
+def _kept_decomposition(path: Path) -> Decomposition | None:
+    """An earlier decomposition."""
     if not path.is_file():
         return None
     with np.load(path) as data:
-        count = int(data["count"])
-        hulls = tuple(Hull(data[f"vertices_{i}"], data[f"faces_{i}"]) for i in range(count))
-        return hulls, str(data["method"]), tuple(map(str, data["notes"]))
+        hulls = tuple(Hull(data[f"vertices_{i}"], data[f"faces_{i}"]) for i in range(int(data["count"])))
+        return Decomposition(hulls, str(data["method"]), error=float(data["error"]))
 
 
-def _best_decomposition(
-    mesh: RepairedMesh, volume: float, settings: DecomposeSettings
-) -> tuple[tuple[Hull, ...], str, tuple[str, ...]]:
-    """Hulls, method and notes; a bad volume error earns a second try at a finer threshold."""
-    first = decompose(mesh.vertices, mesh.faces, settings)
-    error = relative_volume_error(first.hulls, volume)
-    if error > FINER_ABOVE:
-        finer = replace(settings, threshold=settings.threshold * FINER_THRESHOLD)
-        second = decompose(mesh.vertices, mesh.faces, finer)
-        if relative_volume_error(second.hulls, volume) < error:
-            return second.hulls, f"{second.method}, threshold {finer.threshold:g}", second.notes
-    return first.hulls, first.method, first.notes
+def _keep_decomposition(path: Path, parts: Decomposition) -> None:
+    """Keep a decomposition for a later import."""
+    arrays: dict[str, Any] = {"count": len(parts.hulls), "method": parts.method, "error": parts.error}
+    for i, hull in enumerate(parts.hulls):
+        arrays |= {f"vertices_{i}": hull.vertices, f"faces_{i}": hull.faces}
+    with atomic_path(path) as temporary:
+        np.savez(temporary, **arrays)
+
+
+def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
+    """What has to be said of parts that are so far from the surface, on average, as a share of its length.
+
+    Raises:
+        MeshError: They are too far from the mesh.
+    """
+    words = "; ".join(parts.fallback)
+    count = f"{len(parts.hulls)} convex part{'s' if len(parts.hulls) > 1 else ''}"
+    off = f"{count} differ from the mesh by {100 * parts.error:.0f} % of its volume"
+    if parts.error > MAX_ERROR and offset > MAX_OFFSET:
+        raise MeshError(
+            f"{off}, and are {100 * offset:.0f} % of its length off its surface on average"
+            f"{f' ({words})' if words else ''}: thicken its walls, or allow finer parts (--threshold, "
+            "--max-hulls)"
+        )
+    warnings = [f"fall-back, tried again at the next import: {words}"] if words else []
+    return warnings + ([off] if parts.error > GOOD_ERROR else [])
 
 
 def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
@@ -141,42 +165,38 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     mesh = repair_mesh(load_mesh(Path(job.source)))
     scale, size_notes, size_warnings = settings.sizing.scale(mesh.vertices, declared_unit(Path(job.source)))
     mesh = mesh.scaled(scale)
-    solid, method = solid_of(mesh)
-    if not solid.volume > 0.0:
+    body = body_of(mesh)
+    if not body.solid.volume > 0.0:
         raise MeshError("degenerate: encloses no volume")
-    mass, mass_notes, mass_warnings = settings.sizing.mass(solid.volume)
+    mass, mass_notes, mass_warnings = settings.sizing.mass(body.solid.volume)
     notes = [*mesh.notes, *size_notes, *mass_notes]
-    warnings = (*size_warnings, *mass_warnings)
+    error_of = PartsError(body, mesh.vertices)
     key = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes())
     key.update(json.dumps([DECOMPOSITION_VERSION, asdict(settings.decompose)], sort_keys=True).encode())
     cache = Path(settings.cache) / f"{key.hexdigest()}.npz" if settings.cache else None
     whole = 0 < len(mesh.pieces) <= settings.decompose.max_hulls
-    cached = None if whole or cache is None else _cached_hulls(cache)
-    hulls: tuple[Hull, ...]
-    way: str
-    more: tuple[str, ...] = ()
+    kept = None if whole or cache is None else _kept_decomposition(cache)
     if whole:
-        limit = settings.decompose.max_hull_vertices
-        hulls, way = tidy_hulls([p.vertices for p in mesh.pieces], limit), "convex pieces"
-    elif cached:
-        hulls, way, more = cached
+        hulls = tidy_hulls([p.vertices for p in mesh.pieces], settings.decompose.max_hull_vertices)
+        parts = Decomposition(hulls, "convex pieces", error=error_of(hulls))
+    elif kept:
+        parts = kept
     else:
-        hulls, way, more = _best_decomposition(mesh, solid.volume, settings.decompose)
-        # A fallback forced by the clock may not be needed next time: only full results are kept.
-        if cache and not more:
-            arrays: dict[str, Any] = {"count": len(hulls), "method": way, "notes": np.array(more, dtype=str)}
-            for i, hull in enumerate(hulls):
-                arrays |= {f"vertices_{i}": hull.vertices, f"faces_{i}": hull.faces}
-            with atomic_path(cache) as temporary:
-                np.savez(temporary, **arrays)
-    notes += more
+        parts = best_decomposition(mesh.vertices, mesh.faces, settings.decompose, error_of)
+        # A fall-back forced by a limit may not be needed next time: only full results are kept.
+        if cache and not parts.fallback:
+            _keep_decomposition(cache, parts)
+    offset = parts.error * body.volume / triangle_areas(mesh.vertices, mesh.faces).sum()
+    offset /= np.ptp(mesh.vertices, axis=0).max()
+    made = (*mesh.warnings, *body.warnings, *_parts_warnings(parts, offset))
+    warnings = (*made, *size_warnings, *mass_warnings)
     points = surface_points(mesh.vertices, mesh.faces, SURFACE_POINTS)
     visual = cluster_vertices(mesh.vertices, mesh.faces, MAX_VISUAL_FACES)
     model = build_model(
         job.name,
         *visual,
-        hulls,
-        solid,
+        parts.hulls,
+        body.solid,
         points,
         licence=job.licence,
         mass_kg=mass,
@@ -185,14 +205,14 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
         family="imported",
         split=job.split,
         scale=scale,
-        volume_error=relative_volume_error(hulls, solid.volume),
-        volume_method=f"{way}; union of hulls by voxels against {method}",
-        content_hash=content_hash(job, settings),
+        volume_error=parts.error + cavity_share(mesh, body),
+        volume_method=f"{parts.method}; volume in which parts and solid differ; solid: {body.method}",
+        content_hash="" if parts.fallback else content_hash(job, settings),
         notes=tuple(notes),
         warnings=warnings,
     )
     write_object(Path(job.target), model)
-    return replace(_result_of(job, model, "imported"), decomposed=not whole and cached is None)
+    return replace(_result_of(job, model, "imported"), decomposed=not whole and kept is None)
 
 
 def _result_of(job: Job, model: ObjectModel, status: Status) -> ImportResult:
@@ -213,7 +233,7 @@ def _result_of(job: Job, model: ObjectModel, status: Status) -> ImportResult:
 def _run_child(
     job: Job, settings: ImportSettings, threads: int, running: dict[str, subprocess.Popen[str]]
 ) -> ImportResult:
-    """Import one mesh in a child of its own, killed past the time limit."""
+    """Import one mesh in a child of its own, killed if it hangs."""
     import time
 
     start = time.monotonic()
@@ -221,7 +241,8 @@ def _run_child(
     def refused(reason: str) -> ImportResult:
         return ImportResult(job.source, job.name, "refused", reason, seconds=time.monotonic() - start)
 
-    limit = WORKER_ATTEMPTS * settings.decompose.time_limit_s + WORKER_OVERHEAD_S
+    # A busy machine is no reason: processor time is limited, this only ends what hangs.
+    limit = RUNS * HANG_S * settings.decompose.time_limit_s + WORKER_OVERHEAD_S
     environment = os.environ | {"OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": "1"}
     request = json.dumps({"parent": os.getpid(), "job": asdict(job), "settings": asdict(settings)})
     with tempfile.TemporaryFile("w+") as errors:

@@ -1,21 +1,10 @@
-"""Foreign meshes: repair, and the size and weight they are given."""
+"""Foreign meshes: the size and weight they are given."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from vd.assets_usd.objects.geometry import (
-    Hull,
-    Solid,
-    convex_hull,
-    mesh_volume,
-    solid_of_hulls,
-    solid_of_mesh,
-    solid_of_voxels,
-    voxelise_surface,
-)
 from vd.paper import PAPER
 
 LONGEST_SIDE_M = (0.095, 0.165)
@@ -45,103 +34,9 @@ near to others to be guessed."""
 DENSITIES_KG_M3 = (10.0, 23000.0)
 """Least and largest density of an object: from foam to osmium. What is beyond is a mistaken unit."""
 
-CONVEX = 0.99
-"""A closed piece that fills this share of its convex hull is taken as convex."""
-
-FLAT = 1e-3
-"""A mesh thinner than this share of its longest side has no volume to simulate."""
-
 
 class MeshError(ValueError):
     """A mesh is refused; the message is the reason."""
-
-
-@dataclass(frozen=True)
-class RepairedMesh:
-    """A cleaned mesh in its own units.
-
-    Attributes:
-        vertices: [V, 3] float64.
-        faces: [T, 3] int32.
-        watertight: Closed, consistently wound and of one piece.
-        pieces: Convex hulls of the closed pieces if all are convex, else empty: such a mesh is
-            decomposed as it stands.
-        notes: What was done.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
-    watertight: bool
-    pieces: tuple[Hull, ...]
-    notes: tuple[str, ...]
-
-    def scaled(self, factor: float) -> "RepairedMesh":
-        """The mesh times a factor."""
-        pieces = tuple(Hull(p.vertices * factor, p.faces) for p in self.pieces)
-        return replace(self, vertices=self.vertices * factor, pieces=pieces)
-
-
-def repair_mesh(mesh: Any) -> RepairedMesh:
-    """Merge vertices, drop degenerate and duplicate faces, fix winding, fill small holes.
-
-    Raises:
-        MeshError: Nothing but degenerate faces, or flat.
-    """
-    import trimesh
-
-    notes = []
-    mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    before = len(mesh.faces)
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    mesh.update_faces(mesh.nondegenerate_faces() & mesh.unique_faces())
-    mesh.remove_unreferenced_vertices()
-    if not len(mesh.faces):
-        raise MeshError(f"degenerate: all {before} faces have no area")
-    if len(mesh.faces) < before:
-        notes.append(f"removed {before - len(mesh.faces)} degenerate or duplicate faces")
-    extents = np.linalg.svd(mesh.vertices - mesh.vertices.mean(axis=0), full_matrices=False)[2]
-    spread = np.ptp(mesh.vertices @ extents.T, axis=0)
-    if spread.min() < FLAT * spread.max():
-        raise MeshError(f"degenerate: flat ({spread.min():.3g} thick for {spread.max():.3g} long)")
-    if not mesh.is_watertight:
-        trimesh.repair.fill_holes(mesh)
-        if mesh.is_watertight:
-            notes.append("filled holes")
-    if not mesh.is_winding_consistent:
-        notes.append("fixed winding")
-    trimesh.repair.fix_normals(mesh)
-    one_piece = mesh.body_count == 1
-    watertight = bool(mesh.is_watertight and mesh.is_winding_consistent and one_piece and mesh.volume > 0.0)
-    pieces = convex_pieces(mesh)
-    if pieces:
-        notes.append(f"{len(pieces)} convex piece{'s' if len(pieces) > 1 else ''}: nothing to decompose")
-    elif not mesh.is_watertight:
-        notes.append("not watertight: volume and mass properties from a voxelised solid")
-    elif not one_piece:
-        notes.append(f"{mesh.body_count} pieces: volume and mass properties from a voxelised solid")
-    return RepairedMesh(
-        np.asarray(mesh.vertices, dtype=np.float64),
-        np.asarray(mesh.faces, dtype=np.int32),
-        watertight,
-        pieces,
-        tuple(notes),
-    )
-
-
-def convex_pieces(mesh: Any) -> tuple[Hull, ...]:
-    """Convex hulls of a ``trimesh.Trimesh``'s connected pieces; none unless all are closed and convex."""
-    hulls = []
-    for piece in mesh.split(only_watertight=False):
-        if not piece.is_watertight:
-            return ()
-        try:
-            hull = convex_hull(piece.vertices)
-        except ValueError:
-            return ()
-        if abs(mesh_volume(piece.vertices, piece.faces)) < CONVEX * mesh_volume(*hull):
-            return ()
-        hulls.append(hull)
-    return tuple(hulls)
 
 
 def mean_width(vertices: np.ndarray) -> float:
@@ -309,12 +204,3 @@ def choose_scale(sides: Sequence[float], width: float, unit: float | None = None
     if factor != unit:
         words.append(f"scaled by {factor / unit:.3g} to {longest * factor:.3f} m")
     return factor, ", ".join(words)
-
-
-def solid_of(mesh: RepairedMesh) -> tuple[Solid, str]:
-    """Mass properties of a mesh at density 1, and the method: exact if watertight, else by voxels."""
-    if mesh.watertight:
-        return solid_of_mesh(mesh.vertices, mesh.faces), "exact mesh volume"
-    if mesh.pieces:
-        return solid_of_hulls(mesh.pieces), "union of the pieces by voxels"
-    return solid_of_voxels(*voxelise_surface(mesh.vertices, mesh.faces)), "voxelised solid"

@@ -57,7 +57,7 @@ class ObjectModel:
         family: Kind of object (procedural family, or ``imported``).
         split: ``train``, ``test`` or empty.
         scale: Factor from the source's units to metres in this file.
-        volume_error: |volume of the union of hulls - volume of the solid| / volume of the solid.
+        volume_error: Volume in which the union of hulls and the solid differ / volume of the solid.
         volume_method: How that was estimated.
         content_hash: Hash of what the file was made from; equal hashes need no new work.
         notes: What was repaired or assumed.
@@ -361,7 +361,7 @@ def read_object(path: Path) -> ObjectModel:
         volume_error=float(data["volumeError"]),
         volume_method=str(data["volumeMethod"]),
         content_hash=str(data["contentHash"]),
-        notes=tuple(notes.split("\n")) if notes else (),
+        notes=tuple(notes.splitlines()),
         warnings=tuple(str(data.get("warnings", "")).splitlines()),
     )
 

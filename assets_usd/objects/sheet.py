@@ -8,6 +8,7 @@ import colorsys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,9 +37,6 @@ SHARP_EDGE = np.cos(np.radians(35.0))
 
 MAX_FLAT_FACES = 1000
 """Meshes of at most so many faces are drawn with flat facets: they are polyhedra, not sampled curves."""
-
-LARGE_ERROR = 0.25
-"""Volume errors above this are printed in the warning colour."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +174,15 @@ def draw_object(
     )
 
 
+def _shortened(words: str, width: float, font: Any) -> str:
+    """As many of the words as fit a width in pixels."""
+    if font.getlength(words) <= width:
+        return words
+    while words and font.getlength(words + " ...") > width:
+        words = words[:-1]
+    return words.rstrip() + " ..."
+
+
 def contact_sheet(
     models: Sequence[ObjectModel],
     path: Path,
@@ -184,7 +191,7 @@ def contact_sheet(
     style: SheetStyle | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Path:
-    """Write a PNG with every object: mesh, parts, name, longest side, parts, volume error.
+    """Write a PNG with every object: mesh, parts, name, longest side, parts, volume error, warnings.
 
     Args:
         models: Objects.
@@ -199,7 +206,8 @@ def contact_sheet(
     from PIL import Image, ImageDraw, ImageFont
 
     style = style or SheetStyle()
-    tile, pad, caption, head = style.tile, 12, 40, 64
+    tile, pad, head = style.tile, 12, 64
+    caption = 58 if any(m.warnings for m in models) else 40
     columns = style.columns or max(1, round(np.sqrt(len(models) * (tile + caption) / (2 * tile))))
     columns = min(columns, len(models))
     rows = -(-len(models) // columns)
@@ -216,6 +224,8 @@ def contact_sheet(
         f"{len(models)} objects, {np.mean(parts):.1f} convex parts on average, "
         f"volume error: median {np.median(errors):.1%}, worst {max(errors):.1%}"
     )
+    if doubtful := sum(bool(m.warnings) for m in models):
+        summary += f"; {doubtful} with warnings"
     draw.text((pad, 38), summary, fill=FAINT, font=small_font)
     half = None
     if style.common_scale:
@@ -230,9 +240,11 @@ def contact_sheet(
         count = len(model.hulls)
         facts = f"{model.longest_side * 1e3:.0f} mm,  {count} part{'s' if count > 1 else ''},  volume "
         draw.text((left + 6, below + 18), facts, fill=FAINT, font=small_font)
-        colour = WARNING if model.volume_error > LARGE_ERROR else FAINT
+        colour = WARNING if model.warnings else FAINT
         shift = draw.textlength(facts, font=small_font)
         draw.text((left + 6 + shift, below + 18), f"±{model.volume_error:.1%}", fill=colour, font=small_font)
+        words = _shortened("; ".join(model.warnings), 2 * tile - 12, small_font)
+        draw.text((left + 6, below + 35), words, fill=WARNING, font=small_font)
         if progress:
             progress(model.name, i + 1, len(models))
     with atomic_path(Path(path)) as temporary:

@@ -1,12 +1,14 @@
 """Winding numbers of sampled surfaces, against NumPy sums and what Gauss says of closed ones."""
 
 import numpy as np
+import trimesh
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, unwritten
 
-from vd.kernels.winding import winding_kernel
+from vd.assets_usd.objects.geometry import winding_numbers
+from vd.kernels.winding import inside_kernel, winding_kernel
 
 SHAPE = (5, 4, 3)
 
@@ -55,3 +57,39 @@ def test_of_a_sphere_it_is_one_inside_and_zero_outside(device):
     assert abs(found[radius < 0.5] - 1.0).max() < 0.05
     assert abs(found[radius > 1.5]).max() < 0.05
     assert abs(found[radius == 1.0] - 0.5).max() < 0.1
+
+
+def solid_angles(corners, points):
+    """Winding numbers [n] of triangles [T, 3, 3], by the spherical excess of each (L'Huilier)."""
+    total = np.zeros(len(points))
+    for k, point in enumerate(points):
+        a, b, c = np.moveaxis(corners - point, 1, 0)
+        a, b, c = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (a, b, c))
+        sides = [np.arccos(np.clip((x * y).sum(axis=1), -1, 1)) for x, y in ((b, c), (c, a), (a, b))]
+        half = sum(sides) / 2
+        product = np.tan(half / 2) * np.prod([np.tan((half - side) / 2) for side in sides], axis=0)
+        excess = 4 * np.arctan(np.sqrt(np.maximum(product, 0)))
+        total[k] = (np.sign((a * np.cross(b, c)).sum(axis=1)) * excess).sum() / (4 * np.pi)
+    return total
+
+
+@EXAMPLES
+@given(seed=st.integers(0, 2**31), kept=st.floats(0.3, 1.0), level=st.sampled_from([0.2, 0.5, 0.8]))
+def test_inside_is_where_the_winding_number_exceeds_the_level(device, seed, kept, level):
+    """Of a sphere with holes, at points that are not next to the level."""
+    rng = np.random.default_rng(seed)
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.5)
+    faces = ball.faces[rng.uniform(size=len(ball.faces)) < kept]
+    points = rng.uniform(-0.7, 0.7, (50, 3))
+    expected = solid_angles(ball.vertices[faces], points)
+    np.testing.assert_allclose(winding_numbers(ball.vertices, faces, points), expected, atol=1e-4)
+    mesh = wp.Mesh(
+        device_array(ball.vertices, wp.vec3, device),
+        wp.array(faces.ravel(), dtype=wp.int32, device=device),
+        support_winding_number=True,
+    )
+    out = wp.array(rng.uniform(size=50) < 0.5, dtype=wp.bool, device=device)
+    inputs = [mesh.id, level, device_array(points, wp.vec3, device)]
+    wp.launch(inside_kernel, dim=50, inputs=inputs, outputs=[out], device=device)
+    clear = np.abs(expected - level) > 0.03  # far triangles count by clusters
+    np.testing.assert_array_equal(out.numpy()[clear], (expected > level)[clear])

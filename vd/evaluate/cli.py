@@ -232,13 +232,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _evaluate(cfg: EvalCfg) -> int:
     result = evaluate(cfg)
     from vd.config import to_dict
-    from vd.evaluate.report import task_line, terminal_table
+    from vd.evaluate.report import task_line, terminal_table, warning_lines
 
     if cfg.json:
         summary = {key: value for key, value in to_dict(result).items() if key != "episodes"}
         print(json.dumps(summary, indent=1))
     else:
-        print(terminal_table(result))
+        print("\n".join([terminal_table(result), *warning_lines(result.warnings)]))
         print(f"\n{task_line(result)}\n{cfg.output / 'eval.json'}\n{cfg.output / 'eval.html'}")
     return 0
 
@@ -249,6 +249,7 @@ def _compare(cfg: EvalCfg) -> int:
     comparison = compare(cfg)
     from vd.config import to_dict
     from vd.evaluate.comparison_page import terminal_table
+    from vd.evaluate.report import warning_lines
 
     if cfg.json:
         summary = to_dict(comparison)
@@ -258,7 +259,7 @@ def _compare(cfg: EvalCfg) -> int:
             del entry["true_rad"], entry["predicted_rad"]
         print(json.dumps(summary, indent=1))
     else:
-        print(terminal_table(comparison))
+        print("\n".join([terminal_table(comparison), *warning_lines(comparison.warnings)]))
         print(f"\n{cfg.output / 'eval.json'}\n{cfg.output / 'eval.html'}")
     return 0
 
@@ -296,7 +297,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.agents import built_in, check_bundle, open_teacher, task_for
     from vd.evaluate.report import write_report
-    from vd.evaluate.result import Protocol, summarise
+    from vd.evaluate.result import Protocol, summarise, warnings_of
     from vd.evaluate.rollout import collect, collect_drawn, draw_starts_and_goals
     from vd.evaluate.second_view import SecondView
 
@@ -375,6 +376,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         episodes,
         resample=cfg.resample,
         software=software(device),
+        warnings=warnings_of(env.objects),
     )
     result.write(cfg.output / "eval.json")
     write_report(result, cfg.output / "eval.html")

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vd.config import from_dict, to_dict
-from vd.evaluate.result import EvalResult, Protocol, summarise
+from vd.evaluate.result import EvalResult, Protocol, summarise, warnings_of
 from vd.evaluate.statistics import Interval, Unit, choose_unit, rate_intervals
 from vd.evaluate.trace import Trace
 from vd.files import write_json
@@ -103,6 +103,11 @@ class Comparison:
         """Names of the policies, in order."""
         return tuple(dict.fromkeys(row.policy for row in self.rows))
 
+    @property
+    def warnings(self) -> dict[str, str]:
+        """What may be wrong with objects, by name."""
+        return {name: words for row in self.rows for name, words in row.result.warnings.items()}
+
     def write(self, path: Path) -> None:
         """Write as JSON, atomically."""
         write_json(path, to_dict(self))
@@ -139,7 +144,7 @@ def judge(
     Args:
         trace: Its episodes with the objects of the group.
         protocol: How they were run.
-        objects: The objects (name and symmetry are read).
+        objects: The objects (name, symmetry and warnings are read).
         kind: Of the policy.
         sees: What it sees.
         group: Name of the group.
@@ -162,6 +167,7 @@ def judge(
             [item.symmetry for item in objects],
             episodes,
             resample=resample,
+            warnings=warnings_of(objects),
         )
         rows.append(
             Row(

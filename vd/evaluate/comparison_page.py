@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from vd.evaluate.comparison import OUTCOMES, Comparison, Row
 from vd.evaluate.plots import BLUE, GREEN, GREY, ORANGE, ecdf
-from vd.evaluate.report import goals_text, number, percent, starts_text
+from vd.evaluate.report import add_warnings, goals_text, number, percent, starts_text
 from vd.evaluate.result import TOLERANCES_RAD
 from vd.evaluate.statistics import chance_cdf
 from vd.page import Page
@@ -99,6 +99,7 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
             "and 80.9 % by true distance (in the air, twelve objects).",
             small=True,
         )
+    add_warnings(page, comparison.warnings)
     page.section("Every object")
     for row in comparison.rows:
         heading = f"{short[row.policy]}, {row.group}, stopped by {row.stopped_by}"

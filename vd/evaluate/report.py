@@ -1,5 +1,6 @@
 """The evaluation as one HTML page and as lines for a terminal."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -35,12 +36,26 @@ def write_report(result: EvalResult, path: Path) -> None:
     page = Page(f"Evaluation of {result.protocol.policy}", _lead(result))
     add_summary(page, result)
     add_figures(page, result)
+    add_warnings(page, result.warnings)
     page.section("Every object")
     page.table(_HEADER, [_row(summary) for summary in (result.overall, *result.per_object)])
     page.section("Protocol")
     page.table(["setting", "value"], protocol_rows(result))
     page.text(method_note(result), small=True)
     page.write(path)
+
+
+def warning_lines(warnings: Mapping[str, str]) -> list[str]:
+    """A line for each object with warnings."""
+    return [f"warning {name}: {words}" for name, words in warnings.items()]
+
+
+def add_warnings(page: Page, warnings: Mapping[str, str]) -> None:
+    """Add the objects with warnings, if there are any."""
+    if warnings:
+        page.section("Objects with warnings")
+        page.text("What their import says of them; results on these objects may be those of something else.")
+        page.table(["object", "warning"], list(warnings.items()), words=(1,))
 
 
 def add_summary(page: Page, result: EvalResult) -> None:

@@ -4,12 +4,14 @@ Angles are radians, times seconds, quaternions xyzw.
 """
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict, to_dict
 from vd.evaluate.statistics import (
     Interval,
@@ -158,6 +160,8 @@ class EvalResult:
     format_version: int = FORMAT_VERSION
     software: dict[str, str] = field(default_factory=dict)
     """Versions of what ran."""
+    warnings: dict[str, str] = field(default_factory=dict)
+    """By name of an object: what its import says may be wrong with it."""
 
     def errors(self) -> np.ndarray:
         """Scored final errors [rad], shape [K, M]."""
@@ -189,6 +193,11 @@ class EvalResult:
         return from_dict(EvalResult, values)
 
 
+def warnings_of(objects: Iterable[ObjectModel]) -> dict[str, str]:
+    """What the import of objects says may be wrong with them, by name; nothing of those without a warning."""
+    return {item.name: "; ".join(item.warnings) for item in objects if item.warnings}
+
+
 def summarise(
     protocol: Protocol,
     object_names: tuple[str, ...],
@@ -197,6 +206,7 @@ def summarise(
     *,
     resample: Literal["auto", "object", "episode"] = "auto",
     software: dict[str, str] | None = None,
+    warnings: dict[str, str] | None = None,
 ) -> EvalResult:
     """Compute every rate, median and interval of an evaluation.
 
@@ -207,6 +217,7 @@ def summarise(
         episodes: K x M episodes, object by object.
         resample: What intervals speak about: ``object``, ``episode``, or by the number of objects.
         software: Versions to record.
+        warnings: What may be wrong with objects, by name.
     """
     chances = [chance_cdf(np.array(TOLERANCES_RAD), symmetry) for symmetry in symmetries]
     by_object = [episodes[i : i + protocol.episodes] for i in range(0, len(episodes), protocol.episodes)]
@@ -226,6 +237,7 @@ def summarise(
         ),
         episodes=episodes,
         software=software or {},
+        warnings=warnings or {},
     )
 
 

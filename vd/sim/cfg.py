@@ -55,7 +55,8 @@ class SimCfg:
     njmax: int = 160
     """Constraint rows a world may use; an overflow stops the run and names this setting."""
     nconmax: int = 32
-    """Contacts a world may use on average over all worlds (about 10 are used, 20 in a handful); likewise."""
+    """Contacts a world may use on average over all worlds (about 10 are used, 20 in a handful); likewise.
+    Of objects of more than 8 convex parts in proportion more."""
     nccdmax: int = 3
     """Pairs of convex shapes, of any one combination of kinds, that may overlap in a world on average over
     all worlds (0.1 to 0.25 do while fingers push); likewise. Each takes 5 kB of work space: with one for each

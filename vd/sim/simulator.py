@@ -1,5 +1,6 @@
 """Step many worlds with SolverMuJoCo, with the velocity limits and guards the solver lacks."""
 
+import math
 from dataclasses import dataclass
 
 import newton
@@ -28,6 +29,10 @@ AWAY_M = -10.0
 # Work space of convex pairs (5 kB each) is shared by all worlds; few worlds have no average to rely on:
 # 60 of objects wedged between the fingers filled three for each (our choice).
 FEWEST_CONVEX_PAIRS = 1024
+
+# Convex parts of an object up to which sim.nconmax and sim.nccdmax are as they are set: one of 32 parts
+# touches table and fingers at 25 places, one of 8 at 9.
+USUAL_PARTS = 8
 
 # MuJoCo Warp's overflow bits that mean lost contacts or constraint rows, by the setting to change.
 # Its other bits count solver and line-search iterations, which are stopping rules, not losses.
@@ -61,7 +66,12 @@ class NanDump:
 
 
 def make_solver(model: newton.Model, cfg: SimCfg) -> SolverMuJoCo:
-    """The solver with the project's settings; overflow is left to the guards, which need no prints."""
+    """The solver with the project's settings; overflow is left to the guards, which need no prints.
+
+    Room for contacts grows with the convex parts of a world, on average over the worlds.
+    """
+    parts = np.count_nonzero(model.shape_type.numpy() == newton.GeoType.CONVEX_MESH) / model.world_count
+    room = max(1.0, parts / USUAL_PARTS)
     solver = SolverMuJoCo(
         model,
         solver="newton",
@@ -73,13 +83,13 @@ def make_solver(model: newton.Model, cfg: SimCfg) -> SolverMuJoCo:
         tolerance=cfg.tolerance,
         jacobian=cfg.jacobian,
         njmax=cfg.njmax,
-        nconmax=cfg.nconmax,
+        nconmax=math.ceil(room * cfg.nconmax),
         enable_multiccd=cfg.multiccd,
         kinematic_switchable_roots=False,
     )
     solver.mjw_model.opt.warn_overflow = False
     # The solver would take one for each contact, and has no argument for it.
-    solver.mjw_data.naccdmax = max(cfg.nccdmax * model.world_count, FEWEST_CONVEX_PAIRS)
+    solver.mjw_data.naccdmax = max(math.ceil(room * cfg.nccdmax) * model.world_count, FEWEST_CONVEX_PAIRS)
     return solver
 
 
