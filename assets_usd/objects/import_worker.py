@@ -8,12 +8,6 @@ import sys
 from dataclasses import asdict
 from types import FrameType
 
-from vd.assets_usd.objects.decompose import DecomposeSettings
-from vd.assets_usd.objects.importer import ImportResult, import_mesh
-from vd.assets_usd.objects.meshes import MeshError, Sizing
-from vd.assets_usd.objects.model import ObjectError
-from vd.assets_usd.objects.plan import ImportSettings, Job
-
 PR_SET_PDEATHSIG = 1
 """Option of Linux's prctl: the signal that a process gets when its parent ends."""
 
@@ -33,8 +27,14 @@ def end_with(parent: int) -> None:
 
 def main() -> None:
     """Run one import, as the head of a process group. A refusal is a result, anything else a traceback."""
+    end_with(int(sys.argv[1]))  # before what takes long to import
+    from vd.assets_usd.objects.decompose import DecomposeSettings
+    from vd.assets_usd.objects.importer import ImportResult, import_mesh
+    from vd.assets_usd.objects.meshes import MeshError, Sizing
+    from vd.assets_usd.objects.model import ObjectError
+    from vd.assets_usd.objects.plan import ImportSettings, Job
+
     request = json.load(sys.stdin)
-    end_with(request["parent"])
     given = request["settings"]
     given["decompose"] = DecomposeSettings(**given["decompose"])
     given["sizing"] = Sizing(**given["sizing"])

@@ -244,11 +244,11 @@ def _run_child(
     # A busy machine is no reason: processor time is limited, this only ends what hangs.
     limit = RUNS * HANG_S * settings.decompose.time_limit_s + WORKER_OVERHEAD_S
     environment = os.environ | {"OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": "1"}
-    request = json.dumps({"parent": os.getpid(), "job": asdict(job), "settings": asdict(settings)})
+    request = json.dumps({"job": asdict(job), "settings": asdict(settings)})
     with tempfile.TemporaryFile("w+") as errors:
         # A session of its own: Ctrl-C reaches the parent alone, which then ends the children in order.
         child = subprocess.Popen(
-            [sys.executable, "-m", "vd.assets_usd.objects.import_worker"],
+            [sys.executable, "-m", "vd.assets_usd.objects.import_worker", str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
