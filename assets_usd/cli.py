@@ -1,11 +1,17 @@
 """``vd-assets``: author hands, author objects, import meshes, draw contact sheets."""
 
+import contextlib
 import json
+import re
+import signal
 import sys
 import time
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -51,18 +57,30 @@ class Objects:
 
 @dataclass(frozen=True)
 class Import:
-    """Import meshes (OBJ, STL, PLY, GLB): repair, scale, decompose, one USD per object.
+    """Import meshes (OBJ, STL, PLY, GLB, USD): repair, scale, decompose, one USD per object.
 
-    Units are guessed (m, mm or cm, whichever needs the least rescaling). A mesh is scaled as little as
-    makes it fit the hand: longest side 0.095-0.165 m, mean width at most 0.13 m, shortest side at least
-    0.025 m where the others let it. An import that was interrupted goes on where it stopped. The exit
-    status is 1 if any mesh was refused.
+    A mesh is scaled as little as makes it fit the hand: longest side 0.095-0.165 m, mean width at most
+    0.13 m, shortest side at least 0.025 m where the others let it. An object is called like its file, or
+    like the nearest folder that says something if the file's name does not (mug/meshes/model.obj: mug).
+    An import that was interrupted goes on where it stopped. The exit status is 1 if any mesh was refused.
     """
 
     paths: tyro.conf.Positional[tuple[Path, ...]]
     """Mesh files, or folders to search for them."""
     out: Path | None = None
-    """Folder to write to; by default a set in the asset cache, named after the first path."""
+    """Folder to write to; by default a set in the asset cache, named after the folder of the meshes."""
+    units: Literal["auto", "mm", "cm", "m", "in"] = "auto"
+    """Unit of the meshes. auto: what the file declares (GLB, USD), else m, mm or cm, whichever needs the
+    least rescaling. Inches are never guessed."""
+    keep_size: bool = False
+    """Keep the real size, also of what does not fit the hand. The unit must be known."""
+    density: float | None = None
+    """Density that gives each object its mass [kg/m3]; plastic has about 1000, aluminium 2700, steel 7850."""
+    mass: float | None = None
+    """Mass of each object [kg]; without this and --density 0.1. Training draws masses of its own unless its
+    randomisation is off."""
+    drop_gone: bool = False
+    """Remove from the set the objects whose mesh file is gone. Without it they stay, and are named."""
     jobs: int = 0
     """Meshes at a time; 0: one per core."""
     force: bool = False
@@ -137,8 +155,9 @@ class _Bar:
 
 def run_hand(command: Hand) -> int:
     """Author hands."""
-    from vd.assets_usd.hand_author import author_hand, hand_usd
+    from vd.assets_usd.hand_author import hand_usd
     from vd.assets_usd.hand_spec import HANDS
+    from vd.files import write_text
 
     unknown = [name for name in command.names if name not in HANDS]
     if unknown:
@@ -146,11 +165,13 @@ def run_hand(command: Hand) -> int:
         return 2
     paths = {}
     for name in command.names or tuple(HANDS):
-        if command.out is None:
-            paths[name] = str(hand_usd(name))
-        else:
-            author_hand(HANDS[name], command.out / f"{name}.usda")
-            paths[name] = str(command.out / f"{name}.usda")
+        path = hand_usd(name)
+        if command.out is not None:
+            path, text = command.out / path.with_stem(name).name, path.read_text()
+            if path.exists() and path.read_text(errors="replace") != text:
+                raise ValueError(f"{path} is there and another hand; write to another folder (--out)")
+            write_text(path, text)
+        paths[name] = str(path)
     print(json.dumps(paths, indent=1) if command.json else "\n".join(paths.values()))
     return 0
 
@@ -169,7 +190,7 @@ def run_objects(command: Objects) -> int:
         models = procedural.procedural_set(
             command.procedural, command.seed, held_out=command.held_out, progress=_Bar("authoring")
         )
-    folder = command.out or sets.objects_dir() / name
+    folder = command.out or sets.built_in_folder(name)
     files = sets.write_set(folder, models)
     size = sum(p.stat().st_size for p in files)
     if command.json:
@@ -183,14 +204,31 @@ def run_objects(command: Objects) -> int:
     return 0
 
 
+@contextlib.contextmanager
+def _ended_in_order() -> Iterator[None]:
+    """Treat SIGTERM and SIGHUP as Ctrl-C; the KeyboardInterrupt carries the signal."""
+
+    def stop(number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt(number)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def run_import(command: Import) -> int:
     """Import meshes; returns 1 if any was refused."""
     from vd.assets_usd.cache import assets_dir
     from vd.assets_usd.objects.decompose import DecomposeSettings
-    from vd.assets_usd.objects.importer import ImportSettings, import_meshes
-    from vd.assets_usd.objects.meshes import MeshError
-    from vd.assets_usd.objects.sets import objects_dir
+    from vd.assets_usd.objects.importer import import_meshes
+    from vd.assets_usd.objects.meshes import Sizing
+    from vd.assets_usd.objects.plan import ImportSettings, default_set
 
+    if not command.paths:
+        raise ValueError("name the mesh files, or folders of them, to import")
     settings = ImportSettings(
         DecomposeSettings(
             max_hulls=command.max_hulls,
@@ -202,8 +240,9 @@ def run_import(command: Import) -> int:
         licence=command.licence,
         split=command.split,
         cache=str(assets_dir() / "decompositions"),
+        sizing=Sizing(command.units, command.keep_size, command.density, command.mass),
     )
-    out = command.out or objects_dir() / command.paths[0].resolve().stem
+    out = command.out or default_set(command.paths)
     bar = _Bar("importing")
 
     def progress(result: "ImportResult", done: int, total: int) -> None:
@@ -213,35 +252,38 @@ def run_import(command: Import) -> int:
 
     start = time.monotonic()
     try:
-        results = import_meshes(
-            command.paths, out, settings, jobs=command.jobs, force=command.force, progress=progress
-        )
-    except MeshError as error:
-        print(error, file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
+        with _ended_in_order():
+            results = import_meshes(
+                command.paths,
+                out,
+                settings,
+                jobs=command.jobs,
+                force=command.force,
+                drop_gone=command.drop_gone,
+                progress=progress,
+            )
+    except KeyboardInterrupt as stop:
         print(
             f"\ninterrupted; what is finished is in {out}; the same command goes on from there",
             file=sys.stderr,
         )
-        return 130
+        return 128 + int(stop.args[0] if stop.args else signal.SIGINT)
     seconds = time.monotonic() - start
-    refused = [r for r in results if r.status == "refused"]
     if command.json:
         record = {"out": str(out), "seconds": seconds, "objects": [asdict(r) for r in results]}
         print(json.dumps(record, indent=1))
     else:
         print(_summary(results, out, seconds))
-    return 1 if refused else 0
+    return 1 if any(r.status == "refused" for r in results) else 0
 
 
 def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
     """What became of an import, in a few lines."""
-    good = [r for r in results if r.status != "refused"]
-    refused = [r for r in results if r.status == "refused"]
-    fresh = sum(r.status == "imported" for r in results)
+    by = {status: [r for r in results if r.status == status] for status in {r.status for r in results}}
+    fresh, cached, refused = (by.get(status, []) for status in ("imported", "cached", "refused"))
+    good = fresh + cached
     lines = [
-        f"{fresh} imported, {len(good) - fresh} unchanged, {len(refused)} refused in {seconds:.0f} s; {out}"
+        f"{len(fresh)} imported, {len(cached)} unchanged, {len(refused)} refused in {seconds:.0f} s; {out}"
     ]
     if good:
         size = sum(Path(r.target).stat().st_size for r in good)
@@ -251,9 +293,33 @@ def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
         hulls = sum(r.hulls for r in good) / len(good)
         lines.append(f"{hulls:.1f} convex parts on average, {size / 1e6:.1f} MB")
         lines.append(f"volume error of the parts: median {median:.1%}, worst {named}")
+        lines.append(_sizes(good))
     lines += [f"warning {r.name}: {words}" for r in good for words in r.warnings]
     lines += [f"refused {r.source}: {r.reason}" for r in refused]
+    lines += [f"dropped {r.name}: its mesh {r.source} is gone" for r in by.get("dropped", [])]
+    lines += [
+        f"{r.name} stays in the set, although its mesh {r.source} is gone; --drop-gone removes it"
+        for r in by.get("gone", [])
+    ]
     return "\n".join(lines)
+
+
+def _sizes(good: "list[ImportResult]") -> str:
+    """Ranges of size and mass of objects, and how many were taken to be in which unit."""
+
+    def span(values: list[float]) -> str:
+        low, high = f"{min(values):.3g}", f"{max(values):.3g}"
+        return low if low == high else f"{low}-{high}"
+
+    notes = [note for r in good for note in r.notes]
+    units = Counter(found[1] for note in notes if (found := re.search(r"taken as ([^,]+)", note)))
+    units["m"] += len(good) - units.total()
+    taken = ", ".join(f"{count} in {unit}" for unit, count in units.items() if count)
+    scaled = sum("scaled by" in note for note in notes)
+    return (
+        f"longest side {span([r.longest_side_m for r in good])} m ({taken}; {scaled} of {len(good)} scaled), "
+        f"mass {span([r.mass_kg for r in good])} kg"
+    )
 
 
 def run_show(command: Show) -> int:

@@ -128,6 +128,7 @@ class _Reader:
         if not self.root.HasAPI(UsdPhysics.ArticulationRootAPI):
             raise self.fail(self.root, "PhysicsArticulationRootAPI is missing", "apply it to the root prim")
         fingers = self._fingers()
+        self._refuse_unknown(fingers)
         order = [(f, i) for f in range(fingers) for i in range(1, JOINTS_PER_FINGER + 1)]
         links = ("base", *(f"f{f}_l{i}" for f, i in order))
         joints = [self.prim(f"f{f}_j{i}") for f, i in order]
@@ -200,6 +201,24 @@ class _Reader:
                 "name links f0_l1 to f0_l3, f1_l1 and so on, without gaps",
             )
         return len(found)
+
+    def _refuse_unknown(self, fingers: int) -> None:
+        """Refuse links and joints that the model would leave out."""
+        known = {"base"} | {f"f{f}_{kind}{i}" for f in range(fingers) for kind in "lj" for i in (1, 2, 3)}
+        more = [
+            prim
+            for prim in Usd.PrimRange(self.root)
+            if (prim.HasAPI(UsdPhysics.RigidBodyAPI) or prim.IsA(UsdPhysics.Joint))
+            and not prim.IsA(UsdPhysics.FixedJoint)
+            and not (prim.GetParent() == self.root and prim.GetName() in known)
+        ]
+        if more:
+            names = ", ".join(prim.GetName() for prim in more)
+            raise self.fail(
+                self.root,
+                f"has links or joints besides those of fingers with {JOINTS_PER_FINGER} joints: {names}",
+                f"only such fingers are supported so far; weld what is beyond f0_l{JOINTS_PER_FINGER} to it",
+            )
 
     def _relative(self, prim: Usd.Prim, ancestor: Usd.Prim) -> np.ndarray:
         """Pose [7] of a prim in the frame of an ancestor; a scale is dropped, shear is refused."""

@@ -10,7 +10,6 @@ its file, in the world frame; or a file with one on each line.
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -25,8 +24,9 @@ from vd.assets_usd.objects.geometry import (
     solid_of_mesh,
     surface_points,
 )
-from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, UNITS_M, MeshError, check_file
+from vd.assets_usd.objects.meshes import GUESSED_UNITS, LONGEST_SIDE_M, UNITS_M, MeshError
 from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectError, ObjectModel, build_model, load_set
+from vd.assets_usd.objects.reading import load_points
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.scans import Surface, surface_of_scan
 from vd.paper import PAPER
@@ -167,22 +167,11 @@ def _goal(text: str, where: str) -> np.ndarray:
 
 def _surface(path: Path, generator: np.random.Generator) -> Surface:
     """Closed surface of a scan, in its own unit: a closed mesh as it is, else one through its samples."""
-    import trimesh
-
-    check_file(path)
-    try:
-        loaded: Any = trimesh.load(path, process=False, skip_materials=True)
-        if isinstance(loaded, trimesh.Scene):
-            loaded = loaded.to_mesh()
-    except Exception as error:  # parsers raise anything on a broken file
-        raise MeshError(f"neither mesh nor points: {type(error).__name__}: {error}") from error
-    vertices = np.asarray(getattr(loaded, "vertices", np.zeros((0, 3))), dtype=float)
+    loaded = load_points(path)
+    vertices = np.asarray(loaded.vertices)
     if not len(vertices):
         raise MeshError("no points")
-    if not np.isfinite(vertices).all():
-        raise MeshError("some points are NaN or infinite")
-    faces = getattr(loaded, "faces", None)
-    if faces is not None and len(faces):
+    if len(loaded.faces):
         mesh = repair_mesh(loaded)
         if mesh.watertight:
             return Surface(mesh.vertices, mesh.faces)
@@ -223,7 +212,7 @@ def _unit(path: Path, longest: float, unit: str | None) -> float:
     low, high = LONGEST_SIDE_M[0] / LARGER, LONGEST_SIDE_M[1] * LARGER
     if unit is not None and unit not in UNITS_M:
         raise GoalError(f"{path}: unit {unit!r}; choose {', '.join(UNITS_M)}")
-    options = UNITS_M if unit is None else {unit: UNITS_M[unit]}
+    options = {name: UNITS_M[name] for name in (GUESSED_UNITS if unit is None else (unit,))}
     fitting = [factor for factor in options.values() if low <= longest * factor <= high]
     if not fitting:
         raise GoalError(

@@ -88,6 +88,21 @@ def test_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert run(monkeypatch, "objects", "--procedural", 0) == 2
 
 
+def test_an_imported_cube_is_not_taken_for_the_built_in_one(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    mesh = tmp_path / "cube.stl"
+    trimesh.creation.box((0.12, 0.05, 0.03)).export(mesh)
+    assert run(monkeypatch, "import", mesh) == 2
+    error = capsys.readouterr().err
+    out = cache / "objects" / "my-cube"
+    assert "built-in" in error and f"--out {out}" in error and not (cache / "objects").exists()
+    assert run(monkeypatch, "import", mesh, "--out", out, "--units", "m", "--mass", "0.2") == 0
+    text = capsys.readouterr().out
+    assert "longest side 0.12 m (1 in m; 0 of 1 scaled), mass 0.2 kg" in text
+    assert load_set("my-cube")[0].longest_side == pytest.approx(0.12)
+
+
 def test_errors_are_one_line_and_status_2(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):
@@ -95,6 +110,8 @@ def test_errors_are_one_line_and_status_2(
     assert "no object set or path 'nothing-here'" in capsys.readouterr().err
     assert run(monkeypatch, "import", "/nowhere/at/all") == 2
     assert "no such file or folder" in capsys.readouterr().err
+    assert run(monkeypatch, "import") == 2
+    assert "name the mesh files" in capsys.readouterr().err
     assert run(monkeypatch, "hand", "dclaw5") == 2
     assert "dclaw3" in capsys.readouterr().err
 
@@ -103,6 +120,19 @@ def test_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert run(monkeypatch, "hand", "dclaw3", "--out", tmp_path / "hands") == 0
     path = Path(capsys.readouterr().out.strip())
     assert path.is_file() and path.parent == tmp_path / "hands"
+    assert run(monkeypatch, "hand", "dclaw3", "--out", tmp_path / "hands") == 0
+    path.write_text(mine := path.read_text().replace("0.8", "0.9"))
+    assert run(monkeypatch, "hand", "dclaw3", "--out", tmp_path / "hands") == 2
+    assert "another hand" in capsys.readouterr().err and path.read_text() == mine
+
+
+def test_a_folder_that_cannot_be_made_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    mesh = tmp_path / "a.stl"
+    trimesh.creation.box((0.12, 0.05, 0.03)).export(mesh)
+    assert run(monkeypatch, "import", mesh, "--out", mesh / "out") == 2
+    assert str(mesh / "out") in capsys.readouterr().err
 
 
 def test_help_is_fast_and_names_the_commands():

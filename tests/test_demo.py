@@ -214,7 +214,6 @@ def test_an_import_ends_with_its_share_and_goes_on_with_the_smallest_first(tmp_p
         return importer.ImportResult(job.source, job.name, "imported", target=job.target)
 
     monkeypatch.setattr(importer, "_run_child", slow)
-    monkeypatch.setattr(importer, "check_file", lambda path: None)
     monkeypatch.setattr(importer.os, "cpu_count", lambda: 1)
     cfg = demo.DemoCfg(out=tmp_path, meshes=meshes, minutes=1.0)
     monkeypatch.setattr(demo, "IMPORT_SHARE", 0.3 / 60.0)

@@ -7,6 +7,8 @@ import pytest
 import warp as wp
 from scipy.spatial.transform import Rotation
 
+from vd.assets_usd.objects.model import write_object
+from vd.assets_usd.objects.procedural import cube
 from vd.envs.cfg import (
     GoalCfg,
     ObservationCfg,
@@ -353,6 +355,13 @@ def test_randomisation_reaches_the_solver():
     ratio = gains / env.hand.kp
     assert ratio.min() >= 0.8 and ratio.max() <= 1.2 and len(np.unique(ratio)) > 100
     assert env.sim.joint_q.numpy().shape == (16, 9 + 7)
+
+
+def test_objects_weigh_what_their_files_say_where_nothing_is_drawn(tmp_path):
+    write_object(tmp_path / "cube.usd", dataclasses.replace(cube(), mass_kg=0.25))
+    env = make(num_worlds=2, objects=(str(tmp_path),))
+    assert env.sim.model.body_mass.numpy().reshape(2, -1)[:, env.scene.object_body] == pytest.approx(0.25)
+    assert env.randomiser.object_mass.numpy() == pytest.approx(0.25)
 
 
 def test_restitution_is_drawn_and_saved_and_reaches_the_contacts(device):

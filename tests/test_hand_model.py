@@ -310,6 +310,17 @@ def aiming(prim: str, relationship: str, target: str) -> Callable[[Usd.Stage, st
     return change
 
 
+def fourth_joints(stage: Usd.Stage, root: str) -> None:
+    """One more link and joint on each finger, copied from the third."""
+    layer = stage.GetRootLayer()
+    for finger in range(4):
+        for kind in "lj":
+            Sdf.CopySpec(layer, f"{root}/f{finger}_{kind}3", layer, f"{root}/f{finger}_{kind}4")
+        joint = stage.GetPrimAtPath(f"{root}/f{finger}_j4")
+        for side, link in enumerate((3, 4)):
+            joint.GetRelationship(f"physics:body{side}").SetTargets([Sdf.Path(f"{root}/f{finger}_l{link}")])
+
+
 def mesh_collider(stage: Usd.Stage, root: str) -> None:
     UsdPhysics.CollisionAPI.Apply(stage.GetPrimAtPath(f"{root}/f0_l1/visual/servo"))
 
@@ -339,6 +350,7 @@ def mesh_collider(stage: Usd.Stage, root: str) -> None:
         (aiming("f0_j2", "physics:body1", "camera"), "f0_j2", ("physics:body1", "one link")),
         (aiming("f0_l1", "physics:filteredPairs", "nothing"), "f0_l1", ("filteredPairs", "another link")),
         (setting("f0_l2/points", "points", [Gf.Vec3f(0)] * 3), "f0_l2/points", ("points", "(3, 3)")),
+        (fourth_joints, "dclaw4", ("f0_j4", "f3_j4", "3 joints", "supported so far")),
         (mesh_collider, "f0_l1/visual/servo", ("Mesh", "Capsule")),
         (lambda stage, root: UsdGeom.SetStageMetersPerUnit(stage, 0.01), "/", ("metersPerUnit", "metres")),
         (lambda stage, root: UsdGeom.SetStageUpAxis(stage, "Y"), "/", ("upAxis", "z up")),

@@ -20,6 +20,7 @@ def example() -> procedural.ObjectModel:
         licence="CC0-1.0",
         notes=("one", "two"),
         warnings=("three", "four"),
+        file="/home/me/x.stl",
         volume_error=0.125,
     )
 
@@ -110,7 +111,7 @@ def test_load_set_takes_files_folders_and_names(tmp_path: Path, cache: Path, exa
     sets.write_set(folder, [example])
     models = load_set([folder, "cube"])
     assert [m.name for m in models] == [example.name, "cube"]
-    assert (cache / "objects" / "cube" / "cube.usd").is_file()
+    assert (sets.built_in_folder("cube") / "cube.usd").is_file()
     assert [m.name for m in load_set("symmetric")] == ["cube", "cuboid"]
     assert len(load_set("procedural-2-seed5")) == 2
     assert load_set(folder / f"{example.name}.usd")[0].name == example.name
@@ -122,13 +123,36 @@ def test_a_built_in_set_of_an_older_version_is_authored_anew(
     cache: Path, example: procedural.ObjectModel, monkeypatch: pytest.MonkeyPatch
 ):
     load_set("cube")
-    path = cache / "objects" / "cube" / "cube.usd"
+    path = sets.built_in_folder("cube") / "cube.usd"
     before = path.stat().st_mtime_ns
     load_set("cube")
     assert path.stat().st_mtime_ns == before
     monkeypatch.setattr(procedural, "PROCEDURAL_VERSION", procedural.PROCEDURAL_VERSION + 1)
     load_set("cube")
-    assert path.stat().st_mtime_ns > before
+    assert path.stat().st_mtime_ns == before
+    assert (sets.built_in_folder("cube") / "cube.usd").stat().st_mtime_ns > before
+
+
+@pytest.mark.parametrize("name", ["cube", "cuboid", "symmetric", "procedural-2-seed5"])
+def test_a_users_folder_with_the_name_of_a_built_in_set_is_left_alone(
+    name: str, cache: Path, example: procedural.ObjectModel
+):
+    mine = cache / "objects" / name / "cube.usd"
+    write_object(mine, replace(example, name="cube", source="cube.stl", file="/home/me/cube.stl"))
+    (mine.parent / "notes.txt").write_text("mine")
+    before = mine.read_bytes()
+    assert all(not model.file for model in load_set(name))
+    assert mine.read_bytes() == before and (mine.parent / "notes.txt").read_text() == "mine"
+
+
+def test_authored_objects_are_not_written_over_others(tmp_path: Path, example: procedural.ObjectModel):
+    sets.write_set(tmp_path, [example])
+    sets.write_set(tmp_path, [example])  # the same, made anew
+    mine = write_object(tmp_path / "cube.usd", replace(example, name="cube", source="cube.stl"))
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ObjectError, match=r"cube\.usd is there and another object.*--out"):
+        sets.write_set(tmp_path, [procedural.cuboid(), procedural.cube()])
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before and mine in before
 
 
 def test_unknown_set_says_what_there_is(tmp_path: Path, cache: Path, example: procedural.ObjectModel):

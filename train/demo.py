@@ -119,7 +119,7 @@ class _Demo:
         Raises:
             DemoError: None could be imported, and not for want of time.
         """
-        from vd.assets_usd.objects.importer import find_meshes
+        from vd.assets_usd.objects.plan import find_meshes
 
         assert self.cfg.meshes is not None
         # The finer a mesh, the longer its decomposition takes.

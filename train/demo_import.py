@@ -21,7 +21,8 @@ def import_for(meshes: list[Path], out: Path, seconds: float) -> "dict[str, Impo
     """Import meshes in their order for a time; returns the results of those that were reached, by source."""
     from vd.assets_usd.cache import assets_dir
     from vd.assets_usd.objects.decompose import DecomposeSettings
-    from vd.assets_usd.objects.importer import ImportSettings, import_meshes
+    from vd.assets_usd.objects.importer import import_meshes
+    from vd.assets_usd.objects.plan import ImportSettings
 
     results: dict[str, ImportResult] = {}
     with progress_bar("  importing", len(meshes), "mesh") as bar:

@@ -1,17 +1,15 @@
 """Import of meshes: one child process a mesh, cached by content, resumable, with refusals by name."""
 
-import csv
 import hashlib
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,21 +20,29 @@ from vd.assets_usd.objects.decompose import (
     GOOD_ERROR,
     HANG_S,
     RUNS,
-    DecomposeSettings,
     Decomposition,
     best_decomposition,
     tidy_hulls,
 )
 from vd.assets_usd.objects.geometry import Hull, cluster_vertices, surface_points, triangle_areas
-from vd.assets_usd.objects.meshes import (
-    MESH_SUFFIXES,
-    MeshError,
-    check_file,
-    choose_scale,
-    load_mesh,
-    mean_width,
+from vd.assets_usd.objects.meshes import MeshError
+from vd.assets_usd.objects.model import (
+    SURFACE_POINTS,
+    ObjectModel,
+    build_model,
+    read_hash,
+    read_object,
+    write_object,
 )
-from vd.assets_usd.objects.model import SURFACE_POINTS, build_model, read_hash, read_object, write_object
+from vd.assets_usd.objects.plan import (
+    ImportSettings,
+    Job,
+    check_target,
+    find_meshes,
+    gone_objects,
+    plan_jobs,
+)
+from vd.assets_usd.objects.reading import declared_unit, load_mesh, mesh_kind
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.files import atomic_path, make_folder
 
@@ -57,45 +63,10 @@ thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as par
 WORKER_OVERHEAD_S = 600.0
 """Wall-clock time that a child gets beside its runs of CoACD before it is taken to hang."""
 
-Status = Literal["imported", "cached", "refused"]
+ENDING_S = 5.0
+"""Time for a child to leave things in order before it is killed."""
 
-
-@dataclass(frozen=True)
-class ImportSettings:
-    """Settings of an import.
-
-    Attributes:
-        decompose: Convex decomposition.
-        licence: Licence recorded where no ``objects.csv`` names one.
-        split: Split recorded where no ``objects.csv`` names one.
-        cache: Folder of finished decompositions; none if empty.
-    """
-
-    decompose: DecomposeSettings = field(default_factory=DecomposeSettings)
-    licence: str = "unknown"
-    split: str = ""
-    cache: str = ""
-
-
-@dataclass(frozen=True)
-class Job:
-    """One mesh to import.
-
-    Attributes:
-        source: Mesh file.
-        name: Object name.
-        target: USD file to write.
-        licence: Licence of the shape.
-        provenance: Where the shape comes from.
-        split: ``train``, ``test`` or empty.
-    """
-
-    source: str
-    name: str
-    target: str
-    licence: str
-    provenance: str
-    split: str
+Status = Literal["imported", "cached", "refused", "gone", "dropped"]
 
 
 @dataclass(frozen=True)
@@ -105,13 +76,15 @@ class ImportResult:
     Attributes:
         source: Mesh file.
         name: Object name.
-        status: ``imported``, ``cached`` (nothing to do) or ``refused``.
+        status: ``imported``, ``cached`` (nothing to do) or ``refused``; of an object whose mesh file is gone
+            ``gone`` (it stays in the set) or ``dropped``.
         reason: Why it was refused.
         target: USD file, empty if refused.
         seconds: Time of the import.
         hulls: Number of convex parts.
         volume_error: Volume in which parts and object differ, as a share of the object's.
         longest_side_m: Longest side.
+        mass_kg: Mass.
         decomposed: Whether CoACD ran.
         notes: Repairs and assumptions.
         warnings: What may be wrong with the object.
@@ -126,89 +99,22 @@ class ImportResult:
     hulls: int = 0
     volume_error: float = 0.0
     longest_side_m: float = 0.0
+    mass_kg: float = 0.0
     decomposed: bool = False
     notes: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
 
 
-def prim_name(stem: str) -> str:
-    """A valid prim name from a file's stem: letters, digits and underscores, no leading digit."""
-    name = re.sub(r"[^0-9A-Za-z_]+", "_", stem).strip("_") or "object"
-    return name if not name[0].isdigit() else f"o_{name}"
-
-
-def find_meshes(paths: Iterable[Path]) -> list[Path]:
-    """Mesh files among files and folders (searched in depth), each once, in a fixed order.
-
-    A file that was named is kept whatever its suffix, so that it is refused by name; in a folder only
-    the supported suffixes count.
-
-    Raises:
-        MeshError: A path does not exist, or nothing was found.
-    """
-    found: list[Path] = []
-    for path in paths:
-        if path.is_dir():
-            found += sorted(p for p in path.rglob("*") if p.is_file() and p.suffix.lower() in MESH_SUFFIXES)
-        elif path.exists():
-            found.append(path)
-        else:
-            raise MeshError(f"{path}: no such file or folder")
-    if not found:
-        raise MeshError(f"no mesh in {', '.join(map(str, paths))}; supported: {', '.join(MESH_SUFFIXES)}")
-    return list(dict.fromkeys(p.resolve() for p in found))
-
-
-def read_sidecar(folder: Path) -> dict[str, dict[str, str]]:
-    """Rows by name of the ``objects.csv`` in a folder or its parent; empty where there is none.
-
-    Columns: ``name`` and ``source``; optionally ``licence`` and ``split``. Without a licence column,
-    the licence is what stands in brackets in the source.
-    """
-    for table in (folder / "objects.csv", folder.parent / "objects.csv"):
-        if table.is_file():
-            with table.open(newline="") as stream:
-                rows = list(csv.DictReader(stream))
-            return {row["name"]: row for row in rows if row.get("name")}
-    return {}
-
-
-def plan_jobs(meshes: Iterable[Path], out: Path, settings: ImportSettings) -> list[Job]:
-    """Name, target, licence and provenance of each mesh; equal names get a number."""
-    jobs = []
-    taken: set[str] = set()
-    sidecars: dict[Path, dict[str, dict[str, str]]] = {}
-    for mesh in meshes:
-        base = name = prim_name(mesh.stem)
-        number = 2
-        while name.lower() in taken:
-            name = f"{base}_{number}"
-            number += 1
-        taken.add(name.lower())
-        if mesh.parent not in sidecars:
-            sidecars[mesh.parent] = read_sidecar(mesh.parent)
-        row = sidecars[mesh.parent].get(mesh.stem, {})
-        source = row.get("source") or ""
-        bracket = re.search(r"\(([^)]*)\)", source)
-        licence = row.get("licence") or (bracket.group(1) if bracket else settings.licence)
-        provenance = f"{source}: {mesh.name}" if source else mesh.name
-        jobs.append(
-            Job(
-                str(mesh),
-                name,
-                str(out / f"{name}.usd"),
-                licence,
-                provenance,
-                row.get("split") or settings.split,
-            )
-        )
-    return jobs
-
-
 def content_hash(job: Job, settings: ImportSettings) -> str:
-    """Hash of all that decides the file: mesh bytes, name, licence, settings and code version."""
-    digest = hashlib.sha256(Path(job.source).read_bytes())
-    facts = [IMPORT_VERSION, job.name, job.licence, job.provenance, job.split, asdict(settings.decompose)]
+    """Hash of all that decides the object: bytes of the mesh, name, licence, settings and code version."""
+    files = [Path(job.source)]
+    if mesh_kind(files[0]) == "usd":
+        from vd.assets_usd.objects.usd_mesh import usd_files
+
+        files = usd_files(files[0])
+    digest = hashlib.sha256(b"".join(file.read_bytes() for file in files))
+    how = [asdict(settings.decompose), asdict(settings.sizing)]
+    facts = [IMPORT_VERSION, job.name, job.licence, job.provenance, job.split, how]
     digest.update(json.dumps(facts, sort_keys=True).encode())
     return digest.hexdigest()
 
@@ -257,15 +163,13 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
         MeshError: The mesh is refused; the message is the reason.
     """
     mesh = repair_mesh(load_mesh(Path(job.source)))
-    notes = list(mesh.notes)
-    scale, note = choose_scale(np.ptp(mesh.vertices, axis=0), mean_width(mesh.vertices))
-    if note:
-        notes.append(note)
+    scale, size_notes, size_warnings = settings.sizing.scale(mesh.vertices, declared_unit(Path(job.source)))
     mesh = mesh.scaled(scale)
     body = body_of(mesh)
     if not body.solid.volume > 0.0:
         raise MeshError("degenerate: encloses no volume")
-
+    mass, mass_notes, mass_warnings = settings.sizing.mass(body.solid.volume)
+    notes = [*mesh.notes, *size_notes, *mass_notes]
     error_of = PartsError(body, mesh.vertices)
     key = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes())
     key.update(json.dumps([DECOMPOSITION_VERSION, asdict(settings.decompose)], sort_keys=True).encode())
@@ -284,7 +188,8 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
             _keep_decomposition(cache, parts)
     offset = parts.error * body.volume / triangle_areas(mesh.vertices, mesh.faces).sum()
     offset /= np.ptp(mesh.vertices, axis=0).max()
-    warnings = (*mesh.warnings, *body.warnings, *_parts_warnings(parts, offset))
+    made = (*mesh.warnings, *body.warnings, *_parts_warnings(parts, offset))
+    warnings = (*made, *size_warnings, *mass_warnings)
     points = surface_points(mesh.vertices, mesh.faces, SURFACE_POINTS)
     visual = cluster_vertices(mesh.vertices, mesh.faces, MAX_VISUAL_FACES)
     model = build_model(
@@ -294,7 +199,9 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
         body.solid,
         points,
         licence=job.licence,
+        mass_kg=mass,
         source=job.provenance,
+        file=job.source,
         family="imported",
         split=job.split,
         scale=scale,
@@ -305,17 +212,21 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
         warnings=warnings,
     )
     write_object(Path(job.target), model)
+    return replace(_result_of(job, model, "imported"), decomposed=not whole and kept is None)
+
+
+def _result_of(job: Job, model: ObjectModel, status: Status) -> ImportResult:
     return ImportResult(
         job.source,
         job.name,
-        "imported",
+        status,
         target=job.target,
-        hulls=len(parts.hulls),
+        hulls=len(model.hulls),
         volume_error=model.volume_error,
         longest_side_m=model.longest_side,
-        decomposed=not whole and kept is None,
+        mass_kg=model.mass_kg,
         notes=model.notes,
-        warnings=warnings,
+        warnings=model.warnings,
     )
 
 
@@ -337,7 +248,7 @@ def _run_child(
     with tempfile.TemporaryFile("w+") as errors:
         # A session of its own: Ctrl-C reaches the parent alone, which then ends the children in order.
         child = subprocess.Popen(
-            [sys.executable, "-m", "vd.assets_usd.objects.import_worker"],
+            [sys.executable, "-m", "vd.assets_usd.objects.import_worker", str(os.getpid())],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
@@ -364,9 +275,12 @@ def _run_child(
 
 
 def _end_group(child: subprocess.Popen[str]) -> None:
-    """Kill a child and what it started."""
+    """End a child, which removes what it has half written, and kill what is left of it and its children."""
     import contextlib
 
+    child.terminate()
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        child.wait(ENDING_S)
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
     child.wait()
@@ -379,6 +293,7 @@ def import_meshes(
     *,
     jobs: int = 0,
     force: bool = False,
+    drop_gone: bool = False,
     progress: Callable[[ImportResult, int, int], None] | None = None,
 ) -> list[ImportResult]:
     """Import meshes, several at a time, each in a process of its own.
@@ -392,20 +307,22 @@ def import_meshes(
         settings: Settings; the defaults if None.
         jobs: Meshes at a time; 0 takes the machine's cores.
         force: Write every file anew (kept decompositions are still used).
+        drop_gone: Remove the objects of the folder whose mesh file is gone.
         progress: Called after each mesh with its result, the number done and the number of all.
 
     Returns:
-        One result per mesh, in the order of the meshes.
+        One result per mesh, in the order of the meshes, then one for each object whose mesh is gone.
 
     Raises:
-        MeshError: A path does not exist or holds no mesh.
+        MeshError: A path does not exist or holds no mesh, two meshes would have one name, or an object would
+            be written over something else. Nothing has been written then.
+        OutputError: The folder cannot be made.
     """
     settings = settings or ImportSettings()
+    settings.sizing.check()
     out = Path(out)
-    make_folder(out)
     plan = plan_jobs(find_meshes([Path(p) for p in paths]), out, settings)
-    cores = os.cpu_count() or 1
-    workers = min(jobs or cores, len(plan))
+    gone = gone_objects(out)
     results: dict[str, ImportResult] = {}
 
     def finish(result: ImportResult) -> None:
@@ -413,33 +330,55 @@ def import_meshes(
         if progress:
             progress(result, len(results), len(plan))
 
-    todo = []
+    done, todo = _divide(plan, settings, gone if drop_gone else {}, force)
+    make_folder(out)
+    left: Status = "dropped" if drop_gone else "gone"
+    stale = [ImportResult(file, path.stem, left, target=str(path)) for path, file in gone.items()]
+    for path in gone if drop_gone else ():
+        path.unlink()
+    for result in done:
+        finish(result)
+    _import_in_children(todo, settings, jobs or os.cpu_count() or 1, finish)
+    written = {job.target for job in todo}
+    return [*(results[job.name] for job in plan), *(r for r in stale if r.target not in written)]
+
+
+def _divide(
+    plan: list[Job], settings: ImportSettings, dropped: Container[Path], force: bool
+) -> tuple[list[ImportResult], list[Job]]:
+    """The results of the meshes that need no work, and those that do.
+
+    Raises:
+        MeshError: An object would be written over something else.
+    """
+    done: list[ImportResult] = []
+    todo: list[Job] = []
     for job in plan:
         target = Path(job.target)
         try:
-            check_file(Path(job.source))
+            settings.sizing.check_unit(declared_unit(Path(job.source)))
+            content = content_hash(job, settings)
         except MeshError as error:
-            finish(ImportResult(job.source, job.name, "refused", str(error)))
+            done.append(ImportResult(job.source, job.name, "refused", str(error)))
             continue
-        if not force and target.is_file() and read_hash(target) == content_hash(job, settings):
-            model = read_object(target)
-            finish(
-                ImportResult(
-                    job.source,
-                    job.name,
-                    "cached",
-                    target=job.target,
-                    hulls=len(model.hulls),
-                    volume_error=model.volume_error,
-                    longest_side_m=model.longest_side,
-                    notes=model.notes,
-                    warnings=model.warnings,
-                )
-            )
+        current = target.is_file() and target not in dropped and read_hash(target) == content
+        if target not in dropped:
+            check_target(job, current)
+        if current and not force:
+            done.append(_result_of(job, read_object(target), "cached"))
         else:
             todo.append(job)
+    return done, todo
+
+
+def _import_in_children(
+    todo: list[Job], settings: ImportSettings, jobs: int, finish: Callable[[ImportResult], None]
+) -> None:
+    """Import meshes in so many children at a time; none is left when this is interrupted."""
+    cores = os.cpu_count() or 1
+    workers = max(min(jobs, len(todo)), 1)
     running: dict[str, subprocess.Popen[str]] = {}
-    with ThreadPoolExecutor(max(workers, 1)) as pool:
+    with ThreadPoolExecutor(workers) as pool:
         pending: set[Future[ImportResult]] = {
             pool.submit(_run_child, job, settings, max(cores // workers, 1), running) for job in todo
         }
@@ -453,4 +392,3 @@ def import_meshes(
             for child in list(running.values()):
                 _end_group(child)
             raise
-    return [results[job.name] for job in plan]

@@ -1,12 +1,11 @@
-"""Reading foreign meshes: load, refuse what is none, choose the scale."""
+"""Foreign meshes: the size and weight they are given."""
 
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+from vd.paper import PAPER
 
 LONGEST_SIDE_M = (0.095, 0.165)
 """Range of an object's longest side: the objects of the paper."""
@@ -25,51 +24,19 @@ What is thinner lies flat on the table, where no finger gets under it: of eight 
 brought 49 % to their goals (docs/results/runs.md).
 """
 
-UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
-"""Units a mesh may be in; the first that needs the least rescaling is taken."""
+UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
+"""Units a mesh may be in."""
+
+GUESSED_UNITS = ("m", "mm", "cm")
+"""Units that are tried where none is known; the first that needs the least rescaling is taken. An inch is too
+near to others to be guessed."""
+
+DENSITIES_KG_M3 = (10.0, 23000.0)
+"""Least and largest density of an object: from foam to osmium. What is beyond is a mistaken unit."""
 
 
 class MeshError(ValueError):
     """A mesh is refused; the message is the reason."""
-
-
-def check_file(path: Path) -> None:
-    """Refuse what needs no parser to be refused.
-
-    Raises:
-        MeshError: Unsupported type, missing or empty file.
-    """
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        raise MeshError(f"unsupported type {path.suffix or '(no suffix)'}; use {', '.join(MESH_SUFFIXES)}")
-    if not path.is_file():
-        raise MeshError("no such file")
-    if path.stat().st_size == 0:
-        raise MeshError("empty file")
-
-
-def load_mesh(path: Path) -> Any:
-    """Load a mesh file as one ``trimesh.Trimesh``, unprocessed.
-
-    Raises:
-        MeshError: Unsupported type, unreadable, empty, without faces, or with non-finite vertices.
-    """
-    import trimesh
-
-    path = Path(path)
-    check_file(path)
-    try:
-        # Textures and materials are not needed, and missing ones must not stop the import.
-        loaded = trimesh.load(path, process=False, skip_materials=True)
-        mesh = loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
-    except Exception as error:  # parsers raise anything on a broken file
-        raise MeshError(f"not a mesh: {type(error).__name__}: {error}") from error
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        points = len(getattr(mesh, "vertices", ()))
-        raise MeshError(f"not a mesh: {points} points and no faces" if points else "empty: no faces")
-    if not np.isfinite(mesh.vertices).all():
-        bad = int((~np.isfinite(mesh.vertices)).any(axis=1).sum())
-        raise MeshError(f"{bad} of {len(mesh.vertices)} vertices are NaN or infinite")
-    return mesh
 
 
 def mean_width(vertices: np.ndarray) -> float:
@@ -104,18 +71,120 @@ def scales_that_fit(sides: Sequence[float], width: float) -> tuple[float, float]
     return max(low / longest, THINNEST_M / shortest), min(high / longest, MEAN_WIDTH_M / width)
 
 
-def choose_scale(sides: Sequence[float], width: float) -> tuple[float, str]:
+@dataclass(frozen=True)
+class Sizing:
+    """What decides size and weight of imported objects.
+
+    Attributes:
+        units: Unit of the meshes, a key of ``UNITS_M``; ``auto`` takes what a file declares, else guesses.
+        keep_size: Keep the real size, also of what does not fit the hand.
+        density: Density that gives the mass [kg/m^3].
+        mass_kg: Mass of each object. With neither, it is the paper's nominal mass.
+    """
+
+    units: str = "auto"
+    keep_size: bool = False
+    density: float | None = None
+    mass_kg: float | None = None
+
+    def check(self) -> None:
+        """Refuse what cannot be meant.
+
+        Raises:
+            MeshError: Names the option.
+        """
+        if self.units != "auto" and self.units not in UNITS_M:
+            raise MeshError(f"--units {self.units}: choose {', '.join(UNITS_M)} or auto")
+        if self.density is not None and self.mass_kg is not None:
+            raise MeshError("--density and --mass both give the mass; leave one out")
+        low, high = DENSITIES_KG_M3
+        if self.density is not None and not low <= self.density <= high:
+            raise MeshError(
+                f"--density {self.density:g}: {low:g} to {high:g} kg/m3 are possible; water has 1000"
+            )
+        if self.mass_kg is not None and not 0.0 < self.mass_kg < np.inf:
+            raise MeshError(f"--mass {self.mass_kg:g}: give the mass in kg, above 0")
+
+    def check_unit(self, declared: float | None) -> None:
+        """Refuse to keep the size of a mesh whose unit (``declared``, m) is not known.
+
+        Raises:
+            MeshError: Its reason names the option.
+        """
+        if self.keep_size and self.units == "auto" and declared is None:
+            raise MeshError(
+                "its file declares no unit, so its real size is not known; add --units mm (cm, m, in)"
+            )
+
+    def scale(self, vertices: np.ndarray, declared: float | None) -> tuple[float, list[str], list[str]]:
+        """Factor to metres for vertices [V, 3] in a file's unit (``declared``, m); notes and warnings.
+
+        Raises:
+            MeshError: The size is to be kept and the unit is not known.
+        """
+        self.check_unit(declared)
+        sides, width = np.ptp(vertices, axis=0), mean_width(vertices)
+        unit = UNITS_M.get(self.units, declared)
+        if not self.keep_size or unit is None:
+            factor, note = choose_scale(sides, width, unit)
+            return factor, [note] if note else [], []
+        size = f"{sides.max() * unit:.3f} m"
+        problem = misfit(sides * unit, width * unit)
+        warnings = [f"does not fit the hand at its real size of {size}: {problem}"] if problem else []
+        return unit, [f"taken as {unit_name(unit)}, real size kept: {size}"], warnings
+
+    def mass(self, volume: float) -> tuple[float, list[str], list[str]]:
+        """Mass [kg] of a solid of a volume [m^3]; notes and warnings.
+
+        Raises:
+            MeshError: A mass was given that no material of this volume has.
+        """
+        if self.density is not None:
+            mass = self.density * volume
+            return mass, [f"mass {mass:.3g} kg by a density of {self.density:g} kg/m3"], []
+        mass = PAPER.materials.object_mass_kg if self.mass_kg is None else self.mass_kg
+        low, high = DENSITIES_KG_M3
+        density = mass / volume
+        what = f"a mass of {mass:g} kg makes {density:.3g} kg/m3, and {low:g} to {high:g} are possible"
+        if low <= density <= high:
+            return mass, [] if self.mass_kg is None else [f"mass {mass:g} kg as given"], []
+        if self.mass_kg is None:
+            return mass, [], [f"{what}; give --density or --mass"]
+        raise MeshError(f"{what}; --mass is in kg")
+
+
+def unit_name(unit: float) -> str:
+    """Name of a unit of so many metres."""
+    return next((name for name, metres in UNITS_M.items() if metres == unit), f"{unit:g} m")
+
+
+def misfit(sides: np.ndarray, width: float) -> str:
+    """What of a shape [3], [m] does not fit the hand, by the bounds of this module; empty if it fits."""
+    low, high = LONGEST_SIDE_M
+    longest, shortest = float(max(sides)), float(min(sides))
+    found = []
+    if not low <= longest <= high:
+        found.append(f"longest side {longest:.3f} m, of {low:g} to {high:g}")
+    if width > MEAN_WIDTH_M:
+        found.append(f"mean width {width:.3f} m, of {MEAN_WIDTH_M:g} at most")
+    if shortest < THINNEST_M:
+        found.append(f"shortest side {shortest:.3f} m, of {THINNEST_M:g} at least")
+    return ", ".join(found)
+
+
+def choose_scale(sides: Sequence[float], width: float, unit: float | None = None) -> tuple[float, str]:
     """Factor from a mesh's units to metres, so that it fits the hand.
 
     The paper scales each mesh by hand, "to a proper size compared to the robot hand size", with its longest
     side in ``LONGEST_SIDE_M`` (supplementary text on objects). Here a mesh stays as it is where that holds,
     its mean width is at most ``MEAN_WIDTH_M`` and its shortest side at least ``THINNEST_M``; otherwise it is
-    scaled as little as possible. The range of the longest side is kept first, thickness gives way first. The
-    unit (m, mm, cm) is the one that needs the least rescaling.
+    scaled as little as possible. The range of the longest side is kept first, thickness gives way first. A
+    unit that is not known is the one of ``GUESSED_UNITS`` that needs the least rescaling.
 
     Args:
         sides: Sides of the bounding box in the mesh's units, in any order, none of them 0 [3].
         width: :func:`mean_width` in the mesh's units.
+        unit: Unit of the mesh [m]; None if it is not known.
 
     Returns:
         The factor and a note, empty if the mesh is taken as it is.
@@ -128,9 +197,10 @@ def choose_scale(sides: Sequence[float], width: float) -> tuple[float, str]:
     def fitting(unit: float) -> float:
         return float(np.clip(unit, least, most))
 
-    name, unit = min(UNITS_M.items(), key=lambda item: abs(np.log(fitting(item[1]) / item[1])))
+    units = [UNITS_M[name] for name in GUESSED_UNITS] if unit is None else [unit]
+    unit = min(units, key=lambda metres: abs(np.log(fitting(metres) / metres)))
     factor = fitting(unit)
-    words = [] if name == "m" else [f"taken as {name}"]
+    words = [] if unit == 1.0 else [f"taken as {unit_name(unit)}"]
     if factor != unit:
         words.append(f"scaled by {factor / unit:.3g} to {longest * factor:.3f} m")
     return factor, ", ".join(words)

@@ -53,6 +53,7 @@ class ObjectModel:
         symmetry: Rotations that map the object to itself, quaternions xyzw [K, 4]; the identity first.
         licence: Licence of the shape.
         source: Where the shape comes from.
+        file: Mesh file it was imported from, absolute; empty if it was authored.
         family: Kind of object (procedural family, or ``imported``).
         split: ``train``, ``test`` or empty.
         scale: Factor from the source's units to metres in this file.
@@ -74,6 +75,7 @@ class ObjectModel:
     symmetry: np.ndarray = field(default_factory=IDENTITY.copy)
     licence: str = "unknown"
     source: str = ""
+    file: str = ""
     family: str = ""
     split: str = ""
     scale: float = 1.0
@@ -231,6 +233,7 @@ def write_object(path: Path, model: ObjectModel) -> Path:
             "formatVersion": FORMAT_VERSION,
             "licence": model.licence,
             "source": model.source,
+            "file": model.file,
             "family": model.family,
             "split": model.split,
             "scale": float(model.scale),
@@ -245,7 +248,8 @@ def write_object(path: Path, model: ObjectModel) -> Path:
         },
     )
     with atomic_path(path) as temporary:
-        stage.GetRootLayer().Export(str(temporary))
+        if not stage.GetRootLayer().Export(str(temporary)):
+            raise OSError(f"{path}: USD could not write the object; is the disk full?")
     return path
 
 
@@ -281,6 +285,25 @@ def read_hash(path: Path) -> str | None:
         return str(_open(path)[2]["contentHash"])
     except ObjectError:
         return None
+
+
+def is_object(stage: Any) -> bool:
+    """Whether a stage is an object file of ours, of any version."""
+    prim = stage.GetDefaultPrim()
+    return bool(prim and prim.GetCustomDataByKey(_CUSTOM))
+
+
+def read_origin(path: Path) -> tuple[str, str] | None:
+    """``source`` and ``file`` of an object file of any version; None if it is no object file of ours."""
+    from pxr import Sdf, Tf
+
+    try:
+        layer = Sdf.Layer.OpenAsAnonymous(str(path))
+    except Tf.ErrorException:
+        return None
+    prim = layer.GetPrimAtPath(f"/{layer.defaultPrim}") if layer and layer.defaultPrim else None
+    data = prim.customData.get(_CUSTOM) if prim else None
+    return (str(data.get("source", "")), str(data.get("file", ""))) if data else None
 
 
 def read_object(path: Path) -> ObjectModel:
@@ -331,6 +354,7 @@ def read_object(path: Path) -> ObjectModel:
         symmetry=np.array(data["symmetry"], dtype=np.float64).reshape(-1, 4),
         licence=str(data["licence"]),
         source=str(data["source"]),
+        file=str(data.get("file", "")),
         family=str(data["family"]),
         split=str(data["split"]),
         scale=float(data["scale"]),

@@ -216,11 +216,6 @@ def procedural_set(
     return models
 
 
-def is_current(content_hash: str | None) -> bool:
-    """Whether an object with this content hash was authored by this version of the families."""
-    return content_hash is not None and content_hash.split("-")[1:2] == [str(PROCEDURAL_VERSION)]
-
-
 def cube_rotations() -> np.ndarray:
     """The 24 rotations of a cube as quaternions xyzw, the identity first, [24, 4]."""
     return _identity_first(Rotation.create_group("O"))

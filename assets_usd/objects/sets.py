@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from vd.assets_usd.objects.model import ObjectError, ObjectModel, object_files, read_hash, write_object
+from vd.assets_usd.objects.model import ObjectError, ObjectModel, object_files, read_origin, write_object
 from vd.files import make_folder, writing
 
 HELD_OUT_COUNT = 30
@@ -45,9 +45,25 @@ def built_in_models(name: str) -> Callable[[], list[ObjectModel]] | None:
     return lambda: procedural.procedural_set(count, seed, held_out=held_out)
 
 
+def built_in_folder(name: str) -> Path:
+    """Folder of a built-in set, apart from the sets of users; each version of our families has its own."""
+    from vd.assets_usd.cache import assets_dir
+    from vd.assets_usd.objects import procedural
+
+    return Path(assets_dir()) / "built-in" / f"version-{procedural.PROCEDURAL_VERSION}" / name
+
+
 def write_set(folder: Path, models: list[ObjectModel]) -> list[Path]:
-    """Write one file per object into a folder; returns the paths."""
-    return [write_object(Path(folder) / f"{model.name}.usd", model) for model in models]
+    """Write one file per authored object into a folder; returns the paths.
+
+    Raises:
+        ObjectError: A file that is there is another object; nothing is written.
+    """
+    targets = [Path(folder) / f"{model.name}.usd" for model in models]
+    for target, model in zip(targets, models, strict=True):
+        if target.exists() and read_origin(target) != (model.source, model.file):
+            raise ObjectError(f"{target} is there and another object; write to another folder (--out)")
+    return [write_object(target, model) for target, model in zip(targets, models, strict=True)]
 
 
 def check_sets(names_or_paths: Iterable[str | Path]) -> None:
@@ -89,27 +105,26 @@ def _no_such_set(name: str) -> ObjectError:
 def set_folder(name: str) -> Path:
     """Folder of a named set, authored first if it is a built-in one that is not there yet.
 
+    The names of built-in sets are reserved: a folder that happens to have one is left alone.
+
     Args:
         name: Such as ``cube``, ``procedural-150-seed0`` or the name of an imported set.
 
     Raises:
         ObjectError: No such set; the message lists those there are and the commands that make more.
     """
-    from vd.assets_usd.objects import procedural
-
-    root = objects_dir()
-    folder = root / name
     make = built_in_models(name) if _is_plain(name) else None
-    if _is_there(name):
-        if make is None or procedural.is_current(read_hash(object_files(folder)[0])):
-            return folder
-        shutil.rmtree(folder)  # of an older version of our families
     if make is None:
-        raise _no_such_set(name)
-    make_folder(root)
+        if not _is_there(name):
+            raise _no_such_set(name)
+        return objects_dir() / name
+    folder = built_in_folder(name)
+    if folder.is_dir() and object_files(folder):
+        return folder
+    make_folder(folder.parent)
     # Several ranks may ask at once: each writes aside, and the first to finish moves it into place.
     with writing(folder):
-        aside = Path(tempfile.mkdtemp(prefix=f".{name}.", dir=root))
+        aside = Path(tempfile.mkdtemp(prefix=f".{name}.", dir=folder.parent))
     try:
         with writing(folder):
             write_set(aside, make())

@@ -95,6 +95,8 @@ class Randomiser:
         factor = np.ones((n, env.scene.bodies_per_world))
         factor[:, env.scene.link_body] = link_scale.numpy()
         mass = model.body_mass.numpy().reshape(n, -1)
+        if not self.enabled:  # nothing is drawn: objects weigh what their files say
+            self.object_mass.assign(mass[:, env.scene.object_body])
         factor[:, env.scene.object_body] = self.object_mass.numpy() / mass[:, env.scene.object_body]
         flat = factor.reshape(-1)
         inverse = 1.0 / flat

@@ -1,0 +1,296 @@
+"""What an import reads, what the objects are called and where they are written."""
+
+import csv
+import filecmp
+import os
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from vd.assets_usd.objects.decompose import DecomposeSettings
+from vd.assets_usd.objects.meshes import MeshError, Sizing
+from vd.assets_usd.objects.model import object_files, read_origin
+from vd.assets_usd.objects.reading import KINDS, MESH_SUFFIXES, mesh_kind
+from vd.assets_usd.objects.sets import built_in_models, objects_dir
+
+GENERIC_WORDS = frozenset(
+    re.findall(
+        r"\w+",
+        """asset clean cleaned collision convex decimated export exported geometry glb google highres lowres
+        merged mesh meshes model models nontextured normalized obj object objects output ply poisson processed
+        scan scene simple simplified stl textured tsdf untitled usd visual watertight""",
+    )
+)
+"""Words that say what kind of file something is, not of what thing. Data sets have a folder for each object
+and call the files alike (``003_cracker_box/google_16k/textured.obj``, ``Mug/meshes/model.obj``)."""
+
+CLASHES_SHOWN = 3
+"""Files with one name that an error shows."""
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """Settings of an import.
+
+    Attributes:
+        decompose: Convex decomposition.
+        licence: Licence recorded where no ``objects.csv`` names one.
+        split: Split recorded where no ``objects.csv`` names one.
+        cache: Folder of finished decompositions; none if empty.
+        sizing: Unit, size and mass.
+    """
+
+    decompose: DecomposeSettings = field(default_factory=DecomposeSettings)
+    licence: str = "unknown"
+    split: str = ""
+    cache: str = ""
+    sizing: Sizing = field(default_factory=Sizing)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One mesh to import.
+
+    Attributes:
+        source: Mesh file, absolute.
+        name: Object name.
+        target: USD file to write.
+        licence: Licence of the shape.
+        provenance: Where the shape comes from.
+        split: ``train``, ``test`` or empty.
+    """
+
+    source: str
+    name: str
+    target: str
+    licence: str
+    provenance: str
+    split: str
+
+
+def prim_name(stem: str) -> str:
+    """A valid prim name from a file's stem: letters, digits and underscores, no leading digit."""
+    name = re.sub(r"[^0-9A-Za-z_]+", "_", stem).strip("_") or "object"
+    return name if not name[0].isdigit() else f"o_{name}"
+
+
+def says_nothing(word: str) -> bool:
+    """Whether a file's stem or a folder's name is of ``GENERIC_WORDS`` and resolutions (16k) alone."""
+    words = [part for part in re.split(r"[^0-9a-z]+", word.lower()) if part]
+    return all(part in GENERIC_WORDS or re.fullmatch(r"\d+k", part) for part in words)
+
+
+def absolute(path: Path) -> Path:
+    """The path without links to folders. A file keeps its name: downloads are links to nameless files."""
+    return path.resolve() if path.is_dir() else path.parent.resolve() / path.name
+
+
+def object_name(path: Path) -> str:
+    """Name of the object in a mesh file: its stem, or the nearest folder above it that says something.
+
+    It depends on the file's path alone, so that it stays the same whatever else is imported.
+    """
+    path = absolute(path)
+    names = [path.stem, *(folder.name for folder in path.parents if folder.name)]
+    return prim_name(next((name for name in names if not says_nothing(name)), path.stem))
+
+
+def find_meshes(paths: Iterable[Path]) -> list[Path]:
+    """Mesh files among files and folders (searched in depth), each once, in a fixed order, absolute.
+
+    A file that was named is kept whatever it is, so that it is refused by name. In a folder files count that
+    have a mesh's suffix, or no suffix and a mesh's content (downloads are often kept under their hash). Left
+    out are what is hidden, our own objects, parts of a USD that is found too, and nameless files to which a
+    link was found.
+
+    Raises:
+        MeshError: A path does not exist, or nothing was found.
+    """
+    paths = list(paths)
+    found: list[Path] = []
+    for path in paths:
+        if path.is_dir():
+            found += _meshes_below(path)
+        elif path.exists() or path.is_symlink():
+            found.append(path)
+        else:
+            raise MeshError(f"{path}: no such file or folder")
+    if not found:
+        raise MeshError(
+            f"no mesh in {', '.join(map(str, paths))}; supported: {', '.join(MESH_SUFFIXES)}{_seen(paths)}"
+        )
+    return list(dict.fromkeys(map(absolute, found)))
+
+
+def _files_below(folder: Path) -> list[Path]:
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+    )
+
+
+def _meshes_below(folder: Path) -> list[Path]:
+    files = [path for path in _files_below(folder) if _may_be_mesh(path)]
+    linked = {path.resolve() for path in files if path.is_symlink()}
+    parts: set[Path] = set()
+    for path in files:
+        if KINDS.get(path.suffix.lower()) == "usd":
+            parts |= _parts_of_usd(path)
+
+    def counts(path: Path) -> bool:
+        real = path.resolve()
+        return real not in parts and bool(path.suffix or path.is_symlink() or real not in linked)
+
+    return [path for path in files if counts(path)]
+
+
+def _may_be_mesh(path: Path) -> bool:
+    kind = KINDS.get(path.suffix.lower())
+    if kind == "usd":
+        return read_origin(path) is None
+    if kind or path.suffix:
+        return kind is not None
+    try:
+        return bool(mesh_kind(path))
+    except MeshError:
+        return False
+
+
+def _parts_of_usd(path: Path) -> set[Path]:
+    """The other files a USD is composed of; none if it cannot be opened, which its import says."""
+    from vd.assets_usd.objects.usd_mesh import usd_files
+
+    try:
+        return set(usd_files(path)) - {path.resolve()}
+    except MeshError:
+        return set()
+
+
+def _seen(paths: Iterable[Path]) -> str:
+    """What lies in folders in place of meshes, as a hint: the first file that is known for what it is."""
+    for path in (file for folder in paths if folder.is_dir() for file in _files_below(folder)):
+        try:
+            mesh_kind(path)
+        except MeshError as error:
+            if not str(error).startswith(("unsupported type", "empty file")):
+                return f"\n  {path} is {error}"
+    return ""
+
+
+def read_sidecar(folder: Path) -> dict[str, dict[str, str]]:
+    """Rows by name of the ``objects.csv`` in a folder or its parent; empty where there is none.
+
+    Columns: ``name`` and ``source``; optionally ``licence`` and ``split``. Without a licence column,
+    the licence is what stands in brackets in the source.
+    """
+    for table in (folder / "objects.csv", folder.parent / "objects.csv"):
+        if table.is_file():
+            with table.open(newline="") as stream:
+                rows = list(csv.DictReader(stream))
+            return {row["name"]: row for row in rows if row.get("name")}
+    return {}
+
+
+def plan_jobs(meshes: Iterable[Path], out: Path, settings: ImportSettings) -> list[Job]:
+    """Name, target, licence and provenance of each mesh. Copies of a mesh under one name count once.
+
+    Raises:
+        MeshError: Two meshes would have one name; the message has both, and the remedy.
+    """
+    taken: dict[str, Path] = {}
+    clashes: list[str] = []
+    for mesh in meshes:
+        other = taken.setdefault(object_name(mesh), mesh)
+        if other != mesh and not _same_content(other, mesh):
+            clashes.append(f"  {object_name(mesh)}: {other} and {mesh}")
+    if clashes:
+        more = f"\n  and {len(clashes) - CLASHES_SHOWN} more" if len(clashes) > CLASHES_SHOWN else ""
+        raise MeshError(
+            "two meshes would have one name in the set:\n"
+            + "\n".join(clashes[:CLASHES_SHOWN])
+            + f"{more}\nName only the files that you want (such as FOLDER/*/textured.obj), rename one, "
+            "or import one into another set (--out)"
+        )
+    sidecars: dict[Path, dict[str, dict[str, str]]] = {}
+    jobs = []
+    for name, mesh in taken.items():
+        if mesh.parent not in sidecars:
+            sidecars[mesh.parent] = read_sidecar(mesh.parent)
+        row = sidecars[mesh.parent].get(mesh.stem, {})
+        source = row.get("source") or ""
+        bracket = re.search(r"\(([^)]*)\)", source)
+        licence = row.get("licence") or (bracket.group(1) if bracket else settings.licence)
+        provenance = f"{source}: {mesh.name}" if source else mesh.name
+        split = row.get("split") or settings.split
+        jobs.append(Job(str(mesh), name, str(out / f"{name}.usd"), licence, provenance, split))
+    return jobs
+
+
+def _same_content(first: Path, second: Path) -> bool:
+    try:
+        return filecmp.cmp(first, second, shallow=False)
+    except OSError:
+        return False
+
+
+def check_target(job: Job, unchanged: bool) -> None:
+    """Refuse to write over what is not this mesh's own object.
+
+    Args:
+        job: The mesh.
+        unchanged: Whether the object that is there was made from the same content.
+
+    Raises:
+        MeshError: Names both, and the remedy.
+    """
+    target = Path(job.target)
+    if unchanged or not target.exists():
+        return
+    origin = read_origin(target)
+    if origin is None:
+        raise MeshError(f"{target} is there and no object of vd-assets; import into another folder (--out)")
+    source, file = origin
+    # Objects of versions that recorded no file are told by the name in their source.
+    if file and os.path.realpath(file) == os.path.realpath(job.source):
+        return
+    if not file and source.rpartition(": ")[2] == Path(job.source).name:
+        return
+    raise MeshError(
+        f"{job.source} would be written over {target}, which was made from {file or source}; "
+        "rename the mesh, import it into another set (--out), or drop what is gone (--drop-gone)"
+    )
+
+
+def gone_objects(out: Path) -> dict[Path, str]:
+    """Object files of a set whose mesh file is no longer there, and that file's path."""
+    origins = {path: read_origin(path) for path in object_files(out)} if out.is_dir() else {}
+    files = {path: origin[1] for path, origin in origins.items() if origin and origin[1]}
+    return {path: file for path, file in files.items() if not Path(file).exists()}
+
+
+def default_set(paths: Sequence[Path]) -> Path:
+    """Folder in the asset cache for the objects of these paths: named after the folder that holds them all.
+
+    Raises:
+        MeshError: The name is that of a built-in set, or the set holds objects from elsewhere.
+    """
+    above = Path(os.path.commonpath([absolute(path) for path in paths]))
+    name = object_name(above) if above.is_file() else _folder_name(above)
+    folder = objects_dir() / name
+    other = f"say where with --out, such as --out {objects_dir() / f'my-{name}'}"
+    if built_in_models(name) is not None:
+        raise MeshError(f"{name!r} is the name of a built-in object set; {other}")
+    for path in object_files(folder) if folder.is_dir() else ():
+        origin = read_origin(path)
+        if origin and origin[1] and not Path(origin[1]).is_relative_to(above):
+            raise MeshError(f"the set {folder} holds objects from elsewhere ({origin[1]}); {other}")
+    return folder
+
+
+def _folder_name(folder: Path) -> str:
+    """Name of the nearest folder that says something, as it is."""
+    names = [part.name for part in (folder, *folder.parents) if part.name]
+    name = next((name for name in names if not says_nothing(name)), folder.name or "objects")
+    return re.sub(r"[^\w.-]+", "_", name).strip(".") or "objects"

@@ -1,0 +1,186 @@
+"""What an import finds, what it calls objects and where it writes them; their unit, size and mass."""
+
+from pathlib import Path
+
+import pytest
+import trimesh
+
+from vd.assets_usd.objects import importer
+from vd.assets_usd.objects import meshes as m
+from vd.assets_usd.objects.importer import import_meshes
+from vd.assets_usd.objects.model import read_object
+from vd.assets_usd.objects.plan import ImportSettings, default_set, find_meshes, object_name
+
+
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Imports in this process: another one takes seconds to start."""
+    monkeypatch.setattr(importer, "_run_child", lambda job, settings, *_: importer.import_mesh(job, settings))
+
+
+def brick(path: Path, sides: tuple[float, float, float] = (0.12, 0.06, 0.04)) -> Path:
+    """Write a box, of which an import makes one convex part at once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    trimesh.creation.box(sides).export(path)
+    return path
+
+
+def test_meshes_are_found_once_and_in_order(tmp_path: Path):
+    for name in ("b/a.obj", "a/a.STL", "a/A.ply", "a/.hidden/x.obj", "a/._A.ply"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("x")
+    found = find_meshes([tmp_path / "b", tmp_path, tmp_path / "a" / "a.STL"])
+    assert [p.name for p in found] == ["a.obj", "A.ply", "a.STL"]
+    with pytest.raises(m.MeshError, match="no such file or folder"):
+        find_meshes([tmp_path / "nowhere"])
+    (tmp_path / "none").mkdir()
+    with pytest.raises(m.MeshError, match="no mesh in"):
+        find_meshes([tmp_path / "none"])
+    (tmp_path / "none" / "mug.step").write_text("ISO-10303-21;\nHEADER;\n")
+    with pytest.raises(m.MeshError, match=r"no mesh in(.|\n)*mug\.step is a STEP file"):
+        find_meshes([tmp_path / "none"])
+
+
+@pytest.mark.parametrize(
+    ("path", "name"),
+    [
+        ("3d-print (final).stl", "o_3d_print_final"),
+        ("mugs/mug_2.obj", "mug_2"),
+        ("ycb/003_cracker_box/google_16k/textured.obj", "o_003_cracker_box"),
+        ("gso/Ace_Mug/meshes/model.obj", "Ace_Mug"),
+        ("shapenet/02691156/1015e71a/models/model_normalized.obj", "o_1015e71a"),
+        ("duck/Mesh.STL", "duck"),
+        ("bop/models/obj_000001.ply", "obj_000001"),
+    ],
+)
+def test_an_object_is_called_by_what_says_something(path: str, name: str, tmp_path: Path):
+    assert object_name(tmp_path / path) == name
+
+
+def test_two_meshes_of_one_name_are_refused_whether_in_one_call_or_two(in_process: None, tmp_path: Path):
+    first, second = brick(tmp_path / "a" / "mug.stl"), brick(tmp_path / "b" / "mug.stl", (0.1, 0.05, 0.05))
+    out = tmp_path / "out"
+    with pytest.raises(m.MeshError) as both:
+        import_meshes([first, second], out)
+    assert not out.exists()
+    assert import_meshes([first], out)[0].name == "mug"
+    before = (out / "mug.usd").read_bytes()
+    with pytest.raises(m.MeshError) as later:
+        import_meshes([second], out, force=True)
+    assert (out / "mug.usd").read_bytes() == before
+    for error in (both, later):
+        assert all(word in str(error.value) for word in (str(first), str(second), "rename", "--out"))
+    # The same file by another way, or a copy of it, is no other object.
+    (tmp_path / "link").symlink_to(tmp_path / "a")
+    assert import_meshes([tmp_path / "link" / "mug.stl"], out)[0].status == "cached"
+    copy = tmp_path / "c" / "mug.stl"
+    copy.parent.mkdir()
+    copy.write_bytes(first.read_bytes())
+    assert [r.status for r in import_meshes([first, copy], out)] == ["cached"]
+
+
+def test_what_is_no_object_of_ours_is_never_written_over(tmp_path: Path):
+    mesh = brick(tmp_path / "mug.stl")
+    mine = tmp_path / "out" / "mug.usd"
+    mine.parent.mkdir()
+    mine.write_text("#usda 1.0\n")
+    with pytest.raises(m.MeshError, match=r"mug\.usd is there and no object of vd-assets.*--out"):
+        import_meshes([mesh], mine.parent, force=True)
+    assert mine.read_text() == "#usda 1.0\n"
+
+
+def test_objects_whose_mesh_is_gone_stay_until_they_are_dropped(in_process: None, tmp_path: Path):
+    old, new, out = brick(tmp_path / "old.stl"), brick(tmp_path / "new.stl"), tmp_path / "out"
+    import_meshes([old], out)
+    old.unlink()
+    result = {r.name: r.status for r in import_meshes([new], out)}
+    assert result == {"new": "imported", "old": "gone"}
+    assert (out / "old.usd").is_file()
+    result = {r.name: r.status for r in import_meshes([new], out, drop_gone=True)}
+    assert result == {"new": "cached", "old": "dropped"}
+    assert not (out / "old.usd").exists()
+
+
+def test_a_default_set_has_the_objects_of_one_folder(
+    in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "cache"))
+    kits = [brick(tmp_path / place / "kit" / "meshes" / f"{place}.stl") for place in ("here", "there")]
+    first, second = (kit.parent for kit in kits)
+    out = default_set([first])
+    assert out == default_set(kits[:1] * 2).parent / "kit" and default_set(kits[:1]).name == "here"
+    import_meshes([first], out)
+    assert default_set([first]) == out
+    with pytest.raises(m.MeshError) as error:
+        default_set([second])
+    assert all(word in str(error.value) for word in (str(out), str(kits[0]), "--out"))
+    for path in ("cube.stl", "procedural-7-seed3/meshes/a.stl"):
+        reserved = brick(tmp_path / path)
+        with pytest.raises(m.MeshError, match="built-in object set; say where with --out"):
+            default_set([reserved if path == "cube.stl" else reserved.parent])
+
+
+def test_nameless_files_of_a_download_cache_come_by_their_links(in_process: None, tmp_path: Path):
+    blob = brick(tmp_path / "hub" / "blobs" / "mesh.ply").rename(tmp_path / "hub" / "blobs" / "0a1b2c")
+    (blob.parent / "ffff").write_text("no mesh")
+    link = tmp_path / "hub" / "snapshots" / "5d6e" / "Cup" / "model.ply"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(blob)
+    assert find_meshes([tmp_path / "hub"]) == [link]
+    assert find_meshes([blob.parent]) == [blob]
+    for path, name in ((link, "Cup"), (blob, "o_0a1b2c")):
+        (result,) = import_meshes([path], tmp_path / "out")
+        assert (result.status, result.name) == ("imported", name)
+
+
+@pytest.mark.parametrize(
+    ("sizing", "mass", "longest", "words"),
+    [
+        (m.Sizing("in"), 0.1, 0.1524, "taken as in"),
+        (m.Sizing("mm", keep_size=True), 0.1, 0.006, "does not fit the hand at its real size of 0.006 m"),
+        (m.Sizing("in", keep_size=True, density=1000.0), 36e3 * 0.0254**3, 0.1524, "mean width 0.140 m"),
+        (m.Sizing("in", mass_kg=0.25), 0.25, 0.1524, "mass 0.25 kg as given"),
+    ],
+)
+def test_unit_size_and_mass(
+    sizing: m.Sizing, mass: float, longest: float, words: str, in_process: None, tmp_path: Path
+):
+    mesh = brick(tmp_path / "block.stl", (6.0, 2.0, 1.0) if "mean" not in words else (6.0, 3.0, 2.0))
+    (result,) = import_meshes([mesh], tmp_path / "out", ImportSettings(sizing=sizing))
+    model = read_object(tmp_path / "out" / "block.usd")
+    assert model.longest_side == pytest.approx(longest, rel=1e-3)
+    assert model.scale * 6.0 == pytest.approx(longest, rel=1e-3)
+    assert (result.mass_kg, model.mass_kg) == pytest.approx((mass, mass), rel=1e-3)
+    assert words in " ".join((*model.notes, *model.warnings))
+
+
+@pytest.mark.parametrize(
+    ("sizing", "words"),
+    [
+        (m.Sizing("mm", density=2.7), "--density 2.7.*water"),
+        (m.Sizing("mm", density=1000.0, mass_kg=0.1), "--density and --mass"),
+        (m.Sizing("mm", mass_kg=-1.0), "--mass -1"),
+        (m.Sizing("foot"), "--units foot: choose"),
+    ],
+)
+def test_sizes_that_cannot_be_meant_are_refused_before_anything_is_written(
+    sizing: m.Sizing, words: str, tmp_path: Path
+):
+    with pytest.raises(m.MeshError, match=words):
+        import_meshes([brick(tmp_path / "x.stl")], tmp_path / "out", ImportSettings(sizing=sizing))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_real_size_needs_a_unit_and_a_mass_a_material(tmp_path: Path):
+    box = trimesh.creation.box((0.12, 0.06, 0.04)).vertices
+    for declared in (None, 1.0):
+        sizing = m.Sizing(keep_size=True)
+        if declared is None:
+            with pytest.raises(m.MeshError, match=r"no unit.*--units mm"):
+                sizing.scale(box, declared)
+        else:
+            assert sizing.scale(box, declared)[0] == 1.0
+    nut = 0.012 * 0.012 * 0.005
+    assert "give --density or --mass" in m.Sizing().mass(nut)[2][0]
+    with pytest.raises(m.MeshError, match="--mass is in kg"):
+        m.Sizing(mass_kg=5.0).mass(nut)
