@@ -240,3 +240,9 @@ def invert(pose: np.ndarray) -> np.ndarray:
     """The inverse of one pose [7]."""
     turn = Rotation.from_quat(pose[3:]).inv()
     return np.concatenate([-turn.apply(pose[:3]), turn.as_quat()])
+
+
+def canonical_quat(quat: np.ndarray) -> np.ndarray:
+    """Of q and -q, one rotation, the one whose first of w, x, y, z that is not 0 is positive; xyzw [4]."""
+    first = next((value for value in (quat[3], *quat[:3]) if value != 0.0), 1.0)
+    return -quat if first < 0.0 else quat

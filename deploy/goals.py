@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import compose, invert
+from vd.assets_usd.hand_data import canonical_quat, compose, invert
 from vd.assets_usd.objects.geometry import (
     convex_hull,
     random_surface_points,
@@ -124,7 +124,7 @@ def read_goals(texts: Sequence[str]) -> list[np.ndarray]:
         texts: ``x,y,z,w``, ``x,y,z@degrees``, or a file (.txt, .csv) with one on each line, # for comments.
 
     Returns:
-        Unit quaternions xyzw.
+        Unit quaternions xyzw, the same whichever of its two signs was typed.
 
     Raises:
         GoalError: One is none, or a file cannot be read.
@@ -161,8 +161,8 @@ def _goal(text: str, where: str) -> np.ndarray:
     ):
         raise GoalError(f"{where}: give a quaternion x,y,z,w or a turn x,y,z@degrees, such as 0,0,1@90")
     if angle is None:
-        return numbers / length
-    return Rotation.from_rotvec(angle * numbers / length).as_quat()
+        return canonical_quat(numbers / length)
+    return canonical_quat(Rotation.from_rotvec(angle * numbers / length).as_quat())
 
 
 def _surface(path: Path, generator: np.random.Generator) -> Surface:

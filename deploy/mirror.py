@@ -6,6 +6,7 @@ import numpy as np
 import torch
 import warp as wp
 
+from vd.assets_usd.hand_data import canonical_quat
 from vd.deploy.observation import Sensed
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
@@ -24,7 +25,7 @@ class Mirror:
             raise ValueError("a mirror is one world that is not randomised")
         self.env = ReorientEnv(task, "cpu")
         self._goal: np.ndarray | None = None
-        self._yes = wp.ones(1, dtype=wp.int32, device="cpu")
+        self._turn: np.ndarray | None = None
 
     def begin(self) -> None:
         """The next state is the first of its goal, also where that is the same as before."""
@@ -42,6 +43,9 @@ class Mirror:
         pose, velocity = sensed.object_pose, sensed.object_velocity
         if pose is None or velocity is None:
             raise ValueError("the state of the object is not known: only a twin tells it")
+        if self._turn is not None and self._turn @ pose[3:] < 0.0:  # the other quaternion of the same
+            pose = np.concatenate([pose[:3], -pose[3:]])
+        self._turn = pose[3:].copy()
         env = self.env
         for arrays, values in (
             ((env.sim.joint_q, env.measured_q), np.concatenate([sensed.joint_q, pose])),
@@ -52,12 +56,10 @@ class Mirror:
                 whole = array.numpy()
                 whole[0, : len(values)] = values[: whole.shape[1]]
                 array.assign(whole)
-        if self._goal is None or not np.array_equal(self._goal, sensed.goal_quat):
-            self._goal = sensed.goal_quat.copy()
-            env.goal_quat.assign(self._goal[None].astype(np.float32))
-            env.goal_steps.zero_()
-            if env.views is not None:
-                env.views.choose(self._yes, self._yes)
+        goal = canonical_quat(sensed.goal_quat)
+        if self._goal is None or not np.array_equal(self._goal, goal):
+            self._goal = goal.copy()
+            env.give_goals(self._goal[None])
         else:
             env.goal_steps.fill_(int(env.goal_steps.numpy()[0]) + 1)
         env.rotation_error.fill_(float(rotation_angle(pose[None, 3:].astype(float), self._goal[None])[0]))

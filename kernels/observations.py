@@ -8,7 +8,7 @@ import warp as wp
 
 from vd.kernels.columns import read_quat, read_vec3, write_quat, write_vec3
 from vd.kernels.rng import next_stream
-from vd.kernels.transforms import rotation_difference
+from vd.kernels.transforms import canonical, rotation_difference
 
 wp.set_module_options({"enable_backward": False})
 
@@ -56,12 +56,14 @@ class ObservationParams:
     noise_mean: Mean of the noise on measured values, in their units.
     noise_std: Standard deviation of that noise, independent in every value and step.
     file_axes: Whether orientations in the axes of the object's file are seen: 1, or 0 for zeros.
+    canonical: Whether orientations of object and goal, and the rotation between them, are canonical: 1 or 0.
     """
 
     velocity_scale: float
     noise_mean: float
     noise_std: float
     file_axes: float
+    canonical: float
 
 
 @wp.func
@@ -122,7 +124,8 @@ def teacher_observation_kernel(
     Joint positions are mapped from [lower, upper] to [-1, 1]; the relative orientation is
     q_object * conj(q_goal). Every measured value gets N(noise_mean, noise_std) + offset; the goal and
     the previous action are known exactly and get neither. Without ``file_axes`` the orientations of object
-    and goal are zeros, without noise.
+    and goal are zeros, without noise. With ``canonical`` the three do not tell a quaternion q from -q, the
+    same rotation (:func:`vd.kernels.transforms.canonical`, before noise).
 
     Args:
         joint_lower: Lower joint limits [rad], shape [D].
@@ -159,6 +162,11 @@ def teacher_observation_kernel(
     velocity = read_vec3(world, joints, joint_qd_in)
     spin = read_vec3(world, joints + 3, joint_qd_in)
     goal = goal_quat_in[world]
+    turn = rotation_difference(orientation, goal)
+    if settings.canonical != 0.0:
+        orientation = canonical(orientation)
+        goal = canonical(goal)
+        turn = canonical(turn)
 
     column = write_vec3(world, 2 * joints, position, observation_out)
     object_begin = column
@@ -168,7 +176,7 @@ def teacher_observation_kernel(
     goal_begin = column
     column = write_quat(world, column, goal, observation_out)
     goal_end = column
-    column = write_quat(world, column, rotation_difference(orientation, goal), observation_out)
+    column = write_quat(world, column, turn, observation_out)
 
     for finger in range(tip_body.shape[0]):
         body = tip_body[finger]

@@ -10,6 +10,7 @@ from vd.kernels.columns import read_quat
 from vd.kernels.rng import next_stream
 from vd.kernels.transforms import (
     PI,
+    goal_beside,
     random_rotation,
     random_rotation_within,
     rotation_angle,
@@ -148,7 +149,9 @@ def reset_kernel(
     uniform random orientation, all velocities and counters to zero. Where poses at rest are given, the
     object starts in one of them instead, turned by a random angle about the vertical through its origin.
     A goal is uniform among the orientations within max_angle of the object's (or turns it about the
-    vertical only); the smoothed action starts at zero with each goal.
+    vertical only); the smoothed action starts at zero with each goal. A goal that is drawn is less than half
+    a turn from the object's quaternion, not from the other one of its orientation; of a given one the sign is
+    chosen so.
 
     Args:
         reset_q: Hand joints after a reset [rad], shape [D].
@@ -213,7 +216,32 @@ def reset_kernel(
         turn = wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), angle)
     goal = wp.normalize(turn * orientation)
     if use_given_goal != 0:
-        goal = given_goal_in[world]
+        goal = goal_beside(given_goal_in[world], orientation)
     goal_quat_out[world] = goal
     previous_error_out[world] = rotation_angle(rotation_difference(orientation, goal))
     rng[world] = next_stream(state, world)
+
+
+@wp.kernel
+def give_goal_kernel(
+    # In:
+    given_goal_in: wp.array[wp.quat],
+    joint_q_in: wp.array2d[float],
+    object_column: int,
+    # Out:
+    goal_quat_out: wp.array[wp.quat],
+    goal_steps_out: wp.array[int],
+):
+    """Give goals from outside to worlds as they are. Launch: [N].
+
+    Args:
+        given_goal_in: Wanted orientations, shape [N].
+        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
+        object_column: Column of the object's quaternion.
+        goal_quat_out: Goal orientation with the sign that :func:`reset_kernel` gives it, shape [N].
+        goal_steps_out: Control steps since the goal was given: 0, shape [N].
+    """
+    world = wp.tid()
+    orientation = read_quat(world, object_column, joint_q_in)
+    goal_quat_out[world] = goal_beside(given_goal_in[world], orientation)
+    goal_steps_out[world] = 0

@@ -23,6 +23,28 @@ def rotation_angle(q: wp.quat) -> float:
 
 
 @wp.func
+def canonical(q: wp.quat) -> wp.quat:
+    """Of ``q`` and ``-q``, the same rotation, the one whose first of w, x, y, z that is not 0 is positive."""
+    first = q[3]
+    for i in range(3):
+        if first == 0.0:
+            first = q[i]
+    if first < 0.0:
+        return wp.quat(-q[0], -q[1], -q[2], -q[3])
+    return q
+
+
+@wp.func
+def goal_beside(goal: wp.quat, q: wp.quat) -> wp.quat:
+    """Of ``goal`` and ``-goal`` the one from which the rotation to ``q`` is canonical."""
+    turn = rotation_difference(q, goal)
+    kept = canonical(turn)
+    if kept[0] != turn[0] or kept[1] != turn[1] or kept[2] != turn[2] or kept[3] != turn[3]:
+        return wp.quat(-goal[0], -goal[1], -goal[2], -goal[3])
+    return goal
+
+
+@wp.func
 def random_rotation(rng: wp.uint32):
     """Draw uniformly from SO(3): four standard normals, normalised. Returns ``(rng, quaternion)``."""
     x = wp.randn(rng)

@@ -117,6 +117,13 @@ def test_orientations_are_read_as_written(tmp_path):
     np.testing.assert_allclose(goals, [[1, 0, 0, 0], [0, 0, half, half], [0, 0, 0, 1]], atol=1e-12)
 
 
+def test_both_quaternions_of_an_orientation_are_one_goal():
+    for one, other in (("0.1,-0.2,0.3,0.9", "-0.1,0.2,-0.3,-0.9"), ("0,-1,1,0", "0,1,-1,0")):
+        first, second = read_goals([one, other])
+        np.testing.assert_array_equal(first, second)
+        assert first[3] > 0.0 or (first[3] == 0.0 and first[1] > 0.0)
+
+
 @pytest.mark.parametrize("text", ["1,2,3", "0,0,0@90", "0,0,0,0", "a,b,c,d", "0,0,1,0@90", "nan,0,0,1"])
 def test_what_is_no_orientation_is_refused(text, tmp_path):
     with pytest.raises(GoalError, match="such as 0,0,1@90"):

@@ -13,7 +13,7 @@ from vd.deploy.mirror import Mirror
 from vd.deploy.observation import StudentSight, frame
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import open_teacher, task_for
+from vd.evaluate.agents import open_teacher, task_for, trained_task
 from vd.kernels.observations import GOAL_TIME_UNIT_S
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import PRESETS
@@ -152,6 +152,22 @@ def test_a_mirror_counts_the_time_of_a_goal_from_its_first_state_on():
     assert times(2) == pytest.approx([0.0, step])
     mirror.begin()
     assert times(2) == pytest.approx([0.0, step]), "a new flight with the same goal"
+
+
+def test_a_mirror_takes_either_quaternion_of_goal_and_object():
+    task = trained_task(open_teacher("dclaw3-table", "cpu"))
+    cfg = replace(task, objects=("cube",), num_worlds=1, randomisation=RandomisationCfg(enabled=False))
+    env, seen = ReorientEnv(cfg, "cpu"), []
+    for goal_sign, later_sign in ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0)):
+        mirror, state = Mirror(cfg), state_of(env)
+        mirror.take(replace(state, goal_quat=goal_sign * state.goal_quat))
+        first = mirror.env.observation.numpy().copy()
+        pose = np.concatenate([state.object_pose[:3], later_sign * state.object_pose[3:]])
+        mirror.take(replace(state, object_pose=pose, goal_quat=-goal_sign * state.goal_quat))
+        seen.append((first, mirror.env.observation.numpy().copy()))
+    np.testing.assert_array_equal(seen[0][0], env.observation.numpy())
+    for other in seen[1:]:
+        np.testing.assert_array_equal(other, seen[0])
 
 
 def test_a_mirror_wants_one_plain_world_and_the_truth():

@@ -67,7 +67,11 @@ def paper() -> TeacherCfg:
     return TeacherCfg(
         preset="paper",
         run=RunCfg(run_dir=Path("runs/paper")),
-        env=ReorientCfg(num_worlds=PAPER.teacher.num_worlds, objects=TRAINING_SET),
+        env=ReorientCfg(
+            num_worlds=PAPER.teacher.num_worlds,
+            objects=TRAINING_SET,
+            observation=ObservationCfg(canonical=True),
+        ),
     )
 
 
@@ -134,7 +138,7 @@ def gpu() -> TeacherCfg:
             # About one in 40 million was seen, always of a slim object, and ended the run.
             failures_per_million=1.0,
             # A third of the goals is left to learn [d3-view-floor]; paper: neither shape nor views.
-            observation=ObservationCfg(shape="full", view="goal"),
+            observation=ObservationCfg(shape="full", view="goal", canonical=True),
             reward=TOWARDS_GOAL,
             # The tightest: what fingers at a std of 0.08 can keep; without noise they then pass the paper's
             # test, which evaluation asks for [d3-tight, d4-tight]. Goals end more exactly than there: what is
@@ -174,6 +178,7 @@ def cube() -> TeacherCfg:
             objects=("cube",),
             num_worlds=8192,
             failures_per_million=1.0,
+            observation=ObservationCfg(canonical=True),
             reward=TOWARDS_GOAL,
             start=StartCfg(at_rest=True),
             goal=GoalCfg(max_angle_rad=1.0),
@@ -217,7 +222,7 @@ def cpu_demo() -> TeacherCfg:
         env=ReorientCfg(
             num_worlds=256,
             hand="dclaw3",  # its own mirror image, so that all goals are turns one way round
-            observation=ObservationCfg(view="mirrored"),
+            observation=ObservationCfg(view="mirrored", canonical=True),
             reward=RewardCfg(
                 success=10.0,
                 fingertip=-10.0,

@@ -23,7 +23,7 @@ from vd.sim.scene import hand_mount
 from vd.student.cfg import NoiseCfg, StudentCfg
 from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
 from vd.student.object_sense import ObjectSense
-from vd.student.quaternions import relative_rotation, rotation_distance
+from vd.student.quaternions import canonical, relative_rotation, rotation_distance
 from vd.student.sites import Sites
 from vd.student.symmetry import nearest_goal, symmetries_of_worlds
 
@@ -199,12 +199,20 @@ class StudentView:
         return frame
 
     def observation(self, observed: torch.Tensor) -> torch.Tensor:
-        """A teacher's observation [N, O], world frame: of all that looks like the goal the nearest is it."""
+        """A teacher's observation [N, O], world frame: of all that looks like the goal the nearest is it.
+
+        The rotation to it is less than half a turn, as at the beginning of every goal of its training.
+        """
         orientation, goal = self._towards()
+        turn = relative_rotation(orientation, goal)
+        kept = canonical(turn)
+        goal = torch.where((kept == turn).all(dim=-1, keepdim=True), goal, -goal)
         columns = teacher_observation_slices(self.env.num_fingers)
         changed = observed.clone()
-        changed[:, columns["goal_orientation"]] = goal
-        changed[:, columns["relative_orientation"]] = relative_rotation(orientation, goal)
+        changed[:, columns["goal_orientation"]] = (
+            canonical(goal) if self.env.cfg.observation.canonical else goal
+        )
+        changed[:, columns["relative_orientation"]] = kept
         return changed
 
     def points(self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None) -> torch.Tensor:

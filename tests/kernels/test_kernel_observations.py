@@ -57,7 +57,7 @@ def scenes(draw: st.DrawFn) -> dict[str, np.ndarray]:
     }
 
 
-def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=True):
+def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=True, canonical=False):
     """Launch the kernel on a scene; returns observation and streams."""
     worlds = len(scene["q"])
     out = unwritten((worlds, teacher_observation_size(len(scene["tip_body"]))), float, device)
@@ -68,6 +68,7 @@ def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=T
         noise_mean=noise_mean,
         noise_std=noise_std,
         file_axes=float(file_axes),
+        canonical=float(canonical),
     )
     rng = streams(worlds, seed, device)
     wp.launch(
@@ -170,6 +171,30 @@ def test_without_the_axes_of_the_file_their_orientations_alone_are_zeros(device,
         full[:, slices[name]] = 0.0
     np.testing.assert_array_equal(out, full)
     np.testing.assert_array_equal(same_stream, stream)
+
+
+@EXAMPLES
+@given(scene=scenes())
+def test_canonical_orientations_do_not_tell_which_quaternion_they_came_from(device, scene):
+    scene["offset"][:] = 0.0
+    out, _ = observe(device, scene, canonical=True)
+    expected = expected_observation(scene)
+    slices = teacher_observation_slices(len(scene["tip_body"]))
+    for name in ("object_orientation", "goal_orientation", "relative_orientation"):
+        for row in expected[:, slices[name]]:
+            first = next(v for v in row[[3, 0, 1, 2]] if abs(v) > 1e-7)
+            row *= np.sign(first)
+        # A rotation by half a turn, to rounding, is either of the two.
+        turned = np.abs(out[:, slices[name]][:, 3]) < 1e-6
+        found, wanted = out[:, slices[name]][~turned], expected[:, slices[name]][~turned]
+        np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5)
+    joints = len(scene["lower"])
+    for object_sign in (1.0, -1.0):
+        for goal_sign in (1.0, -1.0):
+            q = scene["q"].copy()
+            q[:, joints + 3 :] *= object_sign
+            same, _ = observe(device, scene | {"q": q, "goal": goal_sign * scene["goal"]}, canonical=True)
+            np.testing.assert_array_equal(same, out)
 
 
 @EXAMPLES

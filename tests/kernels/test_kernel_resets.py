@@ -12,7 +12,9 @@ from kernel_oracle import (
     angle_between,
     ball_cdf,
     device_array,
+    goals,
     quaternions,
+    relative_quaternion,
     rotation_angles,
     settings_array,
     streams,
@@ -21,7 +23,7 @@ from kernel_oracle import (
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from vd.kernels.resets import GoalParams, StartParams, episode_kernel, reset_kernel
+from vd.kernels.resets import GoalParams, StartParams, episode_kernel, give_goal_kernel, reset_kernel
 from vd.paper import PAPER
 
 START = np.array(PAPER.scene.object_start_m)
@@ -96,6 +98,13 @@ def test_the_share_of_those_caught_goes_on(device):
     out = end_episodes(device, 0 * ones, 0 * ones, 9 * ones, age=8 * ones, error=2.0 * ones, share=0.7)
     assert 0.65 < 1.0 - out["reset"].mean() < 0.75
     np.testing.assert_array_equal(out["timed_out"], out["reset"])
+
+
+def goal_beside(goal, orientation):
+    """Goals with the sign by which the rotation from them is canonical, in float64 from the definition."""
+    turn = relative_quaternion(orientation, goal)
+    flip = np.array([next((v for v in row[[3, 0, 1, 2]] if abs(v) > 1e-7), 1.0) < 0.0 for row in turn])
+    return np.where(flip[:, None], -goal, goal)
 
 
 class World:
@@ -195,7 +204,7 @@ def test_only_masked_worlds_change_and_only_in_what_is_theirs(device, data, fing
     np.testing.assert_allclose(np.linalg.norm(after["goal"][changed], axis=1), 1.0, atol=1e-6)
     if start is not None and goal is not None:
         np.testing.assert_array_equal(orientation[reset], start[reset])
-        np.testing.assert_array_equal(after["goal"][changed], goal[changed])
+        np.testing.assert_array_equal(after["goal"][changed], goal_beside(goal, orientation)[changed])
     if changed.any():
         error = angle_between(orientation[changed], after["goal"][changed])
         np.testing.assert_allclose(after["error"][changed], error, atol=2e-3)
@@ -272,3 +281,34 @@ def test_starts_at_rest_keep_place_and_tilt(device):
     turn = Rotation.from_quat(after["q"][:, world.joints + 3 :]) * Rotation.from_quat(picked[:, 3:]).inv()
     assert np.abs(turn.as_rotvec()[:, :2]).max() < 1e-5
     assert stats.kstest(turn.as_rotvec()[:, 2], stats.uniform(-np.pi, 2 * np.pi).cdf).pvalue > ALPHA
+
+
+@EXAMPLES
+@given(data=st.data(), worlds=st.integers(1, 5))
+def test_a_given_goal_counts_the_same_by_either_of_its_quaternions(device, data, worlds):
+    """By a reset and where the world is; half a turn and equal orientations among them."""
+    orientation = data.draw(quaternions((worlds,)))
+    goal = data.draw(goals(orientation))
+    ones = np.ones(worlds)
+    found = [
+        World(device, worlds).reset(ones, 0 * ones, start_quat=orientation, goal_quat=g)
+        for g in (goal, -goal)
+    ]
+    for name in found[0]:
+        np.testing.assert_array_equal(found[0][name], found[1][name], err_msg=name)
+    kept = found[0]["goal"]
+    turn = relative_quaternion(orientation, kept)
+    assert (turn[:, 3] > -1e-7).all(), "less than half a turn, as of the goals that are drawn"
+    np.testing.assert_allclose(np.abs((kept * goal).sum(axis=1)), 1.0, atol=1e-6)
+    q = np.concatenate([np.zeros((worlds, 3)), orientation], axis=1)
+    for given_goal in (goal, -goal):
+        out, age = unwritten(worlds, wp.quat, device), unwritten(worlds, int, device)
+        wp.launch(
+            give_goal_kernel,
+            dim=worlds,
+            inputs=[device_array(given_goal, wp.quat, device), device_array(q, float, device), 3],
+            outputs=[out, age],
+            device=device,
+        )
+        np.testing.assert_array_equal(out.numpy(), kept)
+        assert not age.numpy().any()

@@ -104,6 +104,9 @@ class ObservationCfg:
     """See how the axes of the object's file lie, now and at the goal, as in the paper. No cloud shows which
     they are; students know the rotation from one to the other alone. Ours: without them a teacher sees zeros
     in their place, and knows no more of them than its students."""
+    canonical: bool = False
+    """Of the two quaternions of a rotation see always the same, of object, goal and the rotation between
+    them. On in all presets; off where a policy's file does not say: those policies have learned the signs."""
 
     def views(self, fingers: int) -> int:
         """Views in which a hand of so many fingers sees its goals; 0: it sees the world as it is."""

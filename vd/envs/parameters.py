@@ -46,6 +46,7 @@ class TaskParameters:
             noise_mean=on * random.observation_noise_mean,
             noise_std=on * random.observation_noise_std,
             file_axes=float(cfg.observation.file_axes),
+            canonical=float(cfg.observation.canonical),
         )
         self.start = array(
             StartParams, position=wp.vec3(*scene.object_start_m), noise=scene.object_start_noise_m

@@ -24,7 +24,7 @@ from vd.envs.randomise import Randomiser
 from vd.envs.servo import needs_servo, servo_ranges
 from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
-from vd.envs.state import load_state, save_failed_step, save_state
+from vd.envs.state import load_state, motion_arrays, save_failed_step, save_state
 from vd.envs.symmetry import Views
 from vd.envs.table import must_lift, table_array
 from vd.kernels.actions import apply_action_kernel
@@ -35,7 +35,7 @@ from vd.kernels.observations import (
     teacher_observation_kernel,
     teacher_observation_size,
 )
-from vd.kernels.resets import episode_kernel, reset_kernel
+from vd.kernels.resets import episode_kernel, give_goal_kernel, reset_kernel
 from vd.kernels.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.shapes import shape_observation_size
@@ -186,6 +186,7 @@ class ReorientEnv:
         self.dump_dir = Path()
         """Where :meth:`check` saves the step that failed."""
         self._graph: Any = None
+        self._hold_graph: Any = None
         self._kernels_loaded = False
         self.steps = 0
         """Control steps of all worlds since the begin of the run, with those of a checkpoint."""
@@ -202,7 +203,7 @@ class ReorientEnv:
 
         Args:
             object_quat: Start orientations of the objects, xyzw, shape [N, 4]; random by default.
-            goal_quat: Goal orientations, xyzw, shape [N, 4]; drawn as configured by default.
+            goal_quat: Goal orientations, xyzw, either sign, shape [N, 4]; drawn as configured by default.
         """
         for given, buffer in ((object_quat, self._given_start), (goal_quat, self._given_goal)):
             if given is not None:
@@ -218,6 +219,24 @@ class ReorientEnv:
         self._reset_worlds(use_start=object_quat is not None, use_goal=goal_quat is not None)
         self.randomiser.push()
         self.observe()
+
+    def give_goals(self, goal_quat: np.ndarray) -> None:
+        """Give every world a new goal where it is; what is observed is to be refreshed (:meth:`observe`).
+
+        Args:
+            goal_quat: Goal orientations, xyzw, either sign, shape [N, 4].
+        """
+        self._given_goal.assign(np.asarray(goal_quat, dtype=np.float32))
+        wp.launch(
+            give_goal_kernel,
+            dim=self.num_worlds,
+            inputs=[self._given_goal, self.sim.joint_q, self.num_actions + 3],
+            outputs=[self.goal_quat, self.goal_steps],
+            device=self.device,
+        )
+        if self.views is not None:
+            self._new_goal.fill_(1)
+            self.views.choose(self._new_goal, self._new_goal)
 
     def step(self, action: Any) -> None:
         """Simulate one control step; worlds that end are reset, and the observation is fresh.
@@ -239,6 +258,18 @@ class ReorientEnv:
         self.steps += 1
         self._own_steps += 1
         self.randomiser.after_step(self.steps)
+
+    def motion(self) -> dict[str, wp.array]:
+        """What the motion goes on from, see :func:`vd.envs.state.motion_arrays`; not copies."""
+        return motion_arrays(self)
+
+    def hold(self) -> None:
+        """One control step in which no policy acts and the hand keeps its last targets; nothing is reset."""
+        if self._hold_graph is None:
+            with wp.ScopedCapture(device=self.device) as capture:
+                self.sim.step()
+            self._hold_graph = capture.graph
+        wp.capture_launch(self._hold_graph)
 
     def launch_physics(self) -> None:
         """Apply the action and run the solver's steps, nothing else (for benchmarks)."""
@@ -512,5 +543,5 @@ class ReorientEnv:
         load_state(self, state)
 
     def close(self) -> None:
-        """Release the captured graph."""
-        self._graph = None
+        """Release the captured graphs."""
+        self._graph = self._hold_graph = None

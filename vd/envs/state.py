@@ -99,13 +99,22 @@ def _objects(env: "ReorientEnv") -> list[tuple[str, int]]:
     return [(item.name, int(count)) for item, count in zip(env.objects, counts, strict=True)]
 
 
-def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
+def motion_arrays(env: "ReorientEnv") -> dict[str, wp.array]:
+    """What the motion of every world goes on from, the last targets included: arrays with a row for each."""
     sim = env.sim
     return {
         "joint_q": sim.joint_q,
         "joint_qd": sim.joint_qd,
         "target": sim.target,
         "warm_start": sim.solver.mjw_data.qacc_warmstart,
+        **({} if sim.servo is None else sim.servo.stateful()),
+    }
+
+
+def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
+    sim = env.sim
+    return {
+        **motion_arrays(env),
         "smoothed": env.smoothed,
         "goal_quat": env.goal_quat,
         "step_count": env.step_count,
@@ -118,6 +127,5 @@ def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
         **({} if env.views is None else {"view": env.views.view}),
         **({} if env.nudges is None else env.nudges.stateful()),
         **env.randomiser.stateful(),
-        **({} if sim.servo is None else sim.servo.stateful()),
         **({} if sim.restitution is None else sim.restitution.stateful()),
     }

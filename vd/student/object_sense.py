@@ -30,7 +30,7 @@ from vd.kernels.shapes import (
     surface_kernel,
 )
 from vd.paper import PAPER
-from vd.student.quaternions import product, relative_rotation, rotated, rotation_distance
+from vd.student.quaternions import canonical, product, relative_rotation, rotated, rotation_distance
 from vd.student.registration import FAR_M, POINTS, Registration
 from vd.student.sites import Sites
 from vd.student.symmetry import nearest_goal, symmetries_of_worlds
@@ -171,8 +171,7 @@ class ObjectSense:
         angle = rotation_distance(orientation, goal_quat)[:, None]
         if self._aim.enabled:
             goal_quat = self._aimed(orientation, goal_quat)
-        rotation = relative_rotation(orientation, goal_quat)
-        rotation = torch.where(rotation[:, 3:] < 0.0, -rotation, rotation)
+        rotation = canonical(relative_rotation(orientation, goal_quat))
         rate, moves = PAPER.scene.control_hz, known[:, None].float()
         first, second = found.misfit[:, :1], found.misfit[:, 1:2]
         return torch.cat(

@@ -10,6 +10,14 @@ def product(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     return torch.cat([vector, aw * bw - (a * b).sum(dim=-1, keepdim=True)], dim=-1)
 
 
+def canonical(quat: torch.Tensor) -> torch.Tensor:
+    """Of q and -q, one rotation, the one whose first of w, x, y, z that is not 0 is positive [..., 4]."""
+    first = quat[..., 3]
+    for i in range(3):
+        first = torch.where(first == 0.0, quat[..., i], first)
+    return torch.where(first[..., None] < 0.0, -quat, quat)
+
+
 def relative_rotation(first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     """``first * conj(second)``, quaternions xyzw [..., 4]."""
     return product(first, torch.cat([-second[..., :3], second[..., 3:]], dim=-1))

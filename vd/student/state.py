@@ -19,6 +19,7 @@ from vd.policy import MeanAction, PolicySpec, perceptron
 from vd.student.cfg import StateCfg
 from vd.student.fingertips import Fingertips
 from vd.student.object_sense import observed
+from vd.student.quaternions import canonical
 from vd.student.views import ViewMaps
 
 UNSEEN = ("object_orientation", "goal_orientation")
@@ -185,8 +186,7 @@ class StateHead(nn.Module):
         Of a rotation's two quaternions the one of less than half a turn; of what cannot be seen, the mean.
         """
         wanted = observation.clone()
-        turn = wanted[..., self._turn]
-        wanted[..., self._turn] = torch.where(turn[..., 3:] < 0.0, -turn, turn)
+        wanted[..., self._turn] = canonical(wanted[..., self._turn])
         return self.known * (wanted - self.offset) / self.scale
 
     def act(self, estimate: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
