@@ -6,7 +6,6 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import trimesh
 from test_demo_deploy import made_up_flights
@@ -34,10 +33,10 @@ def result(agent: str, reached: int, episodes: int = 40) -> EvalResult:
     unit = (0.0, 0.0, 0.0, 1.0)
     protocol = Protocol(agent, "cube", "dclaw4", episodes, 0, 1.0, 0.4, 10.0, 12.0, False)
     rows = tuple(
-        Episode(0, unit, unit, 0.9, 0.3 if i < reached else 1.2, 60, i < reached, False)
+        Episode(0, unit, unit, 0.9, *2 * (0.3 if i < reached else 1.2,), 60, i < reached, False)
         for i in range(episodes)
     )
-    return summarise(protocol, ("cube",), [np.array([unit])], rows)
+    return summarise(protocol, ("cube",), rows)
 
 
 class Clock:

@@ -243,6 +243,34 @@ def test_viewpoints_differ_between_worlds_as_asked(device, scenes):
     assert theirs.poses.shape == (WORLDS,)
 
 
+def test_clouds_do_not_know_that_the_camera_has_moved(device, scenes):
+    """The same image, seen from where the camera is, is laid out from where it should be."""
+    scene, state = scenes(device)
+    body_q = state.body_q.reshape((WORLDS, -1))
+    cfg = DepthCameraCfg(position_noise_m=0.01, points=2000)
+    camera = DepthCamera.of_scene(scene, body_q, cfg, seed=1)
+    camera.capture()
+    moved, nominal = host(camera.extrinsics)[:, :3], scene.hand.camera.position
+    base = host(body_q)[:, int(scene.link_body[0])]
+    for world in range(WORLDS):
+        cloud = host(camera.points)[world, : host(camera.count)[world]]
+        away = moved[world] - nominal
+        turn, place = Rotation.from_quat(base[world, 3:]), base[world, :3]
+        rows, columns = np.nonzero(host(camera.depth)[world])
+        model = scene.hand.camera
+        depth = host(camera.depth)[world][rows, columns]
+        ray = np.stack(
+            [(columns + 0.5 - model.cx) / model.fx, (rows + 0.5 - model.cy) / model.fy, np.ones(len(rows))],
+            axis=1,
+        )
+        seen = Rotation.from_quat(model.quaternion).apply(ray * depth[:, None]) + nominal
+        assert cKDTree(seen).query(cloud)[0].max() < 1e-5
+        assert np.median(cKDTree(seen + away).query(cloud)[0]) > 1e-4, "it would lie elsewhere"
+        heights = (turn.apply(cloud) + place)[:, 2]
+        low, high = PAPER.camera.crop_m
+        assert heights.min() > low - 1e-5 and heights.max() < high + 1e-5
+
+
 def test_late_images_are_past_images(device, scenes):
     scene, state = scenes(device)
     frame_s = 1.0 / PAPER.scene.control_hz

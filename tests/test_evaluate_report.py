@@ -131,3 +131,20 @@ def test_page_embeds_files(tmp_path):
     kinds = [address.split(";")[0] for address in references.addresses]
     assert kinds == ["data:video/mp4", "data:image/gif", "data:image/png"]
     assert "T &amp; T" in text
+
+
+def test_pages_print_no_absolute_paths_and_intervals_stand_below_their_numbers(tmp_path, result):
+    """A table of seven columns with an interval in each has to fit a window of 1200 pixels."""
+    where = dict(
+        policy="/home/me/runs/a/policy.pt", objects="/data/meshes/mugs, cube", hand="/opt/my/hand.usda"
+    )
+    write_report(
+        replace(result, protocol=replace(result.protocol, **where)), tmp_path / "r.html", pictures=PNG
+    )
+    text, references = read_page(tmp_path / "r.html")
+    assert not any(root in text for root in ("/home", "/data", "/opt"))
+    assert "a/policy.pt" in text and "meshes/mugs, cube" in text and "my/hand.usda" in text
+    assert references.tags.count("img") == 4, "the objects too"
+    page = Page("t")
+    page.table(("a", "b"), [("x", "12.3 % (10.1 to 14.9)")])
+    assert "12.3&nbsp;% <small>(10.1 to 14.9)</small>" in page.html()

@@ -152,7 +152,7 @@ def result_of(objects, episodes=10, worlds=None, fall_at=None, policy=None):
         control_hz=CONTROL_HZ,
         randomised=False,
     )
-    return summarise(protocol, tuple(o.name for o in objects), [o.symmetry for o in objects], recorded)
+    return summarise(protocol, tuple(o.name for o in objects), recorded)
 
 
 def test_rates_count_what_happened():
@@ -174,7 +174,7 @@ def test_time_to_success_is_of_successes_alone():
     start, goal = quarter_turn_ahead()
     (episode,) = collect(env, Turn(np.pi / 2, until=11), start, goal)
     protocol = goal_at_start.protocol.__class__(**{**goal_at_start.protocol.__dict__, "episodes": 1})
-    result = summarise(protocol, ("a",), [np.array([[0.0, 0.0, 0.0, 1.0]])], (episode,))
+    result = summarise(protocol, ("a",), (episode,))
     assert result.overall.time_to_success_s.value == pytest.approx(1.0)
 
 

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -18,12 +19,12 @@ from vd.evaluate import student as module
 from vd.evaluate.agents import SHIPPED_POLICIES, sees_clouds
 from vd.evaluate.cli import main
 from vd.evaluate.comparison import Comparison
-from vd.evaluate.scanned import MISSING, NOISE_M, ScannedGoalView, scan
+from vd.evaluate.scanned import MISSING, NOISE_M, KnownByPoints, scan
 from vd.evaluate.student import StudentActor
 from vd.evaluate.trace import NEVER_RAD, record
 from vd.kernels.shapes import SHAPE_UNIT_M
 from vd.paper import PAPER
-from vd.sensors.cfg import DepthCameraCfg
+from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.student.cfg import LEAN
 from vd.student.network import Student
 from vd.student.object_sense import STATE_VALUES
@@ -32,6 +33,8 @@ from vd.student.stopping import StoppingRule
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main as train
 from vd.vision import StudentView
+
+Scanned = partial(KnownByPoints, exact=False)
 
 TASK = ReorientCfg(
     hand="dclaw3",
@@ -172,7 +175,7 @@ def test_a_scan_is_noisy_and_misses_one_side():
 def test_only_the_goal_is_scanned(env, rendered):
     env.reset()
     settings = dict(rendered=rendered, depth=DepthCameraCfg(points=300))
-    exact, scanned = (view(env, TINY, **settings) for view in (StudentView, ScannedGoalView))
+    exact, scanned = (view(env, TINY, **settings) for view in (StudentView, Scanned))
     frame = exact.frame()
     rows = torch.tensor([2, 0])
     chosen = {key: value[rows] for key, value in frame.items()}
@@ -189,7 +192,7 @@ def test_only_the_goal_is_scanned(env, rendered):
 def test_an_object_is_looked_for_by_its_scan(env):
     """What a student finds of the extents at the goal are those of the scanned shape, not of the true one."""
     env.reset()
-    sensed = [view(env, LEAN, rendered=False) for view in (StudentView, ScannedGoalView)]
+    sensed = [view(env, LEAN, rendered=False) for view in (StudentView, Scanned)]
     shapes = [view.frame()["object"][:, STATE_VALUES:] for view in sensed]
     assert (shapes[0] - shapes[1]).abs().mean() > NOISE_M / SHAPE_UNIT_M / 2.0
 
@@ -266,3 +269,12 @@ def test_a_student_is_shown(tmp_path):
     path = save_student(tmp_path / "student.pt", 2)
     assert record_video(PlayCfg(policy=path, seconds=0.5, device="cpu"), tmp_path / "moments.png") == 6
     assert (tmp_path / "moments.png").is_file()
+
+
+def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
+    student = make_student(2)
+    plain, real = (StudentActor(env, student, sensor_errors=errs)._view.camera.cfg for errs in (False, True))
+    assert not plain.sensor.enabled and plain.latency_s == (0.0, 0.0) and plain.position_noise_m == 0.0
+    assert real.sensor == DepthSensorCfg.realistic() and real.latency_s[1] > real.latency_s[0] > 0.0
+    assert real.position_noise_m > 0.0 and real.rotation_noise_rad > 0.0
+    assert real.points == plain.points, "all else is as in its training"

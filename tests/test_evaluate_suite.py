@@ -5,9 +5,8 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from fake_env import FakeObject
 from student_dummy import asks_its_teacher
-from test_evaluate_report import read_page
+from test_evaluate_report import PNG, read_page
 from test_evaluate_trace import compared, protocol
 
 from vd.evaluate import suite_run
@@ -19,18 +18,22 @@ from vd.evaluate.suite import (
     CLAIMS,
     CONDITIONS,
     NO_STUDENT,
+    OUT_OF_TIME,
     QUICK_OBJECTS,
+    QUICK_S,
     dropped_at_once,
     seen_within,
     success_without_table,
     time_to_success,
 )
-from vd.evaluate.suite_page import paper_text
+from vd.evaluate.suite_page import WHO_JUDGES, paper_text
 from vd.paper import PAPER, ResultConstants
 
 TEACHER, STUDENT = "dclaw3-table", "runs/s/student.pt"
 SYMMETRIC = ("training=cube", "held-out=cube", "symmetric=cube")
 """Sets that need no authoring; the test double looks at none of them."""
+OF_TEACHERS = [c for c in CONDITIONS if c.objects != "validation" and c.concerns(student=False, views=True)]
+"""Conditions of a teacher: its goals are no clouds, to be scanned or told by points, and it has no camera."""
 
 
 @pytest.fixture
@@ -38,7 +41,7 @@ def asked(monkeypatch):
     """Replace the evaluation of one policy; returns what was asked for."""
     asked = []
 
-    def compare(cfg):
+    def compare(cfg, stop_at=None):
         asked.append(cfg)
         (name,) = cfg.agent_names
         rows, prediction = compared()
@@ -61,6 +64,8 @@ def asked(monkeypatch):
 
     monkeypatch.setattr(suite_run, "compare", compare)
     monkeypatch.setattr(suite_run, "sees_clouds", lambda name: name == STUDENT)
+    monkeypatch.setattr(suite_run, "has_second_view", lambda name: name == TEACHER)
+    monkeypatch.setattr(suite_run.SuiteResult, "pictures", {"training": PNG})
     monkeypatch.setattr(suite_run, "fingerprint", lambda name, **_: f"weights of {name}")
     return asked
 
@@ -103,20 +108,50 @@ def test_the_conditions_are_the_papers():
     assert cfg.stop_tolerance == PAPER.success.rotation_rad
 
 
-def test_a_second_view_is_for_teachers_of_views_and_their_students():
-    condition, objects = CONDITIONS[0], suite_run.Objects(("x",), "x", False)
-    names = ("dclaw3-table", "dclaw3-student", "dclaw4-cube", "zero")
-    looks = [
-        suite_run.settings(EvalCfg(second_view=asked), condition, name, objects).second_view
-        for asked in (False, True)
-        for name in names
-    ]
-    assert looks == [False] * 4 + [True, True, False, False]
+def test_the_headline_has_the_papers_conditions_and_what_is_ours_is_marked():
+    """A real camera's errors, neither view selection nor aiming; what students know of goals is said."""
+    objects = suite_run.Objects(("x",), "x", False)
+    for condition in CONDITIONS:
+        cfg = suite_run.settings(EvalCfg(), condition, TEACHER, objects)
+        plain = cfg.sensor_errors and not (cfg.second_view or cfg.aim or cfg.nudge or cfg.explore)
+        assert plain == (not condition.mark), condition.name
+        assert cfg.goals == condition.goals
+    known = {c.name: c.goals for c in CONDITIONS}
+    assert (known["held-out"], known["held-out-points"], known["air-points"]) == ("mesh", "points", "points")
+    looks = next(c for c in CONDITIONS if c.second_view and c.sensor_errors)
+    assert "--second-view" in looks.flags and looks.mark.startswith("ours")
+    assert looks.concerns(student=True, views=True) and not looks.concerns(student=True, views=False)
+    default = EvalCfg()
+    assert default.sensor_errors and not (default.second_view or default.aim)
+
+
+def test_validation_is_measured_where_it_is_named_and_the_page_says_who_judges(tmp_path, asked):
+    result = run(suite(tmp_path, objects=(*SYMMETRIC, "validation=cube")))
+    assert ("validation", TEACHER) in result.found
+    assert ("validation", TEACHER) not in run(suite(tmp_path / "none")).found
+    assert WHO_JUDGES in (tmp_path / "out" / "paper.html").read_text()
+
+
+def test_the_reduced_suite_ends_in_its_time_and_shows_what_it_has(tmp_path, asked, monkeypatch):
+    whole, now = suite_run.compare, [0.0]
+    monkeypatch.setattr(suite_run.time, "monotonic", lambda: now[0])
+
+    def slow(cfg, stop_at):
+        now[0] += 0.45 * QUICK_S
+        if now[0] > stop_at:
+            raise TimeoutError
+        return whole(cfg)
+
+    monkeypatch.setattr(suite_run, "compare", slow)
+    result = run(suite(tmp_path, STUDENT, TEACHER, quick=True))
+    assert [name for _, name in asked_for(asked)] == [TEACHER, TEACHER], "a student takes longest"
+    assert set(result.failed.values()) == {OUT_OF_TIME} and now[0] < 1.5 * QUICK_S
+    assert "not run" in (tmp_path / "out" / "paper.html").read_text()
 
 
 def test_everything_is_run_once_and_a_second_call_runs_nothing(tmp_path, asked):
     first = run(suite(tmp_path))
-    expected = [(c.name, TEACHER) for c in CONDITIONS if not c.scanned_goals]
+    expected = [(c.name, TEACHER) for c in OF_TEACHERS]
     assert asked_for(asked) == expected, "a teacher's goals are no clouds: nothing to scan"
     second = run(suite(tmp_path))
     assert len(asked) == len(expected) and second.summary() == first.summary()
@@ -177,7 +212,7 @@ def test_students_have_fewer_episodes(asked):
 def test_an_interruption_keeps_what_was_measured(tmp_path, asked, monkeypatch):
     whole = suite_run.compare
 
-    def interrupted(cfg):
+    def interrupted(cfg, stop_at):
         if len(asked) == 2:
             raise KeyboardInterrupt
         return whole(cfg)
@@ -188,13 +223,23 @@ def test_an_interruption_keeps_what_was_measured(tmp_path, asked, monkeypatch):
     assert "not run" in (tmp_path / "out" / "paper.html").read_text()
     monkeypatch.setattr(suite_run, "compare", whole)
     assert main(arguments) == 0
-    assert asked_for(asked) == [(c.name, TEACHER) for c in CONDITIONS if not c.scanned_goals]
+    assert asked_for(asked) == [(c.name, TEACHER) for c in OF_TEACHERS]
+
+
+def test_an_interruption_before_anything_was_measured_leaves_a_page_too(tmp_path, asked, monkeypatch):
+    def interrupted(cfg, stop_at):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(suite_run, "compare", interrupted)
+    arguments = [TEACHER, "--suite", "paper", "--objects", *SYMMETRIC, "--output", str(tmp_path / "out")]
+    assert main(arguments) == 130
+    assert "Nothing has been measured yet" in read_page(tmp_path / "out" / "paper.html")[0]
 
 
 def test_a_condition_that_fails_costs_no_other(tmp_path, asked, monkeypatch, capsys):
     whole = suite_run.compare
 
-    def fails(cfg):
+    def fails(cfg, stop_at):
         if cfg.in_air:
             raise RuntimeError("world 3 (spoon) is not finite")
         return whole(cfg)
@@ -260,7 +305,9 @@ def test_which_objects_stand_for_the_papers_is_said(tmp_path, asked):
     groups = suite_run.object_groups((), quick=False)
     assert all(objects.own for objects in groups.values())
     assert groups["training"].sets == ("procedural-150-seed0",)
-    with pytest.raises(ValueError, match="'table' is no group of the suite; training, held-out, symmetric"):
+    with pytest.raises(
+        ValueError, match="'table' is no group of the suite; training, validation, held-out, symmetric"
+    ):
         suite_run.object_groups(("table=cube",), quick=False)
 
 
@@ -308,7 +355,7 @@ def test_a_policy_is_known_by_its_weights(tmp_path):
 
 def episode(steps, *, error=1.0, stopped=False, fell=False):
     quat = (0.0, 0.0, 0.0, 1.0)
-    return Episode(0, quat, quat, 2.0, error, steps, stopped, fell)
+    return Episode(0, quat, quat, 2.0, error, error, steps, stopped, fell)
 
 
 def test_measures_count_what_they_say():
@@ -322,7 +369,7 @@ def test_measures_count_what_they_say():
         episode(6, error=0.9, stopped=True),
         episode(180),
     )
-    result = summarise(protocol("p", 8), ("a",), [FakeObject().symmetry], episodes)
+    result = summarise(protocol("p", 8), ("a",), episodes)
     row = replace(compared()[0][0], result=result, outcomes=outcome_shares(result))
     comparison = Comparison((row,), ())
     assert dropped_at_once(comparison, row).value == pytest.approx(2 / 8)

@@ -1,5 +1,8 @@
 """Rules that stop episodes, applied to what happened; with a test double of the environment."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -8,7 +11,7 @@ from fake_env import FakeEnv, FakeObject
 from scipy.spatial.transform import Rotation
 
 from vd.evaluate.compare import parse_groups
-from vd.evaluate.comparison import OUTCOMES, Comparison, judge
+from vd.evaluate.comparison import OUTCOMES, OWN_NORM, Comparison, judge, ways_to_stop
 from vd.evaluate.comparison_page import labels, terminal_table, write_comparison
 from vd.evaluate.result import Protocol
 from vd.evaluate.trace import NEVER_RAD, record
@@ -38,7 +41,7 @@ class Turner:
         self.steps = int(self.env.step_count.numpy()[0])
         action = torch.zeros((self.env.num_worlds, self.env.num_actions))
         action[:, 2] = STEP_RAD * 12.0 * (self.steps < self.until)
-        wp.to_torch(self.env.smoothed)[:] = action
+        wp.to_torch(self.env.smoothed)[:] = 0.5 * action  # a norm of 0.6: within the paper's bound
         return action
 
 
@@ -76,7 +79,7 @@ def test_what_happened_is_written_down():
     ids=["early", "later", "never"],
 )
 def test_the_first_step_within_the_bounds_ends_it(bound, steps, error):
-    (episode,) = traced().episodes(StoppingRule(bound, 2.0), by_prediction=False)
+    (episode,) = traced().episodes(StoppingRule(bound, 2.0), "error")
     assert (episode.steps, episode.stopped) == (steps, bound > 0.1)
     assert episode.error_rad == pytest.approx(error, abs=1e-5), "at the stop, or at the end"
 
@@ -84,30 +87,30 @@ def test_the_first_step_within_the_bounds_ends_it(bound, steps, error):
 def test_a_loud_action_does_not_stop():
     """The object rests from the third step on: the smoothed action has to be below the bound too."""
     trace = traced(policy={"until": 3})
-    (episode,) = trace.episodes(StoppingRule(0.9, 0.5), by_prediction=False)
+    (episode,) = trace.episodes(StoppingRule(0.9, 0.5), "error")
     assert episode.steps == 4 and episode.stopped
 
 
 def test_a_prediction_stops_where_it_says_and_the_truth_is_scored():
     trace = traced(policy={"offset": -0.3})
-    (by_prediction,) = trace.episodes(StoppingRule(0.2, 2.0), by_prediction=True)
-    (by_truth,) = trace.episodes(StoppingRule(0.2, 2.0), by_prediction=False)
+    (by_prediction,) = trace.episodes(StoppingRule(0.2, 2.0), "predicted")
+    (by_truth,) = trace.episodes(StoppingRule(0.2, 2.0), "error")
     assert by_prediction.steps == 4 and by_prediction.error_rad == pytest.approx(0.45, abs=1e-5)
     assert by_truth.steps == 7 and by_truth.error_rad == pytest.approx(0.15, abs=1e-5)
     with pytest.raises(ValueError, match="only a student predicts"):
-        traced().episodes(StoppingRule(), by_prediction=True)
+        traced().episodes(StoppingRule(), "predicted")
 
 
 def test_nothing_stops_before_the_first_action_or_after_a_fall():
     near = traced(0.05, policy={"until": 0})
-    (episode,) = near.episodes(StoppingRule(0.4, 2.0), by_prediction=False)
+    (episode,) = near.episodes(StoppingRule(0.4, 2.0), "error")
     assert episode.steps == 1 and episode.stopped
     fallen = traced(fall_at={0: 3})
     assert fallen.fell[0, 0] and fallen.steps[0, 0] == 3
     assert np.isnan(fallen.exact[0, 0, 4:]).all(), "the next episode is not this one's"
-    (lost,) = fallen.episodes(StoppingRule(0.3, 2.0), by_prediction=False)
+    (lost,) = fallen.episodes(StoppingRule(0.3, 2.0), "error")
     assert lost.fell and lost.steps == 3 and lost.scored_error_rad == pytest.approx(np.pi)
-    (saved,) = fallen.episodes(StoppingRule(0.8, 2.0), by_prediction=False)
+    (saved,) = fallen.episodes(StoppingRule(0.8, 2.0), "error")
     assert saved.stopped and not saved.fell and saved.steps == 1
 
 
@@ -117,12 +120,104 @@ def test_errors_and_stops_are_up_to_symmetry():
     assert trace.error.shape == (2, 2, 13)
     np.testing.assert_allclose(trace.error[1, 0, :4], [0.3, 0.2, 0.1, 0.0], atol=1e-5)
     np.testing.assert_allclose(trace.exact[1, 0], trace.exact[0, 0], atol=1e-9)
-    stopped = trace.ends(StoppingRule(0.4, 2.0), by_prediction=False)[1]
+    stopped = trace.ends(StoppingRule(0.4, 2.0), "error")[1]
     assert stopped.tolist() == [[False, False], [True, True]]
+    quiet = traced(np.pi / 2 + 0.3, objects=(FakeObject("a"), square), episodes=2, policy={"until": 4})
+    rows, _ = judge(
+        quiet.of([1]),
+        protocol("zero", 2),
+        [square],
+        kind="zero",
+        sees="nothing",
+        group="b",
+        rules=lambda _: StoppingRule(),
+    )
+    assert rows[0].symmetric.value == 1.0 and rows[0].outcomes["success"].value == 0.0
+    (episode, _) = rows[0].result.episodes
+    assert episode.error_rad == pytest.approx(0.1, abs=1e-5)
+    assert episode.exact_error_rad == pytest.approx(np.pi / 2 - 0.1, abs=1e-5)
+    assert rows[0].result.overall.symmetric["0.4"].value == 1.0
+    assert rows[0].result.overall.success["0.4"].value == 0.0, "the headline is against the very goal"
+
+
+class HeldEnv(FakeEnv):
+    """Objects that go on turning by a tenth of a radian a step while they are held; some are lost then."""
+
+    lost, held = (), 0
+
+    def __init__(self, *args, lost=(), **settings):
+        super().__init__(*args, **settings)
+        self.cfg.success = SimpleNamespace(fall_m=0.24)
+        self.smoothed = wp.zeros((self.num_worlds, self.num_actions), dtype=float, device="cpu")
+        self.lost, self.tables = lost, []
+        self.sim.place_table = lambda present: None
+        self.sim.place_tables = lambda count, last: self.tables.append((count.numpy()[0], last.numpy()[0]))
+        self.turned = wp.zeros((self.num_worlds, 4), dtype=float, device="cpu")
+
+    def motion(self):
+        """Orientations."""
+        self.turned.numpy()[:] = self._quat
+        return {"turned": self.turned}
+
+    def hold(self):
+        """Turn on, from what was written into the arrays of the motion."""
+        if self.held % 24 == 0:
+            self._quat = self.turned.numpy().astype(float)
+        self.held += 1
+        turn = Rotation.from_rotvec([0.0, 0.0, STEP_RAD / 10.0])
+        self._quat = (turn * Rotation.from_quat(self._quat)).as_quat()
+
+    def _pose(self):
+        pose = super()._pose()
+        pose[list(self.lost), 2] -= 0.5 * (self.held > 0)
+        return pose
+
+
+def test_what_was_stopped_is_held_and_looked_at_again():
+    """The rule stops at 0.35 rad of 0.85; in 2 s the object turns on by 0.24 rad, past the goal or away."""
     rule = StoppingRule(0.4, 2.0)
-    square_only = trace.of([1]), protocol("zero", 2), [square]
-    rows, _ = judge(*square_only, kind="zero", sees="nothing", group="b", rules=lambda _: rule)
-    assert rows[0].outcomes["success"].value == 1.0 and rows[0].exact.value == 0.0
+    env = HeldEnv([FakeObject("a")], num_worlds=3, max_episode_steps=12, tolerance=NEVER_RAD, lost=[1])
+    goals = goal_ahead(0.85, 1, 3)
+    goals["goals"][0, 2] = Rotation.from_rotvec([0.0, 0.0, -2.0]).as_quat()
+    trace = record(env, Turner(env), 3, **goals, held=[(rule, "exact")], table_steps=8)
+    hold = trace.hold(rule, "exact")
+    assert hold.exact[0, 0] == pytest.approx(0.35 - 0.24, abs=1e-4)
+    assert hold.exact[0, 1] == pytest.approx(np.pi), "lost while it was held"
+    assert np.isnan(hold.exact[0, 2]) and np.isnan(hold.error[0, 2]), "never stopped"
+    assert trace.hold(StoppingRule(0.3, 2.0), "exact") is None
+    assert env.held == 24 and env.tables[:4] == [(5, 8), (6, 8), (7, 8), (8, 8)], "the table goes in its time"
+    assert trace.exact[0, 0, 12] == pytest.approx(0.35, abs=1e-5), "the record itself is not changed"
+    assert trace.of([0]).hold(rule, "exact").exact.shape == (1, 3)
+
+
+def test_success_is_reported_at_the_stop_and_after_the_hold():
+    objects = [FakeObject("a"), FakeObject("b")]
+    env = HeldEnv(objects, num_worlds=4, max_episode_steps=24, tolerance=NEVER_RAD, lost=[1])
+    rules = ways_to_stop(lambda _: StoppingRule(0.3, 2.5), 0.4, predicts=True)
+    assert [(w.stopped_by, w.rule.action_norm, bool(w.ours)) for w in rules] == [
+        ("prediction", 1.0, False),
+        ("true distance", 1.0, False),
+        ("prediction", 2.5, True),
+    ], "the paper's bound is the headline, the student's own stands below"
+    trace = record(
+        env,
+        Turner(env, until=6, offset=0.0),
+        2,
+        **goal_ahead(0.85, 2, 2),
+        held=[(way.rule, way.by) for way in rules],
+    )
+    rows, _ = judge(
+        trace,
+        protocol("s", 2),
+        objects,
+        kind="student of stage 2",
+        sees="rendered clouds",
+        group="g",
+        rules=lambda _: StoppingRule(0.3, 2.5),
+    )
+    assert [row.ours for row in rows] == ["", "", OWN_NORM]
+    assert [row.outcomes["success"].value for row in rows] == [1.0, 1.0, 1.0]
+    assert [row.held.value for row in rows] == [0.75, 0.75, 0.75]
 
 
 def test_the_table_goes_and_comes_back():
@@ -157,7 +252,7 @@ def protocol(name, episodes, **changes):
     return Protocol(**{**values, **changes})
 
 
-def compared(offset=-0.3, fall_at=None, rules=lambda _: StoppingRule(0.2, 2.0)):
+def compared(offset=-0.3, fall_at=None, rules=lambda _: StoppingRule(0.2)):
     objects = (FakeObject("a"), FakeObject("b", warnings=("open", "parts are off")))
     trace = traced(objects=objects, episodes=4, policy={"offset": offset}, fall_at=fall_at)
     return judge(
@@ -196,7 +291,7 @@ def test_what_predictions_are_worth():
     by_prediction, by_truth = (row.stops_within for row in rows)
     assert by_prediction["0.4"].value == 0.0, "it stops at 0.45 rad"
     assert by_truth["0.4"].value == by_truth["0.1"].value == 1.0
-    rows, sure = compared(offset=0.0, rules=lambda tolerance: StoppingRule(tolerance, 2.0))
+    rows, sure = compared(offset=0.0, rules=lambda tolerance: StoppingRule(tolerance))
     assert [bound.right for bound in sure.bounds] == [1.0, 1.0]
     assert rows[0].stops_within == rows[1].stops_within
 
@@ -204,7 +299,7 @@ def test_what_predictions_are_worth():
 def test_each_tolerance_has_its_own_rule():
     """Predictions are 0.3 rad too small; the rule for 0.4 rad knows of it, the one for 0.1 does not."""
     bounds = {0.1: 0.1, 0.4: 0.05}
-    rows, _ = compared(rules=lambda tolerance: StoppingRule(bounds[tolerance], 2.0))
+    rows, _ = compared(rules=lambda tolerance: StoppingRule(bounds[tolerance]))
     by_prediction, by_truth = rows
     assert by_prediction.rule.distance_rad == 0.05 and by_truth.rule.distance_rad == 0.4
     assert by_prediction.stops_within["0.4"].value == by_prediction.outcomes["success"].value == 1.0
@@ -217,11 +312,34 @@ def test_page_and_file(tmp_path):
     comparison = Comparison(tuple(rows), (prediction,), software={"torch": "2"})
     comparison.write(tmp_path / "eval.json")
     assert Comparison.read(tmp_path / "eval.json") == comparison
-    write_comparison(comparison, tmp_path / "eval.html")
+    away = [
+        replace(
+            row,
+            policy="/home/me/student.pt",
+            result=replace(
+                row.result,
+                protocol=replace(row.result.protocol, objects="/data/mugs/a", policy="/home/me/student.pt"),
+            ),
+        )
+        for row in rows
+    ]
+    shown = replace(
+        comparison, rows=tuple(away), predictions=(replace(prediction, policy="/home/me/student.pt"),)
+    )
+    write_comparison(shown, tmp_path / "eval.html", pictures=b"\x89PNG")
     html = (tmp_path / "eval.html").read_text()
-    for word in ("object falls", "stopped by", "near and seen so", "training", "parts are off"):
+    for word in (
+        "object falls",
+        "stopped by",
+        "near and seen so",
+        "complete clouds",
+        "training",
+        "up to symmetry",
+        "parts are off",
+    ):
         assert word in html
-    assert html.count("<img") == 3 and "http" not in html.replace("http://www.w3.org", "")
+    assert "/home" not in html and "/data" not in html
+    assert html.count("<img") == 4 and "http" not in html.replace("http://www.w3.org", "")
     assert "orientation error" in terminal_table(comparison)
     (tmp_path / "x.json").write_text('{"format": 1}')
     with pytest.raises(ValueError, match="run vd-eval again"):

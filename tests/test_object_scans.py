@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from vd.assets_usd.objects.geometry import mesh_volume, random_surface_points, surface_points
 from vd.assets_usd.objects.model import SURFACE_POINTS, load_set
 from vd.assets_usd.objects.scans import smooth, surface_of_scan
-from vd.evaluate.scanned import known_by_scan
+from vd.evaluate.scanned import known_by_points, scan
 from vd.student.registration import Registration
 from vd.student.symmetry import symmetries
 
@@ -81,7 +81,10 @@ def test_points_that_enclose_nothing_are_refused():
 def test_an_object_is_known_by_its_scan(device):
     """Surface and samples agree, so that it is looked for by its surface, inside and outside told apart."""
     items = load_set("procedural-150-seed0")[:40:13]
-    known = [known_by_scan(item, np.random.default_rng(i), device) for i, item in enumerate(items)]
+    known = [
+        known_by_points(item, scan(item.surface_points, np.random.default_rng(i)), device)
+        for i, item in enumerate(items)
+    ]
     for item, found in zip(items, known, strict=True):
         assert found.name == item.name and found.surface_points.shape == (SURFACE_POINTS, 3)
         assert off(found.surface_points, (found.vertices, found.faces)).max() < 1.5e-3

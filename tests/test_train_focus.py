@@ -44,6 +44,7 @@ def _evaluation(rates: dict[str, float]):
             goal_quat=IDENTITY,
             start_error_rad=1.0,
             error_rad=0.2 if number < round(4 * rate) else 2.0,
+            exact_error_rad=0.2 if number < round(4 * rate) else 2.0,
             steps=100,
             stopped=number < round(4 * rate),
             fell=False,
@@ -51,7 +52,7 @@ def _evaluation(rates: dict[str, float]):
         for index, rate in enumerate(rates.values())
         for number in range(4)
     )
-    return summarise(PROTOCOL, tuple(rates), [np.array([IDENTITY])] * len(rates), episodes)
+    return summarise(PROTOCOL, tuple(rates), episodes)
 
 
 @given(weights=st.lists(st.floats(0.001, 1000.0), min_size=1, max_size=12), spare=st.integers(0, 200))

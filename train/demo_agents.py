@@ -55,8 +55,6 @@ def compare_agents(
     Yields:
         Name, result and count of each agent.
     """
-    import numpy as np
-
     from vd.assets_usd.objects.model import load_set
     from vd.evaluate.agents import built_in
     from vd.evaluate.result import Protocol, summarise
@@ -88,7 +86,7 @@ def compare_agents(
             goals_about_vertical=task.goal.about_vertical,
         )
         names = tuple(item.name for item in env.objects)
-        result = summarise(protocol, names, [np.array([IDENTITY])] * count, recorded)
+        result = summarise(protocol, names, recorded)
         yield agent, result, GoalCount(env.num_worlds, reached)
     env.close()
 
@@ -128,6 +126,7 @@ def first_goals(env: Any, policy: Any, *, title: str = "") -> "tuple[Episode, ..
                         goal_quat=_quat(goals[world]),
                         start_error_rad=float(errors[world]),
                         error_rad=float(angle[world]),
+                        exact_error_rad=float(angle[world]),
                         steps=step,
                         stopped=bool(reached[world] and not fell[world]),
                         fell=bool(fell[world]),

@@ -6,6 +6,7 @@ page can be mailed, opened from a disk, printed, and read in a light or dark bro
 
 import base64
 import io
+import re
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -27,14 +28,15 @@ _STYLE = """
 *{box-sizing:border-box}
 body{margin:0;background:var(--ground);color:var(--ink);
 font:16px/1.55 system-ui,-apple-system,"Segoe UI",sans-serif}
-main{max-width:62rem;margin:0 auto;padding:2rem 1.25rem 4rem}
+main{max-width:72rem;margin:0 auto;padding:2rem 1.25rem 4rem}
 h1{font-size:1.9rem;line-height:1.2;margin:0 0 .25rem}h2{font-size:1.3rem;margin:2.5rem 0 .75rem}
 .lead,figcaption,.small{color:var(--soft)}p{margin:.6rem 0;max-width:46rem}
 ul{margin:.6rem 0;padding-left:1.3rem;max-width:46rem}li{margin:.25rem 0}
 .scroll{overflow-x:auto;margin:1rem 0}details{margin:1rem 0}summary{cursor:pointer;font-weight:600}
 table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;font-size:.92rem}
-th,td{padding:.4rem .7rem;border-bottom:1px solid var(--line);text-align:right;white-space:nowrap}
-th:first-child,td:first-child,.words{text-align:left}td.words{white-space:normal;min-width:12rem}
+th,td{padding:.4rem .7rem;border-bottom:1px solid var(--line);text-align:right}
+td small{display:block;color:var(--soft);white-space:nowrap}
+th:first-child,td:first-child,.words{text-align:left}td.words{min-width:7rem;overflow-wrap:anywhere}
 thead th{color:var(--soft);font-weight:600;border-bottom:2px solid var(--line)}
 figure{margin:1.2rem 0}figure img,figure video{display:block;max-width:100%;height:auto;border-radius:.5rem}
 figure img{background:#fff}figcaption{font-size:.88rem;margin-top:.4rem;max-width:46rem}
@@ -112,7 +114,7 @@ class Page:
         head = "".join(f"<th{kind}>{escape(name)}</th>" for kind, name in zip(kinds, header, strict=True))
         body = "".join(
             "<tr>"
-            + "".join(f"<td{kind}>{escape(str(cell))}</td>" for kind, cell in zip(kinds, row, strict=True))
+            + "".join(f"<td{kind}>{_cell(str(cell))}</td>" for kind, cell in zip(kinds, row, strict=True))
             + "</tr>"
             for row in rows
         )
@@ -157,6 +159,19 @@ class Page:
     def write(self, path: Path) -> None:
         """Write the page to ``path`` atomically."""
         write_text(path, self.html())
+
+
+_WITH_INTERVAL = re.compile(r"(-?[\d.]+(?: ?%| [a-z]+)?) (\([^()]+ to [^()]+\))")
+"""A number and its interval."""
+
+
+def _cell(text: str) -> str:
+    """A cell's text; an interval goes below its number, so that columns are narrow."""
+    found = _WITH_INTERVAL.fullmatch(text)
+    if found is None:
+        return escape(text)
+    value, interval = (escape(part) for part in found.groups())
+    return f"{value.replace(' ', '&nbsp;')} <small>{interval}</small>"
 
 
 def _png(figure: Any) -> bytes:

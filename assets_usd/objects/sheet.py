@@ -5,6 +5,7 @@ two lights and an outline where the depth jumps.
 """
 
 import colorsys
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -250,3 +251,34 @@ def contact_sheet(
     with atomic_path(Path(path)) as temporary:
         sheet.save(temporary)
     return Path(path)
+
+
+def pictures(models: Sequence[ObjectModel], *, tile: int = 104, columns: int = 10, most: int = 40) -> bytes:
+    """PNG with the mesh of every object and its name; of more than ``most`` the first ones.
+
+    Args:
+        models: Objects.
+        tile: Side of a picture, pixels.
+        columns: Pictures in a row.
+        most: Objects that are drawn.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    shown, caption = models[:most], 18
+    columns = min(columns, len(shown))
+    paper = tuple(int(255 * c) for c in BACKGROUND)
+    image = Image.new("RGB", (columns * tile, -(-len(shown) // columns) * (tile + caption)), paper)
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(11)
+    for i, model in enumerate(shown):
+        left, top = (i % columns) * tile, (i // columns) * (tile + caption)
+        half = 0.54 * float(np.ptp(model.vertices @ camera_axes()[:2].T, axis=0).max())
+        plain = np.tile(MESH_COLOUR, (len(model.faces), 1))
+        drawn = render(model.vertices, model.faces, plain, tile, half)
+        image.paste(Image.fromarray((drawn * 255.0 + 0.5).astype(np.uint8)), (left, top))
+        name = model.name
+        while draw.textlength(name, font=font) > tile - 6 and len(name) > 4:
+            name = name[:-2].rstrip("_") + "…" if not name.endswith("…") else name[:-2] + "…"
+        draw.text((left + 3, top + tile), name, fill=INK, font=font)
+    buffer = io.BytesIO()
+    image.save(buffer, format="png")
+    return buffer.getvalue()

@@ -2,7 +2,8 @@
 
 import math
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,6 @@ from vd.evaluate.agents import (
     BUILT_IN,
     built_in,
     check_bundle,
-    is_saved_student,
     open_critic,
     open_policy,
     sees_clouds,
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
     from vd.evaluate.cli import EvalCfg
     from vd.evaluate.comparison import Comparison
+    from vd.evaluate.trace import Trace
+    from vd.student.stopping import StoppingRule
 
 STUDENT_WORLDS_GPU = 1024
 """Worlds simulated at once by default where a student looks at them: depth images and clouds take memory."""
@@ -46,16 +48,22 @@ def parse_groups(objects: Sequence[str]) -> dict[str, tuple[str, ...]]:
     return groups
 
 
-def compare(cfg: "EvalCfg") -> "Comparison":
+def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
     """Run a comparison and write its JSON and page into ``cfg.output``.
+
+    Args:
+        cfg: Settings of the command line.
+        stop_at: When to give up [s], on the monotonic clock.
 
     Raises:
         ValueError: A setting, object set or policy cannot be used.
         FileNotFoundError: There is no such policy.
         vd.sim.simulator.SimulationError: Contacts were lost, or a world left the finite numbers.
+        TimeoutError: It was to give up.
     """
     quiet_warp()
     from vd.assets_usd.objects.model import load_set
+    from vd.assets_usd.objects.sheet import pictures
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.cli import resolve_device, software, worlds_for
     from vd.evaluate.comparison import Comparison, judge
@@ -86,7 +94,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             task, start = wanted, env.state_dict()
         env.load_state_dict(start)
         actor, kind, sees, rules = _actor(cfg, name, policy, env, device)
-        trace = _run(cfg, env, actor, name)
+        trace = _run(cfg, env, actor, name, rules, stop_at)
         protocol = Protocol(
             policy=name,
             objects="",
@@ -103,10 +111,11 @@ def compare(cfg: "EvalCfg") -> "Comparison":
             goals_about_vertical=wanted.start.at_rest and wanted.goal.about_vertical,
             in_air=cfg.in_air,
             table_friction=cfg.table_friction,
-            scanned_goals=cfg.scanned_goals,
+            goals=cfg.goals,
+            sensor_errors=cfg.sensor_errors and sees == "rendered clouds",
             nudge=cfg.nudge,
             explore=cfg.explore,
-            aim=cfg.aim or (is_saved_student(policy) and policy.spec.network.aim.enabled),
+            aim=cfg.aim,
             second_view=cfg.second_view and name not in BUILT_IN,
         )
         index = {item.name: number for number, item in enumerate(env.objects)}
@@ -127,7 +136,7 @@ def compare(cfg: "EvalCfg") -> "Comparison":
     env.close()
     comparison = Comparison(tuple(rows), tuple(predictions), software=software(device))
     comparison.write(cfg.output / "eval.json")
-    write_comparison(comparison, cfg.output / "eval.html")
+    write_comparison(comparison, cfg.output / "eval.html", pictures=pictures(env.objects))
     return comparison
 
 
@@ -190,7 +199,9 @@ def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str)
         env,
         policy,
         rendered=rendered,
-        scanned_goals=cfg.scanned_goals,
+        goals=cfg.goals,
+        sensor_errors=cfg.sensor_errors,
+        aim=cfg.aim,
         critic=open_critic(policy, device) if cfg.second_view else None,
         seed=cfg.seed,
     )
@@ -198,12 +209,24 @@ def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str)
     return actor, f"student of stage {policy.spec.stage}", sees, policy.spec.rule_for
 
 
-def _run(cfg: "EvalCfg", env: Any, actor: Any, name: str) -> Any:
-    """All episodes of one policy, with a progress bar."""
+def _run(
+    cfg: "EvalCfg",
+    env: Any,
+    actor: Any,
+    name: str,
+    rules: Callable[[float], "StoppingRule"],
+    stop_at: float,
+) -> "Trace":
+    """All episodes of one policy, with a progress bar.
+
+    Raises:
+        TimeoutError: The monotonic clock has come to ``stop_at`` [s].
+    """
     import numpy as np
     from tqdm import tqdm
 
     from vd.evaluate.cli import LOG_EVERY_S
+    from vd.evaluate.comparison import ways_to_stop
     from vd.evaluate.result import air_table_steps
     from vd.evaluate.rollout import draw_starts_and_goals
     from vd.evaluate.trace import record
@@ -218,7 +241,14 @@ def _run(cfg: "EvalCfg", env: Any, actor: Any, name: str) -> Any:
     rounds = math.ceil(cfg.episodes / (env.num_worlds // len(env.objects)))
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
     title = Path(name).name or name
+    ways = ways_to_stop(rules, cfg.stop_tolerance, predicts=hasattr(actor, "predicted"))
     with tqdm(total=rounds * env.max_episode_steps, unit="step", desc=title, mininterval=refresh) as bar:
+
+        def stepped() -> None:
+            bar.update()
+            if time.monotonic() > stop_at:
+                raise TimeoutError(f"{title} did not end in the time that was left")
+
         trace = record(
             env,
             actor,
@@ -226,7 +256,8 @@ def _run(cfg: "EvalCfg", env: Any, actor: Any, name: str) -> Any:
             starts=starts,
             goals=goals,
             table_steps=air_table_steps(env.cfg.sim.control_hz) if cfg.in_air else None,
-            on_step=bar.update,
+            held=[(way.rule, way.by) for way in ways],
+            on_step=stepped,
         )
     env.check()
     return trace

@@ -14,20 +14,23 @@ import numpy as np
 from vd.config import from_dict, to_dict
 from vd.evaluate.result import EvalResult, Protocol, summarise, warnings_of
 from vd.evaluate.statistics import Interval, Unit, choose_unit, rate_intervals
-from vd.evaluate.trace import Trace
+from vd.evaluate.trace import StopsBy, Trace
 from vd.files import write_json
 from vd.paper import PAPER
 from vd.student.stopping import StoppingRule
 
-COMPARISON_FORMAT = "visual-dexterity comparison 4"
+COMPARISON_FORMAT = "visual-dexterity comparison 5"
 OUTCOMES = ("success", "orientation error", "time-out", "object falls")
-"""Classes of episodes: stopped within the tolerance, stopped outside of it, never stopped, lost."""
+"""Classes of episodes: stopped within the tolerance of the very goal, stopped outside of it, never stopped,
+lost."""
 BOUNDS_RAD = (PAPER.success.precise_rad, PAPER.success.rotation_rad)
 """Bounds on the distance at which stops and predictions are judged, as in the paper."""
 SCATTER = 2000
 """Pairs of predicted and true distance that are kept for a figure."""
 
 StoppedBy = Literal["prediction", "true distance"]
+OWN_NORM = "its own bound of the action"
+"""Mark of rows that are ours: stopped by the bound of the action's norm that a student's file has."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +50,17 @@ class Row:
     """Bounds of the distance and of the action's norm."""
     outcomes: dict[str, Interval]
     """Share of episodes in each class."""
-    exact: Interval
-    """Share of episodes stopped within the tolerance of the very goal, not of what looks like it."""
+    held: Interval | None
+    """Share of episodes stopped so, and still there after the hand has held for HOLD_S; None: not tried."""
+    symmetric: Interval
+    """Share of episodes stopped within the tolerance of what looks like the goal; where the true distance
+    decides, it is that distance."""
     stops_within: dict[str, Interval]
     """By tolerance [rad] (as text): share of episodes that stop within it, by the rule for this tolerance."""
     result: EvalResult
     """Episodes and summaries; their stops are those of ``stopped_by``."""
+    ours: str = ""
+    """What of it is ours, not the paper's; empty for the conditions of the paper."""
 
 
 @dataclass(frozen=True)
@@ -144,28 +152,19 @@ def judge(
     Args:
         trace: Its episodes with the objects of the group.
         protocol: How they were run.
-        objects: The objects (name, symmetry and warnings are read).
+        objects: The objects (name and warnings are read).
         kind: Of the policy.
         sees: What it sees.
         group: Name of the group.
-        rules: The policy's own rule for a tolerance [rad]; where the true distance decides, it is held
-            against the tolerance itself, with the same bound on the action.
+        rules: The policy's own rule for a tolerance [rad], see :func:`ways_to_stop`.
         resample: Of the intervals.
     """
-    rule = rules(protocol.stop_tolerance_rad)
-    true_rule = replace(rule, distance_rad=protocol.stop_tolerance_rad)
-    ways: list[tuple[StoppedBy, StoppingRule]] = [("true distance", true_rule)]
-    if trace.predicted is not None:
-        ways.insert(0, ("prediction", rule))
     rows, unit = [], choose_unit(len(objects), resample)
-    for stopped_by, bounds in ways:
-        by_prediction = stopped_by == "prediction"
-        episodes = trace.episodes(bounds, by_prediction=by_prediction)
+    for way in ways_to_stop(rules, protocol.stop_tolerance_rad, predicts=trace.predicted is not None):
         result = summarise(
             protocol,
             tuple(item.name for item in objects),
-            [item.symmetry for item in objects],
-            episodes,
+            trace.episodes(way.rule, way.by),
             resample=resample,
             warnings=warnings_of(objects),
         )
@@ -175,15 +174,49 @@ def judge(
                 kind=kind,
                 sees=sees,
                 group=group,
-                stopped_by=stopped_by,
-                rule=bounds,
+                stopped_by=way.stopped_by,
+                rule=way.rule,
                 outcomes=outcome_shares(result, resample=resample),
-                exact=_exact(trace, bounds, protocol.stop_tolerance_rad, by_prediction, unit),
-                stops_within=_stops_within(trace, rules, by_prediction, unit),
+                held=_held(trace, way, protocol.stop_tolerance_rad, unit),
+                symmetric=_symmetric(trace, way, protocol.stop_tolerance_rad, unit),
+                stops_within=_stops_within(trace, rules, way, unit),
                 result=result,
+                ours=way.ours,
             )
         )
     return rows, _prediction(trace, protocol.policy, group)
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to stop the episodes of a policy."""
+
+    stopped_by: StoppedBy
+    rule: StoppingRule
+    by: StopsBy
+    ours: str = ""
+
+
+def ways_to_stop(
+    rules: Callable[[float], StoppingRule], tolerance_rad: float, *, predicts: bool
+) -> list[Way]:
+    """The ways to stop a policy, the headline first.
+
+    They are the bounds of the distance that it predicts, if it does, and of the true one, both with the
+    paper's bound of the action's norm; and, as ours, its own bound of the norm where that is another.
+
+    Args:
+        rules: The policy's own rule for a tolerance [rad].
+        tolerance_rad: Of the stop; bound of the true distance, too.
+        predicts: Whether it predicts distances.
+    """
+    own, norm = rules(tolerance_rad), PAPER.success.action_norm
+    ways = [Way("true distance", StoppingRule(tolerance_rad, norm), "exact")]
+    if predicts:
+        ways.insert(0, Way("prediction", replace(own, action_norm=norm), "predicted"))
+        if own.action_norm != norm:
+            ways.append(Way("prediction", own, "predicted", OWN_NORM))
+    return ways
 
 
 def outcome_shares(
@@ -193,36 +226,51 @@ def outcome_shares(
     shape = len(result.object_names), -1
     stopped = np.array([e.stopped for e in result.episodes]).reshape(shape)
     fell = np.array([e.fell for e in result.episodes]).reshape(shape)
-    right = np.array([e.error_rad <= result.protocol.stop_tolerance_rad for e in result.episodes]).reshape(
-        shape
-    )
+    tolerance = result.protocol.stop_tolerance_rad
+    right = np.array([e.exact_error_rad <= tolerance for e in result.episodes]).reshape(shape)
     classes = np.stack([stopped & right, stopped & ~right, ~stopped & ~fell, ~stopped & fell])
     unit = choose_unit(len(result.object_names), resample)
     return dict(zip(OUTCOMES, rate_intervals(classes, unit), strict=True))
 
 
-def _exact(
-    trace: Trace, rule: StoppingRule, tolerance_rad: float, by_prediction: bool, unit: Unit
-) -> Interval:
-    """Share of episodes that a rule stops within the tolerance of the very goal."""
-    steps, stopped = trace.ends(rule, by_prediction=by_prediction)
-    error = np.take_along_axis(trace.exact, steps[..., None], axis=-1)[..., 0]
+def _held(trace: Trace, way: Way, tolerance_rad: float, unit: Unit) -> Interval | None:
+    """Share of episodes stopped within the tolerance of the very goal, and still there after the hold."""
+    hold = trace.hold(way.rule, way.by)
+    if hold is None:
+        return None
+    _, error = _at_stop(trace, way.rule, way.by, trace.exact)
+    with np.errstate(invalid="ignore"):  # what was never stopped was not held
+        return rate_intervals(((error <= tolerance_rad) & (hold.exact <= tolerance_rad))[None], unit)[0]
+
+
+def _symmetric(trace: Trace, way: Way, tolerance_rad: float, unit: Unit) -> Interval:
+    """Share of episodes that are stopped within the tolerance of what looks like the goal."""
+    by: StopsBy = "error" if way.by == "exact" else way.by
+    stopped, error = _at_stop(trace, way.rule, by, trace.error)
     return rate_intervals((stopped & (error <= tolerance_rad))[None], unit)[0]
 
 
 def _stops_within(
-    trace: Trace, rules: Callable[[float], StoppingRule], by_prediction: bool, unit: Unit
+    trace: Trace, rules: Callable[[float], StoppingRule], way: Way, unit: Unit
 ) -> dict[str, Interval]:
-    """Share of episodes that stop within each of BOUNDS_RAD by the rule for it."""
+    """Share of episodes that stop within each of BOUNDS_RAD of the very goal by the rule for it."""
     within = []
     for bound in BOUNDS_RAD:
-        rule = rules(bound)
-        if not by_prediction:
-            rule = replace(rule, distance_rad=bound)
-        steps, stopped = trace.ends(rule, by_prediction=by_prediction)
-        error = np.take_along_axis(trace.error, steps[..., None], axis=-1)[..., 0]
+        ways = ways_to_stop(rules, bound, predicts=trace.predicted is not None)
+        same = next((w for w in ways if (w.by, w.ours) == (way.by, way.ours)), None)
+        # A rule that has the paper's bound for this tolerance has no other of its own.
+        rule = rules(bound) if same is None else same.rule
+        stopped, error = _at_stop(trace, rule, way.by, trace.exact)
         within.append(stopped & (error <= bound))
     return dict(zip(map(str, BOUNDS_RAD), rate_intervals(np.stack(within), unit), strict=True))
+
+
+def _at_stop(
+    trace: Trace, rule: StoppingRule, by: StopsBy, error: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether a rule stops each episode, and the error where it ends, one of the trace's [K, M]."""
+    steps, stopped = trace.ends(rule, by)
+    return stopped, np.take_along_axis(error, steps[..., None], axis=-1)[..., 0]
 
 
 def _prediction(trace: Trace, policy: str, group: str) -> Prediction | None:

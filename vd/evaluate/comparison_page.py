@@ -6,18 +6,16 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from vd.evaluate.comparison import OUTCOMES, Comparison, Row
+from vd.evaluate.comparison import BOUNDS_RAD, OUTCOMES, Comparison, Row
 from vd.evaluate.plots import BLUE, GREEN, GREY, ORANGE, ecdf
-from vd.evaluate.report import add_warnings, goals_text, number, percent, starts_text
-from vd.evaluate.result import TOLERANCES_RAD
+from vd.evaluate.report import add_warnings, goals_text, number, percent, shown_name, starts_text
 from vd.evaluate.statistics import chance_cdf
+from vd.evaluate.trace import HOLD_S
 from vd.page import Page
 from vd.paper import PAPER
 
 COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Of policies, in their order (Okabe and Ito)."""
-EXACT = "very goal"
-"""Heading of the share that was stopped near the goal itself, not near what looks like it."""
 OUTCOME_COLOURS = dict(zip(OUTCOMES, (GREEN, "#E69F00", GREY, ORANGE), strict=True))
 PANEL_WIDTH, PANEL_HEIGHT = 4.2, 3.9
 """Of one panel of a figure [inch]."""
@@ -29,13 +27,13 @@ _HEADER = (
     "policy",
     "objects",
     "stopped by",
-    "episodes",
-    *OUTCOMES,
-    EXACT,
-    *(f"<= {tolerance:g} rad" for tolerance in TOLERANCES_RAD if tolerance <= NEAR_RAD),
+    "success",
+    f"and held {HOLD_S:g} s",
+    "success up to symmetry",
     "median error [rad]",
-    "time to stop [s]",
 )
+"""Of the headline, which is against the very goal but for one column."""
+_REST_HEADER = ("policy", "objects", "stopped by", *OUTCOMES[1:], "time to stop [s]")
 _BOUND_HEADER = (
     "student",
     "objects",
@@ -66,23 +64,36 @@ def labels(names: tuple[str, ...]) -> dict[str, str]:
     return short
 
 
-def write_comparison(comparison: Comparison, path: Path) -> None:
-    """Write the page."""
+def write_comparison(comparison: Comparison, path: Path, *, pictures: bytes | None = None) -> None:
+    """Write the page.
+
+    Args:
+        comparison: What was found.
+        path: Of the page.
+        pictures: PNG with the objects.
+    """
     page = Page("Comparison of policies", _lead(comparison))
     short = labels(comparison.policies)
-    page.section("How episodes ended")
-    page.table(_HEADER, [_cells(row, short) for row in comparison.rows], words=(1, 2))
+    rows = in_order(comparison.rows)
+    page.section("Success")
+    page.table(_HEADER, [_cells(row, short) for row in rows], words=(1, 2))
+    page.text(_HEADLINE, small=True)
+    page.section("How the other episodes ended")
+    page.table(_REST_HEADER, [_rest_cells(row, short) for row in rows], words=(1, 2))
     page.figure(
         outcome_figure(comparison),
-        "Success: stopped within the tolerance. Orientation error: stopped outside of it. Time-out: never "
-        "stopped. Object falls: it left the hand before a stop.",
+        "Success: stopped within the tolerance of the very goal. Orientation error: stopped outside of it. "
+        "Time-out: never stopped. Object falls: it left the hand before a stop.",
     )
+    if pictures is not None:
+        page.section("Objects")
+        page.figure(pictures, "The objects as they are simulated, each at its own scale.")
     page.section("Errors")
     page.figure(
         ecdf_figure(comparison),
-        "Share of episodes that ended within each error. Solid: stopped by itself, a student by its "
-        "prediction, others by the true distance. Dashed: a student stopped by the true distance. A lost "
-        "object never counts, so curves end below one.",
+        "Share of episodes that ended within each error of the very goal. Solid: stopped by itself, a "
+        "student by its prediction, others by the true distance. Dashed: a student stopped by the true "
+        "distance. A lost object never counts, so curves end below one.",
     )
     if comparison.predictions:
         page.section("Predicted distance")
@@ -101,21 +112,22 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
         )
     add_warnings(page, comparison.warnings)
     page.section("Every object")
-    for row in comparison.rows:
-        heading = f"{short[row.policy]}, {row.group}, stopped by {row.stopped_by}"
+    shown = [str(bound) for bound in BOUNDS_RAD]
+    for row in rows:
+        heading = f"{short[row.policy]}, {row.group}, stopped by {_stopped_by(row)}"
         cells = [
             (
                 summary.name,
                 str(summary.episodes),
-                *(percent(rate) for rate in summary.success.values()),
+                *(percent(summary.success[key]) for key in shown),
+                percent(summary.symmetric[str(PAPER.success.rotation_rad)]),
                 number(summary.median_error_rad),
-                percent(summary.stop_rate),
                 percent(summary.drop_rate),
             )
             for summary in row.result.per_object
         ]
-        header = ("object", "episodes", *(f"<= {t:g} rad" for t in TOLERANCES_RAD), "median error [rad]")
-        page.table((*header, "stopped", "fell"), cells, folded=heading)
+        header = ("object", "episodes", *(f"<= {key} rad" for key in shown), "<= 0.4 up to symmetry")
+        page.table((*header, "median error [rad]", "fell"), cells, folded=heading)
     page.section("Protocol")
     page.table(("setting", "value"), _protocol(comparison), words=(1,))
     page.text(_METHOD, small=True)
@@ -123,15 +135,33 @@ def write_comparison(comparison: Comparison, path: Path) -> None:
 
 
 def terminal_table(comparison: Comparison) -> str:
-    """The table of outcomes for a terminal."""
+    """The tables of the headline and of the other episodes as one, for a terminal."""
     short = labels(comparison.policies)
-    # Of the shares only the first has its interval here: a line has to fit.
-    shares = range(_HEADER.index(OUTCOMES[1]), len(_HEADER) - 2)
-    rows = [_HEADER]
-    for row in comparison.rows:
-        cells = _cells(row, short)
-        rows.append(tuple(c.split(" (")[0] if i in shares else c for i, c in enumerate(cells)))
+    rows: list[Sequence[str]] = [(*_HEADER, *_REST_HEADER[3:])]
+    for row in in_order(comparison.rows):
+        cells = (*_cells(row, short), *_rest_cells(row, short)[3:])
+        # Of the shares only the first has its interval here: a line has to fit.
+        rows.append(tuple(c if i <= 3 else c.split(" (")[0] for i, c in enumerate(cells)))
     return aligned(rows, words=3)
+
+
+def in_order(rows: Sequence[Row]) -> list[Row]:
+    """Rows under the paper's conditions, then those with what is ours."""
+    return sorted(rows, key=lambda row: bool(ours(row)))
+
+
+def ours(row: Row) -> str:
+    """What of a row's conditions is ours, not the paper's; empty: nothing."""
+    protocol = row.result.protocol
+    found = [row.ours] if row.ours else []
+    for name, text in (
+        ("second_view", "symmetry-view selection"),
+        ("aim", "aims past near goals"),
+        ("nudge", "nudges"),
+        ("explore", "noise far from the goal"),
+    ):
+        found += [text] if getattr(protocol, name) else []
+    return ", ".join(found)
 
 
 def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
@@ -154,7 +184,7 @@ def ecdf_figure(comparison: Comparison) -> Figure:
     for axes, group in zip(panels, comparison.groups, strict=True):
         rows = [row for row in comparison.rows if row.group == group]
         students = {row.policy for row in rows if row.stopped_by == "prediction"}
-        for row in rows:
+        for row in (row for row in rows if not row.ours):
             other = row.policy in students and row.stopped_by == "true distance"
             style = {"linestyle": "--", "linewidth": 1.2} if other else {"linewidth": 2.0}
             label = None if other else _named(row, short)
@@ -171,7 +201,7 @@ def ecdf_figure(comparison: Comparison) -> Figure:
 
 def outcome_figure(comparison: Comparison) -> Figure:
     """Shares of the outcome classes as stacked bars."""
-    short, rows = labels(comparison.policies), comparison.rows
+    short, rows = labels(comparison.policies), in_order(comparison.rows)
     figure = Figure(figsize=(9.0, 1.2 + 0.34 * len(rows)), layout="constrained")
     axes = figure.add_subplot()
     axes.spines[["top", "right"]].set_visible(False)
@@ -181,7 +211,7 @@ def outcome_figure(comparison: Comparison) -> Figure:
         shares = np.array([row.outcomes[name].value for row in rows])
         axes.barh(places, shares, left=left, color=OUTCOME_COLOURS[name], label=name, height=0.7)
         left += shares
-    names = [f"{short[row.policy]}, {row.group}, by {row.stopped_by}" for row in rows]
+    names = [f"{short[row.policy]}, {row.group}, by {_stopped_by(row)}" for row in rows]
     axes.set_yticks(places, names, fontsize=8)
     axes.set(xlim=(0.0, 1.0), xlabel="share of episodes")
     axes.legend(frameon=False, fontsize=8, ncols=len(OUTCOMES), loc="lower center", bbox_to_anchor=(0.4, 1.0))
@@ -231,18 +261,31 @@ def _named(row: Row, short: dict[str, str]) -> str:
     return row.kind if row.kind == row.policy else f"{short[row.policy]} ({row.kind})"
 
 
+def _stopped_by(row: Row) -> str:
+    """What stops a row's episodes, marked where its conditions are ours."""
+    return f"{row.stopped_by}; ours: {ours(row)}" if ours(row) else row.stopped_by
+
+
 def _cells(row: Row, short: dict[str, str]) -> tuple[str, ...]:
-    overall = row.result.overall
-    shown = [rate for key, rate in overall.success.items() if float(key) <= NEAR_RAD]
     return (
         _named(row, short),
         row.group,
-        row.stopped_by,
-        str(overall.episodes),
-        *(percent(row.outcomes[name]) for name in OUTCOMES),
-        percent(row.exact),
-        *(percent(rate) for rate in shown),
-        number(overall.median_error_rad),
+        _stopped_by(row),
+        percent(row.outcomes[OUTCOMES[0]]),
+        "not tried" if row.held is None else percent(row.held),
+        percent(row.symmetric),
+        number(row.result.overall.median_error_rad),
+    )
+
+
+def _rest_cells(row: Row, short: dict[str, str]) -> tuple[str, ...]:
+    shares = (percent(row.outcomes[name]) for name in OUTCOMES[1:])
+    overall = row.result.overall
+    return (
+        _named(row, short),
+        row.group,
+        _stopped_by(row),
+        *shares,
         number(overall.time_to_success_s),
     )
 
@@ -251,7 +294,7 @@ def _bound_cells(comparison: Comparison, short: dict[str, str]) -> list[tuple[st
     def share(value: float | None) -> str:
         return "none" if value is None else f"{100 * value:.1f} %"
 
-    rows = {(row.policy, row.group, row.stopped_by): row for row in comparison.rows}
+    rows = {(row.policy, row.group, row.stopped_by): row for row in comparison.rows if not row.ours}
     return [
         (
             short[entry.policy],
@@ -279,8 +322,9 @@ def _lead(comparison: Comparison) -> str:
 
 def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
     protocol = comparison.rows[0].result.protocol
+    hands = dict.fromkeys(shown_name(row.result.protocol.hand_name) for row in comparison.rows)
     rows = [
-        ("hand", ", ".join(dict.fromkeys(row.result.protocol.hand_name for row in comparison.rows))),
+        ("hand", ", ".join(hands)),
         ("starts and goals", f"{protocol.episodes} each for every object, seed {protocol.seed}"),
         ("starts", starts_text(protocol)),
         ("goals", goals_text(protocol)),
@@ -294,16 +338,19 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
         rows.append(("hands whose object stands still far from the goal", "are nudged"))
     if protocol.explore:
         rows.append(("actions far from the goal", "have noise"))
-    if protocol.scanned_goals:
-        rows.append(("goals of students", "from scans"))
+    known = {"mesh": "the exact mesh", "points": "500 exact points", "scan": "500 points of a scan"}
+    rows.append(("students know shapes and goals by", known[protocol.goals]))
+    rows.append(("stops", f"bound of the action's norm {PAPER.success.action_norm:g}, as the paper's"))
     by_group = {row.group: row.result.protocol.objects for row in comparison.rows}
-    rows += [(f"objects: {name}", sets) for name, sets in by_group.items()]
-    for row in comparison.rows:
+    rows += [(f"objects: {name}", shown_name(sets)) for name, sets in by_group.items()]
+    short = labels(comparison.policies)
+    for row in in_order(comparison.rows):
         if row.stopped_by == "prediction" or row.kind == "teacher":
             rule = f"distance {row.rule.distance_rad:.3g} rad, action norm {row.rule.action_norm:.3g}"
-            aims = ", aims past goals that are near" if row.result.protocol.aim else ""
-            looks = ", looks twice" if row.result.protocol.second_view else ""
-            rows.append((f"{row.policy}, {row.group}", f"sees {row.sees}, stops below {rule}{aims}{looks}"))
+            errs = ", which err as a real camera does" if row.result.protocol.sensor_errors else ""
+            mark = f"; ours: {ours(row)}" if ours(row) else ""
+            told = f"sees {row.sees}{errs}, stops below {rule}{mark}"
+            rows.append((f"{short[row.policy]}, {row.group}", told))
     return rows + list(comparison.software.items())
 
 
@@ -312,7 +359,11 @@ _METHOD = (
     "by each rule at the first step at which it holds: what decides to stop does not change what happened "
     "before. A rule is a bound on the distance, predicted by a student or true, and one on the norm of the "
     "smoothed action; unlike the evaluation of a single teacher it does not ask for stillness. "
-    "Errors, and distances to stop by, are up to the symmetry of the shape; of the very goal: the share that "
-    "was stopped near the goal itself, not near what looks like it. Intervals are "
-    "95 %, as on the page of a single policy."
+    "Errors are those to the very goal. What a student predicts is the distance to what looks like the goal; "
+    "up to symmetry the true distance is that one too. Intervals are 95 %, as on the page of a single policy."
+)
+_HEADLINE = (
+    "Success: stopped within the tolerance of the very goal. Held: and still within it, and not lost, after "
+    f"the hand has kept its last targets for {HOLD_S:g} s. Up to symmetry: within the tolerance of whatever "
+    "looks like the goal. Rows marked ours have what the paper's have not."
 )

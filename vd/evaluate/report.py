@@ -19,6 +19,12 @@ _UNIT_NOTE = {
 }
 
 
+def shown_name(text: str) -> str:
+    """Names, separated by commas, as a page prints them: of an absolute path its last two parts."""
+    parts = (Path(name) for name in text.split(", "))
+    return ", ".join("/".join(p.parts[-2:]) if p.is_absolute() else str(p) for p in parts)
+
+
 def percent(interval: Interval) -> str:
     """``12.3 % (10.1 to 14.9)``."""
     return f"{100 * interval.value:.1f} % ({100 * interval.low:.1f} to {100 * interval.high:.1f})"
@@ -31,10 +37,19 @@ def number(interval: Interval | None, unit: str = "") -> str:
     return f"{interval.value:.2f}{unit} ({interval.low:.2f} to {interval.high:.2f})"
 
 
-def write_report(result: EvalResult, path: Path) -> None:
-    """Write the page of an evaluation."""
-    page = Page(f"Evaluation of {result.protocol.policy}", _lead(result))
+def write_report(result: EvalResult, path: Path, *, pictures: bytes | None = None) -> None:
+    """Write the page of an evaluation.
+
+    Args:
+        result: What was found.
+        path: Of the page.
+        pictures: PNG with the objects.
+    """
+    page = Page(f"Evaluation of {shown_name(result.protocol.policy)}", _lead(result))
     add_summary(page, result)
+    if pictures is not None:
+        page.section("Objects")
+        page.figure(pictures, "The objects as they are simulated, each at its own scale.")
     add_figures(page, result)
     add_warnings(page, result.warnings)
     page.section("Every object")
@@ -64,8 +79,9 @@ def add_summary(page: Page, result: EvalResult) -> None:
     tiles = [
         (
             f"{100 * rate.value:.1f} %",
-            f"success within {name} rad",
-            f"95 %: {100 * rate.low:.1f} to {100 * rate.high:.1f}; chance {100 * overall.chance[name]:.2f}",
+            f"success within {name} rad of the very goal",
+            f"95 %: {100 * rate.low:.1f} to {100 * rate.high:.1f}; chance {100 * overall.chance[name]:.2f}; "
+            f"up to symmetry {100 * overall.symmetric[name].value:.1f} %",
         )
         for name, rate in overall.success.items()
     ]
@@ -112,9 +128,9 @@ def protocol_rows(result: EvalResult) -> list[tuple[str, str]]:
     """Setting and value pairs that say how the numbers were made."""
     protocol = result.protocol
     rows = [
-        ("policy", protocol.policy),
-        ("objects", f"{protocol.objects} ({len(result.object_names)})"),
-        ("hand", protocol.hand_name),
+        ("policy", shown_name(protocol.policy)),
+        ("objects", f"{shown_name(protocol.objects)} ({len(result.object_names)})"),
+        ("hand", shown_name(protocol.hand_name)),
         ("starts and goals", f"{protocol.episodes} each for every object, seed {protocol.seed}"),
         ("starts", starts_text(protocol)),
         ("goals", goals_text(protocol)),
@@ -158,11 +174,10 @@ def method_note(result: EvalResult) -> str:
     """How errors and intervals are to be read."""
     return (
         "Actions are the policy's means. Errors are measured at the end of an episode or at the first step "
-        "at which all success criteria hold, never as the least error on the way; for a symmetric object the "
-        "least over its symmetry rotations counts. The stop itself knows no symmetry: an object in an "
-        "orientation that only looks like the goal is not stopped there, and where it ends counts, so that "
-        "for a symmetric object the share within a tolerance and the share that stopped may differ either "
-        "way. A dropped object fails at every tolerance. Chance is an "
+        "at which all success criteria hold, never as the least error on the way. They are those to the very "
+        "goal; up to symmetry the least over the object's symmetry rotations counts, but the stop itself "
+        "knows none: an object that only looks like the goal is not stopped there, and where it ends counts. "
+        "A dropped object fails at every tolerance. Chance is an "
         f"orientation drawn uniformly from SO(3): mean error {CHANCE_MEAN_RAD:.2f} rad for an asymmetric "
         f"object; the mean measured here, drops included, is {result.overall.mean_error_rad:.2f} rad. "
         f"{_UNIT_NOTE[result.overall.unit]} Those of a single object are over its episodes. Where all "
@@ -186,6 +201,7 @@ _HEADER = (
     "object",
     "episodes",
     *(f"<= {tolerance:g} rad" for tolerance in TOLERANCES_RAD),
+    f"<= {plots.HEADLINE_TOLERANCE_RAD:g} up to symmetry",
     "median error [rad]",
     "stopped",
     "time to stop [s]",
@@ -198,6 +214,7 @@ def _row(summary: Summary) -> list[str]:
         summary.name,
         str(summary.episodes),
         *(percent(rate) for rate in summary.success.values()),
+        percent(summary.symmetric[str(plots.HEADLINE_TOLERANCE_RAD)]),
         number(summary.median_error_rad),
         percent(summary.stop_rate),
         number(summary.time_to_success_s),
@@ -208,6 +225,7 @@ def _row(summary: Summary) -> list[str]:
 def _lead(result: EvalResult) -> str:
     protocol = result.protocol
     return (
-        f"{len(result.episodes)} episodes: {len(result.object_names)} objects of {protocol.objects}, "
-        f"{protocol.episodes} starts and goals each, {protocol.hand_name}; {task_line(result)}"
+        f"{len(result.episodes)} episodes: {len(result.object_names)} objects of "
+        f"{shown_name(protocol.objects)}, {protocol.episodes} starts and goals each, "
+        f"{shown_name(protocol.hand_name)}; {task_line(result)}"
     )

@@ -13,6 +13,7 @@ import numpy as np
 
 from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict, to_dict
+from vd.evaluate.goals import Goals
 from vd.evaluate.statistics import (
     Interval,
     Unit,
@@ -21,6 +22,7 @@ from vd.evaluate.statistics import (
     median_interval,
     order_interval,
     rate_intervals,
+    rotation_angle,
 )
 from vd.files import write_json
 from vd.paper import PAPER
@@ -28,7 +30,7 @@ from vd.paper import PAPER
 TOLERANCES_RAD = (0.1, 0.2, 0.4, 0.8)
 """Errors at which success is reported; the paper's figures use 0.1, 0.4 and 0.8."""
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 def air_table_steps(control_hz: float) -> int:
@@ -50,6 +52,8 @@ class Episode:
     """Orientation error at the reset, up to the object's symmetry."""
     error_rad: float
     """Orientation error at the last step of the episode, up to the object's symmetry."""
+    exact_error_rad: float
+    """The same to the very goal, which is what counts."""
     steps: int
     """Control steps simulated."""
     stopped: bool
@@ -61,7 +65,7 @@ class Episode:
     @property
     def scored_error_rad(self) -> float:
         """The error that counts: pi, the largest there is, for a dropped object."""
-        return float(np.pi) if self.fell else self.error_rad
+        return float(np.pi) if self.fell else self.exact_error_rad
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ class Protocol:
     max_goal_angle_rad: float
     """Goals are uniform in orientation within this angle of the start; pi is all of SO(3)."""
     stop_tolerance_rad: float
-    """Orientation tolerance of the success criteria that stop an episode."""
+    """Orientation tolerance at which an episode is stopped and judged."""
     episode_s: float
     """Time limit."""
     control_hz: float
@@ -99,8 +103,10 @@ class Protocol:
     """The table is taken away once the hand had time to grasp."""
     table_friction: float | None = None
     """Coefficient of the table if it is not the nominal one."""
-    scanned_goals: bool = False
-    """Students get their goals from scans, with the errors of these."""
+    goals: Goals = "mesh"
+    """What students know shapes and goals by."""
+    sensor_errors: bool = False
+    """Cameras of students have the errors of a real one."""
     nudge: bool = False
     """Hands whose object stands still far from the goal are nudged."""
     explore: bool = False
@@ -127,15 +133,17 @@ class Summary:
     unit: Unit
     """What the intervals speak about."""
     success: dict[str, Interval]
-    """By tolerance [rad] (as text): share of episodes that ended within it, not dropped."""
+    """By tolerance [rad] (as text): share of episodes that ended within it of the very goal, not dropped."""
+    symmetric: dict[str, Interval]
+    """The same up to the object's symmetry."""
     stop_rate: Interval
     """Share of episodes in which all success criteria held at once."""
     drop_rate: Interval
     """Share of episodes in which the object was dropped."""
     median_error_rad: Interval
-    """Median final error; a dropped object counts as pi."""
+    """Median final error to the very goal; a dropped object counts as pi."""
     mean_error_rad: float
-    """Mean final error as measured, drops included, to compare with chance (2.21 rad)."""
+    """Mean final error to the very goal as measured, drops included, to compare with chance (2.21 rad)."""
     time_to_success_s: Interval | None
     """Median time to the stop of the episodes that stopped; None if none did."""
     chance: dict[str, float]
@@ -169,8 +177,9 @@ class EvalResult:
         return errors.reshape(len(self.object_names), -1)
 
     def start_errors(self) -> np.ndarray:
-        """Errors at the reset [rad], shape [K, M]."""
-        errors = np.array([episode.start_error_rad for episode in self.episodes])
+        """Errors to the very goal at the reset [rad], shape [K, M]."""
+        quats = [np.array([getattr(e, name) for e in self.episodes]) for name in ("start_quat", "goal_quat")]
+        errors = rotation_angle(*quats)
         return errors.reshape(len(self.object_names), -1)
 
     def write(self, path: Path) -> None:
@@ -201,7 +210,6 @@ def warnings_of(objects: Iterable[ObjectModel]) -> dict[str, str]:
 def summarise(
     protocol: Protocol,
     object_names: tuple[str, ...],
-    symmetries: list[np.ndarray],
     episodes: tuple[Episode, ...],
     *,
     resample: Literal["auto", "object", "episode"] = "auto",
@@ -213,13 +221,11 @@ def summarise(
     Args:
         protocol: How it was run.
         object_names: K names.
-        symmetries: For each object its symmetry rotations xyzw, shapes [S, 4].
         episodes: K x M episodes, object by object.
         resample: What intervals speak about: ``object``, ``episode``, or by the number of objects.
         software: Versions to record.
         warnings: What may be wrong with objects, by name.
     """
-    chances = [chance_cdf(np.array(TOLERANCES_RAD), symmetry) for symmetry in symmetries]
     by_object = [episodes[i : i + protocol.episodes] for i in range(0, len(episodes), protocol.episodes)]
     if len(by_object) != len(object_names) or any(len(group) != protocol.episodes for group in by_object):
         raise ValueError(
@@ -228,12 +234,10 @@ def summarise(
     return EvalResult(
         protocol=protocol,
         object_names=object_names,
-        overall=_summary(
-            "all", by_object, choose_unit(len(object_names), resample), np.mean(chances, axis=0), protocol
-        ),
+        overall=_summary("all", by_object, choose_unit(len(object_names), resample), protocol),
         per_object=tuple(
-            _summary(name, [group], "episode", chance, protocol)
-            for name, group, chance in zip(object_names, by_object, chances, strict=True)
+            _summary(name, [group], "episode", protocol)
+            for name, group in zip(object_names, by_object, strict=True)
         ),
         episodes=episodes,
         software=software or {},
@@ -241,27 +245,28 @@ def summarise(
     )
 
 
-def _summary(
-    name: str, groups: list[tuple[Episode, ...]], unit: Unit, chance: np.ndarray, protocol: Protocol
-) -> Summary:
+def _summary(name: str, groups: list[tuple[Episode, ...]], unit: Unit, protocol: Protocol) -> Summary:
     def table(attribute: str) -> np.ndarray:
         return np.array([[getattr(episode, attribute) for episode in group] for group in groups])
 
     errors, stopped, fell = table("scored_error_rad"), table("stopped"), table("fell")
-    start = table("start_error_rad")
+    alike = np.where(fell, np.pi, table("error_rad"))
+    start = rotation_angle(table("start_quat").reshape(-1, 4), table("goal_quat").reshape(-1, 4))
     times = table("steps")[stopped] / protocol.control_hz
-    within = np.stack([errors <= tolerance for tolerance in TOLERANCES_RAD])
-    rates = rate_intervals(np.concatenate([within, stopped[None], fell[None]]), unit)
-    labels = [str(tolerance) for tolerance in TOLERANCES_RAD]
+    within = [values <= tolerance for values in (errors, alike) for tolerance in TOLERANCES_RAD]
+    rates = rate_intervals(np.stack([*within, stopped, fell]), unit)
+    labels, count = [str(tolerance) for tolerance in TOLERANCES_RAD], len(TOLERANCES_RAD)
+    chance = chance_cdf(np.array(TOLERANCES_RAD))
     return Summary(
         name=name,
         episodes=errors.size,
         unit=unit,
-        success=dict(zip(labels, rates[:-2], strict=True)),
+        success=dict(zip(labels, rates[:count], strict=True)),
+        symmetric=dict(zip(labels, rates[count:-2], strict=True)),
         stop_rate=rates[-2],
         drop_rate=rates[-1],
         median_error_rad=median_interval(errors, unit),
-        mean_error_rad=float(table("error_rad").mean()),
+        mean_error_rad=float(table("exact_error_rad").mean()),
         time_to_success_s=order_interval(times) if times.size else None,
         chance=dict(zip(labels, map(float, chance), strict=True)),
         start={

@@ -14,7 +14,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.evaluate.result import Episode
-from vd.evaluate.statistics import symmetric_error
+from vd.evaluate.statistics import rotation_angle, symmetric_error
 
 # Points of the inverse of the cumulative distribution of goal angles; linear between them.
 ANGLE_GRID = 4096
@@ -198,6 +198,7 @@ def _run_round(
                     goal_quat=_quat(goal[w]),
                     start_error_rad=float(symmetric_error(start[w], goal[w], symmetry)),
                     error_rad=float(symmetric_error(unit_quats(pose[w, 3:7]), goal[w], symmetry)),
+                    exact_error_rad=float(rotation_angle(unit_quats(pose[w, 3:7]), goal[w])),
                     steps=step,
                     stopped=bool(success[w] and not fell[w]),
                     fell=bool(fell[w]),

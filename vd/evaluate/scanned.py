@@ -1,4 +1,4 @@
-"""Goals as a scan gives them: students know shapes by points with noise, of which a side is missing.
+"""Shapes and goals known by points: 500 exact ones, or those of a scan, with noise and a side missing.
 
 The paper's goals for household objects come from a tablet's scans, which are imperfect in ways it does not
 quantify (its Figure 5). Here a scan errs as much as a cloud in training may, but lastingly: the same points
@@ -45,15 +45,15 @@ def scan(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return points[np.concatenate([seen, again])] + noise
 
 
-def known_by_scan(item: ObjectModel, rng: np.random.Generator, device: str) -> ObjectModel:
-    """An object as its scan tells it: surface and samples, in the frame of the true one.
+def known_by_points(item: ObjectModel, points: np.ndarray, device: str) -> ObjectModel:
+    """An object as points of it tell: the surface through them and its samples, in the frame of the true one.
 
     Args:
         item: The object.
-        rng: Where randomness comes from.
+        points: Points [m], shape [K, 3], body frame.
         device: Warp device.
     """
-    vertices, faces = surface_of_scan(scan(item.surface_points, rng), device)
+    vertices, faces = surface_of_scan(points, device)
     samples = surface_points(vertices, faces, len(item.surface_points))
     return replace(
         item,
@@ -63,13 +63,26 @@ def known_by_scan(item: ObjectModel, rng: np.random.Generator, device: str) -> O
     )
 
 
-class ScannedGoalView(StudentView):
-    """What a student sees whose goals were scanned; one scan for each object."""
+class KnownByPoints(StudentView):
+    """What a student sees that knows each object by one set of points."""
 
-    def __init__(self, env: Any, network: StudentCfg, *, seed: int = 0, **settings: Any):
-        """Scan the objects; arguments are those of :class:`vd.vision.StudentView`."""
+    def __init__(self, env: Any, network: StudentCfg, *, exact: bool, seed: int = 0, **settings: Any):
+        """Lay surfaces through the points.
+
+        Args:
+            env: The environment.
+            network: What of the student concerns its clouds.
+            exact: Take the object's own samples, or a scan of them.
+            seed: Of the scans, and of noise and camera.
+            settings: Those of :class:`vd.vision.StudentView`.
+        """
         rng = np.random.default_rng(seed)
-        scanned = [known_by_scan(item, rng, env.device) for item in env.objects]
+        scanned = [
+            known_by_points(
+                item, item.surface_points if exact else scan(item.surface_points, rng), env.device
+            )
+            for item in env.objects
+        ]
         super().__init__(env, network, seed=seed, known=scanned, **settings)
         scene = env.scene
         self._scanned = SceneClouds(

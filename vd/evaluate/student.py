@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -10,7 +11,8 @@ import warp as wp
 
 from vd.config import from_dict
 from vd.evaluate.agents import trained_task
-from vd.evaluate.scanned import ScannedGoalView
+from vd.evaluate.goals import Goals
+from vd.evaluate.scanned import KnownByPoints
 from vd.evaluate.second_view import GoalClock, StudentSecondView
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.saved import SavedStudent
@@ -38,19 +40,21 @@ class StudentActor:
         student: SavedStudent,
         *,
         rendered: bool | None = None,
-        scanned_goals: bool = False,
+        goals: Goals = "mesh",
+        sensor_errors: bool = False,
+        aim: bool | None = None,
         critic: Callable[[torch.Tensor], torch.Tensor] | None = None,
         seed: int = 0,
     ):
         """Open its eyes in every world.
 
-        It aims past near goals if its file says so, or the environment.
-
         Args:
             env: The environment.
             student: The student.
             rendered: See by a depth camera, or complete clouds; as its stage was trained by default.
-            scanned_goals: Show it goals with the errors of a scan, not exact ones.
+            goals: What it knows shapes and goals by (:mod:`vd.evaluate.scanned`).
+            sensor_errors: Give its camera the errors of a real one, in place of those of its training.
+            aim: Whether it aims past near goals; None: if its file says so, or the environment.
             critic: What its teacher's critic expects (:func:`vd.evaluate.agents.open_critic`), to look twice
                 at goals (:mod:`vd.evaluate.second_view`).
             seed: Of the errors of camera and scans.
@@ -72,15 +76,14 @@ class StudentActor:
         network = spec.network
         if env.cfg.aim.enabled:
             network = replace(network, aim=env.cfg.aim)
+        if aim is not None:
+            network = replace(network, aim=replace(network.aim, enabled=aim))
         network.validate()
-        self._view = (ScannedGoalView if scanned_goals else StudentView)(
-            env,
-            network,
-            rendered=self.rendered,
-            depth=from_dict(DepthCameraCfg, student.depth, where="depth camera of the student"),
-            camera=spec.camera,
-            seed=seed,
-        )
+        depth = from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
+        if sensor_errors:
+            depth = depth.with_errors()
+        seen: Any = StudentView if goals == "mesh" else partial(KnownByPoints, exact=goals == "points")
+        self._view = seen(env, network, rendered=self.rendered, depth=depth, camera=spec.camera, seed=seed)
         self._second = None
         if critic is not None:
             self._student = deepcopy(self._student)  # its views are changed

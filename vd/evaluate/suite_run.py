@@ -5,11 +5,13 @@ What a folder holds already, measured with the same settings and the same policy
 
 import hashlib
 import json
+import math
 import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,14 +27,18 @@ from vd.evaluate.agents import (
 from vd.evaluate.compare import compare, parse_groups
 from vd.evaluate.comparison import Comparison
 from vd.evaluate.comparison_page import labels
+from vd.evaluate.report import shown_name
 from vd.evaluate.statistics import Interval
 from vd.evaluate.suite import (
     CLAIMS,
     CONDITIONS,
     NO_STUDENT,
+    OUT_OF_TIME,
     OWN_SETS,
     QUICK_EPISODES,
     QUICK_OBJECTS,
+    QUICK_S,
+    QUICK_STUDENT_EPISODES,
     Claim,
     Condition,
     Group,
@@ -48,6 +54,8 @@ if TYPE_CHECKING:
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
 RESULT_FILE, PAGE_FILE = "paper.json", "paper.html"
+PAGE_EVERY_S = 30.0
+"""Time between two pages of what there is [s]: drawing one takes seconds."""
 LOG_FILE = "log.txt"
 """Progress of an evaluation that ran beside others."""
 # Settings that say where and how an evaluation runs, not what it measures.
@@ -93,6 +101,14 @@ class SuiteResult:
     def students(self) -> tuple[str, ...]:
         """Those of the policies that are students."""
         return tuple(name for name in self.policies if sees_clouds(name))
+
+    @cached_property
+    def pictures(self) -> dict[Group, bytes]:
+        """PNG with the objects of each group."""
+        from vd.assets_usd.objects.model import load_set
+        from vd.assets_usd.objects.sheet import pictures
+
+        return {group: pictures(load_set(list(objects.sets))) for group, objects in self.objects.items()}
 
     def merged(self, *conditions: str) -> Comparison | None:
         """The comparisons of conditions as one of all policies and groups; None if there is none."""
@@ -156,20 +172,13 @@ def run_suite(cfg: "EvalCfg", *, say: Callable[[str], object] | None = None) -> 
         FileNotFoundError: There is no such policy.
     """
     say = say or (lambda line: print(line, file=sys.stderr, flush=True))
-    conditions = tuple(c for c in CONDITIONS if c.quick or not cfg.quick)
-    result = SuiteResult(cfg.agent_names, object_groups(cfg.objects, quick=cfg.quick), conditions, cfg.quick)
-    # Every name, before anything slow.
-    prints = {name: fingerprint(name, second_view=cfg.second_view) for name in result.policies}
-    short = labels(result.policies)
-    tasks = []
-    for condition in conditions:
-        for name in result.policies:
-            if condition.scanned_goals and name not in result.students:
-                continue
-            one = settings(cfg, condition, name, result.objects[condition.objects])
-            one = replace(one, output=cfg.output / condition.name / short[name].replace("/", "-"))
-            text = f"{condition.title}: {short[name]} ({result.objects[condition.objects].text})"
-            tasks.append(_Task(condition.name, name, one, prints[name], text))
+    stop_at = time.monotonic() + QUICK_S if cfg.quick else math.inf
+    groups = object_groups(cfg.objects, quick=cfg.quick)
+    conditions = tuple(c for c in CONDITIONS if (c.quick or not cfg.quick) and c.objects in groups)
+    result = SuiteResult(cfg.agent_names, groups, conditions, cfg.quick)
+    tasks = _tasks(cfg, result)
+    if cfg.quick:  # what takes long comes last
+        tasks.sort(key=lambda task: task.policy in result.students)
     progress = _Progress(say, len(tasks))
     try:
         waiting = []
@@ -181,16 +190,47 @@ def run_suite(cfg: "EvalCfg", *, say: Callable[[str], object] | None = None) -> 
                 result.found[task.condition, task.policy] = there
                 progress.say(f"{task.text}, done before")
         if cfg.jobs > 1:
-            _run_together(waiting, cfg, result, progress)
+            _run_together(waiting, cfg, result, progress, stop_at)
         else:
             for task in waiting:
+                if time.monotonic() > stop_at:
+                    result.failed[task.condition, task.policy] = OUT_OF_TIME
+                    continue
                 progress.say(task.text)
-                _keep(task, _measure(task), result, progress)
+                _keep(task, _measure(task, stop_at), result, progress)
+                progress.show(result, cfg.output)
     finally:
-        if result.found:
-            write_json(cfg.output / RESULT_FILE, result.summary())
-            write_suite(result, cfg.output / PAGE_FILE)
+        _write(result, cfg.output)
     return result
+
+
+def _tasks(cfg: "EvalCfg", result: SuiteResult) -> list["_Task"]:
+    """Everything that is to be measured. All names are looked up here, before anything slow."""
+    short = labels(result.policies)
+    views = {name: has_second_view(name) for name in result.policies}
+    prints = {
+        (name, looks): fingerprint(name, second_view=looks)
+        for name in result.policies
+        for looks in {condition.second_view for condition in result.conditions}
+        if views[name] or not looks
+    }
+    tasks = []
+    for condition in result.conditions:
+        objects = result.objects[condition.objects]
+        for name in result.policies:
+            if not condition.concerns(student=name in result.students, views=views[name]):
+                continue
+            one = settings(cfg, condition, name, objects)
+            one = replace(one, output=cfg.output / condition.name / short[name].replace("/", "-"))
+            text = f"{condition.title}: {short[name]} ({objects.text})"
+            tasks.append(_Task(condition.name, name, one, prints[name, condition.second_view], text))
+    return tasks
+
+
+def _write(result: SuiteResult, folder: Path) -> None:
+    """The page and its figures, of what there is."""
+    write_json(folder / RESULT_FILE, result.summary())
+    write_suite(result, folder / PAGE_FILE)
 
 
 @dataclass(frozen=True)
@@ -216,30 +256,38 @@ class _Progress:
 
     def __init__(self, say: Callable[[str], object], total: int):
         self.line, self._total, self._number = say, total, 0
-        self._started = time.monotonic()
+        self._started = self._shown = time.monotonic()
 
     def say(self, text: str) -> None:
         self._number += 1
         minutes = (time.monotonic() - self._started) / 60.0
         self.line(f"[{self._number}/{self._total}, {minutes:.1f} min] {text}")
 
+    def show(self, result: SuiteResult, folder: Path) -> None:
+        """Write the page of what there is, should the rest not come; not if there was one just now."""
+        if time.monotonic() > self._shown + PAGE_EVERY_S:
+            _write(result, folder)
+            self._shown = time.monotonic()
 
-def _measure(task: _Task) -> str:
-    """Evaluate into the task's folder; returns why that failed, or nothing."""
+
+def _measure(task: _Task, stop_at: float = math.inf) -> str:
+    """Evaluate into the task's folder until ``stop_at``; returns why that failed, or nothing."""
     try:
-        compare(task.cfg)
-    except RuntimeError as error:  # one world that flies off must not cost the others
+        compare(task.cfg, stop_at)
+    except TimeoutError:
+        return OUT_OF_TIME
+    except (RuntimeError, ValueError) as error:  # one world that flies off must not cost the others
         return str(error)
     return ""
 
 
-def _measure_apart(task: _Task) -> str:
+def _measure_apart(task: _Task, stop_at: float = math.inf) -> str:
     """The same in a process of its own, whose progress goes to a file: several would mix."""
     make_folder(task.cfg.output)
     with (task.cfg.output / LOG_FILE).open("w") as log, redirect_stdout(log), redirect_stderr(log):
         try:
-            return _measure(task)
-        except (ValueError, OSError) as error:
+            return _measure(task, stop_at)
+        except OSError as error:
             return str(error)
 
 
@@ -253,7 +301,9 @@ def _keep(task: _Task, failure: str, result: SuiteResult, progress: _Progress) -
     write_json(task.cfg.output / SETTINGS_FILE, task.wanted)
 
 
-def _run_together(tasks: Sequence[_Task], cfg: "EvalCfg", result: SuiteResult, progress: _Progress) -> None:
+def _run_together(
+    tasks: Sequence[_Task], cfg: "EvalCfg", result: SuiteResult, progress: _Progress, stop_at: float
+) -> None:
     """Evaluate in processes side by side, those of students first, which take longest."""
     import warp as wp
 
@@ -269,13 +319,23 @@ def _run_together(tasks: Sequence[_Task], cfg: "EvalCfg", result: SuiteResult, p
     def finished(task: _Task, failure: str | None, died: str) -> None:
         progress.say(task.text)
         _keep(task, died if failure is None else failure, result, progress)
+        progress.show(result, cfg.output)
 
-    run_tasks(_measure_apart, spread, finished, jobs=cfg.jobs, limit_s=float("inf"), gpu=True)
+    run_tasks(
+        partial(_measure_apart, stop_at=stop_at),
+        spread,
+        finished,
+        jobs=cfg.jobs,
+        limit_s=float("inf"),
+        gpu=True,
+    )
 
 
 def settings(cfg: "EvalCfg", condition: Condition, policy: str, objects: Objects) -> "EvalCfg":
     """The evaluation of one policy under a condition: what ``vd-eval`` would be told."""
-    episodes = condition.student_episodes if sees_clouds(policy) else condition.episodes
+    episodes, most = condition.episodes, QUICK_EPISODES
+    if sees_clouds(policy):
+        episodes, most = condition.student_episodes, QUICK_STUDENT_EPISODES
     return replace(
         cfg,
         suite=None,
@@ -284,13 +344,15 @@ def settings(cfg: "EvalCfg", condition: Condition, policy: str, objects: Objects
         policies=() if policy in BUILT_IN else (policy,),
         agent=policy if policy in BUILT_IN else None,
         objects=tuple(f"{condition.objects}={item}" for item in objects.sets),
-        episodes=min(episodes, QUICK_EPISODES) if cfg.quick else episodes,
+        episodes=min(episodes, most) if cfg.quick else episodes,
         at_rest=False,
-        second_view=cfg.second_view and has_second_view(policy),
+        second_view=condition.second_view,
         no_at_rest=True,  # the paper's objects fall into the hand, whatever a policy was trained with
         in_air=condition.in_air,
         table_friction=condition.table_friction,
-        scanned_goals=condition.scanned_goals,
+        goals=condition.goals,
+        sensor_errors=condition.sensor_errors,
+        aim=condition.aim,
     )
 
 
@@ -308,13 +370,15 @@ def object_groups(objects: tuple[str, ...], *, quick: bool) -> dict[Group, Objec
         raise ValueError(f"--objects: '{unknown[0]}' is no group of the suite; {', '.join(OWN_SETS)} are")
     groups: dict[Group, Objects] = {}
     for group, own in OWN_SETS.items():
-        sets = given.get(group, (own,))
+        if group not in given and own is None:
+            continue
+        sets = given.get(group) or (str(own),)
         files: list[str] = []
         for entry in sets:
             path = Path(entry).expanduser()
             folder = path if path.is_dir() else None if path.is_file() else set_folder(entry)
             files += [entry] if folder is None else [str(file) for file in object_files(folder)]
-        text = f"{len(files)} of {', '.join(sets)}"
+        text = f"{len(files)} of {shown_name(', '.join(sets))}"
         if quick and len(files) > QUICK_OBJECTS:
             sets = tuple(files[i * len(files) // QUICK_OBJECTS] for i in range(QUICK_OBJECTS))
             text = f"{len(sets)} of the {text}"

@@ -1,12 +1,13 @@
 """Episodes that nothing stops: what happened at every step, so that any rule for stopping can be judged.
 
 Whoever stops a policy, its own prediction or the true distance, does not change what it does before: one run
-serves all rules. K objects, M episodes each, T steps; angles in radians, quaternions xyzw.
+serves all rules. What comes after a stop is simulated apart: the hand keeps its last targets for HOLD_S.
+K objects, M episodes each, T steps; angles in radians, quaternions xyzw.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,10 +16,33 @@ import warp as wp
 from vd.evaluate.result import Episode
 from vd.evaluate.rollout import episode_rounds, unit_quats
 from vd.evaluate.statistics import rotation_angle, symmetric_error
+from vd.paper import PAPER
 from vd.student.stopping import StoppingRule
 
+HOLD_S = 2.0
+"""For how long a hand holds its object after a stop, before it is looked at again [s] (ours)."""
+StopsBy = Literal["predicted", "exact", "error"]
+"""The distance that a rule asks for: a student's prediction, or the true one to the very goal, or to what
+looks like it."""
 NEVER_RAD = 1e-9
 """Orientation tolerance that no state meets: an environment with it stops no episode."""
+
+
+@dataclass(frozen=True)
+class Hold:
+    """What became of stopped episodes while the hand held its last targets; NaN where nothing stopped [K, M].
+
+    Attributes:
+        rule: What stopped them.
+        by: The distance it asked for.
+        error: Orientation error afterwards, up to the object's symmetry; pi where it was lost.
+        exact: The same to the very goal.
+    """
+
+    rule: StoppingRule
+    by: StopsBy
+    error: np.ndarray
+    exact: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -34,6 +58,7 @@ class Trace:
         predicted: What a student predicts of ``error`` there; None for other policies [K, M, T + 1].
         steps: Steps to the fall or the time limit [K, M].
         fell: Whether the object was lost [K, M].
+        holds: What came after the stops, of the rules that were to be held.
     """
 
     start_quat: np.ndarray
@@ -44,24 +69,32 @@ class Trace:
     predicted: np.ndarray | None
     steps: np.ndarray
     fell: np.ndarray
+    holds: list[Hold] = field(default_factory=list)
 
     def of(self, objects: Sequence[int]) -> "Trace":
         """The episodes of some objects."""
         chosen = list(objects)
-        parts: dict[str, Any] = {k: None if v is None else v[chosen] for k, v in vars(self).items()}
+        parts: dict[str, Any] = {
+            k: v[chosen] if isinstance(v, np.ndarray) else v for k, v in vars(self).items()
+        }
+        parts["holds"] = [Hold(h.rule, h.by, h.error[chosen], h.exact[chosen]) for h in self.holds]
         return Trace(**parts)
 
-    def ends(self, rule: StoppingRule, *, by_prediction: bool) -> tuple[np.ndarray, np.ndarray]:
+    def hold(self, rule: StoppingRule, by: StopsBy) -> Hold | None:
+        """What came after the stops of a rule; None if that was not to be held."""
+        return next((hold for hold in self.holds if (hold.rule, hold.by) == (rule, by)), None)
+
+    def ends(self, rule: StoppingRule, by: StopsBy) -> tuple[np.ndarray, np.ndarray]:
         """Where a rule ends every episode.
 
         Args:
             rule: Bounds of distance and action norm.
-            by_prediction: Ask the student's prediction, or the true distance.
+            by: The distance it asks for.
 
         Returns:
             Steps to the stop, fall or time limit, and whether the rule stopped it, shape [K, M] each.
         """
-        distance = self.predicted if by_prediction else self.error
+        distance = {"predicted": self.predicted, "exact": self.exact, "error": self.error}[by]
         if distance is None:
             raise ValueError("only a student predicts distances; stop by the true distance")
         with np.errstate(invalid="ignore"):  # NaN stops nothing
@@ -72,10 +105,13 @@ class Trace:
         stopped: np.ndarray = np.asarray(stops.any(axis=-1))
         return np.where(stopped, stops.argmax(axis=-1), self.steps), stopped
 
-    def episodes(self, rule: StoppingRule, *, by_prediction: bool) -> tuple[Episode, ...]:
+    def episodes(self, rule: StoppingRule, by: StopsBy) -> tuple[Episode, ...]:
         """The episodes as a rule ends them, object by object; arguments as of :meth:`ends`."""
-        steps, stopped = self.ends(rule, by_prediction=by_prediction)
-        error = np.take_along_axis(self.error, steps[..., None], axis=-1)[..., 0]
+        steps, stopped = self.ends(rule, by)
+        error, exact = (
+            np.take_along_axis(values, steps[..., None], axis=-1)[..., 0]
+            for values in (self.error, self.exact)
+        )
         return tuple(
             Episode(
                 object_index=k,
@@ -83,6 +119,7 @@ class Trace:
                 goal_quat=_quat(self.goal_quat[k, m]),
                 start_error_rad=float(self.error[k, m, 0]),
                 error_rad=float(error[k, m]),
+                exact_error_rad=float(exact[k, m]),
                 steps=int(steps[k, m]),
                 stopped=bool(stopped[k, m]),
                 fell=bool(self.fell[k, m] and not stopped[k, m]),
@@ -99,6 +136,7 @@ def record(
     starts: np.ndarray | None = None,
     goals: np.ndarray | None = None,
     table_steps: int | None = None,
+    held: Sequence[tuple[StoppingRule, StopsBy]] = (),
     on_step: Callable[[], object] = lambda: None,
 ) -> Trace:
     """Run a policy and write down what happens.
@@ -112,6 +150,7 @@ def record(
         starts: Initial orientations [K, M, 4]; None: the environment draws them, all before the first step.
         goals: Goal orientations [K, M, 4], with ``starts``.
         table_steps: Steps after which the table is taken away; None: never.
+        held: Rules whose stops are to be held for HOLD_S.
         on_step: Called after every control step.
     """
     world_object = np.asarray(env.world_object)
@@ -128,6 +167,7 @@ def record(
         predicted=np.full((*shape, length), np.nan) if predicts else None,
         steps=np.full(shape, env.max_episode_steps),
         fell=np.zeros(shape, dtype=bool),
+        holds=[Hold(rule, by, np.full(shape, np.nan), np.full(shape, np.nan)) for rule, by in held],
     )
     rounds = episode_rounds(world_object, *shape)
     drawn = []
@@ -146,10 +186,78 @@ def record(
             env.reset(
                 object_quat=starts[chosen].astype(np.float32), goal_quat=goals[chosen].astype(np.float32)
             )
-        _record_round(env, policy, numbers, trace, symmetry, table_steps, on_step)
+        stops = [_Stops(env, hold) for hold in trace.holds]
+        _record_round(env, policy, numbers, trace, symmetry, table_steps, on_step, stops)
+        for one in stops:
+            one.hold(numbers, trace.goal_quat, symmetry, table_steps)
     if table_steps is not None:
         env.sim.place_table(present=True)
     return trace
+
+
+class _Stops:
+    """The states in which a rule stops the worlds of a round; those of the others are of its beginning."""
+
+    def __init__(self, env: Any, hold: Hold) -> None:
+        self._env, self._hold = env, hold
+        self._state = {name: _rows(array, env.num_worlds).clone() for name, array in env.motion().items()}
+        self._after = np.full(env.num_worlds, -1)
+
+    def look(self, step: int, trace: Trace, worlds: np.ndarray, place: tuple[np.ndarray, np.ndarray]) -> None:
+        """Keep the states of worlds, those of ``place``, that the rule stops after ``step`` steps."""
+        rule, by = self._hold.rule, self._hold.by
+        distance = {"predicted": trace.predicted, "exact": trace.exact, "error": trace.error}[by]
+        assert distance is not None
+        near = distance[(*place, step)] < rule.distance_rad
+        stops = near & (trace.action_norm[(*place, step)] < rule.action_norm) & (self._after[worlds] < 0)
+        if step == 0 or not stops.any():
+            return
+        self._after[worlds[stops]] = step
+        for name, array in self._env.motion().items():
+            live, kept = _rows(array, self._env.num_worlds), self._state[name]
+            rows = torch.from_numpy(worlds[stops]).to(kept.device)
+            kept[rows] = live[rows]
+
+    def hold(
+        self,
+        numbers: np.ndarray,
+        goals: np.ndarray,
+        symmetry: Sequence[np.ndarray],
+        table_steps: int | None,
+    ) -> None:
+        """Go on from the stops with the last targets, and write down what came of them."""
+        env = self._env
+        worlds = np.flatnonzero(self._after >= 0)
+        if not len(worlds):
+            return
+        for name, array in env.motion().items():
+            _rows(array, env.num_worlds).copy_(self._state[name])
+        place = np.asarray(env.world_object)[worlds], numbers[worlds]
+        lost = np.zeros(len(worlds), dtype=bool)
+        for step in range(round(HOLD_S * env.cfg.sim.control_hz)):
+            if table_steps is not None:
+                env.sim.place_tables(*_int_arrays(env, self._after + step, table_steps))
+            env.hold()
+            away = env.object_pose()[worlds, :3] - np.array(PAPER.scene.goal_position_m)
+            lost |= ~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_m)  # not a number is lost too
+        quat, goal = unit_quats(env.object_pose()[worlds, 3:7]), goals[place]
+        exact = rotation_angle(quat, goal)
+        error = np.array(
+            [symmetric_error(q, g, symmetry[k]) for q, g, k in zip(quat, goal, place[0], strict=True)]
+        )
+        self._hold.exact[place] = np.where(lost, np.pi, exact)
+        self._hold.error[place] = np.where(lost, np.pi, error)
+
+
+def _rows(array: wp.array, worlds: int) -> torch.Tensor:
+    """An array of all worlds with a row for each, sharing its memory."""
+    return wp.to_torch(array).view(worlds, -1)
+
+
+def _int_arrays(env: Any, *values: Any) -> list[wp.array]:
+    """One number, or one of each world, as device arrays [N]."""
+    rows = (np.broadcast_to(np.asarray(value, dtype=np.int32), env.num_worlds) for value in values)
+    return [wp.array(row, dtype=wp.int32, device=env.device) for row in rows]
 
 
 def _record_round(
@@ -160,6 +268,7 @@ def _record_round(
     symmetry: Sequence[np.ndarray],
     table_steps: int | None,
     on_step: Callable[[], object],
+    stops: Sequence[_Stops],
 ) -> None:
     """One episode in every world that has one; ``numbers`` [N]: its place among its object's, -1 for none."""
     worlds = np.flatnonzero(numbers >= 0)
@@ -180,6 +289,8 @@ def _record_round(
         action = policy.act(wp.to_torch(env.observation))
         if trace.predicted is not None:
             trace.predicted[(*living, step)] = policy.predicted.cpu().numpy()[worlds][alive]
+        for one in stops:
+            one.look(step, trace, worlds[alive], living)
         env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
         quat = unit_quats(env.object_pose_end.numpy()[:, 3:7])[worlds]
         _write_errors(trace, symmetry, living, step + 1, quat[alive], goal[alive])

@@ -103,6 +103,10 @@ class DepthCamera:
         """Focal lengths, principal point [pixel] and range [m] of each camera, shape [N]."""
         self.extrinsics = wp.array(_extrinsics(camera, generator, cfg, n), dtype=wp.transform, device=device)
         """Optical frame of each camera in the frame of the body that carries it, shape [N]."""
+        self._believed = self.extrinsics
+        if cfg.position_noise_m > 0.0 or cfg.rotation_noise_rad > 0.0:
+            nominal = np.concatenate([camera.position, camera.quaternion])
+            self._believed = wp.array(np.tile(nominal, (n, 1)), dtype=wp.transform, device=device)
         self.sensors = wp.array([_sensor(cfg.sensor, camera)] * n, dtype=DepthSensorParams, device=device)
         """Sensor settings of each camera; used if any was on at the start, shape [N]."""
         delay = generator.uniform(*cfg.latency_s, size=n) / frame_s
@@ -112,6 +116,9 @@ class DepthCamera:
         """Whether each world's table is there, shape [N]."""
         self.camera_q = empty(n, dtype=wp.transform)
         """Optical frames in the world frame at the last capture, shape [N]."""
+        self._believed_q = (
+            self.camera_q if self._believed is self.extrinsics else empty(n, dtype=wp.transform)
+        )
         self.true_depth = empty(n, cloud.rows, cloud.columns)
         """Depth without sensor errors [m], shape [N, H, W]; a row and column for each block of pixels."""
         self.depth = empty(n, cloud.rows, cloud.columns) if cfg.sensor.enabled else self.true_depth
@@ -229,7 +236,10 @@ class DepthCamera:
                 [self.depth],
             )
         if self.cfg.points:
-            self._cloud.make(self.depth, self.views, self.camera_q, self.extrinsics, self.rng)
+            if self._believed is not self.extrinsics:
+                believed = [self._camera_body, self._believed, body_q]
+                self._launch(place_camera_kernel, n, believed, [self._believed_q])
+            self._cloud.make(self.depth, self.views, self._believed_q, self._believed, self.rng)
         self._launch(next_frame_kernel, n, [self.rng], [])
 
     def _launch(
