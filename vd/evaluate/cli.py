@@ -274,7 +274,7 @@ def _compare(cfg: EvalCfg) -> int:
 
 
 def _run_suite(cfg: EvalCfg) -> int:
-    from vd.evaluate.suite_page import terminal_table
+    from vd.evaluate.suite_page import out_of_time, terminal_table
     from vd.evaluate.suite_run import PAGE_FILE, RESULT_FILE, run_suite
 
     result = run_suite(cfg)
@@ -284,6 +284,8 @@ def _run_suite(cfg: EvalCfg) -> int:
         print(f"{terminal_table(result)}\n")
         if result.found:
             print(f"{cfg.output / RESULT_FILE}\n{cfg.output / PAGE_FILE}")
+    if result.late:
+        print(f"vd-eval: {out_of_time(result)}", file=sys.stderr)
     for (condition, policy), why in result.failed.items():
         print(f"vd-eval: {condition} of {policy} failed: {why}", file=sys.stderr)
     return 1 if result.failed else 0

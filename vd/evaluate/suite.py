@@ -35,7 +35,7 @@ NO_STUDENT = "no policy shipped"
 """What is said in place of a student's figures where there is no student."""
 
 OUT_OF_TIME = "out of time; the same command goes on from here"
-"""Why a condition of the reduced suite was not measured."""
+"""Why evaluations of the reduced suite were not run."""
 
 QUICK_OBJECTS, QUICK_EPISODES = 6, 4
 """Objects of a group and episodes of each in the reduced suite."""

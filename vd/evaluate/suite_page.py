@@ -45,6 +45,8 @@ def write_suite(result: "SuiteResult", path: Path) -> None:
         words=(1, 3),
         folded="Where the paper's figures come from (P: the paper)",
     )
+    if result.late:
+        page.text(out_of_time(result))
     for (condition, policy), why in result.failed.items():
         page.text(f"Not measured: {condition} of {shown_name(policy)}. {why}")
     if result.found:
@@ -80,6 +82,11 @@ def _add_figures(page: Page, result: "SuiteResult") -> None:
         claims = [claim for claim in CLAIMS if claim.condition == condition.name]
         rows = [(claim.text, *_cells(result, claim, condition)) for claim in claims]
         page.table((condition.title, "paper", *names), rows)
+
+
+def out_of_time(result: "SuiteResult") -> str:
+    """What the reduced suite had no time for."""
+    return f"{len(result.late)} evaluations are {OUT_OF_TIME}."
 
 
 def terminal_table(result: "SuiteResult") -> str:
@@ -119,7 +126,7 @@ def _cells(result: "SuiteResult", claim: Claim, condition: Condition) -> tuple[s
 
 def _cell(result: "SuiteResult", claim: Claim, condition: Condition, policy: str) -> str:
     if (condition.name, policy) in result.failed:
-        return "not run" if result.failed[condition.name, policy] == OUT_OF_TIME else "failed"
+        return "failed"
     if (condition.name, policy) not in result.found:
         teacher = policy not in result.students
         if teacher and condition.goals != "mesh":

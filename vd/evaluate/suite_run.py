@@ -88,6 +88,7 @@ class SuiteResult:
         quick: Whether this is the reduced suite.
         found: Comparison of one policy by the names of condition and policy.
         failed: Why a condition could not be measured, likewise.
+        late: Conditions and policies for which there was no time.
     """
 
     policies: tuple[str, ...]
@@ -96,6 +97,7 @@ class SuiteResult:
     quick: bool
     found: dict[tuple[str, str], Comparison] = field(default_factory=dict)
     failed: dict[tuple[str, str], str] = field(default_factory=dict)
+    late: list[tuple[str, str]] = field(default_factory=list)
 
     @property
     def students(self) -> tuple[str, ...]:
@@ -138,6 +140,7 @@ class SuiteResult:
                 {"condition": condition, "policy": policy, "why": why}
                 for (condition, policy), why in self.failed.items()
             ],
+            "out of time": [list(pair) for pair in self.late],
         }
 
     def _figure(self, claim: Claim) -> dict[str, Any]:
@@ -193,10 +196,8 @@ def run_suite(cfg: "EvalCfg", *, say: Callable[[str], object] | None = None) -> 
             _run_together(waiting, cfg, result, progress, stop_at)
         else:
             for task in waiting:
-                if time.monotonic() > stop_at:
-                    result.failed[task.condition, task.policy] = OUT_OF_TIME
-                    continue
-                progress.say(task.text)
+                if time.monotonic() <= stop_at:
+                    progress.say(task.text)
                 _keep(task, _measure(task, stop_at), result, progress)
                 progress.show(result, cfg.output)
     finally:
@@ -272,6 +273,8 @@ class _Progress:
 
 def _measure(task: _Task, stop_at: float = math.inf) -> str:
     """Evaluate into the task's folder until ``stop_at``; returns why that failed, or nothing."""
+    if time.monotonic() > stop_at:  # the same clock in all processes
+        return OUT_OF_TIME
     try:
         compare(task.cfg, stop_at)
     except TimeoutError:
@@ -293,6 +296,9 @@ def _measure_apart(task: _Task, stop_at: float = math.inf) -> str:
 
 def _keep(task: _Task, failure: str, result: SuiteResult, progress: _Progress) -> None:
     """Take what an evaluation left, and mark it as whole."""
+    if failure == OUT_OF_TIME:
+        result.late.append((task.condition, task.policy))
+        return
     if failure:
         result.failed[task.condition, task.policy] = failure
         progress.line(f"  failed: {failure}")
