@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from vd.config import from_dict, to_dict
-from vd.envs.cfg import CurriculumCfg, SuccessCfg
+from vd.envs.cfg import CurriculumCfg, ObservationCfg, SuccessCfg
 from vd.paper import PAPER
 from vd.train.cli import main
 from vd.train.config import minibatches, validate
@@ -47,9 +47,12 @@ def test_paper_preset_is_the_paper():
     assert (cfg.ppo.schedule, cfg.ppo.optimizer) == ("fixed", "adam")
     assert cfg.policy.hidden == (512, 256, 256) and cfg.policy.activation == "elu"
     assert cfg.policy.distribution == "gaussian" and not cfg.policy.normalise_observations
-    assert cfg.env == type(cfg.env)(num_worlds=32000, objects=("procedural-150-seed0",)), (
-        "the task is the paper's, by the environment's defaults, on as many objects"
+    seen = ObservationCfg(canonical=True)
+    assert cfg.env == type(cfg.env)(num_worlds=32000, objects=("procedural-150-seed0",), observation=seen), (
+        "the task is the paper's, by the environment's defaults, on as many objects; signs mean nothing"
     )
+    assert all(preset().env.observation.canonical for preset in PRESETS.values()), "in all that is new"
+    assert not ObservationCfg().canonical, "what files do not say that are older"
 
 
 @pytest.mark.parametrize(
