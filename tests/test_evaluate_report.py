@@ -80,7 +80,8 @@ def test_report_prints_rates_with_their_intervals_and_escapes_names(tmp_path, re
     write_report(result, tmp_path / "report.html")
     text, _ = read_page(tmp_path / "report.html")
     drop = result.overall.drop_rate
-    assert f"{100 * drop.value:.1f} % ({100 * drop.low:.1f} to {100 * drop.high:.1f})" in text
+    interval = f"({100 * drop.low:.1f} to {100 * drop.high:.1f})"
+    assert f"{100 * drop.value:.1f}&nbsp;% <small>{interval}</small>" in text
     assert "b&lt;i&gt;" in text and "<i>" not in text
     assert f"chance {100 * result.overall.chance['0.4']:.2f}" in text
     assert "over the episodes of each object" in text

@@ -160,10 +160,17 @@ def test_rates_count_what_happened():
     assert result.overall.drop_rate.value == pytest.approx(2 / 20)
     assert [s.drop_rate.value for s in result.per_object] == pytest.approx([0.1, 0.1])
     for tolerance in TOLERANCES_RAD:
-        counted = np.mean([not e.fell and e.error_rad <= tolerance for e in result.episodes])
-        assert result.overall.success[str(tolerance)].value == pytest.approx(counted)
+        exact, alike = (
+            np.mean([not e.fell and getattr(e, name) <= tolerance for e in result.episodes])
+            for name in ("exact_error_rad", "error_rad")
+        )
+        assert result.overall.success[str(tolerance)].value == pytest.approx(exact), "of the very goal"
+        assert result.overall.symmetric[str(tolerance)].value == pytest.approx(alike)
+    assert result.overall.success["0.8"].value < result.overall.symmetric["0.8"].value, "one is a cube"
+    for e in result.episodes:
+        assert e.error_rad <= e.exact_error_rad + 1e-9
     assert result.overall.unit == "episode"
-    assert result.per_object[1].chance["0.4"] > 20 * result.per_object[0].chance["0.4"]
+    assert result.per_object[1].chance == result.per_object[0].chance, "a symmetry does not help by chance"
 
 
 def test_time_to_success_is_of_successes_alone():
