@@ -251,14 +251,15 @@ def test_students_and_teacher_side_by_side(tmp_path, capsys):
 def test_a_bundled_student_with_scanned_goals_in_the_air(tmp_path, capsys):
     path = str(tmp_path / "bundle")
     assert train(["bundle", save_student(tmp_path / "student.pt", 1), path]) == 0
-    flags = ["--in-air", "--scanned-goals", "--episodes", "2", "--device", "cpu", "--episode-s", "2.5"]
+    flags = ["--in-air", "--goals", "scan", "--episodes", "2", "--device", "cpu", "--episode-s", "2.5"]
     assert main([path, *flags, "--sees", "rendered", "--output", str(tmp_path / "out")]) == 0
     assert "object falls" in capsys.readouterr().out
     comparison = Comparison.read(tmp_path / "out" / "eval.json")
     by_prediction, by_truth = comparison.rows
     assert by_prediction.sees == "rendered clouds" and by_prediction.result.protocol.in_air
-    assert by_prediction.result.protocol.scanned_goals
-    assert "from scans" in (tmp_path / "out" / "eval.html").read_text()
+    protocol = by_prediction.result.protocol
+    assert protocol.goals == "scan" and protocol.sensor_errors and by_prediction.held is not None
+    assert "500 points of a scan" in (tmp_path / "out" / "eval.html").read_text()
     assert by_truth.outcomes["object falls"].value + by_truth.outcomes["success"].value > 0.0
 
 
