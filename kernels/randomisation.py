@@ -5,7 +5,7 @@ Draws act on the worlds of an int32 mask; worlds outside it keep every bit. Rang
 
 import warp as wp
 
-from vd.kernels.actuators import KD, KP
+from vd.kernels.actuators import COMMAND_DELAY, KD, KP, READ_DELAY
 from vd.kernels.rng import next_stream, uniform
 
 wp.set_module_options({"enable_backward": False})
@@ -122,6 +122,9 @@ def draw_servo_kernel(
 ):
     """Draw the servo model of the joints of the masked worlds, each number for itself. Launch: [N].
 
+    But the delays of commands and of readings are of the bus that all joints share: each is drawn once, as
+    the same share of every joint's range.
+
     Args:
         ranges: Range of each parameter of each joint, shape [D, P]; equal ends draw nothing.
         mask_in: 1 where a world is drawn anew, shape [N].
@@ -135,13 +138,20 @@ def draw_servo_kernel(
         return
     state = rng[world]
     joints = ranges.shape[0]
+    commanded = wp.randf(state)
+    read = wp.randf(state)
     for joint in range(joints):
         row = world * joints + joint
         for column in range(ranges.shape[1]):
             bounds = ranges[joint, column]
             value = bounds[0]
             if bounds[1] > bounds[0]:
-                state, value = uniform(state, bounds)
+                if column == COMMAND_DELAY:
+                    value = wp.lerp(bounds[0], bounds[1], commanded)
+                elif column == READ_DELAY:
+                    value = wp.lerp(bounds[0], bounds[1], read)
+                else:
+                    state, value = uniform(state, bounds)
             parameters_out[row, column] = value
         parameters_out[row, KP] = kp_in[world, joint]
         parameters_out[row, KD] = kd_in[world, joint]

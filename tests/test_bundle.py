@@ -163,6 +163,14 @@ def test_a_contract_of_other_conventions_is_refused(teacher_bundle, hand, field,
         check_hand(read_contract(teacher_bundle), hand, teacher_bundle)
 
 
+@pytest.mark.parametrize("observation", [{"history": 5}, {"dynamics": "actor"}])
+def test_what_a_robots_loop_does_not_observe_is_refused(tmp_path, hand, observation):
+    policy = load_policy(SHIPPED_POLICIES[TEACHER])
+    policy.task["observation"] |= observation
+    with pytest.raises(ContractError, match="does not observe these yet"):
+        write_teacher(tmp_path / "teacher", policy, hand)
+
+
 def test_damage_is_named(teacher_bundle):
     weights = teacher_bundle / "weights.safetensors"
     data = bytearray(weights.read_bytes())

@@ -18,6 +18,7 @@ from vd.evaluate.agents import (
     task_for,
 )
 from vd.evaluate.cli import main
+from vd.evaluate.conditions import CONDITIONS
 from vd.policy import load_policy
 
 
@@ -130,6 +131,27 @@ def test_flags_of_the_start_exclude_each_other(capsys):
     ]
     assert main(["--agent", "zero", "--at-rest", "--no-at-rest"]) == 1
     assert "exclude each other" in capsys.readouterr().err
+
+
+def test_conditions_replace_what_a_policy_was_trained_in_and_nobody_tells_a_critic():
+    trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
+    trained.task["observation"] = {"dynamics": "critic", "history": 2}
+    for condition in CONDITIONS.values():
+        task = task_of(trained, condition=condition)
+        task.validate()
+        assert task.randomisation == condition
+        assert task.observation.dynamics == "none" and task.observation.history == 2
+    assert not CONDITIONS["nominal"].enabled and CONDITIONS["mixed"].observation_latency_s == (0.0, 0.12)
+    assert CONDITIONS["hard"].force_s == 5.0 * CONDITIONS["s3"].force_s
+    trained.task["observation"] = {"dynamics": "critic", "view": "goal"}
+    with pytest.raises(ValueError, match="second view asks the critic"):
+        task_of(trained, second_view=True)
+
+
+@pytest.mark.parametrize("other", ["--randomise", "--in-air"])
+def test_a_condition_excludes_what_would_change_it(other, capsys):
+    assert main(["--agent", "zero", "--condition", "mixed", other]) == 1
+    assert "--condition" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("module", ["vd.evaluate.cli", "vd.play.cli"])

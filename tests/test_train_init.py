@@ -189,6 +189,50 @@ def test_what_does_not_fit_is_named_with_the_flag_that_would(tmp_path):
         runner.begin_from(str(path))
 
 
+class Telling(DummyEnv):
+    """The dummy with two values more for its critic: twice the target."""
+
+    num_privileged = 2
+
+    def _observe(self) -> None:
+        super()._observe()
+        self.privileged.assign(2.0 * self._target)
+
+
+@pytest.mark.parametrize("critic", [True, False])
+def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it_did(tmp_path, critic):
+    path = _export(tmp_path / "first", critic=critic)
+    runner = make_runner(tmp_path / "told", env=Telling(num_worlds=16), policy=NORMALISING, ppo=LEARNED)
+    runner.begin_from(str(path))
+    assert runner.new_inputs == 2 * critic and runner.num_observations == 5
+    observation, plain = runner.env.get_observations(), load_policy(path)
+    with torch.no_grad():
+        actions, values = runner.alg.actor(observation), runner.alg.critic(observation)[:, 0]
+    assert torch.allclose(actions, plain.act(observation["policy"]), atol=1e-6)
+    if critic:
+        assert torch.allclose(values, plain.value(observation["policy"]), atol=1e-5)
+    runner.critic_warmup = 0
+    runner.learn(2)
+    assert runner.alg.critic.state_dict()["mlp.0.weight"][:, 5:].abs().max() > 0.0, "it was not told"
+    ended = load_policy(tmp_path / "told" / "policy.pt")
+    assert ended.act(observation["policy"]).shape == (16, 2)
+    with pytest.raises(ValueError, match="critic was told what no sensor knows"):
+        ended.value(observation["policy"])
+    again = make_runner(tmp_path / "told", env=Telling(num_worlds=16), policy=NORMALISING, ppo=LEARNED)
+    again.load(str(find_checkpoint(tmp_path / "told", "latest")))
+    assert _same(_state(runner.alg.critic), _state(again.alg.critic)) == list(_state(again.alg.critic))
+
+
+def test_values_that_come_last_cannot_become_others(tmp_path):
+    path = _export(tmp_path / "first")
+    state = load_checkpoint(path)
+    state["task"]["observation"] = {"history": 5}
+    save_checkpoint(path, state)
+    runner = make_runner(tmp_path / "second", policy=NORMALISING)
+    with pytest.raises(ValueError, match=r"--env\.observation\.history 5.*history 0"):
+        runner.begin_from(str(path))
+
+
 def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys):
     assert find_start("dclaw3-table") == SHIPPED_POLICIES["dclaw3-table"]
     make_runner(tmp_path).learn(1)

@@ -87,7 +87,7 @@ def test_a_run_that_has_nothing_left_to_do_does_not_speak_of_a_policy(tmp_path, 
 
 
 @pytest.mark.slow
-def test_a_blind_run_goes_on_seeing_the_shape_and_its_policy_is_evaluated(tmp_path):
+def test_a_blind_run_goes_on_with_shape_and_memory_and_its_policy_is_evaluated(tmp_path):
     import numpy as np
     import warp as wp
 
@@ -97,23 +97,27 @@ def test_a_blind_run_goes_on_seeing_the_shape_and_its_policy_is_evaluated(tmp_pa
     assert main([*flags, str(tmp_path / "blind"), "--save-every", "1"]) == 0
     checkpoint = checkpoint_path(tmp_path / "blind", 1)
     cfg = smoke()
+    observation = replace(cfg.env.observation, shape="full", history=2, dynamics="critic")
     cfg = replace(
         cfg,
         init=checkpoint,
         run=replace(cfg.run, run_dir=tmp_path / "seeing"),
-        env=replace(cfg.env, num_worlds=4, observation=replace(cfg.env.observation, shape="full")),
+        env=replace(cfg.env, num_worlds=4, observation=observation),
     )
     runner = build_teacher(cfg)
-    assert runner.new_inputs == runner.env.env.num_observations - load_policy(checkpoint).num_observations > 0
+    before, simulation = load_policy(checkpoint).num_observations, runner.env.env
+    told = simulation.privileged.shape[1]
+    assert runner.new_inputs == simulation.num_observations + told - before > told > 0
     observation = runner.env.get_observations()
-    blind = load_policy(checkpoint).act(observation["policy"][:, : -runner.new_inputs])
+    blind = load_policy(checkpoint).act(observation["policy"][:, :before])
     with torch.no_grad():
         assert torch.allclose(runner.alg.actor(observation), blind, atol=1e-5)
     runner.learn(1)
     policy = load_policy(tmp_path / "seeing" / "policy.pt")
-    assert policy.task["observation"]["shape"] == "full"
+    assert policy.task["observation"]["shape"] == "full" and policy.task["observation"]["history"] == 2
     assert np.isfinite(policy.act(wp.to_torch(runner.env.env.observation)).numpy()).all()
-    arguments = ["--episodes", "1", "--num-worlds", "1", "--episode-s", "0.5", "--device", "cpu", "--output"]
+    arguments = ["--episodes", "1", "--num-worlds", "1", "--episode-s", "0.5", "--device", "cpu"]
+    arguments += ["--condition", "mixed", "--output"]
     assert evaluate([str(tmp_path / "seeing"), *arguments, str(tmp_path / "eval")]) == 0
 
 

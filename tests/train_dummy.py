@@ -34,6 +34,7 @@ class DummyEnv:
 
     num_actions = 2
     num_observations = 5
+    num_privileged = 0
     reward_term_names = ("distance", "bonus")
     reach = 0.2
     fall_probability = 0.02
@@ -44,6 +45,7 @@ class DummyEnv:
         n = num_worlds
         self.action = wp.zeros((n, self.num_actions), dtype=float, device=device)
         self.observation = wp.zeros((n, self.num_observations), dtype=float, device=device)
+        self.privileged = wp.zeros((n, self.num_privileged), dtype=float, device=device)
         self.reward = wp.zeros(n, dtype=float, device=device)
         self.reward_terms = wp.zeros((n, 2), dtype=float, device=device)
         self.rotation_error = wp.zeros(n, dtype=float, device=device)

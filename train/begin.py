@@ -19,6 +19,8 @@ MOMENTS_WARMUP = 3
 FINE_KL, FINE_LEARNING_RATE = 0.03, 1e-4
 """Divergence and first rate of a policy that has learned (rows d3-tight-more, d4-tight-more of
 docs/results/runs.md), for one that does not say how it was trained."""
+_APPENDED = {"history": 0, "dynamics": "none"}
+"""Settings of the observation whose values come last, as they are in a policy without them."""
 _SENSES = ("fingertip", "hand_layer", "sim", "action", "observation")
 """Parts of a task that say what a policy's observations and actions mean."""
 
@@ -122,8 +124,14 @@ def completed(state: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
             ``window``.
     """
     if "critic_state_dict" not in state:
-        normaliser = {k: v for k, v in state["actor_state_dict"].items() if k.startswith("obs_normalizer.")}
-        state = state | {"critic_state_dict": own["critic_state_dict"] | normaliser}
+        critic = own["critic_state_dict"]
+        normaliser = {
+            k: v
+            for k, v in state["actor_state_dict"].items()
+            if k.startswith("obs_normalizer.") and v.shape == critic[k].shape
+        }
+        # One that reads more begins with a normalisation of its own.
+        state = state | {"critic_state_dict": critic | (normaliser if len(normaliser) == 4 else {})}
     if "optimizer_state_dict" in state:
         return state
     tightening = state["task"].get("curriculum", {}).get("tightening", {}).get("enabled", False)
@@ -180,6 +188,15 @@ def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, A
                 f"--init: the networks of {path} have {flag} {words}, those of this run {given[name]}; "
                 f"give {_as_flag(flag, value, words)}, or leave --preset out to go on with its settings"
             )
+    before, now = (
+        {name: t.get("observation", {}).get(name, default) for name, default in _APPENDED.items()}
+        for t in (state["task"], task)
+    )
+    if before not in (_APPENDED, now):
+        raise ValueError(
+            f"--init: {path} observes {_flags(before)} and this run {_flags(now)}; only a policy "
+            "without them can go on with others: give those of the policy"
+        )
     if found.num_observations > spec.num_observations:
         observed = " ".join(
             f"--env.observation.{k} {v}" for k, v in state["task"].get("observation", {}).items()
@@ -211,6 +228,10 @@ def _networks(spec: "PolicySpec") -> dict[str, Any]:
     """The settings of ``PolicyCfg`` that a network's shape decides."""
     names = ("hidden", "activation", "distribution", "normalise_observations")
     return {name: getattr(spec, name) for name in names}
+
+
+def _flags(settings: Mapping[str, Any]) -> str:
+    return " ".join(f"--env.observation.{name} {value}" for name, value in settings.items())
 
 
 def _as_flag(flag: str, value: Any, words: str) -> str:

@@ -4,6 +4,7 @@ Defaults are the paper's (Table S1), or its released code's where the paper says
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -201,8 +202,17 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
         )
 
 
-def rsl_rl_config(ppo: PpoCfg, policy: PolicyCfg, num_envs: int) -> dict[str, Any]:
-    """The dictionary that rsl-rl's runner builds algorithm and models from."""
+def rsl_rl_config(
+    ppo: PpoCfg, policy: PolicyCfg, num_envs: int, groups: Sequence[str] = ("policy",)
+) -> dict[str, Any]:
+    """The dictionary that rsl-rl's runner builds algorithm and models from.
+
+    Args:
+        ppo: Algorithm settings.
+        policy: Network settings.
+        num_envs: Worlds.
+        groups: Groups of observations; the actor reads the first, the critic all.
+    """
     from vd.train.distribution import BoundedStdGaussian, FreeStdGaussian  # imports torch
     from vd.train.ppo import TeacherPPO
 
@@ -219,7 +229,7 @@ def rsl_rl_config(ppo: PpoCfg, policy: PolicyCfg, num_envs: int) -> dict[str, An
     }
     return {
         "num_steps_per_env": ppo.rollout_steps,
-        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "obs_groups": {"actor": [groups[0]], "critic": list(groups)},
         "actor": network | {"distribution_cfg": distribution},
         "critic": network,
         "algorithm": {

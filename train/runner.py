@@ -88,7 +88,8 @@ class TeacherRunner(OnPolicyRunner):
         self.ppo, self.run, self.policy_cfg, self.task = ppo, run, policy, task
         # rsl-rl prints its models and observation groups while it builds them.
         with contextlib.redirect_stdout(io.StringIO()):
-            super().__init__(env, rsl_rl_config(ppo, policy, env.num_envs), log_dir=None, device=device)
+            config = rsl_rl_config(ppo, policy, env.num_envs, tuple(env.get_observations().keys()))
+            super().__init__(env, config, log_dir=None, device=device)
         self.env_steps = 0
         self._steps_per_iteration = ppo.rollout_steps * env.num_envs * self.gpu_world_size
         self._elapsed_s = 0.0
@@ -113,7 +114,7 @@ class TeacherRunner(OnPolicyRunner):
 
     @property
     def num_observations(self) -> int:
-        """Values that actor and critic read."""
+        """Values that the actor reads, and the critic too."""
         return int(self.env.get_observations()[OBSERVATION_GROUP].shape[1])
 
     @property
@@ -328,7 +329,7 @@ class TeacherRunner(OnPolicyRunner):
 
     def _widened(self, state: dict[str, Any]) -> dict[str, Any]:
         """A checkpoint with networks of this run's size, if its own are smaller."""
-        inputs = new_inputs(state, self.num_observations)
+        inputs = new_inputs(state, self.num_observations, self.alg.critic.obs_dim)
         units = new_units(state, self.policy_cfg.hidden)
         if not inputs and not units:
             return state
@@ -423,10 +424,7 @@ class TeacherRunner(OnPolicyRunner):
         storage = self.alg.storage
         # In the order in which a step makes them.
         tensors = (
-            (
-                "observations",
-                torch.cat((storage.observations[OBSERVATION_GROUP], latest[OBSERVATION_GROUP][None])),
-            ),
+            ("observations", torch.cat((_all_values(storage.observations), _all_values(latest)[None]))),
             ("values", storage.values),
             ("actions", storage.actions),
             ("rewards", storage.rewards),
@@ -493,3 +491,8 @@ class TeacherRunner(OnPolicyRunner):
         """
         if self.is_distributed:
             torch.distributed.destroy_process_group()
+
+
+def _all_values(observations: TensorDict) -> torch.Tensor:
+    """Everything that is observed [..., O + P]."""
+    return torch.cat(tuple(observations.values()), dim=-1)

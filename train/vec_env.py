@@ -13,7 +13,9 @@ from vd.evaluate.second_view import GoalClock, OtherViews, view_maps
 from vd.paper import PAPER
 
 OBSERVATION_GROUP = "policy"
-"""The one observation group; actor and critic both read it, as in the paper."""
+"""What actor and critic both read; all there is in the paper."""
+PRIVILEGED_GROUP = "privileged"
+"""What the critic alone reads besides (``ObservationCfg.dynamics``)."""
 
 
 class ReorientVecEnv(VecEnv):
@@ -57,7 +59,9 @@ class ReorientVecEnv(VecEnv):
         self.max_episode_length = env.max_episode_steps
         self.device = str(wp.device_to_torch(env.device))
         self.cfg: dict[str, Any] = to_dict(env.cfg)
-        self._observation = wp.to_torch(env.observation)
+        self._observed = {OBSERVATION_GROUP: wp.to_torch(env.observation)}
+        if env.privileged.shape[1]:
+            self._observed[PRIVILEGED_GROUP] = wp.to_torch(env.privileged)
         self._reward = wp.to_torch(env.reward)
         self._reward_terms = wp.to_torch(env.reward_terms)
         self._success = wp.to_torch(env.success)
@@ -88,8 +92,12 @@ class ReorientVecEnv(VecEnv):
         self._step_count.copy_(value)
 
     def get_observations(self) -> TensorDict:
-        """The observation for the next action, ``{"policy": [N, O]}``, a copy on the device."""
-        return TensorDict({OBSERVATION_GROUP: self._observation.clone()}, batch_size=[self.num_envs])
+        """The observation for the next action, ``{"policy": [N, O]}``, a copy on the device.
+
+        With ``ObservationCfg.dynamics`` also ``"privileged"``, [N, P].
+        """
+        copies = {group: values.clone() for group, values in self._observed.items()}
+        return TensorDict(copies, batch_size=[self.num_envs])
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """Simulate one control step.

@@ -11,19 +11,29 @@ MOMENT, SECOND_MOMENT = "exp_avg", "exp_avg_sq"
 _FILLS = {"obs_normalizer._mean": 0.0, "obs_normalizer._var": 1.0, "obs_normalizer._std": 1.0}
 
 
-def new_inputs(state: dict[str, Any], num_observations: int) -> int:
-    """How many more values ``num_observations`` are than the networks of a checkpoint read.
+def new_inputs(state: dict[str, Any], num_observations: int, critic_observations: int | None = None) -> int:
+    """How many more values a run observes than the networks of a checkpoint read.
+
+    Args:
+        state: The checkpoint, with or without a critic.
+        num_observations: Values that the run's actor reads.
+        critic_observations: Values that its critic reads; as many by default.
 
     Raises:
         ValueError: They are fewer.
     """
     before = int(state["policy"]["num_observations"])
-    if num_observations < before:
-        raise ValueError(
-            f"its networks read {before} values and this run observes {num_observations}, but a run can only "
-            "go on with more"
-        )
-    return num_observations - before
+    read = [(before, num_observations)]
+    if "critic_state_dict" in state:
+        of_critic = state["critic_state_dict"]["mlp.0.weight"].shape[1]
+        read.append((of_critic, num_observations if critic_observations is None else critic_observations))
+    for then, now in read:
+        if now < then:
+            raise ValueError(
+                f"its networks read {then} values and this run observes {now}, but a run can only "
+                "go on with more"
+            )
+    return max(now - then for then, now in read)
 
 
 def can_grow(before: Sequence[int], now: Sequence[int]) -> bool:

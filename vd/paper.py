@@ -115,6 +115,9 @@ class RandomisationConstants:
     gravity_std_code: float = source(0.4, "C", "m/s^2 per axis; not in the paper")
     force_probability: float = source(0.2, "P", "per control step")
     force_n_per_kg: float = source(15.0, "P", "c_d, Table S1: F = 15 m")
+    force_s_code: float = source(
+        1.0 / 60.0, "C", "set once a control step, so one of 5 steps of 1/60 s has it"
+    )
     redraw_s: float = source(100.0, "C", "dynamics are drawn anew at a reset after 1200 control steps")
 
 

@@ -138,6 +138,11 @@ class TrainedPolicy:
             raise ValueError(
                 "the policy has no critic; export it again from a checkpoint of its run (vd-train export)"
             )
+        if self._critic["mlp.0.weight"].shape[1] != self.num_observations:
+            raise ValueError(
+                "the policy's critic was told what no sensor knows (observation.dynamics), so it can be "
+                "asked in its own training only"
+            )
         spec = replace(self.spec, num_actions=1, distribution="gaussian")
         return MeanAction(spec, self._critic).to(self._device)
 

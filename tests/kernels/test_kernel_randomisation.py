@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from kernel_oracle import ALPHA, EXAMPLES, device_array, settings_array, streams, unwritten
 from scipy import stats
 
-from vd.kernels.actuators import PARAMETER_COLUMNS
+from vd.kernels.actuators import COMMAND_DELAY, PARAMETER_COLUMNS, READ_DELAY
 from vd.kernels.randomisation import (
     ForceParams,
     RandomisationParams,
@@ -150,6 +150,21 @@ def test_servos_are_drawn_from_their_ranges_and_carry_the_gains_of_their_world(d
             else:
                 assert (rows[:, joint, column] == ranges[joint, column, 0]).all()
     assert_uncorrelated(np.stack([rows[:, j, c] for j, c in drawn], axis=1), 0.1)
+
+
+def test_delays_are_the_same_share_of_every_joint_s_range(device):
+    worlds, joints = 4000, 3
+    ranges = np.zeros((joints, PARAMETER_COLUMNS, 2), dtype=np.float32)
+    for column in (COMMAND_DELAY, READ_DELAY):
+        ranges[:, column] = [(0.0, 0.04), (0.01, 0.03), (0.02, 0.02)]
+    gains = np.ones((2, worlds, joints), dtype=np.float32)
+    rows, _ = draw_servo(device, np.ones(worlds, int), ranges, gains, seed=8)
+    shares = rows[:, 0, [COMMAND_DELAY, READ_DELAY]] / 0.04
+    for k, column in enumerate((COMMAND_DELAY, READ_DELAY)):
+        assert_uniform(shares[:, k], (0.0, 1.0))
+        np.testing.assert_allclose(rows[:, 1, column], 0.01 + 0.02 * shares[:, k], atol=1e-6)
+        assert (rows[:, 2, column] == np.float32(0.02)).all()
+    assert_uncorrelated(shares, 0.1)
 
 
 def test_no_offsets_by_default(device):

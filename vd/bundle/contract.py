@@ -244,6 +244,12 @@ def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
     from vd.kernels.observations import teacher_observation_slices
     from vd.kernels.shapes import shape_observation_size
 
+    seen = task.observation
+    if seen.history or seen.dynamics == "actor":
+        raise ContractError(
+            f"observation.history is {seen.history} and observation.dynamics {seen.dynamics}: a robot's loop "
+            "does not observe these yet; bundle a policy without"
+        )
     slices = teacher_observation_slices(hand.num_fingers)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}
     if task.observation.shape != "none":

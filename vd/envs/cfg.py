@@ -8,6 +8,8 @@ from vd.aim import AimCfg
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
+MAX_LATENCY_S = 0.5
+"""Largest latency of observations that can be drawn [s] (ours): every world keeps all of it in memory."""
 View = Literal["world", "goal", "mirrored", "either"]
 """What a policy sees its goals in, see :attr:`ObservationCfg.view`."""
 
@@ -107,6 +109,17 @@ class ObservationCfg:
     canonical: bool = False
     """Of the two quaternions of a rotation see always the same, of object, goal and the rotation between
     them. On in all presets; off where a policy's file does not say: those policies have learned the signs."""
+    history: int = 0
+    """Ours: past control steps that are remembered, each with joint positions, action, and the object's way
+    and rotation since (vd/kernels/history.py): from them a policy can tell how late and stiff its hand is."""
+    dynamics: Literal["none", "critic", "actor"] = "none"
+    """Ours, privileged: who is told what was drawn (gains, delay, friction and backlash of joints, frictions,
+    mass, latency). The critic is then also told how the true state differs from what is seen."""
+
+    def validate(self) -> None:
+        """Raise ValueError naming the field and the remedy."""
+        if self.history < 0:
+            raise ValueError(f"observation.history is {self.history}; it is a number of steps, 0 for none")
 
     def views(self, fingers: int) -> int:
         """Views in which a hand of so many fingers sees its goals; 0: it sees the world as it is."""
@@ -402,11 +415,18 @@ class RandomisationCfg:
     """Chance in a control step that a force begins to act on the object."""
     force_n_per_kg: float = PAPER.randomisation.force_n_per_kg
     """Size of that force [N per kg of the object]; its direction is uniform."""
+    force_s: float = PAPER.randomisation.force_s_code
+    """How long a new force acts in its control step [s]. The default is one of five simulation steps, as in
+    the released code; a whole control step, 1/12, gives five times the impulse (condition ``hard``)."""
     force_decay: float = 0.0
     """What remains of a force in the next control step: 0 in the paper, 0.998 in the released code."""
     effects: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Effects of servos to draw for every joint, by name and parameter: command_delay.delay_s 0 0.04 draws a
-    delay of up to 40 ms. They replace what a hand layer says about the same parameter."""
+    delay of up to 40 ms. They replace what a hand layer says about the same parameter. Delays are of the bus:
+    all joints of a world have the same share of their range."""
+    observation_latency_s: tuple[float, float] = (0.0, 0.0)
+    """How old the state is that the policy sees [s], drawn for each episode, to the nearest physics step.
+    Rewards and success are of the true state."""
     redraw_s: float = PAPER.randomisation.redraw_s
     """Gains and frictions are drawn anew at the first reset after this time [s]."""
 
@@ -415,11 +435,23 @@ class RandomisationCfg:
         """Whether any contact has restitution."""
         return self.enabled and self.restitution[1] > 0.0
 
+    def force_steps(self, sim: SimCfg) -> int:
+        """Physics steps for which a new force acts."""
+        return min(sim.substeps, max(1, round(self.force_s * sim.physics_hz)))
+
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         low, high = self.restitution
         if not 0.0 <= low <= high <= 1.0:
             raise ValueError(f"randomisation.restitution is {low:g} {high:g}; it has to rise within 0 and 1")
+        low, high = self.observation_latency_s
+        if not 0.0 <= low <= high <= MAX_LATENCY_S:
+            raise ValueError(
+                f"randomisation.observation_latency_s is {low:g} {high:g}; it has to rise within 0 and "
+                f"{MAX_LATENCY_S:g}"
+            )
+        if self.force_s <= 0.0:
+            raise ValueError(f"randomisation.force_s is {self.force_s:g}; it has to be positive")
         from vd.envs.servo import check_effects  # needs Warp, which settings alone do not
 
         check_effects(self.effects)
@@ -477,6 +509,7 @@ class ReorientCfg:
         """Raise ValueError naming the field and the remedy."""
         self.sim.validate()
         self.reward.validate()
+        self.observation.validate()
         self.randomisation.validate()
         self.curriculum.validate()
         self.focus.validate()

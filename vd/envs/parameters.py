@@ -54,7 +54,10 @@ class TaskParameters:
         self.force = array(
             ForceParams,
             probability=on * random.force_probability,
-            force_per_mass=random.force_n_per_kg,
+            # Of the impulse that is asked for, whatever the physics step.
+            force_per_mass=random.force_n_per_kg
+            * random.force_s
+            / (random.force_steps(cfg.sim) * cfg.sim.physics_dt),
             decay=random.force_decay,
         )
         materials = PAPER.materials

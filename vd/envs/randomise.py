@@ -59,6 +59,9 @@ class Randomiser:
         self.observation_offset = zeros(n, teacher_observation_size(env.num_fingers))
         self.force = zeros(n, dtype=wp.vec3)
         """Disturbance force on the object [N], world frame, shape [N]."""
+        self._no_force = zeros(n, dtype=wp.vec3)
+        if self.enabled:
+            env.sim.force_steps = cfg.randomisation.force_steps(cfg.sim)
         self._gravity = wp.vec3(*env.sim.model.gravity.numpy()[0].tolist())
         self._age, self._due = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
         self._interval = round(cfg.randomisation.redraw_s * cfg.sim.control_hz)
@@ -178,6 +181,13 @@ class Randomiser:
             )
         elif not env.cfg.curriculum.lightens:
             return
+        self._write_force(self.force, env.sim.body_force)
+        if env.cfg.curriculum.lightens:
+            self._write_force(self._no_force, env.sim.lasting_force)
+
+    def _write_force(self, force: wp.array, out: wp.array) -> None:
+        """Write a force on the objects, shape [N], and what carries them, as forces on bodies [N, B]."""
+        env = self._env
         wp.launch(
             write_object_force_kernel,
             dim=env.num_worlds,
@@ -187,9 +197,9 @@ class Randomiser:
                 self._gravity,
                 env.parameters.weight,
                 env.scene.object_body,
-                self.force,
+                force,
             ],
-            outputs=[env.sim.body_force],
+            outputs=[out],
             device=env.device,
         )
 

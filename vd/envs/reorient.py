@@ -19,26 +19,18 @@ from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.fingers import Fingers
 from vd.envs.nudges import Nudges
 from vd.envs.objects import object_scales, object_weights
+from vd.envs.observer import Observer
 from vd.envs.parameters import TaskParameters
 from vd.envs.randomise import Randomiser
 from vd.envs.servo import needs_servo, servo_ranges
-from vd.envs.shapes import ShapeObserver
 from vd.envs.starts import find_rest_poses
 from vd.envs.state import load_state, motion_arrays, save_failed_step, save_state
-from vd.envs.symmetry import Views
 from vd.envs.table import must_lift, table_array
 from vd.kernels.actions import apply_action_kernel
-from vd.kernels.aim import aim_kernel
 from vd.kernels.guard import void_step_kernel
-from vd.kernels.observations import (
-    goal_time_kernel,
-    teacher_observation_kernel,
-    teacher_observation_size,
-)
 from vd.kernels.resets import episode_kernel, give_goal_kernel, reset_kernel
 from vd.kernels.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.rng import init_rng_kernel
-from vd.kernels.shapes import shape_observation_size
 from vd.kernels.worlds import count_goals_kernel, record_step_kernel, world_mask_kernel
 from vd.paper import PAPER
 from vd.sim.scene import build_scene
@@ -101,10 +93,6 @@ class ReorientEnv:
         self.num_fingers = f = self.hand.num_fingers
         self.num_actions = d = self.hand.num_joints
         self.sees_shape = cfg.observation.shape != "none"
-        self.sees_goal_time = cfg.observation.goal_time
-        self.num_observations = (
-            teacher_observation_size(f) + self.sees_shape * shape_observation_size(f) + self.sees_goal_time
-        )
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
         self.reward_term_names = REWARD_TERMS
@@ -119,8 +107,6 @@ class ReorientEnv:
         """Action of the present step in [-1, 1], shape [N, D]."""
         self.smoothed = zeros(n, d)
         """Moving average of the applied actions, shape [N, D]."""
-        self.observation = zeros(n, self.num_observations)
-        """Teacher observation, fresh after resets and new goals, shape [N, O]: state, shape, goal's time."""
         self.reward = zeros(n)
         """Reward of the present step, shape [N]."""
         self.reward_terms = zeros(n, len(REWARD_TERMS))
@@ -159,15 +145,24 @@ class ReorientEnv:
         self._reset, self._new_goal = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
         self._world_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
-        self._lower, self._upper = array(self.hand.lower), array(self.hand.upper)
+        self.lower, self.upper = array(self.hand.lower), array(self.hand.upper)
+        """Joint limits [rad], shape [D]."""
         self.fingers = Fingers(self)
         """Positions of the fingertips and torques of the joints."""
-        self._body_com = wp.clone(self.sim.model.body_com[: self.scene.bodies_per_world])
+        self.body_com = wp.clone(self.sim.model.body_com[: self.scene.bodies_per_world])
+        """Centre of mass of each link in its frame [m], shape [B]."""
         self._reset_q = array(np.tile(PAPER.scene.reset_joint_rad, f))
-        self.views = Views(self) if cfg.observation.view != "world" else None
-        """The views in which the policy observes and acts; None where that is the world frame."""
-        self.world_observation = self.observation if self.views is None else self.views.observation
+        self._lifts = cfg.reward.lift != 0.0
+        self.observer = Observer(self, shapes=self.sees_shape or self._lifts)
+        """Writes what is observed."""
+        self.num_observations = self.observer.num_observations
+        self.observation, self.privileged = self.observer.split(self.observer.all_values)
+        """Teacher observation, fresh after resets and new goals, shape [N, O]: state, shape, goal's time,
+        history, and dynamics if the actor is told; and what the critic alone is told, shape [N, P]."""
+        self.world_observation, _ = self.observer.split(self.observer.world_values)
         """Observation in the world frame, shape [N, O]."""
+        self.views = self.observer.views
+        """The views in which the policy observes and acts; None where that is the world frame."""
         self.acts_in_view = True
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
         self._table_steps = table_array(cfg, self.device)
@@ -175,8 +170,6 @@ class ReorientEnv:
         """1 where success asks that the object does not touch the table, shape [N]."""
         self.nudges = Nudges(cfg, d, n, self.device) if cfg.nudge.enabled or cfg.explore.enabled else None
         """What moves hands that are stuck or far from the goal, or None: they act as the policy does."""
-        self._lifts = cfg.reward.lift != 0.0
-        self._shapes = ShapeObserver(self) if self.sees_shape or self._lifts else None
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
         self.randomiser = Randomiser(self)
 
@@ -287,8 +280,8 @@ class ReorientEnv:
             apply_action_kernel,
             dim=self.num_worlds,
             inputs=[
-                self._lower,
-                self._upper,
+                self.lower,
+                self.upper,
                 p.action,
                 action,
                 self.randomiser.action_offset,
@@ -304,6 +297,7 @@ class ReorientEnv:
         """Launch every kernel of a control step; :meth:`step` replays them as one graph."""
         n, d, p = self.num_worlds, self.num_actions, self.parameters
         sim = self.sim
+        self.observer.remember()
         self._apply_action()
         self.randomiser.disturb()
         if self._table_steps is not None:
@@ -312,8 +306,8 @@ class ReorientEnv:
         if self.cfg.failures_per_million > 0.0:
             sim.put_back(self.step_count, self.goal_steps, self.max_episode_steps - 1)
         self.fingers.measure()
-        if self._shapes is not None and self._lifts:
-            self._shapes.measure_clearance()
+        if self._lifts and self.observer.shapes is not None:
+            self.observer.shapes.measure_clearance()
         wp.launch(
             reward_kernel,
             dim=n,
@@ -425,60 +419,11 @@ class ReorientEnv:
         sim.forward_kinematics()
         if sim.servo is not None:
             sim.servo.reset(self._reset)
+        self.observer.begin(self._reset)
 
     def observe(self) -> None:
         """Refresh the observation from the present state; :meth:`step` and :meth:`reset` have done so."""
-        sim = self.sim
-        if self.cfg.aim.enabled:
-            wp.launch(
-                aim_kernel,
-                dim=self.num_worlds,
-                inputs=[
-                    self.cfg.aim.past_rad,
-                    self.cfg.aim.within_rad,
-                    self.num_actions + 3,
-                    sim.joint_q,
-                    self.goal_quat,
-                ],
-                outputs=[self.aimed_quat],
-                device=self.device,
-            )
-        wp.launch(
-            teacher_observation_kernel,
-            dim=self.num_worlds,
-            inputs=[
-                self._lower,
-                self._upper,
-                self.fingers.tip_body,
-                self.fingers.tip_offset,
-                self._body_com,
-                self.parameters.observation,
-                self.measured_q,
-                self.measured_qd,
-                sim.joint_q,
-                sim.joint_qd,
-                sim.body_q,
-                sim.body_qd,
-                self.aimed_quat,
-                self.smoothed,
-                self.randomiser.observation_offset,
-                self.rng,
-            ],
-            outputs=[self.world_observation],
-            device=self.device,
-        )
-        if self._shapes is not None and self.sees_shape:
-            self._shapes.launch()
-        if self.sees_goal_time:
-            wp.launch(
-                goal_time_kernel,
-                dim=self.num_worlds,
-                inputs=[self.goal_steps, 1.0 / self.cfg.sim.control_hz, self.num_observations - 1],
-                outputs=[self.world_observation],
-                device=self.device,
-            )
-        if self.views is not None:
-            self.views.observe()
+        self.observer.observe()
 
     # Reading
 

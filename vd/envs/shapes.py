@@ -17,6 +17,7 @@ from vd.kernels.shapes import (
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
+    from vd.envs.observer import Observer
     from vd.envs.reorient import ReorientEnv
 
 
@@ -26,9 +27,9 @@ class ShapeObserver:
     Also how high the objects are, for the reward.
     """
 
-    def __init__(self, env: "ReorientEnv"):
+    def __init__(self, env: "ReorientEnv", observer: "Observer"):
         """Put surface points and scales of the objects on the device."""
-        self._env = env
+        self._env, self._observer = env, observer
         device = env.device
         points = np.stack([item.surface_points for item in env.objects])
         self._points = wp.array(points, dtype=wp.vec3, device=device)
@@ -58,8 +59,9 @@ class ShapeObserver:
         )
 
     def launch(self) -> None:
-        """Write the values of the present state and goal."""
-        env = self._env
+        """Write the values of the state that is seen, and of the goal."""
+        env, out = self._env, self._observer.world_values
+        _, _, joint_q, _, body_q, _ = self._observer.seen.arrays
         wp.launch(
             surface_kernel,
             dim=(env.num_worlds, env.num_fingers),
@@ -71,10 +73,10 @@ class ShapeObserver:
                 env.fingers.tip_offset,
                 env.num_actions,
                 self._surface_column,
-                env.sim.joint_q,
-                env.sim.body_q,
+                joint_q,
+                body_q,
             ],
-            outputs=[env.world_observation],
+            outputs=[out],
             device=env.device,
         )
         wp.launch(
@@ -87,9 +89,9 @@ class ShapeObserver:
                 self._directions,
                 env.num_actions,
                 self._extent_column,
-                env.sim.joint_q,
+                joint_q,
                 env.aimed_quat,
             ],
-            outputs=[env.world_observation],
+            outputs=[out],
             device=env.device,
         )

@@ -49,9 +49,10 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
     arrays = {"goal_steps": state["arrays"]["step_count"]} | state["arrays"]
     if arrays.keys() != here.keys():
         raise ValueError(
-            "the saved environment has other servos, views, contacts or nudges; resume with hand_layer, "
-            "observation.view, nudge, explore, randomisation.effects and randomisation.restitution of the "
-            "checkpoint, or from one without worlds (vd-train export --resumable)"
+            "the saved environment has other servos, views, memory, latency, contacts or nudges; resume with "
+            "hand_layer, observation, nudge, explore, randomisation.effects, randomisation.restitution and "
+            "randomisation.observation_latency_s of the checkpoint, or from one without worlds "
+            "(vd-train export --resumable)"
         )
     for name, array in here.items():
         saved = arrays[name]
@@ -122,9 +123,9 @@ def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
         "goals_reached": env.goals_reached,
         "previous_error": env.previous_error,
         "goal_counts": env.goal_counts,
-        "observation": env.observation,
+        "observation": env.observer.all_values,
         "rng": env.rng,
-        **({} if env.views is None else {"view": env.views.view}),
+        **env.observer.stateful(),
         **({} if env.nudges is None else env.nudges.stateful()),
         **env.randomiser.stateful(),
         **({} if sim.restitution is None else sim.restitution.stateful()),

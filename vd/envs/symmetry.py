@@ -5,9 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp as wp
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from vd.envs.cfg import View
+from vd.envs.parts import observation_parts
+from vd.kernels.dynamics import JOINT_CHANNELS, SCALARS
 from vd.kernels.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER, teacher_observation_slices
 from vd.kernels.shapes import extent_directions, shape_observation_slices
 from vd.kernels.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
@@ -80,7 +83,7 @@ def view_tables(env: "ReorientEnv", view: View) -> ViewTables:
     return ViewTables(
         source=source,
         factor=np.take_along_axis(maps, source, axis=2),
-        offset=np.stack([_observation_offset(env, turn) for turn in turns]),
+        offset=np.stack([_observation_offset(env, turn, maps.shape[1]) for turn in turns]),
         joints=np.stack(order),
         sign=np.stack([_joint_signs(turn, fingers) for turn in turns]),
         # An axis of rotation looks the other way in a mirror.
@@ -94,16 +97,20 @@ class Views:
     Attributes:
         tables: What they are made of.
         view: View of each world, from 0, shape [N].
-        observation: Observation in the world frame, shape [N, O]; views of it go to ``env.observation``.
+        observation: Observation in the world frame, shape [N, A]; views of it go to ``out``.
     """
 
-    def __init__(self, env: "ReorientEnv"):
+    def __init__(self, env: "ReorientEnv", out: wp.array):
         """Put the tables of the hand on the device.
+
+        Args:
+            env: The environment.
+            out: Where views of the observation are written, shape [N, A].
 
         Raises:
             ValueError: The hand has no such views, see :func:`view_tables`.
         """
-        self._env = env
+        self._env, self._out = env, out
         device, worlds = env.device, env.num_worlds
         tables = self.tables = view_tables(env, env.cfg.observation.view)
         chosen_from = env.cfg.observation.views(env.num_fingers)
@@ -115,7 +122,7 @@ class Views:
         self._sector = wp.array(tables.sector[:chosen_from], dtype=wp.vec3, device=device)
         self._action = wp.zeros((worlds, env.num_actions), dtype=float, device=device)
         self.view = wp.zeros(worlds, dtype=wp.int32, device=device)
-        self.observation = wp.zeros((worlds, env.num_observations), dtype=float, device=device)
+        self.observation = wp.zeros_like(out)
 
     def choose(self, reset: wp.array, new_goal: wp.array) -> None:
         """Choose anew for worlds in which either mask, shape [N], is set."""
@@ -129,14 +136,13 @@ class Views:
         )
 
     def observe(self) -> None:
-        """Write ``env.observation``."""
-        env = self._env
+        """Write the observation in the present views."""
         wp.launch(
             view_observation_kernel,
-            dim=env.observation.shape,
+            dim=self._out.shape,
             inputs=[self._source, self._factor, self._offset, self.view, self.observation],
-            outputs=[env.observation],
-            device=env.device,
+            outputs=[self._out],
+            device=self._env.device,
         )
 
     def world_action(self, action: wp.array, out: wp.array | None = None) -> wp.array:
@@ -233,13 +239,13 @@ def _joint_signs(turn: np.ndarray, fingers: int) -> np.ndarray:
     return np.tile(MIRROR_SIGNS if np.linalg.det(turn) < 0.0 else np.ones(JOINTS_PER_FINGER), fingers)
 
 
-def _observation_offset(env: "ReorientEnv", turn: np.ndarray) -> np.ndarray:
-    """What is added in a view to what :func:`_observation_map` makes [O].
+def _observation_offset(env: "ReorientEnv", turn: np.ndarray, size: int) -> np.ndarray:
+    """What is added in a view to what :func:`_observation_map` makes, ``size`` values.
 
     An angle is observed as it lies between its limits, from -1 to 1; of one that is turned round these are
     the limits of the other side.
     """
-    offset = np.zeros(env.num_observations)
+    offset = np.zeros(size)
     lower, upper = np.asarray(env.hand.lower), np.asarray(env.hand.upper)
     turned_round = _joint_signs(turn, env.num_fingers) < 0.0
     columns = teacher_observation_slices(env.num_fingers)["joint_position"]
@@ -248,13 +254,14 @@ def _observation_offset(env: "ReorientEnv", turn: np.ndarray) -> np.ndarray:
 
 
 def _observation_map(env: "ReorientEnv", tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Matrix [O, O] from an observation in the world frame to that of a view.
+    """Matrix [A, A] from an observation in the world frame to that of a view.
 
     Args:
         env: The environment, for what is observed.
         tips: Fingertip poses with all angles zero, shape [F, 7].
         turn: Turn or reflection [3, 3] of the world that makes the view.
     """
+    parts = observation_parts(env.cfg.observation, env.num_fingers)
     count, fingers = len(tips), _finger_source(tips, turn)
     quaternion = _orientation_map(turn)
     axial = np.linalg.det(turn) * turn  # rotations look the other way in a mirror
@@ -268,7 +275,7 @@ def _observation_map(env: "ReorientEnv", tips: np.ndarray, turn: np.ndarray) -> 
         for begin, block in ((0, turn), (3, sign * quaternion), (7, turn), (10, axial)):
             end = begin + len(block)
             tip_blocks[finger, begin:end, old, begin:end] = block
-    parts = {
+    blocks = {
         "joint_position": joints,
         "joint_velocity": joints,
         "object_position": turn,
@@ -281,25 +288,31 @@ def _observation_map(env: "ReorientEnv", tips: np.ndarray, turn: np.ndarray) -> 
         "previous_action": joints,
     }
     slices = teacher_observation_slices(count)
-    if env.sees_shape:
+    if "shape" in parts:
         directions = np.array(extent_directions(count))
         back = directions @ turn
         same = np.argmin(np.linalg.norm(back[:, None] - directions[None], axis=2), axis=1)
         extents = np.eye(len(directions))[same]
-        parts |= {
+        blocks |= {
             "surface": np.kron(np.eye(count)[fingers], turn),
             "extent": extents,
             "goal_extent": extents,
         }
-        first = slices["previous_action"].stop
+        first = parts["shape"].start
         for name, columns in shape_observation_slices(count).items():
             slices[name] = slice(first + columns.start, first + columns.stop)
-    # Columns of no direction, such as the goal's time, are the same in all views.
-    matrix = np.zeros((env.num_observations, env.num_observations))
-    last = max(columns.stop for columns in slices.values())
-    matrix[last:, last:] = np.eye(env.num_observations - last)
-    for name, block in parts.items():
-        matrix[slices[name], slices[name]] = block
+    frames = np.eye(env.cfg.observation.history)
+    blocks |= {
+        "goal_time": np.eye(1),
+        "history": np.kron(frames, block_diag(joints, joints, turn, axial)),
+        "dynamics": block_diag(np.kron(np.eye(JOINT_CHANNELS), np.abs(joints)), np.eye(SCALARS)),
+        "truth": block_diag(joints, turn, axial),
+    }
+    slices |= {name: columns for name, columns in parts.items() if name in blocks}
+    size = max(columns.stop for columns in parts.values())
+    matrix = np.zeros((size, size))
+    for name, columns in slices.items():
+        matrix[columns, columns] = blocks[name]
     matrix[np.abs(matrix) < np.finfo(np.float32).eps] = 0.0
     return matrix
 

@@ -14,6 +14,7 @@ from vd.envs.cfg import (
     ExploreCfg,
     NudgeCfg,
     ObservationCfg,
+    RandomisationCfg,
     ReorientCfg,
     SuccessCfg,
     TableCfg,
@@ -287,6 +288,7 @@ def task_for(
     explore: bool = False,
     aim: bool = False,
     second_view: bool = False,
+    condition: RandomisationCfg | None = None,
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
 
@@ -313,6 +315,7 @@ def task_for(
         aim: Whether it is told to turn past a goal that is near.
         second_view: Whether a teacher looks twice at goals (:mod:`vd.evaluate.second_view`); a student needs
             nothing of the task for that.
+        condition: What is drawn, in place of ``randomised`` (:mod:`vd.evaluate.conditions`).
 
     Raises:
         ValueError: The teacher does not see its goals in views.
@@ -325,6 +328,8 @@ def task_for(
         from vd.evaluate.second_view import with_second_view
 
         base = replace(base, observation=with_second_view(base.observation))
+    if base.observation.dynamics == "critic":  # whom nobody asks here
+        base = replace(base, observation=replace(base.observation, dynamics="none"))
     return replace(
         base,
         hand=hand or base.hand,
@@ -345,5 +350,5 @@ def task_for(
         nudge=NudgeCfg(enabled=nudge),
         explore=ExploreCfg(enabled=explore),
         aim=AimCfg(enabled=aim),
-        randomisation=replace(base.randomisation, enabled=randomised),
+        randomisation=condition or replace(base.randomisation, enabled=randomised),
     )

@@ -22,12 +22,14 @@ from vd.evaluate.agents import (
     start_at_rest,
 )
 from vd.evaluate.compare import parse_groups
+from vd.evaluate.conditions import CONDITIONS, Condition
 from vd.evaluate.goals import Goals
 from vd.files import check_folder
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
+    from vd.envs.cfg import RandomisationCfg
     from vd.evaluate.result import EvalResult
 
 # Worlds simulated at once by default: enough to keep the device busy, few enough to fit anywhere.
@@ -132,6 +134,10 @@ class EvalCfg:
     """What students see: complete clouds, a depth camera's, or what their stage was trained on."""
     randomise: bool = False
     """Randomise dynamics and add noise and disturbances as in training."""
+    condition: Condition | None = None
+    """Evaluate in a named condition, whatever the training: nominal; s3, Table S3; hard, the same with forces
+    that last a control step; mixed, Table S3 with friction, backlash, late commands and observations;
+    observation-late and command-late, 83 ms and nothing else."""
     resample: Literal["auto", "object", "episode"] = "auto"
     """What intervals speak about: objects (from 8 of them) or episodes within objects."""
     num_worlds: int | None = None
@@ -171,6 +177,16 @@ class EvalCfg:
         """Time limit of an episode [s]."""
         return episode_limit_s(self.episode_s, in_air=self.in_air)
 
+    @property
+    def randomisation(self) -> "RandomisationCfg | None":
+        """What is drawn; None: as trained, if at all."""
+        return None if self.condition is None else CONDITIONS[self.condition]
+
+    @property
+    def randomised(self) -> bool:
+        """Whether anything is drawn."""
+        return self.randomise if self.randomisation is None else self.randomisation.enabled
+
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
         if self.episodes < 1:
@@ -187,6 +203,8 @@ class EvalCfg:
             raise ValueError(f"--episode-s is {self.episode_s}; it must be positive")
         if self.table_friction is not None and self.randomise:
             raise ValueError("--table-friction and --randomise exclude each other; give one of them")
+        if self.condition is not None and (self.randomise or self.table_friction is not None):
+            raise ValueError("--condition excludes --randomise and --table-friction; give one of them")
         if self.table_friction is not None and self.table_friction < 0.0:
             raise ValueError(f"--table-friction is {self.table_friction}; it must not be negative")
         self._validate_suite()
@@ -227,6 +245,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return _run_suite(cfg)
         traced = cfg.in_air or cfg.table_friction is not None or cfg.goals != "mesh"
         if len(names) > 1 or traced or "=" in "".join(cfg.objects) or sees_clouds(names[0]):
+            if cfg.condition is not None:
+                raise ValueError(
+                    "--condition is for one teacher, without --in-air and groups; run each alone"
+                )
             return _compare(cfg)
         return _evaluate(cfg)
     except (ValueError, OSError, RuntimeError) as error:
@@ -326,7 +348,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         stop_tolerance_rad=cfg.stop_tolerance,
         max_goal_angle_rad=cfg.max_goal_angle,
         episode_s=cfg.limit_s,
-        randomised=cfg.randomise,
+        randomised=cfg.randomised,
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
@@ -334,6 +356,7 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         explore=cfg.explore,
         aim=cfg.aim,
         second_view=cfg.second_view,
+        condition=cfg.randomisation,
     )
     check_bundle(name, task)
     print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
@@ -373,13 +396,14 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         stop_tolerance_rad=cfg.stop_tolerance,
         episode_s=cfg.limit_s,
         control_hz=task.sim.control_hz,
-        randomised=cfg.randomise,
+        randomised=cfg.randomised,
         at_rest=task.start.at_rest,
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
         nudge=cfg.nudge,
         explore=cfg.explore,
         aim=cfg.aim,
         second_view=cfg.second_view,
+        condition=cfg.condition,
     )
     result = summarise(
         protocol,

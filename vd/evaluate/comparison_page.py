@@ -330,7 +330,7 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
         ("goals", goals_text(protocol)),
         ("time limit", f"{protocol.episode_s:g} s at {protocol.control_hz:g} Hz"),
         ("table", f"taken away after {PAPER.scene.air_table_s:g} s" if protocol.in_air else "there"),
-        ("randomisation, noise, disturbances", "on" if protocol.randomised else "off"),
+        ("randomisation, noise, disturbances", protocol.randomisation_text),
     ]
     if protocol.table_friction is not None:
         rows.append(("friction of the table", f"{protocol.table_friction:g}"))

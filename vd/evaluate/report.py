@@ -136,7 +136,7 @@ def protocol_rows(result: EvalResult) -> list[tuple[str, str]]:
         ("goals", goals_text(protocol)),
         ("stop", f"error at most {protocol.stop_tolerance_rad:g} rad, fingers and object still"),
         ("time limit", f"{protocol.episode_s:g} s at {protocol.control_hz:g} Hz"),
-        ("randomisation, noise, disturbances", "on" if protocol.randomised else "off"),
+        ("randomisation, noise, disturbances", protocol.randomisation_text),
     ]
     return rows + [(name, version) for name, version in result.software.items()]
 
@@ -144,7 +144,7 @@ def protocol_rows(result: EvalResult) -> list[tuple[str, str]]:
 def task_line(result: EvalResult) -> str:
     """One line that says what was asked: starts, goals, stop and randomisation."""
     protocol = result.protocol
-    randomisation = "on" if protocol.randomised else "off"
+    randomisation = protocol.randomisation_text
     return (
         f"starts {starts_text(protocol)}; goals {goals_text(protocol)}; stop within "
         f"{protocol.stop_tolerance_rad:g} rad and still; randomisation {randomisation}"

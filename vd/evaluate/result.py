@@ -115,6 +115,13 @@ class Protocol:
     """The policy is told to turn past a goal that is near."""
     second_view: bool = False
     """A goal that is not reached is looked at in other views (:mod:`vd.evaluate.second_view`)."""
+    condition: str | None = None
+    """What was drawn, of :mod:`vd.evaluate.conditions`; None: as in training, if at all."""
+
+    @property
+    def randomisation_text(self) -> str:
+        """What was drawn, for people."""
+        return self.condition or ("on" if self.randomised else "off")
 
     @property
     def hand_name(self) -> str:

@@ -39,6 +39,11 @@ def with_second_view(seen: ObservationCfg) -> ObservationCfg:
             "a second view is for policies that see their goals in views (observation.view goal or "
             "mirrored); this one sees them in observation.view world"
         )
+    if seen.dynamics != "none":
+        raise ValueError(
+            "a second view asks the critic, and this one's was told what no sensor knows "
+            f"(observation.dynamics {seen.dynamics}); leave out --second-view"
+        )
     return replace(seen, view="either") if seen.view == "goal" else seen
 
 

@@ -1,6 +1,7 @@
 """Step many worlds with SolverMuJoCo, with the velocity limits and guards the solver lacks."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import newton
@@ -141,6 +142,8 @@ class Simulator:
         self.body_qd = self.state.body_qd.reshape((n, -1))
         self.body_force = self.state.body_f.reshape((n, -1))
         self._next_body_force = self._next.body_f.reshape((n, -1))
+        self._next_body_q = self._next.body_q.reshape((n, -1))
+        self._next_body_qd = self._next.body_qd.reshape((n, -1))
         self._next_q = self._next.joint_q.reshape((n, -1))
         self._next_qd = self._next.joint_qd.reshape((n, -1))
 
@@ -162,6 +165,13 @@ class Simulator:
         """Control steps that left the finite numbers or were too fast, shape [N]."""
         self.failed = wp.zeros(n, dtype=wp.int32, device=self.device)
         """1 where the latest control step did, shape [N]."""
+        self.force_steps = cfg.substeps
+        """Physics steps of a control step in which ``body_force`` acts, then :attr:`lasting_force` does."""
+        self.lasting_force = wp.zeros_like(self.body_force)
+        """What goes on once ``force_steps`` are over [N, N m], shape [N, B]."""
+        self.after_physics_step: Callable[[wp.array, wp.array, wp.array, wp.array], None] | None = None
+        """Called in every physics step with the new positions, velocities and link poses and velocities,
+        shape [N, *]; device work only."""
         self._start_q, self._start_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
         self._dump_q, self._dump_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
         self._dump_target = wp.clone(self.target)
@@ -211,18 +221,24 @@ class Simulator:
 
     def _physics_steps(self, *, ours: bool) -> None:
         """The physics steps of one control step, with our additions; states end where they began."""
-        here, there = (self.state, self.joint_q, self.joint_qd), (self._next, self._next_q, self._next_qd)
-        for _ in range(self.cfg.substeps):
+        here = self.state, self.joint_q, self.joint_qd, self.body_q, self.body_qd
+        there = self._next, self._next_q, self._next_qd, self._next_body_q, self._next_body_qd
+        for step in range(self.cfg.substeps):
+            if ours and step == self.force_steps:
+                wp.copy(self.body_force, self.lasting_force)
+                wp.copy(self._next_body_force, self.lasting_force)
             if ours and self.servo is not None:
                 self.servo.receive()
-                self.servo.drive(*here[1:])
+                self.servo.drive(*here[1:3])
             if ours and self.restitution is not None:
                 self.restitution.apply(here[2])
             self.solver.step(
                 here[0], there[0], self.control, None, self.cfg.physics_dt, observables=self._observables
             )
             if ours:
-                self._limit_and_collect(here[1], *there[1:])
+                self._limit_and_collect(here[1], *there[1:3])
+                if self.after_physics_step is not None:
+                    self.after_physics_step(*there[1:])
             here, there = there, here
 
     def physics_only(self) -> None:

@@ -1,0 +1,226 @@
+"""What a policy sees late: the state after every physics step, kept in a ring, and read at an age.
+
+A row of the ring holds what observations are made of, in this order: joints as the encoders report them,
+their velocities, all positions, all velocities, and of each fingertip's link pose 7, velocity 6.
+"""
+
+import warp as wp
+
+from vd.kernels.columns import read_quat, read_vec3, write_quat, write_vec3
+from vd.kernels.rng import next_stream, uniform
+
+wp.set_module_options({"enable_backward": False})
+
+LINK_VALUES = 13
+"""Values of a fingertip's link in a row: position 3, quaternion 4, linear 3 and angular velocity 3."""
+
+
+def ring_columns(joints: int, positions: int, velocities: int, fingers: int) -> int:
+    """Values in a row of the ring."""
+    return 2 * joints + positions + velocities + LINK_VALUES * fingers
+
+
+@wp.func
+def write_state(
+    row: int,
+    world: int,
+    joints: int,
+    tip_body: wp.array[int],
+    measured_q: wp.array2d[float],
+    measured_qd: wp.array2d[float],
+    joint_q: wp.array2d[float],
+    joint_qd: wp.array2d[float],
+    body_q: wp.array2d[wp.transform],
+    body_qd: wp.array2d[wp.spatial_vector],
+    ring: wp.array2d[float],
+):
+    """Write a world's present state to a row of the ring."""
+    for i in range(joints):
+        ring[row, i] = measured_q[world, i]
+        ring[row, joints + i] = measured_qd[world, i]
+    column = 2 * joints
+    for i in range(joint_q.shape[1]):
+        ring[row, column + i] = joint_q[world, i]
+    column += joint_q.shape[1]
+    for i in range(joint_qd.shape[1]):
+        ring[row, column + i] = joint_qd[world, i]
+    column += joint_qd.shape[1]
+    for finger in range(tip_body.shape[0]):
+        pose = body_q[world, tip_body[finger]]
+        twist = body_qd[world, tip_body[finger]]
+        column = write_vec3(row, column, wp.transform_get_translation(pose), ring)
+        column = write_quat(row, column, wp.transform_get_rotation(pose), ring)
+        column = write_vec3(row, column, wp.spatial_top(twist), ring)
+        column = write_vec3(row, column, wp.spatial_bottom(twist), ring)
+
+
+@wp.kernel
+def record_state_kernel(
+    # Model:
+    joints: int,
+    slots: int,
+    tip_body: wp.array[int],
+    # In:
+    measured_q_in: wp.array2d[float],
+    measured_qd_in: wp.array2d[float],
+    joint_q_in: wp.array2d[float],
+    joint_qd_in: wp.array2d[float],
+    body_q_in: wp.array2d[wp.transform],
+    body_qd_in: wp.array2d[wp.spatial_vector],
+    # In/Out:
+    head: wp.array[int],
+    # Out:
+    ring_out: wp.array2d[float],
+):
+    """Remember the state after a physics step. Launch: [N].
+
+    Args:
+        joints: Joints of the hand, D.
+        slots: Rows of each world, L.
+        tip_body: Link of each fingertip, an index within a world, shape [G].
+        measured_q_in: Positions of the hand's joints as their encoders report them [rad], shape [N, *].
+        measured_qd_in: Velocities likewise [rad/s], shape [N, *].
+        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
+        joint_qd_in: Hand joints [rad/s], object linear and angular velocity, shape [N, D + 6].
+        body_q_in: Link poses in the world frame, shape [N, B].
+        body_qd_in: Link velocities in the world frame, shape [N, B].
+        head: Slot written last, shape [N].
+        ring_out: Past states, world by world, shape [N L, C].
+    """
+    world = wp.tid()
+    slot = (head[world] + 1) % slots
+    head[world] = slot
+    write_state(
+        world * slots + slot,
+        world,
+        joints,
+        tip_body,
+        measured_q_in,
+        measured_qd_in,
+        joint_q_in,
+        joint_qd_in,
+        body_q_in,
+        body_qd_in,
+        ring_out,
+    )
+
+
+@wp.kernel
+def begin_latency_kernel(
+    # Model:
+    latency: wp.vec2,
+    joints: int,
+    slots: int,
+    tip_body: wp.array[int],
+    # In:
+    mask_in: wp.array[int],
+    measured_q_in: wp.array2d[float],
+    measured_qd_in: wp.array2d[float],
+    joint_q_in: wp.array2d[float],
+    joint_qd_in: wp.array2d[float],
+    body_q_in: wp.array2d[wp.transform],
+    body_qd_in: wp.array2d[wp.spatial_vector],
+    # In/Out:
+    rng: wp.array[wp.uint32],
+    # Out:
+    latency_out: wp.array[float],
+    ring_out: wp.array2d[float],
+):
+    """Draw the latency of an episode that begins; its past is its first state. Launch: [N].
+
+    Args:
+        latency: Range of the draw [s].
+        joints: Joints of the hand, D.
+        slots: Rows of each world, L.
+        tip_body: Link of each fingertip, shape [G].
+        mask_in: 1 where an episode begins, shape [N].
+        measured_q_in: As in :func:`record_state_kernel`, and the five after it.
+        measured_qd_in: Likewise.
+        joint_q_in: Likewise.
+        joint_qd_in: Likewise.
+        body_q_in: Likewise.
+        body_qd_in: Likewise.
+        rng: Random stream of each world, shape [N].
+        latency_out: How late the world is seen [s], shape [N].
+        ring_out: Past states, shape [N L, C].
+    """
+    world = wp.tid()
+    if mask_in[world] == 0:
+        return
+    state, drawn = uniform(rng[world], latency)
+    latency_out[world] = drawn
+    rng[world] = next_stream(state, world)
+    for slot in range(slots):
+        write_state(
+            world * slots + slot,
+            world,
+            joints,
+            tip_body,
+            measured_q_in,
+            measured_qd_in,
+            joint_q_in,
+            joint_qd_in,
+            body_q_in,
+            body_qd_in,
+            ring_out,
+        )
+
+
+@wp.kernel
+def recall_state_kernel(
+    # Model:
+    joints: int,
+    slots: int,
+    physics_dt: float,
+    tip_body: wp.array[int],
+    # In:
+    latency_in: wp.array[float],
+    head_in: wp.array[int],
+    ring_in: wp.array2d[float],
+    # Out:
+    measured_q_out: wp.array2d[float],
+    measured_qd_out: wp.array2d[float],
+    joint_q_out: wp.array2d[float],
+    joint_qd_out: wp.array2d[float],
+    body_q_out: wp.array2d[wp.transform],
+    body_qd_out: wp.array2d[wp.spatial_vector],
+):
+    """The state as it was a latency ago, of the nearest physics step. Launch: [N].
+
+    Args:
+        joints: Joints of the hand, D.
+        slots: Rows of each world, L.
+        physics_dt: Time between two rows [s].
+        tip_body: Link of each fingertip, shape [G]; only their poses are written.
+        latency_in: How late each world is seen [s], at most (L - 1) steps, shape [N].
+        head_in: Slot written last, shape [N].
+        ring_in: Past states, shape [N L, C].
+        measured_q_out: As in :func:`record_state_kernel`, and the five after it.
+        measured_qd_out: Likewise.
+        joint_q_out: Likewise.
+        joint_qd_out: Likewise.
+        body_q_out: Likewise.
+        body_qd_out: Likewise.
+    """
+    world = wp.tid()
+    age = wp.clamp(int(wp.round(latency_in[world] / physics_dt)), 0, slots - 1)
+    row = world * slots + (head_in[world] - age + slots) % slots
+    for i in range(joints):
+        measured_q_out[world, i] = ring_in[row, i]
+        measured_qd_out[world, i] = ring_in[row, joints + i]
+    column = 2 * joints
+    for i in range(joint_q_out.shape[1]):
+        joint_q_out[world, i] = ring_in[row, column + i]
+    column += joint_q_out.shape[1]
+    for i in range(joint_qd_out.shape[1]):
+        joint_qd_out[world, i] = ring_in[row, column + i]
+    column += joint_qd_out.shape[1]
+    for finger in range(tip_body.shape[0]):
+        body = tip_body[finger]
+        body_q_out[world, body] = wp.transform(
+            read_vec3(row, column, ring_in), read_quat(row, column + 3, ring_in)
+        )
+        body_qd_out[world, body] = wp.spatial_vector(
+            read_vec3(row, column + 7, ring_in), read_vec3(row, column + 10, ring_in)
+        )
+        column += wp.static(LINK_VALUES)

@@ -1,0 +1,113 @@
+"""The state as a policy sees it: of the present, or as old as the latency that its episode has drawn."""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from vd.kernels.latency import begin_latency_kernel, recall_state_kernel, record_state_kernel, ring_columns
+
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
+
+
+class SeenState:
+    """What observations are made of; without latency these are the simulator's own arrays.
+
+    Args:
+        env: The environment, whose simulator and fingers exist.
+
+    Attributes:
+        latency: How late each world is seen in its episode [s], shape [N].
+        arrays: Joint positions and velocities as the encoders report them, positions and velocities of hand
+            and object, poses and velocities of the links (of fingertips alone where they are late).
+    """
+
+    def __init__(self, env: "ReorientEnv"):
+        self._env = env
+        sim, n, device = env.sim, env.num_worlds, env.device
+        random = env.cfg.randomisation
+        self.is_late = random.enabled and random.observation_latency_s[1] > 0.0
+        self.latency = wp.zeros(n, dtype=float, device=device)
+        present = [env.measured_q, env.measured_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
+        self.arrays: list[Any] = present
+        if not self.is_late:
+            return
+        self.arrays = [wp.zeros_like(array) for array in present]
+        d, f = env.num_actions, env.num_fingers
+        self._slots = math.ceil(random.observation_latency_s[1] / env.cfg.sim.physics_dt) + 1
+        columns = ring_columns(d, sim.joint_q.shape[1], sim.joint_qd.shape[1], f)
+        self._ring = wp.zeros((n * self._slots, columns), dtype=float, device=device)
+        self._head = wp.zeros(n, dtype=wp.int32, device=device)
+        sim.after_physics_step = self.record
+
+    def record(self, joint_q: wp.array, joint_qd: wp.array, body_q: wp.array, body_qd: wp.array) -> None:
+        """Remember the state after a physics step, shapes [N, *]. Device work only."""
+        measured = self._measured(joint_q, joint_qd)
+        self._launch(
+            record_state_kernel,
+            [self._slots, self._env.fingers.tip_body, *measured, joint_q, joint_qd, body_q, body_qd],
+            [self._head, self._ring],
+        )
+
+    def begin(self, mask: wp.array) -> None:
+        """Draw the latency of the worlds of ``mask`` [N], whose past is their present state."""
+        if not self.is_late:
+            return
+        env, sim = self._env, self._env.sim
+        measured = self._measured(sim.joint_q, sim.joint_qd)
+        state = [*measured, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
+        wp.launch(
+            begin_latency_kernel,
+            dim=env.num_worlds,
+            inputs=[
+                wp.vec2(*env.cfg.randomisation.observation_latency_s),
+                env.num_actions,
+                self._slots,
+                env.fingers.tip_body,
+                mask,
+                *state,
+                env.rng,
+            ],
+            outputs=[self.latency, self._ring],
+            device=env.device,
+        )
+
+    def recall(self) -> None:
+        """Refresh :attr:`arrays`."""
+        if self.is_late:
+            self._launch(
+                recall_state_kernel,
+                [
+                    self._slots,
+                    self._env.cfg.sim.physics_dt,
+                    self._env.fingers.tip_body,
+                    self.latency,
+                    self._head,
+                    self._ring,
+                ],
+                self.arrays,
+            )
+
+    def stateful(self) -> dict[str, wp.array]:
+        """Arrays to save with a checkpoint, by name."""
+        if not self.is_late:
+            return {}
+        return {"latency": self.latency, "latency_ring": self._ring, "latency_head": self._head}
+
+    def _measured(self, joint_q: wp.array, joint_qd: wp.array) -> tuple[wp.array, wp.array]:
+        servo = self._env.sim.servo
+        if servo is None:
+            return joint_q, joint_qd
+        servo.measure()  # once a control step otherwise
+        return servo.measured_q, servo.measured_qd
+
+    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        env = self._env
+        wp.launch(
+            kernel,
+            dim=env.num_worlds,
+            inputs=[env.num_actions, *inputs],
+            outputs=outputs,
+            device=env.device,
+        )

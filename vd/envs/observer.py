@@ -1,0 +1,183 @@
+"""What the policy observes: state, shape, goal's time, memory, and what a critic or a teacher is told."""
+
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from vd.envs.latency import SeenState
+from vd.envs.parts import actor_size, observation_parts
+from vd.envs.shapes import ShapeObserver
+from vd.envs.symmetry import Views
+from vd.kernels.aim import aim_kernel
+from vd.kernels.dynamics import dynamics_kernel
+from vd.kernels.history import forget_kernel, history_kernel, remember_kernel, truth_kernel
+from vd.kernels.observations import (
+    goal_time_kernel,
+    teacher_observation_kernel,
+    teacher_observation_slices,
+)
+from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.envs.reorient import ReorientEnv
+
+
+class Observer:
+    """Writes the observations of N worlds.
+
+    Attributes:
+        parts: Columns of what is observed.
+        num_observations: Values that the actor reads, O.
+        seen: The state that observations are made of.
+        all_values: Everything, in the views if there are any, shape [N, A].
+        world_values: Everything in the world frame, shape [N, A].
+        views: The views in which the policy observes and acts; None where that is the world frame.
+        shapes: Observes and measures shapes, or None.
+    """
+
+    def __init__(self, env: "ReorientEnv", *, shapes: bool):
+        """Allocate for ``env``; ``shapes`` also where they are not observed."""
+        self._env = env
+        cfg, n, device = env.cfg.observation, env.num_worlds, env.device
+        self.parts = observation_parts(cfg, env.num_fingers)
+        self.num_observations = actor_size(cfg, self.parts)
+        self.seen = SeenState(env)
+        width = max(columns.stop for columns in self.parts.values())
+
+        def zeros(*shape: int, dtype: Any = float) -> wp.array:
+            return wp.zeros(shape, dtype=dtype, device=device)
+
+        self.all_values = self.world_values = zeros(n, width)
+        self.views = Views(env, self.all_values) if cfg.view != "world" else None
+        if self.views is not None:
+            self.world_values = self.views.observation
+        self.shapes = ShapeObserver(env, self) if shapes else None
+        slices = teacher_observation_slices(env.num_fingers)
+        self._pose_columns = [slices["object_position"].start, slices["relative_orientation"].start]
+        self._action_column = slices["previous_action"].start
+        self._frames = frames = cfg.history
+        self._head, self._count = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
+        self._past = zeros(n * frames, 2 * env.num_actions + 7)
+        hand, materials = env.hand, PAPER.materials
+        self._gains = [wp.array(gain, dtype=float, device=device) for gain in (hand.kp, hand.kd)]
+        self._nominal = wp.vec4(
+            materials.friction, materials.friction, env.cfg.table_friction, materials.object_mass_kg
+        )
+        self._no_servo = zeros(0, 0)
+
+    def split(self, values: wp.array) -> tuple[wp.array, wp.array]:
+        """What the actor reads [N, O], and what the critic reads besides [N, A - O], of everything [N, A]."""
+        count, width = self.num_observations, values.shape[1]
+        if count == width:
+            return values, wp.zeros((values.shape[0], 0), dtype=float, device=values.device)
+        return values[:, :count], values[:, count:]
+
+    def begin(self, mask: wp.array) -> None:
+        """Begin the episodes of the worlds of ``mask`` [N], after their state was reset."""
+        self.seen.begin(mask)
+        if self._frames:
+            self._launch(forget_kernel, [mask], [self._count])
+
+    def remember(self) -> None:
+        """Keep the present observation for the history, once a control step and before it."""
+        if self._frames:
+            self._launch(
+                remember_kernel,
+                [*self._remembered, self._frames, self.world_values, self._env.aimed_quat],
+                [self._head, self._count, self._past],
+            )
+
+    def observe(self) -> None:
+        """Write the observation of the present state. Device work only."""
+        env = self._env
+        self.seen.recall()
+        if env.cfg.aim.enabled:
+            aim = env.cfg.aim
+            inputs = [aim.past_rad, aim.within_rad, env.num_actions + 3, self.seen.arrays[2], env.goal_quat]
+            self._launch(aim_kernel, inputs, [env.aimed_quat])
+        self._launch(
+            teacher_observation_kernel,
+            [
+                env.lower,
+                env.upper,
+                env.fingers.tip_body,
+                env.fingers.tip_offset,
+                env.body_com,
+                env.parameters.observation,
+                *self.seen.arrays,
+                env.aimed_quat,
+                env.smoothed,
+                env.randomiser.observation_offset,
+                env.rng,
+            ],
+            [self.world_values],
+        )
+        if "shape" in self.parts:
+            assert self.shapes is not None
+            self.shapes.launch()
+        if "goal_time" in self.parts:
+            column = self.parts["goal_time"].start
+            inputs = [env.goal_steps, 1.0 / env.cfg.sim.control_hz, column]
+            self._launch(goal_time_kernel, inputs, [self.world_values])
+        self._observe_history()
+        self._tell()
+        if self.views is not None:
+            self.views.observe()
+
+    @property
+    def _remembered(self) -> list[int]:
+        return [self._env.num_actions, *self._pose_columns, self._action_column]
+
+    def _observe_history(self) -> None:
+        if self._frames:
+            wp.launch(
+                history_kernel,
+                dim=(self._env.num_worlds, self._frames),
+                inputs=[
+                    *self._remembered,
+                    self._frames,
+                    self.parts["history"].start,
+                    self._env.aimed_quat,
+                    self._head,
+                    self._count,
+                    self._past,
+                ],
+                outputs=[self.world_values],
+                device=self._env.device,
+            )
+
+    def _tell(self) -> None:
+        """Write what was drawn, and how the true state differs from what is seen."""
+        if "dynamics" not in self.parts:
+            return
+        env, drawn = self._env, self._env.randomiser
+        servo = self._no_servo if env.sim.servo is None else env.sim.servo.parameters
+        frictions = [drawn.hand_friction, drawn.object_friction, drawn.table_friction]
+        self._launch(
+            dynamics_kernel,
+            [
+                *self._gains,
+                self._nominal,
+                self.parts["dynamics"].start,
+                drawn.kp,
+                drawn.kd,
+                servo,
+                *frictions,
+                drawn.object_mass,
+                self.seen.latency,
+            ],
+            [self.world_values],
+        )
+        columns = [*self._pose_columns, self.parts["truth"].start]
+        inputs = [env.lower, env.upper, *columns, env.sim.joint_q, env.aimed_quat]
+        self._launch(truth_kernel, inputs, [self.world_values])
+
+    def stateful(self) -> dict[str, wp.array]:
+        """Arrays to save with a checkpoint, by name."""
+        past = {"history": self._past, "history_head": self._head, "history_count": self._count}
+        past |= {"history_next": self.world_values}  # remembered when the next step begins
+        view = {} if self.views is None else {"view": self.views.view}
+        return view | self.seen.stateful() | (past if self._frames else {})
+
+    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=self._env.num_worlds, inputs=inputs, outputs=outputs, device=self._env.device)
