@@ -44,7 +44,7 @@ def late(latency_s: float, **changes) -> RandomisationCfg:
     return dataclasses.replace(EXACT, observation_latency_s=(latency_s, latency_s), **changes)
 
 
-@pytest.mark.parametrize("steps_late", [0, 1, 2])
+@pytest.mark.parametrize("steps_late", [0, 2])
 def test_the_policy_sees_what_was_true_a_latency_ago_and_is_paid_for_what_is_true(steps_late):
     observation = ObservationCfg(shape="full")
     present = run(make(observation=observation), 7)
@@ -125,10 +125,9 @@ def expected_frames(seen: np.ndarray, step: int, count: int, parts: dict[str, sl
 
 
 @pytest.mark.parametrize("view", ["world", "goal", "mirrored"])
-@pytest.mark.parametrize("noise", [0.0, 0.002])
-def test_the_history_is_what_was_observed_in_any_view(view, noise):
+def test_the_history_is_what_was_observed_in_any_view(view):
     observation = ObservationCfg(history=4, view=view, file_axes=False)
-    random = dataclasses.replace(late(0.5 * STEP_S), observation_noise_std=noise)
+    random = dataclasses.replace(late(0.5 * STEP_S), observation_noise_std=0.002)
     env = make(observation=observation, randomisation=random)
     seen = run(env, 7)["seen"]
     if view != "world":
@@ -229,12 +228,12 @@ def test_a_saved_memory_goes_on_exactly():
         make().load_state_dict(first.state_dict())
 
 
-@pytest.mark.parametrize("physics_hz", [96.0, 120.0])
-@pytest.mark.parametrize(("force_s", "share"), [(1.0 / 60.0, 0.2), (STEP_S, 1.0)])
-def test_a_force_gives_its_impulse_in_the_time_it_acts(force_s, share, physics_hz):
+@pytest.mark.parametrize(
+    ("force_s", "share", "sim"),
+    [(1.0 / 60.0, 0.2, SimCfg()), (1.0 / 60.0, 0.2, coarser(SimCfg())), (STEP_S, 1.0, SimCfg())],
+)
+def test_a_force_gives_its_impulse_in_the_time_it_acts(force_s, share, sim):
     random = dataclasses.replace(EXACT, force_probability=1.0, force_s=force_s)
-    sim = SimCfg() if physics_hz == 120.0 else coarser(SimCfg())
-    assert sim.physics_hz == physics_hz
     env = make(randomisation=random, sim=sim)
     calm = make(sim=env.cfg.sim)
     ends, d = [], env.num_actions
