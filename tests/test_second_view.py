@@ -213,4 +213,4 @@ def test_an_evaluation_says_that_it_looked_twice(tmp_path):
     assert "looked at in other views" in (tmp_path / "eval.html").read_text()
     both = tmp_path / "both"
     assert cli.main([*arguments, "--agent", "zero", "--episode-s", "0.5", "--output", str(both)]) == 0
-    assert "looks twice" in (both / "eval.html").read_text()
+    assert "symmetry-view selection" in (both / "eval.html").read_text()

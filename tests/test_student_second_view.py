@@ -185,7 +185,7 @@ def test_a_student_asks_its_own_critic_or_that_of_its_teacher_by_name(tmp_path):
 def test_an_evaluation_of_a_student_says_that_it_looked_twice(tmp_path):
     arguments = ["dclaw3-student", "--objects", "cuboid", "--episodes", "1", "--device", "cpu"]
     assert cli.main([*arguments, "--second-view", "--episode-s", "0.3", "--output", str(tmp_path)]) == 0
-    assert "looks twice" in (tmp_path / "eval.html").read_text()
+    assert "symmetry-view selection" in (tmp_path / "eval.html").read_text()
 
 
 def test_a_stopping_rule_is_chosen_of_a_student_that_looks_twice_if_it_is_to(tmp_path, monkeypatch):
