@@ -1,6 +1,6 @@
 """The part of the preflight that reads the motors' control tables, whole, and compares them."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from vd.deploy.answers import BusError, GarbledError, LateError
 from vd.deploy.bus import MotorBus
@@ -37,15 +37,30 @@ def register_findings(connection: Connection, tables: Tables) -> Iterator[Findin
         yield Finding(what, False, str(error))
         return
     for one, motors in rows.items():
-        values = []
-        for id, value, wanted in motors:
-            mend = one.remedy.format(reboot=bus.command(f"reboot {id}"), wanted=wanted)
-            values.append(f"motor {id}: {value}; {mend or f'it will be set to {wanted}'}")
+        if one.remedy:
+            values = [
+                f"motor {id}: {value}; {one.remedy.format(reboot=bus.command(f'reboot {id}'), wanted=wanted)}"
+                for id, value, wanted in motors
+            ]
+            yield Finding(one.name, False, f"{one.why}: {listed(values)}")
+            continue
         where = " (kept without power)" if kept(bus.model, one) else ""
-        found = f"{one.why}: {listed(values)}" if one.remedy else f"{listed(values)}{where}; else {one.why}"
-        yield Finding(one.name, not one.remedy, found)
+        yield Finding(one.name, True, f"{listed(_changes(motors))}{where}; else {one.why}")
     if not rows:
         yield Finding(what, True, "as the hand needs them")
+
+
+def _changes(motors: Iterable[tuple[int, int, int]]) -> list[str]:
+    """What will be set, motors that are alike together: of each its ID, value, and the wanted one."""
+    alike: dict[tuple[int, int], list[str]] = {}
+    for id, value, wanted in motors:
+        alike.setdefault((value, wanted), []).append(str(id))
+    return [
+        f"motors {', '.join(ids)}: {value}; they will be set to {wanted}"
+        if len(ids) > 1
+        else f"motor {ids[0]}: {value}; it will be set to {wanted}"
+        for (value, wanted), ids in alike.items()
+    ]
 
 
 def to_be_set(connection: Connection) -> str:

@@ -20,6 +20,7 @@ from vd.deploy.control_table import (
 )
 from vd.deploy.finding import command
 from vd.deploy.packets import MAX_ID
+from vd.deploy.port import pseudo
 
 RESTART_S = 5.0
 """Longest time that a motor takes to answer after a restart; they need about half a second."""
@@ -189,7 +190,7 @@ def set_baud(cfg: SetBaudCfg) -> int:
     if cfg.new == cfg.baud_rate:
         raise ValueError(f"set-baud {cfg.new}: that is its rate; --baud-rate is the one at which it answers")
     with open_bus(cfg, cfg.new) as bus:  # before anything is written: whether the adapter has this rate
-        if _answers(bus, cfg.id):
+        if not pseudo(bus.port) and _answers(bus, cfg.id):
             raise BusError(f"ID {cfg.id} is taken at {cfg.new} baud: give one of the two another ID")
     with open_bus(cfg, cfg.baud_rate) as bus:
         model, _ = _readable(bus, cfg)

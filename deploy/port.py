@@ -51,7 +51,7 @@ def open_port(path: str, baud_rate: int = BAUD_RATE) -> Any:
         opened = handler.setBaudRate(baud_rate)
         if opened:
             fcntl.flock(handler.ser.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if not _pseudo(path):
+            if not pseudo(path):
                 fcntl.ioctl(handler.ser.fileno(), termios.TIOCEXCL)
     except OSError as error:  # the SDK lets errors of the serial port through
         if handler.is_open:
@@ -74,11 +74,12 @@ def _ask_for(path: str) -> None:
         fcntl.flock(probe, fcntl.LOCK_EX | fcntl.LOCK_NB)
     finally:
         os.close(probe)
-    if not _pseudo(path) and any(pid != os.getpid() for pid, _ in _holders(path)):
+    if not pseudo(path) and any(pid != os.getpid() for pid, _ in _holders(path)):
         raise OSError(errno.EBUSY, "another program has it open")
 
 
-def _pseudo(path: str) -> bool:
+def pseudo(path: str) -> bool:
+    """Whether a port is a pseudo-terminal, as a twin's is: it has no baud rate, so motors answer at each."""
     return os.path.realpath(path).startswith(PSEUDO_TERMINALS)
 
 

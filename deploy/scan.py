@@ -134,10 +134,11 @@ def _strangers(
 
 def scan(cfg: ScanCfg) -> int:
     """Find the motors and print them; 1 if they are not those of the hand."""
+    from vd.deploy.port import pseudo
+
     _, joints = read_hand_and_joints(cfg)
-    # A pseudo-terminal has no rate: a twin answers at each.
-    rates = [cfg.baud_rate] if cfg.twin else cfg.baud_rates
     with open_port(cfg) as port:
+        rates = [cfg.baud_rate] if pseudo(port) else cfg.baud_rates
         found = find(port, rates, lambda text: print(text, file=sys.stderr, flush=True))
     wrong = differences(found, joints, cfg.motor, cfg.baud_rate, port)
     if cfg.json:

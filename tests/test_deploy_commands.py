@@ -23,13 +23,14 @@ from vd.deploy.control_table import MODELS
 from vd.deploy.faults import BEFORE, MOVING, try_fault, try_preflight
 from vd.deploy.joints import uncalibrated
 from vd.deploy.limits import SafetyCfg
+from vd.deploy.maintain import SetBaudCfg, set_baud
 from vd.deploy.motion import reset_pose
 from vd.deploy.motor import Motor
 from vd.deploy.newton_hand import NewtonHand
 from vd.deploy.plant import Drive
 from vd.deploy.realsense import RealSenseCfg
 from vd.deploy.safety import StoppedError
-from vd.deploy.scan import FoundMotor, differences, find
+from vd.deploy.scan import FoundMotor, ScanCfg, differences, find, scan
 from vd.deploy.twin import Twin
 from vd.gap.recording import read_recording
 from vd.sim.cfg import SimCfg
@@ -69,6 +70,16 @@ def test_find_lists_the_motors(hand):
     assert found == [FoundMotor(id, 1_000_000, MOTOR, 45, garbled=id == 22) for id in joints.ids]
     (wrong,) = differences(found, joints, MOTOR, 1_000_000, PORT)
     assert f"several have this ID: unplug one, then `vd-deploy set-id 22 NEW --port {PORT}`" in wrong
+
+
+def test_a_twin_of_another_process_has_no_baud_rate_either(hand, capsys):
+    """It answers at each rate: six motors of one ID were listed, and a rate could not be given."""
+    with Twin([Motor(MODELS[MOTOR], id) for id in uncalibrated(hand).ids]) as twin:
+        assert scan(ScanCfg(hand=hand.name, port=twin.path)) == 0
+        assert set_baud(SetBaudCfg(id=10, new=57_600, port=twin.path, yes=True)) == 0
+    said = capsys.readouterr().out
+    assert len(re.findall("1000000 baud", said)) == len(uncalibrated(hand).ids)
+    assert "motor 10 is now at 57600 baud" in said
 
 
 def test_what_differs_is_named(hand):
@@ -143,7 +154,7 @@ def test_nothing_is_written_before_the_person_agreed(line, torque, capsys):
     settings = [bytes(motor.memory[:PRESENT]) for motor in line.motors]
     assert check.check(check.CheckCfg(port=PORT, no_camera=True)) == 0
     said = capsys.readouterr().out
-    assert ("motors 10, 11 hold" in said) == torque and "motor 10: 900; it will be set to 200" in said
+    assert ("motors 10, 11 hold" in said) == torque and "32: 900; they will be set to 200" in said
     with pytest.raises(RuntimeError, match=r"position_p_gain will be set\. .*Nobody is there to ask"):
         home.home(home.HomeCfg(port=PORT))
     assert ("Motors 10, 11 hold, with up to 0." in capsys.readouterr().err) == torque
