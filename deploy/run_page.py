@@ -83,7 +83,7 @@ def write_page(log: HandLog, results: Sequence[GoalResult]) -> Path:
     film(log, log.path / FILM_FILE)
     run = log.run
     where = f"the twin of {run['hand']}" if run["twin"] else run["hand"]
-    page = Page(f"{run['policy']} on {where}", f"{run['object']['name']}: {len(log.goals)} goals.")
+    page = Page(f"{run['policy']} on {where}", f"{run['object']['name']}; goals: {len(log.goals)}.")
     page.text(summary_line(results, len(log.goals)))
     page.video(log.path / FILM_FILE, "The run, from its log.")
     page.table(
@@ -101,5 +101,10 @@ def write_page(log: HandLog, results: Sequence[GoalResult]) -> Path:
         ],
         words=(1,),
     )
+    if "error" in log.columns:
+        page.text(
+            f"Reached: stopped within {log.tolerance_rad:g} rad. Errors: to what looks like the goal.",
+            small=True,
+        )
     page.write(log.path / PAGE_FILE)
     return log.path / PAGE_FILE

@@ -43,6 +43,8 @@ TORQUE_S = PERIOD_S / 3.0
 """Age of what is known of the motors' torque from which it is asked for again, in a packet of its own, since
 its register lies far from the state's: with each reading of a control loop, each third of a recording."""
 TORQUE_GONE = "another program on the line switched it off, or it restarted"
+UNHEARD = ": motors do not answer, or this computer is busy"
+"""Said where the loop stands on the line."""
 OFF_S = 1.0
 """How long switching off is tried on a bus that does not answer soundly."""
 FINISHED = "finished"
@@ -330,7 +332,10 @@ class SafeHand:
         own = Path(__file__).parent
         stack = traceback.extract_stack(sys._current_frames().get(self._loop))
         at = next((call for call in reversed(stack) if Path(call.filename).parent == own), None)
-        return "" if at is None else f", in {at.name} ({Path(at.filename).name}, line {at.lineno})"
+        if at is None:
+            return ""
+        why = UNHEARD if at.filename == sys.modules[MotorBus.__module__].__file__ else ""
+        return f", in {at.name} ({Path(at.filename).name}, line {at.lineno}){why}"
 
     def _stop(self, reason: str, *, lost: bool = False) -> StoppedError:
         """Hold, and give what to raise.

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -204,6 +206,21 @@ def test_a_loop_that_stands_is_stopped_by_the_watchdog(bus, hand, joints):
         assert safe.report.held_s - safe.report.detected_s < EXCHANGE_S
         with pytest.raises(StoppedError, match="the loop stands"):
             safe.read()
+
+
+def test_a_loop_that_stands_on_the_line_says_what_that_means(bus, hand, joints):
+    """A line of our code alone tells nobody that the twin had no processor."""
+    with SafeHand(bus, joints, hand, QUICK) as safe:
+        safe.arm()
+        with bus._lock:  # whoever asks now waits
+            loop = threading.Thread(target=bus.read_state)
+            loop.start()
+            safe._loop = loop.ident
+            while "bus.py" not in safe._place():
+                time.sleep(0.001)
+            bus.clock.sleep(1.0)
+        loop.join()
+        assert "bus.py" in safe.report.reason and "or this computer is busy" in safe.report.reason
 
 
 def test_motors_stop_by_themselves_if_the_driver_dies(bus, line, hand, joints):

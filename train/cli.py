@@ -27,9 +27,6 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.train.runner import TeacherRunner
 
-INTERRUPTED = 130
-"""Exit status after an interruption; ``vd.interrupt`` makes 143 of it where SIGTERM was the reason."""
-
 USAGE = """usage: vd-train COMMAND [flags]
 
 commands:
@@ -143,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         print("vd-train: stopped at once; --resume goes on from the last checkpoint", file=sys.stderr)
-        return INTERRUPTED
+        return interrupt.INTERRUPTED
 
 
 def _elsewhere(module: str, function: str) -> Callable[[list[str], float], int]:
@@ -252,7 +249,7 @@ def _train_teacher(cfg: TeacherCfg, main_process: bool, started: float) -> int:
     if not whole:
         if main_process and not cfg.smoke:
             print(f"saved in {folder}; go on with: vd-train teacher --run-dir {folder} --resume")
-        return INTERRUPTED
+        return interrupt.INTERRUPTED
     from vd.train.runner import POLICY_NAME  # loads torch, which the first message should not wait for
 
     if main_process and cfg.smoke:

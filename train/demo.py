@@ -63,7 +63,6 @@ JUDGED = "dclaw3-table"
 """Installed policy that is judged by the paper's criteria: the demo's own training is too short for them."""
 # Episodes of all objects together under the paper's criteria.
 PAPER_EPISODES = {"cpu": 64, "cuda": 2048}
-EXIT_INTERRUPTED = 130
 
 
 @dataclass
@@ -446,7 +445,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         page = run_demo(cfg, started=started)
     except KeyboardInterrupt:
         print("\ninterrupted; the same command goes on from here", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return interrupt.INTERRUPTED
     except (ValueError, RuntimeError) as error:
         print(f"\ndemo: {error}; the same command goes on from here", file=sys.stderr)
         return 1

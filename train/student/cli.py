@@ -9,6 +9,7 @@ from typing import Annotated, Literal, cast
 
 import tyro
 
+from vd import interrupt
 from vd.config import from_dict
 from vd.files import check_file
 from vd.paper import PAPER
@@ -109,7 +110,7 @@ def student_command(arguments: list[str], started: float) -> int:
     from vd.evaluate.agents import check_names
 
     check_names([] if cfg.teacher is None else [cfg.teacher], cfg.task.objects)
-    from vd.train.cli import INTERRUPTED, print_damaged
+    from vd.train.cli import print_damaged
     from vd.train.ending import finished
     from vd.train.progress import waiting
 
@@ -130,7 +131,7 @@ def student_command(arguments: list[str], started: float) -> int:
     if not whole:
         if main_process:
             print(f"saved in {folder}; go on with: vd-train student --run-dir {folder} --resume")
-        return INTERRUPTED
+        return interrupt.INTERRUPTED
     if main_process:
         print(f"done: {folder}/student.pt is the student, vd-train curves {folder} draws the curves")
     return 0

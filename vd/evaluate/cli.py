@@ -55,7 +55,6 @@ OF_THE_SUITE = (
     "sees",
 )
 """Settings that a suite decides."""
-EXIT_INTERRUPTED = 130
 POLICY_HELP = (
     "A policy.pt or student.pt, a checkpoint, the folder of a bundle or of a run, or the name of an "
     f"installed policy: {', '.join(SHIPPED_POLICIES)}."
@@ -257,7 +256,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         hint = "; the same command goes on from here" if cfg.suite else ""
         print(f"\nvd-eval: interrupted{hint}", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return interrupt.INTERRUPTED
 
 
 def _evaluate(cfg: EvalCfg) -> int:

@@ -225,7 +225,7 @@ def _row(summary: Summary) -> list[str]:
 def _lead(result: EvalResult) -> str:
     protocol = result.protocol
     return (
-        f"{len(result.episodes)} episodes: {len(result.object_names)} objects of "
+        f"{len(result.episodes)} episodes; objects: {len(result.object_names)} of "
         f"{shown_name(protocol.objects)}, {protocol.episodes} starts and goals each, "
         f"{shown_name(protocol.hand_name)}; {task_line(result)}"
     )

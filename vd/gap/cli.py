@@ -16,8 +16,8 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.gap.steps import Analysis
 
-OK, FAILED, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
-"""Exit statuses: a verdict was reached, something else is wrong, the recording cannot be used, Ctrl-C."""
+OK, FAILED, UNUSABLE = 0, 1, 2
+"""Exit statuses: a verdict was reached, something else is wrong, the recording cannot be used."""
 
 RecordingPath = Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
 
@@ -305,7 +305,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FAILED
     except KeyboardInterrupt:
         print("vd-gap: stopped; the same command goes on with the step it was in", file=sys.stderr)
-        return INTERRUPTED
+        return interrupt.INTERRUPTED
 
 
 def _print_step(step: _Step, name: str, file: str) -> int:
