@@ -339,8 +339,10 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
     if protocol.explore:
         rows.append(("actions far from the goal", "have noise"))
     known = {"mesh": "the exact mesh", "points": "500 exact points", "scan": "500 points of a scan"}
-    rows.append(("students know shapes and goals by", known[protocol.goals]))
-    rows.append(("stops", f"bound of the action's norm {PAPER.success.action_norm:g}, as the paper's"))
+    if comparison.predictions:
+        rows.append(("students know shapes and goals by", known[protocol.goals]))
+    norm = f"{PAPER.success.action_norm:g}, as in the released code"
+    rows.append(("stops", f"bound of the action's norm {norm}"))
     by_group = {row.group: row.result.protocol.objects for row in comparison.rows}
     rows += [(f"objects: {name}", shown_name(sets)) for name, sets in by_group.items()]
     short = labels(comparison.policies)
