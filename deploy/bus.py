@@ -38,7 +38,7 @@ from vd.deploy.control_table import (
 )
 from vd.deploy.finding import BAUD_RATE, command
 from vd.deploy.packets import MAX_ID
-from vd.deploy.port import WAIT_S, open_port, sdk
+from vd.deploy.port import WAIT_S, KeptPacket, open_port, sdk
 from vd.deploy.registers import MotorSettings, different
 
 STARVED_S = 0.02
@@ -48,25 +48,6 @@ BUSY = "this computer is busy; end other programs, or give this one real-time pr
 TORQUE_BYTES = 1
 LATE_S = 0.02
 """Pause after a question that was asked in vain or again; what arrives meanwhile is dropped."""
-
-
-class _Kept:
-    """A port that keeps the packet that the SDK makes."""
-
-    def __init__(self) -> None:
-        self.is_using, self.packet, self.answer_bytes = False, b"", 0
-
-    def clearPort(self) -> None:  # noqa: N802 (the SDK's name)
-        """Nothing has come."""
-
-    def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
-        """Keep it."""
-        self.packet = bytes(packet)
-        return len(packet)
-
-    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
-        """Keep how long the answer is."""
-        self.answer_bytes = packet_length
 
 
 def check_wiring() -> str:
@@ -384,7 +365,7 @@ class MotorBus:
             byte for id, value in zip(self.ids, values, strict=True) for byte in (id, *item.to_bytes(value))
         ]
         with self._line():
-            port = _Kept() if later else self._port
+            port = KeptPacket() if later else self._port
             result = self._packets.syncWriteTxOnly(port, item.address, item.size, rows, len(rows))
             self._goals = port.packet if later else b""
         if result != self._sdk.COMM_SUCCESS:
@@ -448,7 +429,7 @@ class MotorBus:
             length: How many.
             before: Packets to send in one piece with it.
         """
-        ids, question = list(self.ids), _Kept()
+        ids, question = list(self.ids), KeptPacket()
         self._packets.syncReadTx(question, address, length, ids, len(ids), fast_option=False)
         packets = before + question.packet
         self._port.clearPort()

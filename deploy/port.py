@@ -6,7 +6,7 @@ import grp
 import os
 import re
 import termios
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -20,6 +20,25 @@ again and again, which takes a core, and keeps whatever shares it from answering
 PSEUDO_TERMINALS = "/dev/pts/"
 """A twin holds its own end of these open, so exclusive use by one program is for the lock alone."""
 LONGEST_COMMAND = 80
+
+
+class KeptPacket:
+    """In place of a port: keeps the packet that the SDK makes."""
+
+    def __init__(self) -> None:
+        self.is_using, self.packet, self.answer_bytes = False, b"", 0
+
+    def clearPort(self) -> None:  # noqa: N802 (the SDK's name)
+        """Nothing has come."""
+
+    def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
+        """Keep it."""
+        self.packet = bytes(packet)
+        return len(packet)
+
+    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
+        """Keep how long the answer is."""
+        self.answer_bytes = packet_length
 
 
 def sdk() -> ModuleType:

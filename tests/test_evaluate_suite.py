@@ -321,6 +321,7 @@ def test_installed_policies_are_taken_where_none_is_named():
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
+        (["--suite", "paper", "--condition", "mixed"], "--condition is decided by --suite paper"),
         (["--suite", "paper", "--in-air"], "--in-air is decided by --suite paper"),
         (["--suite", "paper", "--episodes", "3"], "--episodes is decided by"),
         (["dclaw4-cube", "--quick"], "add --suite paper"),

@@ -49,6 +49,7 @@ OF_THE_SUITE = (
     "explore",
     "aim",
     "table_friction",
+    "condition",
     "goals",
     "sensor_errors",
     "second_view",
