@@ -203,7 +203,7 @@ def ways_to_stop(
     """The ways to stop a policy, the headline first.
 
     They are the bounds of the distance that it predicts, if it does, and of the true one, both with the
-    paper's bound of the action's norm; and, as ours, its own bound of the norm where that is another.
+    released code's bound of the action's norm; and, as ours, its own bound of the norm where that is another.
 
     Args:
         rules: The policy's own rule for a tolerance [rad].

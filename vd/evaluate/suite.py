@@ -31,8 +31,8 @@ FRICTIONS = (*PAPER.randomisation.table_friction, 0.25, 0.75)
 """Frictions of the table beside the nominal one. The paper's five materials have no published values; these
 span the range of its training."""
 
-NO_STUDENT = "no policy shipped"
-"""What is said in place of a student's figures where there is no student."""
+NO_STUDENT = "no student named"
+"""What is said in place of a student's figures where none is evaluated."""
 
 OUT_OF_TIME = "out of time; the same command goes on from here"
 """Why evaluations of the reduced suite were not run."""
