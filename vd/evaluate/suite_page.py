@@ -270,9 +270,10 @@ _HOW_TO_READ = (
     "the table and four in the air, on seven training and five test objects; ours are of the policies and "
     "objects named here. Its own rule: a student stops when the distance that it predicts is below its "
     "bound, others when the true distance is below 0.4 rad, both with a bound of 1 on the norm of the "
-    "action (the released code's); stillness is not asked for. Error at most: to the very goal, at the stop, or at the end of "
-    "an episode without one; up to symmetry: to what looks like it. Stopped within: the bound stands in "
-    f"place of the rule's. Held: and still there {HOLD_S:g} s later, the hand keeping its last targets. "
+    "action, as in the released code; stillness is not asked for. Error at most: to the very goal, at the "
+    "stop, or at the end of an episode without one; up to symmetry: to what looks like it. Stopped within: "
+    f"the bound stands in place of the rule's. Held: and still there {HOLD_S:g} s later, the hand keeping "
+    "its last targets. "
     "Cameras have the errors of a D415. A lost object's error counts as pi. Conditions marked ours have what "
     "the paper's have not."
 )
