@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.geometry import surface_points
 from vd.assets_usd.objects.model import IDENTITY, ObjectModel, load_set
-from vd.student.symmetry import APART_RAD, CLOSED_RAD, nearest_goal, symmetries
+from vd.student.symmetry import APART_RAD, CLOSED_RAD, MOST, nearest_goal, symmetries
 
 NEAR_RAD = 0.05
 """A symmetry that was found, from its true rotation."""
@@ -25,12 +25,13 @@ def shape(mesh: trimesh.Trimesh) -> ObjectModel:
 
 
 def test_symmetries_of_solids_are_found(device):
-    """Of a box and a cylinder; a box with a corner cut off has none."""
+    """Of a box, a cylinder and a ball; a box with a corner cut off has none."""
     box = trimesh.creation.box((0.10, 0.06, 0.04))
     cylinder = trimesh.creation.cylinder(radius=0.02, height=0.1)
     cut = trimesh.creation.box((0.10, 0.06, 0.04))
     cut.vertices[cut.vertices.argmax(axis=0)[0]] *= 0.4
-    found = symmetries([shape(mesh) for mesh in (box, cylinder, cut)], device)
+    ball = trimesh.creation.icosphere(radius=0.04)
+    found = symmetries([shape(mesh) for mesh in (box, cylinder, cut, ball)], device)
     quarter = Rotation.from_quat(found[0])
     assert len(quarter) == 4
     for turn in Rotation.create_group("D2"):
@@ -41,6 +42,7 @@ def test_symmetries_of_solids_are_found(device):
     for turn in Rotation.from_rotvec(np.outer(spin, [0.0, 0.0, 1.0])):
         assert (Rotation.from_quat(found[1]) * turn.inv()).magnitude().min() < 2.0 * APART_RAD
     np.testing.assert_array_equal(found[2], IDENTITY)
+    assert len(found[3]) == MOST
 
 
 def test_a_shape_that_differs_by_a_part_of_its_surface_is_not_symmetric(device):

@@ -193,14 +193,15 @@ def _apart(turns: np.ndarray) -> np.ndarray:
 def _closed(turns: np.ndarray, surface: _Surface) -> np.ndarray:
     """A group of rotations [S, 4]: products that were missed are added, what has others is left out.
 
-    Symmetries form a group: where the product of two is none, one of them only nearly is.
+    Symmetries form a group: where the product of two is none, one of them only nearly is. Those of a ball are
+    too many to be one; then all stay.
     """
     growing = True
     while True:
         each = torch.tensor(turns).expand(len(turns), -1, -1)
         products = product(each.transpose(0, 1), each).numpy()
         missed = _angles(products[:, :, None], turns).min(axis=2) > CLOSED_RAD
-        if not missed.any():
+        if not missed.any() or len(turns) == MOST:
             return turns
         if growing:
             new = _apart(products[missed])
