@@ -1,16 +1,12 @@
 """``vd-assets``: author hands, author objects, import meshes, draw contact sheets."""
 
-import contextlib
 import json
 import re
-import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -204,21 +200,6 @@ def run_objects(command: Objects) -> int:
     return 0
 
 
-@contextlib.contextmanager
-def _ended_in_order() -> Iterator[None]:
-    """Treat SIGTERM and SIGHUP as Ctrl-C; the KeyboardInterrupt carries the signal."""
-
-    def stop(number: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt(number)
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def run_import(command: Import) -> int:
     """Import meshes; returns 1 if any was refused."""
     from vd.assets_usd.cache import assets_dir
@@ -252,22 +233,21 @@ def run_import(command: Import) -> int:
 
     start = time.monotonic()
     try:
-        with _ended_in_order():
-            results = import_meshes(
-                command.paths,
-                out,
-                settings,
-                jobs=command.jobs,
-                force=command.force,
-                drop_gone=command.drop_gone,
-                progress=progress,
-            )
-    except KeyboardInterrupt as stop:
+        results = import_meshes(
+            command.paths,
+            out,
+            settings,
+            jobs=command.jobs,
+            force=command.force,
+            drop_gone=command.drop_gone,
+            progress=progress,
+        )
+    except KeyboardInterrupt:
         print(
             f"\ninterrupted; what is finished is in {out}; the same command goes on from there",
             file=sys.stderr,
         )
-        return 128 + int(stop.args[0] if stop.args else signal.SIGINT)
+        return interrupt.INTERRUPTED
     seconds = time.monotonic() - start
     if command.json:
         record = {"out": str(out), "seconds": seconds, "objects": [asdict(r) for r in results]}

@@ -16,7 +16,7 @@ PROJECT = tomllib.loads((Path(__file__).resolve().parents[1] / "pyproject.toml")
 SCRIPTS: dict[str, str] = PROJECT["project"]["scripts"]
 FIRST = {"vd-train": "teacher", "vd-deploy": "home"}
 """A command of those that have commands, before its options are read."""
-STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}
+STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 129}
 
 
 @pytest.mark.parametrize("number", STATUS)
@@ -58,3 +58,16 @@ def test_what_a_command_forks_ends_by_the_signal_itself():
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
     assert forks() == -signal.SIGTERM
+
+
+def test_a_command_below_nohup_outlives_its_terminal():
+    @interrupt.command("vd-some")
+    def goes_on() -> int:
+        os.kill(os.getpid(), signal.SIGHUP)
+        return 0
+
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        assert goes_on() == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)

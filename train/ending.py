@@ -49,15 +49,8 @@ class EndRequest:
             interrupt.note(number)
             note("stopping: saving a checkpoint (again to stop at once, without saving)")
 
-        previous = {}
-        with contextlib.suppress(ValueError):  # signals belong to the main thread; elsewhere there are none
-            for number in (signal.SIGINT, signal.SIGTERM):
-                previous[number] = signal.signal(number, request)
-        try:
+        with interrupt.handled(request, signal.SIGINT, signal.SIGTERM):
             yield
-        finally:
-            for number, handler in previous.items():
-                signal.signal(number, handler)
 
     def due(self) -> bool:
         """Whether a signal or the deadline asks for the end; all processes agree."""

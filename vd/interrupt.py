@@ -1,6 +1,6 @@
 """What all commands do: say at once that they start, and end by a signal with 128 and its number.
 
-That is 130 after Ctrl-C and 143 after SIGTERM.
+That is 130 after Ctrl-C, 143 after SIGTERM, and 129 once the terminal is gone.
 """
 
 import functools
@@ -23,7 +23,7 @@ _last = 0
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM. What is tidied up after Ctrl-C is tidied up after this too."""
+    """SIGTERM or SIGHUP. What is tidied up after Ctrl-C is tidied up after these too."""
 
 
 def note(number: int) -> None:
@@ -45,7 +45,7 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
             given = args[0] if args and isinstance(args[0], Sequence) else sys.argv[1:]
             if given and not {"-h", "--help"} & set(given):
                 print(f"{name}: starting", file=sys.stderr, flush=True)  # what it imports takes seconds
-            with _sigterm():
+            with _terminated():
                 try:
                     status = main(*args, **kwargs)
                 except SystemExit as end:
@@ -53,7 +53,7 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
                     raise
                 except KeyboardInterrupt as error:
                     print(f"\n{name}: stopped", file=sys.stderr)
-                    return TERMINATED if isinstance(error, Terminated) else INTERRUPTED
+                    return 128 + _last if isinstance(error, Terminated) else INTERRUPTED
             return _status(status)
 
         return run
@@ -63,15 +63,27 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
 
 def _status(status: Any) -> Any:
     """An exit status; where a command only knows that it was interrupted, by which signal."""
-    return TERMINATED if status == INTERRUPTED and _last == signal.SIGTERM else status
+    return 128 + _last if _last and status == INTERRUPTED else status
 
 
 @contextmanager
-def _sigterm() -> Iterator[None]:
-    """Have SIGTERM raise :class:`Terminated` in this process; what it forks ends at once, as without this."""
-    if threading.current_thread() is not threading.main_thread():
-        yield  # signals belong to the main thread
-        return
+def handled(handler: Callable[[int, FrameType | None], None], *numbers: signal.Signals) -> Iterator[None]:
+    """Have signals call ``handler``, but for a SIGHUP that is ignored (nohup)."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():  # signals belong to it; elsewhere are none
+        for number in numbers:
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                before[number] = signal.signal(number, handler)
+    try:
+        yield
+    finally:
+        for number, previous in before.items():
+            signal.signal(number, previous)
+
+
+@contextmanager
+def _terminated() -> Iterator[None]:
+    """Have SIGTERM and SIGHUP raise :class:`Terminated`; what this process forks ends at once, as without."""
     owner = os.getpid()
 
     def terminate(number: int, _: FrameType | None) -> None:
@@ -82,8 +94,5 @@ def _sigterm() -> Iterator[None]:
         raise Terminated
 
     note(0)
-    before = signal.signal(signal.SIGTERM, terminate)
-    try:
+    with handled(terminate, signal.SIGTERM, signal.SIGHUP):
         yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
