@@ -19,7 +19,12 @@ from vd.assets_usd.objects import decompose as d
 from vd.assets_usd.objects import meshes as m
 from vd.assets_usd.objects.bodies import PartsError, body_of
 from vd.assets_usd.objects.geometry import Hull, hull_depth, mesh_volume, union_depth
-from vd.assets_usd.objects.importer import import_mesh, import_meshes
+from vd.assets_usd.objects.importer import (
+    _keep_decomposition,
+    _kept_decomposition,
+    import_mesh,
+    import_meshes,
+)
 from vd.assets_usd.objects.model import read_object
 from vd.assets_usd.objects.plan import (
     ImportSettings,
@@ -166,6 +171,16 @@ def test_a_finished_decomposition_is_reused_and_another_setting_is_not(imported,
     assert reused.volume_error == pytest.approx(first["bracket"].volume_error)
     finer = replace(settings, decompose=replace(FAST, seed=1))
     assert import_meshes([mesh], tmp_path / "a", finer)[0].decomposed
+
+
+@pytest.mark.parametrize("left", [0.0, 0.1, 0.9])
+def test_a_damaged_decomposition_is_as_none(left: float, tmp_path: Path):
+    box = trimesh.creation.box()
+    path = tmp_path / "kept.npz"
+    _keep_decomposition(path, d.Decomposition((Hull(box.vertices, box.faces),), "coacd", error=0.1))
+    assert _kept_decomposition(path).error == 0.1
+    os.truncate(path, int(left * path.stat().st_size))
+    assert _kept_decomposition(path) is None
 
 
 @pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])

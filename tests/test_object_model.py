@@ -94,7 +94,7 @@ def test_bad_files_are_named(tmp_path: Path, example: procedural.ObjectModel):
         read_object(tmp_path / "gone.usd")
     junk = tmp_path / "junk.usd"
     junk.write_text("not a stage")
-    with pytest.raises(ObjectError, match=r"junk\.usd: not a USD file"):
+    with pytest.raises(ObjectError, match=r"junk\.usd: not a USD file.*remove it"):
         read_object(junk)
     foreign = tmp_path / "foreign.usda"
     foreign.write_text('#usda 1.0\n(defaultPrim = "a")\ndef Xform "a" {}\n')

@@ -79,14 +79,15 @@ def test_two_meshes_of_one_name_are_refused_whether_in_one_call_or_two(in_proces
     assert [r.status for r in import_meshes([first, copy], out)] == ["cached"]
 
 
-def test_what_is_no_object_of_ours_is_never_written_over(tmp_path: Path):
+@pytest.mark.parametrize("text", ["#usda 1.0\n", "", "PXR-USDC cut short"])
+def test_what_is_no_object_of_ours_is_never_written_over(text: str, tmp_path: Path):
     mesh = brick(tmp_path / "mug.stl")
     mine = tmp_path / "out" / "mug.usd"
     mine.parent.mkdir()
-    mine.write_text("#usda 1.0\n")
-    with pytest.raises(m.MeshError, match=r"mug\.usd is there and no object of vd-assets.*--out"):
+    mine.write_text(text)
+    with pytest.raises(m.MeshError, match=r"mug\.usd is there and no object of vd-assets.*remove it.*--out"):
         import_meshes([mesh], mine.parent, force=True)
-    assert mine.read_text() == "#usda 1.0\n"
+    assert mine.read_text() == text
 
 
 def test_objects_whose_mesh_is_gone_stay_until_they_are_dropped(in_process: None, tmp_path: Path):

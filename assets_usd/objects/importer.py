@@ -1,5 +1,6 @@
 """Import of meshes: one child process a mesh, cached by content, resumable, with refusals by name."""
 
+import contextlib
 import hashlib
 import json
 import os
@@ -7,6 +8,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Container, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass, replace
@@ -120,12 +122,13 @@ def content_hash(job: Job, settings: ImportSettings) -> str:
 
 
 def _kept_decomposition(path: Path) -> Decomposition | None:
-    """An earlier decomposition."""
-    if not path.is_file():
+    """An earlier decomposition, None if there is none or it is damaged."""
+    try:
+        with np.load(path) as data:
+            hulls = tuple(Hull(data[f"vertices_{i}"], data[f"faces_{i}"]) for i in range(int(data["count"])))
+            return Decomposition(hulls, str(data["method"]), error=float(data["error"]))
+    except Exception:  # zip, NumPy and zlib have errors of their own
         return None
-    with np.load(path) as data:
-        hulls = tuple(Hull(data[f"vertices_{i}"], data[f"faces_{i}"]) for i in range(int(data["count"])))
-        return Decomposition(hulls, str(data["method"]), error=float(data["error"]))
 
 
 def _keep_decomposition(path: Path, parts: Decomposition) -> None:
@@ -234,8 +237,6 @@ def _run_child(
     job: Job, settings: ImportSettings, threads: int, running: dict[str, subprocess.Popen[str]]
 ) -> ImportResult:
     """Import one mesh in a child of its own, killed if it hangs."""
-    import time
-
     start = time.monotonic()
 
     def refused(reason: str) -> ImportResult:
@@ -276,8 +277,6 @@ def _run_child(
 
 def _end_group(child: subprocess.Popen[str]) -> None:
     """End a child, which removes what it has half written, and kill what is left of it and its children."""
-    import contextlib
-
     child.terminate()
     with contextlib.suppress(subprocess.TimeoutExpired):
         child.wait(ENDING_S)

@@ -260,13 +260,14 @@ def _open(path: Path) -> tuple[Any, Any, dict[str, Any]]:
     path = Path(path)
     if not path.is_file():
         raise ObjectError(f"{path}: no such object file")
+    what = "not a USD file, or a damaged one; remove it, and import or author the object again"
     try:
         # Anonymous: a layer cached by path would hide that the file was written anew.
         layer = Sdf.Layer.OpenAsAnonymous(str(path))
     except Tf.ErrorException as error:
-        raise ObjectError(f"{path}: not a USD file; import it again") from error
+        raise ObjectError(f"{path}: {what}") from error
     if layer is None:
-        raise ObjectError(f"{path}: not a USD file; import it again")
+        raise ObjectError(f"{path}: {what}")
     stage = Usd.Stage.Open(layer)
     prim = stage.GetDefaultPrim()
     data = dict(prim.GetCustomDataByKey(_CUSTOM) or {}) if prim else {}

@@ -250,7 +250,10 @@ def check_target(job: Job, unchanged: bool) -> None:
         return
     origin = read_origin(target)
     if origin is None:
-        raise MeshError(f"{target} is there and no object of vd-assets; import into another folder (--out)")
+        raise MeshError(
+            f"{target} is there and no object of vd-assets, or a damaged one; remove it, or import into "
+            "another folder (--out)"
+        )
     source, file = origin
     # Objects of versions that recorded no file are told by the name in their source.
     if file and os.path.realpath(file) == os.path.realpath(job.source):
