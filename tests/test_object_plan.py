@@ -102,6 +102,15 @@ def test_objects_whose_mesh_is_gone_stay_until_they_are_dropped(in_process: None
     assert not (out / "old.usd").exists()
 
 
+def test_an_object_follows_its_mesh(in_process: None, tmp_path: Path):
+    here, there, out = tmp_path / "here" / "mug.stl", tmp_path / "there" / "mug.stl", tmp_path / "out"
+    import_meshes([brick(here)], out)
+    here.parent.rename(there.parent)
+    assert [r.status for r in import_meshes([there], out)] == ["imported"]
+    assert read_object(out / "mug.usd").file == str(there)
+    assert [r.status for r in import_meshes([there], out)] == ["cached"]
+
+
 def test_a_default_set_has_the_objects_of_one_folder(
     in_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -11,12 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull
 
 from vd.assets_usd.objects.geometry import (
     SLIVER_THICKNESS,
     Hull,
     convex_hull,
+    hull_volume,
     mesh_volume,
     simplify_hull,
 )
@@ -229,11 +230,11 @@ def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:
     CoACD merges by the depth of concavities, and fills thin walls and rings more than it has to.
     """
     corners = dict(enumerate(parts))
-    volume = {i: _hull_volume(part) for i, part in corners.items()}
+    volume = {i: hull_volume(part) for i, part in corners.items()}
     together: dict[tuple[int, int], float] = {}
 
     def pair(i: int, j: int) -> None:
-        together[i, j] = _hull_volume(np.concatenate([corners[i], corners[j]]))
+        together[i, j] = hull_volume(np.concatenate([corners[i], corners[j]]))
 
     for i in corners:
         for j in range(i):
@@ -250,14 +251,6 @@ def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:
         for other in others:
             pair(new, other)
     return list(corners.values())
-
-
-def _hull_volume(points: np.ndarray) -> float:
-    """Volume of the convex hull of points [N, 3]; 0 if they are flat."""
-    try:
-        return float(ConvexHull(points).volume)
-    except QhullError:
-        return 0.0
 
 
 def best_decomposition(

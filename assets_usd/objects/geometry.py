@@ -73,6 +73,14 @@ def convex_hull(points: np.ndarray) -> Hull:
     return Hull(points[used], faces.reshape(-1, 3).astype(np.int32))
 
 
+def hull_volume(points: np.ndarray) -> float:
+    """Volume of the convex hull of points [n, 3], m^3; 0 if they are flat."""
+    try:
+        return float(ConvexHull(points).volume)
+    except QhullError:
+        return 0.0
+
+
 def hull_planes(hull: Hull) -> tuple[np.ndarray, np.ndarray]:
     """Half-spaces of a hull: unit outward normals [P, 3] and offsets [P]; inside is ``n.x <= d``."""
     corner = hull.vertices[hull.faces].astype(np.float64)

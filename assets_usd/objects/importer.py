@@ -147,11 +147,12 @@ def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
         MeshError: They are too far from the mesh.
     """
     words = "; ".join(parts.fallback)
-    count = f"{len(parts.hulls)} convex part{'s' if len(parts.hulls) > 1 else ''}"
-    off = f"{count} differ from the mesh by {100 * parts.error:.0f} % of its volume"
+    count = len(parts.hulls)
+    which = f"{count} convex parts differ" if count > 1 else "one convex part differs"
+    off = f"{which} from the mesh by {100 * parts.error:.0f} % of its volume"
     if parts.error > MAX_ERROR and offset > MAX_OFFSET:
         raise MeshError(
-            f"{off}, and are {100 * offset:.0f} % of its length off its surface on average"
+            f"{off}, {100 * offset:.0f} % of its length off its surface on average"
             f"{f' ({words})' if words else ''}: thicken its walls, or allow finer parts (--threshold, "
             "--max-hulls)"
         )
@@ -297,8 +298,8 @@ def import_meshes(
 ) -> list[ImportResult]:
     """Import meshes, several at a time, each in a process of its own.
 
-    An object file whose content hash still holds is left alone, and finished decompositions are
-    kept, so that an interrupted import goes on where it stopped.
+    An object file whose content hash still holds is left alone, unless its mesh has moved, and finished
+    decompositions are kept, so that an interrupted import goes on where it stopped.
 
     Args:
         paths: Files and folders.
@@ -329,7 +330,7 @@ def import_meshes(
         if progress:
             progress(result, len(results), len(plan))
 
-    done, todo = _divide(plan, settings, gone if drop_gone else {}, force)
+    done, todo = _divide(plan, settings, gone, drop_gone=drop_gone, force=force)
     make_folder(out)
     left: Status = "dropped" if drop_gone else "gone"
     stale = [ImportResult(file, path.stem, left, target=str(path)) for path, file in gone.items()]
@@ -343,9 +344,9 @@ def import_meshes(
 
 
 def _divide(
-    plan: list[Job], settings: ImportSettings, dropped: Container[Path], force: bool
+    plan: list[Job], settings: ImportSettings, gone: Container[Path], *, drop_gone: bool, force: bool
 ) -> tuple[list[ImportResult], list[Job]]:
-    """The results of the meshes that need no work, and those that do.
+    """The results of the meshes that need no work, and those that do: also what has moved (is ``gone``).
 
     Raises:
         MeshError: An object would be written over something else.
@@ -360,10 +361,10 @@ def _divide(
         except MeshError as error:
             done.append(ImportResult(job.source, job.name, "refused", str(error)))
             continue
-        current = target.is_file() and target not in dropped and read_hash(target) == content
-        if target not in dropped:
+        current = target.is_file() and read_hash(target) == content
+        if not (drop_gone and target in gone):
             check_target(job, current)
-        if current and not force:
+        if current and not force and target not in gone:
             done.append(_result_of(job, read_object(target), "cached"))
         else:
             todo.append(job)

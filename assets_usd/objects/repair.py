@@ -12,6 +12,7 @@ from vd.assets_usd.objects.geometry import (
     SLIVER_THICKNESS,
     Hull,
     convex_hull,
+    hull_volume,
     mesh_volume,
     random_surface_points,
     triangle_areas,
@@ -272,15 +273,7 @@ def _bodies(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     joined = connected_components(graph, directed=False)[1][pieces.of_face]
     body = np.unique(joined, return_inverse=True)[1]
     corners = [mesh.vertices[mesh.faces[body == b].ravel()] for b in range(body.max() + 1)]
-    return body, np.array([_hull_volume(points) for points in corners])
-
-
-def _hull_volume(points: np.ndarray) -> float:
-    """Volume of the convex hull of points [N, 3]; 0 if they are flat."""
-    try:
-        return mesh_volume(*convex_hull(points))
-    except ValueError:
-        return 0.0
+    return body, np.array([hull_volume(points) for points in corners])
 
 
 def _containers(mesh: Any, pieces: _Pieces) -> dict[int, int]:
