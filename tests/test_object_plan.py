@@ -7,6 +7,7 @@ import trimesh
 
 from vd.assets_usd.objects import importer
 from vd.assets_usd.objects import meshes as m
+from vd.assets_usd.objects.decompose import DecomposeSettings
 from vd.assets_usd.objects.importer import import_meshes
 from vd.assets_usd.objects.model import read_object
 from vd.assets_usd.objects.plan import ImportSettings, default_set, find_meshes, object_name
@@ -178,6 +179,24 @@ def test_sizes_that_cannot_be_meant_are_refused_before_anything_is_written(
 ):
     with pytest.raises(m.MeshError, match=words):
         import_meshes([brick(tmp_path / "x.stl")], tmp_path / "out", ImportSettings(sizing=sizing))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ({"max_hulls": 0}, "--max-hulls 0: give 1 or more"),
+        ({"threshold": 5.0}, "--threshold 5: give 0.01 to 1"),
+        ({"max_hull_vertices": 3}, "--max-hull-vertices 3: give 4 or more"),
+        ({"time_limit_s": -3.0}, "--time-limit -3: give 1 or more"),
+    ],
+)
+def test_a_decomposition_that_cannot_be_is_refused_before_anything_is_written(
+    setting: dict[str, float], words: str, tmp_path: Path
+):
+    settings = ImportSettings(DecomposeSettings(**setting))
+    with pytest.raises(m.MeshError, match=words):
+        import_meshes([brick(tmp_path / "x.stl")], tmp_path / "out", settings)
     assert not (tmp_path / "out").exists()
 
 

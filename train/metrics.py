@@ -160,7 +160,7 @@ class ProgressFile:
 
 def _report_thread(args: threading.ExceptHookArgs) -> None:
     """Report what ended a thread, but for the ``OSError`` of TensorBoard's: its caller is told anyway."""
-    if not issubclass(args.exc_type, OSError):
+    if not (issubclass(args.exc_type, OSError) and type(args.thread).__module__.startswith("tensorboard")):
         threading.__excepthook__(args)
 
 

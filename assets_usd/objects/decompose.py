@@ -75,6 +75,23 @@ class DecomposeSettings:
     time_limit_s: float = 120.0
     seed: int = 0
 
+    def check(self) -> None:
+        """Refuse what CoACD, or a convex part, cannot have.
+
+        Raises:
+            MeshError: Names the option.
+        """
+        for option, value, least, most in (
+            ("--max-hulls", self.max_hulls, 1, np.inf),
+            ("--threshold", self.threshold, FINEST_THRESHOLD, 1.0),
+            ("--mcts-iterations", self.mcts_iterations, 1, np.inf),
+            ("--max-hull-vertices", self.max_hull_vertices, 4, np.inf),
+            ("--time-limit", self.time_limit_s, 1, np.inf),
+        ):
+            if not least <= value <= most:
+                up = f" to {most:g}" if np.isfinite(most) else " or more"
+                raise MeshError(f"{option} {value:g}: give {least:g}{up}")
+
 
 @dataclass(frozen=True)
 class Decomposition:

@@ -320,6 +320,7 @@ def import_meshes(
     """
     settings = settings or ImportSettings()
     settings.sizing.check()
+    settings.decompose.check()
     out = Path(out)
     plan = plan_jobs(find_meshes([Path(p) for p in paths]), out, settings)
     gone = gone_objects(out)
