@@ -105,6 +105,16 @@ def test_a_run_goes_on_from_its_newest_sound_checkpoint(tmp_path, monkeypatch, c
     assert "no checkpoint is sound" in error and "start anew with another --run-dir" in error
 
 
+def test_a_run_of_which_the_best_alone_is_left_is_gone_on_with_and_not_begun_anew(tmp_path):
+    make_runner(tmp_path).learn(1)
+    for path in list_checkpoints(tmp_path):
+        path.rename(path.with_name(f"{path.name}.damaged"))
+    for which in ("latest", "auto"):
+        assert find_checkpoint(tmp_path, which) == tmp_path / "checkpoints" / "best.pt"
+    with pytest.raises(FileExistsError, match="add --resume"):
+        find_checkpoint(tmp_path, None)
+
+
 def test_checkpoints_of_a_run_that_went_on_from_an_older_one_are_kept(tmp_path):
     make_runner(tmp_path, save_every=1, keep_last=3).learn(5)
     resumed = make_runner(tmp_path, save_every=1, keep_last=1)

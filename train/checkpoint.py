@@ -49,7 +49,9 @@ def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") ->
         FileNotFoundError: There is none; the message says what is there.
         ValueError: None is sound.
     """
-    files, folder = list_checkpoints(run_dir), run_dir / CHECKPOINT_FOLDER
+    folder = run_dir / CHECKPOINT_FOLDER
+    best = folder / BEST_NAME
+    files = [*([best] if best.is_file() else []), *list_checkpoints(run_dir)]
     if which is None and files:
         raise FileExistsError(
             f"{run_dir} holds a run; add --resume to go on with it, or choose another --run-dir"
@@ -59,18 +61,18 @@ def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") ->
     if which in (AUTO, "latest"):
         if not files:
             raise FileNotFoundError(f"--resume: no checkpoint in {folder}; leave --resume out to start")
-        return _newest_sound(files, folder / BEST_NAME, network)
-    path = folder / BEST_NAME if which == "best" else Path(which)
+        return _newest_sound(files, network)
+    path = best if which == "best" else Path(which)
     if not path.is_file():
         found = ", ".join(p.name for p in files) or "none"
         raise FileNotFoundError(f"--resume: no file {path}; checkpoints of {run_dir}: {found}")
     return path
 
 
-def _newest_sound(files: list[Path], best: Path, network: str) -> Path:
-    """The newest of ``files`` that can be read, or else ``best``."""
+def _newest_sound(files: list[Path], network: str) -> Path:
+    """The last of ``files`` that can be read."""
     reasons = []
-    for path in [*reversed(files), *([best] if best.is_file() else [])]:
+    for path in reversed(files):
         reason = damage(path, network)
         if not reason:
             return path
