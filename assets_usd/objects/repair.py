@@ -59,7 +59,8 @@ class RepairedMesh:
         watertight: Closed, consistently wound and of one piece.
         pieces: Convex hulls of the closed pieces if all are convex, else empty: such a mesh is
             decomposed as it stands.
-        cavities: Closed surfaces within, as (vertices, faces) wound outward as if they were solids.
+        cavities: Closed surfaces within, as (vertices, faces) wound outward as if they were solids; inward
+            what is solid in a cavity.
         notes: What was done.
         warnings: What may be wrong with the object.
     """
@@ -330,6 +331,7 @@ def _turned_outward(mesh: Any, warnings: list[str]) -> tuple[Any, tuple[tuple[np
     """The outer surface with its closed pieces wound outward, and the cavities in it.
 
     A closed piece in another is a cavity if it is wound the other way round, and else inside of the solid.
+    What is in a cavity is solid again: it is given as a cavity of negative volume.
     """
     import trimesh
 
@@ -340,8 +342,11 @@ def _turned_outward(mesh: Any, warnings: list[str]) -> tuple[Any, tuple[tuple[np
     faces[inward] = faces[inward][:, ::-1]
     hidden = np.isin(pieces.of_face, list(inner))
     hollow = [k for k, outer in inner.items() if pieces.volume[k] * pieces.volume[outer] < 0.0]
+    again = [k for k in hollow if pieces.volume[k] * pieces.volume[_outermost(k, inner)] > 0.0]
+    turned = np.isin(pieces.of_face, again)
+    faces[turned] = faces[turned][:, ::-1]
     whole = np.abs(pieces.volume[np.setdiff1d(np.arange(len(pieces.volume)), list(inner))]).sum()
-    cavities = np.abs(pieces.volume[hollow]).sum()
+    cavities = np.abs(pieces.volume[hollow]).sum() - 2.0 * np.abs(pieces.volume[again]).sum()
     if cavities > CAVITY * whole:
         warnings.append(
             f"has a closed cavity of {100 * cavities / whole:.0f} % of its volume: mass and inertia are "
@@ -357,6 +362,12 @@ def _turned_outward(mesh: Any, warnings: list[str]) -> tuple[Any, tuple[tuple[np
     outer = trimesh.Trimesh(mesh.vertices, faces[~hidden], process=False)
     outer.remove_unreferenced_vertices()
     return outer, kept
+
+
+def _outermost(piece: int, inner: dict[int, int]) -> int:
+    while piece in inner:
+        piece = inner[piece]
+    return piece
 
 
 def convex_pieces(mesh: Any) -> tuple[Hull, ...]:
