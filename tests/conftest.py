@@ -1,6 +1,7 @@
 """Fixtures shared by all tests: devices, and the optional folder of real meshes."""
 
 import os
+import signal
 from collections import Counter
 from pathlib import Path
 
@@ -11,6 +12,9 @@ import pytest
 import warp as wp
 
 wp.config.log_level = wp.LOG_WARNING
+# What a shell starts in the background, or nohup, is deaf to these; the tests and what they start are not.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 def devices() -> list[str]:

@@ -204,10 +204,10 @@ def test_interrupted_import_leaves_no_part_and_no_process(ending: signal.Signals
     environment = os.environ | {"VD_ASSETS": str(tmp_path / "assets")}
     child = subprocess.Popen(
         [*command, "--mcts-iterations", "500", "--threshold", "0.01"],
-        env=environment, stderr=subprocess.PIPE, text=True,
-        # A shell that runs tests in the background makes its children deaf to Ctrl-C.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )  # fmt: skip
+        env=environment,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     deadline = time.monotonic() + 120
     while not (below := [p for w in _children(child.pid) for p in _children(w)]):
         assert time.monotonic() < deadline, "no decomposition has begun"
