@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from vd.assets_usd.hands import load_hand
 from vd.gap import cli
@@ -209,7 +210,11 @@ def test_a_bare_servo_is_no_hand_to_identify(tmp_path, capsys):
 
 def test_identify_prints_the_drives_and_writes_the_layer(tmp_path, capsys):
     recording = motions("step_large", ("f0_j1",), 1.2)
-    moved = tuple(replace(t, position=t.command) for t in recording.trajectories)
+    # A servo of any kind, a tenth of the way behind in each sample.
+    moved = tuple(
+        replace(t, position=lfilter([0.1], [1.0, -0.9], t.command, axis=0, zi=0.9 * t.command[:1])[0])
+        for t in recording.trajectories
+    )
     write_recording(replace(recording, trajectories=moved), tmp_path / "rec")
     layer = tmp_path / "drives.usda"
     flags = ["--generations", "1", "--population", "4", "--rate", "120", "--out", str(layer)]

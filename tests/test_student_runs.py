@@ -16,7 +16,7 @@ from student_dummy import TINY, make_student_runner
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import find_policy, open_teacher
+from vd.evaluate.agents import find_policy, open_teacher, trained_task
 from vd.evaluate.statistics import symmetric_error
 from vd.evaluate.trace import Trace
 from vd.sensors.cfg import DepthCameraCfg
@@ -311,7 +311,7 @@ def test_a_teacher_of_views_is_imitated_in_those_that_the_student_chooses(tmp_pa
     head = saved.network.state
     assert teacher is not None and head is not None and head.views is not None and head.fitted
     assert len(head.views) == 3 and torch.equal(head.view_offset, teacher.network.offset[0])
-    assert saved.task["observation"] == teacher.task["observation"] | {"view": "world"}
+    assert trained_task(saved).observation == replace(trained_task(teacher).observation, view="world")
     (row,) = read_progress(folder / "progress.jsonl")
     assert row["loss/state"] > 0.0
 
