@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 
 import tyro
 
@@ -14,6 +15,10 @@ from vd.train.begin import settings_of
 from vd.train.focus import read_success
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
 
+if TYPE_CHECKING:
+    from vd.train.student.config import StudentTrainCfg
+
+Cfg = TypeVar("Cfg", TeacherCfg, "StudentTrainCfg")
 CONFIG_NAME = "config.json"
 """The resolved configuration, in the run's folder, written before the first iteration."""
 
@@ -65,7 +70,7 @@ def parse_teacher(
         start = PRESETS.get(preset or unnamed or "gpu", PRESETS["gpu"])()
     if init is None:
         start = for_hand(start, value_of(arguments, "--env.hand"))
-    base = _saved_config(arguments, start) if resume is not None else start
+    base = (saved_config(arguments, start) or start) if resume is not None else start
     cfg = _parsed(arguments, base)
     if cfg.env.observation.view == "either":
         raise ValueError("env.observation.view either is of evaluations; train with goal, which it looks at")
@@ -154,16 +159,25 @@ def _has_config(arguments: list[str]) -> bool:
     return folder is not None and (Path(folder) / CONFIG_NAME).is_file()
 
 
-def _saved_config(arguments: list[str], start: TeacherCfg) -> TeacherCfg:
-    """Configuration of the run that ``--resume`` goes on with; ``start`` is that of a new one."""
+def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:
+    """Configuration of the run that ``--resume`` goes on with; None where ``auto`` finds no run.
+
+    Args:
+        arguments: The flags.
+        start: Configuration of a new run, teacher's or student's: what is read is of its kind.
+
+    Raises:
+        FileNotFoundError: There is no such run.
+        ValueError: Its configuration is of another version.
+    """
     run_dir = Path(value_of(arguments, "--run-dir") or start.run.run_dir)
     path = run_dir / CONFIG_NAME
     if not path.is_file():
         if value_of(arguments, "--resume") == "auto":
-            return start
+            return None
         raise FileNotFoundError(f"--resume: no {path}; give the --run-dir of the run to go on with")
     try:
-        cfg = from_dict(TeacherCfg, json.loads(path.read_text()))
+        cfg = from_dict(type(start), json.loads(path.read_text()))
     except ValueError as error:
         raise ValueError(
             f"{path}: {error}; it was written by another version, start anew or edit it"

@@ -10,10 +10,9 @@ from typing import Annotated, Literal, cast
 import tyro
 
 from vd import interrupt
-from vd.config import from_dict
 from vd.files import check_file
 from vd.paper import PAPER
-from vd.train.student.build import CONFIG_NAME, build_student, default_init
+from vd.train.student.build import build_student, default_init
 from vd.train.student.config import PRESETS, PRETRAINING, Stage, StudentTrainCfg
 
 HELP = """Train the student: imitate the teacher from point clouds.
@@ -89,7 +88,7 @@ def parse_student(
         FileNotFoundError: ``--resume`` or ``--init`` name what is not there.
         ValueError: What they name is not of this version.
     """
-    from vd.train.flags import normalise, value_of
+    from vd.train.flags import normalise, saved_config, value_of
 
     arguments = normalise(arguments, SHORT_FORMS, "task")
     preset, stage = value_of(arguments, "--preset") or "gpu", value_of(arguments, "--stage") or "1"
@@ -97,7 +96,7 @@ def parse_student(
     number = cast(Stage, int(stage)) if stage in ("0", "1", "2") else 1
     base = PRESETS.get(preset, PRESETS["gpu"])(number)
     if "--resume" in arguments:
-        base = _saved_config(arguments, base)
+        base = saved_config(arguments, base) or _with_init(arguments, base)
     elif "--help" not in arguments and "-h" not in arguments:
         base = _with_init(arguments, base)
     return tyro.cli(StudentTrainCfg, args=arguments, default=base, prog=prog, description=description)
@@ -248,22 +247,3 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
     return replace(
         base, init=path, network=network, camera=camera, teacher=base.teacher or spec.teacher or None
     )
-
-
-def _saved_config(arguments: list[str], start: StudentTrainCfg) -> StudentTrainCfg:
-    """Configuration of the run that ``--resume`` goes on with; ``start`` is that of a new one."""
-    from vd.train.flags import value_of
-
-    run_dir = Path(value_of(arguments, "--run-dir") or start.run.run_dir)
-    path = run_dir / CONFIG_NAME
-    if not path.is_file():
-        if value_of(arguments, "--resume") == "auto":
-            return _with_init(arguments, start)
-        raise FileNotFoundError(f"--resume: no {path}; give the --run-dir of the run to go on with")
-    try:
-        cfg = from_dict(StudentTrainCfg, json.loads(path.read_text()))
-    except ValueError as error:
-        raise ValueError(
-            f"{path}: {error}; it was written by another version, start anew or edit it"
-        ) from error
-    return replace(cfg, run=replace(cfg.run, run_dir=run_dir))
