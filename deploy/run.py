@@ -26,12 +26,12 @@ from vd.deploy.limits import SafetyCfg
 from vd.deploy.motion import MOVE_S, move, reset_pose
 from vd.deploy.realsense import RealSenseCfg
 from vd.deploy.registers import D_GAIN, P_GAIN
-from vd.deploy.run_page import GoalResult, goal_results, summary_line, write_page
-from vd.deploy.safety import SafeHand
+from vd.deploy.run_page import goal_results, summary_line, write_page
+from vd.deploy.safety import SafeHand, StoppedError
 from vd.deploy.timely import Priority, real_time, undisturbed
 from vd.evaluate.agents import check_names
 from vd.files import check_folder
-from vd.hand_log import HandLog, read_log
+from vd.hand_log import LogError, read_log
 from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
 
@@ -129,7 +129,11 @@ class RunCfg(HandOptions):
 
 
 def run(cfg: RunCfg) -> int:
-    """Fly the policy; 0 if all goals were pursued, 1 if the object was lost."""
+    """Fly the policy; 0 if all goals were pursued, 1 if the object was lost.
+
+    Raises:
+        StoppedError: A limit or a fault stopped the hand; the page of what it did is written before.
+    """
     cfg.validate()
     check_folder(cfg.log or LOGS)
     import torch
@@ -163,6 +167,9 @@ def run(cfg: RunCfg) -> int:
         raise ValueError(
             f"{cfg.policy} needs the object's true pose, which no real hand tells; give a student of stage 2"
         )
+    folder = cfg.log or LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
+    fault: StoppedError | None = None
+    status = 0
     with contextlib.ExitStack() as stack:
         twin_options: list[str] = []
         side = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vd-twin-"))) / "side"
@@ -174,16 +181,32 @@ def run(cfg: RunCfg) -> int:
             twin_options += ["--realtime", cfg.realtime]
         connection = stack.enter_context(connect(cfg, twin_options))
         link = stack.enter_context(TwinLink(side)) if cfg.twin else None
-        log, results, status = _fly(cfg, flight, connection, item, link)
+        try:
+            status = _fly(cfg, flight, connection, item, link, folder)
+        except StoppedError as error:
+            if error.signal:  # who ends it does not wait for a film
+                raise
+            fault = error
+    try:
+        log = read_log(folder)
+    except LogError as error:  # it ended before the first step
+        raise fault or error from None
     print("drawing the film (the first one compiles its kernels) ...", file=sys.stderr, flush=True)
-    print(f"page: {write_page(log, results)}")
+    print(f"page: {write_page(log, goal_results(log))}")
+    if fault is not None:
+        raise fault
     return status
 
 
 def _fly(
-    cfg: RunCfg, flight: "Flight", connection: Connection, item: "ObjectModel", link: "TwinLink | None"
-) -> tuple[HandLog, list[GoalResult], int]:
-    """Preflight, way to the start, the loop, and its log: that, what came of the goals, and the status."""
+    cfg: RunCfg,
+    flight: "Flight",
+    connection: Connection,
+    item: "ObjectModel",
+    link: "TwinLink | None",
+    folder: Path,
+) -> int:
+    """Preflight, way to the start, the loop, and its log in a folder; the exit status."""
     from vd.deploy.action import ActionFilter
     from vd.deploy.check import ready
     from vd.deploy.check_camera import camera_findings
@@ -218,7 +241,6 @@ def _fly(
         stack.enter_context(real_time(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals."
         ready(connection, question, yes=cfg.yes or cfg.twin, quiet=cfg.twin, more=seen)
-        folder = cfg.log or LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
         log = LogWriter(
             folder,
             hand,
@@ -274,8 +296,8 @@ def _fly(
             times = {} if loop is None else summary(loop.times)
             steps = 0 if loop is None else len(loop.times)
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
-            results = report(folder, steps, pacer.missed, times)
-    return read_log(folder), results, int(reason == "lost")
+            report(folder, steps, pacer.missed, times)
+    return int(reason == "lost")
 
 
 def place(safe: SafeHand, pose: np.ndarray, link: "TwinLink | None", *, yes: bool) -> None:
@@ -326,9 +348,8 @@ class StatusLine:
             print(file=sys.stderr)
 
 
-def report(folder: Path, steps: int, missed: int, times: dict[str, Any]) -> list[GoalResult]:
-    """Print what came of it, in a few lines; what came of each goal."""
-    results: list[GoalResult] = []
+def report(folder: Path, steps: int, missed: int, times: dict[str, Any]) -> None:
+    """Print what came of it, in a few lines."""
     if steps:
         log = read_log(folder)
         results = goal_results(log)
@@ -343,4 +364,3 @@ def report(folder: Path, steps: int, missed: int, times: dict[str, Any]) -> list
             t = times[name]
             print(f"{title:<17} {t['median']:.1f} ms, 99 % {t['p99']:.1f}, most {t['max']:.1f}")
     print(f"log: {folder}")
-    return results

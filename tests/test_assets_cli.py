@@ -54,6 +54,8 @@ def test_import_then_show(
 
     assert run(monkeypatch, "import", folder / "brick.stl", "--out", record["out"]) == 0
     assert "0 imported, 1 unchanged, 0 refused" in capsys.readouterr().out
+    nothing = tmp_path / "nothing"
+    assert run(monkeypatch, "import", folder / "broken.obj", "--out", nothing) == 1 and not nothing.exists()
     assert run(monkeypatch, "import", folder) == 1
     out = capsys.readouterr().out
     assert "1 refused" in out and "broken.obj: " in out and "volume error" in out

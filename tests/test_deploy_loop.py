@@ -18,8 +18,9 @@ from vd.deploy.answers import HandState
 from vd.deploy.clock import Pacer
 from vd.deploy.log import LogWriter
 from vd.deploy.loop import ControlLoop, LoopCfg
-from vd.deploy.pilot import Decision
+from vd.deploy.pilot import Decision, TeacherPilot
 from vd.deploy.run_page import FILM_FILE, PAGE_FILE, goal_results, summary_line
+from vd.deploy.safety import StoppedError
 from vd.deploy.twin_link import TwinState
 from vd.envs.cfg import ReorientCfg
 from vd.hand_log import read_log
@@ -236,12 +237,11 @@ def patient() -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("hand", ["dclaw3", "dclaw4"])
-def test_a_teacher_flies_a_twin(hand, tmp_path, capsys, patient):
+def test_a_teacher_flies_a_twin(tmp_path, capsys, patient):
     """Everything but a real hand: the process of the twin, its bus, limits, policy, log."""
     pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
     folder = tmp_path / "log"
-    flags = ["--hand", hand, "--twin", "--goal-s", "2", "--hold-s", "0.2", "--log", str(folder)]
+    flags = ["--hand", "dclaw3", "--twin", "--goal-s", "2", "--hold-s", "0.2", "--log", str(folder)]
     goals = ["--goal", "0,0,0,1", "0,0,0.84147,0.5403"]  # the second 2 rad away, so that it takes a while
     status, (out, words) = cli.main([*flags, *patient, *goals]), capsys.readouterr()
     if "loop rate" in words or "asked again" in words:
@@ -258,6 +258,28 @@ def test_a_teacher_flies_a_twin(hand, tmp_path, capsys, patient):
     assert np.isfinite(log.object_pose).all() and log.object_pose[:, 2].max() < 0.2
     assert "of 2 goals reached" in out and f"page: {folder / PAGE_FILE}" in out
     assert "<video" in (folder / PAGE_FILE).read_text() and (folder / FILM_FILE).stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_a_flight_that_a_fault_ends_leaves_its_page(tmp_path, capsys, patient, monkeypatch):
+    pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
+    folder = tmp_path / "log"
+    decide, seen = TeacherPilot.decide, []
+
+    def until_hot(pilot, sensed):
+        seen.append(sensed)
+        if len(seen) > 10:
+            raise StoppedError("f0_j0, motor 10: 81 deg C, over 70")
+        return decide(pilot, sensed)
+
+    monkeypatch.setattr(TeacherPilot, "decide", until_hot)
+    flags = ["--hand", "dclaw4", "--twin", "--goal", "0,0,0.84147,0.5403", "--log", str(folder)]
+    status, (out, words) = cli.main([*flags, *patient]), capsys.readouterr()
+    if "loop rate" in words or "asked again" in words:
+        pytest.skip(f"this machine is too busy: {words.splitlines()[-1]}")
+    assert status == 1 and "81 deg C" in words
+    assert "goal 1: not reached: aborted" in out
+    assert "aborted" in (folder / PAGE_FILE).read_text() and (folder / FILM_FILE).stat().st_size > 1000
 
 
 @pytest.mark.slow

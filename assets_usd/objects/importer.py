@@ -332,6 +332,7 @@ def import_meshes(
             progress(result, len(results), len(plan))
 
     done, todo = _divide(plan, settings, gone, drop_gone=drop_gone, force=force)
+    new = not out.exists()
     make_folder(out)
     left: Status = "dropped" if drop_gone else "gone"
     stale = [ImportResult(file, path.stem, left, target=str(path)) for path, file in gone.items()]
@@ -340,6 +341,8 @@ def import_meshes(
     for result in done:
         finish(result)
     _import_in_children(todo, settings, jobs or os.cpu_count() or 1, finish)
+    if new and not any(out.iterdir()):  # all were refused
+        out.rmdir()
     written = {job.target for job in todo}
     return [*(results[job.name] for job in plan), *(r for r in stale if r.target not in written)]
 
