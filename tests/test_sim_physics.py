@@ -9,6 +9,7 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.decompose import DecomposeSettings
 from vd.assets_usd.objects.geometry import Hull
 from vd.assets_usd.objects.model import load_set
 from vd.bench.physics import GRAVITY, SmallScene, bounce, pinch, rest, slide
@@ -58,17 +59,34 @@ def inertia_about(hand, q: np.ndarray, joint: int) -> float:
     return total
 
 
-@pytest.mark.parametrize(("parts", "contacts"), [(1, 32), (8, 32), (12, 48)])
-def test_room_for_contacts_grows_with_convex_parts(cube, parts, contacts):
-    """Half of the worlds have a cube, the others one cut into slabs: room is for their mean."""
+def sliced(cube, count):
+    """The cube cut into slabs."""
     (hull,) = cube.hulls
     low, high = hull.vertices.min(axis=0), hull.vertices.max(axis=0)
     slabs = []
-    for k in range(2 * parts - 1):
-        ends = low[0] + (high[0] - low[0]) * np.array([k, k + 1]) / (2 * parts - 1)
+    for k in range(count):
+        ends = low[0] + (high[0] - low[0]) * np.array([k, k + 1]) / count
         slabs.append(Hull(np.where(hull.vertices > 0, [ends[1], *high[1:]], [ends[0], *low[1:]]), hull.faces))
+    return dataclasses.replace(cube, hulls=tuple(slabs))
+
+
+@pytest.mark.parametrize("hand", ["dclaw3", "dclaw4"])
+def test_an_object_of_as_many_parts_as_an_import_makes_fits_beside_a_hand(cube, hand):
+    """MuJoCo's masks have 32 bits for who touches whom; parts of one object need none among themselves."""
+    item = sliced(cube, DecomposeSettings().max_hulls)
+    scene = build_scene(hand=load_hand(hand), objects=[item], num_worlds=1, cfg=CFG, device="cpu")
+    model = Simulator(scene, CFG).solver.mj_model
+    meets = (model.geom_contype[:, None] & model.geom_conaffinity[None]) != 0
+    on_object = model.geom_bodyid == model.geom_bodyid[-1]
+    assert on_object.sum() == len(item.hulls)
+    assert (meets | meets.T)[np.ix_(on_object, ~on_object)].all()
+
+
+@pytest.mark.parametrize(("parts", "contacts"), [(1, 32), (8, 32), (12, 48)])
+def test_room_for_contacts_grows_with_convex_parts(cube, parts, contacts):
+    """Half of the worlds have a cube, the others one cut into slabs: room is for their mean."""
     builder = new_builder()
-    for item in (cube, dataclasses.replace(cube, hulls=tuple(slabs))):
+    for item in (cube, sliced(cube, 2 * parts - 1)):
         world = new_builder()
         add_object(world, item, CFG, scale=1.0, visuals=False)
         builder.add_world(world)

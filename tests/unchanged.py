@@ -1,0 +1,273 @@
+"""What a simplification must not change: numbers recorded on a CPU before it, compared after it bit by bit.
+
+    python tests/unchanged.py record FOLDER
+    python tests/unchanged.py compare FOLDER [--only teachers steps]
+
+Times, paths and versions are left out. Faults run in real time: last, alone, and best on a quiet machine.
+"""
+
+import argparse
+import json
+import math
+import os
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = Path(os.environ.get("VD_SHARED", ROOT.parent / "shared"))
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+# Evaluations by their name in the reference: what vd-eval is told.
+TEACHERS = {
+    "dclaw3-procedural": ("dclaw3-procedural",),
+    "dclaw3-table": ("dclaw3-table",),
+    "dclaw3-table, again by its critic": ("dclaw3-table", "--second-view"),
+    "dclaw3-table, mixed": ("dclaw3-table", "--condition", "mixed"),
+    "dclaw4-table": ("dclaw4-table",),
+    "dclaw4-cube": ("dclaw4-cube",),
+    "dclaw4-air": ("dclaw4-air", "--in-air"),
+}
+TRACKING = {
+    "dclaw3-student": ("dclaw3-student", "dclaw3-table"),
+    "dclaw4-student": ("dclaw4-student",),
+    "dclaw4-table-student": ("dclaw4-table-student",),
+}
+EPISODES = {"teachers": 8, "tracking": 8}
+"""Of each of the objects."""
+EPISODE_FIELDS = ("start_quat", "goal_quat", "error_rad", "exact_error_rad", "steps", "stopped", "fell")
+# Recordings that are made, by what vd-gap hide is told, and measured ones where they are at hand.
+HIDDEN = {
+    "servo, friction": ("servo", "--effect", "coulomb_friction"),
+    "servo, late": ("servo", "--effect", "command_delay", "--pwm"),
+    "pendulum, backlash": ("pendulum", "--effect", "backlash"),
+    "pendulum, nothing": ("pendulum",),
+    "finger, friction": ("dclaw3", "--effect", "coulomb_friction"),
+}
+MEASURED = ("xl330_pendulum",)
+ARRAYS = ("observation", "privileged", "reward", "reward_terms", "rotation_error", "success", "fell", "done")
+STEPS, WORLDS = 18, 8
+TIMES = {"seconds", "elapsed_s", "steps_per_s", "collect_s", "learn_s", "detected_s", "safe_s", "own_s"}
+# Threads that meet in the search for a gap make the same fit twice, and count it.
+IGNORED = TIMES | {"rollouts", "rollouts_per_s", "command", "software", "path", "layer", "whole_hand_layer"}
+
+
+def call(*words: object, log: Path) -> None:
+    """Run a module or file of Python with one thread of linear algebra; its last words if it fails."""
+    command = [sys.executable, *map(str, words)]
+    with log.open("w") as said:
+        done = subprocess.run(command, stdout=said, stderr=subprocess.STDOUT, env=os.environ | ONE_THREAD)
+    if done.returncode:
+        raise RuntimeError(f"{' '.join(command)}: status {done.returncode}\n{log.read_text()[-2000:]}")
+
+
+def packed(array: Any) -> str:
+    """An array as text, exactly."""
+    array = np.ascontiguousarray(array)
+    return f"{array.dtype.str}:{array.tobytes().hex()}"
+
+
+def evaluated(part: str, items: dict[str, tuple[str, ...]], work: Path, objects: Path) -> dict[str, Any]:
+    """Every episode of every policy, by each rule that stops it."""
+    found = {}
+    for name, words in items.items():
+        out = work / name.replace(" ", "-")
+        flags = ["--objects", objects, "--episodes", EPISODES[part], "--seed", 1, "--device", "cpu"]
+        call("-m", "vd.evaluate.cli", *words, *flags, "--output", out, log=out.with_suffix(".log"))
+        read = json.loads((out / "eval.json").read_text())
+        for row in read.get("rows", [{"result": read}]):
+            label = [row[key] for key in ("policy", "stopped_by", "ours") if row.get(key)]
+            label += [f"{bound:g}" for bound in row.get("rule", {}).values()]
+            columns = {field: [e[field] for e in row["result"]["episodes"]] for field in EPISODE_FIELDS}
+            found[", ".join([name, *label])] = columns | {"held": row.get("held")}
+    return found
+
+
+def teachers(work: Path, objects: Path) -> dict[str, Any]:
+    """Policies that see the simulator's state."""
+    return evaluated("teachers", TEACHERS, work, objects)
+
+
+def tracking(work: Path, objects: Path) -> dict[str, Any]:
+    """Policies that see by cameras."""
+    return evaluated("tracking", TRACKING, work, objects)
+
+
+def tasks() -> dict[str, Any]:
+    """Every task that ships, of presets, policies and conditions, and options that none of them has."""
+    from vd.evaluate.agents import open_teacher, trained_task
+    from vd.evaluate.conditions import CONDITIONS
+    from vd.train.presets import PRESETS
+
+    found = {f"preset {name}": preset().env for name, preset in PRESETS.items()}
+    found |= {f"policy {n}": trained_task(open_teacher(n, "cpu")) for n in {w[0] for w in TEACHERS.values()}}
+    table, four = found["policy dclaw3-table"], found["policy dclaw4-table"]
+    found |= {f"condition {name}": replace(table, randomisation=drawn) for name, drawn in CONDITIONS.items()}
+    for view, base in (("world", table), ("mirrored", table), ("either", table), ("either", four)):
+        found[f"view {view} {base.hand}"] = replace(base, observation=replace(base.observation, view=view))
+    known = replace(table.observation, history=3, dynamics="critic", file_axes=False)
+    found["history and dynamics"] = replace(found["condition mixed"], observation=known)
+    found["soft, aimed"] = replace(four, fingertip="soft", aim=replace(four.aim, enabled=True))
+    loose = replace(table.success, rotation_rad=0.8, joint_speed_rad_s=0, object_speed_m_s=0, action_norm=0)
+    fixed = replace(table.curriculum, enabled=False, tightening=type(table.curriculum.tightening)())
+    near = replace(table.goal, max_angle_rad=1.0)
+    found["near goals"] = replace(table, success=loose, goal=near, curriculum=fixed)
+    return found
+
+
+def step_tasks(objects: Path, out: Path) -> None:
+    """Observation, reward and ends of episodes under random actions, in every task."""
+    import warp as wp
+
+    from vd.envs.reorient import ReorientEnv
+
+    files = tuple(str(path) for path in sorted(objects.glob("*.usd"))[:2])
+    found: dict[str, Any] = {}
+    for name, task in sorted(tasks().items()):
+        env = ReorientEnv(replace(task, num_worlds=WORLDS, objects=files, seed=5, episode_s=1.0), "cpu")
+        rng, found[name] = np.random.default_rng(7), []
+        for _ in range(STEPS):
+            action = rng.uniform(-1.0, 1.0, (WORLDS, env.num_actions)).astype(np.float32)
+            env.step(wp.array(action, dtype=float, device="cpu"))
+            found[name].append({array: packed(getattr(env, array).numpy()) for array in ARRAYS})
+        env.close()
+    out.write_text(json.dumps(found))
+
+
+def steps(work: Path, objects: Path) -> dict[str, Any]:
+    """The environment's step in every task, in a process of its own."""
+    call(__file__, "steps", work / "steps.json", "--objects", objects, log=work / "steps.log")
+    return json.loads((work / "steps.json").read_text())
+
+
+def gap(work: Path, objects: Path) -> dict[str, Any]:
+    """Reports of what a simulation lacks beside a recording."""
+    recordings = {name: SHARED / "measured" / name for name in MEASURED}
+    recordings = {name: folder for name, folder in recordings.items() if folder.is_dir()}
+    for name, words in HIDDEN.items():
+        recordings[name] = work / name.replace(", ", "-")
+        call(
+            "-m", "vd.gap.cli", "hide", *words, "--seed", 2, "--out", recordings[name], log=work / "hide.log"
+        )
+    found = {}
+    for name, recording in recordings.items():
+        out = work / f"gap-{recording.name}"
+        call("-m", "vd.gap.cli", "run", recording, "--out", out, log=out.with_suffix(".log"))
+        found[name] = json.loads((out / "report.json").read_text())
+    return found
+
+
+def training(work: Path, objects: Path) -> dict[str, Any]:
+    """Weights and curve of a run that stops after three iterations and goes on for three."""
+    from vd.policy import load_policy
+    from vd.train.metrics import read_progress
+
+    run, command = work / "run", ("-m", "vd.train.cli", "teacher", "--smoke", "--run-dir", work / "run")
+    call(*command, "--max-steps", 384, log=work / "first.log")
+    call(*command, "--resume", "--max-steps", 768, log=work / "second.log")
+    weights = load_policy(run / "policy.pt", "cpu").weights
+    arrays = {name: packed(value.numpy()) for name, value in weights.items()}
+    return {"weights": arrays, "progress": read_progress(run / "progress.jsonl")}
+
+
+def faults(work: Path, objects: Path) -> dict[str, Any]:
+    """How every fault of the twin ends, without the figures that its words tell."""
+    call("-m", "vd.deploy.faults", "--json", work / "faults.json", log=work / "faults.log")
+    rows = json.loads((work / "faults.json").read_text())
+    return {row["fault"]: row | {"happened": re.sub(r"[\d.]+", "#", row["happened"])} for row in rows}
+
+
+Part = Callable[[Path, Path], dict[str, Any]]
+PARTS: dict[str, Part] = {f.__name__: f for f in (tracking, gap, teachers, steps, training, faults)}
+"""The longest first."""
+
+
+def measure(names: list[str], objects: Path, jobs: int) -> Iterator[tuple[str, dict[str, Any], float]]:
+    """Every part, what it found and how long it took [s]."""
+
+    def one(name: str) -> tuple[str, dict[str, Any], float]:
+        began = time.monotonic()
+        with TemporaryDirectory() as work:
+            return name, PARTS[name](Path(work), objects), time.monotonic() - began
+
+    with ThreadPoolExecutor(jobs) as pool:
+        yield from pool.map(one, [name for name in names if name != "faults"])
+    yield from (one(name) for name in names if name == "faults")
+
+
+def leaves(value: Any, where: str = "") -> Iterator[tuple[str, Any]]:
+    """Every number, text and array with its place, but what is ignored."""
+    if not isinstance(value, (dict, list)):
+        yield where, value
+        return
+    for key, item in value.items() if isinstance(value, dict) else enumerate(value):
+        if key not in IGNORED:
+            yield from leaves(item, f"{where}/{key}")
+
+
+def distance(a: Any, b: Any) -> float:
+    """Largest difference of two numbers or arrays; infinite where there is none."""
+    if isinstance(a, str) and isinstance(b, str) and a[:1] == "<" and a[:4] == b[:4] and len(a) == len(b):
+        arrays = [np.frombuffer(bytes.fromhex(text[4:]), text[:3]).astype(float) for text in (a, b)]
+        return float(np.nanmax(np.abs(arrays[0] - arrays[1])))
+    return abs(a - b) if all(isinstance(x, (int, float)) for x in (a, b)) else math.inf
+
+
+def differences(reference: Any, found: Any) -> dict[str, tuple[float, str]]:
+    """By item of a part: the largest difference, and the first place that differs."""
+    before, now = dict(leaves(reference)), dict(leaves(found))
+    differing: dict[str, tuple[float, str]] = {}
+    for where in dict.fromkeys([*before, *now]):
+        a, b = before.get(where), now.get(where)
+        if a != b and not (a != a and b != b):  # NaN is equal to NaN here
+            item = where.split("/")[1]
+            first = f"{where}: {str(a)[:40]} became {str(b)[:40]}"
+            largest, first = differing.get(item, (0.0, first))
+            differing[item] = max(largest, distance(a, b)), first
+    return differing
+
+
+def main() -> int:
+    """Record or compare; 1 if anything differs."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("what", choices=("record", "compare", "steps"))
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS), help="parts")
+    parser.add_argument(
+        "--objects", type=Path, default=ROOT / "build" / "unchanged", help="folder of their USD"
+    )
+    parser.add_argument("--jobs", type=int, default=2, help="parts side by side")
+    args = parser.parse_args()
+    if not args.objects.is_dir():
+        words = ("import", SHARED / "objects" / "test", "--out", args.objects, "--split", "test")
+        call("-m", "vd.assets_usd.cli", *words, log=args.objects.with_suffix(".log"))
+    if args.what == "steps":
+        step_tasks(args.objects, args.folder)
+        return 0
+    args.folder.mkdir(parents=True, exist_ok=True)
+    changed = False
+    for name, found, seconds in measure(args.only, args.objects.resolve(), args.jobs):
+        file = args.folder / f"{name}.json"
+        if args.what == "record":
+            file.write_text(json.dumps(found))
+            print(f"{name:9} recorded in {seconds:.0f} s", flush=True)
+            continue
+        differing = differences(json.loads(file.read_text()), json.loads(json.dumps(found)))
+        verdict = f"{len(differing)} items differ" if differing else "equal"
+        print(f"{name:9} {verdict} ({seconds:.0f} s)", flush=True)
+        for item, (largest, first) in differing.items():
+            print(f"  {item}: by up to {largest:.3g}; first {first}", flush=True)
+        changed |= bool(differing)
+    return int(changed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
