@@ -1,16 +1,20 @@
-"""Self-contained HTML pages: text, tables, figures and videos in one file that needs no network.
+"""Self-contained HTML pages from the templates in ``vd/templates``: one file that needs no network.
 
-Pictures and videos are embedded as base64, the style is a few lines of CSS, and there is no script, so a
-page can be mailed, opened from a disk, printed, and read in a light or dark browser.
+A page extends ``base.html`` and takes its parts from ``macros.html``. Templates get plain data and
+escape all text. Pictures and videos are embedded as base64, and there is no script: a page can be
+mailed, opened from a disk, printed, and read in a light or dark browser.
 """
 
 import base64
 import io
 import re
 from collections.abc import Sequence
-from html import escape
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
 
 from vd.files import write_text
 
@@ -19,35 +23,66 @@ if TYPE_CHECKING:
 
 # Dots per inch of embedded figures: sharp on a high-density screen at the width of the text.
 FIGURE_DPI = 160
+TEMPLATES = Path(__file__).parent / "templates"
 
-_STYLE = """
-:root{color-scheme:light dark;--ink:#1c2330;--soft:#5c6675;--line:#d8dde5;--ground:#fff;--tint:#f3f5f8;
---lead:#1f5fbf}
-@media(prefers-color-scheme:dark){
-:root{--ink:#e7eaf0;--soft:#9aa5b5;--line:#343c49;--ground:#12161d;--tint:#1b212b;--lead:#7fb0ff}}
-*{box-sizing:border-box}
-body{margin:0;background:var(--ground);color:var(--ink);
-font:16px/1.55 system-ui,-apple-system,"Segoe UI",sans-serif}
-main{max-width:72rem;margin:0 auto;padding:2rem 1.25rem 4rem}
-h1{font-size:1.9rem;line-height:1.2;margin:0 0 .25rem}h2{font-size:1.3rem;margin:2.5rem 0 .75rem}
-.lead,figcaption,.small{color:var(--soft)}p{margin:.6rem 0;max-width:46rem}
-ul{margin:.6rem 0;padding-left:1.3rem;max-width:46rem}li{margin:.25rem 0}
-.scroll{overflow-x:auto;margin:1rem 0}details{margin:1rem 0}summary{cursor:pointer;font-weight:600}
-table{border-collapse:collapse;width:100%;font-variant-numeric:tabular-nums;font-size:.92rem}
-th,td{padding:.4rem .7rem;border-bottom:1px solid var(--line);text-align:right}
-td small{display:block;color:var(--soft);white-space:nowrap}
-th:first-child,td:first-child,.words{text-align:left}td.words{min-width:7rem;overflow-wrap:anywhere}
-thead th{color:var(--soft);font-weight:600;border-bottom:2px solid var(--line)}
-figure{margin:1.2rem 0}figure img,figure video{display:block;max-width:100%;height:auto;border-radius:.5rem}
-figure img{background:#fff}figcaption{font-size:.88rem;margin-top:.4rem;max-width:46rem}
-a{color:var(--lead)}
-.tiles{display:grid;grid-template-columns:repeat(auto-fit,minmax(11rem,1fr));gap:.75rem;margin:1.25rem 0}
-.tile{background:var(--tint);border-radius:.6rem;padding:.8rem 1rem}
-.tile b{display:block;font-size:1.55rem;line-height:1.25;color:var(--lead);font-variant-numeric:tabular-nums}
-.tile span{font-size:.85rem;color:var(--soft)}
-code{background:var(--tint);border-radius:.25rem;padding:.1rem .3rem;font-size:.88em;overflow-wrap:anywhere}
-@media print{.tile,figure,tr{break-inside:avoid}main{max-width:none;padding:0}}
-"""
+_WITH_INTERVAL = re.compile(r"(-?[\d.]+(?: ?%| [a-z]+)?) (\([^()]+ to [^()]+\))")
+"""A number and its interval."""
+_KINDS = {".gif": "image/gif", ".mp4": "video/mp4"}
+
+
+def render(template: str, **data: Any) -> str:
+    """The HTML of a template.
+
+    Args:
+        template: Name of the file in ``vd/templates``.
+        data: What the template asks for.
+
+    Raises:
+        jinja2.UndefinedError: The template asks for something that was not given.
+    """
+    return environment().get_template(template).render(data)
+
+
+def write_page(path: Path, template: str, **data: Any) -> None:
+    """Write the page of :func:`render` to ``path`` atomically."""
+    write_text(path, render(template, **data))
+
+
+@cache
+def environment() -> Environment:
+    """The templates, with the filters ``cell`` (a table's cell) and ``embed`` (a picture or video)."""
+    found = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    found.filters |= {"cell": _cell, "embed": _embed}
+    return found
+
+
+def _cell(value: object) -> Markup:
+    """A table's cell; an interval goes below its number, so that columns are narrow."""
+    found = _WITH_INTERVAL.fullmatch(str(value))
+    if found is None:
+        return escape(value)
+    number, interval = found.groups()
+    return Markup("{} <small>{}</small>").format(number.replace(" ", "\N{NO-BREAK SPACE}"), interval)
+
+
+def _embed(image: "Figure | bytes | Path") -> str:
+    """A matplotlib figure, PNG bytes, or a PNG, GIF or MP4 file as an address that holds it."""
+    kind = "image/png"
+    if isinstance(image, Path):
+        kind, data = _KINDS.get(image.suffix.lower(), kind), image.read_bytes()
+    elif isinstance(image, bytes):
+        data = image
+    else:
+        buffer = io.BytesIO()
+        image.savefig(buffer, format="png", dpi=FIGURE_DPI, bbox_inches="tight")
+        data = buffer.getvalue()
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
 
 
 class Page:
@@ -59,10 +94,8 @@ class Page:
     """
 
     def __init__(self, title: str, lead: str = ""):
-        self._title = title
-        self._parts = [f"<h1>{escape(title)}</h1>"]
-        if lead:
-            self._parts.append(f'<p class="lead">{escape(lead)}</p>')
+        self._title, self._lead = title, lead
+        self._parts: list[str] = []
 
     def section(self, title: str) -> None:
         """Start a section."""
@@ -114,7 +147,7 @@ class Page:
         head = "".join(f"<th{kind}>{escape(name)}</th>" for kind, name in zip(kinds, header, strict=True))
         body = "".join(
             "<tr>"
-            + "".join(f"<td{kind}>{_cell(str(cell))}</td>" for kind, cell in zip(kinds, row, strict=True))
+            + "".join(f"<td{kind}>{_cell(cell)}</td>" for kind, cell in zip(kinds, row, strict=True))
             + "</tr>"
             for row in rows
         )
@@ -131,17 +164,11 @@ class Page:
 
     def figure(self, image: "Figure | bytes | Path", caption: str) -> None:
         """Add a picture: a matplotlib figure, PNG bytes, or the path of a PNG or GIF file."""
-        kind = "image/png"
-        if isinstance(image, Path):
-            kind = "image/gif" if image.suffix.lower() == ".gif" else kind
-            data = image.read_bytes()
-        else:
-            data = image if isinstance(image, bytes) else _png(image)
-        self._add_figure(f'<img alt="{escape(caption)}" src="{_data_url(data, kind)}">', caption)
+        self._add_figure(f'<img alt="{escape(caption)}" src="{_embed(image)}">', caption)
 
     def video(self, path: Path, caption: str) -> None:
         """Add an MP4 file; it plays muted and in a loop."""
-        source = _data_url(Path(path).read_bytes(), "video/mp4")
+        source = _embed(path)
         self._add_figure(f'<video controls autoplay loop muted playsinline src="{source}"></video>', caption)
 
     def _add_figure(self, content: str, caption: str) -> None:
@@ -149,36 +176,8 @@ class Page:
 
     def html(self) -> str:
         """The whole document."""
-        return (
-            '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-            '<meta name="viewport" content="width=device-width,initial-scale=1">'
-            f"<title>{escape(self._title)}</title><style>{_STYLE}</style></head>\n"
-            f"<body><main>\n{chr(10).join(self._parts)}\n</main></body></html>\n"
-        )
+        return render("parts.html", title=self._title, lead=self._lead, parts=Markup("\n".join(self._parts)))
 
     def write(self, path: Path) -> None:
         """Write the page to ``path`` atomically."""
         write_text(path, self.html())
-
-
-_WITH_INTERVAL = re.compile(r"(-?[\d.]+(?: ?%| [a-z]+)?) (\([^()]+ to [^()]+\))")
-"""A number and its interval."""
-
-
-def _cell(text: str) -> str:
-    """A cell's text; an interval goes below its number, so that columns are narrow."""
-    found = _WITH_INTERVAL.fullmatch(text)
-    if found is None:
-        return escape(text)
-    value, interval = (escape(part) for part in found.groups())
-    return f"{value.replace(' ', '&nbsp;')} <small>{interval}</small>"
-
-
-def _png(figure: Any) -> bytes:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=FIGURE_DPI, bbox_inches="tight")
-    return buffer.getvalue()
-
-
-def _data_url(data: bytes, kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"

@@ -1,0 +1,58 @@
+"""Pages are single files that hold their pictures, escape what they are given, and ask for all they show."""
+
+import pytest
+from jinja2 import UndefinedError
+from matplotlib.figure import Figure
+from test_evaluate_report import PNG, References
+
+from vd.page import environment
+
+PAGE = """
+{% extends "base.html" %}
+{% from "macros.html" import figure, object_warnings, points, table, tiles, video %}
+{% block title %}{{ name }}{% endblock %}
+{% block content %}
+{{ tiles([("1 <m>", "far & wide", "95 %")]) }}
+{{ points([name]) }}
+{{ table(("a", "b"), rows, words=(1,), folded=name) }}
+{{ object_warnings({name: "open"}) }}
+{% call figure(image) %}The \"{{ name }}\"{% endcall %}
+{% call video(clip) %}a clip{% endcall %}
+{% endblock %}
+"""
+
+
+def rendered(tmp_path, **changes):
+    (tmp_path / "clip.mp4").write_bytes(b"\0\0\0\x18ftypmp42")
+    data = {"name": "T & <i>", "rows": [(3, "<b>")], "image": PNG, "clip": tmp_path / "clip.mp4"} | changes
+    text = environment().from_string(PAGE).render(data)
+    references = References()
+    references.feed(text)
+    assert references.stack == []
+    return text, references
+
+
+def test_a_page_escapes_all_it_is_given(tmp_path):
+    text, references = rendered(tmp_path)
+    assert not {"i", "m"} & set(references.tags)
+    assert text.lstrip().startswith("<!doctype html>")
+    assert "<title>T &amp; &lt;i&gt;</title>" in text and "<h1>T &amp; &lt;i&gt;</h1>" in text
+    assert '<td class="words">&lt;b&gt;</td>' in text and "far &amp; wide" in text
+    assert 'alt="The &#34;T &amp; &lt;i&gt;&#34;"' in text
+
+
+def test_pictures_and_videos_are_embedded(tmp_path):
+    (tmp_path / "loop.gif").write_bytes(b"GIF89a")
+    for image, kind in ((PNG, "png"), (tmp_path / "loop.gif", "gif"), (Figure(), "png")):
+        _, references = rendered(tmp_path, image=image)
+        assert [a.split(";")[0] for a in references.addresses] == [f"data:image/{kind}", "data:video/mp4"]
+
+
+def test_an_interval_stands_below_its_number(tmp_path):
+    text, _ = rendered(tmp_path, rows=[("x", "12.3 % (10.1 to 14.9)")])
+    assert "12.3\N{NO-BREAK SPACE}% <small>(10.1 to 14.9)</small>" in text
+
+
+def test_what_a_template_asks_for_has_to_be_given(tmp_path):
+    with pytest.raises(UndefinedError):
+        environment().from_string(PAGE).render()
