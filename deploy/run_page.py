@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from vd.hand_log import HandLog
-from vd.page import Page
+from vd.page import write_html
 
 FILM_FILE, PAGE_FILE = "run.mp4", "run.html"
 ABORTED = "aborted"
@@ -81,14 +81,14 @@ def write_page(log: HandLog, results: Sequence[GoalResult]) -> Path:
     from vd.play.replay import film
 
     film(log, log.path / FILM_FILE)
-    run = log.run
-    where = f"the twin of {run['hand']}" if run["twin"] else run["hand"]
-    page = Page(f"{run['policy']} on {where}", f"{run['object']['name']}; goals: {len(log.goals)}.")
-    page.text(summary_line(results, len(log.goals)))
-    page.video(log.path / FILM_FILE, "The run, from its log.")
-    page.table(
-        ("goal", "outcome", "time [s]", "predicted [rad]", "error [rad]", "reached"),
-        [
+    write_html(
+        log.path / PAGE_FILE,
+        "run.html",
+        run=log.run,
+        goals=len(log.goals),
+        summary=summary_line(results, len(log.goals)),
+        film=log.path / FILM_FILE,
+        rows=[
             (
                 one.goal + 1,
                 one.outcome,
@@ -99,12 +99,6 @@ def write_page(log: HandLog, results: Sequence[GoalResult]) -> Path:
             )
             for one in results
         ],
-        words=(1,),
+        tolerance_rad=f"{log.tolerance_rad:g}" if "error" in log.columns else None,
     )
-    if "error" in log.columns:
-        page.text(
-            f"Reached: stopped within {log.tolerance_rad:g} rad. Errors: to what looks like the goal.",
-            small=True,
-        )
-    page.write(log.path / PAGE_FILE)
     return log.path / PAGE_FILE

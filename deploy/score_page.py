@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from vd.deploy.score import Score, step_errors
 from vd.evaluate.plots import BLUE, GREEN, GREY, ORANGE, ecdf
 from vd.evaluate.statistics import chance_cdf
-from vd.page import Page
+from vd.page import write_html
 
 
 def write_page(path: Path, result: Score, symmetry: np.ndarray) -> None:
@@ -19,11 +19,28 @@ def write_page(path: Path, result: Score, symmetry: np.ndarray) -> None:
         result: The run.
         symmetry: Rotations of the object onto itself, xyzw [S, 4].
     """
-    run = result.log.run
-    page = Page(
-        f"{run.get('policy', 'A policy')} on {run['hand']}, scored by motion capture",
-        f"{run['object']['name']}: {len(result.trials)} goals. Errors at stops, up to the object's symmetry.",
+    write_html(
+        path,
+        "score.html",
+        run=result.log.run,
+        headline=_headline(result),
+        errors=_errors(result, symmetry) if len(result.errors) else None,
+        over_time=_over_time(result, symmetry),
+        rows=[
+            (
+                str(trial.goal + 1),
+                f"{trial.time_s:.1f}",
+                trial.outcome + (", discarded" if trial.discarded else ""),
+                "" if trial.error_rad is None else f"{trial.error_rad:.3f}",
+                "" if trial.predicted_rad is None else f"{trial.predicted_rad:.3f}",
+            )
+            for trial in result.trials
+        ],
+        offset_s=f"{result.offset_s:.3f}",
     )
+
+
+def _headline(result: Score) -> list[tuple[str, str, str]]:
     tiles = []
     if result.median is not None:
         m = result.median
@@ -38,37 +55,7 @@ def write_page(path: Path, result: Score, symmetry: np.ndarray) -> None:
         for tolerance, share in result.within
     ]
     discarded = len(result.trials) - result.scored
-    tiles.append((f"{discarded}", "trials discarded", "markers lost at the stop"))
-    page.tiles(tiles)
-    if len(result.errors):
-        page.figure(
-            _errors(result, symmetry),
-            "Share of the stops whose error is at most so large, and that of orientations drawn at random.",
-        )
-    page.section("The run")
-    page.figure(
-        _over_time(result, symmetry),
-        "Angle to the goal that was pursued, measured (gaps: markers lost) and predicted by the policy; "
-        "lines mark the ends of goals.",
-    )
-    rows = [
-        (
-            str(trial.goal + 1),
-            f"{trial.time_s:.1f}",
-            trial.outcome + (", discarded" if trial.discarded else ""),
-            "" if trial.error_rad is None else f"{trial.error_rad:.3f}",
-            "" if trial.predicted_rad is None else f"{trial.predicted_rad:.3f}",
-        )
-        for trial in result.trials
-    ]
-    page.table(("goal", "ended at [s]", "outcome", "error [rad]", "predicted [rad]"), rows, words=(2,))
-    page.text(
-        f"Clocks: {result.offset_s:.3f} s of the motion capture is the beginning of the log. Intervals are "
-        "95 % (t on the log odds over the trials; exact binomial where all agree). Trials that did not stop "
-        "count as failures in the shares.",
-        small=True,
-    )
-    page.write(path)
+    return [*tiles, (f"{discarded}", "trials discarded", "markers lost at the stop")]
 
 
 def _errors(result: Score, symmetry: np.ndarray) -> Figure:

@@ -26,7 +26,7 @@ from vd.evaluate.suite import (
     success_without_table,
     time_to_success,
 )
-from vd.evaluate.suite_page import WHO_JUDGES, paper_text
+from vd.evaluate.suite_page import paper_text
 from vd.paper import PAPER, ResultConstants
 
 TEACHER, STUDENT = "dclaw3-table", "runs/s/student.pt"
@@ -302,7 +302,7 @@ def test_the_reduced_suite_takes_a_spread_of_objects(tmp_path, asked):
 def test_which_objects_stand_for_the_papers_is_said(tmp_path, asked):
     result = run(suite(tmp_path, objects=("training=cube", "held-out=cube", "validation=cube")))
     page = (tmp_path / "out" / "paper.html").read_text()
-    assert "No others were given" not in page and WHO_JUDGES in page
+    assert "No others were given" not in page and "Held-out objects judge, and nothing is" in page
     assert ("validation", TEACHER) in result.found
     groups = suite_run.object_groups((), quick=False)
     assert "validation" not in groups, "nothing stands in for it"

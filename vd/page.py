@@ -43,7 +43,7 @@ def render(template: str, **data: Any) -> str:
     return environment().get_template(template).render(data)
 
 
-def write_page(path: Path, template: str, **data: Any) -> None:
+def write_html(path: Path, template: str, **data: Any) -> None:
     """Write the page of :func:`render` to ``path`` atomically."""
     write_text(path, render(template, **data))
 

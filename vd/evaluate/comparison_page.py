@@ -8,10 +8,10 @@ from matplotlib.figure import Figure
 
 from vd.evaluate.comparison import BOUNDS_RAD, OUTCOMES, Comparison, Row
 from vd.evaluate.plots import BLUE, GREEN, GREY, ORANGE, ecdf
-from vd.evaluate.report import add_warnings, goals_text, number, percent, shown_name, starts_text
+from vd.evaluate.report import aligned, goals_text, number, percent, shown_name, starts_text
 from vd.evaluate.statistics import chance_cdf
 from vd.evaluate.trace import HOLD_S
-from vd.page import Page
+from vd.page import write_html
 from vd.paper import PAPER
 
 COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -44,6 +44,14 @@ _BOUND_HEADER = (
     "stops within, by true distance",
     "mean error [rad]",
 )
+_OBJECT_HEADER = (
+    "object",
+    "episodes",
+    *(f"<= {bound} rad" for bound in BOUNDS_RAD),
+    "<= 0.4 up to symmetry",
+    "median error [rad]",
+    "fell",
+)
 
 
 def labels(names: tuple[str, ...]) -> dict[str, str]:
@@ -72,66 +80,46 @@ def write_comparison(comparison: Comparison, path: Path, *, pictures: bytes | No
         path: Of the page.
         pictures: PNG with the objects.
     """
-    page = Page("Comparison of policies", _lead(comparison))
     short = labels(comparison.policies)
     rows = in_order(comparison.rows)
-    page.section("Success")
-    page.table(_HEADER, [_cells(row, short) for row in rows], words=(1, 2))
-    page.text(_HEADLINE, small=True)
-    page.section("How the other episodes ended")
-    page.table(_REST_HEADER, [_rest_cells(row, short) for row in rows], words=(1, 2))
-    page.figure(
-        outcome_figure(comparison),
-        "Success: stopped within the tolerance of the very goal. Orientation error: stopped outside of it. "
-        "Time-out: never stopped. Object falls: it left the hand before a stop.",
+    write_html(
+        path,
+        "comparison.html",
+        lead=_lead(comparison),
+        success_header=_HEADER,
+        success=[_cells(row, short) for row in rows],
+        hold_s=f"{HOLD_S:g}",
+        rest_header=_REST_HEADER,
+        rest=[_rest_cells(row, short) for row in rows],
+        outcomes=outcome_figure(comparison),
+        pictures=pictures,
+        ecdf=ecdf_figure(comparison),
+        scatter=scatter_figure(comparison) if comparison.predictions else None,
+        bound_header=_BOUND_HEADER,
+        bounds=_bound_cells(comparison, short),
+        warnings=comparison.warnings,
+        objects=[(_heading(row, short), _object_cells(row)) for row in rows],
+        object_header=_OBJECT_HEADER,
+        protocol=_protocol(comparison),
     )
-    if pictures is not None:
-        page.section("Objects")
-        page.figure(pictures, "The objects as they are simulated, each at its own scale.")
-    page.section("Errors")
-    page.figure(
-        ecdf_figure(comparison),
-        "Share of episodes that ended within each error of the very goal. Solid: stopped by itself, a "
-        "student by its prediction, others by the true distance. Dashed: a student stopped by the true "
-        "distance. A lost object never counts, so curves end below one.",
-    )
-    if comparison.predictions:
-        page.section("Predicted distance")
-        page.figure(
-            scatter_figure(comparison),
-            "Predicted beside true distance to the goal, before symmetry, in a sample of all states of all "
-            "episodes; right, the near ones. Lines are 0.1 rad apart from equal.",
+
+
+def _heading(row: Row, short: dict[str, str]) -> str:
+    return f"{short[row.policy]}, {row.group}, stopped by {_stopped_by(row)}"
+
+
+def _object_cells(row: Row) -> list[tuple[str, ...]]:
+    return [
+        (
+            summary.name,
+            str(summary.episodes),
+            *(percent(summary.success[str(bound)]) for bound in BOUNDS_RAD),
+            percent(summary.symmetric[str(PAPER.success.rotation_rad)]),
+            number(summary.median_error_rad),
+            percent(summary.drop_rate),
         )
-        page.table(_BOUND_HEADER, _bound_cells(comparison, short), words=(1,))
-        page.text(
-            "Near and seen so: of the states truly within the bound, the share predicted within it. Said and "
-            "right: of those predicted within it, the share that is. The paper reports 29.4 % and 85.9 % for "
-            "the first at 0.1 and 0.4 rad, and stops within them of 25.9 % and 72.3 % by prediction, 67.4 % "
-            "and 80.9 % by true distance (in the air, twelve objects).",
-            small=True,
-        )
-    add_warnings(page, comparison.warnings)
-    page.section("Every object")
-    shown = [str(bound) for bound in BOUNDS_RAD]
-    for row in rows:
-        heading = f"{short[row.policy]}, {row.group}, stopped by {_stopped_by(row)}"
-        cells = [
-            (
-                summary.name,
-                str(summary.episodes),
-                *(percent(summary.success[key]) for key in shown),
-                percent(summary.symmetric[str(PAPER.success.rotation_rad)]),
-                number(summary.median_error_rad),
-                percent(summary.drop_rate),
-            )
-            for summary in row.result.per_object
-        ]
-        header = ("object", "episodes", *(f"<= {key} rad" for key in shown), "<= 0.4 up to symmetry")
-        page.table((*header, "median error [rad]", "fell"), cells, folded=heading)
-    page.section("Protocol")
-    page.table(("setting", "value"), _protocol(comparison), words=(1,))
-    page.text(_METHOD, small=True)
-    page.write(path)
+        for summary in row.result.per_object
+    ]
 
 
 def terminal_table(comparison: Comparison) -> str:
@@ -162,18 +150,6 @@ def ours(row: Row) -> str:
     ):
         found += [text] if getattr(protocol, name) else []
     return ", ".join(found)
-
-
-def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
-    """Rows of cells as lines of text: the first ``words`` columns flush left, the others right."""
-    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
-    return "\n".join(
-        "  ".join(
-            cell.ljust(width) if column < words else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    )
 
 
 def ecdf_figure(comparison: Comparison) -> Figure:
@@ -354,18 +330,3 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
             told = f"sees {row.sees}{errs}, stops below {rule}{mark}"
             rows.append((f"{short[row.policy]}, {row.group}", told))
     return rows + list(comparison.software.items())
-
-
-_METHOD = (
-    "Episodes run to the fall of the object or the time limit, whatever a policy does, and are then ended "
-    "by each rule at the first step at which it holds: what decides to stop does not change what happened "
-    "before. A rule is a bound on the distance, predicted by a student or true, and one on the norm of the "
-    "smoothed action; unlike the evaluation of a single teacher it does not ask for stillness. "
-    "Errors are those to the very goal. What a student predicts is the distance to what looks like the goal; "
-    "up to symmetry the true distance is that one too. Intervals are 95 %, as on the page of a single policy."
-)
-_HEADLINE = (
-    "Success: stopped within the tolerance of the very goal. Held: and still within it, and not lost, after "
-    f"the hand has kept its last targets for {HOLD_S:g} s. Up to symmetry: within the tolerance of whatever "
-    "looks like the goal. Rows marked ours have what the paper's have not."
-)

@@ -1,6 +1,6 @@
 """The evaluation as one HTML page and as lines for a terminal."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,15 +8,7 @@ import numpy as np
 from vd.evaluate import plots
 from vd.evaluate.result import TOLERANCES_RAD, EvalResult, Protocol, Summary
 from vd.evaluate.statistics import CHANCE_MEAN_RAD, Interval
-from vd.page import Page
-
-_UNIT_NOTE = {
-    "object": "Intervals over all objects are 95 % t intervals on the log odds, with the jackknife's "
-    "standard error over whole objects: they speak about objects of this kind, not only about these.",
-    "episode": "Intervals over all objects are 95 % t intervals on the log odds, with the jackknife's "
-    "standard error over the episodes of each object: they speak about these very objects under new starts "
-    "and goals. With so few objects nothing can be said about others.",
-}
+from vd.page import write_html
 
 
 def shown_name(text: str) -> str:
@@ -45,19 +37,24 @@ def write_report(result: EvalResult, path: Path, *, pictures: bytes | None = Non
         path: Of the page.
         pictures: PNG with the objects.
     """
-    page = Page(f"Evaluation of {shown_name(result.protocol.policy)}", _lead(result))
-    add_summary(page, result)
-    if pictures is not None:
-        page.section("Objects")
-        page.figure(pictures, "The objects as they are simulated, each at its own scale.")
-    add_figures(page, result)
-    add_warnings(page, result.warnings)
-    page.section("Every object")
-    page.table(_HEADER, [_row(summary) for summary in (result.overall, *result.per_object)])
-    page.section("Protocol")
-    page.table(["setting", "value"], protocol_rows(result))
-    page.text(method_note(result), small=True)
-    page.write(path)
+    write_html(
+        path,
+        "evaluation.html",
+        policy=shown_name(result.protocol.policy),
+        lead=_lead(result),
+        result=result,
+        headline=_headline(result),
+        pictures=pictures,
+        ecdf=plots.ecdf_figure(result),
+        violins=plots.violin_figure(result),
+        by_object=plots.success_figure(result),
+        drawn_note=plots.drawn_note(result),
+        header=_HEADER,
+        rows=[_row(summary) for summary in (result.overall, *result.per_object)],
+        protocol=_protocol_rows(result),
+        chance_mean=f"{CHANCE_MEAN_RAD:.2f}",
+        mean=f"{result.overall.mean_error_rad:.2f}",
+    )
 
 
 def warning_lines(warnings: Mapping[str, str]) -> list[str]:
@@ -65,16 +62,7 @@ def warning_lines(warnings: Mapping[str, str]) -> list[str]:
     return [f"warning {name}: {words}" for name, words in warnings.items()]
 
 
-def add_warnings(page: Page, warnings: Mapping[str, str]) -> None:
-    """Add the objects with warnings, if there are any."""
-    if warnings:
-        page.section("Objects with warnings")
-        page.text("What their import says of them; results on these objects may be those of something else.")
-        page.table(["object", "warning"], list(warnings.items()), words=(1,))
-
-
-def add_summary(page: Page, result: EvalResult) -> None:
-    """Add the headline numbers with their intervals."""
+def _headline(result: EvalResult) -> list[tuple[str, str, str]]:
     overall = result.overall
     tiles = [
         (
@@ -86,7 +74,8 @@ def add_summary(page: Page, result: EvalResult) -> None:
         for name, rate in overall.success.items()
     ]
     error, drop, time = overall.median_error_rad, overall.drop_rate, overall.time_to_success_s
-    tiles += [
+    return [
+        *tiles,
         (
             f"{error.value:.2f} rad",
             "median error",
@@ -108,23 +97,9 @@ def add_summary(page: Page, result: EvalResult) -> None:
             "no episode stopped" if time is None else f"95 %: {time.low:.1f} to {time.high:.1f}",
         ),
     ]
-    page.tiles(tiles)
 
 
-def add_figures(page: Page, result: EvalResult) -> None:
-    """Add the error distributions and the success of each object."""
-    note = plots.drawn_note(result)
-    page.section("Errors")
-    page.figure(
-        plots.ecdf_figure(result),
-        "Empirical distribution of the orientation error at the end or stop of every episode. A dropped "
-        "object never counts, so the curve ends at one minus the drop rate.",
-    )
-    page.figure(plots.violin_figure(result), f"The same errors by object, best median first.{note}")
-    page.figure(plots.success_figure(result), f"Success by object with 95 % intervals.{note}")
-
-
-def protocol_rows(result: EvalResult) -> list[tuple[str, str]]:
+def _protocol_rows(result: EvalResult) -> list[tuple[str, str]]:
     """Setting and value pairs that say how the numbers were made."""
     protocol = result.protocol
     rows = [
@@ -170,31 +145,21 @@ def goals_text(protocol: Protocol) -> str:
     return "uniform on SO(3)" if angle >= np.pi - 1e-6 else f"uniform within {angle:g} rad of the start"
 
 
-def method_note(result: EvalResult) -> str:
-    """How errors and intervals are to be read."""
-    return (
-        "Actions are the policy's means. Errors are measured at the end of an episode or at the first step "
-        "at which all success criteria hold, never as the least error on the way. They are those to the very "
-        "goal; up to symmetry the least over the object's symmetry rotations counts, but the stop itself "
-        "knows none: an object that only looks like the goal is not stopped there, and where it ends counts. "
-        "A dropped object fails at every tolerance. Chance is an "
-        f"orientation drawn uniformly from SO(3): mean error {CHANCE_MEAN_RAD:.2f} rad for an asymmetric "
-        f"object; the mean measured here, drops included, is {result.overall.mean_error_rad:.2f} rad. "
-        f"{_UNIT_NOTE[result.overall.unit]} Those of a single object are over its episodes. Where all "
-        "outcomes agree the interval is Clopper and Pearson's exact one, which takes episodes as "
-        "independent. Times have distribution-free intervals between order statistics."
-    )
-
-
 def terminal_table(result: EvalResult) -> str:
     """A table for the terminal, worst objects last."""
-    rows = [_row(summary) for summary in (result.overall, *result.per_object)]
-    widths = [max(len(str(row[i])) for row in [_HEADER, *rows]) for i in range(len(_HEADER))]
-    lines = [
-        "  ".join(str(cell).ljust(w) if i == 0 else str(cell).rjust(w) for i, (cell, w) in enumerate(cells))
-        for cells in (list(zip(row, widths, strict=True)) for row in [_HEADER, *rows])
-    ]
-    return "\n".join(lines)
+    return aligned([_HEADER, *(_row(summary) for summary in (result.overall, *result.per_object))], words=1)
+
+
+def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
+    """Rows of cells as lines of text: the first ``words`` columns flush left, the others right."""
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if column < words else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    )
 
 
 _HEADER = (

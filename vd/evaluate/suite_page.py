@@ -1,17 +1,19 @@
 """The suite as one HTML page, and its table for a terminal."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from matplotlib.figure import Figure
 
 from vd.evaluate import plots
 from vd.evaluate.comparison import Row
-from vd.evaluate.comparison_page import aligned, ecdf_figure, labels, outcome_figure, scatter_figure
-from vd.evaluate.report import number, shown_name
+from vd.evaluate.comparison_page import ecdf_figure, labels, outcome_figure, scatter_figure
+from vd.evaluate.report import aligned, number, shown_name
 from vd.evaluate.statistics import Interval
 from vd.evaluate.suite import CLAIMS, NO_STUDENT, OUT_OF_TIME, Claim, Condition, own_row, within
 from vd.evaluate.suite_plots import distance_figure, friction_figure, object_outcomes_figure
 from vd.evaluate.trace import HOLD_S
-from vd.page import Page
+from vd.page import write_html
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -24,64 +26,46 @@ LEAST_POINTS = 30
 
 def write_suite(result: "SuiteResult", path: Path) -> None:
     """Write the page."""
-    page = Page("The paper's evaluations", _lead(result))
-    for group, objects in result.objects.items():
-        note = " No others were given: our own objects stand for the paper's meshes." if objects.own else ""
-        page.text(f"Objects, {group}: {objects.text}.{note if group != 'symmetric' else ''}", small=True)
-    page.text(WHO_JUDGES, small=True)
-    if not result.found:
-        page.text("Nothing has been measured yet; the same command goes on from here.")
-    page.section("The paper's figures beside ours")
-    _add_figures(page, result)
-    page.text(_HOW_TO_READ, small=True)
     named = {condition.name: condition.title for condition in result.conditions}
-    page.table(
-        ("figure", "condition", "paper", "source"),
-        [
+    everything = result.merged(*named)
+    write_html(
+        path,
+        "suite.html",
+        lead=_lead(result),
+        result=result,
+        paper=PAPER,
+        hold_s=f"{HOLD_S:g}",
+        no_student=NO_STUDENT,
+        figures=_figures(result),
+        sources=[
             (claim.text, named[claim.condition], paper_text(claim), claim.source)
             for claim in CLAIMS
             if claim.paper is not None and claim.condition in named
         ],
-        words=(1, 3),
-        folded="Where the paper's figures come from (P: the paper)",
+        late=out_of_time(result) if result.late else "",
+        failed=[(name, shown_name(policy), why) for (name, policy), why in result.failed.items()],
+        **_errors(result),
+        frictions=_frictions(result),
+        **_air(result),
+        **_students(result),
+        conditions=[(f"{c.name}: {c.title}", c.paper, c.flags) for c in result.conditions],
+        software={} if everything is None else everything.software,
     )
-    if result.late:
-        page.text(out_of_time(result))
-    for (condition, policy), why in result.failed.items():
-        page.text(f"Not measured: {condition} of {shown_name(policy)}. {why}")
-    if result.found:
-        page.section("Objects")
-        for group, image in result.pictures.items():
-            page.figure(image, f"Objects, {group}, each at its own scale.")
-    _errors(page, result)
-    _materials(page, result)
-    _air(page, result)
-    _students(page, result)
-    page.section("Conditions")
-    page.table(
-        ("condition", "the paper's", "vd-eval POLICY --objects ..."),
-        [(f"{c.name}: {c.title}", c.paper, c.flags) for c in result.conditions],
-        words=(1, 2),
-    )
-    if result.quick:
-        page.text(
-            "This is the reduced suite: few objects of each set and few episodes of each object, whatever "
-            "the flags above say. Its intervals are wide.",
-            small=True,
+
+
+def _figures(result: "SuiteResult") -> list[tuple[tuple[str, ...], list[tuple[str, ...]]]]:
+    """A table for each condition, header and rows: those of the paper, then what is ours."""
+    return [
+        (
+            (condition.title, "paper", *_columns(result)),
+            [
+                (claim.text, *_cells(result, claim, condition))
+                for claim in CLAIMS
+                if claim.condition == condition.name
+            ],
         )
-    everything = result.merged(*(condition.name for condition in result.conditions))
-    if everything is not None:
-        page.table(("software", "version"), list(everything.software.items()), words=(1,))
-    page.write(path)
-
-
-def _add_figures(page: Page, result: "SuiteResult") -> None:
-    """A table for each condition: those of the paper, then what is ours."""
-    names = _columns(result)
-    for condition in sorted(result.conditions, key=lambda condition: bool(condition.mark)):
-        claims = [claim for claim in CLAIMS if claim.condition == condition.name]
-        rows = [(claim.text, *_cells(result, claim, condition)) for claim in claims]
-        page.table((condition.title, "paper", *names), rows)
+        for condition in sorted(result.conditions, key=lambda condition: bool(condition.mark))
+    ]
 
 
 def out_of_time(result: "SuiteResult") -> str:
@@ -155,28 +139,26 @@ def _own(result: "SuiteResult", condition: str, policy: str) -> Row | None:
     return None if comparison is None else own_row(comparison)
 
 
-def _errors(page: Page, result: "SuiteResult") -> None:
+def _errors(result: "SuiteResult") -> dict[str, Any]:
+    """Figures of the errors on the table."""
     table = result.merged("training", "held-out", "symmetric")
-    if table is None:
-        return
-    page.section("Errors on the table")
-    page.figure(
-        ecdf_figure(table),
-        "Share of episodes that ended within each error (the paper's Figures 7D to 7G, 4F). Solid: stopped "
-        "by its own rule. Dashed: a student stopped by the true distance. A lost object never counts.",
-    )
     short = labels(result.policies)
-    for condition in ("held-out", "training", "symmetric"):
-        for policy in result.policies:
-            if (row := _own(result, condition, policy)) is not None:
-                note = plots.drawn_note(row.result)
-                page.figure(
-                    plots.violin_figure(row.result),
-                    f"{short[policy]}, {condition} objects: errors by object (Figure 2D).{note}",
-                )
+    rows = [
+        (policy, condition, row)
+        for condition in ("held-out", "training", "symmetric")
+        for policy in result.policies
+        if (row := _own(result, condition, policy)) is not None
+    ]
+    return {
+        "table_ecdf": None if table is None else ecdf_figure(table),
+        "violins": [
+            (plots.violin_figure(row.result), short[policy], condition, plots.drawn_note(row.result))
+            for policy, condition, row in rows
+        ],
+    }
 
 
-def _materials(page: Page, result: "SuiteResult") -> None:
+def _frictions(result: "SuiteResult") -> Figure | None:
     measure = within(plots.HEADLINE_TOLERANCE_RAD)
     nominal = [c for c in result.conditions if c.name == "held-out"]
     tables = [*nominal, *(c for c in result.conditions if c.table_friction is not None)]
@@ -192,63 +174,37 @@ def _materials(page: Page, result: "SuiteResult") -> None:
                 points.append((PAPER.materials.table_friction if friction is None else friction, rate))
         if points:
             rates[short[policy]] = points
-    if not rates:
-        return
-    page.section("Materials of the table")
-    page.figure(
-        friction_figure(rates),
-        "Success with 95 % intervals on held-out objects. Contacts of table and object get the mean of the "
-        f"table's friction and the object's {PAPER.materials.friction:g}. The paper's Figures 2F and 2G show "
-        "the same for five real materials, whose friction it does not give, and one object each.",
-    )
+    return friction_figure(rates) if rates else None
 
 
-def _air(page: Page, result: "SuiteResult") -> None:
+def _air(result: "SuiteResult") -> dict[str, Any]:
+    """Figures of the outcomes in the air, and of each policy by object and by distance."""
     air = result.merged("air", "air-training")
-    if air is None:
-        return
-    page.section("In the air")
-    page.figure(
-        outcome_figure(air),
-        f"How episodes end when the table goes after {PAPER.scene.air_table_s:g} s.",
-    )
     short = labels(result.policies)
-    for policy in result.policies:
-        if (row := _own(result, "air", policy)) is not None:
-            page.figure(
+    rows = [(policy, row) for policy in result.policies if (row := _own(result, "air", policy)) is not None]
+    return {
+        "air_outcomes": None if air is None else outcome_figure(air),
+        "air": [
+            (
+                short[policy],
                 object_outcomes_figure(row),
-                f"{short[policy]}, held-out objects: how episodes of each object end (Figure S12c).",
+                distance_figure(row)
+                if sum(not e.fell for e in row.result.episodes) >= LEAST_POINTS
+                else None,
             )
-            if sum(not e.fell for e in row.result.episodes) >= LEAST_POINTS:
-                page.figure(
-                    distance_figure(row),
-                    f"{short[policy]}: error beside the distance that was to go, lost objects left out "
-                    "(Figure S12b).",
-                )
+            for policy, row in rows
+        ],
+    }
 
 
-def _students(page: Page, result: "SuiteResult") -> None:
-    page.section("Predicted distance, and goals from scans")
-    if not result.students:
-        page.text(
-            "Both are of students, which see point clouds and predict the distance to the goal: "
-            f"{NO_STUDENT}. The paper's figures of students stand in the table without ours."
-        )
-        return
-    predicted = result.merged("air", "air-training")
-    if predicted is not None and predicted.predictions:
-        page.figure(
-            scatter_figure(predicted),
-            "Predicted beside true distance in the air, in a sample of all states of all episodes; right, "
-            "near ones (Figure S14). Lines are 0.1 rad apart from equal.",
-        )
-    scanned = result.merged("scanned-goals")
-    if scanned is not None:
-        page.figure(
-            ecdf_figure(scanned),
-            "Errors with goals that have the errors of a scan: 4 mm of noise, and a fifth of the points "
-            "missing on one side, the same in every step (Figure 5).",
-        )
+def _students(result: "SuiteResult") -> dict[str, Figure | None]:
+    """Figures that only students have."""
+    predicted = result.merged("air", "air-training") if result.students else None
+    scanned = result.merged("scanned-goals") if result.students else None
+    return {
+        "scatter": scatter_figure(predicted) if predicted and predicted.predictions else None,
+        "scanned": None if scanned is None else ecdf_figure(scanned),
+    }
 
 
 def _lead(result: "SuiteResult") -> str:
@@ -259,21 +215,3 @@ def _lead(result: "SuiteResult") -> str:
         for name in result.policies
     )
     return f"{', '.join(named)} beside what the paper reports{', the reduced suite' if result.quick else ''}"
-
-
-WHO_JUDGES = (
-    "Held-out objects judge, and nothing is chosen on them. What is chosen (which checkpoint, rules of "
-    "stopping, settings of the registration) is chosen on training objects and on those of validation."
-)
-_HOW_TO_READ = (
-    "Intervals are 95 %. The paper's figures are of students, which see point clouds, with three fingers on "
-    "the table and four in the air, on seven training and five test objects; ours are of the policies and "
-    "objects named here. Its own rule: a student stops when the distance that it predicts is below its "
-    "bound, others when the true distance is below 0.4 rad, both with a bound of 1 on the norm of the "
-    "action, as in the released code; stillness is not asked for. Error at most: to the very goal, at the "
-    "stop, or at the end of an episode without one; up to symmetry: to what looks like it. Stopped within: "
-    f"the bound stands in place of the rule's. Held: and still there {HOLD_S:g} s later, the hand keeping "
-    "its last targets. "
-    "Cameras have the errors of a D415. A lost object's error counts as pi. Conditions marked ours have what "
-    "the paper's have not."
-)
