@@ -38,7 +38,7 @@ class References(HTMLParser):
 
 def read_page(path):
     references = References()
-    text = " ".join(path.read_text().split())  # templates wrap their lines
+    text = re.sub(r"\s*\n\s*", " ", path.read_text())  # templates wrap their lines
     references.feed(text)
     assert references.stack == []
     return text, references
