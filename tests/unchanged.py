@@ -41,8 +41,8 @@ TRACKING = {
     "dclaw4-student": ("dclaw4-student",),
     "dclaw4-table-student": ("dclaw4-table-student",),
 }
-EPISODES = {"teachers": 8, "tracking": 8}
-"""Of each of the objects."""
+EPISODES = {"teachers": 8, "tracking": 2}
+"""Of each object; eight by camera would take half an hour."""
 EPISODE_FIELDS = ("start_quat", "goal_quat", "error_rad", "exact_error_rad", "steps", "stopped", "fell")
 # Recordings that are made, by what vd-gap hide is told, and measured ones where they are at hand.
 HIDDEN = {
@@ -55,17 +55,19 @@ HIDDEN = {
 MEASURED = ("xl330_pendulum",)
 ARRAYS = ("observation", "privileged", "reward", "reward_terms", "rotation_error", "success", "fell", "done")
 STEPS, WORLDS = 18, 8
+RETRIES = 2
+"""Of a fault that ended otherwise: on a busy machine the twin's clock, or a start, may be late."""
 TIMES = {"seconds", "elapsed_s", "steps_per_s", "collect_s", "learn_s", "detected_s", "safe_s", "own_s"}
 # Threads that meet in the search for a gap make the same fit twice, and count it.
 IGNORED = TIMES | {"rollouts", "rollouts_per_s", "command", "software", "path", "layer", "whole_hand_layer"}
 
 
-def call(*words: object, log: Path) -> None:
+def call(*words: object, log: Path, status: tuple[int, ...] = (0,)) -> None:
     """Run a module or file of Python with one thread of linear algebra; its last words if it fails."""
     command = [sys.executable, *map(str, words)]
     with log.open("w") as said:
         done = subprocess.run(command, stdout=said, stderr=subprocess.STDOUT, env=os.environ | ONE_THREAD)
-    if done.returncode:
+    if done.returncode not in status:
         raise RuntimeError(f"{' '.join(command)}: status {done.returncode}\n{log.read_text()[-2000:]}")
 
 
@@ -178,10 +180,12 @@ def training(work: Path, objects: Path) -> dict[str, Any]:
     return {"weights": arrays, "progress": read_progress(run / "progress.jsonl")}
 
 
-def faults(work: Path, objects: Path) -> dict[str, Any]:
-    """How every fault of the twin ends, without the figures that its words tell."""
-    call("-m", "vd.deploy.faults", "--json", work / "faults.json", log=work / "faults.log")
-    rows = json.loads((work / "faults.json").read_text())
+def faults(work: Path, objects: Path, only: str = "") -> dict[str, Any]:
+    """How every fault of the twin ends, or one, without the figures that its words tell."""
+    file = work / "faults.json"
+    # Status 1 is of a fault that ended otherwise than it has to: its row says so.
+    call("-m", "vd.deploy.faults", "--json", file, "--only", only, log=work / "faults.log", status=(0, 1))
+    rows = json.loads(file.read_text())
     return {row["fault"]: row | {"happened": re.sub(r"[\d.]+", "#", row["happened"])} for row in rows}
 
 
@@ -235,6 +239,16 @@ def differences(reference: Any, found: Any) -> dict[str, tuple[float, str]]:
     return differing
 
 
+def try_again(differing: dict[str, tuple[float, str]], reference: dict[str, Any]) -> None:
+    """Take out of ``differing`` the faults that end as in the reference when they are tried again."""
+    for fault in list(differing) * RETRIES:
+        if fault in differing:
+            with TemporaryDirectory() as work:
+                found = faults(Path(work), ROOT, fault)
+            if fault not in differences({fault: reference.get(fault)}, found):
+                del differing[fault]
+
+
 def main() -> int:
     """Record or compare; 1 if anything differs."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
@@ -260,7 +274,10 @@ def main() -> int:
             file.write_text(json.dumps(found))
             print(f"{name:9} recorded in {seconds:.0f} s", flush=True)
             continue
-        differing = differences(json.loads(file.read_text()), json.loads(json.dumps(found)))
+        reference = json.loads(file.read_text())
+        differing = differences(reference, json.loads(json.dumps(found)))
+        if name == "faults":
+            try_again(differing, reference)
         verdict = f"{len(differing)} items differ" if differing else "equal"
         print(f"{name:9} {verdict} ({seconds:.0f} s)", flush=True)
         for item, (largest, first) in differing.items():
