@@ -1,6 +1,6 @@
 """What happens when something goes wrong: each fault injected into a moving hand's twin, and how it ended.
 
-``python -m vd.deploy.faults`` prints the table of docs/results/deploy.md. The twin runs in this process,
+``python -m vd.deploy.faults`` prints a row for every fault. The twin runs in this process,
 behind its pseudo-terminal, so that what its motors really did is known: who had torque, and who pushed.
 """
 

@@ -53,7 +53,7 @@ KINDS = ("step_medium", "step_large", "sine_0.50hz", "sine_1.00hz")
 
 @pytest.mark.slow
 def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
-    """Four motions of one joint, and three candidates: the whole of it is in docs/results/deploy.md."""
+    """Four motions of one joint, and three candidates: enough for one effect."""
     layer = tmp_path / "late.usda"
     layer.write_text(LAYER)
     hand = load_hand("dclaw4")

@@ -17,8 +17,7 @@ to 8 steps later, 4.5 in the mean, so an error of states that last shrinks by ga
 MOMENTS_WARMUP = 3
 """Iterations of it where only the optimiser is missing: about a hundred steps, for Adam's second moment."""
 FINE_KL, FINE_LEARNING_RATE = 0.03, 1e-4
-"""Divergence and first rate of a policy that has learned (rows d3-tight-more, d4-tight-more of
-docs/results/runs.md), for one that does not say how it was trained."""
+"""Divergence and first rate of a policy that has learned, for one that does not say how it was trained."""
 _APPENDED = {"history": 0, "dynamics": "none"}
 """Settings of the observation whose values come last, as they are in a policy without them."""
 _SENSES = ("fingertip", "hand_layer", "sim", "action", "observation")

@@ -87,7 +87,7 @@ TOWARDS_GOAL = RewardCfg(
     scale=0.01,
 )
 """Forms of the released code, and ours: a reward for turning towards the goal, dear falls, and cheap energy
-and table contact. Rows a to j of docs/results/runs.md chose it."""
+and table contact."""
 
 SHORT_ROLLOUTS = PpoCfg(
     rollout_steps=8,
@@ -100,49 +100,49 @@ SHORT_ROLLOUTS = PpoCfg(
     value_coefficient=1.0,
     entropy_coefficient=1e-3,
 )
-"""Many optimiser steps per sample, and a rate that follows the divergence: rows f, i and j there."""
+"""Many optimiser steps per sample, and a rate that follows the divergence."""
 
 
 def gpu() -> TeacherCfg:
     """One GPU: the paper's task, by the recipe that learns.
 
-    Named in brackets: the row of docs/results/runs.md that measured it, beside the paper's value where that
-    differs (``paper``). Four fingers did better with ``--ppo.desired-kl 0.03`` [d4-more].
+    What measurements chose, beside the paper's value where that differs (docs/lessons.md). Four fingers did
+    better with ``--ppo.desired-kl 0.03``.
     """
     return TeacherCfg(
         preset="gpu",
-        # Half as fast again, and as good in the physics of the tests [d4-light9].
+        # Half as fast again, and as good in the physics of the tests.
         run=RunCfg(run_dir=Path("runs/gpu"), coarse_physics=True),
         ppo=replace(
             SHORT_ROLLOUTS,
-            actor_learning_rate=2e-4,  # where the schedule starts [d3-both]; paper: 3e-4, fixed
-            desired_kl=0.06,  # longer steps pay once the floor holds the std [d3-kl]
-            gamma=PAPER.teacher.gamma,  # far enough to let go and grasp anew [d3-small]; 0.97 before
-            bound_coefficient=0.01,  # a third of the means lay beyond the clip [d3-small]; paper: none
-            cuda_graph=True,  # a seventh of the time of learning [d3-on]; ignored but on one GPU
+            actor_learning_rate=2e-4,  # where the schedule starts; paper: 3e-4, fixed
+            desired_kl=0.06,  # longer steps pay once the floor holds the std
+            gamma=PAPER.teacher.gamma,  # far enough to let go and grasp anew; 0.97 before
+            bound_coefficient=0.01,  # a third of the means lay beyond the clip; paper: none
+            cuda_graph=True,  # a seventh of the time of learning; ignored but on one GPU
         ),
         policy=PolicyCfg(
             distribution="state-dependent",
             initial_std=0.5,
-            # Below a std of 0.2 noise hides the gradient [d3-small], above 0.6 what was learned [d3-calm];
+            # Below a std of 0.2 noise hides the gradient, above 0.6 what was learned;
             # paper: one free std per joint.
             std_range=(0.2, 0.6),
-            quiet_std=0.08,  # where stillness has tightened [d3-tight, d4-tight]
+            quiet_std=0.08,  # where stillness has tightened
             # Positions and velocities of the object vary by 0.02, those of the goal by 0.5.
             normalise_observations=True,
         ),
         env=ReorientCfg(
             num_worlds=16384,
             objects=TRAINING_SET,
-            episode_s=5.0,  # stuck worlds waste samples [d3-small]; paper: 10 s
+            episode_s=5.0,  # stuck worlds waste samples; paper: 10 s
             # About one in 40 million was seen, always of a slim object, and ended the run.
             failures_per_million=1.0,
-            # A third of the goals is left to learn [d3-view-floor]; paper: neither shape nor views.
+            # A third of the goals is left to learn; paper: neither shape nor views.
             observation=ObservationCfg(shape="full", view="goal", canonical=True),
             reward=TOWARDS_GOAL,
             # The tightest: what fingers at a std of 0.08 can keep; without noise they then pass the paper's
-            # test, which evaluation asks for [d3-tight, d4-tight]. Goals end more exactly than there: what is
-            # pressed from 0.4 rad on would never be turned the rest of the way [d3-fine, d4-fine].
+            # test, which evaluation asks for. Goals end more exactly than there: what is
+            # pressed from 0.4 rad on would never be turned the rest of the way.
             success=SuccessCfg(
                 rotation_rad=0.15,
                 joint_speed_rad_s=0.7,
@@ -150,8 +150,8 @@ def gpu() -> TeacherCfg:
                 object_spin_rad_s=0.8,
                 fall_m=0.12,
             ),
-            # As soon as some goals are reached, and never back [d3-shape-far-bold, d3-small], and then from
-            # what fingers at a std of 0.2 can keep [d3-small] to the above [d3-tight]; paper: none.
+            # As soon as some goals are reached, and never back, and then from
+            # what fingers at a std of 0.2 can keep to the above; paper: none.
             curriculum=CurriculumCfg(
                 enabled=True,
                 raise_at=0.3,
@@ -159,7 +159,7 @@ def gpu() -> TeacherCfg:
                 rate=0.005,
                 tightening=TighteningCfg(enabled=True, raise_at=0.4, lower_at=0.3, rate=0.003),
             ),
-            randomisation=RandomisationCfg(enabled=False),  # in all rows; paper: Table S3
+            randomisation=RandomisationCfg(enabled=False),  # paper: Table S3
         ),
     )
 

@@ -14,14 +14,14 @@ MEAN_WIDTH_M = 0.13
 """Most of the mean width, the side of the bounding box averaged over all its orientations (our choice).
 
 What is wider starts wedged between the fingers and stays there: of seven such objects (14.5 cm and more)
-a policy brought 22 % to their goals, of the others 92 % (docs/results/runs.md).
+a policy brought 22 % to their goals, of the others 92 %.
 """
 
 THINNEST_M = 0.025
 """Least of the shortest side, as far as the other bounds let it be (our choice).
 
 What is thinner lies flat on the table, where no finger gets under it: of eight such objects the same policy
-brought 49 % to their goals (docs/results/runs.md).
+brought 49 % to their goals.
 """
 
 UNITS_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}

@@ -213,7 +213,7 @@ SHORT_ROLLOUTS = DaggerCfg(
 def gpu(stage: Stage) -> StudentTrainCfg:
     """One GPU: the lean network, the student's own joints, rollouts kept, half precision.
 
-    The numbers of the released code do not learn in hours: docs/results/student.md.
+    The numbers of the released code do not learn in hours.
     """
     start = paper(stage)
     dagger, network = SHORT_ROLLOUTS, LEAN

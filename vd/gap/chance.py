@@ -27,8 +27,7 @@ LIMITS = ("torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag
 """What keeps a joint late where it starts and turns, as random delays do; from few starts it is not found."""
 PROMISING = 2.0
 """Error, in noise floors, that a model leaves at most through a first guess of random delays that are all it
-lacks (our choice): 1.1 where they were, 5.4 where friction was missing as well, on one recording
-(docs/results/gap-log.md, seed 14048)."""
+lacks (our choice): 1.1 where they were, 5.4 where friction was missing as well, on one recording."""
 HELPS = 0.95
 """Share of the error that a fixed delay, their mean, leaves at most where delays are random (our choice)."""
 MOST = 0.2
@@ -140,7 +139,7 @@ def unlimited(search: "Selection", late: JointFit, random: JointFit) -> bool:
     """Whether random delays are likelier than a limit of the torque beside what is late, from every start.
 
     Lest the early end of a search be for the want of a start: so two torque-speed lines beside a delay or a
-    payload were taken for random delays (docs/results/gap-log.md, seeds 15025 and 15123).
+    payload were taken for random delays.
 
     Args:
         search: The search that would end.

@@ -196,7 +196,7 @@ def agree(
     has a model of more effects than the joint's own, which also has to leave noise. A model of fewer effects
     needs no second joint, and where it leaves noise the joint's own has to gain as much over it: a load and a
     coupling stood for a limit that one of three joints had been found to have, a filter for what a line was
-    short of at the end of its fit (docs/results/gap-log.md, seeds 15108 and 15125).
+    short of at the end of its fit.
 
     Args:
         explanations: Of the joints.

@@ -102,7 +102,7 @@ COARSE_ITERATIONS = 4
 def coarser(cfg: SimCfg) -> SimCfg:
     """Cheaper physics to learn in, which trained policies cannot tell from the default.
 
-    Measured in docs/results/simulation.md, "Coarser physics for training". The contacts' time constant stays
+    Measured in docs/lessons.md, "Physics and speed". The contacts' time constant stays
     two physics steps. What is coarser already stays as it is.
 
     Args:

@@ -52,7 +52,7 @@ CHOSEN, CHOSEN_STEPS = 64, 8
 KEPT = 6
 """Poses that are followed."""
 OTHERS = 6
-"""Other rotations that are tried in each step (ours, docs/results/student.md: What falls is followed)."""
+"""Other rotations that are tried in each step (our choice)."""
 STRIDE = 370
 """How far along the spiral of rotations those of the next step are: all come in turn."""
 STEPS = 8

@@ -7,7 +7,7 @@ rotation from one to the other, for shapes seen in training and for others.
 
 Global pooling of a convolution has to learn this from nothing: a rotation from the goal is a product of two
 unknown ones, of which neither cloud alone says anything, so there is no gradient to begin with
-(docs/results/student.md). G clouds, P points, K vectors.
+(docs/lessons.md). G clouds, P points, K vectors.
 """
 
 from dataclasses import dataclass
