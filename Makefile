@@ -20,7 +20,7 @@ TEST_ARGS ?=
 BENCH_ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo test lint type format bench clean
+.PHONY: help env demo test lint type format docs bench clean
 
 help:
 	@echo 'make demo     author the assets, train and evaluate a small policy, write demo/index.html'
@@ -28,6 +28,7 @@ help:
 	@echo 'make test     all tests; TEST_ARGS="-k rewards" chooses some'
 	@echo 'make lint     ruff, without changing files      make format   the same, changing files'
 	@echo 'make type     mypy on the built package         make bench    simulation throughput'
+	@echo 'make docs     the documentation as a site, build/site/index.html'
 	@echo 'make env      only the environment (.venv)      make clean    remove build products'
 	@echo 'TORCH_INDEX=URL takes torch from another wheel index, such as its CPU-only one'
 
@@ -68,6 +69,11 @@ type: $(STAMP)
 	$(BIN)/pip wheel --quiet --no-deps --no-build-isolation --wheel-dir build/types .
 	cd build/types && "$(abspath $(BIN))/python" -m zipfile -e *.whl . && \
 	  "$(abspath $(BIN))/mypy" --config-file ../../pyproject.toml -p vd
+
+# Strict: a broken link or anchor, or a page that is nowhere listed, fails.
+docs: $(STAMP)
+	test -x $(BIN)/mkdocs || $(BIN)/pip install -c constraints.txt --no-build-isolation -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 bench: $(STAMP)
 	$(BIN)/vd-bench sim $(BENCH_ARGS)

@@ -295,8 +295,8 @@ def test_two_motors_with_one_id_are_thought_of(rig, port):
 
 
 def test_the_commands_of_the_troubleshooting_parse():
-    text = (Path(__file__).parents[1] / "docs" / "deploy.md").read_text()
-    rows = commands(text[text.index("### Troubleshooting") : text.index("## Flying")])
+    text = (Path(__file__).parents[1] / "docs" / "troubleshooting.md").read_text()
+    rows = commands(text[text.index("## Motors") : text.index("## While a hand runs")])
     assert {"reboot", "set-id", "set-baud", "scan", "record"} == {words[0] for words in rows}
     assert all(parse(words).port == "/dev/ttyUSB0" for words in rows)
 

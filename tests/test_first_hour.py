@@ -13,7 +13,7 @@ import warp as wp
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-PAGES = (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md")))
+PAGES = (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")))
 HEAVY = ("torch", "newton", "warp", "pxr", "mujoco", "matplotlib", "viser")
 RUN = """
 import importlib, sys

@@ -5,7 +5,6 @@ import html
 import json
 import math
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -427,13 +426,3 @@ def test_overlays_show_joints_with_a_gap_in_different_motions(report, curves):
 )
 def test_amounts_are_said_in_their_usual_size(value, unit, text):
     assert words.amount(value, unit) == text
-
-
-def test_the_guide_lists_every_effect_with_its_parameters():
-    guide = (Path(__file__).parents[1] / "docs" / "gap.md").read_text()
-    table = guide.partition("<!-- effects: begin -->")[2].partition("<!-- effects: end -->")[0]
-    rows = {row.split("|")[1].strip(" `"): row for row in table.splitlines() if row.startswith("| `")}
-    assert list(rows) == list(EFFECTS)
-    for name, row in rows.items():
-        assert EFFECTS[name].meaning.replace("|", "\\|") in row
-        assert re.findall(r"`(\w+)`", row.split(" | ")[-1]) == [p.name for p in EFFECTS[name].parameters]

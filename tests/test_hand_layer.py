@@ -13,9 +13,8 @@ from vd.assets_usd.hand_data import HandError, HandModel
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hand_model import open_stage, read_hand
 from vd.kernels import actuators
-from vd.kernels.effects import BASELINE, EFFECTS
+from vd.kernels.effects import EFFECTS
 
-DOCS = Path(__file__).resolve().parents[1] / "docs" / "effects.md"
 HEADER = '#usda 1.0\n(\n    defaultPrim = "dclaw3"\n)\n'
 EVERYTHING = {
     name: {p.name: (p.typical or 0.1, 0.9 * p.typical, 1.1 * p.typical + 0.2) for p in effect.parameters}
@@ -193,20 +192,3 @@ def test_wrong_numbers_are_not_written(hand, tmp_path, baseline, effects, messag
     with pytest.raises(HandError, match=re.escape(message)):
         write(path, hand, baseline, effects)
     assert not path.exists()
-
-
-def test_the_document_lists_every_effect_and_parameter():
-    rows = [
-        [cell.strip().replace("\\|", "|") for cell in re.split(r"(?<!\\)\|", line.strip("|"))]
-        for line in DOCS.read_text().splitlines()
-        if line.startswith("| `vd:") or line.startswith("| `drive:") or line.startswith("| `newton:")
-    ]
-    listed = {row[0].strip("`"): row[1:] for row in rows}
-    wanted = {
-        f"vd:{name}:{p.name}": [p.unit, effect.meaning]
-        for name, effect in EFFECTS.items()
-        for p in effect.parameters
-    }
-    effects = {key: value for key, value in listed.items() if key.startswith("vd:") and "baseline" not in key}
-    assert effects == wanted
-    assert len(listed) == len(wanted) + len(BASELINE)

@@ -1,0 +1,130 @@
+"""What the site has beyond the files of ``docs``: documents of the root, and tables made from the code.
+
+A hook of mkdocs (``mkdocs.yml``). The package has to be installed; nothing heavy is imported.
+"""
+
+import contextlib
+import importlib
+import io
+import os
+import re
+import sys
+import textwrap
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+ROOT = Path(__file__).resolve().parents[1]
+AT_ROOT = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "ARCHITECTURE.md": "architecture.md",
+    "CHANGELOG.md": "changelog.md",
+    "LICENSE": "LICENSE",
+    "CITATION.cff": "CITATION.cff",
+}
+"""Files of the repository's root, and where they are on the site."""
+COLUMNS = 96
+"""Width of help texts: what a page shows without scrolling."""
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the documents of the root."""
+    from mkdocs.structure.files import File
+
+    for name, uri in AT_ROOT.items():
+        files.append(File.generated(config, uri, content=(ROOT / name).read_text()))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Fill in what is generated, and have links between root and ``docs`` lead to pages of the site."""
+    uri = page.file.src_uri
+    if uri in AT_ROOT.values():
+        markdown = markdown.replace("](docs/", "](")
+    names = "|".join(map(re.escape, AT_ROOT))
+    up = "../" * uri.count("/")
+    markdown = re.sub(rf"\]\((?:\.\./)*({names})(?=[)#])", lambda link: f"]({up}{AT_ROOT[link[1]]}", markdown)
+    return re.sub(r"<!-- generated: (\w+) -->", lambda mark: GENERATED[mark[1]](), markdown)
+
+
+def commands() -> str:
+    """Every command and subcommand with its own help text."""
+    parts = []
+    for script, target in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"].items():
+        module, _, function = target.partition(":")
+        main = getattr(importlib.import_module(module), function)
+        text = _help(main, script, ())
+        parts += [f"## {script}", f"```text\n{text}\n```"]
+        for name in _subcommands(text):
+            parts += [f"### {script} {name}", f"```text\n{_help(main, script, (name,))}\n```"]
+        if script == "vd-deploy":  # alone it lists its commands; a policy's flags come with any option
+            parts += ["### vd-deploy POLICY", f"```text\n{_help(main, script, ('--twin',))}\n```"]
+    return "\n\n".join(parts)
+
+
+def _help(main: Callable[[], object], script: str, words: Sequence[str]) -> str:
+    """What ``script words --help`` prints."""
+    shown = io.StringIO()
+    with (
+        mock.patch.dict(os.environ, {"COLUMNS": str(COLUMNS), "NO_COLOR": "1", "TERM": "dumb"}),
+        mock.patch.object(sys, "argv", [script, *words, "--help"]),
+        contextlib.redirect_stdout(shown),
+        contextlib.suppress(SystemExit),
+    ):
+        main()
+    lines = shown.getvalue().strip().splitlines()
+    if not lines:
+        raise ValueError(f"`{script} {' '.join(words)} --help` prints nothing")
+    return "\n".join(textwrap.fill(line, COLUMNS) if line[:1].isalpha() else line.rstrip() for line in lines)
+
+
+def _subcommands(text: str) -> Iterator[str]:
+    """Names of the subcommands that a help text lists."""
+    listed = re.search(r"^usage: vd-\w+ \[-h\] \{([a-z,-]+)\}", text)
+    if listed:
+        yield from listed[1].split(",")
+    elif "\ncommands:\n" in text:
+        block = text.partition("\ncommands:\n")[2].partition("\n\n")[0]
+        yield from re.findall(r"^  ([a-z][a-z-]+)", block, re.MULTILINE)
+
+
+def constants() -> str:
+    """The paper's constants with their sources."""
+    from vd.paper import provenance
+
+    rows = ((f"`{name}`", value, tag, note) for name, value, tag, note in provenance())
+    return _table(("name", "value", "kind", "source"), rows)
+
+
+def effects() -> str:
+    """The effects of the servo model with their parameters."""
+    from vd.kernels.effects import EFFECTS
+
+    rows = (
+        (f"`{effect.name}`", effect.meaning, f"`vd:{effect.name}:{p.name}`", p.unit, f"{p.typical:g}")
+        for effect in EFFECTS.values()
+        for p in effect.parameters
+    )
+    return _table(("effect", "what it is", "attribute", "unit", "typical"), rows)
+
+
+def registers() -> str:
+    """The registers of a motor that the preflight compares."""
+    from vd.deploy.registers import REGISTERS
+
+    rows = ((f"`{one.name}`", one.why, "refused" if one.remedy else "set") for one in REGISTERS)
+    return _table(("register", "with another value", "what we do"), rows)
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    cells = ([" ".join(str(cell).replace("|", "\\|").split()) for cell in line] for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
+GENERATED = {"commands": commands, "constants": constants, "effects": effects, "registers": registers}
+"""What takes the place of a comment ``<!-- generated: name -->``."""
