@@ -26,7 +26,7 @@ AT_ROOT = {
     "CITATION.cff": "CITATION.cff",
 }
 """Files of the repository's root, and where they are on the site."""
-COLUMNS = 96
+COLUMNS = 78
 """Width of help texts: what a page shows without scrolling."""
 
 
