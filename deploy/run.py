@@ -11,7 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -75,10 +75,6 @@ class RunCfg(HandOptions):
     """How long the hand holds still between goals [s]."""
     precise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Stop within 0.1 rad rather than 0.4, as the paper's precise variant does: fewer goals, nearer."""
-    nudge: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
-    explore: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     second_view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Where a goal is not reached in 3 s, look at it in other views (vd-eval --help): more goals."""
     air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -215,7 +211,6 @@ def _fly(
     from vd.deploy.flight import look, make_goals, warm_up
     from vd.deploy.log import LogWriter
     from vd.deploy.loop import ControlLoop, LoopCfg, summary
-    from vd.deploy.nudging import NudgedPilot
 
     hand = connection.hand
     goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
@@ -229,13 +224,7 @@ def _fly(
             view = look(flight, camera, hand, cfg.camera_layer)
             fps = flight.task.sim.control_hz if cfg.twin else cfg.camera.fps
             seen = camera_findings(camera, view, fps=fps)
-        chance = replace(
-            flight.task,
-            nudge=replace(flight.task.nudge, enabled=cfg.nudge),
-            explore=replace(flight.task.explore, enabled=cfg.explore),
-        )
-        by_chance = cfg.nudge or cfg.explore
-        pilot = NudgedPilot(flight.pilot, hand, chance) if by_chance else flight.pilot
+        pilot = flight.pilot
         warm_up(pilot, hand, goals[0], camera, link)
         stack.enter_context(undisturbed())
         stack.enter_context(real_time(cfg.realtime))
@@ -254,8 +243,6 @@ def _fly(
                 "stopping": vars(pilot.rule),
                 "tolerance_rad": cfg.tolerance_rad,
                 "second_view": cfg.second_view,
-                "nudge": vars(chance.nudge) if cfg.nudge else None,
-                "explore": vars(chance.explore) if cfg.explore else None,
                 "action": vars(flight.task.action),
             },
             servo={"model": cfg.motor, "p_gain": P_GAIN, "d_gain": D_GAIN},

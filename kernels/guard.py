@@ -97,11 +97,8 @@ def put_back_kernel(
     joint_q: wp.array2d[float],
     joint_qd: wp.array2d[float],
     step_count: wp.array[wp.int32],
-    goal_steps: wp.array[wp.int32],
 ):
     """Put worlds that failed back to where the step began, at rest, in the last step of their episode.
-
-    Their goal counts as a new one, so that they are not taken for caught and do end.
 
     Args:
         failed: 1 where this step failed, shape [N].
@@ -110,7 +107,6 @@ def put_back_kernel(
         joint_q: Positions, shape [N, D + 7]; written where it failed, like those below.
         joint_qd: Velocities, shape [N, D + 6].
         step_count: Control steps since the reset, this one not counted, shape [N].
-        goal_steps: Control steps since the goal was given, likewise, shape [N].
     """
     world = wp.tid()
     if failed[world] == 0:
@@ -120,7 +116,6 @@ def put_back_kernel(
     for i in range(joint_qd.shape[1]):
         joint_qd[world, i] = 0.0
     step_count[world] = last_step
-    goal_steps[world] = 0
 
 
 @wp.kernel

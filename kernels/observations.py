@@ -15,10 +15,6 @@ wp.set_module_options({"enable_backward": False})
 JOINTS_PER_FINGER = 3
 FINGERTIP_VALUES = 13
 """Position 3, quaternion 4, linear velocity 3, angular velocity 3."""
-GOAL_TIME_UNIT_S = 3.0
-"""Unit of the time for which a goal has been pursued [s] (ours): four in five are reached by then."""
-GOAL_TIME_MOST_S = 12.0
-"""Time from which on it reads the same [s] (ours)."""
 
 
 def teacher_observation_slices(fingers: int) -> dict[str, slice]:
@@ -207,25 +203,3 @@ def teacher_observation_kernel(
         write_quat(world, object_begin, wp.quat(0.0, 0.0, 0.0, 0.0), observation_out)
         write_quat(world, goal_begin, wp.quat(0.0, 0.0, 0.0, 0.0), observation_out)
     rng[world] = next_stream(state, world)
-
-
-@wp.kernel
-def goal_time_kernel(
-    # In:
-    goal_steps_in: wp.array[int],
-    step_s: float,
-    column: int,
-    # Out:
-    observation_out: wp.array2d[float],
-):
-    """For how long the present goal has been pursued, up to GOAL_TIME_MOST_S. Launch: [N].
-
-    Args:
-        goal_steps_in: Control steps since the goal was given, shape [N].
-        step_s: Length of a control step [s].
-        column: Column of the time.
-        observation_out: Time [GOAL_TIME_UNIT_S], one column, shape [N, O].
-    """
-    world = wp.tid()
-    time = wp.min(float(goal_steps_in[world]) * step_s, wp.static(GOAL_TIME_MOST_S))
-    observation_out[world, column] = time / wp.static(GOAL_TIME_UNIT_S)

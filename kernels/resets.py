@@ -49,17 +49,12 @@ def episode_kernel(
     # In:
     success_in: wp.array[int],
     fell_in: wp.array[int],
-    rotation_error_in: wp.array[float],
     max_steps: int,
     hold: int,
-    caught_steps: int,
-    caught_rad: float,
-    go_on_share: float,
     # In/Out:
     step_count: wp.array[int],
     goal_steps: wp.array[int],
     goals_reached: wp.array[int],
-    rng: wp.array[wp.uint32],
     # Out:
     timed_out_out: wp.array[int],
     done_out: wp.array[int],
@@ -69,23 +64,17 @@ def episode_kernel(
     """Count the step and decide what ends with it. Launch: [N].
 
     The learner bootstraps values where ``timed_out`` is 1, so that is 0 where the last step also
-    succeeded or fell: those are real ends. Of the worlds whose time is up while they are far from a
-    goal that they have had for long, a share goes on as they are, with the time of another episode.
+    succeeded or fell: those are real ends.
 
     Args:
         success_in: 1 where the goal is reached, shape [N].
         fell_in: 1 where the object is lost, shape [N].
-        rotation_error_in: Angle to the goal [rad], shape [N].
         max_steps: Length of an episode [control steps].
         hold: 0: a success gives a new goal and the episode goes on (training); 1: it ends the episode
             (evaluation).
-        caught_steps: Age of a goal from which a world may go on when its time is up [control steps].
-        caught_rad: Angle to it above which it may [rad].
-        go_on_share: Share of these that does; at 0 nothing is drawn.
-        step_count: Control steps since the reset, shape [N]; from 0 again where a world goes on.
+        step_count: Control steps since the reset, shape [N].
         goal_steps: Control steps since the goal was given, shape [N].
         goals_reached: Successes since the reset, shape [N].
-        rng: Random stream of each world, shape [N].
         timed_out_out: 1 where the episode ends only by its length, shape [N].
         done_out: 1 where the return ends for the learner: success, fall or time-out, shape [N].
         reset_out: 1 where the world is to be reset, shape [N].
@@ -98,18 +87,9 @@ def episode_kernel(
     step_count[world] = steps
     if success:
         goals_reached[world] = goals_reached[world] + 1
-
-    age = goal_steps[world] + 1
-    goal_steps[world] = age
+    goal_steps[world] = goal_steps[world] + 1
 
     at_end = steps >= max_steps
-    caught = age >= caught_steps and rotation_error_in[world] > caught_rad
-    if at_end and caught and go_on_share > 0.0 and not success and not fell:
-        state = rng[world]
-        if wp.randf(state) < go_on_share:
-            at_end = False
-            step_count[world] = 0
-        rng[world] = next_stream(state, world)
     reset = fell or at_end or (success and hold != 0)
     timed_out_out[world] = wp.where(at_end and not success and not fell, 1, 0)
     done_out[world] = wp.where(success or fell or at_end, 1, 0)

@@ -14,7 +14,6 @@ from vd.deploy.observation import StudentSight, frame
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_teacher, task_for, trained_task
-from vd.kernels.observations import GOAL_TIME_UNIT_S
 from vd.sensors.cfg import DepthCameraCfg
 from vd.student.cfg import PRESETS
 from vd.student.network import Student
@@ -127,31 +126,29 @@ def test_a_teacher_sees_in_the_mirror_what_it_saw(hand):
     assert worst < 1e-4
 
 
-def test_a_mirror_counts_the_time_of_a_goal_from_its_first_state_on():
-    seeing = ObservationCfg(view="goal", goal_time=True)
+def test_a_mirror_counts_the_steps_of_a_goal_from_its_first_state_on():
     cfg = ReorientCfg(
         hand="dclaw3",
         objects=("cube",),
         num_worlds=1,
         randomisation=RandomisationCfg(enabled=False),
-        observation=seeing,
+        observation=ObservationCfg(view="goal"),
     )
     env, mirror = ReorientEnv(cfg, "cpu"), Mirror(cfg)
 
-    def times(count: int) -> list[float]:
+    def steps(count: int) -> list[int]:
         seen = []
         for _ in range(count):
             mirror.take(state_of(env))
-            seen.append(float(mirror.env.observation.numpy()[0, -1]))
+            seen.append(int(mirror.env.goal_steps.numpy()[0]))
         return seen
 
-    step = 1.0 / (cfg.sim.control_hz * GOAL_TIME_UNIT_S)
-    assert times(3) == pytest.approx([0.0, step, 2.0 * step])
+    assert steps(3) == [0, 1, 2]
     goal = env.goal_quat.numpy()
     env.goal_quat.assign(goal[:, [1, 0, 3, 2]])
-    assert times(2) == pytest.approx([0.0, step])
+    assert steps(2) == [0, 1]
     mirror.begin()
-    assert times(2) == pytest.approx([0.0, step]), "a new flight with the same goal"
+    assert steps(2) == [0, 1], "a new flight with the same goal"
 
 
 def test_a_mirror_takes_either_quaternion_of_goal_and_object():

@@ -97,14 +97,6 @@ def test_goals_are_as_trained_unless_an_angle_is_given():
     assert task_of(trained, max_goal_angle_rad=0.5).goal.max_angle_rad == 0.5
 
 
-def test_an_evaluation_ends_where_a_training_went_on_and_shows_what_it_showed():
-    trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
-    trained.task["caught"] = {"go_on_share": 0.9}
-    trained.task["observation"] = {"goal_time": True}
-    task = task_of(trained)
-    assert task.caught.go_on_share == 0.0 and task.observation.goal_time
-
-
 def test_the_layer_over_the_hand_is_as_trained_unless_asked_otherwise():
     trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
     assert task_of(trained).hand_layer is None

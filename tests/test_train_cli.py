@@ -45,7 +45,7 @@ def test_paper_preset_is_the_paper():
     assert (cfg.ppo.actor_learning_rate, cfg.ppo.critic_learning_rate) == (3e-4, 1e-3)
     assert (cfg.ppo.clip, cfg.ppo.gamma, cfg.ppo.gae_lambda) == (0.1, 0.99, 0.95)
     assert (cfg.ppo.schedule, cfg.ppo.optimizer) == ("fixed", "adam")
-    assert cfg.policy.hidden == (512, 256, 256) and cfg.policy.activation == "elu"
+    assert cfg.policy.hidden == (512, 256, 256)
     assert cfg.policy.distribution == "gaussian" and not cfg.policy.normalise_observations
     seen = ObservationCfg(canonical=True)
     assert cfg.env == type(cfg.env)(num_worlds=32000, objects=("procedural-150-seed0",), observation=seen), (
@@ -313,13 +313,23 @@ def test_export_and_curves_commands(tmp_path, capsys):
 
 
 def test_files_from_before_a_field_went_are_read_if_it_was_off():
-    """success.no_table_contact asked of all worlds what table.lift_share asks of a share of them."""
+    """Of a group that went its switch counts; what it was set to while it was off does not."""
     before = to_dict(PRESETS["gpu"]())
     before["env"]["success"]["no_table_contact"] = False
+    before["env"]["caught"] = {"after_s": 2.0, "beyond_rad": 0.4, "go_on_share": 0.0}
+    before["env"]["focus"] = {"success": {}, "share": 0.7}
+    before["run"]["keep_last"] = 3
     assert from_dict(TeacherCfg, before) == PRESETS["gpu"]()
-    before["env"]["success"]["no_table_contact"] = True
-    with pytest.raises(ValueError, match=r"env\.success\.no_table_contact is True, and this version has"):
-        from_dict(TeacherCfg, before)
+    for group, field, value in (
+        ("success", "no_table_contact", True),
+        ("caught", "go_on_share", 0.9),
+        ("focus", "success", {"cube": 0.5}),
+        ("curriculum", "goal_span", [0.0, 0.5]),
+    ):
+        on = json.loads(json.dumps(before))
+        on["env"][group][field] = value
+        with pytest.raises(ValueError, match=rf"env\.{group}\.{field} is .*, and this version has only"):
+            from_dict(TeacherCfg, on)
 
 
 def test_configuration_errors_name_the_path_of_the_field():

@@ -115,9 +115,10 @@ def test_a_run_of_which_the_best_alone_is_left_is_gone_on_with_and_not_begun_ane
         find_checkpoint(tmp_path, None)
 
 
-def test_checkpoints_of_a_run_that_went_on_from_an_older_one_are_kept(tmp_path):
-    make_runner(tmp_path, save_every=1, keep_last=3).learn(5)
-    resumed = make_runner(tmp_path, save_every=1, keep_last=1)
+def test_checkpoints_of_a_run_that_went_on_from_an_older_one_are_kept(tmp_path, monkeypatch):
+    make_runner(tmp_path, save_every=1).learn(5)
+    monkeypatch.setattr("vd.train.checkpoint.KEEP_LAST", 1)
+    resumed = make_runner(tmp_path, save_every=1)
     resumed.load(str(checkpoint_path(tmp_path, 3)))
     (tmp_path / "checkpoints" / "model_0000009.pt").touch()
     resumed.learn(1)

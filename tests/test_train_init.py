@@ -254,7 +254,7 @@ def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
     assert cfg.env.objects == ("cube",) and cfg.env.num_worlds == 8
     trained = trained_task(load_policy(SHIPPED_POLICIES[name]))
     assert replace(cfg.env, objects=trained.objects, num_worlds=trained.num_worlds) == trained
-    for field in ("hidden", "activation", "distribution", "normalise_observations"):
+    for field in ("hidden", "distribution", "normalise_observations"):
         wanted = state["policy"][field]
         assert getattr(cfg.policy, field) == (tuple(wanted) if isinstance(wanted, list) else wanted)
     assert parse_teacher(["--init", name, "--preset", "cube"]).env == PRESETS["cube"]().env

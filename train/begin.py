@@ -166,8 +166,8 @@ def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, A
     Raises:
         ValueError: Another hand, or networks of another shape.
     """
+    from vd.envs.cfg import ObservationCfg
     from vd.policy import PolicySpec
-    from vd.train.widen import can_grow
 
     found = from_dict(PolicySpec, state["policy"], where="policy")
     hand, here = state["task"].get("hand"), task.get("hand")
@@ -176,10 +176,10 @@ def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, A
             f"--init: {path} moves {found.num_actions} joints of {hand}, and this run's hand, {here}, has "
             f"{spec.num_actions}; give --hand {hand}"
         )
+    if found.activation != spec.activation:
+        raise ValueError(f"--init: {path} has {found.activation} units, this version {spec.activation} alone")
     wanted, given = _networks(found), _networks(spec)
     for name, value in wanted.items():
-        if name == "hidden" and can_grow(value, given[name]):
-            continue
         if value != given[name]:
             flag = f"--policy.{name.replace('_', '-')}"
             words = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
@@ -187,6 +187,7 @@ def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, A
                 f"--init: the networks of {path} have {flag} {words}, those of this run {given[name]}; "
                 f"give {_as_flag(flag, value, words)}, or leave --preset out to go on with its settings"
             )
+    seen = from_dict(ObservationCfg, state["task"].get("observation", {}), where="task.observation")
     before, now = (
         {name: t.get("observation", {}).get(name, default) for name, default in _APPENDED.items()}
         for t in (state["task"], task)
@@ -197,9 +198,7 @@ def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, A
             "without them can go on with others: give those of the policy"
         )
     if found.num_observations > spec.num_observations:
-        observed = " ".join(
-            f"--env.observation.{k} {v}" for k, v in state["task"].get("observation", {}).items()
-        )
+        observed = _flags(to_dict(seen))
         raise ValueError(
             f"--init: {path} reads {found.num_observations} values and this run observes "
             f"{spec.num_observations}, but a run can only go on with more; give what it was trained with: "
@@ -225,7 +224,7 @@ def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
 
 def _networks(spec: "PolicySpec") -> dict[str, Any]:
     """The settings of ``PolicyCfg`` that a network's shape decides."""
-    names = ("hidden", "activation", "distribution", "normalise_observations")
+    names = ("hidden", "distribution", "normalise_observations")
     return {name: getattr(spec, name) for name in names}
 
 

@@ -14,6 +14,8 @@ from vd.policy import read_state
 
 CHECKPOINT_FOLDER = "checkpoints"
 BEST_NAME = "best.pt"
+KEEP_LAST = 3
+"""Periodic checkpoints to keep besides the best: one to go on from, and others should it be damaged."""
 AUTO = "auto"
 """``--resume auto`` goes on with a run where there is one, and starts it otherwise."""
 _NEEDED = {"actor": ("policy", "task", "iter", "env_steps"), "student": ("spec", "task", "iter", "env_steps")}
@@ -106,16 +108,15 @@ def set_aside(damaged: dict[Path, str]) -> None:
             path.rename(path.with_name(f"{path.name}.damaged"))
 
 
-def prune_checkpoints(run_dir: Path, newest: int, keep: int, every: int | None = None) -> None:
+def prune_checkpoints(run_dir: Path, newest: int, every: int | None = None) -> None:
     """Delete old periodic checkpoints, and what a killed run left half-written.
 
     Args:
         run_dir: Folder of the run.
         newest: Iteration of the newest; what a run that went on from an older one finds after it, stays.
-        keep: How many of the newest to keep.
-        every: Keep those after every so many iterations too; None: no others.
+        every: Keep those after every so many iterations, besides the newest; None: no others.
     """
-    for path in [path for path in list_checkpoints(run_dir) if _iteration_of(path) <= newest][:-keep]:
+    for path in [path for path in list_checkpoints(run_dir) if _iteration_of(path) <= newest][:-KEEP_LAST]:
         if every is None or _iteration_of(path) % every:
             path.unlink(missing_ok=True)
     for path in (run_dir / CHECKPOINT_FOLDER).glob(".*.pt"):

@@ -15,12 +15,10 @@ import tyro
 
 from vd import interrupt
 from vd.config import to_dict
-from vd.envs.cfg import FocusCfg
 from vd.files import check_file, check_folder, write_json
 from vd.train.begin import find_start
 from vd.train.config import NoiseCfg
 from vd.train.flags import CONFIG_NAME, parse_teacher, resolve_device
-from vd.train.focus import worlds_text
 from vd.train.presets import SMOKE_RUN, TeacherCfg
 from vd.warp_quiet import quiet_warp
 
@@ -181,8 +179,6 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     from vd.train.runner import TeacherRunner
     from vd.train.vec_env import ReorientVecEnv
 
-    # How worlds were shared out is this run's alone: its config.json says it, and its policies do not.
-    task = to_dict(replace(cfg.env, focus=FocusCfg()))
     # Actions of different processes have to differ; parameters are broadcast from the first.
     torch.manual_seed(cfg.env.seed + rank)
     # TF32 halves the update on a GPU; the simulator is not touched by it.
@@ -197,7 +193,9 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     deadline = None
     if cfg.run.max_minutes is not None:
         deadline = (time.monotonic() if started is None else started) + 60.0 * cfg.run.max_minutes
-    runner = TeacherRunner(env, cfg.ppo, cfg.policy, cfg.run, task=task, device=device, deadline=deadline)
+    runner = TeacherRunner(
+        env, cfg.ppo, cfg.policy, cfg.run, task=to_dict(cfg.env), device=device, deadline=deadline
+    )
     if checkpoint is not None:
         runner.load(str(checkpoint))
     elif init is not None:
@@ -237,9 +235,6 @@ def _train_teacher(cfg: TeacherCfg, main_process: bool, started: float) -> int:
     with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):
         runner = build_teacher(cfg, started=started)
     folder = cfg.run.run_dir
-    if cfg.env.focus.success and main_process:
-        simulation = runner.env.env
-        print(worlds_text([item.name for item in simulation.objects], simulation.world_object))
     if main_process:
         print_damaged(runner.damaged)
     if runner.current_learning_iteration and main_process:
@@ -272,8 +267,6 @@ def _print_begin(cfg: TeacherCfg, runner: "TeacherRunner") -> None:
         print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
     if runner.new_inputs:
         print(f"{runner.new_inputs} observed values are new to the networks and start without effect")
-    if runner.new_units:
-        print(f"{runner.new_units} hidden units are new to each network and start without effect")
     if runner.critic_warmup:
         print(f"the critic learns alone for {runner.critic_warmup} iterations, the actor stays as it is")
     for difference in runner.unlike:

@@ -7,11 +7,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
 from vd.paper import PAPER
+
+ACTIVATION = "elu"
+"""Activation of the hidden layers, as in the paper (MLP 512-256-256 ELU)."""
 
 
 @dataclass
@@ -60,10 +63,9 @@ class PpoCfg:
 class PolicyCfg:
     """Networks of actor and critic."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"activation": "elu"}
     hidden: tuple[int, ...] = PAPER.teacher.hidden
     """Width of the hidden layers, the same for actor and critic."""
-    activation: Literal["elu", "relu", "tanh", "gelu"] = "elu"
-    """Activation function."""
     distribution: Literal["gaussian", "state-dependent"] = "gaussian"
     """gaussian: a learned std per action, as in the paper's code; state-dependent: the network's, bounded."""
     initial_std: float = math.exp(PAPER.teacher.initial_log_std_code)
@@ -81,6 +83,7 @@ class PolicyCfg:
 class RunCfg:
     """Where, how long and how reproducibly."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"keep_last": 3, "stagger": True}
     run_dir: Path = Path("runs/teacher")
     """Folder for configuration, checkpoints, curves and TensorBoard files."""
     device: str = "auto"
@@ -94,13 +97,9 @@ class RunCfg:
     keep the task's own, and are judged in it."""
     save_every: int = 100
     """Iterations between checkpoints."""
-    keep_last: int = 3
-    """Periodic checkpoints to keep besides the best."""
     keep_every: int | None = None
-    """Keep those after every so many iterations too, for good, a multiple of --save-every: vd-train average
-    takes their mean."""
-    stagger: bool = True
-    """Start worlds at random times of their first episode, so that time-outs do not come all at once."""
+    """Keep those after every so many iterations besides the last three and the best, a multiple of
+    --save-every: vd-train average takes their mean."""
     tensorboard: bool = True
     """Write TensorBoard files (tensorboard --logdir RUN-DIR)."""
 
@@ -170,7 +169,6 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
         "--policy.hidden": min(policy.hidden, default=0),
         "--max-steps": run.max_steps,
         "--save-every": run.save_every,
-        "--keep-last": run.keep_last,
     }
     if run.max_minutes is not None:
         positive["--max-minutes"] = run.max_minutes
@@ -224,7 +222,7 @@ def rsl_rl_config(
     network = {
         "class_name": "MLPModel",
         "hidden_dims": policy.hidden,
-        "activation": policy.activation,
+        "activation": ACTIVATION,
         "obs_normalization": policy.normalise_observations,
     }
     return {

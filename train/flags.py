@@ -12,7 +12,6 @@ import tyro
 from vd.config import from_dict
 from vd.evaluate.agents import check_names
 from vd.train.begin import settings_of
-from vd.train.focus import read_success
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
 
 if TYPE_CHECKING:
@@ -46,10 +45,8 @@ def parse_teacher(
         say: Is told which preset the machine decided.
 
     Raises:
-        FileNotFoundError: ``--resume`` names a run without a configuration, or
-            ``--focus-on`` no file.
-        ValueError: The run's configuration is not one of this version, ``--init`` is no teacher, or
-            ``--focus-on`` no evaluation.
+        FileNotFoundError: ``--resume`` names a run without a configuration.
+        ValueError: The run's configuration is not one of this version, or ``--init`` is no teacher.
     """
     arguments = normalise(arguments, SHORT_FORMS, "env")
     preset, init, resume = (value_of(arguments, flag) for flag in ("--preset", "--init", "--resume"))
@@ -74,11 +71,7 @@ def parse_teacher(
     cfg = _parsed(arguments, base)
     if cfg.env.observation.view == "either":
         raise ValueError("env.observation.view either is of evaluations; train with goal, which it looks at")
-    if cfg.focus_on is None:
-        return cfg
-    # What the run needs of the file is kept with it.
-    success = read_success(cfg.focus_on)
-    return replace(cfg, focus_on=None, env=replace(cfg.env, focus=replace(cfg.env.focus, success=success)))
+    return cfg
 
 
 def resolve_device(name: str) -> str:

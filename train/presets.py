@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
@@ -31,6 +31,7 @@ TRAINING_SET = ("procedural-150-seed0",)
 class TeacherCfg:
     """Train the teacher: PPO on the simulator's state."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None}
     preset: PresetName = "paper"
     """Settings to start from; every other flag overrides one of them. By default what learns on this
     machine."""
@@ -45,10 +46,6 @@ class TeacherCfg:
     init_stage: tuple[float, float] | None = None
     """Difficulty and tightness of the curriculum at which a run with --init begins. None: those of what it
     begins from; 1 and 1 for a policy that does not say, which is the task as configured."""
-    focus_on: Path | None = None
-    """More worlds for the objects that a policy fails with: eval.json of a vd-eval on the objects
-    trained on. Its success rates become --env.focus.success, so that the file is not needed again; see
-    --env.focus.share."""
     second_view: bool = False
     """Look again at goals that are not reached in 3 s, once a second, in a view that is drawn, of those that
     vd-eval --second-view chooses from: more is learned there of what is stuck. For policies that see their

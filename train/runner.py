@@ -28,14 +28,14 @@ from vd.train.checkpoint import (
     set_random_state,
     without_worlds,
 )
-from vd.train.config import PolicyCfg, PpoCfg, RunCfg, rsl_rl_config, validate
+from vd.train.config import ACTIVATION, PolicyCfg, PpoCfg, RunCfg, rsl_rl_config, validate
 from vd.train.distributed import Processes, join_processes, watch_iteration
 from vd.train.ending import EndRequest, Interrupted, TrainingDivergedError
 from vd.train.metrics import GoalWindow, ProgressFile, StepMeans
 from vd.train.ppo import TeacherPPO
 from vd.train.progress import ProgressLine
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
-from vd.train.widen import new_inputs, new_units, widen
+from vd.train.widen import new_inputs, widen
 
 POLICY_NAME = "policy.pt"
 """The best policy so far, in the run's folder: what vd-eval, vd-play and deployment read."""
@@ -63,7 +63,6 @@ class TeacherRunner(OnPolicyRunner):
         env_steps: Control steps completed, over all worlds and processes.
         new_episodes: Why the checkpoint that was loaded could not restore the worlds; empty if it did.
         new_inputs: Observed values that the networks of that checkpoint did not read.
-        new_units: Hidden units that each network of that checkpoint did not have.
         critic_warmup: Iterations left in which the critic learns alone (``PpoCfg.critic_warmup_iterations``).
         begun: Whether this run began from another one's networks, in this process.
         unlike: What observations and actions mean otherwise than to the policy that the run began from.
@@ -102,7 +101,7 @@ class TeacherRunner(OnPolicyRunner):
         self._end = EndRequest(deadline, device=device, distributed=self.is_distributed)
         self._stagger_due = True
         self.new_episodes = ""
-        self.new_inputs = self.new_units = 0
+        self.new_inputs = 0
         self.critic_warmup = ppo.critic_warmup_iterations or 0
         self.begun = False
         self.unlike: list[str] = []
@@ -135,8 +134,8 @@ class TeacherRunner(OnPolicyRunner):
 
         Args:
             num_learning_iterations: Iterations to do now; up to ``run.max_steps`` if ``None``.
-            init_at_random_ep_len: Stagger the first episodes; as ``run.stagger`` says if ``None``, and
-                never where a checkpoint restored the worlds.
+            init_at_random_ep_len: Stagger the first episodes, so that time-outs do not come all at once; yes
+                if ``None``, and never where a checkpoint restored the worlds.
 
         Raises:
             Interrupted: Ctrl-C or SIGTERM, after saving.
@@ -144,8 +143,7 @@ class TeacherRunner(OnPolicyRunner):
         """
         first = self.current_learning_iteration
         total = self.total_iterations if num_learning_iterations is None else first + num_learning_iterations
-        stagger = self.run.stagger if init_at_random_ep_len is None else init_at_random_ep_len
-        if stagger and self._stagger_due:
+        if init_at_random_ep_len is not False and self._stagger_due:
             steps = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(steps, high=int(self.env.max_episode_length))
         self._stagger_due = False
@@ -263,8 +261,7 @@ class TeacherRunner(OnPolicyRunner):
 
         With the processes and worlds of the checkpoint the run goes on exactly. With others, or from a
         checkpoint without worlds, all but worlds and random states is restored, and episodes start anew.
-        So they do where the run observes more than the checkpoint's networks read. Those are widened, as they
-        are to hidden layers with more units.
+        So they do where the run observes more than the checkpoint's networks read, which are widened.
 
         Args:
             path: The checkpoint.
@@ -328,19 +325,12 @@ class TeacherRunner(OnPolicyRunner):
         return state["infos"]
 
     def _widened(self, state: dict[str, Any]) -> dict[str, Any]:
-        """A checkpoint with networks of this run's size, if its own are smaller."""
+        """A checkpoint with networks that read what this run observes, if its own read less."""
         inputs = new_inputs(state, self.num_observations, self.alg.critic.obs_dim)
-        units = new_units(state, self.policy_cfg.hidden)
-        if not inputs and not units:
+        if not inputs:
             return state
-        self.new_inputs, self.new_units = inputs, units
-        return widen(
-            state,
-            self.alg.actor,
-            self.alg.critic,
-            num_observations=self.num_observations,
-            hidden=self.policy_cfg.hidden,
-        )
+        self.new_inputs = inputs
+        return widen(state, self.alg.actor, self.alg.critic, num_observations=self.num_observations)
 
     def _load_worlds(self, ranks: list[dict[str, Any]]) -> None:
         """Restore worlds and random state, or else the curriculum alone. All processes decide alike."""
@@ -390,7 +380,7 @@ class TeacherRunner(OnPolicyRunner):
             num_observations=self.num_observations,
             num_actions=self.env.num_actions,
             hidden=self.policy_cfg.hidden,
-            activation=self.policy_cfg.activation,
+            activation=ACTIVATION,
             distribution=self.policy_cfg.distribution,
             normalise_observations=self.policy_cfg.normalise_observations,
         )
@@ -415,9 +405,7 @@ class TeacherRunner(OnPolicyRunner):
             save_checkpoint(path.with_name(BEST_NAME), state)
         if better or not (self.run.run_dir / POLICY_NAME).exists():
             save_checkpoint(self.run.run_dir / POLICY_NAME, policy_export(state))
-        prune_checkpoints(
-            self.run.run_dir, self.current_learning_iteration, self.run.keep_last, self.run.keep_every
-        )
+        prune_checkpoints(self.run.run_dir, self.current_learning_iteration, self.run.keep_every)
 
     def _check_rollout(self, latest: TensorDict) -> None:
         """Stop before an update on values that are not finite. One wait for the device an iteration."""

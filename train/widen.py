@@ -1,6 +1,5 @@
-"""Going on with larger networks: inputs and hidden units that are new begin without effect."""
+"""Going on with networks that read more: inputs that are new begin without effect."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -8,7 +7,14 @@ from torch import nn
 
 MOMENT, SECOND_MOMENT = "exp_avg", "exp_avg_sq"
 """Adam's running means of a gradient and of its square."""
-_FILLS = {"obs_normalizer._mean": 0.0, "obs_normalizer._var": 1.0, "obs_normalizer._std": 1.0}
+_FIRST = "mlp.0.weight"
+_FILLS = {
+    _FIRST: 0.0,
+    "obs_normalizer._mean": 0.0,
+    "obs_normalizer._var": 1.0,
+    "obs_normalizer._std": 1.0,
+}
+"""What reads or normalises the inputs, and what it has for new ones."""
 
 
 def new_inputs(state: dict[str, Any], num_observations: int, critic_observations: int | None = None) -> int:
@@ -36,41 +42,22 @@ def new_inputs(state: dict[str, Any], num_observations: int, critic_observations
     return max(now - then for then, now in read)
 
 
-def can_grow(before: Sequence[int], now: Sequence[int]) -> bool:
-    """Whether hidden layers of ``now`` units can take over those of ``before``: as many, none smaller."""
-    return len(before) == len(now) and all(old <= new for old, new in zip(before, now, strict=True))
-
-
-def new_units(state: dict[str, Any], hidden: Sequence[int]) -> int:
-    """How many hidden units more ``hidden`` has than a checkpoint's networks; 0 if they cannot grow to it."""
-    before = state["policy"]["hidden"]
-    return sum(hidden) - sum(before) if can_grow(before, hidden) else 0
-
-
 def widen(
-    state: dict[str, Any],
-    actor: nn.Module,
-    critic: nn.Module,
-    *,
-    num_observations: int,
-    hidden: Sequence[int],
+    state: dict[str, Any], actor: nn.Module, critic: nn.Module, *, num_observations: int
 ) -> dict[str, Any]:
-    """A checkpoint with the networks of a run that observes more or has wider layers, acting as before.
+    """A checkpoint with the networks of a run that observes more, acting as before.
 
     What was there reads nothing of what is new: those weights are zero, and normalisation of new inputs
-    starts at mean 0 and std 1. New units read everything, with the weights of the run's own beginning, so
-    that each is a feature of its own which the layer after it can come to use (Net2Net, Chen et al. 2016,
-    copies units instead). Of the optimiser's new moments the first is zero; the second is the mean of that
-    of the unit's other weights, for new units that of the layer's. From zero Adam's first steps would be
-    several times too long, because it counts steps from the begin of the run.
+    starts at mean 0 and std 1. Of the optimiser's new moments the first is zero; the second is the mean of
+    that of the unit's other weights: from zero Adam's first steps would be several times too long, because it
+    counts steps from the begin of the run.
 
     Args:
         state: The checkpoint, as :func:`vd.train.checkpoint.load_checkpoint` reads it; not changed. Critic
             and optimiser may be missing, as in an exported policy.
-        actor: The actor it is for, as the run begins: the weights of new units are taken from it.
-        critic: The critic it is for, likewise.
+        actor: The actor it is for.
+        critic: The critic it is for.
         num_observations: Values that the run observes, at least as many as the checkpoint's networks read.
-        hidden: Units of the run's hidden layers, see :func:`can_grow`.
     """
     optimiser = state.get("optimizer_state_dict", {"state": {}})
     moments = dict(optimiser["state"])
@@ -79,43 +66,27 @@ def widen(
     for network, module in (("actor", actor), ("critic", critic)):
         weights = dict(state.get(f"{network}_state_dict", {}))
         own = module.state_dict()
-        for name, _ in module.named_parameters():
-            if index in moments:
-                moments[index] = _grown_moments(moments[index], own[name].shape)
+        for name, parameter in module.named_parameters():
+            if name == _FIRST and index in moments:
+                moments[index] = _wider_moments(moments[index], parameter.shape[1])
             index += 1
-        for name in weights:
-            if name in _FILLS:
-                extra = own[name].shape[-1] - weights[name].shape[-1]
-                weights[name] = nn.functional.pad(weights[name], (0, extra), value=_FILLS[name])
-            else:
-                weights[name] = _grown(weights[name], own[name])
+        for name in weights.keys() & _FILLS.keys():
+            extra = own[name].shape[-1] - weights[name].shape[-1]
+            weights[name] = nn.functional.pad(weights[name], (0, extra), value=_FILLS[name])
         if weights:
             widened[f"{network}_state_dict"] = weights
     if "optimizer_state_dict" in state:
         widened["optimizer_state_dict"] = optimiser | {"state": moments}
-    widened["policy"] = state["policy"] | {"num_observations": num_observations, "hidden": list(hidden)}
+    widened["policy"] = state["policy"] | {"num_observations": num_observations}
     return widened
 
 
-def _grown(old: torch.Tensor, fresh: torch.Tensor) -> torch.Tensor:
-    """``fresh`` with ``old`` as its first rows (and columns), which read nothing of further columns."""
-    if old.shape == fresh.shape:
-        return old
-    grown = fresh.detach().clone().to(old)
-    if old.dim() == 2:
-        grown[: old.shape[0], old.shape[1] :] = 0.0
-    grown[tuple(slice(size) for size in old.shape)] = old
-    return grown
-
-
-def _grown_moments(moment: dict[str, Any], shape: torch.Size) -> dict[str, Any]:
-    """Adam's moments of a parameter that has grown to ``shape``."""
+def _wider_moments(moment: dict[str, Any], inputs: int) -> dict[str, Any]:
+    """Adam's moments of the first layer, for more inputs."""
     first, second = moment[MOMENT], moment[SECOND_MOMENT]
-    if first.shape == shape:
-        return moment
-    old = tuple(slice(size) for size in first.shape)
-    grown, squares = first.new_zeros(shape), second.new_full(shape, float(second.mean()))
-    if second.dim() == 2:
-        squares[: second.shape[0]] = second.mean(dim=1, keepdim=True)
-    grown[old], squares[old] = first, second
-    return moment | {MOMENT: grown, SECOND_MOMENT: squares}
+    extra = inputs - first.shape[1]
+    means = second.mean(dim=1, keepdim=True).expand(-1, extra)
+    return moment | {
+        MOMENT: nn.functional.pad(first, (0, extra)),
+        SECOND_MOMENT: torch.cat((second, means), dim=1),
+    }

@@ -40,7 +40,8 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
         values: Field values by name.
         where: Dotted path of ``values``, for error messages.
 
-    A class that lost a field says so in ``RETIRED``: by name the value that means what is now always so.
+    A class that lost a field says so in ``RETIRED``: by name the value that means what is now always so, of a
+    group that went the values of those fields that say so.
 
     Raises:
         ValueError: A field that ``cls`` does not have, one that is needed and absent, or a value of the wrong
@@ -66,10 +67,13 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
 def _without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], where: str) -> dict[str, Any]:
     """``values`` without fields that are no more."""
     for name in retired.keys() & values.keys():
-        if values[name] != retired[name]:
+        value, wanted = values[name], retired[name]
+        if isinstance(wanted, Mapping) and wanted and isinstance(value, Mapping):
+            _without_retired(value, wanted, f"{where}.{name}")
+        elif to_dict(value) != wanted:
             raise ValueError(
-                f"{where}.{name} is {values[name]!r}, and this version has only {retired[name]!r}; take the "
-                "version that wrote it"
+                f"{where}.{name} is {value!r}, and this version has only {wanted!r}; take the version that "
+                "wrote it"
             )
     return {name: value for name, value in values.items() if name not in retired}
 

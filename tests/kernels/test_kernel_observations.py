@@ -21,11 +21,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from vd.kernels.observations import (
-    GOAL_TIME_MOST_S,
-    GOAL_TIME_UNIT_S,
     ObservationParams,
     fingertip_kernel,
-    goal_time_kernel,
     teacher_observation_kernel,
     teacher_observation_size,
     teacher_observation_slices,
@@ -276,15 +273,3 @@ def test_noise_of_table_s3_on_measured_values_only(device, fingers):
     assert np.abs(np.corrcoef(noise.T) - np.eye(mask.sum())).max() < bound, "values share noise"
     assert np.abs(np.corrcoef(noise[:50]) - np.eye(50)).max() < 0.7, "worlds share noise"
     assert not np.any(rng == streams(len(noise), 9, device).numpy()), "the streams did not advance"
-
-
-@EXAMPLES
-@given(seed=st.integers(0, 2**31 - 1), worlds=st.integers(1, 8), step_s=st.floats(0.01, 0.2))
-def test_the_time_of_a_goal_is_its_steps_up_to_a_bound(device, seed, worlds, step_s):
-    steps, column = np.random.default_rng(seed).integers(0, 600, worlds), 2
-    out = unwritten((worlds, 4), float, device)
-    inputs = [device_array(steps, int, device), step_s, column]
-    wp.launch(goal_time_kernel, dim=worlds, inputs=inputs, outputs=[out], device=device)
-    seconds = np.minimum(steps * step_s, GOAL_TIME_MOST_S)
-    np.testing.assert_allclose(out.numpy()[:, column], seconds / GOAL_TIME_UNIT_S, rtol=1e-5)
-    assert np.isnan(np.delete(out.numpy(), column, axis=1)).all(), "nothing else is written"

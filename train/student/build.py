@@ -98,7 +98,7 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
 
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
-    from vd.evaluate.agents import find_policy, policy_name, trained_task
+    from vd.evaluate.agents import find_policy, policy_name
     from vd.policy import load_policy
     from vd.student.network import Student
     from vd.student.saved import StudentSpec
@@ -108,11 +108,6 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
 
     device = cfg.run.device
     teacher = load_policy(find_policy(cfg.teacher), device)
-    if trained_task(teacher).observation.goal_time:
-        raise ValueError(
-            f"{cfg.teacher} sees for how long it has pursued its goal (observation.goal_time), which "
-            "students do not sense; give a teacher trained without it"
-        )
     task = student_task(teacher, cfg)
     if checkpoint is None:
         cfg = replace(cfg, network=replace(cfg.network, state=state_head(cfg, teacher)))
@@ -305,7 +300,7 @@ def _dagger(
         )
     simulation.dump_dir = cfg.run.run_dir
     env = ReorientVecEnv(simulation)
-    if fresh and cfg.run.stagger and not cfg.dagger.reset:
+    if fresh and not cfg.dagger.reset:
         steps = env.episode_length_buf
         env.episode_length_buf = torch.randint_like(steps, high=int(env.max_episode_length))
     # Teachers aim at the goals themselves, and so does whoever learns from them.

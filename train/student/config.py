@@ -337,7 +337,6 @@ def validate(cfg: StudentTrainCfg) -> None:
         "--num-worlds": cfg.task.num_worlds,
         "--max-steps": run.max_steps,
         "--save-every": run.save_every,
-        "--keep-last": run.keep_last,
         "--max-minutes": 1.0 if run.max_minutes is None else run.max_minutes,
     }
     for flag, value in positive.items():

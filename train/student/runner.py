@@ -184,7 +184,7 @@ class StudentRunner:
         folder = self.run.run_dir
         save_checkpoint(checkpoint_path(folder, self.iteration), state)
         save_checkpoint(folder / STUDENT_NAME, student_export(state))
-        prune_checkpoints(folder, self.iteration, self.run.keep_last, self.run.keep_every)
+        prune_checkpoints(folder, self.iteration, self.run.keep_every)
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint: exactly, with its processes and worlds; else with new episodes.

@@ -255,9 +255,6 @@ def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
     if task.observation.shape != "none":
         end = slices["previous_action"].stop
         parts["shape"] = (end, end + shape_observation_size(hand.num_fingers))
-    if task.observation.goal_time:
-        end = max(stop for _, stop in parts.values())
-        parts["goal_time"] = (end, end + 1)
     return ObservationPart(parts, view=task.observation.view, file_axes=task.observation.file_axes)
 
 

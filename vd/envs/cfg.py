@@ -28,6 +28,7 @@ class ActionCfg:
 class RewardCfg:
     """Coefficients of equations 1-5, 7 and 8, and of our own shaping (off by default)."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"fingertip_height": PAPER.reward.fingertip_height, "lift_m": 0.02}
     success: float = PAPER.reward.success
     """c1: once for each goal reached."""
     rotation: float = PAPER.reward.rotation
@@ -46,21 +47,12 @@ class RewardCfg:
     """c5: when the object leaves the workspace."""
     table_contact: float = PAPER.reward.table_contact
     """c6: while the object touches the table. Set 0 to learn with table support."""
-    fingertip_height: float = PAPER.reward.fingertip_height
-    """c7: for each fingertip above fingertip_height_m."""
     progress: float = 0.0
     """Ours: per radian by which the error fell since the last step."""
     lift: float = 0.0
-    """Ours: times the height of the object's lowest point above the table (there or not), 1 at lift_m."""
-    lift_m: float = 0.02
-    """Ours: height from which more is worth nothing [m]; as far as a finger can give way without a fall."""
+    """Ours: times the height of the object's lowest point above the table (there or not), 1 from 2 cm on."""
     scale: float = 1.0
     """Ours: factor on the sum; changes no optimum, keeps value targets near 1."""
-
-    def validate(self) -> None:
-        """Raise ValueError naming the field and the remedy."""
-        if not self.lift_m > 0.0:
-            raise ValueError(f"reward.lift_m is {self.lift_m:g}; it has to be positive (lift 0 is off)")
 
 
 @dataclass(frozen=True)
@@ -87,6 +79,7 @@ class SuccessCfg:
 class ObservationCfg:
     """What the teacher sees besides the paper's state."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"goal_time": False}
     shape: Literal["none", "full"] = "none"
     """none: nothing of the object's shape, as in the paper. full: the vector from each fingertip to the
     nearest point of the surface, and how far the object extends in 9 directions for each finger, up and
@@ -98,10 +91,6 @@ class ObservationCfg:
     where the wanted rotation would be clockwise from above: half of that. The hand must be its own mirror
     image, as dclaw3 is; of dclaw4 all fingers lean the same way round. either: as goal, and the same views in
     the mirror, if the hand has them, are there for who looks twice (vd-eval --second-view)."""
-
-    goal_time: bool = False
-    """Ours: see for how long the present goal has been pursued. A policy that sees nothing but the state does
-    the same again where it is caught; one that knows the time can learn to try something else."""
     file_axes: bool = True
     """See how the axes of the object's file lie, now and at the goal, as in the paper. No cloud shows which
     they are; students know the rotation from one to the other alone. Ours: without them a teacher sees zeros
@@ -140,13 +129,12 @@ class GoalCfg:
 class StartCfg:
     """How the object starts."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"settle_s": 1.5}
     at_rest: bool = False
     """Start at rest on the table, turned about the vertical at random, rather than falling (paper). Goals
     near the start are then near a pose that lasts."""
     poses: int = 4
     """Poses at rest that each world keeps to choose from; found by dropping the object at the beginning."""
-    settle_s: float = 1.5
-    """Time an object has to come to rest [s]."""
 
 
 @dataclass(frozen=True)
@@ -170,86 +158,6 @@ class TableCfg:
             raise ValueError(
                 f"table.away_s is {self.away_s[0]:g} {self.away_s[1]:g}; it has to rise, and be positive"
             )
-
-
-@dataclass(frozen=True)
-class CaughtCfg:
-    """Ours: worlds that are caught, and go on when their episode's time is up. None by default.
-
-    Where a hand is caught an episode soon ends, and most of what is learned from is how hands that are not
-    do it. A goal that has been pursued for long is where more is to be learned.
-    """
-
-    after_s: float = 3.0
-    """Time for which a goal has to have been pursued [s]; four in five are reached by then."""
-    beyond_rad: float = PAPER.success.rotation_rad
-    """Distance from it above which the world is caught [rad]."""
-    go_on_share: float = 0.0
-    """Share of the time-outs of such worlds after which they go on as they are, with the time of another
-    episode."""
-
-    def after_steps(self, control_hz: float) -> int:
-        """The time in control steps."""
-        return round(self.after_s * control_hz)
-
-    def validate(self) -> None:
-        """Raise ValueError naming the field and the remedy."""
-        for name in ("after_s", "beyond_rad"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"caught.{name} is {getattr(self, name):g}; it has to be positive")
-        if not 0.0 <= self.go_on_share < 1.0:
-            raise ValueError(
-                f"caught.go_on_share is {self.go_on_share:g}; it is from 0 to below 1: what cannot be freed "
-                "would never end"
-            )
-
-
-@dataclass(frozen=True)
-class NudgeCfg:
-    """Ours: hands whose object stands still far from its goal are moved at random. Off by default.
-
-    A policy without memory that has come to rest has nothing that would move it again.
-    """
-
-    enabled: bool = False
-    """Whether hands are nudged."""
-    beyond_rad: float = PAPER.success.rotation_rad
-    """Distance from the goal above which an object that stands still is stuck [rad]."""
-    still_rad_s: float = 0.3
-    """Rate of the distance up to which it stands still [rad/s]."""
-    still_s: float = 0.5
-    """How long it has to [s]."""
-    nudge_s: float = 0.25
-    """How long the hand is then moved [s]."""
-    action_std: float = 0.5
-    """Standard deviation of the action that moves it, one draw for each nudge and joint."""
-
-    def validate(self) -> None:
-        """Raise ValueError naming the field and the remedy."""
-        for name in ("beyond_rad", "still_rad_s", "still_s", "nudge_s", "action_std"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"nudge.{name} is {getattr(self, name):g}; it has to be positive")
-
-
-@dataclass(frozen=True)
-class ExploreCfg:
-    """Ours: noise on the actions, as in training, but only while the goal is far. Off by default.
-
-    Near the goal the mean action is stiller; far from it, it is caught where noise is not.
-    """
-
-    enabled: bool = False
-    """Whether there is noise."""
-    beyond_rad: float = PAPER.success.rotation_rad
-    """Distance from the goal above which there is [rad]."""
-    action_std: float = 0.15
-    """Standard deviation of the noise of each joint's action, drawn anew in every control step."""
-
-    def validate(self) -> None:
-        """Raise ValueError naming the field and the remedy."""
-        for name in ("beyond_rad", "action_std"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(f"explore.{name} is {getattr(self, name):g}; it has to be positive")
 
 
 @dataclass(frozen=True)
@@ -311,30 +219,25 @@ class CurriculumCfg:
     """Ours: make the task harder as the success rate allows. Off by default.
 
     While the success rate of goals is above ``raise_at`` the difficulty grows by ``rate`` per update,
-    while it is below ``lower_at`` it shrinks; in between it stays. Difficulty 0 is ``stillness_start``
-    times the stillness thresholds and ``goal_start_rad``; difficulty 1 is the configured task. Goals and
-    stillness each move over a span of the difficulty, together by default; ``goal_span`` 0 0.5 and
-    ``stillness_span`` 0.5 1 widen the goals first.
+    while it is below ``lower_at`` it shrinks; in between it stays. Difficulty 0 is loose stillness, near
+    goals and free energy (:mod:`vd.envs.parameters`), difficulty 1 the configured task.
     """
 
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "stillness_start": 12.0,
+        "goal_start_rad": 1.0,
+        "stillness_span": [0.0, 1.0],
+        "goal_span": [0.0, 1.0],
+        "energy_start": 0.0,
+    }
     enabled: bool = False
     """Whether difficulty starts at 0 rather than 1."""
-    stillness_start: float = 12.0
-    """Factor on the four stillness thresholds at difficulty 0."""
-    goal_start_rad: float = 1.0
-    """Largest goal angle at difficulty 0 [rad]."""
-    stillness_span: tuple[float, float] = (0.0, 1.0)
-    """Difficulties from which to which the stillness thresholds tighten."""
-    goal_span: tuple[float, float] = (0.0, 1.0)
-    """Difficulties from which to which the largest goal angle grows."""
     raise_at: float = 0.6
     """Success rate of goals above which the task gets harder."""
     lower_at: float = 0.3
     """Success rate of goals below which the task gets easier."""
     rate: float = 0.02
     """Change of the difficulty per update (one update each training iteration)."""
-    energy_start: float = 0.0
-    """Factor on the energy term at difficulty 0; it grows to 1."""
     tightening: TighteningCfg = field(default_factory=TighteningCfg)
 
     @property
@@ -345,33 +248,6 @@ class CurriculumCfg:
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         self.tightening.validate()
-        for name, (low, high) in {"stillness_span": self.stillness_span, "goal_span": self.goal_span}.items():
-            if not 0.0 <= low < high <= 1.0:
-                raise ValueError(
-                    f"curriculum.{name} is {low:g} {high:g}; it has to rise, and lie within 0 and 1"
-                )
-
-
-@dataclass(frozen=True)
-class FocusCfg:
-    """Ours: more worlds for the objects that fail. Without success rates, the default, all get the same."""
-
-    success: dict[str, float] = field(default_factory=dict)
-    """Success rate of every object, 0 to 1, by name, measured before; --focus-on takes them from an
-    evaluation. Those of objects that are not simulated are not used."""
-    share: float = 0.5
-    """Share of the worlds that is given by failure, in proportion to it. The others are spread evenly, so
-    that no object is forgotten."""
-
-    def validate(self) -> None:
-        """Raise ValueError naming the field and the remedy."""
-        if not 0.0 <= self.share < 1.0:
-            raise ValueError(
-                f"focus.share is {self.share:g}; it is from 0 to below 1: every object keeps some worlds"
-            )
-        for name, rate in self.success.items():
-            if not 0.0 <= rate <= 1.0:
-                raise ValueError(f"focus.success of {name} is {rate:g}; a success rate is within 0 and 1")
 
 
 @dataclass(frozen=True)
@@ -461,6 +337,12 @@ class RandomisationCfg:
 class ReorientCfg:
     """The in-hand reorientation task: hand, objects, worlds and all terms."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "caught": {"go_on_share": 0.0},
+        "nudge": {"enabled": False},
+        "explore": {"enabled": False},
+        "focus": {"success": {}},
+    }
     hand: str = "dclaw4"
     """Name of a hand (dclaw3, dclaw4) or path of a hand's USD."""
     fingertip: str = "rigid"
@@ -492,12 +374,8 @@ class ReorientCfg:
     start: StartCfg = field(default_factory=StartCfg)
     goal: GoalCfg = field(default_factory=GoalCfg)
     table: TableCfg = field(default_factory=TableCfg)
-    caught: CaughtCfg = field(default_factory=CaughtCfg)
-    nudge: NudgeCfg = field(default_factory=NudgeCfg)
-    explore: ExploreCfg = field(default_factory=ExploreCfg)
     aim: AimCfg = field(default_factory=AimCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
-    focus: FocusCfg = field(default_factory=FocusCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
 
     @property
@@ -508,27 +386,13 @@ class ReorientCfg:
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         self.sim.validate()
-        self.reward.validate()
         self.observation.validate()
         self.randomisation.validate()
         self.curriculum.validate()
-        self.focus.validate()
         self.table.validate()
-        self.caught.validate()
-        if self.caught.go_on_share > 0.0 and self.table.away_share > 0.0:
-            raise ValueError(
-                f"caught.go_on_share is {self.caught.go_on_share:g} and table.away_share "
-                f"{self.table.away_share:g}; a world that goes on would get its table back, so one of them "
-                "has to be 0"
-            )
-        self.nudge.validate()
-        self.explore.validate()
         self.aim.validate()
-        if self.start.at_rest and (self.start.poses < 1 or self.start.settle_s <= 0.0):
-            raise ValueError(
-                f"start.at_rest needs start.poses >= 1 (now {self.start.poses}) and start.settle_s > 0 "
-                f"(now {self.start.settle_s})"
-            )
+        if self.start.at_rest and self.start.poses < 1:
+            raise ValueError(f"start.at_rest needs start.poses >= 1 (now {self.start.poses})")
         if self.failures_per_million < 0.0:
             raise ValueError(f"failures_per_million = {self.failures_per_million}; it is 0 or positive")
         if self.num_worlds < 1:

@@ -1,4 +1,4 @@
-"""What the policy observes: state, shape, goal's time, memory, and what a critic or a teacher is told."""
+"""What the policy observes: state, shape, memory, and what a critic or a teacher is told."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +11,7 @@ from vd.envs.symmetry import Views
 from vd.kernels.aim import aim_kernel
 from vd.kernels.dynamics import dynamics_kernel
 from vd.kernels.history import forget_kernel, history_kernel, remember_kernel, truth_kernel
-from vd.kernels.observations import (
-    goal_time_kernel,
-    teacher_observation_kernel,
-    teacher_observation_slices,
-)
+from vd.kernels.observations import teacher_observation_kernel, teacher_observation_slices
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -115,10 +111,6 @@ class Observer:
         if "shape" in self.parts:
             assert self.shapes is not None
             self.shapes.launch()
-        if "goal_time" in self.parts:
-            column = self.parts["goal_time"].start
-            inputs = [env.goal_steps, 1.0 / env.cfg.sim.control_hz, column]
-            self._launch(goal_time_kernel, inputs, [self.world_values])
         self._observe_history()
         self._tell()
         if self.views is not None:

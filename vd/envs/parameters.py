@@ -14,6 +14,13 @@ from vd.kernels.resets import GoalParams, StartParams
 from vd.kernels.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, RewardParams, SuccessParams
 from vd.paper import PAPER
 
+STILLNESS_START = 12.0
+"""Factor on the four stillness thresholds at difficulty 0 (ours): what moving fingers can keep."""
+GOAL_START_RAD = 1.0
+"""Largest goal angle at difficulty 0 [rad] (ours)."""
+LIFT_M = 0.02
+"""Height from which more is worth nothing [m]; as far as a finger can give way without a fall."""
+
 
 class TaskParameters:
     """All parameter structs of the task, each an array of length 1 on the device.
@@ -85,12 +92,11 @@ class TaskParameters:
 
     def set_stage(self, stage: Stage) -> None:
         """Write reward, success and goal parameters for a stage of the curriculum."""
-        cfg, curriculum, difficulty = self.cfg, self.cfg.curriculum, stage.difficulty
-        loose = curriculum.tightening
+        cfg, difficulty = self.cfg, stage.difficulty
+        loose = cfg.curriculum.tightening
         # Thresholds shrink geometrically: each step of difficulty tightens by the same factor.
-        slack = curriculum.stillness_start ** (1.0 - _progress(difficulty, curriculum.stillness_span))
-        energy = curriculum.energy_start + (1.0 - curriculum.energy_start) * difficulty
-        start = min(curriculum.goal_start_rad, cfg.goal.max_angle_rad)
+        slack = STILLNESS_START ** (1.0 - difficulty)
+        start = min(GOAL_START_RAD, cfg.goal.max_angle_rad)
         reward, success = cfg.reward, cfg.success
 
         def threshold(tightest: float, loosest: float) -> float:
@@ -103,16 +109,16 @@ class TaskParameters:
             rotation_epsilon=reward.rotation_epsilon_rad,
             fingertip=reward.fingertip,
             fingertip_form=FINGERTIP_MEAN if reward.fingertip_mean_distance else FINGERTIP_SQUARED_SUM,
-            energy=reward.energy * energy,
+            energy=reward.energy * difficulty,
             energy_clip=reward.energy_clip_w,
             fall=reward.fall,
             table_contact=reward.table_contact,
             table_contact_force=PAPER.reward.table_contact_force_n,
-            fingertip_height=reward.fingertip_height,
+            fingertip_height=PAPER.reward.fingertip_height,
             height_limit=PAPER.reward.fingertip_height_m,
             progress=reward.progress,
             lift=reward.lift,
-            lift_height=reward.lift_m,
+            lift_height=LIFT_M,
             scale=reward.scale,
         )
         self._write(
@@ -127,7 +133,7 @@ class TaskParameters:
         )
         self._write(
             "goal",
-            max_angle=start + (cfg.goal.max_angle_rad - start) * _progress(difficulty, curriculum.goal_span),
+            max_angle=start + (cfg.goal.max_angle_rad - start) * difficulty,
             about_vertical=int(cfg.goal.about_vertical),
         )
 
@@ -138,9 +144,3 @@ class TaskParameters:
         for field, value in values.items():
             staging[field][0] = value
         getattr(self, name).assign(staging)
-
-
-def _progress(difficulty: float, span: tuple[float, float]) -> float:
-    """How far ``difficulty`` has come from the begin to the end of ``span``, in [0, 1]."""
-    begin, end = span
-    return min(1.0, max(0.0, (difficulty - begin) / (end - begin)))

@@ -10,14 +10,13 @@ from vd.kernels.shapes import shape_observation_size
 def observation_parts(cfg: ObservationCfg, fingers: int) -> dict[str, slice]:
     """Columns of the parts of an observation, in order, those included that only the critic reads.
 
-    state, shape, goal_time, history (frame by frame), dynamics, truth; parts that are off are missing.
+    state, shape, history (frame by frame), dynamics, truth; parts that are off are missing.
     """
     joints = teacher_observation_slices(fingers)["joint_position"].stop
     told = cfg.dynamics != "none"
     sizes = {
         "state": teacher_observation_size(fingers),
         "shape": shape_observation_size(fingers) if cfg.shape != "none" else 0,
-        "goal_time": int(cfg.goal_time),
         "history": cfg.history * frame_size(joints),
         "dynamics": dynamics_size(joints) if told else 0,
         "truth": truth_size(joints) if told else 0,

@@ -17,8 +17,7 @@ from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.fingers import Fingers
-from vd.envs.nudges import Nudges
-from vd.envs.objects import object_scales, object_weights
+from vd.envs.objects import object_scales
 from vd.envs.observer import Observer
 from vd.envs.parameters import TaskParameters
 from vd.envs.randomise import Randomiser
@@ -69,7 +68,6 @@ class ReorientEnv:
             cfg=cfg.sim,
             device=self.device,
             scales=object_scales(cfg.randomisation),
-            weights=object_weights([item.name for item in self.objects], cfg.focus),
             visuals=cfg.visuals,
         )
         self.servo_ranges = servo_ranges(self.hand, cfg.randomisation)
@@ -126,7 +124,7 @@ class ReorientEnv:
         self.aimed_quat = zeros(n, dtype=wp.quat) if cfg.aim.enabled else self.goal_quat
         """The same as it is observed, shape [N]."""
         self.step_count = zeros(n, dtype=wp.int32)
-        """Control steps since the world's reset, shape [N]; from 0 again where a caught world goes on."""
+        """Control steps since the world's reset, shape [N]."""
         self.goal_steps = zeros(n, dtype=wp.int32)
         """Control steps since the world's goal was given, shape [N]."""
         self.goals_reached = zeros(n, dtype=wp.int32)
@@ -157,8 +155,8 @@ class ReorientEnv:
         """Writes what is observed."""
         self.num_observations = self.observer.num_observations
         self.observation, self.privileged = self.observer.split(self.observer.all_values)
-        """Teacher observation, fresh after resets and new goals, shape [N, O]: state, shape, goal's time,
-        history, and dynamics if the actor is told; and what the critic alone is told, shape [N, P]."""
+        """Teacher observation, fresh after resets and new goals, shape [N, O]: state, shape, history,
+        and dynamics if the actor is told; and what the critic alone is told, shape [N, P]."""
         self.world_observation, _ = self.observer.split(self.observer.world_values)
         """Observation in the world frame, shape [N, O]."""
         self.views = self.observer.views
@@ -168,8 +166,6 @@ class ReorientEnv:
         self._table_steps = table_array(cfg, self.device)
         self.must_lift = array(must_lift(cfg), wp.int32)
         """1 where success asks that the object does not touch the table, shape [N]."""
-        self.nudges = Nudges(cfg, d, n, self.device) if cfg.nudge.enabled or cfg.explore.enabled else None
-        """What moves hands that are stuck or far from the goal, or None: they act as the policy does."""
         wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
         self.randomiser = Randomiser(self)
 
@@ -274,8 +270,6 @@ class ReorientEnv:
         action = self.action
         if self.views is not None and self.acts_in_view:
             action = self.views.world_action(action)
-        if self.nudges is not None:
-            action = self.nudges.action(action, self.previous_error, self.step_count, self._new_goal)
         wp.launch(
             apply_action_kernel,
             dim=self.num_worlds,
@@ -304,7 +298,7 @@ class ReorientEnv:
             sim.place_tables(self.step_count, self._table_steps)
         sim.step()
         if self.cfg.failures_per_million > 0.0:
-            sim.put_back(self.step_count, self.goal_steps, self.max_episode_steps - 1)
+            sim.put_back(self.step_count, self.max_episode_steps - 1)
         self.fingers.measure()
         if self._lifts and self.observer.shapes is not None:
             self.observer.shapes.measure_clearance()
@@ -342,16 +336,11 @@ class ReorientEnv:
             inputs=[
                 self.success,
                 self.fell,
-                self.rotation_error,
                 self.max_episode_steps,
                 int(self.cfg.success_ends_episode),
-                self.cfg.caught.after_steps(self.cfg.sim.control_hz),
-                self.cfg.caught.beyond_rad,
-                self.cfg.caught.go_on_share,
                 self.step_count,
                 self.goal_steps,
                 self.goals_reached,
-                self.rng,
             ],
             outputs=[self.timed_out, self.done, self._reset, self._new_goal],
             device=self.device,

@@ -10,6 +10,9 @@ from vd.paper import PAPER
 if TYPE_CHECKING:
     from vd.envs.reorient import ReorientEnv
 
+SETTLE_S = 1.5
+"""Time an object has to come to rest after a drop [s]; some slim ones still rock then."""
+
 
 def find_rest_poses(env: "ReorientEnv") -> wp.array:
     """Drop every object a few times and keep where it came to lie, shape [N, K].
@@ -21,7 +24,7 @@ def find_rest_poses(env: "ReorientEnv") -> wp.array:
     inside = np.zeros((env.num_worlds, count), dtype=bool)
     for k in range(count):
         env.reset()
-        for _ in range(round(env.cfg.start.settle_s * env.cfg.sim.control_hz)):
+        for _ in range(round(SETTLE_S * env.cfg.sim.control_hz)):
             wp.copy(env.sim.target, env.sim.joint_q)
             env.sim.step()
         env.check()

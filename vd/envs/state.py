@@ -49,8 +49,8 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
     arrays = {"goal_steps": state["arrays"]["step_count"]} | state["arrays"]
     if arrays.keys() != here.keys():
         raise ValueError(
-            "the saved environment has other servos, views, memory, latency, contacts or nudges; resume with "
-            "hand_layer, observation, nudge, explore, randomisation.effects, randomisation.restitution and "
+            "the saved environment has other servos, views, memory, latency or contacts; resume with "
+            "hand_layer, observation, randomisation.effects, randomisation.restitution and "
             "randomisation.observation_latency_s of the checkpoint, or from one without worlds "
             "(vd-train export --resumable)"
         )
@@ -64,14 +64,12 @@ def load_state(env: "ReorientEnv", state: dict[str, Any]) -> None:
             )
     if state.get("objects", _objects(env)) != _objects(env):
         raise ValueError(
-            "the worlds of the saved environment hold other objects; resume with objects and focus of the "
-            "checkpoint, or from one without worlds (vd-train export --resumable)"
+            "the worlds of the saved environment hold other objects; resume with objects of the checkpoint, "
+            "or from one without worlds (vd-train export --resumable)"
         )
     for name, array in here.items():
         array.assign(arrays[name])
     env.steps = int(state["steps"])
-    if env.nudges is not None:
-        env.nudges.forget()
     env.set_stage(saved_stage(state, env.cfg.curriculum))
     env.randomiser.push()
     env.sim.forward_kinematics()
@@ -126,7 +124,6 @@ def _arrays(env: "ReorientEnv") -> dict[str, wp.array]:
         "observation": env.observer.all_values,
         "rng": env.rng,
         **env.observer.stateful(),
-        **({} if env.nudges is None else env.nudges.stateful()),
         **env.randomiser.stateful(),
         **({} if sim.restitution is None else sim.restitution.stateful()),
     }

@@ -303,7 +303,6 @@ def _observation_map(env: "ReorientEnv", tips: np.ndarray, turn: np.ndarray) -> 
             slices[name] = slice(first + columns.start, first + columns.stop)
     frames = np.eye(env.cfg.observation.history)
     blocks |= {
-        "goal_time": np.eye(1),
         "history": np.kron(frames, block_diag(joints, joints, turn, axial)),
         "dynamics": block_diag(np.kron(np.eye(JOINT_CHANNELS), np.abs(joints)), np.eye(SCALARS)),
         "truth": block_diag(joints, turn, axial),

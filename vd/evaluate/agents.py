@@ -9,10 +9,7 @@ from vd.aim import AimCfg
 from vd.bundle import is_bundle
 from vd.config import from_dict
 from vd.envs.cfg import (
-    CaughtCfg,
     CurriculumCfg,
-    ExploreCfg,
-    NudgeCfg,
     ObservationCfg,
     RandomisationCfg,
     ReorientCfg,
@@ -284,8 +281,6 @@ def task_for(
     success_ends_episode: bool,
     at_rest: bool | None = None,
     hand_layer: str | None = None,
-    nudge: bool = False,
-    explore: bool = False,
     aim: bool = False,
     second_view: bool = False,
     condition: RandomisationCfg | None = None,
@@ -310,8 +305,6 @@ def task_for(
         at_rest: Start at rest on the table rather than from a drop; None: as trained.
         hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is, None: as
             trained.
-        nudge: Whether hands that are stuck are nudged.
-        explore: Whether actions have noise while the goal is far.
         aim: Whether it is told to turn past a goal that is near.
         second_view: Whether a teacher looks twice at goals (:mod:`vd.evaluate.second_view`); a student needs
             nothing of the task for that.
@@ -346,9 +339,6 @@ def task_for(
         else replace(base.goal, max_angle_rad=max_goal_angle_rad),
         curriculum=CurriculumCfg(),
         table=TableCfg(),
-        caught=CaughtCfg(),  # time is up for those that are caught, too
-        nudge=NudgeCfg(enabled=nudge),
-        explore=ExploreCfg(enabled=explore),
         aim=AimCfg(enabled=aim),
         randomisation=condition or replace(base.randomisation, enabled=randomised),
     )

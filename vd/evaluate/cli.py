@@ -45,8 +45,6 @@ OF_THE_SUITE = (
     "stop_tolerance",
     "episode_s",
     "in_air",
-    "nudge",
-    "explore",
     "aim",
     "table_friction",
     "condition",
@@ -114,10 +112,6 @@ class EvalCfg:
     """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
     table_friction: float | None = None
     """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
-    nudge: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
-    explore: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
     """Ours: aim past the goal while the object is near it; more come within 0.1 rad."""
     second_view: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -352,8 +346,6 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        nudge=cfg.nudge,
-        explore=cfg.explore,
         aim=cfg.aim,
         second_view=cfg.second_view,
         condition=cfg.randomisation,
@@ -399,8 +391,6 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
         randomised=cfg.randomised,
         at_rest=task.start.at_rest,
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
-        nudge=cfg.nudge,
-        explore=cfg.explore,
         aim=cfg.aim,
         second_view=cfg.second_view,
         condition=cfg.condition,

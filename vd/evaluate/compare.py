@@ -113,8 +113,6 @@ def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
             table_friction=cfg.table_friction,
             goals=cfg.goals,
             sensor_errors=cfg.sensor_errors and sees == "rendered clouds",
-            nudge=cfg.nudge,
-            explore=cfg.explore,
             aim=cfg.aim,
             second_view=cfg.second_view and name not in BUILT_IN,
         )
@@ -157,8 +155,6 @@ def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        nudge=cfg.nudge,
-        explore=cfg.explore,
         aim=cfg.aim,
         second_view=cfg.second_view,
     )

@@ -145,8 +145,6 @@ def ours(row: Row) -> str:
     for name, text in (
         ("second_view", "symmetry-view selection"),
         ("aim", "aims past near goals"),
-        ("nudge", "nudges"),
-        ("explore", "noise far from the goal"),
     ):
         found += [text] if getattr(protocol, name) else []
     return ", ".join(found)
@@ -310,10 +308,6 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
     ]
     if protocol.table_friction is not None:
         rows.append(("friction of the table", f"{protocol.table_friction:g}"))
-    if protocol.nudge:
-        rows.append(("hands whose object stands still far from the goal", "are nudged"))
-    if protocol.explore:
-        rows.append(("actions far from the goal", "have noise"))
     known = {"mesh": "the exact mesh", "points": "500 exact points", "scan": "500 points of a scan"}
     if comparison.predictions:
         rows.append(("students know shapes and goals by", known[protocol.goals]))

@@ -123,8 +123,6 @@ def task_line(result: EvalResult) -> str:
     return (
         f"starts {starts_text(protocol)}; goals {goals_text(protocol)}; stop within "
         f"{protocol.stop_tolerance_rad:g} rad and still; randomisation {randomisation}"
-        + ("; stuck hands are nudged" if protocol.nudge else "")
-        + ("; actions have noise far from the goal" if protocol.explore else "")
         + ("; aimed past goals that are near" if protocol.aim else "")
         + ("; goals not reached are looked at in other views" if protocol.second_view else "")
     )

@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -72,6 +72,7 @@ class Episode:
 class Protocol:
     """How the episodes were run."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"nudge": False, "explore": False}
     policy: str
     """Checkpoint path, or the name of a built-in agent."""
     objects: str
@@ -107,10 +108,6 @@ class Protocol:
     """What students know shapes and goals by."""
     sensor_errors: bool = False
     """Cameras of students have the errors of a real one."""
-    nudge: bool = False
-    """Hands whose object stands still far from the goal are nudged."""
-    explore: bool = False
-    """Actions have noise while the goal is far."""
     aim: bool = False
     """The policy is told to turn past a goal that is near."""
     second_view: bool = False

@@ -121,6 +121,4 @@ class StudentActor:
                 self._hidden[rows] = output.hidden
                 self.predicted[rows] = output.distance[:, -1]
                 mean[rows] = output.mean
-        if self.env.nudges is not None:
-            self.env.nudges.predict(self.predicted)
         return mean

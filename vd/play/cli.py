@@ -67,10 +67,6 @@ class PlayCfg:
     """Start at rest on the table; the default is as trained, and a drop for --agent zero and random."""
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
-    nudge: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Where the object stands still far from the goal, move the hand at random for a quarter of a second."""
-    explore: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Add noise to the actions while the object is farther than 0.4 rad from its goal."""
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
     """Aim past the goal while the object is near it: more come within 0.1 rad. Some students do so anyway."""
     second_view: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -280,8 +276,6 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         success_ends_episode=False,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        nudge=cfg.nudge,
-        explore=cfg.explore,
         aim=cfg.aim,
         second_view=cfg.second_view,
     )

@@ -71,26 +71,12 @@ def hand_mount() -> wp.transform:
     return wp.transform(wp.vec3(0.0, 0.0, PAPER.scene.hand_height_m), wp.quat(0.0, 1.0, 0.0, 0.0))
 
 
-def assign_objects(
-    num_worlds: int, num_objects: int, weights: Sequence[float] | np.ndarray | None = None
-) -> np.ndarray:
-    """Spread objects over worlds in contiguous blocks, shape [num_worlds], non-decreasing.
+def assign_objects(num_worlds: int, num_objects: int) -> np.ndarray:
+    """Spread objects evenly over worlds in contiguous blocks, shape [num_worlds], non-decreasing.
 
     Blocks because Newton copies a run of equal worlds in one pass.
-
-    Args:
-        num_worlds: At least ``num_objects`` with ``weights``.
-        num_objects: K.
-        weights: Positive, shape [K]: each object gets one world, and the rest in proportion to these, by
-            largest remainders; evenly if None.
     """
-    if weights is None:
-        return (np.arange(num_worlds) * num_objects) // num_worlds
-    quota = (num_worlds - num_objects) * np.asarray(weights, dtype=float) / np.sum(weights)
-    counts = 1 + np.floor(quota).astype(int)
-    order = np.argsort(-(quota % 1.0), kind="stable")  # of equal remainders the first object's is first
-    counts[order[: num_worlds - counts.sum()]] += 1
-    return np.repeat(np.arange(num_objects), counts)
+    return (np.arange(num_worlds) * num_objects) // num_worlds
 
 
 def new_builder() -> newton.ModelBuilder:
@@ -249,7 +235,6 @@ def build_scene(
     cfg: SimCfg,
     device: str,
     scales: Sequence[float] = (1.0,),
-    weights: Sequence[float] | np.ndarray | None = None,
     visuals: bool = False,
 ) -> Scene:
     """Build and finalize ``num_worlds`` worlds.
@@ -261,7 +246,6 @@ def build_scene(
         cfg: Physics settings.
         device: Warp device.
         scales: Size factors, spread evenly over the worlds of each object.
-        weights: How many worlds each object gets beside others (:func:`assign_objects`); evenly if None.
         visuals: Include visual shapes.
 
     Raises:
@@ -276,7 +260,7 @@ def build_scene(
             "raise num_worlds or name fewer objects"
         )
     hand_builder = build_hand(hand, cfg, visuals=visuals)
-    world_object = assign_objects(num_worlds, len(objects), weights)
+    world_object = assign_objects(num_worlds, len(objects))
     world_scale = np.ones(num_worlds)
     scene = new_builder()
     for index, item in enumerate(objects):

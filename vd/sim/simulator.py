@@ -209,13 +209,13 @@ class Simulator:
             device=self.device,
         )
 
-    def put_back(self, step_count: wp.array, goal_steps: wp.array, last_step: int) -> None:
+    def put_back(self, step_count: wp.array, last_step: int) -> None:
         """Put worlds of which this step failed back to its begin, as :func:`put_back_kernel` says."""
         wp.launch(
             put_back_kernel,
             dim=self.num_worlds,
             inputs=[self.failed, self._start_q, last_step],
-            outputs=[self.joint_q, self.joint_qd, step_count, goal_steps],
+            outputs=[self.joint_q, self.joint_qd, step_count],
             device=self.device,
         )
 
