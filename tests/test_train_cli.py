@@ -5,6 +5,7 @@ import dataclasses
 import inspect
 import itertools
 import json
+import re
 import textwrap
 import types
 import typing
@@ -17,7 +18,7 @@ from vd.envs.cfg import CurriculumCfg, ObservationCfg, SuccessCfg
 from vd.paper import PAPER
 from vd.train.cli import main
 from vd.train.config import minibatches, validate
-from vd.train.flags import parse_teacher, resolve_device
+from vd.train.flags import OF_HELP_ALL, parse_teacher, resolve_device
 from vd.train.presets import PRESETS, PresetName, TeacherCfg, smoke
 from vd.train.student.config import StudentTrainCfg
 
@@ -140,14 +141,23 @@ def _flags(cls: type, prefix: str = "--") -> list[str]:
     return flags
 
 
-def test_help_lists_every_nested_field(capsys):
+def _listed(capsys, flag: str) -> set[str]:
+    """Flags that a help lists."""
     with pytest.raises(SystemExit) as end:
-        main(["teacher", "--help"])
+        main(["teacher", flag])
     assert end.value.code == 0
-    text = capsys.readouterr().out
-    flags = _flags(TeacherCfg)
-    assert len(flags) > 80 and "--env.reward.success" in flags and "--max-minutes" in flags
-    assert [flag for flag in flags if flag not in text] == []
+    return set(re.findall(r"^[^\w\n]*?(--(?!no-)\S+?)[, ]", capsys.readouterr().out, flags=re.MULTILINE))
+
+
+def test_help_lists_at_most_80_flags_and_help_all_the_others_too(capsys):
+    short, everything = (_listed(capsys, flag) for flag in ("--help", "--help-all"))
+    assert everything == set(_flags(TeacherCfg)) >= {"--env.reward.success", "--max-minutes"}
+    assert len(short) <= 80
+    hidden = {"--" + name.replace("_", "-") for name in OF_HELP_ALL}
+    left_out = everything - short
+    assert all(any(flag == name or flag.startswith(f"{name}.") for name in hidden) for flag in left_out)
+    assert all(any(flag == name or flag.startswith(f"{name}.") for flag in left_out) for name in hidden)
+    assert parse_teacher(["--preset", "gpu", "--env.sim.njmax", "200"]).env.sim.njmax == 200
 
 
 def _undescribed(cls: type, prefix: str = "") -> list[str]:

@@ -1,15 +1,16 @@
 """Flags of the teacher's training, and what they start from."""
 
+import dataclasses
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, get_type_hints
 
 import tyro
 
-from vd.config import from_dict
+from vd.config import from_dict, to_dict
 from vd.evaluate.agents import check_names
 from vd.train.begin import settings_of
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
@@ -25,7 +26,19 @@ TEACHER_HELP = """Train the teacher: PPO on the simulator's state.
 
 Flags start from --preset, or with --resume from the run's config.json. Without either the machine decides:
 gpu, under torchrun multi-gpu, and cpu-demo where there is no GPU. Short forms: --hand, --hand-layer,
---objects, --num-worlds and --seed stand for --env.hand and so on. Ctrl-C saves."""
+--objects, --num-worlds and --seed stand for --env.hand and so on. Ctrl-C saves. --help-all lists the flags of
+physics, reward, success and of the ranges of Table S3 too."""
+
+_RARE = {
+    "env": "sim action aim reward success visuals table_friction",
+    "env.curriculum.tightening": "joint_speed_rad_s object_speed_m_s object_spin_rad_s action_norm",
+    "env.randomisation": "stiffness_scale damping_scale link_mass_scale friction table_friction restitution "
+    "object_scale object_scale_count object_mass_kg action_noise_std action_offset_std "
+    "observation_noise_mean observation_noise_std observation_offset_std force_probability force_n_per_kg "
+    "force_decay",
+}
+OF_HELP_ALL = frozenset(f"{group}.{name}" for group, names in _RARE.items() for name in names.split())
+"""Settings that few runs change: ``--help`` leaves them out, ``--help-all`` does not, and all are flags."""
 
 SHORT_FORMS = ("hand", "hand-layer", "objects", "num-worlds", "seed")
 """Fields of the environment that are common enough to be flags without the ``--env.`` prefix."""
@@ -141,9 +154,28 @@ def value_of(arguments: list[str], flag: str) -> str | None:
 
 def _parsed(arguments: list[str], default: TeacherCfg) -> TeacherCfg:
     """Every flag, with the values of ``default`` for those that are not given."""
-    return tyro.cli(
-        TeacherCfg, args=arguments, default=default, prog="vd-train teacher", description=TEACHER_HELP
-    )
+    kind = TeacherCfg
+    if "--help-all" in arguments:
+        arguments = ["--help"]
+    elif {"-h", "--help"} & set(arguments):
+        kind = _without(TeacherCfg, OF_HELP_ALL)
+        default = from_dict(kind, to_dict(default))
+    return tyro.cli(kind, args=arguments, default=default, prog="vd-train teacher", description=TEACHER_HELP)
+
+
+def _without(kind: type, hidden: Collection[str], where: str = "") -> type:
+    """The dataclass ``kind``, of which help does not show the fields ``hidden``, named by dotted path."""
+    shown = {}
+    hints, annotations = get_type_hints(kind), get_type_hints(kind, include_extras=True)
+    for field in dataclasses.fields(kind):
+        path, hint = where + field.name, hints[field.name]
+        if path in hidden:
+            shown[field.name] = tyro.conf.Suppress[hint]
+        elif any(name.startswith(f"{path}.") for name in hidden):
+            shown[field.name] = _without(hint, hidden, f"{path}.")
+        else:
+            shown[field.name] = annotations[field.name]
+    return type(kind.__name__, (kind,), {"__annotations__": shown, "__doc__": kind.__doc__})
 
 
 def _has_config(arguments: list[str]) -> bool:
