@@ -227,7 +227,7 @@ def test_a_policy_of_views_gives_labels_in_the_order_of_the_world():
             return torch.arange(9.0).repeat(WORLDS, 1)
 
     env = ReorientEnv(CFG, "cpu")
-    label = WorldOrder(Constant(), env).act(None)
+    label = WorldOrder(Constant(), env.views).act(None)
     env.acts_in_view = False
     env.action.assign(label.numpy())
     env.step(env.action)
@@ -237,7 +237,7 @@ def test_a_policy_of_views_gives_labels_in_the_order_of_the_world():
     assert np.array_equal(again.sim.joint_q.numpy(), by_label)
     assert len({tuple(row) for row in label.tolist()}) > 1
     plain = ReorientEnv(dataclasses.replace(CFG, observation=ObservationCfg()), "cpu")
-    assert torch.equal(WorldOrder(Constant(), plain).act(None), Constant().act(None))
+    assert torch.equal(WorldOrder(Constant(), plain.views).act(None), Constant().act(None))
 
 
 def test_with_mirrors_every_wanted_rotation_is_counter_clockwise_from_above():

@@ -69,7 +69,7 @@ def teacher(env):
 def head(env, teacher):
     views = env.cfg.observation.views(env.num_fingers)
     made = StateHead(state_cfg(teacher.spec, views=views), WIDTH, env.num_actions)
-    made.adopt(teacher.network, view_tables(env, env.cfg.observation.view))
+    made.adopt(teacher.network, view_tables(env.state, env.cfg.observation.view))
     return made
 
 
@@ -90,7 +90,7 @@ def at_step(env: ReorientEnv, step: int) -> None:
 
 def wanted(env: ReorientEnv, head: StateHead, teacher: TrainedPolicy, estimate: torch.Tensor) -> list[int]:
     """Views of which the critic expects most, from the simulator's own tables and one world at a time."""
-    tables = view_tables(env, with_second_view(env.cfg.observation).view)
+    tables = view_tables(env.state, with_second_view(env.cfg.observation).view)
     fingers, chosen = env.num_fingers, []
     for world in (head.offset + head.scale * estimate).double().numpy():
         turn = world[teacher_observation_slices(fingers)["relative_orientation"]]

@@ -44,7 +44,7 @@ def views_of(env: ReorientEnv) -> int:
 
 
 def tables_of(env: ReorientEnv) -> ViewTables:
-    return view_tables(env, env.cfg.observation.view)
+    return view_tables(env.state, env.cfg.observation.view)
 
 
 def teacher_of(env: ReorientEnv) -> TrainedPolicy:

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 
 import tyro
 
@@ -154,7 +154,7 @@ def value_of(arguments: list[str], flag: str) -> str | None:
 
 def _parsed(arguments: list[str], default: TeacherCfg) -> TeacherCfg:
     """Every flag, with the values of ``default`` for those that are not given."""
-    kind = TeacherCfg
+    kind: Any = TeacherCfg
     if "--help-all" in arguments:
         arguments = ["--help"]
     elif {"-h", "--help"} & set(arguments):
@@ -165,12 +165,13 @@ def _parsed(arguments: list[str], default: TeacherCfg) -> TeacherCfg:
 
 def _without(kind: type, hidden: Collection[str], where: str = "") -> type:
     """The dataclass ``kind``, of which help does not show the fields ``hidden``, named by dotted path."""
-    shown = {}
+    shown: dict[str, Any] = {}
+    suppressed: Any = tyro.conf.Suppress
     hints, annotations = get_type_hints(kind), get_type_hints(kind, include_extras=True)
     for field in dataclasses.fields(kind):
         path, hint = where + field.name, hints[field.name]
         if path in hidden:
-            shown[field.name] = tyro.conf.Suppress[hint]
+            shown[field.name] = suppressed[hint]
         elif any(name.startswith(f"{path}.") for name in hidden):
             shown[field.name] = _without(hint, hidden, f"{path}.")
         else:

@@ -248,19 +248,17 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
 
 
 def _pretrainer(cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", world_size: int) -> Any:
-    import numpy as np
-
     from vd.assets_usd.hands import load_hand
     from vd.assets_usd.objects.model import load_set
+    from vd.envs.objects import object_scales
     from vd.train.student.pretrain import Pretrainer, RandomScenes
 
-    objects, random = load_set(list(task.objects)), task.randomisation
-    scales = np.linspace(*random.object_scale, random.object_scale_count) if random.enabled else [1.0]
+    objects = load_set(list(task.objects))
     scenes = RandomScenes(
         load_hand(task.hand, task.fingertip, task.hand_layer),
         objects,
         cfg.network,
-        scales=[float(scale) for scale in scales],
+        scales=object_scales(task.randomisation),
         near_share=cfg.pretrain.near_share,
         noise=cfg.noise,
         rendered_share=cfg.pretrain.rendered_share,
@@ -314,11 +312,11 @@ def _dagger(
         batch=cfg.dagger.minibatch_worlds * cfg.dagger.rollout_steps,
         seed=task.seed,
     )
-    labels: Any = WorldOrder(teacher, simulation)
+    labels: Any = WorldOrder(teacher, simulation.views)
     state = student.state
     if state is not None:
         seen_in = trained_task(teacher).observation.view
-        tables = view_tables(simulation, seen_in) if state.views is not None else None
+        tables = view_tables(simulation.state, seen_in) if state.views is not None else None
         if fresh and state.adopt(teacher.network, tables):
             # What is added to the actions of another teacher's layers is of no use to these.
             student.forget_correction()

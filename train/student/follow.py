@@ -103,7 +103,7 @@ def with_views(student: Student, task: ReorientCfg) -> Student:
     head = network.state
     if views:
         assert head is not None and head.views is not None
-        head.views.adopt(view_tables(env, one.observation.view))
+        head.views.adopt(view_tables(env.state, one.observation.view))
     return network.eval().requires_grad_(False)
 
 

@@ -328,7 +328,7 @@ class RandomisationCfg:
             )
         if self.force_s <= 0.0:
             raise ValueError(f"randomisation.force_s is {self.force_s:g}; it has to be positive")
-        from vd.envs.servo import check_effects  # needs Warp, which settings alone do not
+        from vd.envs.effects import check_effects  # needs Warp, which settings alone do not
 
         check_effects(self.effects)
 

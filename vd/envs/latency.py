@@ -1,21 +1,19 @@
 """The state as a policy sees it: of the present, or as old as the latency that its episode has drawn."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import warp as wp
 
+from vd.envs.task_state import TaskState
 from vd.kernels.latency import begin_latency_kernel, recall_state_kernel, record_state_kernel, ring_columns
-
-if TYPE_CHECKING:
-    from vd.envs.reorient import ReorientEnv
 
 
 class SeenState:
     """What observations are made of; without latency these are the simulator's own arrays.
 
     Args:
-        env: The environment, whose simulator and fingers exist.
+        state: The task.
 
     Attributes:
         latency: How late each world is seen in its episode [s], shape [N].
@@ -23,19 +21,19 @@ class SeenState:
             and object, poses and velocities of the links (of fingertips alone where they are late).
     """
 
-    def __init__(self, env: "ReorientEnv"):
-        self._env = env
-        sim, n, device = env.sim, env.num_worlds, env.device
-        random = env.cfg.randomisation
+    def __init__(self, state: TaskState):
+        self._state = state
+        sim, n, device = state.sim, state.num_worlds, state.device
+        random = state.cfg.randomisation
         self.is_late = random.enabled and random.observation_latency_s[1] > 0.0
         self.latency = wp.zeros(n, dtype=float, device=device)
-        present = [env.measured_q, env.measured_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
+        present = [state.measured_q, state.measured_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
         self.arrays: list[Any] = present
         if not self.is_late:
             return
         self.arrays = [wp.zeros_like(array) for array in present]
-        d, f = env.num_actions, env.num_fingers
-        self._slots = math.ceil(random.observation_latency_s[1] / env.cfg.sim.physics_dt) + 1
+        d, f = state.num_actions, state.num_fingers
+        self._slots = math.ceil(random.observation_latency_s[1] / state.cfg.sim.physics_dt) + 1
         columns = ring_columns(d, sim.joint_q.shape[1], sim.joint_qd.shape[1], f)
         self._ring = wp.zeros((n * self._slots, columns), dtype=float, device=device)
         self._head = wp.zeros(n, dtype=wp.int32, device=device)
@@ -46,7 +44,7 @@ class SeenState:
         measured = self._measured(joint_q, joint_qd)
         self._launch(
             record_state_kernel,
-            [self._slots, self._env.fingers.tip_body, *measured, joint_q, joint_qd, body_q, body_qd],
+            [self._slots, self._state.fingers.tip_body, *measured, joint_q, joint_qd, body_q, body_qd],
             [self._head, self._ring],
         )
 
@@ -54,23 +52,23 @@ class SeenState:
         """Draw the latency of the worlds of ``mask`` [N], whose past is their present state."""
         if not self.is_late:
             return
-        env, sim = self._env, self._env.sim
+        state, sim = self._state, self._state.sim
         measured = self._measured(sim.joint_q, sim.joint_qd)
-        state = [*measured, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
+        now = [*measured, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
         wp.launch(
             begin_latency_kernel,
-            dim=env.num_worlds,
+            dim=state.num_worlds,
             inputs=[
-                wp.vec2(*env.cfg.randomisation.observation_latency_s),
-                env.num_actions,
+                wp.vec2(*state.cfg.randomisation.observation_latency_s),
+                state.num_actions,
                 self._slots,
-                env.fingers.tip_body,
+                state.fingers.tip_body,
                 mask,
-                *state,
-                env.rng,
+                *now,
+                state.rng,
             ],
             outputs=[self.latency, self._ring],
-            device=env.device,
+            device=state.device,
         )
 
     def recall(self) -> None:
@@ -80,8 +78,8 @@ class SeenState:
                 recall_state_kernel,
                 [
                     self._slots,
-                    self._env.cfg.sim.physics_dt,
-                    self._env.fingers.tip_body,
+                    self._state.cfg.sim.physics_dt,
+                    self._state.fingers.tip_body,
                     self.latency,
                     self._head,
                     self._ring,
@@ -96,18 +94,18 @@ class SeenState:
         return {"latency": self.latency, "latency_ring": self._ring, "latency_head": self._head}
 
     def _measured(self, joint_q: wp.array, joint_qd: wp.array) -> tuple[wp.array, wp.array]:
-        servo = self._env.sim.servo
+        servo = self._state.sim.servo
         if servo is None:
             return joint_q, joint_qd
         servo.measure()  # once a control step otherwise
         return servo.measured_q, servo.measured_qd
 
     def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        env = self._env
+        state = self._state
         wp.launch(
             kernel,
-            dim=env.num_worlds,
-            inputs=[env.num_actions, *inputs],
+            dim=state.num_worlds,
+            inputs=[state.num_actions, *inputs],
             outputs=outputs,
-            device=env.device,
+            device=state.device,
         )

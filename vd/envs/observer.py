@@ -1,21 +1,20 @@
 """What the policy observes: state, shape, memory, and what a critic or a teacher is told."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import warp as wp
 
 from vd.envs.latency import SeenState
 from vd.envs.parts import actor_size, observation_parts
+from vd.envs.randomise import Randomiser
 from vd.envs.shapes import ShapeObserver
 from vd.envs.symmetry import Views
+from vd.envs.task_state import TaskState
 from vd.kernels.aim import aim_kernel
 from vd.kernels.dynamics import dynamics_kernel
 from vd.kernels.history import forget_kernel, history_kernel, remember_kernel, truth_kernel
 from vd.kernels.observations import teacher_observation_kernel, teacher_observation_slices
 from vd.paper import PAPER
-
-if TYPE_CHECKING:
-    from vd.envs.reorient import ReorientEnv
 
 
 class Observer:
@@ -31,33 +30,34 @@ class Observer:
         shapes: Observes and measures shapes, or None.
     """
 
-    def __init__(self, env: "ReorientEnv", *, shapes: bool):
-        """Allocate for ``env``; ``shapes`` also where they are not observed."""
-        self._env = env
-        cfg, n, device = env.cfg.observation, env.num_worlds, env.device
-        self.parts = observation_parts(cfg, env.num_fingers)
+    def __init__(self, state: TaskState, drawn: Randomiser, *, shapes: bool):
+        """Allocate for what ``drawn`` has drawn; ``shapes`` also where they are not observed."""
+        self._state, self._drawn = state, drawn
+        cfg, n, device = state.cfg.observation, state.num_worlds, state.device
+        self.parts = observation_parts(cfg, state.num_fingers)
         self.num_observations = actor_size(cfg, self.parts)
-        self.seen = SeenState(env)
+        self.seen = SeenState(state)
         width = max(columns.stop for columns in self.parts.values())
 
         def zeros(*shape: int, dtype: Any = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
 
         self.all_values = self.world_values = zeros(n, width)
-        self.views = Views(env, self.all_values) if cfg.view != "world" else None
+        self.views = Views(state, self.all_values) if cfg.view != "world" else None
         if self.views is not None:
             self.world_values = self.views.observation
-        self.shapes = ShapeObserver(env, self) if shapes else None
-        slices = teacher_observation_slices(env.num_fingers)
+        self.shapes = ShapeObserver(state, self.seen, self.world_values) if shapes else None
+        slices = teacher_observation_slices(state.num_fingers)
         self._pose_columns = [slices["object_position"].start, slices["relative_orientation"].start]
         self._action_column = slices["previous_action"].start
         self._frames = frames = cfg.history
         self._head, self._count = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
-        self._past = zeros(n * frames, 2 * env.num_actions + 7)
-        hand, materials = env.hand, PAPER.materials
+        self._past = zeros(n * frames, 2 * state.num_actions + 7)
+        self._body_com = wp.clone(state.sim.model.body_com[: state.scene.bodies_per_world])
+        hand, materials = state.hand, PAPER.materials
         self._gains = [wp.array(gain, dtype=float, device=device) for gain in (hand.kp, hand.kd)]
         self._nominal = wp.vec4(
-            materials.friction, materials.friction, env.cfg.table_friction, materials.object_mass_kg
+            materials.friction, materials.friction, state.cfg.table_friction, materials.object_mass_kg
         )
         self._no_servo = zeros(0, 0)
 
@@ -79,32 +79,38 @@ class Observer:
         if self._frames:
             self._launch(
                 remember_kernel,
-                [*self._remembered, self._frames, self.world_values, self._env.aimed_quat],
+                [*self._remembered, self._frames, self.world_values, self._state.aimed_quat],
                 [self._head, self._count, self._past],
             )
 
     def observe(self) -> None:
         """Write the observation of the present state. Device work only."""
-        env = self._env
+        state = self._state
         self.seen.recall()
-        if env.cfg.aim.enabled:
-            aim = env.cfg.aim
-            inputs = [aim.past_rad, aim.within_rad, env.num_actions + 3, self.seen.arrays[2], env.goal_quat]
-            self._launch(aim_kernel, inputs, [env.aimed_quat])
+        if state.cfg.aim.enabled:
+            aim = state.cfg.aim
+            inputs = [
+                aim.past_rad,
+                aim.within_rad,
+                state.num_actions + 3,
+                self.seen.arrays[2],
+                state.goal_quat,
+            ]
+            self._launch(aim_kernel, inputs, [state.aimed_quat])
         self._launch(
             teacher_observation_kernel,
             [
-                env.lower,
-                env.upper,
-                env.fingers.tip_body,
-                env.fingers.tip_offset,
-                env.body_com,
-                env.parameters.observation,
+                state.lower,
+                state.upper,
+                state.fingers.tip_body,
+                state.fingers.tip_offset,
+                self._body_com,
+                state.parameters.observation,
                 *self.seen.arrays,
-                env.aimed_quat,
-                env.smoothed,
-                env.randomiser.observation_offset,
-                env.rng,
+                state.aimed_quat,
+                state.smoothed,
+                self._drawn.observation_offset,
+                state.rng,
             ],
             [self.world_values],
         )
@@ -118,32 +124,32 @@ class Observer:
 
     @property
     def _remembered(self) -> list[int]:
-        return [self._env.num_actions, *self._pose_columns, self._action_column]
+        return [self._state.num_actions, *self._pose_columns, self._action_column]
 
     def _observe_history(self) -> None:
         if self._frames:
             wp.launch(
                 history_kernel,
-                dim=(self._env.num_worlds, self._frames),
+                dim=(self._state.num_worlds, self._frames),
                 inputs=[
                     *self._remembered,
                     self._frames,
                     self.parts["history"].start,
-                    self._env.aimed_quat,
+                    self._state.aimed_quat,
                     self._head,
                     self._count,
                     self._past,
                 ],
                 outputs=[self.world_values],
-                device=self._env.device,
+                device=self._state.device,
             )
 
     def _tell(self) -> None:
         """Write what was drawn, and how the true state differs from what is seen."""
         if "dynamics" not in self.parts:
             return
-        env, drawn = self._env, self._env.randomiser
-        servo = self._no_servo if env.sim.servo is None else env.sim.servo.parameters
+        state, drawn = self._state, self._drawn
+        servo = self._no_servo if state.sim.servo is None else state.sim.servo.parameters
         frictions = [drawn.hand_friction, drawn.object_friction, drawn.table_friction]
         self._launch(
             dynamics_kernel,
@@ -161,7 +167,7 @@ class Observer:
             [self.world_values],
         )
         columns = [*self._pose_columns, self.parts["truth"].start]
-        inputs = [env.lower, env.upper, *columns, env.sim.joint_q, env.aimed_quat]
+        inputs = [state.lower, state.upper, *columns, state.sim.joint_q, state.aimed_quat]
         self._launch(truth_kernel, inputs, [self.world_values])
 
     def stateful(self) -> dict[str, wp.array]:
@@ -172,4 +178,6 @@ class Observer:
         return view | self.seen.stateful() | (past if self._frames else {})
 
     def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, dim=self._env.num_worlds, inputs=inputs, outputs=outputs, device=self._env.device)
+        wp.launch(
+            kernel, dim=self._state.num_worlds, inputs=inputs, outputs=outputs, device=self._state.device
+        )

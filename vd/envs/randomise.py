@@ -1,12 +1,13 @@
 """Domain randomisation (Table S3): draws on the device, written into the simulator's model."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
 
 from vd.envs.servo import gain_scales
+from vd.envs.task_state import TaskState
 from vd.kernels.actuators import INERTIA, PAYLOAD_INERTIA
 from vd.kernels.observations import teacher_observation_size
 from vd.kernels.randomisation import (
@@ -25,9 +26,6 @@ from vd.kernels.worlds import (
 from vd.paper import PAPER
 from vd.sim.scene import SHAPE_HAND, SHAPE_OBJECT, SHAPE_TABLE
 
-if TYPE_CHECKING:
-    from vd.envs.reorient import ReorientEnv
-
 # Drawn gains and frictions reach the solver once a second: a world in this many has new ones then.
 PUSH_INTERVAL_S = 1.0
 
@@ -38,13 +36,13 @@ class Randomiser:
     With randomisation off the same arrays hold the nominal values.
     """
 
-    def __init__(self, env: "ReorientEnv"):
-        """Allocate for ``env`` and draw the masses."""
-        self._env = env
-        cfg = env.cfg
+    def __init__(self, state: TaskState):
+        """Allocate, and draw the masses."""
+        self._state = state
+        cfg = state.cfg
         self.enabled = cfg.randomisation.enabled
-        n, d = env.num_worlds, env.num_actions
-        device = env.device
+        n, d = state.num_worlds, state.num_actions
+        device = state.device
 
         def zeros(*shape: int, dtype: Any = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -56,26 +54,26 @@ class Randomiser:
         """Object mass [kg], shape [N]."""
         self.action_offset = zeros(n, d)
         # Not of the shape's values, which no sensor measures.
-        self.observation_offset = zeros(n, teacher_observation_size(env.num_fingers))
+        self.observation_offset = zeros(n, teacher_observation_size(state.num_fingers))
         self.force = zeros(n, dtype=wp.vec3)
         """Disturbance force on the object [N], world frame, shape [N]."""
         self._no_force = zeros(n, dtype=wp.vec3)
         if self.enabled:
-            env.sim.force_steps = cfg.randomisation.force_steps(cfg.sim)
-        self._gravity = wp.vec3(*env.sim.model.gravity.numpy()[0].tolist())
+            state.sim.force_steps = cfg.randomisation.force_steps(cfg.sim)
+        self._gravity = wp.vec3(*state.sim.model.gravity.numpy()[0].tolist())
         self._age, self._due = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
         self._interval = round(cfg.randomisation.redraw_s * cfg.sim.control_hz)
         self._push_interval = round(PUSH_INTERVAL_S * cfg.sim.control_hz)
         self._push_graph: Any = None
 
-        model, scene = env.sim.model, env.scene
-        self._nominal_kp = wp.array(env.hand.kp, dtype=float, device=device)
-        self._nominal_kd = wp.array(env.hand.kd, dtype=float, device=device)
-        kp_scale, kd_scale = gain_scales(env.hand, cfg.randomisation)
+        model, scene = state.sim.model, state.scene
+        self._nominal_kp = wp.array(state.hand.kp, dtype=float, device=device)
+        self._nominal_kd = wp.array(state.hand.kd, dtype=float, device=device)
+        kp_scale, kd_scale = gain_scales(state.hand, cfg.randomisation)
         self._kp_scale = wp.array(kp_scale, dtype=wp.vec2, device=device)
         self._kd_scale = wp.array(kd_scale, dtype=wp.vec2, device=device)
-        self._servo_ranges = wp.array(env.servo_ranges, dtype=wp.vec2, device=device)
-        inertia = env.servo_ranges[:, [INERTIA, PAYLOAD_INERTIA]]
+        self._servo_ranges = wp.array(state.servo_ranges, dtype=wp.vec2, device=device)
+        inertia = state.servo_ranges[:, [INERTIA, PAYLOAD_INERTIA]]
         self._inertia_varies = bool(np.any(inertia[..., 0] != inertia[..., 1]))
         self._shape_kind = wp.array(scene.shape_kind, dtype=wp.int32, device=device)
         self._nominal_friction = wp.clone(model.shape_material_mu)
@@ -85,22 +83,26 @@ class Randomiser:
 
     def _draw_masses(self) -> None:
         """Draw link and object masses; inertias scale with them."""
-        env = self._env
-        n, model = env.num_worlds, env.sim.model
-        link_scale = wp.ones((n, len(env.scene.link_body)), dtype=float, device=env.device)
+        state = self._state
+        n, model = state.num_worlds, state.sim.model
+        link_scale = wp.ones((n, len(state.scene.link_body)), dtype=float, device=state.device)
         wp.launch(
             draw_masses_kernel,
             dim=n,
-            inputs=[env.parameters.randomisation, wp.ones(n, dtype=wp.int32, device=env.device), env.rng],
+            inputs=[
+                state.parameters.randomisation,
+                wp.ones(n, dtype=wp.int32, device=state.device),
+                state.rng,
+            ],
             outputs=[link_scale, self.object_mass],
-            device=env.device,
+            device=state.device,
         )
-        factor = np.ones((n, env.scene.bodies_per_world))
-        factor[:, env.scene.link_body] = link_scale.numpy()
+        factor = np.ones((n, state.scene.bodies_per_world))
+        factor[:, state.scene.link_body] = link_scale.numpy()
         mass = model.body_mass.numpy().reshape(n, -1)
         if not self.enabled:  # nothing is drawn: objects weigh what their files say
-            self.object_mass.assign(mass[:, env.scene.object_body])
-        factor[:, env.scene.object_body] = self.object_mass.numpy() / mass[:, env.scene.object_body]
+            self.object_mass.assign(mass[:, state.scene.object_body])
+        factor[:, state.scene.object_body] = self.object_mass.numpy() / mass[:, state.scene.object_body]
         flat = factor.reshape(-1)
         inverse = 1.0 / flat
         for array, scale in (
@@ -110,7 +112,7 @@ class Randomiser:
             (model.body_inv_inertia, inverse[:, None, None]),
         ):
             array.assign((array.numpy() * scale).astype(np.float32))
-        env.sim.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
+        state.sim.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def redraw(self, reset: wp.array) -> None:
         """Draw anew for the worlds of ``reset`` whose dynamics are old enough."""
@@ -118,27 +120,27 @@ class Randomiser:
             return
         wp.launch(
             redraw_mask_kernel,
-            dim=self._env.num_worlds,
+            dim=self._state.num_worlds,
             inputs=[reset, self._interval, self._age],
             outputs=[self._due],
-            device=self._env.device,
+            device=self._state.device,
         )
         self.draw(self._due)
 
     def draw(self, mask: wp.array) -> None:
         """Draw gains, servos, frictions, restitution and constant errors for the worlds of ``mask`` [N]."""
-        env = self._env
+        state = self._state
         wp.launch(
             draw_dynamics_kernel,
-            dim=env.num_worlds,
+            dim=state.num_worlds,
             inputs=[
                 self._nominal_kp,
                 self._nominal_kd,
                 self._kp_scale,
                 self._kd_scale,
-                env.parameters.randomisation,
+                state.parameters.randomisation,
                 mask,
-                env.rng,
+                state.rng,
             ],
             outputs=[
                 self.kp,
@@ -149,69 +151,69 @@ class Randomiser:
                 self.action_offset,
                 self.observation_offset,
             ],
-            device=env.device,
+            device=state.device,
         )
-        if env.sim.servo is not None:
+        if state.sim.servo is not None:
             wp.launch(
                 draw_servo_kernel,
-                dim=env.num_worlds,
-                inputs=[self._servo_ranges, mask, self.kp, self.kd, env.rng],
-                outputs=[env.sim.servo.parameters],
-                device=env.device,
+                dim=state.num_worlds,
+                inputs=[self._servo_ranges, mask, self.kp, self.kd, state.rng],
+                outputs=[state.sim.servo.parameters],
+                device=state.device,
             )
-        if env.sim.restitution is not None:
-            drawn = env.sim.restitution
+        if state.sim.restitution is not None:
+            drawn = state.sim.restitution
             wp.launch(
                 draw_restitution_kernel,
-                dim=env.num_worlds,
-                inputs=[wp.vec2(*env.cfg.randomisation.restitution), mask, env.rng],
+                dim=state.num_worlds,
+                inputs=[wp.vec2(*state.cfg.randomisation.restitution), mask, state.rng],
                 outputs=[drawn.hand, drawn.object, drawn.table],
-                device=env.device,
+                device=state.device,
             )
 
     def disturb(self) -> None:
         """Draw this control step's disturbance force, and apply it and what carries the object."""
-        env = self._env
+        state = self._state
         if self.enabled:
             wp.launch(
                 disturbance_force_kernel,
-                dim=env.num_worlds,
-                inputs=[self.object_mass, env.parameters.force, self.force, env.rng],
-                device=env.device,
+                dim=state.num_worlds,
+                inputs=[self.object_mass, state.parameters.force, self.force, state.rng],
+                device=state.device,
             )
-        elif not env.cfg.curriculum.lightens:
+        elif not state.cfg.curriculum.lightens:
             return
-        self._write_force(self.force, env.sim.body_force)
-        if env.cfg.curriculum.lightens:
-            self._write_force(self._no_force, env.sim.lasting_force)
+        self._write_force(self.force, state.sim.body_force)
+        if state.cfg.curriculum.lightens:
+            self._write_force(self._no_force, state.sim.lasting_force)
 
     def _write_force(self, force: wp.array, out: wp.array) -> None:
         """Write a force on the objects, shape [N], and what carries them, as forces on bodies [N, B]."""
-        env = self._env
+        state = self._state
         wp.launch(
             write_object_force_kernel,
-            dim=env.num_worlds,
+            dim=state.num_worlds,
             inputs=[
                 self.object_mass,
-                env.must_lift,
+                state.must_lift,
                 self._gravity,
-                env.parameters.weight,
-                env.scene.object_body,
+                state.parameters.weight,
+                state.scene.object_body,
                 force,
             ],
             outputs=[out],
-            device=env.device,
+            device=state.device,
         )
 
     def after_step(self, steps: int) -> None:
         """Hand what was drawn in this step to the solver, once a second (outside the step's graph)."""
         if not self.enabled or steps % self._push_interval:
             return
-        if self._env.device == "cpu":
+        if self._state.device == "cpu":
             self.push()
             return
         if self._push_graph is None:
-            with wp.ScopedCapture(device=self._env.device) as capture:
+            with wp.ScopedCapture(device=self._state.device) as capture:
                 self._push_gains_and_frictions()
             self._push_graph = capture.graph
         wp.capture_launch(self._push_graph)
@@ -224,21 +226,21 @@ class Randomiser:
 
     def _push_inertia(self) -> None:
         # The solver computes constants from it in memory of its own: not for a graph.
-        if self._env.sim.servo is not None and self._inertia_varies:
-            self._env.sim.servo.push_inertia()
+        if self._state.sim.servo is not None and self._inertia_varies:
+            self._state.sim.servo.push_inertia()
 
     def _push_gains_and_frictions(self) -> None:
-        env = self._env
-        model = env.sim.model
+        state = self._state
+        model = state.sim.model
         flags = newton.ModelFlags.SHAPE_PROPERTIES
-        if env.sim.servo is None:  # which sets the gains itself, in every physics step
+        if state.sim.servo is None:  # which sets the gains itself, in every physics step
             flags |= newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES
             wp.launch(
                 write_gains_kernel,
-                dim=(env.num_worlds, env.num_actions),
+                dim=(state.num_worlds, state.num_actions),
                 inputs=[self.kp, self.kd],
                 outputs=[self._model_kp, self._model_kd],
-                device=env.device,
+                device=state.device,
             )
         wp.launch(
             write_friction_kernel,
@@ -256,9 +258,9 @@ class Randomiser:
                 self.table_friction,
             ],
             outputs=[model.shape_material_mu],
-            device=env.device,
+            device=state.device,
         )
-        env.sim.solver.notify_model_changed(flags)
+        state.sim.solver.notify_model_changed(flags)
 
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint. Masses are drawn from the seed alone and need no saving."""

@@ -11,29 +11,21 @@ import newton
 import numpy as np
 import warp as wp
 
-from vd.assets_usd.hand_model import HandModel
-from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import ObjectModel, load_set
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
-from vd.envs.fingers import Fingers
-from vd.envs.objects import object_scales
 from vd.envs.observer import Observer
-from vd.envs.parameters import TaskParameters
 from vd.envs.randomise import Randomiser
-from vd.envs.servo import needs_servo, servo_ranges
-from vd.envs.starts import find_rest_poses
-from vd.envs.state import load_state, motion_arrays, save_failed_step, save_state
-from vd.envs.table import must_lift, table_array
+from vd.envs.starts import SETTLE_S, rest_poses
+from vd.envs.state import load_arrays, motion_arrays, save_failed_step, save_state, saved_stage
+from vd.envs.table import table_array
+from vd.envs.task_state import build_task
 from vd.kernels.actions import apply_action_kernel
 from vd.kernels.guard import void_step_kernel
 from vd.kernels.resets import episode_kernel, give_goal_kernel, reset_kernel
 from vd.kernels.rewards import REWARD_TERMS, reward_kernel
-from vd.kernels.rng import init_rng_kernel
 from vd.kernels.worlds import count_goals_kernel, record_step_kernel, world_mask_kernel
 from vd.paper import PAPER
-from vd.sim.scene import build_scene
-from vd.sim.simulator import SimulationError, Simulator
+from vd.sim.simulator import SimulationError
 
 FAILURES_AT_FIRST = 10.0
 """Steps of worlds that may fail beside those that ``failures_per_million`` allows (ours): one object in an
@@ -59,33 +51,12 @@ class ReorientEnv:
         cfg.validate()
         self.cfg = cfg
         self.device = str(wp.get_device(device or ("cuda:0" if wp.is_cuda_available() else "cpu")))
-        self.hand: HandModel = load_hand(cfg.hand, cfg.fingertip, cfg.hand_layer)
-        self.objects: list[ObjectModel] = load_set(list(cfg.objects))
-        self.scene = build_scene(
-            hand=self.hand,
-            objects=self.objects,
-            num_worlds=cfg.num_worlds,
-            cfg=cfg.sim,
-            device=self.device,
-            scales=object_scales(cfg.randomisation),
-            visuals=cfg.visuals,
-        )
-        self.servo_ranges = servo_ranges(self.hand, cfg.randomisation)
-        """Range (low, high) of each number of each joint's servo, shape [D, P, 2]; equal ends are fixed."""
-        largest = self.servo_ranges[:, :, 1] if needs_servo(self.servo_ranges) else None
-        self.sim = Simulator(
-            self.scene,
-            cfg.sim,
-            servo_rows=largest,
-            servo_seed=cfg.seed,
-            restitution=cfg.randomisation.bounces,
-        )
-        servo = self.sim.servo
-        self.measured_q = self.sim.joint_q if servo is None else servo.measured_q
-        """Joint positions as the encoders report them at the end of the step [rad], shape [N, *]."""
-        self.measured_qd = self.sim.joint_qd if servo is None else servo.measured_qd
-        """Joint velocities likewise: as old as the positions [rad/s], shape [N, *]."""
-        self.parameters = TaskParameters(cfg, self.device)
+        self.state = state = build_task(cfg, self.device)
+        """What this and its parts share."""
+        self.hand, self.objects, self.scene, self.sim = state.hand, state.objects, state.scene, state.sim
+        self.fingers, self.parameters = state.fingers, state.parameters
+        self.measured_q, self.measured_qd = state.measured_q, state.measured_qd
+        self.smoothed, self.goal_quat, self.must_lift = state.smoothed, state.goal_quat, state.must_lift
 
         self.num_worlds = n = cfg.num_worlds
         self.num_fingers = f = self.hand.num_fingers
@@ -98,13 +69,8 @@ class ReorientEnv:
         def zeros(*shape: int, dtype: Any = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=self.device)
 
-        def array(values: Any, dtype: Any = float) -> wp.array:
-            return wp.array(values, dtype=dtype, device=self.device)
-
         self.action = zeros(n, d)
         """Action of the present step in [-1, 1], shape [N, D]."""
-        self.smoothed = zeros(n, d)
-        """Moving average of the applied actions, shape [N, D]."""
         self.reward = zeros(n)
         """Reward of the present step, shape [N]."""
         self.reward_terms = zeros(n, len(REWARD_TERMS))
@@ -119,10 +85,6 @@ class ReorientEnv:
         """1 where the episode ended by its length alone, shape [N]."""
         self.done = zeros(n, dtype=wp.int32)
         """1 where the return ends: success, fall or time-out, shape [N]."""
-        self.goal_quat = zeros(n, dtype=wp.quat)
-        """Wanted orientation of the object, shape [N]."""
-        self.aimed_quat = zeros(n, dtype=wp.quat) if cfg.aim.enabled else self.goal_quat
-        """The same as it is observed, shape [N]."""
         self.step_count = zeros(n, dtype=wp.int32)
         """Control steps since the world's reset, shape [N]."""
         self.goal_steps = zeros(n, dtype=wp.int32)
@@ -135,23 +97,15 @@ class ReorientEnv:
         """Goals ended, goals reached and objects lost since cleared, over all worlds, shape [3]."""
         self.clearance = zeros(n)
         """Height of the object's lowest point above the table [m], shape [N]; 0 unless it is rewarded."""
-        self.rng = zeros(n, dtype=wp.uint32)
-        """Random stream of each world, shape [N]."""
-
         self.previous_error = zeros(n)
         """Rotation error at the end of the last step, for the progress in it [rad], shape [N]."""
         self._reset, self._new_goal = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
         self._world_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
-        self.lower, self.upper = array(self.hand.lower), array(self.hand.upper)
-        """Joint limits [rad], shape [D]."""
-        self.fingers = Fingers(self)
-        """Positions of the fingertips and torques of the joints."""
-        self.body_com = wp.clone(self.sim.model.body_com[: self.scene.bodies_per_world])
-        """Centre of mass of each link in its frame [m], shape [B]."""
-        self._reset_q = array(np.tile(PAPER.scene.reset_joint_rad, f))
+        self._reset_q = wp.array(np.tile(PAPER.scene.reset_joint_rad, f), dtype=float, device=self.device)
         self._lifts = cfg.reward.lift != 0.0
-        self.observer = Observer(self, shapes=self.sees_shape or self._lifts)
+        self.randomiser = Randomiser(state)
+        self.observer = Observer(state, self.randomiser, shapes=self.sees_shape or self._lifts)
         """Writes what is observed."""
         self.num_observations = self.observer.num_observations
         self.observation, self.privileged = self.observer.split(self.observer.all_values)
@@ -164,10 +118,6 @@ class ReorientEnv:
         self.acts_in_view = True
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
         self._table_steps = table_array(cfg, self.device)
-        self.must_lift = array(must_lift(cfg), wp.int32)
-        """1 where success asks that the object does not touch the table, shape [N]."""
-        wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[self.rng], device=self.device)
-        self.randomiser = Randomiser(self)
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
@@ -182,8 +132,21 @@ class ReorientEnv:
         self._own_steps = 0
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         if cfg.start.at_rest:
-            self._rest_poses = find_rest_poses(self)
+            self._rest_poses = self._find_rest_poses()
         self.reset()
+
+    def _find_rest_poses(self) -> wp.array:
+        """Drop every object a few times and keep where it came to lie, shape [N, K]."""
+        dropped = []
+        for _ in range(self.cfg.start.poses):
+            self.reset()
+            for _ in range(round(SETTLE_S * self.cfg.sim.control_hz)):
+                wp.copy(self.sim.target, self.sim.joint_q)
+                self.sim.step()
+            self.check()
+            dropped.append(self.object_pose())
+        poses = rest_poses(np.stack(dropped, axis=1), self.cfg.success.fall_m)
+        return wp.array(poses, dtype=wp.transform, device=self.device)
 
     # Stepping
 
@@ -250,7 +213,7 @@ class ReorientEnv:
 
     def motion(self) -> dict[str, wp.array]:
         """What the motion goes on from, see :func:`vd.envs.state.motion_arrays`; not copies."""
-        return motion_arrays(self)
+        return motion_arrays(self.sim)
 
     def hold(self) -> None:
         """One control step in which no policy acts and the hand keeps its last targets; nothing is reset."""
@@ -274,14 +237,14 @@ class ReorientEnv:
             apply_action_kernel,
             dim=self.num_worlds,
             inputs=[
-                self.lower,
-                self.upper,
+                self.state.lower,
+                self.state.upper,
                 p.action,
                 action,
                 self.randomiser.action_offset,
                 self.measured_q,
                 self.smoothed,
-                self.rng,
+                self.state.rng,
             ],
             outputs=[sim.target],
             device=self.device,
@@ -299,9 +262,9 @@ class ReorientEnv:
         sim.step()
         if self.cfg.failures_per_million > 0.0:
             sim.put_back(self.step_count, self.max_episode_steps - 1)
-        self.fingers.measure()
+        self.fingers.measure(self.randomiser.kp, self.randomiser.kd)
         if self._lifts and self.observer.shapes is not None:
-            self.observer.shapes.measure_clearance()
+            self.observer.shapes.measure_clearance(self.clearance)
         wp.launch(
             reward_kernel,
             dim=n,
@@ -381,7 +344,7 @@ class ReorientEnv:
                 self._given_goal,
                 int(use_goal),
                 sim.joint_q,
-                self.rng,
+                self.state.rng,
             ],
             outputs=[
                 sim.joint_qd,
@@ -436,7 +399,7 @@ class ReorientEnv:
         try:
             self.sim.check(tolerated)
         except SimulationError as error:
-            path = save_failed_step(self)
+            path = save_failed_step(self.sim, self.cfg, self.dump_dir)
             if path is None:
                 raise
             raise SimulationError(f"{error} (dump: {path})") from error
@@ -470,11 +433,34 @@ class ReorientEnv:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to continue exactly, see :func:`vd.envs.state.save_state`."""
-        return save_state(self)
+        return save_state(self.state, self._arrays(), self.stage, self.steps)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from :meth:`state_dict`, see :func:`vd.envs.state.load_state`."""
-        load_state(self, state)
+        """Continue from :meth:`state_dict`, see :func:`vd.envs.state.load_arrays`."""
+        load_arrays(self.state, self._arrays(), state)
+        self.steps = int(state["steps"])
+        self.set_stage(saved_stage(state, self.cfg.curriculum))
+        self.randomiser.push()
+        self.sim.forward_kinematics()
+
+    def _arrays(self) -> dict[str, wp.array]:
+        """What changes from step to step: simulation, episodes, randomisation, random streams."""
+        restitution = self.sim.restitution
+        return {
+            **self.motion(),
+            "smoothed": self.smoothed,
+            "goal_quat": self.goal_quat,
+            "step_count": self.step_count,
+            "goal_steps": self.goal_steps,
+            "goals_reached": self.goals_reached,
+            "previous_error": self.previous_error,
+            "goal_counts": self.goal_counts,
+            "observation": self.observer.all_values,
+            "rng": self.state.rng,
+            **self.observer.stateful(),
+            **self.randomiser.stateful(),
+            **({} if restitution is None else restitution.stateful()),
+        }
 
     def close(self) -> None:
         """Release the captured graphs."""

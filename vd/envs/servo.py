@@ -1,37 +1,12 @@
 """Which servo models the worlds draw: a hand layer's values and intervals, Table S3, chosen effects."""
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import RandomisationCfg
+from vd.envs.effects import PARAMETERS
 from vd.kernels import actuators
-from vd.kernels.effects import EFFECTS, Parameter
 from vd.sim.actuators import has_effects
-
-PARAMETERS: dict[str, Parameter] = {
-    f"{name}.{p.name}": p for name, effect in EFFECTS.items() for p in effect.parameters
-}
-"""Every parameter of every effect, by the name ``effect.parameter``."""
-
-
-def check_effects(effects: Mapping[str, tuple[float, float]]) -> None:
-    """Raise ValueError for ranges that cannot be drawn, naming the parameter and the remedy.
-
-    Args:
-        effects: Ranges (low, high) by ``effect.parameter``.
-    """
-    for name, (low, high) in effects.items():
-        if name not in PARAMETERS:
-            raise ValueError(f"randomisation.effects: no parameter {name!r}; one of {', '.join(PARAMETERS)}")
-        parameter = PARAMETERS[name]
-        lowest = -parameter.upper if parameter.signed else parameter.lower
-        if not lowest <= low <= high <= parameter.upper:
-            raise ValueError(
-                f"randomisation.effects: {name} from {low:g} to {high:g}; the low end comes first, and both "
-                f"lie between {lowest:g} and {parameter.upper:g} {parameter.unit}"
-            )
 
 
 def gain_scales(hand: HandModel, cfg: RandomisationCfg) -> tuple[np.ndarray, np.ndarray]:

@@ -1,10 +1,10 @@
 """The shape of each world's object: its points on the device, what a teacher sees of it, how high it is."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import warp as wp
 
+from vd.envs.latency import SeenState
+from vd.envs.task_state import TaskState
 from vd.kernels.observations import teacher_observation_size
 from vd.kernels.shapes import (
     ORIENTATIONS,
@@ -16,82 +16,81 @@ from vd.kernels.shapes import (
 )
 from vd.paper import PAPER
 
-if TYPE_CHECKING:
-    from vd.envs.observer import Observer
-    from vd.envs.reorient import ReorientEnv
-
 
 class ShapeObserver:
-    """Writes the columns of ``vd.kernels.shapes`` behind the state in the observation of ``env``.
+    """Writes the columns of ``vd.kernels.shapes`` behind the state, and how high the objects are.
 
-    Also how high the objects are, for the reward.
+    Args:
+        state: The task.
+        seen: The state that observations are made of.
+        out: Observation, shape [N, A].
     """
 
-    def __init__(self, env: "ReorientEnv", observer: "Observer"):
-        """Put surface points and scales of the objects on the device."""
-        self._env, self._observer = env, observer
-        device = env.device
-        points = np.stack([item.surface_points for item in env.objects])
+    def __init__(self, state: TaskState, seen: SeenState, out: wp.array):
+        self._state, self._seen, self._out = state, seen, out
+        device = state.device
+        points = np.stack([item.surface_points for item in state.objects])
         self._points = wp.array(points, dtype=wp.vec3, device=device)
-        self._object = wp.array(env.scene.world_object, dtype=wp.int32, device=device)
-        self._scale = wp.array(env.scene.world_scale, dtype=float, device=device)
-        self._directions = wp.array(extent_directions(env.num_fingers), dtype=wp.vec3, device=device)
-        first, slices = teacher_observation_size(env.num_fingers), shape_observation_slices(env.num_fingers)
+        self._object = wp.array(state.scene.world_object, dtype=wp.int32, device=device)
+        self._scale = wp.array(state.scene.world_scale, dtype=float, device=device)
+        self._directions = wp.array(extent_directions(state.num_fingers), dtype=wp.vec3, device=device)
+        first = teacher_observation_size(state.num_fingers)
+        slices = shape_observation_slices(state.num_fingers)
         self._surface_column = first + slices["surface"].start
         self._extent_column = first + slices["extent"].start
 
-    def measure_clearance(self) -> None:
-        """Write the heights of the objects' lowest points into ``env.clearance``."""
-        env = self._env
+    def measure_clearance(self, out: wp.array) -> None:
+        """Write the heights of the objects' lowest points above the table [m] into ``out``, shape [N]."""
+        state = self._state
         wp.launch(
             clearance_kernel,
-            dim=env.num_worlds,
+            dim=state.num_worlds,
             inputs=[
                 self._points,
                 self._object,
                 self._scale,
-                env.num_actions,
+                state.num_actions,
                 PAPER.scene.table_top_m,
-                env.sim.joint_q,
+                state.sim.joint_q,
             ],
-            outputs=[env.clearance],
-            device=env.device,
+            outputs=[out],
+            device=state.device,
         )
 
     def launch(self) -> None:
         """Write the values of the state that is seen, and of the goal."""
-        env, out = self._env, self._observer.world_values
-        _, _, joint_q, _, body_q, _ = self._observer.seen.arrays
+        state, out = self._state, self._out
+        _, _, joint_q, _, body_q, _ = self._seen.arrays
         wp.launch(
             surface_kernel,
-            dim=(env.num_worlds, env.num_fingers),
+            dim=(state.num_worlds, state.num_fingers),
             inputs=[
                 self._points,
                 self._object,
                 self._scale,
-                env.fingers.tip_body,
-                env.fingers.tip_offset,
-                env.num_actions,
+                state.fingers.tip_body,
+                state.fingers.tip_offset,
+                state.num_actions,
                 self._surface_column,
                 joint_q,
                 body_q,
             ],
             outputs=[out],
-            device=env.device,
+            device=state.device,
         )
         wp.launch(
             extent_kernel,
-            dim=(env.num_worlds, ORIENTATIONS, len(self._directions)),
+            dim=(state.num_worlds, ORIENTATIONS, len(self._directions)),
             inputs=[
                 self._points,
                 self._object,
                 self._scale,
                 self._directions,
-                env.num_actions,
+                state.num_actions,
                 self._extent_column,
                 joint_q,
-                env.aimed_quat,
+                state.aimed_quat,
             ],
             outputs=[out],
-            device=env.device,
+            device=state.device,
         )

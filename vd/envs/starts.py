@@ -1,39 +1,26 @@
 """Poses in which an object lies at rest on the table, found by dropping it."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-import warp as wp
 
 from vd.paper import PAPER
-
-if TYPE_CHECKING:
-    from vd.envs.reorient import ReorientEnv
 
 SETTLE_S = 1.5
 """Time an object has to come to rest after a drop [s]; some slim ones still rock then."""
 
 
-def find_rest_poses(env: "ReorientEnv") -> wp.array:
-    """Drop every object a few times and keep where it came to lie, shape [N, K].
+def rest_poses(dropped: np.ndarray, fall_m: float) -> np.ndarray:
+    """Where the objects came to lie, of those drops that stayed in the claw, float, shape [N, K, 7].
 
-    A drop that leaves the claw is replaced by one that did not.
+    A drop that left it is replaced by one of the same world that did not, or, if all did, by the start.
+
+    Args:
+        dropped: Poses after K drops, position [m] and quaternion xyzw, shape [N, K, 7].
+        fall_m: Distance from the goal position at which an object counts as lost [m].
     """
-    count = env.cfg.start.poses
-    poses = np.zeros((env.num_worlds, count, 7), dtype=np.float32)
-    inside = np.zeros((env.num_worlds, count), dtype=bool)
-    for k in range(count):
-        env.reset()
-        for _ in range(round(SETTLE_S * env.cfg.sim.control_hz)):
-            wp.copy(env.sim.target, env.sim.joint_q)
-            env.sim.step()
-        env.check()
-        poses[:, k] = env.object_pose()
-        distance = np.linalg.norm(poses[:, k, :3] - PAPER.scene.goal_position_m, axis=1)
-        inside[:, k] = distance < env.cfg.success.fall_m
+    count = dropped.shape[1]
+    inside = np.linalg.norm(dropped[:, :, :3] - PAPER.scene.goal_position_m, axis=2) < fall_m
     # Choose, for every slot, the slot itself or the first good one of the world.
     slot = np.where(inside, np.arange(count), np.argmax(inside, axis=1)[:, None])
-    poses = np.take_along_axis(poses, slot[:, :, None], axis=1)
-    lost = ~inside.any(axis=1)
-    poses[lost] = [*PAPER.scene.object_start_m, 0.0, 0.0, 0.0, 1.0]
-    return wp.array(poses, dtype=wp.transform, device=env.device)
+    poses = np.take_along_axis(dropped, slot[:, :, None], axis=1)
+    poses[~inside.any(axis=1)] = [*PAPER.scene.object_start_m, 0.0, 0.0, 0.0, 1.0]
+    return poses

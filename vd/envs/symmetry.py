@@ -1,7 +1,7 @@
 """The views of :mod:`vd.kernels.symmetry` for a hand and an observation: their tables, and their launches."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -10,13 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from vd.envs.cfg import View
 from vd.envs.parts import observation_parts
+from vd.envs.task_state import TaskState
 from vd.kernels.dynamics import JOINT_CHANNELS, SCALARS
 from vd.kernels.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER, teacher_observation_slices
 from vd.kernels.shapes import extent_directions, shape_observation_slices
 from vd.kernels.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
-
-if TYPE_CHECKING:
-    from vd.envs.reorient import ReorientEnv
 
 TERMS = 4
 """Most values that a turned value is made of: those of a quaternion."""
@@ -55,21 +53,21 @@ class ViewTables:
     """The direction near which a view has the axis of the wanted rotation, as it is in the world [V, 3]."""
 
 
-def view_tables(env: "ReorientEnv", view: View) -> ViewTables:
-    """The views of an environment's hand and observation.
+def view_tables(state: TaskState, view: View) -> ViewTables:
+    """The views of a task's hand and observation.
 
     Args:
-        env: The environment.
+        state: The task.
         view: What goals are seen in (``ObservationCfg.view``); views in the mirror come after the others.
 
     Raises:
         ValueError: The fingers are not spaced evenly about the vertical, or the hand is not its own mirror
             image.
     """
-    fingers, tips = env.num_fingers, _tips(env, np.zeros(JOINTS_PER_FINGER))
+    fingers, tips = state.num_fingers, _tips(state, np.zeros(JOINTS_PER_FINGER))
     turns = [_turn(step, fingers) for step in range(fingers)]
     try:
-        mirror = _mirror(env, tips) if view in ("mirrored", "either") else None
+        mirror = _mirror(state, tips) if view in ("mirrored", "either") else None
     except ValueError:
         if view == "mirrored":
             raise
@@ -77,13 +75,13 @@ def view_tables(env: "ReorientEnv", view: View) -> ViewTables:
     if mirror is not None:
         turns += [turn @ mirror for turn in turns]
     direction = SECTOR + UP if view == "mirrored" else SECTOR
-    maps = np.stack([_observation_map(env, tips, turn) for turn in turns])
+    maps = np.stack([_observation_map(state, tips, turn) for turn in turns])
     source = np.argsort(-np.abs(maps), axis=2, kind="stable")[:, :, :TERMS]
     order = [_joint_source(_finger_source(tips, turn.T)) for turn in turns]
     return ViewTables(
         source=source,
         factor=np.take_along_axis(maps, source, axis=2),
-        offset=np.stack([_observation_offset(env, turn, maps.shape[1]) for turn in turns]),
+        offset=np.stack([_observation_offset(state, turn, maps.shape[1]) for turn in turns]),
         joints=np.stack(order),
         sign=np.stack([_joint_signs(turn, fingers) for turn in turns]),
         # An axis of rotation looks the other way in a mirror.
@@ -92,7 +90,7 @@ def view_tables(env: "ReorientEnv", view: View) -> ViewTables:
 
 
 class Views:
-    """The view of each world of ``env``, and what the policy sees and does in it.
+    """The view of each world, and what the policy sees and does in it.
 
     Attributes:
         tables: What they are made of.
@@ -100,39 +98,39 @@ class Views:
         observation: Observation in the world frame, shape [N, A]; views of it go to ``out``.
     """
 
-    def __init__(self, env: "ReorientEnv", out: wp.array):
+    def __init__(self, state: TaskState, out: wp.array):
         """Put the tables of the hand on the device.
 
         Args:
-            env: The environment.
+            state: The task.
             out: Where views of the observation are written, shape [N, A].
 
         Raises:
             ValueError: The hand has no such views, see :func:`view_tables`.
         """
-        self._env, self._out = env, out
-        device, worlds = env.device, env.num_worlds
-        tables = self.tables = view_tables(env, env.cfg.observation.view)
-        chosen_from = env.cfg.observation.views(env.num_fingers)
+        self._state, self._out = state, out
+        device, worlds = state.device, state.num_worlds
+        tables = self.tables = view_tables(state, state.cfg.observation.view)
+        chosen_from = state.cfg.observation.views(state.num_fingers)
         self._source = wp.array(tables.source, dtype=wp.int32, device=device)
         self._factor = wp.array(tables.factor, dtype=float, device=device)
         self._joints = wp.array(tables.joints, dtype=wp.int32, device=device)
         self._offset = wp.array(tables.offset, dtype=float, device=device)
         self._sign = wp.array(tables.sign, dtype=float, device=device)
         self._sector = wp.array(tables.sector[:chosen_from], dtype=wp.vec3, device=device)
-        self._action = wp.zeros((worlds, env.num_actions), dtype=float, device=device)
+        self._action = wp.zeros((worlds, state.num_actions), dtype=float, device=device)
         self.view = wp.zeros(worlds, dtype=wp.int32, device=device)
         self.observation = wp.zeros_like(out)
 
     def choose(self, reset: wp.array, new_goal: wp.array) -> None:
         """Choose anew for worlds in which either mask, shape [N], is set."""
-        env = self._env
+        state = self._state
         wp.launch(
             choose_view_kernel,
-            dim=env.num_worlds,
-            inputs=[self._sector, env.num_actions, reset, new_goal, env.sim.joint_q, env.goal_quat],
+            dim=state.num_worlds,
+            inputs=[self._sector, state.num_actions, reset, new_goal, state.sim.joint_q, state.goal_quat],
             outputs=[self.view],
-            device=env.device,
+            device=state.device,
         )
 
     def observe(self) -> None:
@@ -142,7 +140,7 @@ class Views:
             dim=self._out.shape,
             inputs=[self._source, self._factor, self._offset, self.view, self.observation],
             outputs=[self._out],
-            device=self._env.device,
+            device=self._state.device,
         )
 
     def world_action(self, action: wp.array, out: wp.array | None = None) -> wp.array:
@@ -153,7 +151,7 @@ class Views:
             dim=action.shape,
             inputs=[self._joints, self._sign, self.view, action],
             outputs=[out],
-            device=self._env.device,
+            device=self._state.device,
         )
         return out
 
@@ -161,13 +159,13 @@ class Views:
 class WorldOrder:
     """A policy of views with its actions in the world's order: a teacher for a student that acts there."""
 
-    def __init__(self, policy: Any, env: "ReorientEnv"):
-        """Wrap ``policy``; without views in ``env`` it acts as before."""
-        self._policy, self._views = policy, env.views
+    def __init__(self, policy: Any, views: Views | None):
+        """Wrap ``policy``; without ``views`` of its environment it acts as before."""
+        self._policy, self._views = policy, views
         self.num_observations, self.num_actions = policy.num_observations, policy.num_actions
 
     def act(self, observation: Any) -> Any:
-        """Actions [N, D] (torch) of ``env.observation``."""
+        """Actions [N, D] (torch) of an environment's observation."""
         action = self._policy.act(observation)
         if self._views is None:
             return action
@@ -175,17 +173,17 @@ class WorldOrder:
         return wp.to_torch(ordered).clone()
 
 
-def _tips(env: "ReorientEnv", angles: np.ndarray) -> np.ndarray:
+def _tips(state: TaskState, angles: np.ndarray) -> np.ndarray:
     """Fingertip poses of a hand with these angles [3] in all fingers, with the simulation's signs [F, 7]."""
-    joints = env.sim.joint_q.numpy().copy()
+    joints = state.sim.joint_q.numpy().copy()
     posed = joints.copy()
-    posed[:, : env.num_actions] = np.tile(angles, env.num_fingers)
-    env.sim.joint_q.assign(posed)
-    env.sim.forward_kinematics()
-    bodies = env.sim.body_q.numpy()[0].copy()
-    env.sim.joint_q.assign(joints)
-    env.sim.forward_kinematics()
-    pairs = zip(bodies[env.fingers.tip_body.numpy()], env.fingers.tip_offset.numpy(), strict=True)
+    posed[:, : state.num_actions] = np.tile(angles, state.num_fingers)
+    state.sim.joint_q.assign(posed)
+    state.sim.forward_kinematics()
+    bodies = state.sim.body_q.numpy()[0].copy()
+    state.sim.joint_q.assign(joints)
+    state.sim.forward_kinematics()
+    pairs = zip(bodies[state.fingers.tip_body.numpy()], state.fingers.tip_offset.numpy(), strict=True)
     tips: list[Any] = [wp.transform_multiply(wp.transform(*body), wp.transform(*tip)) for body, tip in pairs]
     return np.array([[tip[i] for i in range(7)] for tip in tips])
 
@@ -195,7 +193,7 @@ def _turn(step: int, fingers: int) -> np.ndarray:
     return Rotation.from_euler("z", 2.0 * np.pi * step / fingers).as_matrix()
 
 
-def _mirror(env: "ReorientEnv", tips: np.ndarray) -> np.ndarray:
+def _mirror(state: TaskState, tips: np.ndarray) -> np.ndarray:
     """Reflection [3, 3] in the vertical plane through the first fingertip and the hand's axis.
 
     Raises:
@@ -203,12 +201,14 @@ def _mirror(env: "ReorientEnv", tips: np.ndarray) -> np.ndarray:
     """
     across = np.array([-tips[0, 1], tips[0, 0], 0.0]) / np.linalg.norm(tips[0, :2])
     mirror = np.eye(3) - 2.0 * np.outer(across, across)
-    refusal = f"{env.cfg.hand} is not its own mirror image; set observation.view to goal, which turns it only"
+    refusal = (
+        f"{state.cfg.hand} is not its own mirror image; set observation.view to goal, which turns it only"
+    )
     try:
         source = _finger_source(tips, mirror)
     except ValueError as error:
         raise ValueError(refusal) from error
-    bent, opposite = _tips(env, BENT)[source], _tips(env, MIRROR_SIGNS * BENT)
+    bent, opposite = _tips(state, BENT)[source], _tips(state, MIRROR_SIGNS * BENT)
     apart = np.linalg.norm(bent[:, :3] @ mirror.T - opposite[:, :3], axis=1)
     axes = Rotation.from_quat(bent[:, 3:]).as_matrix()
     twisted = np.abs(mirror @ axes @ OBJECT_MIRROR - Rotation.from_quat(opposite[:, 3:]).as_matrix())
@@ -239,29 +239,29 @@ def _joint_signs(turn: np.ndarray, fingers: int) -> np.ndarray:
     return np.tile(MIRROR_SIGNS if np.linalg.det(turn) < 0.0 else np.ones(JOINTS_PER_FINGER), fingers)
 
 
-def _observation_offset(env: "ReorientEnv", turn: np.ndarray, size: int) -> np.ndarray:
+def _observation_offset(state: TaskState, turn: np.ndarray, size: int) -> np.ndarray:
     """What is added in a view to what :func:`_observation_map` makes, ``size`` values.
 
     An angle is observed as it lies between its limits, from -1 to 1; of one that is turned round these are
     the limits of the other side.
     """
     offset = np.zeros(size)
-    lower, upper = np.asarray(env.hand.lower), np.asarray(env.hand.upper)
-    turned_round = _joint_signs(turn, env.num_fingers) < 0.0
-    columns = teacher_observation_slices(env.num_fingers)["joint_position"]
+    lower, upper = np.asarray(state.hand.lower), np.asarray(state.hand.upper)
+    turned_round = _joint_signs(turn, state.num_fingers) < 0.0
+    columns = teacher_observation_slices(state.num_fingers)["joint_position"]
     offset[columns] = np.where(turned_round, -2.0 * (upper + lower) / (upper - lower), 0.0)
     return offset
 
 
-def _observation_map(env: "ReorientEnv", tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def _observation_map(state: TaskState, tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """Matrix [A, A] from an observation in the world frame to that of a view.
 
     Args:
-        env: The environment, for what is observed.
+        state: The task, for what is observed.
         tips: Fingertip poses with all angles zero, shape [F, 7].
         turn: Turn or reflection [3, 3] of the world that makes the view.
     """
-    parts = observation_parts(env.cfg.observation, env.num_fingers)
+    parts = observation_parts(state.cfg.observation, state.num_fingers)
     count, fingers = len(tips), _finger_source(tips, turn)
     quaternion = _orientation_map(turn)
     axial = np.linalg.det(turn) * turn  # rotations look the other way in a mirror
@@ -301,7 +301,7 @@ def _observation_map(env: "ReorientEnv", tips: np.ndarray, turn: np.ndarray) -> 
         first = parts["shape"].start
         for name, columns in shape_observation_slices(count).items():
             slices[name] = slice(first + columns.start, first + columns.stop)
-    frames = np.eye(env.cfg.observation.history)
+    frames = np.eye(state.cfg.observation.history)
     blocks |= {
         "history": np.kron(frames, block_diag(joints, joints, turn, axial)),
         "dynamics": block_diag(np.kron(np.eye(JOINT_CHANNELS), np.abs(joints)), np.eye(SCALARS)),

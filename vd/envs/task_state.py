@@ -1,0 +1,118 @@
+"""What the parts of the environment share: the task, its simulation, and arrays with a row for each world."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import warp as wp
+
+from vd.assets_usd.hand_model import HandModel
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.model import ObjectModel, load_set
+from vd.envs.cfg import ReorientCfg
+from vd.envs.fingers import Fingers
+from vd.envs.objects import object_scales
+from vd.envs.parameters import TaskParameters
+from vd.envs.servo import needs_servo, servo_ranges
+from vd.envs.table import must_lift
+from vd.kernels.rng import init_rng_kernel
+from vd.sim.scene import Scene, build_scene
+from vd.sim.simulator import Simulator
+
+
+@dataclass(frozen=True)
+class TaskState:
+    """N worlds with a hand of F fingers and D joints, and an object. Arrays are on ``device``."""
+
+    cfg: ReorientCfg
+    device: str
+    hand: HandModel
+    objects: list[ObjectModel]
+    scene: Scene
+    sim: Simulator
+    fingers: Fingers
+    parameters: TaskParameters
+    servo_ranges: Any
+    """Range (low, high) of each number of each joint's servo, [D, P, 2]; equal ends are fixed."""
+    measured_q: wp.array
+    """Joint positions as the encoders report them at the end of the step [rad], shape [N, *]."""
+    measured_qd: wp.array
+    """Joint velocities likewise: as old as the positions [rad/s], shape [N, *]."""
+    lower: wp.array
+    """Lower joint limits [rad], shape [D]."""
+    upper: wp.array
+    """Upper joint limits [rad], shape [D]."""
+    smoothed: wp.array
+    """Moving average of the applied actions, shape [N, D]."""
+    goal_quat: wp.array
+    """Wanted orientation of the object, shape [N]."""
+    aimed_quat: wp.array
+    """The same as it is observed, shape [N]."""
+    must_lift: wp.array
+    """1 where success asks that the object does not touch the table, shape [N]."""
+    rng: wp.array
+    """Random stream of each world, shape [N]."""
+
+    @property
+    def num_worlds(self) -> int:
+        """N."""
+        return self.cfg.num_worlds
+
+    @property
+    def num_fingers(self) -> int:
+        """F."""
+        return self.hand.num_fingers
+
+    @property
+    def num_actions(self) -> int:
+        """D."""
+        return self.hand.num_joints
+
+
+def build_task(cfg: ReorientCfg, device: str) -> TaskState:
+    """Read hand and objects, build the simulation and allocate what is shared.
+
+    Raises:
+        ValueError: For a configuration that cannot work, naming field and remedy.
+    """
+    hand, objects = load_hand(cfg.hand, cfg.fingertip, cfg.hand_layer), load_set(list(cfg.objects))
+    scene = build_scene(
+        hand=hand,
+        objects=objects,
+        num_worlds=cfg.num_worlds,
+        cfg=cfg.sim,
+        device=device,
+        scales=object_scales(cfg.randomisation),
+        visuals=cfg.visuals,
+    )
+    ranges = servo_ranges(hand, cfg.randomisation)
+    sim = Simulator(
+        scene,
+        cfg.sim,
+        servo_rows=ranges[:, :, 1] if needs_servo(ranges) else None,
+        servo_seed=cfg.seed,
+        restitution=cfg.randomisation.bounces,
+    )
+    n = cfg.num_worlds
+    goal = wp.zeros(n, dtype=wp.quat, device=device)
+    rng = wp.zeros(n, dtype=wp.uint32, device=device)
+    wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[rng], device=device)
+    return TaskState(
+        cfg=cfg,
+        device=device,
+        hand=hand,
+        objects=objects,
+        scene=scene,
+        sim=sim,
+        fingers=Fingers(hand, scene, sim),
+        parameters=TaskParameters(cfg, device),
+        servo_ranges=ranges,
+        measured_q=sim.joint_q if sim.servo is None else sim.servo.measured_q,
+        measured_qd=sim.joint_qd if sim.servo is None else sim.servo.measured_qd,
+        lower=wp.array(hand.lower, dtype=float, device=device),
+        upper=wp.array(hand.upper, dtype=float, device=device),
+        smoothed=wp.zeros((n, hand.num_joints), dtype=float, device=device),
+        goal_quat=goal,
+        aimed_quat=wp.zeros(n, dtype=wp.quat, device=device) if cfg.aim.enabled else goal,
+        must_lift=wp.array(must_lift(cfg), dtype=wp.int32, device=device),
+        rng=rng,
+    )
