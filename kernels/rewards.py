@@ -1,12 +1,11 @@
-"""Reward terms of equations 1-5, 7 and 8, with success and fall of the paper's criteria.
+"""Reward terms of equations 1-5, 7 and 8.
 
 World frame (z up, table top at z = 0), SI units, radians, quaternions xyzw.
 """
 
 import warp as wp
 
-from vd.kernels.columns import read_quat, read_vec3
-from vd.kernels.transforms import rotation_angle, rotation_difference
+from vd.kernels.columns import read_vec3
 
 wp.set_module_options({"enable_backward": False})
 
@@ -69,112 +68,58 @@ class RewardParams:
     scale: float
 
 
-@wp.struct
-class SuccessParams:
-    """Thresholds of success and fall; an array of length 1 in device memory.
-
-    A stillness threshold (joint_speed to action_norm) or fall_distance that is <= 0 asks for nothing;
-    infinity does so too.
-
-    rotation: Largest rotation error [rad]; always asked for.
-    joint_speed: Largest norm of the joint velocities [rad/s].
-    object_speed: Largest speed of the object [m/s].
-    object_spin: Largest angular speed of the object [rad/s].
-    action_norm: Largest norm of the smoothed action.
-    fall_distance: Distance of the object from fall_center at which it is lost [m].
-    fall_center: Centre of the space in which the object is held, world frame [m].
-    """
-
-    rotation: float
-    joint_speed: float
-    object_speed: float
-    object_spin: float
-    action_norm: float
-    fall_distance: float
-    fall_center: wp.vec3
-
-
-@wp.func
-def within(value: float, limit: float) -> bool:
-    """Whether ``value`` <= ``limit``, or the limit is switched off (<= 0)."""
-    return limit <= 0.0 or value <= limit
-
-
 @wp.kernel
 def reward_kernel(
     # Model:
     params: wp.array[RewardParams],
-    success_params: wp.array[SuccessParams],
     # In:
     joint_q_in: wp.array2d[float],
     joint_qd_in: wp.array2d[float],
     tip_pos_in: wp.array2d[wp.vec3],
     effort_in: wp.array2d[float],
-    goal_quat_in: wp.array[wp.quat],
-    smoothed_in: wp.array2d[float],
     table_force_in: wp.array[float],
     clearance_in: wp.array[float],
-    must_lift_in: wp.array[int],
+    rotation_error_in: wp.array[float],
+    success_in: wp.array[int],
+    fell_in: wp.array[int],
     # In/Out:
     previous_error: wp.array[float],
     # Out:
     reward_out: wp.array[float],
     terms_out: wp.array2d[float],
-    rotation_error_out: wp.array[float],
-    success_out: wp.array[int],
-    fell_out: wp.array[int],
 ):
-    """Reward, success and fall of the state after a control step. Launch: [N].
+    """Reward of the state after a control step. Launch: [N], after :func:`vd.kernels.success.success_kernel`.
 
     reward = scale * (c1 [success] + c2 / (error + epsilon) + c3 sum_i norm(tip_i - object)^2
     + c4 sum_j abs(qd_j tau_j) + c5 [fell] + c6 [table force > limit]
     + c7 sum_i [tip_i.z > height_limit] + progress (previous_error - error)
     + lift clamp(clearance / lift_height, 0, 1)).
-    Success: the rotation error and all speeds are at most their thresholds, without contact with the table
-    where that is asked for. Fall: the object's distance
-    from fall_center is at least fall_distance. ``previous_error`` becomes the present error; the reset
-    kernel starts it anew with each goal.
+    ``previous_error`` becomes the present error; the reset kernel starts it anew with each goal.
 
     Args:
         params: Coefficients, shape [1].
-        success_params: Thresholds, shape [1].
         joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
         joint_qd_in: Hand joints [rad/s], object linear [m/s] and angular [rad/s] velocity, shape [N, D + 6].
         tip_pos_in: Fingertip positions, world frame [m], shape [N, G].
         effort_in: Joint torques [N m], shape [N, D].
-        goal_quat_in: Wanted orientation of the object, shape [N].
-        smoothed_in: Smoothed action, shape [N, D].
         table_force_in: Magnitude of the object's force on the table [N], shape [N].
         clearance_in: Height of the object's lowest point above the table's top [m], shape [N].
-        must_lift_in: 1 where the object must not touch the table for success, shape [N].
+        rotation_error_in: Angle between object and goal [rad], shape [N].
+        success_in: 1 where the goal is reached, shape [N].
+        fell_in: 1 where the object is lost, shape [N].
         previous_error: Rotation error of the last step [rad], shape [N].
         reward_out: Reward, shape [N].
         terms_out: Terms with their coefficients, without scale, columns REWARD_TERMS, shape [N, 9].
-        rotation_error_out: Angle between object and goal [rad], shape [N].
-        success_out: 1 where the goal is reached, shape [N].
-        fell_out: 1 where the object is lost, shape [N].
     """
     world = wp.tid()
     weights = params[0]
-    limits = success_params[0]
     joints = effort_in.shape[1]
     fingers = tip_pos_in.shape[1]
 
     position = read_vec3(world, joints, joint_q_in)
-    orientation = read_quat(world, joints + 3, joint_q_in)
-    velocity = read_vec3(world, joints, joint_qd_in)
-    spin = read_vec3(world, joints + 3, joint_qd_in)
-
     power = wp.float32(0.0)
-    joint_speed = wp.float32(0.0)
-    action_norm = wp.float32(0.0)
     for joint in range(joints):
-        speed = joint_qd_in[world, joint]
-        power += wp.abs(speed * effort_in[world, joint])
-        joint_speed += speed * speed
-        action_norm += smoothed_in[world, joint] * smoothed_in[world, joint]
-    joint_speed = wp.sqrt(joint_speed)
-    action_norm = wp.sqrt(action_norm)
+        power += wp.abs(joint_qd_in[world, joint] * effort_in[world, joint])
     if weights.energy_clip > 0.0:
         power = wp.min(power, weights.energy_clip)
 
@@ -189,24 +134,13 @@ def reward_kernel(
         if tip[2] > weights.height_limit:
             high_tips += 1.0
 
-    error = rotation_angle(rotation_difference(orientation, goal_quat_in[world]))
-    touches = table_force_in[world] > weights.table_contact_force
-    success = (
-        error <= limits.rotation
-        and within(joint_speed, limits.joint_speed)
-        and within(wp.length(velocity), limits.object_speed)
-        and within(wp.length(spin), limits.object_spin)
-        and within(action_norm, limits.action_norm)
-        and not (must_lift_in[world] != 0 and touches)
-    )
-    fell = limits.fall_distance > 0.0 and wp.length(position - limits.fall_center) >= limits.fall_distance
-
-    success_term = wp.where(success, weights.success, 0.0)
+    error = rotation_error_in[world]
+    success_term = wp.where(success_in[world] != 0, weights.success, 0.0)
     rotation_term = weights.rotation / (error + weights.rotation_epsilon)
     fingertip_term = weights.fingertip * reach
     energy_term = weights.energy * power
-    fall_term = wp.where(fell, weights.fall, 0.0)
-    table_term = wp.where(touches, weights.table_contact, 0.0)
+    fall_term = wp.where(fell_in[world] != 0, weights.fall, 0.0)
+    table_term = wp.where(table_force_in[world] > weights.table_contact_force, weights.table_contact, 0.0)
     height_term = weights.fingertip_height * high_tips
     progress_term = weights.progress * (previous_error[world] - error)
     lift_term = weights.lift * wp.clamp(clearance_in[world] / weights.lift_height, 0.0, 1.0)
@@ -223,7 +157,4 @@ def reward_kernel(
     total = success_term + rotation_term + fingertip_term + energy_term
     total += fall_term + table_term + height_term + progress_term + lift_term
     reward_out[world] = weights.scale * total
-    rotation_error_out[world] = error
-    success_out[world] = wp.where(success, 1, 0)
-    fell_out[world] = wp.where(fell, 1, 0)
     previous_error[world] = error

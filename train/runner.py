@@ -143,10 +143,7 @@ class TeacherRunner(OnPolicyRunner):
         """
         first = self.current_learning_iteration
         total = self.total_iterations if num_learning_iterations is None else first + num_learning_iterations
-        if init_at_random_ep_len is not False and self._stagger_due:
-            steps = self.env.episode_length_buf
-            self.env.episode_length_buf = torch.randint_like(steps, high=int(self.env.max_episode_length))
-        self._stagger_due = False
+        self._stagger(init_at_random_ep_len is not False)
         if self.is_distributed:
             self.alg.broadcast_parameters()
         self.alg.train_mode()
@@ -156,32 +153,43 @@ class TeacherRunner(OnPolicyRunner):
             else None
         )
         progress = ProgressLine(total, done=first, enabled=self.is_main)
-        saved = first
         try:
             with self._end.signals(progress.note), progress:
-                observation = self.env.get_observations()
-                while self.current_learning_iteration < total:
-                    if self.is_distributed:
-                        watch_iteration()
-                    row, observation = self._iterate(observation)
-                    if row is None:
-                        break
-                    if log is not None:
-                        log.write(row)
-                    done = self.current_learning_iteration - first
-                    progress.update(row, self._end.time_left(done, total - self.current_learning_iteration))
-                    if self.current_learning_iteration % self.run.save_every == 0:
-                        self._save_periodic()
-                        saved = self.current_learning_iteration
-                    if self._end.due():
-                        break
-                if saved < self.current_learning_iteration or self.current_learning_iteration == 0:
-                    self._save_periodic()
+                self._iterate_until(total, log, progress)
         finally:
             if log is not None:
                 log.close()
         if self._end.signal:
             raise Interrupted
+
+    def _stagger(self, wanted: bool) -> None:
+        """Start worlds that are new at random times of their first episode."""
+        if wanted and self._stagger_due:
+            steps = self.env.episode_length_buf
+            self.env.episode_length_buf = torch.randint_like(steps, high=int(self.env.max_episode_length))
+        self._stagger_due = False
+
+    def _iterate_until(self, total: int, log: ProgressFile | None, progress: ProgressLine) -> None:
+        """Iterations up to ``total`` or the end of the time, curves, and checkpoints."""
+        first = saved = self.current_learning_iteration
+        observation = self.env.get_observations()
+        while self.current_learning_iteration < total:
+            if self.is_distributed:
+                watch_iteration()
+            row, observation = self._iterate(observation)
+            if row is None:
+                break
+            if log is not None:
+                log.write(row)
+            done = self.current_learning_iteration - first
+            progress.update(row, self._end.time_left(done, total - self.current_learning_iteration))
+            if self.current_learning_iteration % self.run.save_every == 0:
+                self._save_periodic()
+                saved = self.current_learning_iteration
+            if self._end.due():
+                break
+        if saved < self.current_learning_iteration or self.current_learning_iteration == 0:
+            self._save_periodic()
 
     def _iterate(self, observation: TensorDict) -> tuple[dict[str, Any] | None, TensorDict]:
         """One rollout and update.

@@ -87,30 +87,44 @@ def _convert(hint: Any, value: Any, where: str) -> Any:
         return _convert(args[0], value, where)
     if origin in (typing.Union, types.UnionType):
         return _convert_union(args, value, where)
-    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
-        if not isinstance(value, Mapping):
-            raise ValueError(f"{where}: expected fields of {hint.__name__}, got {value!r}")
-        return from_dict(hint, value, where=where)
     if origin in (tuple, list) and isinstance(value, (list, tuple)):
-        inner = [args[0]] * len(value) if origin is list or args[-1:] == (Ellipsis,) else list(args)
-        if len(inner) != len(value):
-            raise ValueError(f"{where}: expected {len(inner)} values, got {len(value)}")
-        pairs = enumerate(zip(inner, value, strict=True))
-        return origin(_convert(kind, item, f"{where}[{i}]") for i, (kind, item) in pairs)
+        return _convert_sequence(origin, args, value, where)
+    if dataclasses.is_dataclass(hint) and isinstance(hint, type):
+        return from_dict(hint, _mapping(value, f"fields of {hint.__name__}", where), where=where)
     if origin is dict:
-        if not isinstance(value, Mapping):
-            raise ValueError(f"{where}: expected values by name, got {value!r}")
-        return {key: _convert(args[1], item, f"{where}.{key}") for key, item in value.items()}
+        named = _mapping(value, "values by name", where)
+        return {key: _convert(args[1], item, f"{where}.{key}") for key, item in named.items()}
     if origin is typing.Literal:
         if value not in args:
             raise ValueError(f"{where}: {value!r} is not one of {', '.join(map(repr, args))}")
         return value
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+    return _convert_plain(hint, value, where) if isinstance(hint, type) else value
+
+
+def _mapping(value: Any, wanted: str, where: str) -> Mapping[str, Any]:
+    """``value``, if it has names."""
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{where}: expected {wanted}, got {value!r}")
+    return value
+
+
+def _convert_sequence(kind: Any, args: tuple[Any, ...], value: list | tuple, where: str) -> Any:
+    """``value`` as a list or tuple of what ``args`` say."""
+    inner = [args[0]] * len(value) if kind is list or args[-1:] == (Ellipsis,) else list(args)
+    if len(inner) != len(value):
+        raise ValueError(f"{where}: expected {len(inner)} values, got {len(value)}")
+    pairs = enumerate(zip(inner, value, strict=True))
+    return kind(_convert(each, item, f"{where}[{i}]") for i, (each, item) in pairs)
+
+
+def _convert_plain(kind: type, value: Any, where: str) -> Any:
+    """``value`` as a number, text, path or enumeration."""
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
-    if isinstance(hint, type) and issubclass(hint, (Path, Enum)):
-        return hint(value)
-    if isinstance(hint, type) and (not isinstance(value, hint) or (hint is int and isinstance(value, bool))):
-        raise ValueError(f"{where}: expected {hint.__name__}, got {value!r}")
+    if issubclass(kind, (Path, Enum)):
+        return kind(value)
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise ValueError(f"{where}: expected {kind.__name__}, got {value!r}")
     return value
 
 

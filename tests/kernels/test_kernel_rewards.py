@@ -19,9 +19,9 @@ from vd.kernels.rewards import (
     FINGERTIP_SQUARED_SUM,
     REWARD_TERMS,
     RewardParams,
-    SuccessParams,
     reward_kernel,
 )
+from vd.kernels.success import SuccessParams, success_kernel
 from vd.paper import PAPER
 
 REWARD = {
@@ -48,6 +48,7 @@ SUCCESS = {
     "object_speed": PAPER.success.object_speed_m_s,
     "object_spin": PAPER.success.object_spin_rad_s,
     "action_norm": PAPER.success.action_norm,
+    "table_contact_force": PAPER.reward.table_contact_force_n,
     "fall_distance": PAPER.success.fall_m,
     "fall_center": wp.vec3(*PAPER.scene.goal_position_m),
 }
@@ -73,38 +74,57 @@ def rest(fingers=3, worlds=1):
 
 
 def evaluate(device, state, reward=None, success=None):
-    """Launch the kernel; returns its outputs by name."""
+    """Launch the kernels, success first; returns their outputs by name."""
     worlds = len(state["q"])
-    previous = device_array(state["previous_error"], float, device)
-    out = {
-        "reward": unwritten(worlds, float, device),
-        "terms": unwritten((worlds, len(REWARD_TERMS)), float, device),
+    arrays = {
+        name: device_array(state[name], kind, device)
+        for name, kind in {
+            "q": float,
+            "qd": float,
+            "tips": wp.vec3,
+            "effort": float,
+            "goal": wp.quat,
+            "smoothed": float,
+            "table_force": float,
+            "clearance": float,
+            "must_lift": int,
+            "previous_error": float,
+        }.items()
+    }
+    reached = {
         "error": unwritten(worlds, float, device),
         "success": unwritten(worlds, int, device),
         "fell": unwritten(worlds, int, device),
     }
+    paid = {
+        "reward": unwritten(worlds, float, device),
+        "terms": unwritten((worlds, len(REWARD_TERMS)), float, device),
+    }
+    out = reached | paid
+    wp.launch(
+        success_kernel,
+        dim=worlds,
+        inputs=[
+            settings_array(SuccessParams, device, **{**SUCCESS, **(success or {})}),
+            *(arrays[name] for name in ("q", "qd", "goal", "smoothed", "table_force", "must_lift")),
+        ],
+        outputs=list(reached.values()),
+        device=device,
+    )
     wp.launch(
         reward_kernel,
         dim=worlds,
         inputs=[
             settings_array(RewardParams, device, **{**REWARD, **(reward or {})}),
-            settings_array(SuccessParams, device, **{**SUCCESS, **(success or {})}),
-            device_array(state["q"], float, device),
-            device_array(state["qd"], float, device),
-            device_array(state["tips"], wp.vec3, device),
-            device_array(state["effort"], float, device),
-            device_array(state["goal"], wp.quat, device),
-            device_array(state["smoothed"], float, device),
-            device_array(state["table_force"], float, device),
-            device_array(state["clearance"], float, device),
-            device_array(state["must_lift"], int, device),
-            previous,
+            *(arrays[name] for name in ("q", "qd", "tips", "effort", "table_force", "clearance")),
+            *reached.values(),
+            arrays["previous_error"],
         ],
-        outputs=list(out.values()),
+        outputs=list(paid.values()),
         device=device,
     )
     result = {name: array.numpy() for name, array in out.items()}
-    result["previous_error"] = previous.numpy()
+    result["previous_error"] = arrays["previous_error"].numpy()
     return result
 
 
@@ -274,7 +294,7 @@ def test_contact_at_its_threshold_is_none_and_above_it_spoils_success_where_lift
     state = rest(worlds=6)
     state["table_force"] = np.tile([0.0, 0.25, 0.26], 2)
     state["must_lift"] = np.repeat([0, 1], 3)
-    out = evaluate(device, state, {"table_contact_force": 0.25})
+    out = evaluate(device, state, {"table_contact_force": 0.25}, {"table_contact_force": 0.25})
     np.testing.assert_array_equal(out["terms"][:, 5], [0, 0, -1, 0, 0, -1])
     np.testing.assert_array_equal(out["success"], [1, 1, 1, 1, 1, 0])
 

@@ -401,21 +401,24 @@ class ReorientCfg:
             raise ValueError(f"episode_s = {self.episode_s} is shorter than one control step")
         if self.fingertip not in ("rigid", "soft"):
             raise ValueError(f"fingertip = {self.fingertip!r}; choose rigid or soft")
-        if self.success.rotation_rad <= 0.0:
-            raise ValueError(f"success.rotation_rad = {self.success.rotation_rad}; it must be positive")
-        tightening = self.curriculum.tightening
-        lifted = self.table.lift_share > 0.0
-        if tightening.enabled and self.success.rotation_rad > tightening.rotation_rad:
-            raise ValueError(
-                f"success.rotation_rad is {self.success.rotation_rad:g}, looser than where it begins, "
-                f"curriculum.tightening.rotation_rad {tightening.rotation_rad:g}; raise the latter"
-            )
-        if tightening.enabled and tightening.object_weight != 1.0 and not lifted:
-            raise ValueError(
-                f"curriculum.tightening.object_weight is {tightening.object_weight:g}, but no world asks for "
-                "objects off the table, and only there are they light; give table.lift_share"
-            )
         if self.table_friction < 0.0:
             raise ValueError(f"table_friction = {self.table_friction}; it must not be negative")
         if self.goal.max_angle_rad <= 0.0:
             raise ValueError(f"goal.max_angle_rad = {self.goal.max_angle_rad}; it must be positive")
+        if self.success.rotation_rad <= 0.0:
+            raise ValueError(f"success.rotation_rad = {self.success.rotation_rad}; it must be positive")
+        if self.curriculum.tightening.enabled:
+            self._check_tightening(self.curriculum.tightening)
+
+    def _check_tightening(self, tightening: TighteningCfg) -> None:
+        """Refuse one that would loosen, or do nothing."""
+        if self.success.rotation_rad > tightening.rotation_rad:
+            raise ValueError(
+                f"success.rotation_rad is {self.success.rotation_rad:g}, looser than where it begins, "
+                f"curriculum.tightening.rotation_rad {tightening.rotation_rad:g}; raise the latter"
+            )
+        if tightening.object_weight != 1.0 and self.table.lift_share == 0.0:
+            raise ValueError(
+                f"curriculum.tightening.object_weight is {tightening.object_weight:g}, but no world asks for "
+                "objects off the table, and only there are they light; give table.lift_share"
+            )

@@ -11,7 +11,8 @@ from vd.kernels.actions import ActionParams
 from vd.kernels.observations import ObservationParams
 from vd.kernels.randomisation import ForceParams, RandomisationParams
 from vd.kernels.resets import GoalParams, StartParams
-from vd.kernels.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, RewardParams, SuccessParams
+from vd.kernels.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, RewardParams
+from vd.kernels.success import SuccessParams
 from vd.paper import PAPER
 
 STILLNESS_START = 12.0
@@ -128,6 +129,7 @@ class TaskParameters:
             object_speed=threshold(success.object_speed_m_s, loose.object_speed_m_s),
             object_spin=threshold(success.object_spin_rad_s, loose.object_spin_rad_s),
             action_norm=threshold(success.action_norm, loose.action_norm),
+            table_contact_force=PAPER.reward.table_contact_force_n,
             fall_distance=success.fall_m,
             fall_center=np.array(PAPER.scene.goal_position_m, dtype=np.float32),
         )

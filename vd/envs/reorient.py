@@ -23,6 +23,7 @@ from vd.kernels.actions import apply_action_kernel
 from vd.kernels.guard import void_step_kernel
 from vd.kernels.resets import episode_kernel, give_goal_kernel, reset_kernel
 from vd.kernels.rewards import REWARD_TERMS, reward_kernel
+from vd.kernels.success import success_kernel
 from vd.kernels.worlds import count_goals_kernel, record_step_kernel, world_mask_kernel
 from vd.paper import PAPER
 from vd.sim.simulator import SimulationError
@@ -58,13 +59,49 @@ class ReorientEnv:
         self.measured_q, self.measured_qd = state.measured_q, state.measured_qd
         self.smoothed, self.goal_quat, self.must_lift = state.smoothed, state.goal_quat, state.must_lift
 
-        self.num_worlds = n = cfg.num_worlds
-        self.num_fingers = f = self.hand.num_fingers
-        self.num_actions = d = self.hand.num_joints
+        self.num_worlds = cfg.num_worlds
+        self.num_fingers = self.hand.num_fingers
+        self.num_actions = self.hand.num_joints
         self.sees_shape = cfg.observation.shape != "none"
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
         self.reward_term_names = REWARD_TERMS
+
+        self._allocate()
+        self._lifts = cfg.reward.lift != 0.0
+        self.randomiser = Randomiser(state)
+        self.observer = Observer(state, self.randomiser, shapes=self.sees_shape or self._lifts)
+        """Writes what is observed."""
+        self.num_observations = self.observer.num_observations
+        self.observation, self.privileged = self.observer.split(self.observer.all_values)
+        """Teacher observation, fresh after resets and new goals, shape [N, O]: state, shape, history,
+        and dynamics if the actor is told; and what the critic alone is told, shape [N, P]."""
+        self.world_observation, _ = self.observer.split(self.observer.world_values)
+        """Observation in the world frame, shape [N, O]."""
+        self.views = self.observer.views
+        """The views in which the policy observes and acts; None where that is the world frame."""
+        self.acts_in_view = True
+        """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
+        self._table_steps = table_array(cfg, self.device)
+
+        self.stage = first_stage(cfg.curriculum)
+        """How hard the task is at present; all ones is the configured task."""
+        self.parameters.set_stage(self.stage)
+        self.dump_dir = Path()
+        """Where :meth:`check` saves the step that failed."""
+        self._graph: Any = None
+        self._hold_graph: Any = None
+        self._kernels_loaded = False
+        self.steps = 0
+        """Control steps of all worlds since the begin of the run, with those of a checkpoint."""
+        self._own_steps = 0
+        if cfg.start.at_rest:
+            self._rest_poses = self._find_rest_poses()
+        self.reset()
+
+    def _allocate(self) -> None:
+        """Arrays of what a step decides, and of its counts."""
+        n, d, f = self.num_worlds, self.num_actions, self.num_fingers
 
         def zeros(*shape: int, dtype: Any = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=self.device)
@@ -102,38 +139,8 @@ class ReorientEnv:
         self._reset, self._new_goal = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
         self._world_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
-        self._reset_q = wp.array(np.tile(PAPER.scene.reset_joint_rad, f), dtype=float, device=self.device)
-        self._lifts = cfg.reward.lift != 0.0
-        self.randomiser = Randomiser(state)
-        self.observer = Observer(state, self.randomiser, shapes=self.sees_shape or self._lifts)
-        """Writes what is observed."""
-        self.num_observations = self.observer.num_observations
-        self.observation, self.privileged = self.observer.split(self.observer.all_values)
-        """Teacher observation, fresh after resets and new goals, shape [N, O]: state, shape, history,
-        and dynamics if the actor is told; and what the critic alone is told, shape [N, P]."""
-        self.world_observation, _ = self.observer.split(self.observer.world_values)
-        """Observation in the world frame, shape [N, O]."""
-        self.views = self.observer.views
-        """The views in which the policy observes and acts; None where that is the world frame."""
-        self.acts_in_view = True
-        """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
-        self._table_steps = table_array(cfg, self.device)
-
-        self.stage = first_stage(cfg.curriculum)
-        """How hard the task is at present; all ones is the configured task."""
-        self.parameters.set_stage(self.stage)
-        self.dump_dir = Path()
-        """Where :meth:`check` saves the step that failed."""
-        self._graph: Any = None
-        self._hold_graph: Any = None
-        self._kernels_loaded = False
-        self.steps = 0
-        """Control steps of all worlds since the begin of the run, with those of a checkpoint."""
-        self._own_steps = 0
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
-        if cfg.start.at_rest:
-            self._rest_poses = self._find_rest_poses()
-        self.reset()
+        self._reset_q = wp.array(np.tile(PAPER.scene.reset_joint_rad, f), dtype=float, device=self.device)
 
     def _find_rest_poses(self) -> wp.array:
         """Drop every object a few times and keep where it came to lie, shape [N, K]."""
@@ -266,23 +273,37 @@ class ReorientEnv:
         if self._lifts and self.observer.shapes is not None:
             self.observer.shapes.measure_clearance(self.clearance)
         wp.launch(
+            success_kernel,
+            dim=n,
+            inputs=[
+                p.success,
+                sim.joint_q,
+                sim.joint_qd,
+                self.goal_quat,
+                self.smoothed,
+                sim.table_force,
+                self.must_lift,
+            ],
+            outputs=[self.rotation_error, self.success, self.fell],
+            device=self.device,
+        )
+        wp.launch(
             reward_kernel,
             dim=n,
             inputs=[
                 p.reward,
-                p.success,
                 sim.joint_q,
                 sim.joint_qd,
                 self.fingers.tip_pos,
                 self.fingers.effort,
-                self.goal_quat,
-                self.smoothed,
                 sim.table_force,
                 self.clearance,
-                self.must_lift,
+                self.rotation_error,
+                self.success,
+                self.fell,
                 self.previous_error,
             ],
-            outputs=[self.reward, self.reward_terms, self.rotation_error, self.success, self.fell],
+            outputs=[self.reward, self.reward_terms],
             device=self.device,
         )
         if self.cfg.failures_per_million > 0.0:
