@@ -9,6 +9,7 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import networkx as nx
 import pytest
 
 from vd.paper import provenance
@@ -41,6 +42,14 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "vd": ("vd.train", "vd.deploy"),
     "vd.train": ("vd.deploy",),
     "vd.deploy": ("vd.train",),
+}
+# Modules that still import each other in a circle; no new ones.
+IN_CIRCLES = {
+    *(f"vd.assets_usd.objects.{name}" for name in ("model", "procedural", "sets")),
+    *(f"vd.evaluate.{name}" for name in ("cli", "compare", "suite_page", "suite_run")),
+    *(f"vd.gap.{name}" for name in ("recording", "recording_checks", "crowd", "rollout")),
+    *(f"vd.gap.{name}" for name in ("chance", "clock", "consensus", "select")),
+    *(f"vd.deploy.{name}" for name in ("score", "score_page")),
 }
 # Libraries that one part keeps to itself.
 OWNED_LIBRARIES = {"pxr": "vd.assets_usd", "coacd": "vd.assets_usd", "rsl_rl": "vd.train"}
@@ -90,6 +99,19 @@ def test_imports_go_one_way():
             if forbidden or not allowed:
                 wrong.append(f"{module} imports {name}")
     assert not wrong, "\n".join(wrong)
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    files = dict(modules())
+    graph = nx.DiGraph(
+        (module, name)
+        for module, path in files.items()
+        for name in imports(path) & files.keys()
+        if name != module
+    )
+    circles = [sorted(circle) for circle in nx.strongly_connected_components(graph) if len(circle) > 1]
+    new = [circle for circle in circles if not set(circle) <= IN_CIRCLES]
+    assert not new, "\n".join(map(str, new))
 
 
 def test_kernels_import_nothing_but_warp():
