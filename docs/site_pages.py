@@ -66,18 +66,19 @@ def commands() -> str:
 
 
 def _help(main: Callable[[], object], script: str, words: Sequence[str]) -> str:
-    """What ``script words --help`` prints."""
+    """What ``script words --help`` prints, or ``--help-all`` where that says more."""
+    flag = "--help-all" if tuple(words) == ("teacher",) else "--help"
     shown = io.StringIO()
     with (
         mock.patch.dict(os.environ, {"COLUMNS": str(COLUMNS), "NO_COLOR": "1", "TERM": "dumb"}),
-        mock.patch.object(sys, "argv", [script, *words, "--help"]),
+        mock.patch.object(sys, "argv", [script, *words, flag]),
         contextlib.redirect_stdout(shown),
         contextlib.suppress(SystemExit),
     ):
         main()
     lines = shown.getvalue().strip().splitlines()
     if not lines:
-        raise ValueError(f"`{script} {' '.join(words)} --help` prints nothing")
+        raise ValueError(f"`{script} {' '.join(words)} {flag}` prints nothing")
     return "\n".join(textwrap.fill(line, COLUMNS) if line[:1].isalpha() else line.rstrip() for line in lines)
 
 
