@@ -14,11 +14,12 @@ from pathlib import Path
 import pytest
 
 from vd.config import from_dict, to_dict
+from vd.device import resolve_device
 from vd.envs.cfg import CurriculumCfg, ObservationCfg, SuccessCfg
 from vd.paper import PAPER
 from vd.train.cli import main
 from vd.train.config import minibatches, validate
-from vd.train.flags import OF_HELP_ALL, parse_teacher, resolve_device
+from vd.train.flags import OF_HELP_ALL, parse_teacher
 from vd.train.presets import PRESETS, PresetName, TeacherCfg, smoke
 from vd.train.student.config import StudentTrainCfg
 
@@ -189,14 +190,11 @@ def test_every_flag_is_described(cls):
 
 
 def test_a_command_names_itself_in_its_help(capsys):
-    for command in ("teacher", "student", "profile", "calibrate", "follow", "average", "export", "noise"):
+    for command in ("teacher", "student", "calibrate", "follow", "average", "export"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
         text = capsys.readouterr().out
         assert text.startswith(f"usage: vd-train {command} ")
-    with pytest.raises(SystemExit):
-        main(["profile", "--help"])
-    assert "Where the time of a student's training goes" in capsys.readouterr().out
 
 
 def test_help_needs_neither_torch_nor_the_simulator():

@@ -15,10 +15,10 @@ import tyro
 
 from vd import interrupt
 from vd.config import to_dict
+from vd.device import resolve_device
 from vd.files import check_file, check_folder, write_json
 from vd.train.begin import find_start
-from vd.train.config import NoiseCfg
-from vd.train.flags import CONFIG_NAME, parse_teacher, resolve_device
+from vd.train.flags import CONFIG_NAME, parse_teacher
 from vd.train.presets import SMOKE_RUN, TeacherCfg
 from vd.warp_quiet import quiet_warp
 
@@ -30,7 +30,6 @@ USAGE = """usage: vd-train COMMAND [flags]
 commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --run-dir runs/first
   student    imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
-  profile    where a student's time goes          vd-train profile --stage 1 --teacher dclaw3-table
   calibrate  choose when a student stops          vd-train calibrate student.pt --objects SET
   follow     give a student a newer teacher       vd-train follow dclaw4-student runs/more student.pt
   average    mean weights of several teachers     vd-train average runs/a runs/b --output policy.pt
@@ -39,7 +38,6 @@ commands:
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
   bundle     write a policy as it is deployed     vd-train bundle student.pt bundles/first
   curves     draw the curves of a run             vd-train curves runs/first
-  noise      how much of an update is signal      vd-train noise --init dclaw4-air --objects SET
   precompile compile CUDA kernels without a GPU   vd-train precompile FOLDER --preset gpu
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset multi-gpu
@@ -113,12 +111,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "student": _elsewhere("vd.train.student.cli", "student_command"),
         "calibrate": _elsewhere("vd.train.student.cli", "calibrate_command"),
         "follow": _elsewhere("vd.train.student.cli", "follow_command"),
-        "profile": _elsewhere("vd.train.student.cli", "profile_command"),
         "average": _elsewhere("vd.train.average", "average_command"),
         "export": _export,
         "bundle": _bundle,
         "curves": _curves,
-        "noise": _noise,
         "precompile": _precompile,
     }
     if not arguments or arguments[0] in ("-h", "--help"):
@@ -226,9 +222,6 @@ def _teacher(arguments: list[str], started: float) -> int:
 
 
 def _train_teacher(cfg: TeacherCfg, main_process: bool, started: float) -> int:
-    from vd.evaluate.agents import check_names
-
-    check_names((), cfg.env.objects, cfg.env.hand)
     from vd.train.ending import finished
     from vd.train.progress import waiting
 
@@ -347,16 +340,6 @@ def _curves(arguments: list[str], _started: float) -> int:
     plot = plot_student_curves if any(key.startswith("student/") for key in first) else plot_curves
     plot(files, output)
     print(output)
-    return 0
-
-
-def _noise(arguments: list[str], _started: float) -> int:
-    cfg, rest = tyro.cli(NoiseCfg, args=arguments, prog="vd-train noise", return_unknown_args=True)
-    teacher = parse_teacher(rest)
-
-    from vd.train.noise import print_noise
-
-    print_noise(cfg, teacher, build_teacher)
     return 0
 
 

@@ -7,9 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
-
-import tyro
+from typing import Any, ClassVar, Literal
 
 from vd.paper import PAPER
 
@@ -112,36 +110,6 @@ class RunCfg:
         if self.keep_every is not None and (self.keep_every < 1 or self.keep_every % self.save_every):
             raise ValueError(
                 f"--keep-every is {self.keep_every}; give a multiple of --save-every {self.save_every}"
-            )
-
-
-@dataclass
-class NoiseCfg:
-    """How much of an update is signal: the noise scale of the policy gradient, by GAE lambda.
-
-    All other flags are those of vd-train teacher, --init with the policy in question among them. Nothing is
-    trained.
-    """
-
-    steps: int = 192
-    """Control steps of every world to record, after one episode, so that states are those of training."""
-    groups: int = 64
-    """Groups of worlds, each of which gives a gradient of its own."""
-    lambdas: tuple[float, ...] = (0.8, 0.9, 0.95, 0.98)
-    """GAE lambdas to look at, besides 1 and that of the learner."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print the rows as JSON."""
-
-    def validate(self, num_worlds: int) -> None:
-        """Raise ValueError naming the flag and the remedy."""
-        if self.steps < 3:
-            raise ValueError(f"--steps is {self.steps}; give at least 3, a third of which is left out")
-        for value in self.lambdas:
-            if not 0.0 <= value <= 1.0:
-                raise ValueError(f"--lambdas has {value:g}; it has to lie within 0 and 1")
-        if self.groups < 3 or num_worlds % self.groups:
-            raise ValueError(
-                f"--groups is {self.groups}; give at least 3, and a divisor of the {num_worlds} worlds"
             )
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
 import tyro
 
 from vd.config import from_dict, to_dict
+from vd.device import resolve_device
 from vd.evaluate.agents import check_names
 from vd.train.begin import settings_of
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
@@ -70,8 +71,7 @@ def parse_teacher(
         start = settings_of(init, PRESETS["gpu"]())
     elif preset is None and unnamed is None and not saved:
         # Wrong flags and names, and --help, do not wait for torch.
-        given = _parsed(arguments, PRESETS["gpu"]()).env
-        check_names((), given.objects, given.hand)
+        _parsed(arguments, PRESETS["gpu"]())
         preset, reason = machine_preset(value_of(arguments, "--device"))
         start = PRESETS[preset]()
         if say is not None:
@@ -85,30 +85,6 @@ def parse_teacher(
     if cfg.env.observation.view == "either":
         raise ValueError("env.observation.view either is of evaluations; train with goal, which it looks at")
     return cfg
-
-
-def resolve_device(name: str) -> str:
-    """The torch device for ``--device``: ``auto`` is this process's GPU (torchrun), the first, or the CPU.
-
-    Raises:
-        ValueError: The device does not exist here.
-    """
-    import torch
-
-    if name == "auto":
-        name = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
-    if name == "cuda":
-        name = "cuda:0"
-    if name == "cpu":
-        return name
-    index = name.removeprefix("cuda:")
-    if not name.startswith("cuda:") or not index.isdigit():
-        raise ValueError(f"--device is '{name}'; it has to be auto, cpu, or cuda:N")
-    if int(index) >= torch.cuda.device_count():
-        raise ValueError(
-            f"--device is '{name}', but torch finds {torch.cuda.device_count()} GPUs; use auto or cpu"
-        )
-    return name
 
 
 def machine_preset(device: str | None) -> tuple[str, str]:
@@ -153,14 +129,16 @@ def value_of(arguments: list[str], flag: str) -> str | None:
 
 
 def _parsed(arguments: list[str], default: TeacherCfg) -> TeacherCfg:
-    """Every flag, with the values of ``default`` for those that are not given."""
+    """Every flag, with the values of ``default`` for those that are not given; wrong names are refused."""
     kind: Any = TeacherCfg
     if "--help-all" in arguments:
         arguments = ["--help"]
     elif {"-h", "--help"} & set(arguments):
         kind = _without(TeacherCfg, OF_HELP_ALL)
         default = from_dict(kind, to_dict(default))
-    return tyro.cli(kind, args=arguments, default=default, prog="vd-train teacher", description=TEACHER_HELP)
+    cfg = tyro.cli(kind, args=arguments, default=default, prog="vd-train teacher", description=TEACHER_HELP)
+    check_names((), cfg.env.objects, cfg.env.hand)
+    return cfg
 
 
 def _without(kind: type, hidden: Collection[str], where: str = "") -> type:

@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
@@ -15,6 +16,9 @@ from typing import Any, ParamSpec
 
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 """Exit statuses."""
+
+PARENT_S = 0.5
+"""Between two looks at the parent [s]."""
 
 P = ParamSpec("P")
 
@@ -96,3 +100,18 @@ def _terminated() -> Iterator[None]:
     note(0)
     with handled(terminate, signal.SIGTERM, signal.SIGHUP):
         yield
+
+
+def end_with_parent(parent: int) -> None:
+    """Have SIGTERM end this process once its parent is gone: one that is killed cannot tell its children.
+
+    Args:
+        parent: The parent's process ID, as the parent tells it: it may be gone already.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_S)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -1,8 +1,6 @@
 """Processes for many long tasks of unequal length: one that hangs or dies costs its own task only."""
 
-import multiprocessing
 import os
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -10,6 +8,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import connection, get_context
 from typing import Any
+
+from vd.interrupt import end_with_parent
 
 SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 """Variables that keep the linear algebra of a worker to one thread; it reads them when it starts."""
@@ -70,7 +70,7 @@ def run_tasks(
 
     def start() -> _Worker:
         mine, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(work, theirs), daemon=True)
+        process = context.Process(target=_serve, args=(work, theirs, os.getpid()), daemon=True)
         process.start()
         theirs.close()
         return _Worker(process, mine)
@@ -122,22 +122,14 @@ def run_tasks(
                 worker.process.kill()
 
 
-def _serve(work: Callable[[Any], Any], pipe: connection.Connection) -> None:
+def _serve(work: Callable[[Any], Any], pipe: connection.Connection, parent: int) -> None:
     """A worker: tasks in, results out, until the other end closes."""
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    end_with_parent(parent)
     try:
         while True:
             pipe.send(work(pipe.recv()))
     except (EOFError, OSError, KeyboardInterrupt):
         return
-
-
-def end_with_parent() -> None:
-    """End this process once its parent is gone: one that is killed has no time to tell its workers."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
 
 
 @contextmanager

@@ -79,8 +79,8 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         FileNotFoundError: There is no such teacher, student or checkpoint.
         ValueError: The settings do not fit each other, or the student to begin from.
     """
+    from vd.device import resolve_device
     from vd.train.checkpoint import damaged_after, find_checkpoint, set_aside
-    from vd.train.flags import resolve_device
 
     validate(cfg)
     rank, folder = int(os.environ.get("RANK", "0")), cfg.run.run_dir

@@ -10,6 +10,7 @@ from typing import Annotated, Literal, cast
 import tyro
 
 from vd import interrupt
+from vd.device import resolve_device
 from vd.files import check_file
 from vd.paper import PAPER
 from vd.train.student.build import build_student, default_init
@@ -21,10 +22,6 @@ Stage 0 pre-trains the encoder on random scenes, stage 1 imitates on complete sy
 those of a depth camera. Flags start from --preset and --stage, or with --resume from the run's config.json;
 the network from --init. Short forms: --objects, --num-worlds and --seed stand for --task.objects and so on.
 Ctrl-C saves."""
-
-PROFILE_HELP = """Where the time of a student's training goes: two iterations, of which nothing is kept.
-
-Flags are those of vd-train student."""
 
 SHORT_FORMS = ("objects", "num-worlds", "seed")
 """Fields of the task that are flags without the ``--task.`` prefix too."""
@@ -76,9 +73,7 @@ class FollowCfg:
     """File to write."""
 
 
-def parse_student(
-    arguments: Sequence[str], *, prog: str = "vd-train student", description: str = HELP
-) -> StudentTrainCfg:
+def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
     """The configuration that command-line flags ask for.
 
     The first pass finds where to start from (``--preset`` and ``--stage``, the run's own configuration with
@@ -99,7 +94,7 @@ def parse_student(
         base = saved_config(arguments, base) or _with_init(arguments, base)
     elif "--help" not in arguments and "-h" not in arguments:
         base = _with_init(arguments, base)
-    return tyro.cli(StudentTrainCfg, args=arguments, default=base, prog=prog, description=description)
+    return tyro.cli(StudentTrainCfg, args=arguments, default=base, prog="vd-train student", description=HELP)
 
 
 def student_command(arguments: list[str], started: float) -> int:
@@ -136,43 +131,12 @@ def student_command(arguments: list[str], started: float) -> int:
     return 0
 
 
-def profile_command(arguments: list[str], _started: float) -> int:
-    """``vd-train profile``: flags as of ``vd-train student``; nothing is kept."""
-    from tempfile import TemporaryDirectory
-
-    with TemporaryDirectory() as folder:
-        cfg = parse_student(
-            ["--from-scratch", *arguments, "--run-dir", folder],
-            prog="vd-train profile",
-            description=PROFILE_HELP,
-        )
-
-        from vd.train.progress import waiting
-        from vd.train.student.dagger import Dagger
-        from vd.train.student.profile import profile_iteration
-
-        if cfg.stage == 0:
-            raise ValueError("--stage 0 has no iterations of imitation; give --stage 1 or 2")
-        with waiting("two iterations (the first start compiles the kernels: a minute or two)"):
-            learner = build_student(cfg).learner
-            assert isinstance(learner, Dagger)
-            times = profile_iteration(learner)
-            samples = learner.samples_per_iteration
-            learner.close()
-    whole = sum(times.values())
-    print(f"stage {cfg.stage}: an iteration of {samples} control steps takes {whole:.2f} s, of which")
-    for name, seconds in times.items():
-        print(f"  {name:34s} {seconds:8.3f} s  {seconds / whole:6.1%}")
-    return 0
-
-
 def calibrate_command(arguments: list[str], _started: float) -> int:
     """``vd-train calibrate``; the exit status."""
     cfg = tyro.cli(CalibrateCfg, args=arguments, prog="vd-train calibrate")
     check_file(cfg.student)
 
     from vd.config import to_dict
-    from vd.train.flags import resolve_device
     from vd.train.progress import waiting
     from vd.train.student.calibrate import calibrate_student
 

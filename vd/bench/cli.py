@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from vd import interrupt
+from vd.device import resolve_device
 from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
 
@@ -57,7 +58,7 @@ class SimCommand:
         from vd.policy import load_policy
 
         quiet_warp()
-        device = choose_device(self.device)
+        device = resolve_device(self.device)
         teacher = None if self.policy is None else load_policy(find_policy(self.policy), device)
         rows: list[dict[str, Any]] = []
         for worlds, jacobian in itertools.product(self.worlds, self.jacobian):
@@ -164,7 +165,7 @@ class DepthCommand:
         from vd.files import write_json
 
         quiet_warp()
-        device = choose_device(self.device)
+        device = resolve_device(self.device)
         objects = load_set(list(self.objects))
         rows: list[dict[str, Any]] = []
         for worlds in self.worlds:
@@ -222,7 +223,7 @@ class StudentCommand:
                     "a student.pt"
                 )
         quiet_warp()
-        device = choose_device(self.device)
+        device = resolve_device(self.device)
         objects = load_set(list(self.objects))
         rows: dict[str, list[dict[str, Any]]] = {"latency": [], "training": []}
 
@@ -344,7 +345,7 @@ class GapCommand:
             make_folder(self.out)
             print(f"{take_over(self.merge, self.out)} results taken over")
         if not self.collect:
-            device = choose_device(self.device)
+            device = resolve_device(self.device)
             shard = parse_shard(self.shard)
             run_battery(
                 cases,
@@ -365,15 +366,6 @@ class GapCommand:
         write_text(self.out / "summary.md", markdown(results))
         print(markdown(results))
         return 0
-
-
-def choose_device(name: str) -> str:
-    """The Warp device of ``auto``, ``cpu``, ``cuda`` or ``cuda:N``."""
-    import warp as wp
-
-    if name == "auto":
-        return "cuda:0" if wp.is_cuda_available() else "cpu"
-    return str(wp.get_device(name))
 
 
 Command = (

@@ -51,7 +51,7 @@ class ReorientEnv:
         """
         cfg.validate()
         self.cfg = cfg
-        self.device = str(wp.get_device(device or ("cuda:0" if wp.is_cuda_available() else "cpu")))
+        self.device = str(wp.get_device(device))
         self.state = state = build_task(cfg, self.device)
         """What this and its parts share."""
         self.hand, self.objects, self.scene, self.sim = state.hand, state.objects, state.scene, state.sim

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from vd import interrupt
+from vd.device import resolve_device
 from vd.evaluate.agents import (
     LAYER_HELP,
     SHIPPED_POLICIES,
@@ -406,23 +407,6 @@ def evaluate(cfg: EvalCfg) -> "EvalResult":
     result.write(cfg.output / "eval.json")
     write_report(result, cfg.output / "eval.html", pictures=pictures(env.objects))
     return result
-
-
-def resolve_device(name: str) -> str:
-    """The Warp and torch device that ``--device`` means.
-
-    Raises:
-        ValueError: It does not exist here.
-    """
-    import warp as wp
-
-    if name == "auto":
-        return "cuda:0" if wp.is_cuda_available() else "cpu"
-    known = ["cpu", *(device.alias for device in wp.get_cuda_devices())]
-    name = "cuda:0" if name == "cuda" else name
-    if name not in known:
-        raise ValueError(f"--device is '{name}', but this machine has {', '.join(known)}")
-    return name
 
 
 def worlds_for(num_objects: int, episodes: int, device: str, *, limit: int | None = None) -> int:

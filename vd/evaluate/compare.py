@@ -64,8 +64,9 @@ def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
     quiet_warp()
     from vd.assets_usd.objects.model import load_set
     from vd.assets_usd.objects.sheet import pictures
+    from vd.device import resolve_device
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.cli import resolve_device, software, worlds_for
+    from vd.evaluate.cli import software, worlds_for
     from vd.evaluate.comparison import Comparison, judge
     from vd.evaluate.comparison_page import write_comparison
     from vd.evaluate.result import Protocol

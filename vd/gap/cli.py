@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from vd import interrupt
+from vd.device import resolve_device
 from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
 
@@ -65,7 +66,7 @@ class _Step:
                 "hand_layer": self.hand_layer,
                 "effects": None if self.effects is None else _effects(self.effects),
                 "seed": self.seed,
-                "device": None if self.device is None else _device(self.device),
+                "device": None if self.device is None else resolve_device(self.device),
             },
         )
         if recording is not None:
@@ -253,7 +254,7 @@ class Identify:
             generations=self.generations,
             population=self.population,
             dt=1.0 / self.rate,
-            device=_device(self.device),
+            device=resolve_device(self.device),
             seed=self.seed,
             progress=show,
         )
@@ -347,12 +348,6 @@ def _effects(text: str) -> tuple[str, ...]:
             f"--effects: no effect is called {', '.join(unknown)}; choose from {', '.join(EFFECTS)}"
         )
     return names
-
-
-def _device(name: str) -> str:
-    from vd.evaluate.cli import resolve_device
-
-    return resolve_device(name)
 
 
 if __name__ == "__main__":

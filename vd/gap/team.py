@@ -2,6 +2,7 @@
 
 import copy
 import multiprocessing
+import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -18,8 +19,8 @@ from vd.gap.fit import JointProblem
 from vd.gap.jitter import CALLS
 from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
+from vd.interrupt import end_with_parent
 from vd.warp_quiet import quiet_warp
-from vd.workers import end_with_parent
 
 Call = tuple[str, dict[str, Any]]
 SHORT_S = 0.1
@@ -123,9 +124,9 @@ _bench: Bench | None = None
 """Of a worker process."""
 
 
-def _start(bench: Bench) -> None:
+def _start(bench: Bench, parent: int) -> None:
     global _bench
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    end_with_parent(parent)
     quiet_warp()
     _bench = bench
 
@@ -163,7 +164,7 @@ class Team:
             # Not forked: Warp and its threads may be running.
             context = multiprocessing.get_context("spawn")
             self._pool = ProcessPoolExecutor(
-                self.workers, mp_context=context, initializer=_start, initargs=(self.bench,)
+                self.workers, mp_context=context, initializer=_start, initargs=(self.bench, os.getpid())
             )
         return self
 

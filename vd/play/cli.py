@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 from vd import interrupt
+from vd.device import resolve_device
 from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, check_names, episode_limit_s, start_at_rest
 from vd.evaluate.cli import POLICY_HELP
 from vd.files import check_file
@@ -253,7 +254,6 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         open_policy,
         task_for,
     )
-    from vd.evaluate.cli import resolve_device
     from vd.policy import TrainedPolicy
 
     device = resolve_device(cfg.device)

@@ -1,0 +1,27 @@
+"""The device that ``--device`` means, the same in every command."""
+
+import os
+
+
+def resolve_device(name: str) -> str:
+    """The device for Warp and torch: ``auto`` is this process's GPU (torchrun), the first, or the CPU.
+
+    Raises:
+        ValueError: The device does not exist here.
+    """
+    import torch
+
+    if name == "auto":
+        name = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if torch.cuda.is_available() else "cpu"
+    if name == "cuda":
+        name = "cuda:0"
+    if name == "cpu":
+        return name
+    index = name.removeprefix("cuda:")
+    if not name.startswith("cuda:") or not index.isdigit():
+        raise ValueError(f"--device is '{name}'; it has to be auto, cpu, or cuda:N")
+    if int(index) >= torch.cuda.device_count():
+        raise ValueError(
+            f"--device is '{name}', but torch finds {torch.cuda.device_count()} GPUs; use auto or cpu"
+        )
+    return name
