@@ -11,7 +11,9 @@ if "PYTEST_XDIST_WORKER" in os.environ:  # before anything reads it: of shared c
 import pytest
 import warp as wp
 
-wp.config.log_level = wp.LOG_WARNING
+from vd.warp_quiet import quiet_warp
+
+quiet_warp()
 # What a shell starts in the background, or nohup, is deaf to these; the tests and what they start are not.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)

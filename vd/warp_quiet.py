@@ -1,4 +1,4 @@
-"""Warp without the lines that would scroll everything else away."""
+"""Warp without the lines that would scroll everything else away, and without gradients that nobody takes."""
 
 import ctypes
 import os
@@ -10,7 +10,10 @@ _NO_DRIVER = b"Warp CUDA warning: Could not find or load the NVIDIA CUDA driver"
 
 
 def quiet_warp() -> None:
-    """Keep Warp to warnings; where there is no GPU driver, start it without its warning of that.
+    """Keep Warp to warnings and forward kernels; without a GPU driver, start it without its warning of that.
+
+    Backward kernels are a fifth of a first start's compilation. Modules take the setting when they are
+    imported, so this comes before Newton.
 
     Without a driver there is no CUDA context that an early start could spoil. With one Warp starts when it
     is first used, as ever.
@@ -18,6 +21,7 @@ def quiet_warp() -> None:
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING
+    wp.config.enable_backward = False
     if _has_driver():
         return
     sys.stderr.flush()
