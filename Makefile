@@ -23,8 +23,8 @@ BENCH_ARGS ?=
 .PHONY: help env demo test lint type format docs bench clean
 
 help:
-	@echo 'make demo     author the assets, train and evaluate a small policy, write demo/index.html'
-	@echo '              MESHES=DIR tries it on your own meshes; DEMO_ARGS="--minutes 8" passes options on'
+	@echo 'make demo     turn unseen objects, close a gap, fly a hand, train a little: demo/index.html'
+	@echo '              MESHES=DIR turns your own meshes; DEMO_ARGS=--quick ends after the first part'
 	@echo 'make test     all tests; TEST_ARGS="-k rewards" chooses some'
 	@echo 'make lint     ruff, without changing files      make format   the same, changing files'
 	@echo 'make type     mypy on the built package         make bench    simulation throughput'

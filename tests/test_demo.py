@@ -1,337 +1,248 @@
-"""The demo from end to end, tiny, and what its page says about what it cannot know beforehand."""
+"""The demo: what it calls, what its page says of parts that end, fail or stop, and what it refuses."""
 
+import importlib
 import json
-import re
+import signal
+import subprocess
+import sys
 import time
-from dataclasses import replace
+import tomllib
 from pathlib import Path
 
 import pytest
-import trimesh
-from test_demo_deploy import made_up_flights
-from test_demo_student import student_rows
+import tyro
+from test_evaluate_report import PNG
+from test_evaluate_trace import compared
 from test_gap_report import sample_curves, sample_report
 
-from vd.assets_usd.objects import importer
-from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import SHIPPED_POLICIES
-from vd.evaluate.result import Episode, EvalResult, Protocol, summarise
+from vd.assets_usd.hands import load_hand
+from vd.deploy.log import LogWriter
+from vd.evaluate.comparison import Comparison
 from vd.gap.report import write_report
-from vd.train import cli, demo, demo_agents, demo_page
-from vd.train.demo_gap import ANALYSIS
-from vd.train.demo_stages import Budget, Stages, TimeUp, time_limit
-from vd.train.demo_student import student_files
+from vd.hand_log import JOINT_CHANNELS
+from vd.train import demo
+from vd.train.demo import Demo, DemoCfg, FailureError, Part, all_parts, main
 from vd.train.metrics import PROGRESS_FILE
-from vd.train.presets import PRESETS
 
-EPISODE_S = 0.5
-"""Six control steps: a step takes as long with few worlds as with many."""
-
-
-def result(agent: str, reached: int, episodes: int = 40) -> EvalResult:
-    """An evaluation in which the first ``reached`` of ``episodes`` reached their goal."""
-    unit = (0.0, 0.0, 0.0, 1.0)
-    protocol = Protocol(agent, "cube", "dclaw4", episodes, 0, 1.0, 0.4, 10.0, 12.0, False)
-    rows = tuple(
-        Episode(0, unit, unit, 0.9, *2 * (0.3 if i < reached else 1.2,), 60, i < reached, False)
-        for i in range(episodes)
-    )
-    return summarise(protocol, ("cube",), rows)
+ROOT = Path(__file__).resolve().parents[1]
+SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 
 
-class Clock:
-    """A clock that moves only when told to."""
-
-    now = 0.0
-
-    def __call__(self) -> float:
-        """What it says [s]."""
-        return self.now
+def option(line: list[str], flag: str) -> Path:
+    return Path(line[line.index(flag) + 1])
 
 
-def stages_in(folder: Path, minutes: float = 1.0, clock: Clock | None = None) -> Stages:
-    clock = clock or Clock()
-    return Stages(folder / "stages.json", 1, Budget(minutes, clock, clock()))
+def leave_evaluation(line: list[str]) -> None:
+    rows, prediction = compared()
+    Comparison(tuple(rows), (prediction,)).write(option(line, "--output") / "eval.json")
 
 
-def made_up_gap(folder: Path, _seed: int, _device: str) -> None:
-    """The report of a gap that was never looked for; tests/test_demo_gap.py looks for one."""
-    curves = sample_curves()
-    write_report(sample_report(curves), curves, folder / ANALYSIS)
+def leave_report(line: list[str]) -> None:
+    write_report(sample_report(sample_curves()), sample_curves(), option(line, "--out"))
 
 
-def made_up_students(folder: Path, _seed: int, *, minutes: float) -> None:
-    """Runs of students that never were; tests/test_demo_student.py trains some."""
-    assert minutes > 0.0
-    for path, rows in zip(student_files(folder), (student_rows(0.1), student_rows(0.4)), strict=True):
-        path.parent.mkdir(parents=True)
-        path.touch()
-        lines = [json.dumps(row) for row in rows]
-        (path.parent / PROGRESS_FILE).write_text("\n".join(lines) + "\n")
+def leave_flight(line: list[str]) -> None:
+    import numpy as np
+
+    hand = load_hand("dclaw4")
+    run = {"object": {"name": "mug", "set": "x"}, "goals": [[0.0, 0.0, 0.0, 1.0]], "control_hz": 12.0}
+    log = LogWriter(option(line, "--log"), hand, run, servo={})
+    joints = dict.fromkeys(JOINT_CHANNELS, np.zeros(hand.num_joints))
+    for step in range(3):
+        now = log.started_s + step / 12
+        log.step(now, now + 0.04, joints, [0.0, 1.0, 0.5, 0.0, 0.002, 0.04, 0.004, 1.0])
+    log.event("stop", goal=0, outcome="stopped", distance=0.2)
+    log.finish("all goals pursued")
+    (option(line, "--log") / "run.mp4").write_bytes(b"no film")
 
 
-@pytest.fixture(scope="module")
-def assets(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder that the first demo fills."""
-    return tmp_path_factory.mktemp("assets")
-
-
-@pytest.fixture
-def small(monkeypatch, tmp_path, assets) -> demo.DemoCfg:
-    """Settings under which every stage is short, with assets of its own."""
-    monkeypatch.setenv("VD_ASSETS", str(assets))
-    preset = PRESETS["cpu-demo"]()
-    env = replace(preset.env, episode_s=EPISODE_S, start=replace(preset.env.start, poses=1))
-    monkeypatch.setitem(PRESETS, "cpu-demo", lambda: replace(preset, env=env))
-    monkeypatch.setitem(demo.EPISODES_RANGE, "cpu", (4, 4))
-    monkeypatch.setitem(demo.PAPER_EPISODES, "cpu", 4)
-    monkeypatch.setitem(demo.MESH_EPISODES, "cpu", 4)
-    monkeypatch.setattr(demo_agents, "VIDEO_SECONDS", 0.5)
-    monkeypatch.setattr(demo_agents, "VIDEO_CELLS", 1)
-    monkeypatch.setattr(demo, "find_hidden_gap", made_up_gap)
-    monkeypatch.setattr(demo, "train_students", made_up_students)
-    monkeypatch.setattr(demo, "fly_twins", made_up_flights)
-    return demo.DemoCfg(
-        out=tmp_path / "demo", minutes=20.0, objects=("cube",), preset="cpu-demo", num_worlds=4, max_steps=128
-    )
-
-
-@pytest.fixture
-def cone(tmp_path) -> Path:
-    """A folder with one mesh."""
-    meshes = tmp_path / "meshes"
-    meshes.mkdir()
-    trimesh.creation.cone(0.05, 0.12, sections=12).export(meshes / "cone.stl")
-    return meshes
-
-
-@pytest.mark.slow
-def test_demo_ends_with_a_page_and_repeats_nothing(small, cone, capsys):
-    small = replace(small, meshes=cone)
-    page = demo.run_demo(small)
-    text = page.read_text()
-    assert text.count("<video") == 4  # its own objects, imported ones, both twins
-    assert text.count("<img") >= 5  # comparison, learning, curves, contact sheet, student
-    assert "lacks command delay" in text
-    assert "begins to imitate" in text and "0.45 on held-out episodes" in text
-    (link,) = re.findall(r'<a href="([^"]+)"', text)
-    assert (page.parent / link).is_file()
-    assert "task on purpose" in text  # what makes it easier is said
-    assert "not trained" in text and "no time" not in text
-    for name in demo_page.NAMES.values():
-        assert text.count(name) >= 2  # on its own objects and on imported ones
-    (folder,) = (path.parent for path in small.out.rglob("stages.json"))
-    assert EvalResult.read(folder / "trained.json").object_names == ("cube",)
-    assert EvalResult.read(folder / "imported" / "zero.json").object_names == ("cone",)
-    judged = EvalResult.read(folder / "evaluation" / "eval.json")
-    assert "cone" in judged.object_names
-    assert judged.protocol.policy in SHIPPED_POLICIES and not judged.protocol.at_rest
-    assert f"are of {judged.protocol.policy}" in text
-    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*.pt")}
-    output = capsys.readouterr().out
-    total = demo.STAGES + 1 + demo.MESH_STAGES
-    assert all(f"[{number}/{total}, " in output for number in range(1, total + 1))
-    assert "done before" not in output
-
-    page.unlink()
-    assert demo.run_demo(small) == page
-    assert page.is_file()
-    assert {path: path.stat().st_mtime_ns for path in before} == before
-    # Import, objects, gap, training, comparison, video, both again with meshes, student, twins, evaluation.
-    assert capsys.readouterr().out.count("done before") == total - 2
-
-
-@pytest.mark.slow
-def test_a_used_up_budget_still_ends_with_a_page_that_says_what_is_missing(small, cone, monkeypatch, capsys):
-    compare = demo._Demo.compare
-
-    def late(self):  # the time is over just after the comparison
-        agents = compare(self)
-        monkeypatch.setattr(demo, "PAGE_MIN", 10.0)
-        return agents
-
-    monkeypatch.setattr(demo._Demo, "compare", late)
-    monkeypatch.setattr(demo, "IMPORT_SHARE", 0.0)
-    page = demo.run_demo(replace(small, minutes=10.0, meshes=cone))
-    text, output = page.read_text(), capsys.readouterr().out
-    assert "<video" not in text
-    for name in demo_page.NAMES.values():
-        assert name in text
-    for command in ("vd-assets import", "vd-play", "vd-eval"):
-        assert f"by hand: {command}" in output
-        assert command in text.partition("Left out")[2]
-    assert "cone.stl" in text
-    assert "[11/11, " in output  # nothing is announced for meshes that are not there
-
-
-def test_a_machine_too_slow_for_the_comparison_ends_with_the_remedy(tmp_path):
-    clock = Clock()
-    it = demo._Demo(demo.DemoCfg(out=tmp_path), "cpu-demo", "cpu", tmp_path, stages_in(tmp_path, 14.0, clock))
-    clock.now = 60.0 * 13.9
-    with pytest.raises(demo.DemoError, match="--minutes"):
-        it.compare()
-
-
-def test_training_gets_what_the_other_stages_leave(tmp_path, monkeypatch):
-    clock, asked = Clock(), []
-
-    def teacher(arguments):
-        asked.append(float(arguments[arguments.index("--max-minutes") + 1]))
-        (tmp_path / "teacher").mkdir(exist_ok=True)
-        (tmp_path / "teacher" / "policy.pt").touch()
-        return 0
-
-    monkeypatch.setattr(cli, "main", teacher)
-    for meshes, used_min in ((None, 0.0), (None, 3.0), (tmp_path, 3.0), (None, 13.0)):
-        clock.now = 60.0 * used_min
-        cfg = demo.DemoCfg(out=tmp_path, meshes=meshes)
-        stages = Stages(tmp_path / "stages.json", 1, Budget(cfg.minutes, clock, 0.0))
-        demo._Demo(cfg, "cpu-demo", "cpu", tmp_path, stages).train()
-    end = demo.DemoCfg().minutes - demo.RESERVE_MIN
-    assert asked == [end, end - 3.0, end - 3.0 - demo.RESERVE_MESHES_MIN, demo.LEAST_TRAINING_MIN]
-
-
-def test_the_plan_of_fifteen_minutes_leaves_time_to_learn():
-    minutes = demo.DemoCfg().minutes
-    assert minutes < 15.0
-    reserve = demo.RESERVE_MIN + demo.RESERVE_MESHES_MIN
-    assert minutes * (1.0 - demo.IMPORT_SHARE) - reserve > 5.0
-
-
-def test_an_import_ends_with_its_share_and_goes_on_with_the_smallest_first(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv("VD_ASSETS", str(tmp_path / "assets"))
-    meshes = tmp_path / "meshes"
-    meshes.mkdir()
-    for size, name in enumerate(("c", "b", "a"), start=1):
-        (meshes / f"{name}.obj").write_text("o\n" * size)
-    order = []
-
-    def slow(job, *_):
-        order.append(job.name)
-        time.sleep(0.0 if job.name == "c" else 0.7)
-        Path(job.target).write_text("")
-        return importer.ImportResult(job.source, job.name, "imported", target=job.target)
-
-    monkeypatch.setattr(importer, "_run_child", slow)
-    monkeypatch.setattr(importer.os, "cpu_count", lambda: 1)
-    cfg = demo.DemoCfg(out=tmp_path, meshes=meshes, minutes=1.0)
-    monkeypatch.setattr(demo, "IMPORT_SHARE", 0.3 / 60.0)
-    stages = stages_in(tmp_path)
-    it = demo._Demo(cfg, "cpu-demo", "cpu", tmp_path, stages)
-    it.import_meshes()
-    assert order == ["c", "b"]  # b was under way when the time was over
-    ((what, command),) = stages.left_out
-    assert "2 of 3 meshes: b.obj, a.obj" in what
-    assert command.startswith(f"vd-assets import {meshes} --out {tmp_path / 'meshes'} ")
-    assert command in capsys.readouterr().out
-
-
-def test_meshes_that_cannot_be_imported_end_the_demo_with_the_reason(small, tmp_path, capfd):
-    meshes = tmp_path / "meshes"
-    meshes.mkdir()
-    (meshes / "empty.obj").write_text("# no vertices\n")
-    with pytest.raises(demo.DemoError, match="none of the meshes"):
-        demo.run_demo(replace(small, meshes=meshes))
-    assert "empty.obj" in "".join(capfd.readouterr())
-
-
-def test_other_meshes_seeds_and_objects_get_their_own_folder(tmp_path):
-    meshes = tmp_path / "meshes"
-    meshes.mkdir()
-    (meshes / "a.obj").write_text("o a\n")
-    base = demo.DemoCfg(out=tmp_path)
-    labels = [
-        demo._label(cfg, "cpu-demo")
-        for cfg in (base, replace(base, seed=1), replace(base, objects=("cuboid",)))
+def leave_training(line: list[str]) -> None:
+    rows = [
+        {"env_steps": 1000 * k, "goals_per_episode": goals} for k, goals in enumerate((None, 5.0, 4.5, 9.9))
     ]
-    labels.append(demo._label(replace(base, meshes=meshes), "cpu-demo"))
-    (meshes / "b.obj").write_text("o b\n")
-    labels.append(demo._label(replace(base, meshes=meshes), "cpu-demo"))
-    assert len(set(labels)) == len(labels)
-    # More time is no other demo: what is finished stays.
-    assert demo._label(replace(base, minutes=30.0), "cpu-demo") == labels[0]
+    option(line, "--run-dir").mkdir()
+    (option(line, "--run-dir") / PROGRESS_FILE).write_text("\n".join(map(json.dumps, rows)))
+
+
+LEAVE = {
+    "vd-eval": leave_evaluation,
+    "vd-play": lambda line: option(line, "--video").write_bytes(b"no film"),
+    "vd-gap run": leave_report,
+    "vd-deploy": leave_flight,
+    "vd-train teacher": leave_training,
+    "vd-train curves": lambda line: option(line, "--output").write_bytes(PNG),
+}
+"""What stands in for each command: it leaves the files that the page is made of."""
+
+
+class ParsedError(Exception):
+    """Raised in place of running a command, once its line was understood."""
+
+
+@pytest.fixture
+def played(monkeypatch):
+    """The command lines that a demo runs; they are understood, and their files made up."""
+    lines: list[list[str]] = []
+    parse = tyro.cli
+
+    def only_parse(*args, **kwargs):
+        parse(*args, **kwargs)
+        raise ParsedError
+
+    def command(self, *commands, seconds=None):
+        monkeypatch.setattr(tyro, "cli", only_parse)
+        for words in commands:
+            line = [str(word) for word in words]
+            module = importlib.import_module(SCRIPTS[line[0]].partition(":")[0])
+            with monkeypatch.context() as patch, pytest.raises(ParsedError):
+                patch.setattr(sys, "argv", line)
+                module.main()
+            lines.append(line)
+            for start, leave in LEAVE.items():
+                if start in " ".join(line):
+                    leave(line)
+        monkeypatch.setattr(tyro, "cli", parse)
+        return [0] * len(commands)
+
+    monkeypatch.setattr(Demo, "command", command)
+    return lines
+
+
+def test_the_page_shows_every_part(played, tmp_path):
+    assert main(["--out", str(tmp_path / "demo"), "--seed", "3"]) == 0
+    text = (tmp_path / "demo" / "index.html").read_text()
+    assert text.count("<video") == 3 and "http-equiv" not in text
+    for words in ("The simulation lacks", "mug", "stopped", "9.9 goals an episode", "4.5"):
+        assert words in text
+    assert [line[0] for line in played if "--seed" in line and option(line, "--seed").name != "3"] == []
+    assert (tmp_path / "demo" / "gap" / "analysis" / "report.html").is_file()
+
+
+def test_quick_ends_after_the_first_part(played, tmp_path):
+    assert main(["--out", str(tmp_path), "--quick"]) == 0
+    assert {line[0] for line in played} == {"vd-eval", "vd-play"}
+
+
+def test_training_gets_what_the_other_parts_leave_and_a_minute_at_least(played, tmp_path):
+    for minutes, expected in (("8", 8.0 - demo.AFTER_TRAINING_MIN), ("1", demo.LEAST_TRAINING_MIN)):
+        assert main(["--out", str(tmp_path), "--minutes", minutes]) == 0
+        (line,) = [line for line in played if "teacher" in line]
+        assert float(option(line, "--max-minutes").name) == pytest.approx(expected, abs=0.5)
+        played.clear()
+
+
+def test_meshes_are_turned_in_place_of_built_in_objects(played, tmp_path, monkeypatch):
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    for size, name in enumerate("dcbaef", start=1):
+        (meshes / f"{name}.obj").write_text("v 0 0 0\n" * size)
+
+    def leave_set(line):
+        option(line, "--out").mkdir()
+        (option(line, "--out") / "d.usda").touch()
+
+    monkeypatch.setitem(LEAVE, "vd-assets import", leave_set)
+    assert main(["--out", str(tmp_path / "demo"), "--meshes", str(meshes)]) == 0
+    assert [Path(word).name for word in played[0][2:6]] == ["d.obj", "c.obj", "b.obj", "a.obj"]
+    folder = tmp_path / "demo" / "camera" / "objects"
+    assert option(played[1], "--objects") == folder
+    assert option(next(line for line in played if line[0] == "vd-deploy"), "--object") == folder / "d.usda"
+
+
+def test_meshes_of_which_none_is_imported_fail_with_the_remedy(played, tmp_path, capsys):
+    (tmp_path / "a.obj").write_text("v 0 0 0\n")
+    assert main(["--out", str(tmp_path / "demo"), "--meshes", str(tmp_path), "--quick"]) == 1
+    assert "none of a.obj was imported" in capsys.readouterr().err
+
+
+def fail(_demo):
+    raise FailureError("vd-x <y> ended with status 1: no such motor")
+
+
+def test_a_part_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch, capsys):
+    seen = []
+
+    def look(demo):
+        seen.append(demo.page.read_text())
+        fail(demo)
+
+    parts = [Part("camera", "One", fail), Part("gap", "Two", look), Part("twin", "Three", fail)]
+    monkeypatch.setattr(demo, "all_parts", lambda: parts)
+    assert main(["--out", str(tmp_path)]) == 1
+    assert "failed: One, Two, Three" in capsys.readouterr().err
+    assert "http-equiv" in seen[0] and "This part failed.</b> vd-x &lt;y&gt; ended" in seen[0]
+    assert '<p class="small">running' in seen[0] and '<p class="small">waiting' in seen[0]
+
+
+def test_an_interrupted_demo_leaves_the_page_with_what_is_there(played, tmp_path, monkeypatch):
+    def interrupted(demo):
+        raise KeyboardInterrupt
+
+    parts = all_parts()
+    monkeypatch.setattr(parts[1], "work", interrupted)
+    monkeypatch.setattr(demo, "all_parts", lambda: parts)
+    assert main(["--out", str(tmp_path)]) == 130
+    text = (tmp_path / "index.html").read_text()
+    assert text.count("<video") == 1 and "interrupted" in text and "http-equiv" not in text
+
+
+def demo_of(tmp_path: Path) -> Demo:
+    made = Demo(DemoCfg(out=tmp_path), [Part("x", "X", lambda demo: {})])
+    made.folder().mkdir(parents=True)
+    return made
+
+
+def test_a_command_that_fails_says_which_and_why(tmp_path):
+    with pytest.raises(FailureError, match=r"(?s)vd-play nosuch .*with status 1: .*no policy at nosuch"):
+        demo_of(tmp_path).command(["vd-play", "nosuch", "--video", tmp_path / "x.mp4"])
+
+
+def test_a_command_is_ended_with_its_time(tmp_path, monkeypatch):
+    began = time.monotonic()
+    monkeypatch.setattr(demo.sys, "executable", "/bin/sh")
+    (status,) = demo_of(tmp_path).command(["sleep", "100"], seconds=0.2)
+    assert status == -signal.SIGTERM and time.monotonic() - began < 50.0
+    assert demo_of(tmp_path / "y").command(["false"], seconds=50.0) == [1], "some meshes are refused"
+
+
+def test_ctrl_c_ends_the_command_under_way(tmp_path):
+    script = (
+        "import sys; from pathlib import Path; from vd.train import demo; sys.executable = '/bin/sh'\n"
+        "work = lambda demo: demo.command(['sleep', '100'])\n"
+        "demo.all_parts = lambda: [demo.Part('camera', 'X', work)]\n"
+        "sys.exit(demo.main(['--out', sys.argv[1]]))"
+    )
+    process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE)
+    while b"$ sleep" not in process.stdout.readline():
+        assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    assert process.wait(50.0) == 130
+    assert "interrupted" in (tmp_path / "index.html").read_text()
 
 
 @pytest.mark.parametrize(
-    ("changes", "flag"),
+    ("arguments", "message"),
     [
-        ({"minutes": 0.0}, "--minutes"),
-        ({"meshes": "nowhere"}, "--meshes"),
-        ({"objects": ()}, "--objects"),
-        ({"num_worlds": 0}, "--num-worlds"),
+        (["--minutes", "0"], "--minutes"),
+        (["--meshes", "nowhere"], "nowhere: no such file"),
+        (["--out", "."], "has other files than a demo's"),
     ],
 )
-def test_wrong_settings_are_refused_by_flag(tmp_path, changes, flag):
-    if "meshes" in changes:
-        changes = {"meshes": tmp_path / "nowhere"}
-    with pytest.raises(ValueError, match=flag):
-        demo.DemoCfg(out=tmp_path, **changes).validate()
+def test_settings_that_cannot_be_used_are_refused_before_anything_is_written(
+    tmp_path, monkeypatch, capsys, arguments, message
+):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.txt").touch()
+    assert main(arguments) == 1
+    assert message in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_a_stage_that_fails_is_run_again(tmp_path, capsys):
-    product = tmp_path / "product"
-    stages = stages_in(tmp_path)
-    with pytest.raises(RuntimeError), stages.run("work", "work", products=[product]) as needed:
-        assert needed
-        product.write_text("half")
-        raise RuntimeError
-    stages.load()
-    with stages.run("work", "work", products=[product]) as needed:
-        assert needed
-    again = stages_in(tmp_path)
-    again.load()
-    with again.run("work", "work", products=[product]) as needed:
-        assert not needed
-    product.unlink()
-    with again.run("work", "work", products=[product]) as needed:
-        assert needed
-    assert capsys.readouterr().out.count("done before") == 1
-
-
-def test_the_alarm_ends_a_block_and_leaves_no_alarm_behind():
-    started = time.monotonic()
-    with pytest.raises(TimeUp), time_limit(0.05):
-        time.sleep(120.0)
-    assert time.monotonic() - started < 60.0
-    with time_limit(0.05):
-        pass
-    time.sleep(0.1)
-    with pytest.raises(TimeUp), time_limit(0.0):
-        pytest.fail("there was no time to begin")
-
-
-def test_a_stage_without_time_is_left_out_and_run_by_the_next_call(tmp_path, capsys):
-    clock, product = Clock(), tmp_path / "product"
-    keep = {"products": [product], "keep_min": 0.5, "command": "vd-eval policy.pt"}
-    stages = stages_in(tmp_path, 1.0, clock)
-    clock.now = 31.0
-    assert not stages.run_if_time("work", "do the work", product.touch, **keep)
-    assert stages.left_out == [("do the work", "vd-eval policy.pt")]
-    assert "by hand: vd-eval policy.pt" in capsys.readouterr().out
-    again = stages_in(tmp_path, 1.0, clock)
-    again.load()
-    assert again.run_if_time("work", "do the work", product.touch, **keep)
-    assert not again.left_out
-    assert product.exists()
-
-
-def test_the_page_says_what_makes_the_task_easier():
-    task = PRESETS["cpu-demo"]().env
-    text = " ".join(demo_page.task_sentences(task))
-    assert f"vertical only, by up to {task.goal.max_angle_rad:.2g} rad" in text
-    assert "must not be compared" in text
-    assert "easier" not in " ".join(demo_page.task_sentences(ReorientCfg()))
-
-
-def test_the_page_lists_exactly_the_settings_that_differ():
-    task = replace(ReorientCfg(), num_worlds=7, seed=3, reward=replace(ReorientCfg().reward, energy=-0.5))
-    assert list(demo_page.differences(task)) == [("reward.energy", "-20", "-0.5")]
-
-
-@pytest.mark.parametrize(
-    ("trained", "random", "words"),
-    [(36, 4, "better than random"), (12, 10, "do not settle"), (4, 12, "not better")],
-)
-def test_the_verdict_follows_the_intervals(trained, random, words):
-    agents = {"trained": result("trained", trained), "random": result("random", random)}
-    assert words in demo_page.verdict(agents)
+def test_what_an_earlier_demo_left_is_replaced(played, tmp_path):
+    for _ in range(2):
+        assert main(["--out", str(tmp_path), "--quick"]) == 0
+        (tmp_path / "camera" / "old.txt").touch()
+        assert (tmp_path / "camera" / "eval.json").is_file()
+    assert main(["--out", str(tmp_path), "--quick"]) == 0
+    assert not (tmp_path / "camera" / "old.txt").exists()
+    assert Comparison.read(tmp_path / "camera" / "eval.json").rows
