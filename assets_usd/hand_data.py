@@ -4,11 +4,17 @@ Units are SI and radians, quaternions are xyzw. Frames: the base frame is that o
 pose is a row ``(x, y, z, qx, qy, qz, qw)``.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from vd.paper import PAPER
+
+BASE_IN_WORLD = (0.0, 0.0, PAPER.scene.hand_height_m, 0.0, 1.0, 0.0, 0.0)
+"""Pose of a hand's base over its table: palm down, turned pi about +y."""
 
 
 class HandError(ValueError):
@@ -60,6 +66,19 @@ class CameraModel(Intrinsics):
     far: float
     position: np.ndarray
     quaternion: np.ndarray
+
+    def at(self, place: Sequence[float] | None) -> "CameraModel":
+        """The camera at a pose in the base frame, position [m] and quaternion xyzw; where it is by default.
+
+        Raises:
+            ValueError: It is no pose.
+        """
+        if place is None:
+            return self
+        pose = np.asarray(place, dtype=float)
+        if pose.shape != (7,) or not np.linalg.norm(pose[3:]) > 0.0:
+            raise ValueError(f"camera = {tuple(place)}; it must be a position and a quaternion")
+        return replace(self, position=pose[:3], quaternion=pose[3:] / np.linalg.norm(pose[3:]))
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixel (u, v) and depth [m] of points [.., 3] [m] of the base frame, as [.., 3].

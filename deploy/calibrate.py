@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert
+from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, Intrinsics, compose, invert
 from vd.config import from_dict
 from vd.deploy.calibration_poses import plan
 from vd.deploy.calibration_twin import CalibrationTwin
@@ -32,7 +32,6 @@ from vd.deploy.realsense import RealSenseCfg, RealSenseInfrared, find_device
 from vd.deploy.safety import SafeHand
 from vd.files import atomic_path, make_folder, write_json
 from vd.paper import PAPER
-from vd.sensors.depth_cloud import BASE_IN_WORLD
 
 FORMAT = "vd-calibration-views/1"
 VIEWS_FILE = "views.json"

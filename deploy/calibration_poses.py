@@ -8,11 +8,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert
+from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, Intrinsics, compose, invert
 from vd.deploy.camera import CameraError
 from vd.deploy.hand_eye import project, square
 from vd.deploy.motion import reset_pose
-from vd.sensors.depth_cloud import BASE_IN_WORLD
 
 DRAWS = 400
 """Random poses of a finger."""

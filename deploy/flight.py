@@ -16,13 +16,13 @@ from vd.deploy.goals import read_goals
 from vd.deploy.mirror import Mirror
 from vd.deploy.motion import reset_pose
 from vd.deploy.observation import Sensed
-from vd.deploy.pilot import Pilot, StillPilot, StudentPilot, TeacherPilot
+from vd.deploy.pilot import Pilot, StillPilot, StudentPilot, TeacherPilot, TrackingPilot
 from vd.deploy.twin_link import TwinLink
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.agents import (
     check_bundle,
     is_saved_student,
-    open_critic,
+    is_tracking_policy,
     open_policy,
     task_for,
     trained_task,
@@ -45,7 +45,7 @@ class Flight:
     name: str
     """As it was asked for."""
     kind: str
-    """teacher, student or still."""
+    """teacher, student, tracking or still."""
     pilot: Pilot
     """It."""
     task: ReorientCfg
@@ -97,17 +97,23 @@ def make_flight(
     if moves != hand.num_joints:
         raise ValueError(f"{name} moves {moves} joints, the hand {hand.name} has {hand.num_joints}")
     check_bundle(name, replace(trained_task(policy), hand=hand_name))
-    if student:
-        critic = open_critic(policy, "cpu") if second_view else None
-        pilot = StudentPilot(policy, hand, item, tolerance_rad=tolerance_rad, critic=critic, seed=seed)
-        camera = pilot.camera
+    if student or is_tracking_policy(policy):
+        pilot: StudentPilot | TrackingPilot
+        if student:
+            if second_view:
+                raise ValueError(f"--second-view: {name} is a student, which has no views to select")
+            pilot = StudentPilot(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
+        else:
+            pilot = TrackingPilot(
+                policy, hand, item, tolerance_rad=tolerance_rad, second_view=second_view, seed=seed
+            )
         return Flight(
             name,
-            "student",
+            "student" if student else "tracking",
             pilot,
             trained_task(policy),
-            camera,
-            needs_truth=camera is None,
+            pilot.camera,
+            needs_truth=pilot.camera is None,
             calibrated=policy.spec.calibrated_for(tolerance_rad),
         )
     task = mirror_task(policy, hand_name, item_name, second_view=second_view)
@@ -160,7 +166,7 @@ def make_goals(texts: Sequence[str], drawn: int, max_angle: float, *, seed: int)
 
 
 def look(flight: Flight, source: DepthSource, hand: HandModel, layer: Path | None) -> CameraModel:
-    """Let a student see by the camera's own lens, from where it was found to be.
+    """Let a policy see by the camera's own lens, from where it was found to be.
 
     Args:
         flight: The policy, one that has a camera.
@@ -174,7 +180,7 @@ def look(flight: Flight, source: DepthSource, hand: HandModel, layer: Path | Non
     Raises:
         HandError: The layer is none of this hand.
     """
-    assert isinstance(flight.pilot, StudentPilot) and flight.camera is not None
+    assert isinstance(flight.pilot, (StudentPilot, TrackingPilot)) and flight.camera is not None
     place = flight.camera if layer is None else read_camera(hand, layer)
     seen = source.intrinsics.seen_from(place)
     flight.pilot.look_by(seen)

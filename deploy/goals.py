@@ -1,7 +1,7 @@
 """What to reach: the shape of an object, from its USD or any scan, and the orientations it shall take.
 
 A scan is a mesh or a cloud of points, with noise, holes and what floats about it. A closed surface is laid
-through it, by which a student finds the object; it need not be closed before, as for a simulation
+through it, by which a tracking policy finds the object; it need not be closed before, as for a simulation
 (vd-assets import).
 
 Orientations are quaternions ``x,y,z,w`` or turns ``x,y,z@degrees`` about an axis, from how the object is in
@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import canonical_quat, compose, invert
+from vd.assets_usd.hand_data import BASE_IN_WORLD, canonical_quat, compose, invert
 from vd.assets_usd.objects.geometry import (
     convex_hull,
     random_surface_points,
@@ -30,7 +30,6 @@ from vd.assets_usd.objects.reading import load_points
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.scans import Surface, surface_of_scan
 from vd.paper import PAPER
-from vd.sensors.depth_cloud import BASE_IN_WORLD
 
 SCAN_SUFFIXES = (".ply", ".obj", ".glb")
 """Files that are taken as scans."""

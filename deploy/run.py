@@ -1,6 +1,6 @@
 """Drive a hand with a policy: pursue goals one after the other, in one process at 12 Hz, and log every step.
 
-On a real hand the policy is a student, a bundle of vd-train, which sees joints and a depth camera. On a twin
+On a real hand the policy sees joints and a depth camera: a tracking policy, or a student. On a twin
 it can be a teacher too; that one reads the simulated object's true pose, which no real hand tells.
 """
 
@@ -48,7 +48,7 @@ HOME_RAD_S = 0.5
 SETTLE_S = 1.5
 """Time that an object of a twin has to come to rest between the fingers [s]."""
 LATEST = 0.25
-"""Share of a control period by which a step may begin late: a student takes more than half of one."""
+"""Share of a control period by which a step may begin late: to find the object takes much of one."""
 STATUS_S = 5.0
 """Seconds between status lines where there is no terminal to rewrite one on."""
 
@@ -58,7 +58,7 @@ class RunCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """Bundle or file of a student, or with --twin also a teacher: a file or an installed policy; with --twin
+    """Bundle, file or name of a policy that sees by camera, or with --twin also of a teacher; with --twin
     the installed teacher of the hand by default. "still" does nothing."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj, .glb)."""
@@ -156,12 +156,13 @@ def run(cfg: RunCfg) -> int:
     if cfg.precise and not flight.calibrated:
         print(
             f"{flight.name} has no rule of its own for {PAPER.success.precise_rad:g} rad: it stops where it "
-            "predicts that distance; vd-train calibrate finds a better one",
+            "predicts that distance; vd-train tracker finds a better one",
             file=sys.stderr,
         )
     if flight.needs_truth and not cfg.twin:
         raise ValueError(
-            f"{cfg.policy} needs the object's true pose, which no real hand tells; give a student of stage 2"
+            f"{cfg.policy} needs the object's true pose, which no real hand tells; give a policy "
+            "that sees by a camera"
         )
     folder = cfg.log or LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
     fault: StoppedError | None = None

@@ -1,16 +1,15 @@
-"""Compare what a policy saw on a hand with what the simulator shows in the same state, step by step.
+"""Compare what a policy was told on a hand with what the simulator shows in the same state, step by step.
 
 Every step of a log is put into a simulated world. Its observation, by the code of the training, is compared
-with the one that the loop makes of the same joints: points, voxels, senses and joint goals, the object as the
-student finds it, and where images of a twin were kept (--images) the depth image too: the object is then
-looked for in both images. With --follow it runs beside the loop.
+with what the loop makes of the same joints, and the joint goals likewise. Where images were kept (--images)
+the image is compared too, and the object is looked for in both. With --follow it runs beside the loop.
 """
 
 import json
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,16 +19,13 @@ import tyro
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
-    import torch
-
     from vd.deploy.observation import Sensed
     from vd.hand_log import HandLog
 
-POINT_M = 2e-6
-"""Points lie this close: rounding of poses computed in another order [m]."""
-SENSE = 1e-6
-"""So do senses; and joint goals within the digits of a log."""
+SENSE = 5e-5
+"""Values that are observed lie this close: rounding of poses computed in another order."""
 GOAL_RAD = 2e-5
+"""So do joint goals within the digits of a log."""
 FOUND_RAD = 0.15
 """The object is found turned by no more in most steps, a symmetric one up to its symmetry: twice what the
 errors of a camera made of it."""
@@ -39,8 +35,6 @@ PIXEL_SHARE = 0.05
 """Share of such pixels that motion explains, between the image and the reading of the state."""
 FOLLOW_S = 0.5
 """How often a log is looked at that is still being written."""
-OBJECT = "object"
-"""Name of the sense by which a student finds its object."""
 SILENT_S = 30.0
 """Time without a new step after which a log is taken to be finished."""
 BEGIN_S = 300.0
@@ -51,12 +45,12 @@ UNKNOWN_POSE = (0.0, 0.0, -1.0, 0.0, 0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class ShadowCfg:
-    """Compare what a policy saw on a hand with what the simulator shows in the same state."""
+    """Compare what a policy was told on a hand with what the simulator shows in the same state."""
 
     log: Annotated[Path, tyro.conf.Positional]
     """Folder of the log."""
     policy: str | None = None
-    """The student whose clouds are compared; by default the policy of the log, or the lean network."""
+    """The policy by whose camera the object is looked for; by default that of the log."""
     follow: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Wait for the log to begin, and go on as it grows until it ends: beside the loop."""
     every: int = 1
@@ -69,31 +63,20 @@ class ShadowCfg:
 class Difference:
     """One step, on the hand and in the simulator."""
 
-    points_m: float
-    """Largest distance of a point of the goal, the hand or the object from its counterpart [m]."""
-    voxels: int
-    """Voxels of the simulator's cloud."""
-    voxels_apart: int
-    """Voxels that only one of them has."""
-    borders: int
-    """Points so close to a border between voxels that rounding decides."""
     sense: float
-    """Largest difference of what the policy senses of itself."""
+    """Largest difference of what is observed of joints, fingertips and the action before."""
     goal_rad: float
     """Largest difference of the joint goals [rad]; 0 where the policy did not act."""
     pixels: float | None
     """Share of the pixels with depth in both images that show something else; None without an image."""
     found_rad: float | None = None
-    """Angle between the object's orientations as found, up to its symmetry [rad]; None where it is not looked
-    for, or by a camera whose image was not kept."""
+    """Angle between the object's orientations as found, up to its symmetry [rad]; None without an image."""
 
     @property
     def ok(self) -> bool:
         """Whether nothing but rounding tells them apart."""
         return (
-            self.points_m <= POINT_M
-            and self.voxels_apart <= 2 * self.borders
-            and self.sense <= SENSE
+            self.sense <= SENSE
             and self.goal_rad <= GOAL_RAD
             and (self.pixels is None or self.pixels <= PIXEL_SHARE)
         )
@@ -104,44 +87,50 @@ class Shadow:
 
     Args:
         log: Its first steps.
-        policy: Name of the student; None: that of the log.
+        policy: Name of the policy; None: that of the log.
     """
 
     def __init__(self, log: "HandLog", policy: str | None = None):
+        from vd.aim import AimCfg
         from vd.assets_usd.hands import load_hand
-        from vd.config import from_dict
         from vd.deploy.action import ActionFilter
         from vd.deploy.flight import STILL, mirror_task
         from vd.deploy.goals import one_object
         from vd.deploy.mirror import Mirror
-        from vd.deploy.observation import StudentSight
-        from vd.deploy.pilot import student_camera
-        from vd.evaluate.agents import is_saved_student, open_policy
-        from vd.sensors.cfg import DepthCameraCfg
-        from vd.student.cfg import LEAN
-        from vd.vision import StudentView
+        from vd.deploy.pilot import camera_and_depth
+        from vd.evaluate.agents import open_policy
+        from vd.evaluate.senses import EnvironmentSenses
+        from vd.kernels.observations import teacher_observation_slices
+        from vd.sensors.depth_cloud import CameraCloud
+        from vd.tracking.observer import Observer
 
         name = policy or log.run["policy"]
         loaded: Any = None if name == STILL else open_policy(name, "cpu")
-        student = loaded if is_saved_student(loaded) else None
-        hand_name, item_name = log.run["hand"], log.run["object"]["set"]
-        hand, item = load_hand(hand_name), one_object(item_name)
-        self._network = LEAN if student is None else student.spec.network
-        task = mirror_task(loaded, hand_name, item_name)
+        hand, item = load_hand(log.run["hand"]), one_object(log.run["object"]["set"])
+        task = mirror_task(loaded, log.run["hand"], log.run["object"]["set"])
+        camera, depth = camera_and_depth(loaded, hand)
         self._mirror = Mirror(task)
         self._actions = ActionFilter(hand, task)
-        # The object is looked for in what the student sees: its camera's images, or complete clouds.
-        blind = replace(self._network, senses=tuple(n for n in self._network.senses if n != OBJECT))
-        whole, rendered, depth, place = self._network, blind, DepthCameraCfg(points=0), None
-        self._image_sight: StudentSight | None = None
-        camera = None if student is None else student_camera(student, hand)
-        if student is not None and camera is not None:
-            whole, rendered, place = blind, self._network, student.spec.camera
-            depth = from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
-            self._image_sight = StudentSight(hand, item, rendered, camera=camera, depth=depth)
-        self._sight = StudentSight(hand, item, whole)
-        self._view = StudentView(self._mirror.env, whole, rendered=False)
-        self._image_view = StudentView(self._mirror.env, rendered, rendered=True, depth=depth, camera=place)
+        self._simulated = EnvironmentSenses(self._mirror.env, camera, depth)
+        self._eye = CameraCloud(camera, points=depth.points, crop_m=depth.crop_m)
+        columns = teacher_observation_slices(hand.num_fingers)
+
+        def observer() -> Observer:
+            return Observer(
+                hand,
+                [item],
+                columns["previous_action"].stop,
+                world_object=np.zeros(1, dtype=int),
+                world_scale=np.ones(1),
+                camera=camera,
+                aim=AimCfg(),
+                control_hz=task.sim.control_hz,
+                device="cpu",
+            )
+
+        self._ours, self._theirs = observer(), observer()
+        names = ("joint_position", "joint_velocity", "fingertips", "previous_action")
+        self._told = [column for part in names for column in range(columns[part].start, columns[part].stop)]
         self._symmetry = item.symmetry
         self._compared = 0
 
@@ -150,34 +139,28 @@ class Shadow:
         import torch
         import warp as wp
 
-        sensed = _sensed(log, step)
+        from vd.deploy.observation import seen_points, senses_of
+
+        sensed, image, env = _sensed(log, step), log.image(step), self._mirror.env
         self._mirror.take(sensed)
         # The simulator looks for the object anew where an episode begins.
-        wp.to_torch(self._mirror.env.step_count).fill_(self._compared)
+        wp.to_torch(env.step_count).fill_(self._compared)
+        steps = torch.full((1,), self._compared, dtype=torch.int32)
         self._compared += 1
-        seen = self._view.frame()
-        points, expected = self._sight.points(sensed), self._view.points(seen)
-        ours, theirs = self._sight.sites(points), self._view.sites(seen, augment=False)
-        known = self._sight.frame(sensed, points, ours)
-        with torch.inference_mode():
-            apart = (points - expected).norm(dim=-1)
-        image = log.image(step)
-        pixels, found_rad = None, self._found_apart(known, seen, sensed.goal_quat)
-        if image is not None:
-            shown = self._image_view.frame()
+        pixels, found_rad = None, None
+        if image is None:
+            points = torch.full((1, 1, 3), torch.nan)
+        else:
+            points, shown = seen_points(self._eye, image), self._simulated.read()
             pixels = self._pixels(image)
-            if (sight := self._image_sight) is not None:
-                sensed = replace(sensed, depth=image)
-                cloud = sight.points(sensed)
-                looked = sight.frame(sensed, cloud, sight.sites(cloud))
-                found_rad = self._found_apart(looked, shown, sensed.goal_quat)
+            self._theirs(shown)
+        observed, _ = self._ours(senses_of(sensed, points, fresh=steps == 0, goal_steps=steps))
+        if image is not None:
+            found_rad = self._found_apart()
+        apart = observed - wp.to_torch(env.world_observation)[:, : observed.shape[1]]
         acted = log.columns["acting"][step] > 0.5 and np.abs(log.channel("action")[step]).max() > 0.0
         return Difference(
-            points_m=float(apart.max()),
-            voxels=sum(len(sites) for sites in theirs),
-            voxels_apart=sum(len(_keys(a) ^ _keys(b)) for a, b in zip(ours, theirs, strict=True)),
-            borders=_near_borders(expected[0].numpy(), self._network.voxel_m),
-            sense=max(float((known[name] - seen[name]).abs().max()) for name in known if name != OBJECT),
+            sense=float(apart[0, self._told].abs().max()),
             goal_rad=self._goal_difference(log, step) if acted else 0.0,
             pixels=pixels,
             found_rad=found_rad,
@@ -189,21 +172,18 @@ class Shadow:
         goal = self._actions.goal(log.channel("action")[step], log.channel("position")[step])
         return float(np.abs(goal - log.channel("command")[step]).max())
 
-    def _found_apart(
-        self, known: dict[str, "torch.Tensor"], seen: dict[str, "torch.Tensor"], goal: np.ndarray
-    ) -> float | None:
-        """Angle between two findings of the object [rad]; None if it is not looked for."""
-        from vd.evaluate.statistics import quat_multiply, symmetric_error
-        from vd.student.object_sense import ROTATION
+    def _found_apart(self) -> float:
+        """Angle between the object as it is found in both images [rad]."""
+        from vd.evaluate.statistics import symmetric_error
 
-        if OBJECT not in known:
-            return None
-        ours, theirs = (quat_multiply(one[OBJECT][0, ROTATION].numpy(), goal) for one in (known, seen))
-        return float(symmetric_error(ours, theirs, self._symmetry))
+        ours, theirs = self._ours.found, self._theirs.found
+        assert ours is not None and theirs is not None
+        one, other = (found.orientation[0].numpy() for found in (ours, theirs))
+        return float(symmetric_error(one, other, self._symmetry))
 
     def _pixels(self, image: np.ndarray) -> float:
         """Share of pixels of an image that differ from the simulated one, which was rendered before."""
-        camera = self._image_view.camera
+        camera = self._simulated.camera
         assert camera is not None
         shown = camera.depth.numpy()[0]
         both = (shown > 0.0) & (image > 0.0)  # a camera misses some of what is there
@@ -265,11 +245,7 @@ def summary(found: list[Difference]) -> dict[str, Any]:
         "ok": all(one.ok for one in found) and turned <= FOUND_RAD,
         "steps": len(found),
         "steps apart": sum(not one.ok for one in found),
-        "points, largest [m]": float(f"{max(one.points_m for one in found):.2g}"),
-        "voxels of a cloud": round(float(np.mean([one.voxels for one in found]))),
-        "voxels apart": sum(one.voxels_apart for one in found),
-        "points on borders of voxels": sum(one.borders for one in found),
-        "senses, largest": float(f"{max(one.sense for one in found):.2g}"),
+        "observed, largest": float(f"{max(one.sense for one in found):.2g}"),
         "joint goals, largest [rad]": float(f"{max(one.goal_rad for one in found):.2g}"),
     }
     if pixels:
@@ -292,13 +268,3 @@ def _sensed(log: "HandLog", step: int) -> "Sensed":
         object_pose=np.array(UNKNOWN_POSE if pose is None else pose[step], dtype=np.float32),
         object_velocity=np.zeros(6, dtype=np.float32),
     )
-
-
-def _keys(sites: Any) -> set[tuple[int, ...]]:
-    return {tuple(row) for row in sites.coordinates.tolist()}
-
-
-def _near_borders(points: np.ndarray, side: float) -> int:
-    """Points closer to a border between voxels than they are to their counterparts."""
-    cells = points / side
-    return int((np.abs(cells - np.round(cells)) < 2.0 * POINT_M / side).any(axis=1).sum())

@@ -16,6 +16,7 @@ class CloudModel:
     hand_points: Samples of the hand, each in the frame of its link [H] [m].
     hand_body: Link of each sample, an index within a world [H].
     object_points: Samples of each object in its frame, unscaled [O, K] [m].
+    goal_points: Those by which its goal is shown [O, K] [m].
     world_object: Object of each world [N].
     world_scale: Size factor of each world's object [N].
     base_body: The hand's base, an index within a world.
@@ -26,6 +27,7 @@ class CloudModel:
     hand_points: wp.array[wp.vec3]
     hand_body: wp.array[int]
     object_points: wp.array2d[wp.vec3]
+    goal_points: wp.array2d[wp.vec3]
     world_object: wp.array[int]
     world_scale: wp.array[float]
     base_body: int
@@ -67,7 +69,7 @@ def link_points_kernel(
         points_out[row, column] = wp.transform_point(link, model.hand_points[sample])
         return
     if column < samples:
-        point = model.world_scale[world] * model.object_points[model.world_object[world], column]
+        point = model.world_scale[world] * model.goal_points[model.world_object[world], column]
         turn = wp.transform_get_rotation(to_base) * goal_quat_in[row]
         points_out[row, column] = model.goal_position + wp.quat_rotate(turn, point)
     else:

@@ -1,7 +1,6 @@
 """A student small enough to train in a second: clouds of two bars whose lengths are the teacher's action."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,16 +9,15 @@ import warp as wp
 from train_dummy import DummyEnv
 
 from vd.config import to_dict
-from vd.evaluate.agents import find_policy
-from vd.student.cfg import EncoderCfg, NoiseCfg, StudentCfg
-from vd.student.clouds import Voxeliser
-from vd.student.network import Student
-from vd.student.saved import StudentSpec
 from vd.train.config import RunCfg
 from vd.train.student.config import DaggerCfg
 from vd.train.student.dagger import Dagger
 from vd.train.student.runner import StudentRunner
 from vd.train.vec_env import ReorientVecEnv
+from vd.vision.cfg import EncoderCfg, NoiseCfg, StudentCfg
+from vd.vision.network import Student
+from vd.vision.saved import StudentSpec
+from vd.vision.voxels import Voxeliser
 
 BAR_POINTS = 24
 VOXEL_M = 0.01
@@ -123,13 +121,3 @@ def make_student_runner(
 def weights(student: Student) -> np.ndarray:
     """All weights and buffers in one vector."""
     return np.concatenate([value.double().numpy().ravel() for value in student.state_dict().values()])
-
-
-def asks_its_teacher(name: str, path: Path) -> Path:
-    """Write an installed student without the critic of its teacher, whom it then has to ask by name."""
-    saved = torch.load(find_policy(name), map_location="cpu", weights_only=True)
-    saved["spec"]["network"]["state"]["critic"] = False
-    weights = saved["student_state_dict"]
-    saved["student_state_dict"] = {key: value for key, value in weights.items() if ".critic." not in key}
-    torch.save(saved, path)
-    return path

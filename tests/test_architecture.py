@@ -22,6 +22,10 @@ DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
 MAX_LINES = 600
 LEAVES = ("vd.paper", "vd.files", "vd.aim", "vd.interrupt")
+SHARED = ("vd.config", "vd.policy", "vd.clouds", "vd.quaternions", "vd.senses", "vd.stopping", "vd.views")
+"""What camera policies share; no simulator."""
+DESCRIPTIONS = ("vd.envs.cfg", "vd.envs.view_tables", "vd.sensors.cfg")
+"""What describes a task, and needs no simulator either."""
 # What each part may import of this project; the longest prefix of a module's name decides.
 ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.paper": (),
@@ -31,7 +35,13 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.kernels": ("vd.kernels",),
     "vd.assets_usd": (*LEAVES, "vd.kernels", "vd.assets_usd"),
     "vd.sim": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim"),
-    "vd.student": (*LEAVES, "vd.config", "vd.policy", "vd.kernels", "vd.assets_usd", "vd.student"),
+    "vd.clouds": (*LEAVES, "vd.kernels", "vd.assets_usd"),
+    "vd.quaternions": (),
+    "vd.senses": (),
+    "vd.stopping": LEAVES,
+    "vd.views": ("vd.kernels", "vd.assets_usd", *DESCRIPTIONS),
+    "vd.tracking": (*LEAVES, *SHARED, *DESCRIPTIONS, "vd.kernels", "vd.assets_usd", "vd.tracking"),
+    "vd.vision": (*LEAVES, *SHARED, "vd.kernels", "vd.assets_usd", "vd.vision"),
     "vd.envs": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim", "vd.envs"),
     "vd.sensors": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim", "vd.sensors"),
     "vd": ("vd",),

@@ -59,7 +59,7 @@ def test_a_teacher_acts_in_its_own_task(tmp_path, capsys):
 
 def test_a_student_is_no_teacher_to_measure():
     with pytest.raises(ValueError, match="holds no policy"):
-        SimCommand(policy="dclaw3-student", device="cpu", allegro=False).run()
+        SimCommand(policy="dclaw3-tracking", device="cpu", allegro=False).run()
 
 
 def test_kernels_add_up_and_the_longest_is_first(device):

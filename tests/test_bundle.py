@@ -16,18 +16,19 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
 from vd.bundle import is_bundle
 from vd.bundle.contract import ContractError, check_hand
-from vd.bundle.store import read_bundle, read_contract, write_student, write_teacher
+from vd.bundle.store import read_bundle, read_contract, write_student, write_teacher, write_tracking
 from vd.config import to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.evaluate.agents import SHIPPED_POLICIES, find_policy, open_policy
 from vd.evaluate.cli import main as evaluate
 from vd.policy import load_policy
 from vd.sensors.cfg import DepthCameraCfg
-from vd.student.network import Student
-from vd.student.saved import SavedStudent, StudentSpec, student_export
-from vd.student.stopping import StoppingRule
+from vd.stopping import StoppingRule
+from vd.tracking.policy import load_tracking
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main as train
+from vd.vision.network import Student
+from vd.vision.saved import SavedStudent, StudentSpec, student_export
 
 TEACHER = "dclaw3-table"
 
@@ -42,11 +43,11 @@ def make_student(stage=2, goal="merged", camera=None):
     torch.manual_seed(0)
     cfg = replace(TINY, goal=goal)
     spec = StudentSpec(
-        cfg,
-        9,
-        stage,
-        TEACHER,
-        camera,
+        network=cfg,
+        num_actions=9,
+        stage=stage,
+        teacher=TEACHER,
+        camera=camera,
         stopping=StoppingRule(0.31, 0.7),
         tolerance_rad=0.3,
         precise=StoppingRule(0.08, 0.9),
@@ -75,7 +76,7 @@ def edit(folder, change, *, sign=True):
 
 
 def test_a_teacher_comes_back(teacher_bundle):
-    policy, original = read_bundle(teacher_bundle).teacher, load_policy(SHIPPED_POLICIES[TEACHER])
+    policy, original = read_bundle(teacher_bundle).policy, load_policy(SHIPPED_POLICIES[TEACHER])
     observation = torch.randn(5, policy.num_observations)
     assert torch.equal(policy.act(observation), original.act(observation))
     assert policy.task == original.task and policy.env_steps == original.env_steps
@@ -88,7 +89,7 @@ def test_a_teacher_comes_back(teacher_bundle):
 def test_a_student_comes_back(tmp_path, hand, stage, goal):
     student = make_student(stage, goal, camera=(0.5, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0) if stage == 2 else None)
     contract = write_student(tmp_path / "student", student, hand)
-    found = read_bundle(tmp_path / "student").student
+    found = read_bundle(tmp_path / "student").policy
     assert found.spec == student.spec and found.iteration == 3 and found.env_steps == 4000
     for name, value in student.network.state_dict().items():
         assert torch.equal(found.network.state_dict()[name], value), name
@@ -96,6 +97,22 @@ def test_a_student_comes_back(tmp_path, hand, stage, goal):
     assert contract.provenance.objects == ("training-set", "cube"), "no folders of the machine"
     assert "/somewhere" not in (tmp_path / "student" / "contract.json").read_text()
     check_hand(read_contract(tmp_path / "student"), hand, "it")
+
+
+@pytest.mark.parametrize("camera", [None, (0.5, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)])
+def test_a_tracking_policy_comes_back(tmp_path, hand, camera):
+    original = load_tracking(SHIPPED_POLICIES["dclaw3-tracking"])
+    original = replace(original, spec=replace(original.spec, camera=camera))
+    contract = write_tracking(tmp_path / "tracking", original, hand)
+    found = open_policy(str(tmp_path / "tracking"), "cpu")
+    assert found.spec == original.spec and found.teacher.env_steps == original.teacher.env_steps
+    observation = torch.randn(5, found.teacher.num_observations)
+    assert torch.equal(found.teacher.act(observation), original.teacher.act(observation))
+    assert torch.equal(found.teacher.value(observation), original.teacher.value(observation))
+    assert contract.kind == "tracking" and contract.interface.camera.source == (
+        "hand" if camera is None else "policy"
+    )
+    check_hand(read_contract(tmp_path / "tracking"), hand, "it")
 
 
 def test_another_hand_is_refused_by_field(teacher_bundle, hand, capsys):
@@ -123,7 +140,7 @@ def test_another_camera_is_refused_unless_the_policy_has_its_own(tmp_path, hand)
         hand, camera=replace(hand.camera, position=hand.camera.position + np.array([0.0, 0.0, 0.02]))
     )
     write_student(tmp_path / "own", make_student(), hand)
-    with pytest.raises(ContractError, match=r"camera\.pose_in_base\[2\] is .*fine-tune it"):
+    with pytest.raises(ContractError, match=r"camera\.pose_in_base\[2\] is .*write it for this one"):
         check_hand(read_contract(tmp_path / "own"), moved, "it")
     pose = (0.5, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0)
     write_student(tmp_path / "placed", make_student(camera=pose), hand)
@@ -239,8 +256,8 @@ def test_golden_clouds_are_those_of_the_kernels(tmp_path, hand):
     """From golden joint positions and poses the product's kernels make the golden cloud."""
     from safetensors.torch import load_file
 
+    from vd.clouds import HandKinematics, SceneClouds
     from vd.sim.scene import hand_mount
-    from vd.student.clouds import HandKinematics, SceneClouds
 
     write_student(tmp_path / "student", make_student(), hand)
     golden = load_file(tmp_path / "student" / "golden.safetensors")

@@ -12,7 +12,7 @@ from camera_sdk import camera_sdk
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.camera_layer import read_camera, write_camera_layer
-from vd.assets_usd.hand_data import HandError, Intrinsics, compose, invert
+from vd.assets_usd.hand_data import BASE_IN_WORLD, HandError, Intrinsics, compose, invert
 from vd.assets_usd.hands import load_hand
 from vd.deploy.calibrate import CalibrateCfg, Shot, calibrate, misplaced, object_place, save_views
 from vd.deploy.calibration_poses import plan, seat
@@ -20,7 +20,6 @@ from vd.deploy.calibration_twin import SLIP, CalibrationTwin
 from vd.deploy.hand_eye import HandEyeError, Views, dual_quaternions, project, refine, solve, square
 from vd.deploy.markers import MarkerFinder, draw
 from vd.deploy.realsense import RealSenseCfg
-from vd.sensors.depth_cloud import BASE_IN_WORLD
 
 pytest.importorskip("cv2", reason="OpenCV is not installed (extra: hardware)")
 

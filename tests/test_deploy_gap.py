@@ -31,7 +31,7 @@ from vd.gap.rollout import Rollouts
 from vd.gap.workflow import explain
 from vd.kernels.actuators import COMMAND_DELAY
 from vd.sim.cfg import SimCfg
-from vd.student.stopping import StoppingRule
+from vd.stopping import StoppingRule
 
 DELAY_S = 0.04
 LAYER = """#usda 1.0

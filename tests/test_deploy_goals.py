@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -9,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
 from vd.deploy.goals import GoalError, goal_cloud, one_object, read_goals, scan_object
-from vd.deploy.observation import Sensed, StudentSight
-from vd.student.cfg import PRESETS
+from vd.deploy.observation import Sensed, senses_of
+from vd.vision.cfg import PRESETS
+from vd.vision.sight import Sight
 
 NOISE_M = 0.001
 HOLE_M = 0.012
@@ -80,11 +82,12 @@ def test_a_closed_mesh_is_taken_as_it_is(item, tmp_path, suffix):
 def test_the_goals_cloud_is_that_of_the_student(item):
     """Bit for bit the kernel's, but for rounding, for any orientation."""
     hand, network = load_hand("dclaw3"), PRESETS["small"]
-    sight = StudentSight(hand, item, network)
+    sight = Sight(hand, [item], network, complete=True)
     quat = Rotation.random(random_state=np.random.default_rng(3)).as_quat()
     zero = np.zeros(hand.num_joints)
-    pose = np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0])
-    seen = sight.points(Sensed(zero, zero, zero, quat, object_pose=pose))[0, : sight.ends[0]].numpy()
+    senses = senses_of(Sensed(zero, zero, zero, quat), torch.empty((1, 0, 3)))
+    frame = sight.frame(senses, torch.tensor([[0.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0]]))
+    seen = sight.points(frame)[0, : sight.ends[0]].numpy()
     np.testing.assert_allclose(goal_cloud(item, quat), seen, atol=1e-6)
 
 

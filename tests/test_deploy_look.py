@@ -12,10 +12,10 @@ from vd.deploy.observation import Sensed
 from vd.deploy.pilot import StudentPilot
 from vd.envs.cfg import ReorientCfg
 from vd.sensors.cfg import DepthCameraCfg
-from vd.student.cfg import PRESETS
-from vd.student.network import Student
-from vd.student.saved import SavedStudent, StudentSpec
-from vd.student.stopping import StoppingRule
+from vd.stopping import StoppingRule
+from vd.vision.cfg import PRESETS
+from vd.vision.network import Student
+from vd.vision.saved import SavedStudent, StudentSpec
 
 SHIFT_M = 0.01
 
@@ -30,7 +30,14 @@ def make_student(**rules):
     """A student of stage 2 with random weights."""
     network = PRESETS["small"]
     task, depth = to_dict(ReorientCfg(hand="dclaw3", objects=("cube",))), to_dict(DepthCameraCfg(points=500))
-    return SavedStudent(StudentSpec(network, 9, 2, **rules), Student(network, 9).eval(), task, depth, 1, 1)
+    return SavedStudent(
+        StudentSpec(network=network, num_actions=9, stage=2, **rules),
+        Student(network, 9).eval(),
+        task,
+        depth,
+        1,
+        1,
+    )
 
 
 def test_a_pilot_stops_by_the_rule_for_its_tolerance():
@@ -43,12 +50,12 @@ def test_a_pilot_stops_by_the_rule_for_its_tolerance():
     assert teacher.pilot.rule == StoppingRule(0.1) and teacher.calibrated
 
 
-def test_installed_students_stop_by_rules_from_episodes_and_a_flight_says_where_there_is_none():
+def test_installed_trackers_stop_by_rules_from_episodes_and_a_flight_says_where_there_is_none():
     (item,) = load_set("cube")
     for name in ("dclaw3", "dclaw4"):
         hand = load_hand(name)
         flights = {
-            tolerance: make_flight(f"{name}-student", name, "cube", hand, item, tolerance_rad=tolerance)
+            tolerance: make_flight(f"{name}-tracking", name, "cube", hand, item, tolerance_rad=tolerance)
             for tolerance in (0.4, 0.2, 0.1)
         }
         assert [flight.calibrated for flight in flights.values()] == [True, False, True]
@@ -64,7 +71,7 @@ def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
     sensed = Sensed(zero, zero, zero, np.array([0.0, 0.0, 0.0, 1.0]), depth=image)
 
     def middle():
-        points = pilot.sight.points(sensed)[0, pilot.sight.ends[1] :].numpy()
+        points = pilot.sight.points(pilot.frame(sensed))[0, pilot.sight.ends[1] :].numpy()
         return points[np.isfinite(points).all(axis=1)]
 
     look(flight, Source(), hand, None)

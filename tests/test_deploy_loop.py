@@ -26,9 +26,9 @@ from vd.envs.cfg import ReorientCfg
 from vd.hand_log import read_log
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
-from vd.student.network import Student
-from vd.student.saved import SavedStudent, StudentSpec
-from vd.student.stopping import StoppingRule
+from vd.stopping import StoppingRule
+from vd.vision.network import Student
+from vd.vision.saved import SavedStudent, StudentSpec
 
 HZ = PAPER.scene.control_hz
 GOAL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -287,7 +287,9 @@ def test_a_student_sees_a_twin_through_the_cameras_sdk(tmp_path, capsys, patient
     """Random weights that never stop; the simulator shows what the student saw, images included."""
     pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
     camera_sdk()
-    spec = StudentSpec(TINY, 9, 2, "none", None, StoppingRule(-100.0, 1.0))
+    spec = StudentSpec(
+        network=TINY, num_actions=9, stage=2, teacher="none", stopping=StoppingRule(-100.0, 1.0)
+    )
     network = Student(TINY, 9).eval().requires_grad_(False)
     task, depth = to_dict(ReorientCfg(hand="dclaw3")), to_dict(DepthCameraCfg())
     write_student(tmp_path / "student", SavedStudent(spec, network, task, depth, 0, 0), load_hand("dclaw3"))

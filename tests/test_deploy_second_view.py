@@ -4,21 +4,20 @@ import numpy as np
 import pytest
 import warp as wp
 from sensed_world import state_of
-from student_dummy import TINY
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
-from vd.config import to_dict
 from vd.deploy.flight import make_flight, mirror_task
 from vd.deploy.mirror import Mirror
 from vd.deploy.observation import Sensed
-from vd.deploy.pilot import StudentPilot, TeacherPilot
+from vd.deploy.pilot import TeacherPilot, TrackingPilot
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.evaluate.agents import open_critic, open_policy
-from vd.evaluate.second_view import AFTER_S, EVERY_S, NEAREST, SecondView
-from vd.student.network import Student
-from vd.student.saved import SavedStudent, StudentSpec
+from vd.evaluate.agents import open_policy
+from vd.evaluate.second_view import SecondView
+from vd.tracking.policy import TrackingPolicy, TrackingSpec
+from vd.tracking.tracker import NEAREST
+from vd.tracking.views import AFTER_S, EVERY_S
 
 HZ = ReorientCfg().sim.control_hz
 AFTER, EVERY = round(AFTER_S * HZ), round(EVERY_S * HZ)
@@ -51,11 +50,9 @@ def test_a_teacher_takes_the_views_on_a_twin_that_it_takes_in_the_simulator(hand
     assert later - first, "some goal is looked at in another view"
 
 
-def test_a_student_looks_again_after_a_while_and_begins_anew_with_a_new_goal():
-    student, hand, (item,) = open_policy("dclaw3-student", "cpu"), load_hand("dclaw3"), load_set("cube")
-    plain, pilot = (
-        StudentPilot(student, hand, item, critic=critic) for critic in (None, open_critic(student, "cpu"))
-    )
+def test_a_tracker_looks_again_after_a_while_and_begins_anew_with_a_new_goal():
+    policy, hand, (item,) = open_policy("dclaw3-tracking", "cpu"), load_hand("dclaw3"), load_set("cube")
+    plain, pilot = (TrackingPilot(policy, hand, item, second_view=second) for second in (False, True))
     zero = np.zeros(9)
     image = np.full((hand.camera.height, hand.camera.width), 0.6, dtype=np.float32)
     sensed = Sensed(zero, zero, zero, np.array([np.sin(1.0), 0.0, 0.0, np.cos(1.0)]), depth=image)
@@ -66,7 +63,7 @@ def test_a_student_looks_again_after_a_while_and_begins_anew_with_a_new_goal():
         for _ in range(steps):
             one, other = plain.decide(sensed).action, pilot.decide(sensed).action
             alike.append(np.allclose(one, other, atol=1e-5))
-            taken.append(int(pilot._second._taken[0]))
+            taken.append(int(pilot._tracker._selected[0]))
         return alike, taken
 
     for begin in ("begin", "new_goal"):
@@ -75,7 +72,6 @@ def test_a_student_looks_again_after_a_while_and_begins_anew_with_a_new_goal():
         alike, taken = flown(AFTER + 1)
         assert all(alike[:AFTER]) and set(taken[:AFTER]) == {NEAREST}
         assert taken[AFTER] != NEAREST
-    assert plain._network.state.look is None, "the file's student stays as it was"
 
 
 def test_what_has_no_second_view_is_refused():
@@ -84,13 +80,7 @@ def test_what_has_no_second_view_is_refused():
         make_flight("still", "dclaw4", "cube", hand, item, second_view=True)
     with pytest.raises(ValueError, match=r"observation\.view world"):
         make_flight("dclaw4-cube", "dclaw4", "cube", hand, item, second_view=True)
-    other = SavedStudent(
-        StudentSpec(TINY, hand.num_joints, 1, teacher="dclaw4-table"),
-        Student(TINY, hand.num_joints).eval(),
-        to_dict(ReorientCfg(hand="dclaw4")),
-        {},
-        1,
-        1,
-    )
-    with pytest.raises(ValueError, match="does not act by the layers of a teacher"):
-        StudentPilot(other, hand, item, critic=open_critic(other, "cpu"))
+    with pytest.raises(ValueError, match="does not see its goals in views"):
+        TrackingPilot(
+            TrackingPolicy(open_policy("dclaw4-cube", "cpu"), TrackingSpec()), hand, item, second_view=True
+        )

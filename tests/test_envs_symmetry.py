@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.envs.symmetry import SECTOR, WorldOrder
+from vd.envs.symmetry import WorldOrder
+from vd.envs.view_tables import SECTOR
 from vd.kernels.observations import teacher_observation_slices
 
 WORLDS = 6

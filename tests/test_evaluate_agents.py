@@ -11,7 +11,7 @@ import torch
 from vd.evaluate.agents import (
     SHIPPED_POLICIES,
     find_policy,
-    is_saved_student,
+    is_tracking_policy,
     open_policy,
     policy_name,
     start_at_rest,
@@ -41,15 +41,9 @@ def task_of(policy, **changes):
 def test_installed_policies_load_and_act(name):
     policy = open_policy(name, "cpu")
     assert name.startswith(f"{policy.task['hand']}-"), "the name begins with the hand"
-    if is_saved_student(policy):
-        student = policy.network
-        seen = torch.zeros((1, 3, student.cfg.encoder.embedding)), torch.zeros((1, 3, student.num_senses))
-        action, actions = student(*seen, student.initial_hidden(3)).mean[0], policy.spec.num_actions
-        assert policy.spec.calibrated_on and "/" not in policy.spec.teacher + policy.spec.calibrated_on
-        assert student.cfg.aim.enabled, "its rule for stops within 0.1 rad is that of a hand that aims"
-    else:
-        action, actions = policy.act(torch.zeros(3, policy.num_observations)), policy.num_actions
-    assert action.shape == (3, actions) and torch.isfinite(action).all()
+    layers = policy.teacher if is_tracking_policy(policy) else policy
+    action = layers.act(torch.zeros(3, layers.num_observations))
+    assert action.shape == (3, layers.num_actions) and torch.isfinite(action).all()
     assert not any("/" in item for item in policy.task["objects"]), "a path of the machine it was trained on"
 
 

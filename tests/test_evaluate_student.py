@@ -2,16 +2,13 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 import torch
 import warp as wp
-from scipy.spatial.transform import Rotation
 from student_dummy import TINY
 
-from vd.aim import AimCfg
 from vd.config import to_dict
 from vd.envs.cfg import RandomisationCfg, ReorientCfg, SuccessCfg
 from vd.envs.reorient import ReorientEnv
@@ -19,22 +16,15 @@ from vd.evaluate import student as module
 from vd.evaluate.agents import SHIPPED_POLICIES, sees_clouds
 from vd.evaluate.cli import main
 from vd.evaluate.comparison import Comparison
-from vd.evaluate.scanned import MISSING, NOISE_M, KnownByPoints, scan
-from vd.evaluate.student import StudentActor
+from vd.evaluate.scanned import MISSING, NOISE_M, known_objects, scan
+from vd.evaluate.student import StudentActor, StudentView
 from vd.evaluate.trace import NEVER_RAD, record
-from vd.kernels.shapes import SHAPE_UNIT_M
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
-from vd.student.cfg import LEAN
-from vd.student.network import Student
-from vd.student.object_sense import STATE_VALUES
-from vd.student.saved import SavedStudent, StudentSpec, student_export
-from vd.student.stopping import StoppingRule
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main as train
-from vd.vision import StudentView
-
-Scanned = partial(KnownByPoints, exact=False)
+from vd.vision.network import Student
+from vd.vision.saved import SavedStudent, StudentSpec, student_export
 
 TASK = ReorientCfg(
     hand="dclaw3",
@@ -49,7 +39,7 @@ TASK = ReorientCfg(
 def make_student(stage=1, goal="merged", num_actions=9, cfg=TINY):
     torch.manual_seed(stage)
     cfg = replace(cfg, goal=goal)
-    spec = StudentSpec(cfg, num_actions, stage, "dclaw3-table", None, StoppingRule(0.4, 1.0))
+    spec = StudentSpec(network=cfg, num_actions=num_actions, stage=stage, teacher="dclaw3-table")
     network = Student(cfg, num_actions).eval().requires_grad_(False)
     return SavedStudent(spec, network, to_dict(TASK), to_dict(DepthCameraCfg(points=300)), 1, 100)
 
@@ -101,31 +91,6 @@ def test_worlds_are_seen_in_parts_without_a_difference(env, monkeypatch):
     assert (actor.predicted > 0.0).any() or (actor.predicted < 0.0).any()
 
 
-def test_a_student_aims_if_its_file_says_so_or_the_environment(env, monkeypatch):
-    """Near their goals, which they then see farther away; the distance that they predict stays."""
-    encoder = replace(TINY.encoder, inputs=("constant", "marks"))
-    sees = replace(TINY, senses=("action", "object"), encoder=encoder)
-    env.reset()
-    turn = Rotation.from_rotvec([0.0, 0.0, 0.2])
-    here = env.object_pose()[:, 3:7]
-    env.reset(object_quat=here, goal_quat=(turn * Rotation.from_quat(here)).as_quat())
-    aims = AimCfg(enabled=True, past_rad=0.5)
-    state, task = env.state_dict(), env.cfg
-    found = []
-    for own, asked in ((AimCfg(), AimCfg()), (aims, AimCfg()), (AimCfg(), aims)):
-        monkeypatch.setattr(env, "cfg", replace(task, aim=asked))
-        env.load_state_dict(state)
-        actor = StudentActor(env, make_student(cfg=replace(sees, aim=own)))
-        found.append((actor.act(wp.to_torch(env.observation)), actor.predicted))
-    (plain, distance), (own, near), (asked, same) = found
-    torch.testing.assert_close(own, asked, atol=1e-5, rtol=0.0)
-    assert not torch.allclose(plain, own, atol=1e-4)
-    for other in (near, same):
-        torch.testing.assert_close(distance, other, atol=1e-5, rtol=0.0)
-    with pytest.raises(ValueError, match="object to be found"):
-        StudentActor(env, make_student())  # the environment still asks for it
-
-
 def test_memory_lasts_until_the_reset(env):
     env.reset()
     actor = StudentActor(env, make_student())
@@ -175,26 +140,19 @@ def test_a_scan_is_noisy_and_misses_one_side():
 def test_only_the_goal_is_scanned(env, rendered):
     env.reset()
     settings = dict(rendered=rendered, depth=DepthCameraCfg(points=300))
-    exact, scanned = (view(env, TINY, **settings) for view in (StudentView, Scanned))
+    scans = known_objects(env.objects, "scan", seed=0, device="cpu")
+    exact, scanned = (StudentView(env, TINY, **settings, goals=goals) for goals in (None, scans))
     frame = exact.frame()
     rows = torch.tensor([2, 0])
     chosen = {key: value[rows] for key, value in frame.items()}
-    clouds = [view.points(chosen, rows) for view in (exact, scanned)]
+    clouds = [view.sight.points(chosen, rows) for view in (exact, scanned)]
     goal = len(env.objects[0].surface_points)
     np.testing.assert_array_equal(*(cloud[:, goal:].numpy() for cloud in clouds))
     centre = np.array(PAPER.cloud.goal_position_m)
     reach = [np.linalg.norm(cloud[:, :goal].numpy() - centre, axis=-1).max() for cloud in clouds]
     assert not torch.allclose(clouds[0][:, :goal], clouds[1][:, :goal], atol=NOISE_M)
     assert reach[1] < reach[0] + 5 * NOISE_M, "the goal is where it belongs"
-    np.testing.assert_array_equal(scanned.points(chosen, rows).numpy(), clouds[1].numpy())
-
-
-def test_an_object_is_looked_for_by_its_scan(env):
-    """What a student finds of the extents at the goal are those of the scanned shape, not of the true one."""
-    env.reset()
-    sensed = [view(env, LEAN, rendered=False) for view in (StudentView, Scanned)]
-    shapes = [view.frame()["object"][:, STATE_VALUES:] for view in sensed]
-    assert (shapes[0] - shapes[1]).abs().mean() > NOISE_M / SHAPE_UNIT_M / 2.0
+    np.testing.assert_array_equal(scanned.sight.points(chosen, rows).numpy(), clouds[1].numpy())
 
 
 def test_without_a_table_objects_fall_and_it_comes_back(env):
@@ -274,7 +232,9 @@ def test_a_student_is_shown(tmp_path):
 
 def test_a_camera_errs_as_a_real_one_where_it_is_asked_to(env):
     student = make_student(2)
-    plain, real = (StudentActor(env, student, sensor_errors=errs)._view.camera.cfg for errs in (False, True))
+    plain, real = (
+        StudentActor(env, student, sensor_errors=errs)._view.senses.camera.cfg for errs in (False, True)
+    )
     assert not plain.sensor.enabled and plain.latency_s == (0.0, 0.0) and plain.position_noise_m == 0.0
     assert real.sensor == DepthSensorCfg.realistic() and real.latency_s[1] > real.latency_s[0] > 0.0
     assert real.position_noise_m > 0.0 and real.rotation_noise_rad > 0.0

@@ -5,7 +5,6 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
-from student_dummy import asks_its_teacher
 from test_evaluate_report import PNG, read_page
 from test_evaluate_trace import compared, protocol
 
@@ -339,14 +338,6 @@ def test_settings_that_cannot_be_are_refused(flags, message, capsys, tmp_path):
 
 
 def test_a_policy_is_known_by_its_weights(tmp_path):
-    asking = str(asks_its_teacher("dclaw4-table-student", tmp_path / "student.pt"))
-    student = suite_run.fingerprint(asking)
-    seen_twice = suite_run.fingerprint(asking, second_view=True)
-    assert seen_twice != student, "its teacher's critic too, which its file does not have"
-    own = suite_run.fingerprint("dclaw3-student")
-    assert suite_run.fingerprint("dclaw3-student", second_view=True) == own, "that is in its file"
-    teacher = suite_run.fingerprint("dclaw3-table")
-    assert suite_run.fingerprint("dclaw3-table", second_view=True) == teacher
     path = tmp_path / "policy.pt"
     path.write_bytes(b"one")
     first = suite_run.fingerprint(str(path))

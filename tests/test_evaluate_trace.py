@@ -15,7 +15,7 @@ from vd.evaluate.comparison import OUTCOMES, OWN_NORM, Comparison, judge, ways_t
 from vd.evaluate.comparison_page import labels, terminal_table, write_comparison
 from vd.evaluate.result import Protocol
 from vd.evaluate.trace import NEVER_RAD, record
-from vd.student.stopping import StoppingRule
+from vd.stopping import StoppingRule
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 HALF_TURN = Rotation.from_rotvec([0.0, 0.0, np.pi]).as_quat()

@@ -119,7 +119,7 @@ def commands(taken: str) -> dict[str, list[str]]:
         "vd-train  ": ["export", "x.pt", f"{taken}/x.pt"],
         "vd-train   ": ["average", "a", "b", "--output", f"{taken}/x.pt"],
         "vd-train    ": ["bundle", "dclaw4-cube", f"{taken}/x"],
-        "vd-train     ": ["follow", "dclaw4-student", "dclaw4-table", f"{taken}/x.pt"],
+        "vd-train     ": ["tracker", "dclaw4-table", "--objects", "cube", "--output", f"{taken}/x.pt"],
         "vd-eval": ["--agent", "zero", "--output", taken],
         "vd-play": ["--agent", "zero", "--video", f"{taken}/x.mp4"],
         "vd-gap": ["run", "recording", "--out", taken],

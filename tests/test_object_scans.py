@@ -9,8 +9,8 @@ from vd.assets_usd.objects.geometry import mesh_volume, random_surface_points, s
 from vd.assets_usd.objects.model import SURFACE_POINTS, load_set
 from vd.assets_usd.objects.scans import smooth, surface_of_scan
 from vd.evaluate.scanned import known_by_points, scan
-from vd.student.registration import Registration
-from vd.student.symmetry import symmetries
+from vd.tracking.registration import Registration
+from vd.tracking.symmetry import symmetries
 
 RADIUS_M = 0.05
 

@@ -11,9 +11,10 @@ import warp as wp
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
-from vd.evaluate.second_view import AFTER_S, EVERY_S, GoalClock, OtherViews, SecondView, view_maps
+from vd.evaluate.second_view import SecondView, view_maps
 from vd.kernels.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
+from vd.tracking.views import AFTER_S, EVERY_S, ViewSelection
 from vd.train.vec_env import ReorientVecEnv
 
 WORLDS = 8
@@ -63,18 +64,18 @@ def steps_with_new_views(env: ReorientEnv, actor: SecondView, steps: int, far: b
     """Steps, counted from the reset, at which views were chosen: what was shown and chosen there."""
     error = wp.to_torch(env.rotation_error)
     still, chosen, now = torch.zeros(WORLDS, env.num_actions), {}, [0]
-    better = actor._others.better
+    better = actor._selection.better
 
     def watched(world: torch.Tensor, value: Callable) -> torch.Tensor:
         chosen[now[0]] = world.clone(), better(world, value)
         return chosen[now[0]][1]
 
-    actor._others.better = watched
+    actor._selection.better = watched
     for now[0] in range(steps):
         error.fill_(2.0 if far else 0.1)
         actor.act(wp.to_torch(env.observation))
         env.step(wp.from_torch(still, dtype=wp.float32))
-    actor._others.better = better
+    actor._selection.better = better
     return chosen
 
 
@@ -171,7 +172,7 @@ def test_a_training_draws_one_of_these_views(env):
         np.testing.assert_array_equal(env.views.view.numpy(), first)
         wp.to_torch(env.goal_steps)[0] = 0  # has come to a goal, and is not due
         observed = learner.step(still)[0]["policy"]
-        view, others = env.views.view.numpy(), OtherViews(GoalClock.of(env), view_maps(env))
+        view, others = env.views.view.numpy(), ViewSelection(view_maps(env), env.cfg.sim.control_hz)
         assert view[0] == first[0]
         world = wp.to_torch(env.world_observation)
         offered = others.of(world).numpy()

@@ -7,10 +7,10 @@ import torch
 from student_dummy import TINY, make_student_runner
 
 from vd.policy import PolicySpec
-from vd.student.cfg import StudentCfg
-from vd.student.network import Student
-from vd.student.state import state_cfg
 from vd.train.student.build import begin_from
+from vd.vision.cfg import StudentCfg
+from vd.vision.network import Student
+from vd.vision.state import state_cfg
 
 ACTIONS = 3
 HEAD = state_cfg(PolicySpec(100, ACTIONS, (8,), "elu", "gaussian", False))
@@ -77,11 +77,3 @@ def test_another_network_is_refused_but_for_what_an_encoder_does_not_need(saved)
     other = replace(TINY, encoder=replace(TINY.encoder, channels=(4, 8)))
     with pytest.raises(ValueError, match="another network"):
         begin_from(path, Student(other, ACTIONS), "cpu")
-
-
-def test_what_told_the_whole_distance_does_not_correct_an_angle_that_is_found(saved):
-    marked = replace(TINY, encoder=replace(TINY.encoder, inputs=("constant", "marks")))
-    path, there = saved(0, marked)
-    here = Student(replace(marked, senses=("action", "object")), ACTIONS)
-    assert "distance" in begin_from(path, here, "cpu") and same(here, there, "encoder")
-    assert not any(layers[-1].weight.any() for layers in here.distance.values())

@@ -8,10 +8,11 @@ import warp as wp
 from vd.assets_usd.hand_data import compose
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
+from vd.clouds import HandKinematics, SceneClouds
 from vd.paper import PAPER
 from vd.sim.scene import hand_mount
-from vd.student.cfg import NoiseCfg
-from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
+from vd.vision.cfg import NoiseCfg
+from vd.vision.voxels import Voxeliser
 
 
 @pytest.fixture(scope="module")

@@ -4,17 +4,12 @@ import math
 import os
 import signal
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 from student_dummy import TINY, DummyTeacher, make_dagger, make_student_runner, weights
-from train_dummy import DummyEnv
 
-from vd.student.cfg import NoiseCfg
-from vd.student.network import Student
-from vd.student.saved import load_student
 from vd.train.checkpoint import list_checkpoints
 from vd.train.cli import main
 from vd.train.ending import Interrupted, TrainingDivergedError
@@ -22,6 +17,9 @@ from vd.train.metrics import read_progress
 from vd.train.student.losses import distance_loss, imitation_loss, poses, unexplained
 from vd.train.student.optimise import scheduled
 from vd.train.student.rollout import taken
+from vd.vision.cfg import NoiseCfg
+from vd.vision.network import Student
+from vd.vision.saved import load_student
 
 
 def test_the_losses_fall_on_one_rollout():
@@ -259,7 +257,7 @@ def test_poses_are_read_from_frames_and_learned(monkeypatch):
     bodies = torch.zeros(4, 3, 2, 7)
     bodies[..., 1, :] = torch.tensor([0.05, -0.1, 0.0, 0.0, 0.0, math.sin(0.5), math.cos(0.5)])
     goal = torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(4, 3, 4)
-    found = poses({"body_q": bodies, "goal_quat": goal}, 1)
+    found = poses({"body_q": bodies, "goal_quat": goal})
     assert found.shape == (4, 3, 9)
     np.testing.assert_allclose(
         found[0, 0],
@@ -267,11 +265,10 @@ def test_poses_are_read_from_frames_and_learned(monkeypatch):
         atol=1e-6,
     )
 
-    def target(frames, body):
+    def target(frames):
         return frames["target"].repeat(1, 1, 5)[..., :9]
 
     monkeypatch.setattr("vd.train.student.dagger.poses", target)
-    monkeypatch.setattr(DummyEnv, "scene", SimpleNamespace(object_body=1), raising=False)
     dagger = make_dagger(pose_weight=1.0, epochs=1, rollout_steps=4)
     assert weights(dagger.student).size == weights(make_dagger().student).size
     rollout = dagger.collect()

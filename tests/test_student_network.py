@@ -10,9 +10,9 @@ import torch
 import warp as wp
 
 from vd.config import from_dict, to_dict
-from vd.student.cfg import LEAN, PAPER_NETWORK, PRESETS, EncoderCfg, StudentCfg
-from vd.student.clouds import Voxeliser
-from vd.student.network import Student, voxel_features
+from vd.vision.cfg import LEAN, PAPER_NETWORK, PRESETS, EncoderCfg, StudentCfg
+from vd.vision.network import Student, voxel_features
+from vd.vision.voxels import Voxeliser
 
 ACTIONS = 12
 SMALL = StudentCfg(
@@ -284,6 +284,6 @@ def test_refuses_sizes_that_make_no_network(change, field):
 
 
 def test_a_robot_needs_no_simulator():
-    code = "import sys, vd.student.network, vd.student.clouds; print(*sys.modules)"
+    code = "import sys, vd.vision.network, vd.vision.voxels; print(*sys.modules)"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not {"newton", "mujoco", "pxr", "rsl_rl"} & set(run.stdout.split())

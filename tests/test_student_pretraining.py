@@ -12,12 +12,8 @@ from student_dummy import weights
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import load_set
 from vd.config import to_dict
+from vd.quaternions import relative_rotation, rotation_distance
 from vd.sensors.cfg import DepthCameraCfg
-from vd.student.cfg import EncoderCfg, NoiseCfg, StudentCfg
-from vd.student.match import Matches
-from vd.student.network import Student
-from vd.student.quaternions import relative_rotation, rotation_distance
-from vd.student.saved import StudentSpec
 from vd.train.checkpoint import list_checkpoints
 from vd.train.config import RunCfg
 from vd.train.student.config import PretrainCfg
@@ -30,6 +26,10 @@ from vd.train.student.pretrain import (
 )
 from vd.train.student.rotations import angle_between, multiply, random_rotations, two_columns
 from vd.train.student.runner import StudentRunner
+from vd.vision.cfg import EncoderCfg, NoiseCfg, StudentCfg
+from vd.vision.match import Matches
+from vd.vision.network import Student
+from vd.vision.saved import StudentSpec
 
 NETWORK = StudentCfg(
     encoder=EncoderCfg(channels=(8, 16), blocks=0, embedding=30), voxel_m=0.015, memory=8, head_hidden=8
@@ -107,7 +107,7 @@ def test_matched_points_are_right_where_the_goal_has_them(assets):
     _, targets = scenes.draw()
     points, clouds = wp.to_torch(scenes._points), scenes._clouds
     item, goal = points[:, clouds.item], points[:, clouds.goal]
-    poses = {"body_q": targets["body_q"], "goal_quat": targets["goal"], "base": 0, "item": -1}
+    poses = {"body_q": targets["body_q"], "goal_quat": targets["goal"]}
     present = torch.ones_like(item[..., :1])
     assert float(match_loss(Matches(item, goal, present), **poses)) < 1e-4
     off = torch.tensor([0.0, 0.0, 0.02])  # 0.4 units: beyond the bend, 0.4 - 0.5 x 0.2

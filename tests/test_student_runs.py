@@ -18,17 +18,16 @@ from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_teacher, trained_task
 from vd.evaluate.statistics import symmetric_error
-from vd.evaluate.trace import Trace
+from vd.evaluate.student import StudentView
 from vd.sensors.cfg import DepthCameraCfg
-from vd.student.cfg import LEAN, NoiseCfg, StudentCfg
-from vd.student.saved import load_student, read_student
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main
 from vd.train.metrics import read_progress
 from vd.train.student.build import check_start, default_init
 from vd.train.student.cli import parse_student
 from vd.train.student.config import PRESETS, validate
-from vd.vision import StudentView
+from vd.vision.cfg import LEAN, NoiseCfg, StudentCfg
+from vd.vision.saved import load_student, read_student
 
 NETWORK = StudentCfg(voxel_m=0.01)
 SEPARATE = replace(NETWORK, goal="separate")
@@ -137,9 +136,8 @@ def test_the_hand_is_seen_where_the_encoders_say(env):
         moved = (view.frame()["body_q"] - true).abs().amax(dim=(0, 2))
     finally:
         env.measured_q = exact
-    links = env.scene.link_body
-    assert (moved[links[1:4]] > 1e-3).all()  # the first finger, not the others and not the object
-    assert (np.delete(moved.numpy(), links[1:4]) < 1e-5).all()
+    assert (moved[1:4] > 1e-3).all()  # the first finger, not the others and not the object
+    assert (np.delete(moved.numpy(), slice(1, 4)) < 1e-5).all()
 
 
 def test_random_states_of_a_view_come_back(env):
@@ -223,12 +221,12 @@ def test_another_network_or_no_teacher_is_explained(tmp_path, stage, capsys):
 
 
 @pytest.mark.slow
-def test_stages_on_the_command_line(tmp_path, capsys, monkeypatch):
-    """Stage 1 by imitation of an installed teacher, stage 2 from it, resumed; then its stopping rule."""
+def test_stages_on_the_command_line(tmp_path, capsys):
+    """Stage 1 by imitation of an installed teacher, stage 2 from it, resumed."""
     small = ["--preset", "cpu-demo", "--num-worlds", "2", "--dagger.rollout-steps", "3", "--no-tensorboard"]
     small += ["--dagger.validation-worlds", "1"]
     small += ["--task.at-rest", "False"]  # the search for poses at rest takes long
-    both = ["--network.turn.vectors", "4", "--network.senses", "action", "position", "velocity", "object"]
+    both = ["--network.turn.vectors", "4", "--network.senses", "action", "position", "velocity"]
     first = ["student", *small, *both, "--run-dir", str(tmp_path / "stage1")]
     assert main([*first, "--max-steps", "6"]) == 0
     (row,) = read_progress(tmp_path / "stage1" / "progress.jsonl")
@@ -249,50 +247,7 @@ def test_stages_on_the_command_line(tmp_path, capsys, monkeypatch):
     assert network.turn.vectors == 4 and network.state.values == teacher.num_observations
     assert saved.network.state is not None and saved.network.state.fitted
     assert saved.depth["points"] == 2000 and saved.task["randomisation"]["observation_noise_std"] == 0.0
-    tolerance = ["--tolerance-rad", "3.1416", "--episodes", "2", "--episode-s", "0.5", "--json"]
-    assert main(["calibrate", str(path), *tolerance]) == 0
-    rule = json.loads(capsys.readouterr().out)["rule"]
-    spec = load_student(path).spec
-    assert spec.stopping.distance_rad == rule["distance_rad"] and "2 episodes" in spec.calibrated_on
-    assert spec.tolerance_rad == 3.1416, "what the rule is for is kept with it"
     assert read_student(path)["iter"] == 2
-    _check_calibration(path, monkeypatch, capsys)
-
-
-def _check_calibration(path, monkeypatch, capsys):
-    """Tables and times are those of the paper's tests, and the file says which."""
-    asked: list[tuple[int | None, int]] = []
-
-    def spy(env, actor, episodes, *, table_steps, on_step):
-        asked.append((table_steps, env.max_episode_steps))
-        for _ in range(env.max_episode_steps):
-            on_step()
-        seen = np.zeros((1, 2, 4))
-        none, turn = np.zeros((1, 2), dtype=bool), np.zeros((1, 2, 4))
-        norms = np.linspace(1.0, 0.0, seen.size).reshape(seen.shape)
-        return Trace(turn, turn, seen, seen, norms, seen, np.full((1, 2), 3), none)
-
-    monkeypatch.setattr("vd.train.student.calibrate.record", spy)
-    assert main(["calibrate", str(path), "--episodes", "2"]) == 0
-    assert main(["calibrate", str(path), "--episodes", "2", "--in-air"]) == 0
-    assert asked == [(None, 120), (24, 180)], "both as long as the paper's tests"
-    assert "120/120" in (progress := capsys.readouterr().err) and "180/180" in progress
-    spec = load_student(path).spec
-    assert "2 episodes in the air" in spec.calibrated_on
-    # Both episodes lie at their goals, so that the strictest bounds that stop them are the best for both.
-    assert spec.precise is not None and spec.rule_for(0.1) == spec.precise
-    assert 0.0 < spec.precise.distance_rad < spec.stopping.distance_rad
-    assert not spec.network.aim.enabled
-    for asked_for, aims in (("on", True), ("kept", True), ("off", False)):
-        flags = ["--episodes", "2", "--aim", asked_for]
-        assert main(["calibrate", str(path), *flags]) == 0
-        spec = load_student(path).spec
-        assert spec.network.aim.enabled == aims == ("aimed" in spec.calibrated_on)
-    small = path.with_name("small.pt")
-    assert main(["export", str(path), str(small)]) == 0
-    size = small.stat().st_size
-    assert main(["calibrate", str(small), "--episodes", "2"]) == 0
-    assert load_student(small).spec.calibrated_on and small.stat().st_size < 1.1 * size, "it stays small"
 
 
 @pytest.mark.slow
@@ -323,7 +278,7 @@ from train_dummy import DummyEnv
 import vd.train.student.dagger as dagger_module
 from vd.train.distributed import join_processes
 DummyEnv.scene = SimpleNamespace(object_body=1)
-dagger_module.poses = lambda frames, body: frames["target"].repeat(1, 1, 5)[..., :9]
+dagger_module.poses = lambda frames: frames["target"].repeat(1, 1, 5)[..., :9]
 rank, folder = int(os.environ["RANK"]), Path({folder!r})
 dagger = make_dagger(seed=rank, world_size=2, pose_weight=1.0)  # other worlds; other weights at first
 runner = make_student_runner(folder, dagger, processes=join_processes("cpu"))

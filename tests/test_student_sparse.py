@@ -11,11 +11,11 @@ import warp as wp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import vd.student
+import vd.vision
 from vd.kernels.voxels import voxelise
-from vd.student import sparse
-from vd.student.sites import Sites
-from vd.student.sparse import SparseConv3d, SparseMaxPool3d, global_pool, parts
+from vd.vision import sparse
+from vd.vision.sites import Sites
+from vd.vision.sparse import SparseConv3d, SparseMaxPool3d, global_pool, parts
 
 OFFSETS = list(itertools.product((-1, 0, 1), repeat=3))
 EXTENT = 8
@@ -185,8 +185,8 @@ def test_parts_give_the_same_as_the_whole(device, monkeypatch):
 
 
 def test_warns_and_gathers_where_the_fused_kernels_cannot_be_had(monkeypatch):
-    monkeypatch.setitem(sys.modules, "vd.student.fused", None)
-    monkeypatch.delattr(vd.student, "fused", raising=False)
+    monkeypatch.setitem(sys.modules, "vd.vision.fused", None)
+    monkeypatch.delattr(vd.vision, "fused", raising=False)
     with pytest.warns(UserWarning, match="Triton"):
         assert sparse.fused_kernels.__wrapped__(torch.device("cpu")) is None
 

@@ -7,12 +7,10 @@ from scipy.spatial.transform import Rotation
 
 from vd.config import from_dict, to_dict
 from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
-from vd.kernels.shapes import shape_observation_size
 from vd.policy import MeanAction, PolicySpec, perceptron
-from vd.student.cfg import StateCfg, StudentCfg
-from vd.student.network import Student
-from vd.student.object_sense import object_values, observed
-from vd.student.state import UNSEEN, StateHead, state_cfg
+from vd.vision.cfg import StateCfg, StudentCfg
+from vd.vision.network import Student
+from vd.vision.state import UNSEEN, StateHead, state_cfg
 
 FINGERS, ACTIONS, WIDTH = 3, 9, 12
 SHAPE_VALUES = 5
@@ -126,26 +124,3 @@ def test_sizes_that_do_not_fit_are_refused():
         Student(StudentCfg(state=StateCfg(values=-1)), ACTIONS)
     with pytest.raises(RuntimeError, match="size mismatch"):
         StateHead(StateCfg(values=SPEC.num_observations, hidden=(16, 9)), WIDTH, ACTIONS).adopt(teacher())
-
-
-def test_what_is_found_of_the_object_stands_and_is_what_the_teacher_observes():
-    """The sense's values come to the columns of the observation; the first fit leaves them as they are."""
-    values = teacher_observation_size(FINGERS) + shape_observation_size(FINGERS)
-    columns, sources, factors = observed(ACTIONS, values)
-    assert len(set(columns)) == len(columns) == 4 + 3 * 3 + shape_observation_size(FINGERS)
-    assert not set(columns) & set(range(COLUMNS["fingertips"].start, COLUMNS["fingertips"].stop))
-    width, found = 5, 3
-    cfg = StateCfg(values=values, hidden=(8,), inside=4)
-    head = StateHead(cfg, width + object_values(ACTIONS), ACTIONS, found=found)
-    head.offset.normal_()
-    head.scale.uniform_(0.5, 2.0)
-    observation, features = torch.randn(50, values), torch.randn(50, width + object_values(ACTIONS))
-    turn = observation[:, COLUMNS["relative_orientation"]]
-    turn[:, 3].abs_()
-    for column, source, factor in zip(columns, sources, factors, strict=True):
-        features[:, found + source] = observation[:, column] / factor
-    head.fit(features, observation)
-    estimate = head(features)[0]
-    torch.testing.assert_close(
-        estimate[:, columns], head.target(observation)[:, columns], atol=1e-4, rtol=1e-4
-    )

@@ -8,13 +8,13 @@ import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from vd.student.cfg import EncoderCfg, StudentCfg, TurnCfg
-from vd.student.clouds import Voxeliser
-from vd.student.match import PointMatch, orthogonal
-from vd.student.network import Student
-from vd.student.quaternions import relative_rotation
-from vd.student.turn import ShapeVectors, TurnEncoder
+from vd.quaternions import relative_rotation
 from vd.train.student.rotations import angle_between, random_rotations, two_columns
+from vd.vision.cfg import EncoderCfg, StudentCfg, TurnCfg
+from vd.vision.match import PointMatch, orthogonal
+from vd.vision.network import Student
+from vd.vision.turn import ShapeVectors, TurnEncoder
+from vd.vision.voxels import Voxeliser
 
 SIZES = TurnCfg(vectors=4, rounds=2, hidden=8, pairs=3)
 GOAL_POINTS, HAND_POINTS, ITEM_POINTS = 60, 40, 60

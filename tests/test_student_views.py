@@ -8,11 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.envs.symmetry import ViewTables, view_tables
+from vd.envs.view_tables import ViewTables, view_tables
 from vd.kernels.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
-from vd.student.state import UNSEEN, StateHead, state_cfg
-from vd.student.views import EveryView, ViewMaps
+from vd.train.student.every_view import EveryView
+from vd.views import ViewMaps
+from vd.vision.state import UNSEEN, StateHead, state_cfg
 
 WORLDS, WIDTH = 48, 8
 
@@ -44,7 +45,7 @@ def views_of(env: ReorientEnv) -> int:
 
 
 def tables_of(env: ReorientEnv) -> ViewTables:
-    return view_tables(env.state, env.cfg.observation.view)
+    return view_tables(env.hand, env.cfg.observation, env.cfg.observation.view)
 
 
 def teacher_of(env: ReorientEnv) -> TrainedPolicy:

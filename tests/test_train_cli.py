@@ -22,6 +22,7 @@ from vd.train.config import minibatches, validate
 from vd.train.flags import OF_HELP_ALL, parse_teacher
 from vd.train.presets import PRESETS, PresetName, TeacherCfg, smoke
 from vd.train.student.config import StudentTrainCfg
+from vd.train.tracker import TrackerCfg
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
@@ -183,14 +184,14 @@ def _undescribed(cls: type, prefix: str = "") -> list[str]:
     return missing
 
 
-@pytest.mark.parametrize("cls", [TeacherCfg, StudentTrainCfg])
+@pytest.mark.parametrize("cls", [TeacherCfg, StudentTrainCfg, TrackerCfg])
 def test_every_flag_is_described(cls):
     assert _undescribed(cls) == []
     assert not [flag for flag in _flags(cls) if ".no-" in flag], "--no-no- would be its other side"
 
 
 def test_a_command_names_itself_in_its_help(capsys):
-    for command in ("teacher", "student", "calibrate", "follow", "average", "export"):
+    for command in ("teacher", "student", "tracker", "average", "export"):
         with pytest.raises(SystemExit):
             main([command, "--help"])
         text = capsys.readouterr().out

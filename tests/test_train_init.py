@@ -240,7 +240,7 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert find_start(str(tmp_path / "policy.pt")) == tmp_path / "policy.pt"
     with pytest.raises(FileNotFoundError, match=r"--init: no policy at .*installed policy: dclaw3"):
         find_start(str(tmp_path / "none"))
-    assert main(["teacher", "--init", "dclaw3-student", "--run-dir", str(tmp_path / "run")]) == 1
+    assert main(["teacher", "--init", "dclaw3-tracking", "--run-dir", str(tmp_path / "run")]) == 1
     assert "holds no actor; give --init" in capsys.readouterr().err
     assert main(["teacher", "--init-stage", "1", "0", "--run-dir", str(tmp_path / "run")]) == 1
     assert "--init-stage says where a run with --init begins" in capsys.readouterr().err

@@ -37,9 +37,9 @@ TEACHERS = {
     "dclaw4-air": ("dclaw4-air", "--in-air"),
 }
 TRACKING = {
-    "dclaw3-student": ("dclaw3-student", "dclaw3-table"),
-    "dclaw4-student": ("dclaw4-student",),
-    "dclaw4-table-student": ("dclaw4-table-student",),
+    "dclaw3-tracking": ("dclaw3-tracking", "dclaw3-table"),
+    "dclaw4-air-tracking": ("dclaw4-air-tracking",),
+    "dclaw4-tracking": ("dclaw4-tracking",),
 }
 EPISODES = {"teachers": 8, "tracking": 2}
 """Of each object; eight by camera would take half an hour."""

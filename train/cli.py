@@ -30,8 +30,7 @@ USAGE = """usage: vd-train COMMAND [flags]
 commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --run-dir runs/first
   student    imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
-  calibrate  choose when a student stops          vd-train calibrate student.pt --objects SET
-  follow     give a student a newer teacher       vd-train follow dclaw4-student runs/more student.pt
+  tracker    let it act by a camera, learn nothing vd-train tracker dclaw3-table --objects SET
   average    mean weights of several teachers     vd-train average runs/a runs/b --output policy.pt
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
@@ -50,6 +49,10 @@ A run goes on with any number of GPUs and worlds (--resume); on another machine 
 checkpoint, progress.jsonl for the curve so far: vd-train teacher --run-dir FOLDER --resume small.pt
 
 vd-train COMMAND --help lists the flags of a command."""
+
+_TRACKER = "vd-train tracker TEACHER --objects SET writes a tracking policy and its stopping rules"
+GONE = {"calibrate": _TRACKER, "follow": _TRACKER}
+"""Commands that are no more, and what to do."""
 
 
 @dataclass
@@ -109,8 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     commands = {
         "teacher": _teacher,
         "student": _elsewhere("vd.train.student.cli", "student_command"),
-        "calibrate": _elsewhere("vd.train.student.cli", "calibrate_command"),
-        "follow": _elsewhere("vd.train.student.cli", "follow_command"),
+        "tracker": _elsewhere("vd.train.tracker", "tracker_command"),
         "average": _elsewhere("vd.train.average", "average_command"),
         "export": _export,
         "bundle": _bundle,
@@ -120,6 +122,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
         return 0 if arguments else 2
+    if arguments[0] in GONE:
+        print(f"vd-train: '{arguments[0]}' is no more; {GONE[arguments[0]]}", file=sys.stderr)
+        return 2
     if arguments[0] not in commands:
         print(
             f"vd-train: no command '{arguments[0]}'; one of {', '.join(commands)}\n\n{USAGE}", file=sys.stderr
@@ -271,8 +276,8 @@ def _export(arguments: list[str], _started: float) -> int:
     check_file(cfg.output)
 
     from vd.policy import policy_export
-    from vd.student.saved import is_student, read_student, student_export
     from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
+    from vd.vision.saved import is_student, read_student, student_export
 
     if is_student(cfg.checkpoint):
         if cfg.resumable or cfg.output.suffix == ".onnx":

@@ -9,8 +9,9 @@ from tensordict import TensorDict
 
 from vd.config import to_dict
 from vd.envs.state import saved_stage
-from vd.evaluate.second_view import GoalClock, OtherViews, view_maps
+from vd.evaluate.second_view import view_maps
 from vd.paper import PAPER
+from vd.tracking.views import ViewSelection
 
 OBSERVATION_GROUP = "policy"
 """What actor and critic both read; all there is in the paper."""
@@ -52,7 +53,8 @@ class ReorientVecEnv(VecEnv):
         self.env = env
         self._others = None
         if second_view:
-            self._others = OtherViews(GoalClock.of(env), view_maps(env))
+            self._others = ViewSelection(view_maps(env), env.cfg.sim.control_hz)
+            self._goal_steps = wp.to_torch(env.goal_steps)
             self._world, self._view = wp.to_torch(env.world_observation), wp.to_torch(env.views.view)
         self.num_envs = env.num_worlds
         self.num_actions = env.num_actions
@@ -139,12 +141,12 @@ class ReorientVecEnv(VecEnv):
             {"time_outs": timed_out.float(), "log": log},
         )
 
-    def _look_again(self, others: OtherViews) -> None:
+    def _look_again(self, others: ViewSelection) -> None:
         """Draw a view for the worlds that are due, and observe in it; nothing waits on the host."""
         views = others.of(self._world)
         drawn = torch.randint(len(views), views.shape[1:], device=views.device)
         chosen = views.gather(0, drawn[None])[0].to(self._view.dtype)
-        due = others.due() & (self._rotation_error > PAPER.success.rotation_rad)
+        due = others.due(self._goal_steps) & (self._rotation_error > PAPER.success.rotation_rad)
         self._view.copy_(torch.where(due, chosen, self._view))
         self.env.views.observe()
 

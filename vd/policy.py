@@ -127,6 +127,11 @@ class TrainedPolicy:
         """Whether the file has one."""
         return self._critic is not None
 
+    @property
+    def critic_weights(self) -> dict[str, torch.Tensor]:
+        """State of its critic; empty if the file has none."""
+        return self._critic or {}
+
     @cached_property
     def critic(self) -> MeanAction:
         """What it expects: from observations [N, O] to values [N, 1].
@@ -280,18 +285,22 @@ def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
     if not {"policy", "actor_state_dict", "task"} <= state.keys():
         raise ValueError(f"{path} holds no policy; give a file that vd-train wrote")
     try:
-        spec = from_dict(PolicySpec, state["policy"], where="policy")
-        return TrainedPolicy(
-            spec,
-            state["actor_state_dict"],
-            task=state["task"],
-            iteration=int(state["iter"]),
-            env_steps=int(state["env_steps"]),
-            device=device,
-            critic=state.get("critic_state_dict"),
-        )
+        return policy_of(state, device)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"{path}: the weights do not fit the network it describes ({error})") from error
+
+
+def policy_of(state: dict[str, Any], device: str) -> TrainedPolicy:
+    """The policy in the contents of a file; raises what the reading of a wrong one raises."""
+    return TrainedPolicy(
+        from_dict(PolicySpec, state["policy"], where="policy"),
+        state["actor_state_dict"],
+        task=state["task"],
+        iteration=int(state["iter"]),
+        env_steps=int(state["env_steps"]),
+        device=device,
+        critic=state.get("critic_state_dict"),
+    )
 
 
 def policy_export(state: dict[str, Any]) -> dict[str, Any]:

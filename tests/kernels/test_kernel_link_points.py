@@ -11,11 +11,12 @@ BASE, OBJECT = 0, 1
 GOAL_POSITION = np.array([0.1, -0.2, -0.08])
 
 
-def cloud_model(hand, body, samples, world_object, world_scale, device):
+def cloud_model(hand, body, samples, world_object, world_scale, device, shown=None):
     model = CloudModel()
     model.hand_points = device_array(hand, wp.vec3, device)
     model.hand_body = device_array(body, int, device)
     model.object_points = device_array(samples, wp.vec3, device)
+    model.goal_points = device_array(samples if shown is None else shown, wp.vec3, device)
     model.world_object = device_array(world_object, int, device)
     model.world_scale = device_array(world_scale, float, device)
     model.base_body, model.object_body = BASE, OBJECT
@@ -66,11 +67,13 @@ def expected_points(scene):
     return np.array(clouds)
 
 
-def launch(scene, device, *, with_object=True, spare=0):
+def launch(scene, device, *, with_object=True, spare=0, shown=None):
     hand, samples = len(scene["hand"]), scene["samples"].shape[1]
     rows = len(scene["goal"])
     model = cloud_model(
-        *(scene[key] for key in ("hand", "body", "samples", "world_object", "world_scale")), device
+        *(scene[key] for key in ("hand", "body", "samples", "world_object", "world_scale")),
+        device,
+        shown,
     )
     columns = hand + samples * (2 if with_object else 1)
     out = unwritten((rows, columns + spare), wp.vec3, device)
@@ -102,6 +105,16 @@ def test_a_shorter_launch_leaves_the_object_out_and_room_for_a_camera(device, sc
     expected = expected_points(scene)[:, : -scene["samples"].shape[1]]
     np.testing.assert_allclose(points[:, :-3], expected, atol=1e-6)
     assert np.isnan(points[:, -3:]).all()
+
+
+@EXAMPLES
+@given(scene=scenes())
+def test_a_goal_is_shown_by_samples_of_its_own(device, scene):
+    """Those of a scan, for example: here the same in another order."""
+    goal = scene["samples"].shape[1]
+    expected, points = expected_points(scene), launch(scene, device, shown=scene["samples"][:, ::-1])
+    np.testing.assert_allclose(points[:, goal:], expected[:, goal:], atol=1e-6)
+    np.testing.assert_allclose(points[:, :goal], expected[:, :goal][:, ::-1], atol=1e-6)
 
 
 def test_goal_reached_means_equal_clouds_but_for_the_place(device):

@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vd.aim import AimCfg
 from vd.config import to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.files import check_folder, write_json
@@ -23,9 +22,9 @@ from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
-    from vd.student.cfg import StateCfg
-    from vd.student.network import Student
     from vd.train.student.runner import Learner, StudentRunner
+    from vd.vision.cfg import StateCfg
+    from vd.vision.network import Student
 
 CONFIG_NAME = "config.json"
 """The resolved configuration, in the run's folder, written before the first iteration."""
@@ -100,10 +99,10 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     quiet_warp()
     from vd.evaluate.agents import find_policy, policy_name
     from vd.policy import load_policy
-    from vd.student.network import Student
-    from vd.student.saved import StudentSpec
     from vd.train.distributed import Processes, join_processes
     from vd.train.student.runner import StudentRunner
+    from vd.vision.network import Student
+    from vd.vision.saved import StudentSpec
     from vd.workers import one_thread_without_gpu
 
     device = cfg.run.device
@@ -176,7 +175,7 @@ def check_start(cfg: StudentTrainCfg) -> None:
                 f"{cfg.run.run_dir.with_name(f'stage{SYNTHETIC}')}; --from-scratch begins without one"
             )
         return
-    from vd.student.saved import read_student, saved_spec
+    from vd.vision.saved import read_student, saved_spec
 
     stage = saved_spec(read_student(cfg.init), cfg.init).stage
     if cfg.stage == RENDERED and stage == PRETRAINING and not cfg.from_scratch:
@@ -188,22 +187,22 @@ def check_start(cfg: StudentTrainCfg) -> None:
 
 def state_head(cfg: StudentTrainCfg, teacher: "TrainedPolicy") -> "StateCfg":
     """The head for what the teacher observes: a student that acts already keeps to having one, or none."""
-    from vd.student.cfg import StateCfg
-    from vd.student.saved import read_student, saved_spec
+    from vd.vision.cfg import StateCfg
+    from vd.vision.saved import read_student, saved_spec
 
     wanted = cfg.dagger.state_weight > 0.0
     if cfg.init is not None and saved_spec(read_student(cfg.init), cfg.init).stage != PRETRAINING:
         wanted = cfg.network.state.values > 0
     if not wanted:
         return StateCfg()
-    return replace(head_of(teacher), fingertips=cfg.network.senses_joints)
+    return head_of(teacher)
 
 
 def head_of(teacher: "TrainedPolicy") -> "StateCfg":
     """The head that estimates what a teacher observes, in the views that it was trained in."""
     from vd.evaluate.agents import trained_task
     from vd.kernels.observations import JOINTS_PER_FINGER
-    from vd.student.state import state_cfg
+    from vd.vision.state import state_cfg
 
     observation = trained_task(teacher).observation
     return state_cfg(teacher.spec, views=observation.views(teacher.num_actions // JOINTS_PER_FINGER))
@@ -221,7 +220,7 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
     Raises:
         ValueError: It is of another network, or has learned to move another hand.
     """
-    from vd.student.saved import read_student, saved_spec
+    from vd.vision.saved import read_student, saved_spec
 
     state = read_student(path, device)
     spec = saved_spec(state, path)
@@ -233,12 +232,9 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
         )
     other = to_dict(replace(spec.network, state=student.cfg.state)) != to_dict(student.cfg)
     own, theirs = student.state_dict(), state["student_state_dict"]
-    if replace(spec.network.state, critic=False) != replace(student.cfg.state, critic=False):
+    if spec.network.state != student.cfg.state:
         # Actions were read from the memory alone, or added to those of another teacher.
         theirs = {name: value for name, value in theirs.items() if not name.startswith(("state.", "mean."))}
-    if ("object" in spec.network.senses) != ("object" in student.cfg.senses):
-        # Heads for the whole distance, or for what is to be added to the angle that was found.
-        theirs = {name: value for name, value in theirs.items() if not name.startswith("distance.")}
     fits = {key: value for key, value in theirs.items() if key in own and own[key].shape == value.shape}
     anew = sorted({name.split(".")[0] for name in own.keys() - fits.keys()})
     if other and (acts or "encoder" in anew):
@@ -282,13 +278,13 @@ def _dagger(
     import torch
 
     from vd.envs.reorient import ReorientEnv
-    from vd.envs.symmetry import WorldOrder, view_tables
+    from vd.envs.symmetry import WorldOrder
+    from vd.envs.view_tables import view_tables
     from vd.evaluate.agents import trained_task
-    from vd.sim.scene import hand_mount
-    from vd.student.views import EveryView
+    from vd.evaluate.student import StudentView
     from vd.train.student.dagger import Dagger
+    from vd.train.student.every_view import EveryView
     from vd.train.vec_env import ReorientVecEnv
-    from vd.vision import StudentView
 
     simulation = ReorientEnv(task, cfg.run.device)
     if simulation.num_observations != teacher.num_observations:
@@ -301,10 +297,9 @@ def _dagger(
     if fresh and not cfg.dagger.reset:
         steps = env.episode_length_buf
         env.episode_length_buf = torch.randint_like(steps, high=int(env.max_episode_length))
-    # Teachers aim at the goals themselves, and so does whoever learns from them.
     view = StudentView(
         simulation,
-        replace(cfg.network, aim=AimCfg()),
+        cfg.network,
         rendered=cfg.stage == RENDERED,
         depth=cfg.depth,
         camera=cfg.camera,
@@ -316,12 +311,14 @@ def _dagger(
     state = student.state
     if state is not None:
         seen_in = trained_task(teacher).observation.view
-        tables = view_tables(simulation.state, seen_in) if state.views is not None else None
+        tables = (
+            view_tables(simulation.hand, simulation.cfg.observation, seen_in)
+            if state.views is not None
+            else None
+        )
         if fresh and state.adopt(teacher.network, tables):
             # What is added to the actions of another teacher's layers is of no use to these.
             student.forget_correction()
-        if fresh and state.fingertips is not None:
-            state.fingertips.adopt(simulation.hand, list(hand_mount()))
         if state.views is not None:
             labels = EveryView(teacher, state.views)
     return Dagger(env, view, student, labels, cfg.dagger, world_size=world_size)

@@ -9,8 +9,8 @@ import tyro
 
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
-from vd.student.cfg import LEAN, PAPER_NETWORK, EncoderCfg, NoiseCfg, StudentCfg, TurnCfg
 from vd.train.config import RunCfg
+from vd.vision.cfg import LEAN, PAPER_NETWORK, EncoderCfg, NoiseCfg, StudentCfg
 
 Stage = Literal[0, 1, 2]
 PresetName = Literal["gpu", "paper", "cpu-demo", "cpu-overfit"]
@@ -55,7 +55,7 @@ class DaggerCfg:
     to see them much later. 0, as in the released code: no such head."""
     state_weight: float = 0.0
     """Weight of the squared error of an estimate of the teacher's observation, normalised, on which the
-    teacher's own layers act (:mod:`vd.student.state`). 0, as in the released code: no such head. A student
+    teacher's own layers act (:mod:`vd.vision.state`). 0, as in the released code: no such head. A student
     to begin from decides for itself whether it has one."""
     match_weight: float = 0.0
     """Weight of how far points of the object are found from where they are on the goal, for a network whose
@@ -217,8 +217,6 @@ def gpu(stage: Stage) -> StudentTrainCfg:
     """
     start = paper(stage)
     dagger, network = SHORT_ROLLOUTS, LEAN
-    if stage == PRETRAINING:  # nothing else could see the rotation that it is to predict
-        network = replace(LEAN, turn=TurnCfg(vectors=32))
     if stage == RENDERED:  # it begins from a student that acts already
         dagger = replace(dagger, learning_rate=5e-4, teacher_share=dagger.teacher_share_last)
     return replace(

@@ -13,10 +13,6 @@ import torch
 from torch import nn
 
 from vd.policy import Policy
-from vd.student.match import Matches
-from vd.student.network import Student, StudentOutput
-from vd.student.sites import Sites
-from vd.student.state import StateHead
 from vd.train.ending import TrainingDivergedError
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import DaggerCfg
@@ -33,6 +29,10 @@ from vd.train.student.optimise import all_finite, autocast, descend, make_optimi
 from vd.train.student.rollout import UNCLIPPED, Rollout, moved, rollout_bytes, taken
 from vd.train.student.rotations import angle_between
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
+from vd.vision.match import Matches
+from vd.vision.network import Student, StudentOutput
+from vd.vision.sites import Sites
+from vd.vision.state import StateHead
 
 CHECKPOINT_ROLLOUT_BYTES = 2**28
 """Kept rollouts that are larger together, those with camera points, are not written into checkpoints: a run
@@ -44,7 +44,7 @@ LOWER_RATES = "lower --dagger.learning-rate or --dagger.grad-norm, or take --dag
 
 
 class View(Protocol):
-    """What the student sees of the environment (:class:`vd.vision.StudentView`)."""
+    """What the student sees of the environment (:class:`vd.evaluate.student.StudentView`)."""
 
     def frame(self) -> dict[str, torch.Tensor]:
         """Tensors [N, ...] of the present state, among them the student's senses and ``distance`` [N]."""
@@ -130,7 +130,6 @@ class Dagger:
         self._kept: deque[Rollout] = deque(maxlen=cfg.keep_rollouts)
         self._held_out: list[Rollout] = []
         self._steps_done = 0
-        self._object = -1 if self.pose is None else env.env.scene.object_body
         self._figures: dict[str, torch.Tensor] = {}
         self._episode_rollouts = math.ceil(env.max_episode_length / cfg.rollout_steps)
         self._learned_worlds = env.num_envs - cfg.validation_worlds
@@ -267,11 +266,7 @@ class Dagger:
                 means.append(output.mean)
                 wanted.append(in_view(part.label, output.view))
                 if self.pose is not None:
-                    turns.append(
-                        angle_between(
-                            self.pose(embedding)[..., 3:], poses(part.frames, self._object)[..., 3:]
-                        )
-                    )
+                    turns.append(angle_between(self.pose(embedding)[..., 3:], poses(part.frames)[..., 3:]))
                 errors.append((output.distance[..., -1] - part.frames["distance"]).abs())
         figures = imitation_figures("validation", torch.cat(means), torch.cat(wanted))
         figures["validation/distance_error"] = torch.cat(errors).mean()
@@ -321,16 +316,14 @@ class Dagger:
             "distance": distance_loss(output.distance, rollout.frames["distance"]),
         }
         if self.pose is not None:
-            error = self.pose(embedding) - poses(rollout.frames, self._object)
+            error = self.pose(embedding) - poses(rollout.frames)
             found["pose"] = error.square().mean()
         if self.student.state is not None:
             error = output.state - self.student.state.target(rollout.frames["observation"])
             found["state"] = error.square().mean()
         if matches is not None and self.cfg.match_weight > 0.0:
             poses_of = (rollout.frames[name].flatten(0, 1) for name in ("body_q", "goal_quat"))
-            scene = self.env.env.scene
-            base, item = int(scene.link_body[0]), scene.object_body
-            found["match"] = match_loss(matches, *poses_of, base=base, item=item)
+            found["match"] = match_loss(matches, *poses_of)
         return found
 
     def state_dict(self) -> dict[str, Any]:

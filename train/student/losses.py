@@ -7,10 +7,11 @@ import torch
 from torch import nn
 
 from vd.paper import PAPER
-from vd.student.match import Matches
-from vd.student.network import StudentOutput
-from vd.student.quaternions import relative_rotation
+from vd.quaternions import relative_rotation
 from vd.train.student.rotations import matrices, two_columns
+from vd.vision.match import Matches
+from vd.vision.network import StudentOutput
+from vd.vision.sight import BASE, OBJECT
 
 POSE_SCALE_M = 0.05
 """Positions of objects are predicted in units of this, about their spread."""
@@ -86,34 +87,29 @@ def imitation_figures(prefix: str, mean: torch.Tensor, label: torch.Tensor) -> d
     }
 
 
-def poses(frames: Mapping[str, torch.Tensor], body: int) -> torch.Tensor:
+def poses(frames: Mapping[str, torch.Tensor]) -> torch.Tensor:
     """Where the object of frames is, in units of 5 cm, and how it is turned from the goal [.., 9].
 
     Args:
         frames: ``body_q`` [.., B, 7] and ``goal_quat`` [.., 4].
-        body: The object's column.
     """
-    pose = frames["body_q"][..., body, :]
+    pose = frames["body_q"][..., OBJECT, :]
     turn = two_columns(relative_rotation(pose[..., 3:], frames["goal_quat"]))
     return torch.cat((pose[..., :3] / POSE_SCALE_M, turn), dim=-1)
 
 
-def match_loss(
-    matches: Matches, body_q: torch.Tensor, goal_quat: torch.Tensor, *, base: int, item: int
-) -> torch.Tensor:
+def match_loss(matches: Matches, body_q: torch.Tensor, goal_quat: torch.Tensor) -> torch.Tensor:
     """How far points of objects are found from where they are on their goals, the mean over all.
 
     Args:
         matches: Of R clouds.
-        body_q: Body poses in the world frame [R, B, 7].
+        body_q: Poses of frames in the world frame [R, B, 7].
         goal_quat: Wanted orientations in the world frame [R, 4].
-        base: The hand's base, a column of ``body_q``.
-        item: The object's column.
 
     Returns:
         A scalar.
     """
-    origin, place = body_q[:, base], body_q[:, item]
+    origin, place = body_q[:, BASE], body_q[:, OBJECT]
     world, now, wanted = (
         matrices(two_columns(quaternion)) for quaternion in (origin[:, 3:], place[:, 3:], goal_quat)
     )

@@ -14,22 +14,23 @@ from torch import nn
 
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.objects.model import ObjectModel
+from vd.clouds import HandKinematics, SceneClouds
 from vd.paper import PAPER
+from vd.quaternions import relative_rotation, rotation_distance
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sensors.surfaces import hand_surfaces
 from vd.sim.scene import hand_mount
-from vd.student.cfg import NoiseCfg, StudentCfg
-from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
-from vd.student.network import Student
-from vd.student.quaternions import relative_rotation, rotation_distance
-from vd.student.sites import Sites
 from vd.train.ending import TrainingDivergedError
 from vd.train.student.config import PretrainCfg
 from vd.train.student.losses import match_loss
 from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer, scheduled
 from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
-from vd.vision import voxels
+from vd.vision.cfg import NoiseCfg, StudentCfg
+from vd.vision.network import Student
+from vd.vision.sight import voxels
+from vd.vision.sites import Sites
+from vd.vision.voxels import Voxeliser
 
 OBJECT_RANGE_M = ((-0.06, 0.06), (-0.06, 0.06), (0.02, 0.16))
 """Where objects are in random scenes, world frame: from the table to the palm, as wide as the claw opens."""
@@ -209,8 +210,6 @@ class PretrainHeads(nn.Module):
         self._split = cfg.embedding == "split"
         part = width // EMBEDDING_PARTS if self._split else width
         own = "before" in student.distance and cfg.distance == "scalar" and not self._split
-        # Where the object is found, its head only corrects the angle that was found.
-        own = own and "object" not in student.cfg.senses
         sizes = {
             "category": (part, objects, cfg.category_weight),
             "joints": (width - 2 * part if self._split else width, student.num_actions, cfg.joint_weight),
@@ -335,7 +334,7 @@ class Pretrainer:
             radians = (error.detach() * self.scenes.joint_scale_rad).square().mean().sqrt()
             figures |= {"student/joint_error": radians, "loss/joints": error.detach().square().mean()}
         if matches is not None and cfg.match_weight > 0.0:
-            loss = match_loss(matches, targets["body_q"], targets["goal"], base=0, item=-1)
+            loss = match_loss(matches, targets["body_q"], targets["goal"])
             total = total + cfg.match_weight * loss
             figures |= {"loss/match": loss.detach()}
         return total, figures

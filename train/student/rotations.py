@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from vd.student.quaternions import relative_rotation
+from vd.quaternions import relative_rotation
 
 
 def random_rotations(count: int, device: torch.device) -> torch.Tensor:

@@ -10,8 +10,6 @@ from typing import Any, Protocol
 import torch
 
 from vd.config import to_dict
-from vd.student.network import Student
-from vd.student.saved import StudentSpec, student_export
 from vd.train.checkpoint import (
     CHECKPOINT_FOLDER,
     checkpoint_path,
@@ -27,6 +25,8 @@ from vd.train.ending import EndRequest, Interrupted, TrainingDivergedError
 from vd.train.metrics import ProgressFile
 from vd.train.progress import ProgressLine, format_duration, format_steps
 from vd.train.student.config import STUDENT_NAME
+from vd.vision.network import Student
+from vd.vision.saved import StudentSpec, student_export
 
 
 class Learner(Protocol):

@@ -179,13 +179,10 @@ class DepthCommand:
 
 @dataclass(frozen=True)
 class StudentCommand:
-    """Latency of the student's control step on the CPU, and on a GPU its clouds per second in training.
-
-    Its encoder is timed beside dense convolutions, and spconv's where installed, on the same voxels.
-    """
+    """Latency of a camera policy's control step on the CPU, and on a GPU a student's clouds per second."""
 
     networks: tuple[str, ...] = ("lean", "paper")
-    """Presets to measure; for the latency also students, installed ones by name, or their files."""
+    """Presets to measure; for the latency also camera policies, installed ones by name, or their files."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets."""
     hand: str = "dclaw4"
@@ -213,14 +210,14 @@ class StudentCommand:
         from vd.bench.student import measure_latency, measure_training
         from vd.evaluate.agents import SHIPPED_POLICIES
         from vd.files import write_json
-        from vd.student.cfg import PRESETS
+        from vd.vision.cfg import PRESETS
 
         presets = [name for name in self.networks if name in PRESETS]
         for name in self.networks:
             if name not in presets and name not in SHIPPED_POLICIES and not Path(name).exists():
                 raise ValueError(
-                    f"--networks {name}: no such preset or student; choose of {', '.join(PRESETS)}, or give "
-                    "a student.pt"
+                    f"--networks {name}: no such preset or policy; choose of {', '.join(PRESETS)}, or give "
+                    "a camera policy"
                 )
         quiet_warp()
         device = resolve_device(self.device)

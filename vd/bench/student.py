@@ -1,38 +1,41 @@
-"""``vd-bench student``: the student's latency on a robot's computer, and clouds per second in training.
+"""``vd-bench student``: a camera policy's latency on a robot's computer, and a student's clouds per second.
 
 Latency is that of a whole control step, batch 1, on the CPU: depth image and joint positions to action.
-Its encoder is timed beside dense convolutions, and spconv's if installed, on the same voxels; the three
-take turns, so that whatever else the machine does slows all alike. Training is one minibatch of whole
-sequences: points, voxels, maps, forward and backward; simulation and optimiser are not in it.
+Training is one minibatch of whole sequences: points, voxels, maps, forward and backward; simulation and
+optimiser are not in it.
 """
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 import warp as wp
 
+from vd.assets_usd.hand_data import BASE_IN_WORLD
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.bench.depth import JOINT_SPREAD_RAD, OBJECT_HEIGHT_M, bench_scene
-from vd.bench.student_twins import DenseEncoder, SpconvEncoder, scattered
+from vd.clouds import HandKinematics, SceneClouds
 from vd.evaluate.agents import open_policy
 from vd.paper import PAPER
+from vd.senses import Senses
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sensors.depth_cloud import CameraCloud
-from vd.sim.scene import hand_mount
-from vd.student.cfg import PRESETS, NoiseCfg
-from vd.student.clouds import HandKinematics, SceneClouds, Voxeliser
-from vd.student.network import Student
-from vd.student.object_sense import ObjectSense
-from vd.student.saved import SavedStudent
-from vd.student.sites import Sites
+from vd.sim.scene import Scene
+from vd.tracking.policy import TrackingPolicy
+from vd.tracking.tracker import Tracker
+from vd.vision.cfg import PRESETS, NoiseCfg
+from vd.vision.network import Student
+from vd.vision.saved import SavedStudent
+from vd.vision.sites import Sites
+from vd.vision.voxels import Voxeliser
 
+Parts = dict[str, Callable[[], None]]
+"""Parts of a control step, in order."""
 WARM_UP = 5
 """Calls before timing: allocators have grown, kernels are loaded."""
 SEQUENCE_STEPS = 80
@@ -41,38 +44,26 @@ SEQUENCE_STEPS = 80
 
 @dataclass(frozen=True)
 class LatencyRow:
-    """One control step of one network on the CPU."""
+    """One control step of one policy on the CPU."""
 
     network: str
-    """Preset, or the student."""
+    """Preset, or the policy."""
     parameters: int
     """Numbers in the network."""
     precision: str
     """Of the encoder: float32 or bfloat16."""
     threads: int
     """Threads of torch; our kernels use one."""
-    points: int
-    """Points of the cloud: goal, hand, camera."""
-    voxels: int
-    """Occupied voxels."""
-    sites: tuple[int, ...]
-    """Occupied cells of each coarser level."""
-    median_ms: float = 0.0
+    median_ms: float
     """Depth image and joint positions to action."""
-    p99_ms: float = 0.0
+    p99_ms: float
     """The same, the 99th percentile."""
-    cpu_ms: float = 0.0
+    cpu_ms: float
     """The same, processor time of all threads, median: other programs on the machine do not lengthen it."""
-    parts_ms: dict[str, float] = field(default_factory=dict)
+    parts_ms: dict[str, float]
     """Medians of its parts."""
-    parts_cpu_ms: dict[str, float] = field(default_factory=dict)
+    parts_cpu_ms: dict[str, float]
     """The same, processor time of all threads."""
-    encoder_ms: dict[str, float] = field(default_factory=dict)
-    """Voxels to pooled features, maps included: ours, the others of ``student_twins``; medians."""
-    encoder_cpu_ms: dict[str, float] = field(default_factory=dict)
-    """The same, processor time of all threads."""
-    missing: str = ""
-    """What could not be measured, and why."""
 
 
 @dataclass(frozen=True)
@@ -109,110 +100,82 @@ def take_turns(functions: dict[str, Callable[[], Any]], calls: int) -> dict[str,
     return {name: np.array(values) for name, values in times.items()}
 
 
-class ControlStep:
-    """What a robot's computer does in a control step, from a depth image and joint positions to an action."""
+class StudentStep:
+    """What a robot's computer does for a student in a control step, from image and joints to an action."""
 
-    def __init__(self, objects: list[ObjectModel], hand_name: str, net: Student, seed: int):
-        """Render the depth image of a scene, and prepare everything that does not change."""
-        scene, state = bench_scene(objects, 1, hand_name, "cpu", seed)
-        body_q = state.body_q.reshape((1, -1))
-        camera = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(points=0))
-        camera.capture()
-        self.image = camera.depth.numpy()[0]
-        self.camera = CameraCloud(scene.hand.camera)
-        self.net = net
-        self.joint_q = wp.zeros((1, scene.hand.num_joints), dtype=float, device="cpu")
-        self.measured_q = state.joint_q.numpy()[None, : scene.hand.num_joints].copy()
-        base = body_q.numpy()[0, scene.link_body[0]]
-        self.kinematics = HandKinematics(scene.hand, link_body=scene.link_body, base=base, device="cpu")
-        self.body_q = wp.zeros((1, scene.bodies_per_world), dtype=wp.transform, device="cpu")
-        self.goal = wp.array([[0.0, 0.0, 0.0, 1.0]], dtype=wp.quat, device="cpu")
-        worlds: dict[str, Any] = {
-            "link_body": scene.link_body,
-            "world_object": scene.world_object,
-            "world_scale": scene.world_scale,
-            "device": "cpu",
-        }
-        self.clouds = SceneClouds(scene.hand, scene.objects, object_body=scene.object_body, **worlds)
-        self.sense: ObjectSense | None = None
-        if "object" in net.cfg.senses:
-            self.sense = ObjectSense(
-                scene.hand,
-                scene.objects,
-                camera=scene.hand.camera,
-                voxel_m=net.cfg.voxel_m,
-                aim=net.cfg.aim,
-                **worlds,
-            )
-        self.fresh = torch.ones(1, dtype=torch.bool)
-        size = self.clouds.item.start + self.camera.cloud.points.shape[1]
-        self.points = wp.empty((1, size), dtype=wp.vec3, device="cpu")
-        self.voxelise = Voxeliser(net.cfg.voxel_m)
-        self.senses = torch.zeros(1, net.num_senses)
-        self.hidden = net.initial_hidden(1)
-        self.sites: Sites | None = None
-
-    def camera_points(self) -> None:
-        """Depth image to points."""
-        points, _ = self.camera.make(self.image)
-        wp.copy(self.points[:, self.clouds.item.start :], points)
-
-    def model_points(self) -> None:
-        """Joint positions to the points of hand and goal."""
-        self.joint_q.assign(self.measured_q)
-        self.kinematics.write(self.joint_q, self.body_q)
-        self.clouds.write(self.points, self.body_q, self.goal, with_object=False)
-
-    def voxels(self) -> None:
-        """Points to voxels."""
-        marked = "marks" in self.net.cfg.encoder.inputs
-        self.sites = self.voxelise(self.points, ends=self.clouds.ends if marked else ())
-
-    def find(self) -> None:
-        """The object among the voxels, followed from step to step."""
-        if self.sense is None:
-            return
-        assert self.sites is not None
-        found = self.sense(
-            (self.sites,),
-            wp.to_torch(self.body_q),
-            wp.to_torch(self.goal),
-            fresh=self.fresh,
-            points=wp.to_torch(self.points)[:, self.clouds.item.start :],
+    def __init__(self, net: Student, scene: Scene, image: np.ndarray, joint_q: np.ndarray):
+        links, self._image, self._net = np.arange(len(scene.hand.link_names)), image, net
+        self._camera = CameraCloud(scene.hand.camera)
+        self._joint_q = wp.array(joint_q[None], dtype=float, device="cpu")
+        self._kinematics = HandKinematics(scene.hand, link_body=links, base=BASE_IN_WORLD, device="cpu")
+        self._body_q = wp.zeros((1, len(links) + 1), dtype=wp.transform, device="cpu")
+        self._goal = wp.array([[0.0, 0.0, 0.0, 1.0]], dtype=wp.quat, device="cpu")
+        self._clouds = SceneClouds(
+            scene.hand,
+            scene.objects,
+            link_body=links,
+            object_body=len(links),
+            world_object=scene.world_object,
+            world_scale=scene.world_scale,
+            device="cpu",
         )
-        self.fresh.fill_(False)
-        first = self.net.cfg.senses.index("object") * self.net.num_actions
-        self.senses[:, first : first + found.shape[1]] = found
+        size = self._clouds.item.start + self._camera.cloud.points.shape[1]
+        self._points = wp.empty((1, size), dtype=wp.vec3, device="cpu")
+        self._marks = self._clouds.ends if "marks" in net.cfg.encoder.inputs else ()
+        self._voxelise = Voxeliser(net.cfg.voxel_m)
+        self._senses, self._hidden = torch.zeros(1, net.num_senses), net.initial_hidden(1)
+        self.parts: Parts = {"points": self._see, "voxels": self._cells, "maps and network": self._act}
 
-    def act(self) -> np.ndarray:
-        """Voxels, previous action and memory to the next action [D]."""
-        assert self.sites is not None
-        output = self.net.act(self.sites, self.senses, self.hidden)
-        action, self.hidden = output.mean.clamp(-1.0, 1.0), output.hidden
-        self.senses[:, : self.net.num_actions] = action
-        return action.numpy()[0]
+    def _see(self) -> None:
+        points, _ = self._camera.make(self._image)
+        wp.copy(self._points[:, self._clouds.item.start :], points)
+        self._kinematics.write(self._joint_q, self._body_q)
+        self._clouds.write(self._points, self._body_q, self._goal, with_object=False)
 
-    def __call__(self) -> np.ndarray:
-        """The whole step."""
-        self.camera_points()
-        self.model_points()
-        self.voxels()
-        self.find()
-        return self.act()
+    def _cells(self) -> None:
+        self._sites = self._voxelise(self._points, ends=self._marks)
+
+    def _act(self) -> None:
+        self._hidden = self._net.act(self._sites, self._senses, self._hidden).hidden
 
 
-def open_network(name: str, hand: str) -> tuple[Student, str]:
-    """A preset for a hand, with random weights; or a student, installed or in a file, and its own hand.
+class TrackingStep:
+    """The same for a tracking policy."""
+
+    def __init__(self, policy: TrackingPolicy, scene: Scene, image: np.ndarray, joint_q: np.ndarray):
+        camera, depth = scene.hand.camera.at(policy.spec.camera), policy.spec.depth
+        self._image, self._fresh = image, torch.ones(1, dtype=torch.bool)
+        self._camera = CameraCloud(camera, points=depth.points, crop_m=depth.crop_m)
+        self._tracker = Tracker(policy, scene.hand, scene.objects, camera)
+        self._joint_q = torch.tensor(joint_q, dtype=torch.float32)[None]
+        self.parts: Parts = {"points": self._see, "object and action": self._act}
+
+    def _see(self) -> None:
+        self._points = wp.to_torch(self._camera.make(self._image)[0])
+
+    def _act(self) -> None:
+        q = self._joint_q
+        still, goal = torch.zeros_like(q), torch.tensor([[0.0, 0.0, 0.0, 1.0]])
+        steps = torch.ones(1, dtype=torch.int32)
+        senses = Senses(q, still, still, goal, self._points, fresh=self._fresh, goal_steps=steps)
+        self._tracker.step(senses)
+        self._fresh.fill_(False)
+
+
+def open_network(name: str, hand: str) -> tuple[Student | TrackingPolicy, str]:
+    """A preset for a hand, with random weights; or a camera policy, installed or in a file, and its own hand.
 
     Raises:
         FileNotFoundError: There is neither.
-        ValueError: It is no student.
+        ValueError: It sees no clouds.
     """
     if name in PRESETS:
         return Student(PRESETS[name], load_hand(hand).num_joints).eval(), hand
     saved = open_policy(name, "cpu")
+    if isinstance(saved, TrackingPolicy):
+        return saved, saved.hand
     if not isinstance(saved, SavedStudent):
-        raise ValueError(f"--networks {name}: a teacher has no clouds; give a preset or a student")
+        raise ValueError(f"--networks {name}: a teacher has no clouds; give a preset or a camera policy")
     return saved.network.eval(), str(saved.task["hand"])
 
 
@@ -226,72 +189,52 @@ def measure_latency(
     calls: int = 300,
     seed: int = 0,
 ) -> LatencyRow:
-    """Measure one network on the CPU.
+    """Measure one policy on the CPU.
 
     Args:
         objects: The first of them lies on the table.
-        network: Preset, or a student: the name of an installed one or a file.
-        hand: Hand of a preset; a student has its own.
+        network: Preset, or a camera policy: the name of an installed one or a file.
+        hand: Hand of a preset; a policy has its own.
         threads: Threads of torch.
-        half: Encoder in bfloat16; the others it is timed beside stay in float32.
+        half: Encoder of a student in bfloat16.
         calls: Control steps to time.
         seed: Of poses and weights.
     """
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
-    net, hand = open_network(network, hand)
-    offsets = scattered(net.encoder)
-    if half:
-        net.encoder.bfloat16()
+    policy, hand = open_network(network, hand)
+    scene, state = bench_scene(objects, 1, hand, "cpu", seed)
+    camera = DepthCamera.of_scene(scene, state.body_q.reshape((1, -1)), DepthCameraCfg(points=0))
+    camera.capture()
+    image, joint_q = camera.depth.numpy()[0], state.joint_q.numpy()[: scene.hand.num_joints]
+    step: StudentStep | TrackingStep
+    if isinstance(policy, TrackingPolicy):
+        net: torch.nn.Module = policy.teacher.network
+        step = TrackingStep(policy, scene, image, joint_q)
+    else:
+        net = policy
+        if half:
+            policy.encoder.bfloat16()
+        step = StudentStep(policy, scene, image, joint_q)
+
+    def whole() -> None:
+        for part in step.parts.values():
+            part()
+
     with torch.inference_mode():
-        step = ControlStep(objects, hand, net, seed)
-        step()
-        sites = step.sites
-        assert sites is not None
-        twins: dict[str, torch.nn.Module] = {"dense": DenseEncoder(net.cfg.encoder).eval()}
-        missing = ""
-        try:
-            twins["spconv"] = SpconvEncoder(net.cfg.encoder).eval()
-        except ImportError as error:
-            missing = f"spconv is not installed ({error})"
-        # Fresh sites each time: their maps are part of the work.
-        encoders: dict[str, Callable[[], Any]] = {
-            "ours": lambda: net.encoder.pooled(sites.fresh()),
-            "per offset": lambda: offsets.pooled(sites.fresh()),
-        }
-        encoders |= {name: partial(twin, sites) for name, twin in twins.items()}
-        beside = take_turns(encoders, max(WARM_UP, calls // 10))
-        parts = take_turns(
-            {
-                "camera points": step.camera_points,
-                "hand and goal points": step.model_points,
-                "voxels": step.voxels,
-                "object": step.find,
-                "maps and network": step.act,
-            },
-            calls,
-        )
-        whole = take_turns({"whole": step}, calls)["whole"]
-    levels, level = [], sites
-    for _ in range(len(net.cfg.encoder.channels) + net.cfg.encoder.pooled_stages):
-        level = level.coarser
-        levels.append(len(level))
+        whole()
+        parts = take_turns(step.parts, calls)
+        times = take_turns({"whole": whole}, calls)["whole"]
     return LatencyRow(
         network=network,
         parameters=sum(parameter.numel() for parameter in net.parameters()),
         precision="bfloat16" if half else "float32",
         threads=threads,
-        points=step.points.shape[1],
-        voxels=len(sites),
-        sites=tuple(levels),
-        median_ms=float(np.median(whole[:, 0])),
-        p99_ms=float(np.percentile(whole[:, 0], 99)),
-        cpu_ms=float(np.median(whole[:, 1])),
-        parts_ms={name: float(np.median(times[:, 0])) for name, times in parts.items()},
-        parts_cpu_ms={name: float(np.median(times[:, 1])) for name, times in parts.items()},
-        encoder_ms={name: float(np.median(times[:, 0])) for name, times in beside.items()},
-        encoder_cpu_ms={name: float(np.median(times[:, 1])) for name, times in beside.items()},
-        missing=missing,
+        median_ms=float(np.median(times[:, 0])),
+        p99_ms=float(np.percentile(times[:, 0], 99)),
+        cpu_ms=float(np.median(times[:, 1])),
+        parts_ms={name: float(np.median(part[:, 0])) for name, part in parts.items()},
+        parts_cpu_ms={name: float(np.median(part[:, 1])) for name, part in parts.items()},
     )
 
 
@@ -312,7 +255,7 @@ class Scenes:
         goal = np.roll(poses[:, links, 3:], 1, axis=0)
         self.body_q = wp.array(poses, dtype=wp.transform, device=device)
         self.goal = wp.array(goal, dtype=wp.quat, device=device)
-        kinematics = HandKinematics(hand, link_body=np.arange(links), base=hand_mount(), device=device)
+        kinematics = HandKinematics(hand, link_body=np.arange(links), base=BASE_IN_WORLD, device=device)
         limited = np.clip(joints, hand.lower, hand.upper)
         kinematics.write(wp.array(limited, dtype=float, device=device), self.body_q)
         self.clouds = SceneClouds(

@@ -15,13 +15,13 @@ from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
-from vd.student.cfg import StudentCfg
+from vd.vision.cfg import StudentCfg
 
 BUNDLE_FORMAT = "visual-dexterity bundle 1"
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-4, 1e-5
 """Differences of numbers that are no difference: a hand that was measured again differs by more."""
 
-Kind = Literal["teacher", "student"]
+Kind = Literal["teacher", "student", "tracking"]
 
 
 class ContractError(ValueError):
@@ -72,7 +72,7 @@ class ActionPart:
 
 @dataclass(frozen=True)
 class ObservationPart:
-    """The vector a teacher sees."""
+    """The vector that a teacher's layers see; a tracking policy makes it of joints and camera."""
 
     parts: dict[str, tuple[int, int]]
     """First column and the one after the last of each part."""
@@ -110,7 +110,7 @@ class CloudPart:
 
 @dataclass(frozen=True)
 class CameraPart:
-    """The depth camera behind a student of rendered clouds."""
+    """The depth camera behind a policy that sees by one."""
 
     source: str
     """hand: the camera of the hand's USD; policy: one that the training placed elsewhere."""
@@ -143,7 +143,7 @@ class Interface:
 
 @dataclass(frozen=True)
 class StoppingPart:
-    """When a student stops: predicted distance and norm of the smoothed action below these bounds."""
+    """When a policy that sees clouds stops: predicted distance and norm of the smoothed action are below."""
 
     distance_rad: float
     action_norm: float
@@ -180,7 +180,7 @@ class Contract:
     kind: Kind
     interface: Interface
     network: dict[str, Any]
-    """What rebuilds the network: PolicySpec or StudentCfg."""
+    """What rebuilds the network: PolicySpec or StudentCfg; of a tracking policy the former and its aim."""
     stopping: StoppingPart | None
     provenance: Provenance
     software: dict[str, str]
@@ -208,8 +208,8 @@ def derive_interface(
     Args:
         hand: The hand.
         task: Environment of the training.
-        network: Of a student; None for a teacher.
-        depth: Depth camera of a student of rendered clouds; None for complete clouds.
+        network: Of a student; None for a policy that acts by a teacher's layers.
+        depth: Depth camera of a policy that sees by one; None for others.
         camera: Where the training put it, optical frame in the base frame [7]; None: the hand's own.
     """
     from vd.sim.scene import hand_mount
@@ -284,7 +284,7 @@ _REMEDY = {
     "action": "export the policy again; its contract was changed after the export",
     "observation": "export the policy again with this version",
     "cloud": "use the hand it was trained for, or export the policy again with this version",
-    "camera": "use the camera it was trained with, or fine-tune it: vd-train student --stage 2 --camera",
+    "camera": "use the camera it was made for, or write it for this one (vd-train, --camera)",
 }
 """What to do about a difference in each part of the interface."""
 
@@ -301,7 +301,7 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
         ContractError: The first field that differs, what the hand has, what the bundle wants, what to do.
     """
     wanted = contract.interface
-    found = derive_interface(hand, contract.task, **_student_parts(contract))
+    found = derive_interface(hand, contract.task, **_seeing_parts(contract))
     for name, have, want in _differences(to_dict(found), to_dict(wanted)):
         part = name.split(".")[0]
         raise ContractError(
@@ -310,14 +310,16 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
         )
 
 
-def _student_parts(contract: Contract) -> dict[str, Any]:
-    """The arguments of :func:`derive_interface` that a student has."""
+def _seeing_parts(contract: Contract) -> dict[str, Any]:
+    """The arguments of :func:`derive_interface` that a policy has that sees clouds."""
     if contract.kind == "teacher":
         return {}
     camera = contract.interface.camera
     depth = from_dict(DepthCameraCfg, contract.provenance.depth, where="provenance.depth")
     return {
-        "network": from_dict(StudentCfg, contract.network, where="network"),
+        "network": from_dict(StudentCfg, contract.network, where="network")
+        if contract.kind == "student"
+        else None,
         "depth": None if camera is None else depth,
         "camera": camera.pose_in_base if camera is not None and camera.source == "policy" else None,
     }

@@ -12,7 +12,7 @@ from vd.paper import PAPER
 from vd.policy import TrainedPolicy
 
 if TYPE_CHECKING:
-    from vd.student.saved import SavedStudent
+    from vd.vision.saved import SavedStudent
 
 STATES = 8
 """Observations of a teacher."""
@@ -26,7 +26,7 @@ TOLERANCE = 5e-3
 """Largest difference of an output from the golden one. Actions are of size 1; processors, GPUs and other
 versions of torch differ by 1e-6 to 1e-3."""
 
-SENSES = {"action": "previous_action", "position": "joint_q", "velocity": "joint_qd", "object": "object"}
+SENSES = {"action": "previous_action", "position": "joint_q", "velocity": "joint_qd"}
 """Golden input behind each sense of a student."""
 
 Golden = dict[str, torch.Tensor]
@@ -49,13 +49,11 @@ def student_golden(student: "SavedStudent", hand: HandModel) -> Golden:
 
     Inputs: ``joint_q`` [T, D] [rad]; ``object_pose`` [T, 7] in the base frame; ``goal_quat`` [4] in the world
     frame; ``points`` [T, P, 3] [m], base frame, the cloud that these give with a cube, moved away from the
-    borders of voxels; ``previous_action`` [T, D]; ``joint_qd`` [T, D] [rad/s]; if it senses its object
-    ``object`` [T, V]. Outputs: ``action`` [T, D]
-    and ``distance`` [T, H] [rad].
+    borders of voxels; ``previous_action`` [T, D]; ``joint_qd`` [T, D] [rad/s]. Outputs: ``action`` [T, D] and
+    ``distance`` [T, H] [rad].
     """
     from vd.assets_usd.objects.model import load_set
     from vd.sim.scene import hand_mount
-    from vd.student.object_sense import object_values
 
     rng = np.random.default_rng(0)
     cube = load_set(["cube"])[0].surface_points
@@ -81,16 +79,14 @@ def student_golden(student: "SavedStudent", hand: HandModel) -> Golden:
         "previous_action": rng.uniform(-1.0, 1.0, (STEPS, len(rest))),
         "joint_qd": rng.normal(size=(STEPS, len(rest))),
     }
-    if "object" in student.spec.network.senses:
-        values["object"] = rng.normal(size=(STEPS, object_values(len(rest))))
     golden = {name: torch.tensor(value, dtype=torch.float32) for name, value in values.items()}
     return {**golden, **student_outputs(student, golden)}
 
 
 def student_outputs(student: "SavedStudent", golden: Mapping[str, torch.Tensor]) -> Golden:
     """What a student makes of golden inputs, one step after the other."""
-    from vd.student.clouds import Voxeliser
-    from vd.vision import voxels
+    from vd.vision.sight import voxels
+    from vd.vision.voxels import Voxeliser
 
     network, cfg = student.network, student.spec.network
     device = str(network.mean.weight.device)

@@ -37,7 +37,9 @@ from vd.sensors.cfg import DepthCameraCfg
 from vd.versions import installed_versions
 
 if TYPE_CHECKING:
-    from vd.student.saved import SavedStudent
+    from vd.stopping import StoppingRules
+    from vd.tracking.policy import TrackingPolicy
+    from vd.vision.saved import SavedStudent
 
 WEIGHTS_FILE, GOLDEN_FILE = "weights.safetensors", "golden.safetensors"
 FILE_MODE, FOLDER_MODE = 0o644, 0o755
@@ -49,11 +51,10 @@ _PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle that was read: its contract, and the policy, a teacher's or a student."""
+    """A bundle that was read: its contract, and its policy."""
 
     contract: Contract
-    teacher: TrainedPolicy | None
-    student: "SavedStudent | None"
+    policy: "TrainedPolicy | SavedStudent | TrackingPolicy"
 
 
 def write_teacher(folder: Path, policy: TrainedPolicy, hand: HandModel) -> Contract:
@@ -100,13 +101,7 @@ def write_student(folder: Path, student: "SavedStudent", hand: HandModel) -> Con
             camera=spec.camera,
         ),
         network=to_dict(spec.network),
-        stopping=StoppingPart(
-            spec.stopping.distance_rad,
-            spec.stopping.action_norm,
-            spec.calibrated_on,
-            None if spec.precise is None else (spec.precise.distance_rad, spec.precise.action_norm),
-            spec.tolerance_rad,
-        ),
+        stopping=_stopping(spec),
         provenance=replace(
             _provenance(student.task, spec.teacher, spec.stage, student.iteration, student.env_steps),
             depth=student.depth if rendered else {},
@@ -115,6 +110,49 @@ def write_student(folder: Path, student: "SavedStudent", hand: HandModel) -> Con
     )
     _write(folder, contract, student.network.state_dict(), student_golden(student, hand))
     return contract
+
+
+def write_tracking(folder: Path, policy: "TrackingPolicy", hand: HandModel) -> Contract:
+    """Write the bundle of a tracking policy.
+
+    Args:
+        folder: To write; a bundle that is there is replaced.
+        policy: The policy, on the CPU.
+        hand: The hand of its teacher's training.
+    """
+    teacher, spec = policy.teacher, policy.spec
+    contract = Contract(
+        kind="tracking",
+        interface=derive_interface(
+            hand,
+            from_dict(ReorientCfg, policy.task, where="task of the policy"),
+            depth=spec.depth,
+            camera=spec.camera,
+        ),
+        network={"policy": to_dict(teacher.spec), "aim": to_dict(spec.aim)},
+        stopping=_stopping(spec),
+        provenance=replace(
+            _provenance(policy.task, spec.teacher, None, teacher.iteration, teacher.env_steps),
+            depth=to_dict(spec.depth),
+        ),
+        software=installed_versions(_PACKAGES),
+    )
+    weights = {f"actor.{name}": value for name, value in teacher.weights.items()}
+    if teacher.has_critic:
+        weights |= {f"critic.{name}": value for name, value in teacher.critic_weights.items()}
+    _write(folder, contract, weights, teacher_golden(teacher))
+    return contract
+
+
+def _stopping(rules: "StoppingRules") -> StoppingPart:
+    precise = rules.precise
+    return StoppingPart(
+        rules.stopping.distance_rad,
+        rules.stopping.action_norm,
+        rules.calibrated_on,
+        None if precise is None else (precise.distance_rad, precise.action_norm),
+        rules.tolerance_rad,
+    )
 
 
 def read_contract(folder: str | Path) -> Contract:
@@ -167,12 +205,7 @@ def read_bundle(folder: str | Path, device: str = "cpu") -> Bundle:
             f"{folder}: policy and {CONTRACT_FILE} do not fit this version ({first}); "
             "another one wrote them: write the bundle again with vd-train bundle"
         ) from error
-    if bundle.teacher is not None:
-        on_device = {name: value.to(device) for name, value in golden.items()}
-        outputs = teacher_outputs(bundle.teacher, on_device)
-    else:
-        assert bundle.student is not None
-        outputs = student_outputs(bundle.student, golden)
+    outputs = _outputs(bundle.policy, golden, device)
     worst = worst_difference(outputs, golden)
     if worst > TOLERANCE:
         raise ContractError(
@@ -180,6 +213,16 @@ def read_bundle(folder: str | Path, device: str = "cpu") -> Bundle:
             f"{TOLERANCE:g}); it was written by other software ({contract.software}): write it again"
         )
     return bundle
+
+
+def _outputs(policy: "TrainedPolicy | SavedStudent | TrackingPolicy", golden: Golden, device: str) -> Golden:
+    """What a policy makes of golden inputs."""
+    from vd.vision.saved import SavedStudent
+
+    if isinstance(policy, SavedStudent):
+        return student_outputs(policy, golden)
+    teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
+    return teacher_outputs(teacher, {name: value.to(device) for name, value in golden.items()})
 
 
 def _build(contract: Contract, weights: dict[str, torch.Tensor], device: str) -> Bundle:
@@ -194,30 +237,69 @@ def _build(contract: Contract, weights: dict[str, torch.Tensor], device: str) ->
             env_steps=source.env_steps,
             device=device,
         )
-        return Bundle(contract, policy, None)
-    from vd.student.cfg import StudentCfg
-    from vd.student.network import Student
-    from vd.student.saved import SavedStudent, StudentSpec
-    from vd.student.stopping import StoppingRule
+        return Bundle(contract, policy)
+    if contract.kind == "tracking":
+        return Bundle(contract, _tracking(contract, weights, device))
+    from vd.vision.cfg import StudentCfg
+    from vd.vision.network import Student
+    from vd.vision.saved import SavedStudent, StudentSpec
 
-    assert contract.stopping is not None and source.stage is not None
-    camera, stopping = contract.interface.camera, contract.stopping
+    assert source.stage is not None
     spec = StudentSpec(
         network=from_dict(StudentCfg, contract.network, where="network"),
         num_actions=len(contract.interface.hand.joint_names),
         stage=source.stage,
         teacher=source.teacher,
-        camera=camera.pose_in_base if camera is not None and camera.source == "policy" else None,
-        stopping=StoppingRule(stopping.distance_rad, stopping.action_norm),
-        tolerance_rad=stopping.tolerance_rad,
-        precise=None if stopping.precise is None else StoppingRule(*stopping.precise),
-        calibrated_on=stopping.calibrated_on,
+        **_settings(contract),
     )
     network = Student(spec.network, spec.num_actions).to(device)
     network.load_state_dict(weights)
     network.eval().requires_grad_(False)
     student = SavedStudent(spec, network, source.task, source.depth, source.iterations, source.env_steps)
-    return Bundle(contract, None, student)
+    return Bundle(contract, student)
+
+
+def _tracking(contract: Contract, weights: dict[str, torch.Tensor], device: str) -> "TrackingPolicy":
+    """The tracking policy of a contract with weights."""
+    from vd.aim import AimCfg
+    from vd.tracking.policy import TrackingPolicy, TrackingSpec
+
+    source = contract.provenance
+    parts: dict[str, dict[str, torch.Tensor]] = {"actor": {}, "critic": {}}
+    for name, value in weights.items():
+        part, _, inside = name.partition(".")
+        parts[part][inside] = value
+    teacher = TrainedPolicy(
+        from_dict(PolicySpec, contract.network["policy"], where="network.policy"),
+        parts["actor"],
+        task=source.task,
+        iteration=source.iterations,
+        env_steps=source.env_steps,
+        device=device,
+        critic=parts["critic"] or None,
+    )
+    spec = TrackingSpec(
+        teacher=source.teacher,
+        depth=from_dict(DepthCameraCfg, source.depth, where="provenance.depth"),
+        aim=from_dict(AimCfg, contract.network["aim"], where="network.aim"),
+        **_settings(contract),
+    )
+    return TrackingPolicy(teacher, spec)
+
+
+def _settings(contract: Contract) -> dict[str, Any]:
+    """Camera and stopping rules of a policy that sees clouds, as its description names them."""
+    from vd.stopping import StoppingRule
+
+    assert contract.stopping is not None
+    camera, stopping = contract.interface.camera, contract.stopping
+    return {
+        "camera": camera.pose_in_base if camera is not None and camera.source == "policy" else None,
+        "stopping": StoppingRule(stopping.distance_rad, stopping.action_norm),
+        "tolerance_rad": stopping.tolerance_rad,
+        "precise": None if stopping.precise is None else StoppingRule(*stopping.precise),
+        "calibrated_on": stopping.calibrated_on,
+    }
 
 
 def _provenance(

@@ -1,92 +1,12 @@
-"""The views of :mod:`vd.kernels.symmetry` for a hand and an observation: their tables, and their launches."""
+"""The views of :mod:`vd.kernels.symmetry` in the worlds of a task: their launches."""
 
-from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import warp as wp
-from scipy.linalg import block_diag
-from scipy.spatial.transform import Rotation
 
-from vd.envs.cfg import View
-from vd.envs.parts import observation_parts
 from vd.envs.task_state import TaskState
-from vd.kernels.dynamics import JOINT_CHANNELS, SCALARS
-from vd.kernels.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER, teacher_observation_slices
-from vd.kernels.shapes import extent_directions, shape_observation_slices
+from vd.envs.view_tables import view_tables
 from vd.kernels.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
-
-TERMS = 4
-"""Most values that a turned value is made of: those of a quaternion."""
-TOLERANCE_M = 1e-4
-"""Farthest that a turned fingertip may be from the one whose place it takes; of a mirrored one's axes
-likewise."""
-SECTOR = np.array([1.0, 0.0, 0.0])
-"""Views turn the axis of the wanted rotation near to this direction, world frame; any would do."""
-UP = np.array([0.0, 0.0, 10.0])
-"""Added to it where there are mirrors, so that up counts before the sector does: seen from above, wanted
-rotations are counter-clockwise, but for axes within 2 degrees of level (ours)."""
-MIRROR_SIGNS = np.array([-1.0, 1.0, 1.0])
-"""Factors on the angles of a finger in the mirror: it swings to the other side, and bends as before.
-The first joint is the one that swings (hand's description, joint order)."""
-OBJECT_MIRROR = np.diag([1.0, -1.0, 1.0])
-"""What is mirrored has left-handed axes; its y axis is turned round, of fingertips and objects alike."""
-BENT = np.array([0.3, 0.5, -0.4])
-"""Angles [rad] of every finger, far from zero, at which a hand has to be its own mirror image (ours)."""
-
-
-@dataclass(frozen=True)
-class ViewTables:
-    """What the V views of a hand are made of: one for each finger, and as many in the mirror, if any."""
-
-    source: np.ndarray
-    """Values of the world frame that make each value of a view, int [V, O, T]."""
-    factor: np.ndarray
-    """Their factors [V, O, T]."""
-    offset: np.ndarray
-    """What is added to their sum [V, O]: limits about which a joint is observed may be uneven."""
-    joints: np.ndarray
-    """Joint of the view that is each joint of the world, int [V, D]."""
-    sign: np.ndarray
-    """-1 where that joint turns the other way, else 1 [V, D]."""
-    sector: np.ndarray
-    """The direction near which a view has the axis of the wanted rotation, as it is in the world [V, 3]."""
-
-
-def view_tables(state: TaskState, view: View) -> ViewTables:
-    """The views of a task's hand and observation.
-
-    Args:
-        state: The task.
-        view: What goals are seen in (``ObservationCfg.view``); views in the mirror come after the others.
-
-    Raises:
-        ValueError: The fingers are not spaced evenly about the vertical, or the hand is not its own mirror
-            image.
-    """
-    fingers, tips = state.num_fingers, _tips(state, np.zeros(JOINTS_PER_FINGER))
-    turns = [_turn(step, fingers) for step in range(fingers)]
-    try:
-        mirror = _mirror(state, tips) if view in ("mirrored", "either") else None
-    except ValueError:
-        if view == "mirrored":
-            raise
-        mirror = None  # either: those that there are
-    if mirror is not None:
-        turns += [turn @ mirror for turn in turns]
-    direction = SECTOR + UP if view == "mirrored" else SECTOR
-    maps = np.stack([_observation_map(state, tips, turn) for turn in turns])
-    source = np.argsort(-np.abs(maps), axis=2, kind="stable")[:, :, :TERMS]
-    order = [_joint_source(_finger_source(tips, turn.T)) for turn in turns]
-    return ViewTables(
-        source=source,
-        factor=np.take_along_axis(maps, source, axis=2),
-        offset=np.stack([_observation_offset(state, turn, maps.shape[1]) for turn in turns]),
-        joints=np.stack(order),
-        sign=np.stack([_joint_signs(turn, fingers) for turn in turns]),
-        # An axis of rotation looks the other way in a mirror.
-        sector=np.stack([np.linalg.det(turn) * turn.T @ direction for turn in turns]),
-    )
 
 
 class Views:
@@ -106,12 +26,13 @@ class Views:
             out: Where views of the observation are written, shape [N, A].
 
         Raises:
-            ValueError: The hand has no such views, see :func:`view_tables`.
+            ValueError: The hand has no such views, see :func:`vd.envs.view_tables.view_tables`.
         """
         self._state, self._out = state, out
         device, worlds = state.device, state.num_worlds
-        tables = self.tables = view_tables(state, state.cfg.observation.view)
-        chosen_from = state.cfg.observation.views(state.num_fingers)
+        seen = state.cfg.observation
+        tables = self.tables = view_tables(state.hand, seen, seen.view)
+        chosen_from = seen.views(state.num_fingers)
         self._source = wp.array(tables.source, dtype=wp.int32, device=device)
         self._factor = wp.array(tables.factor, dtype=float, device=device)
         self._joints = wp.array(tables.joints, dtype=wp.int32, device=device)
@@ -171,161 +92,3 @@ class WorldOrder:
             return action
         ordered = self._views.world_action(wp.from_torch(action.contiguous()))
         return wp.to_torch(ordered).clone()
-
-
-def _tips(state: TaskState, angles: np.ndarray) -> np.ndarray:
-    """Fingertip poses of a hand with these angles [3] in all fingers, with the simulation's signs [F, 7]."""
-    joints = state.sim.joint_q.numpy().copy()
-    posed = joints.copy()
-    posed[:, : state.num_actions] = np.tile(angles, state.num_fingers)
-    state.sim.joint_q.assign(posed)
-    state.sim.forward_kinematics()
-    bodies = state.sim.body_q.numpy()[0].copy()
-    state.sim.joint_q.assign(joints)
-    state.sim.forward_kinematics()
-    pairs = zip(bodies[state.fingers.tip_body.numpy()], state.fingers.tip_offset.numpy(), strict=True)
-    tips: list[Any] = [wp.transform_multiply(wp.transform(*body), wp.transform(*tip)) for body, tip in pairs]
-    return np.array([[tip[i] for i in range(7)] for tip in tips])
-
-
-def _turn(step: int, fingers: int) -> np.ndarray:
-    """Turn about the vertical by ``step`` of so many fingers [3, 3]."""
-    return Rotation.from_euler("z", 2.0 * np.pi * step / fingers).as_matrix()
-
-
-def _mirror(state: TaskState, tips: np.ndarray) -> np.ndarray:
-    """Reflection [3, 3] in the vertical plane through the first fingertip and the hand's axis.
-
-    Raises:
-        ValueError: The hand is not its own mirror image in it.
-    """
-    across = np.array([-tips[0, 1], tips[0, 0], 0.0]) / np.linalg.norm(tips[0, :2])
-    mirror = np.eye(3) - 2.0 * np.outer(across, across)
-    refusal = (
-        f"{state.cfg.hand} is not its own mirror image; set observation.view to goal, which turns it only"
-    )
-    try:
-        source = _finger_source(tips, mirror)
-    except ValueError as error:
-        raise ValueError(refusal) from error
-    bent, opposite = _tips(state, BENT)[source], _tips(state, MIRROR_SIGNS * BENT)
-    apart = np.linalg.norm(bent[:, :3] @ mirror.T - opposite[:, :3], axis=1)
-    axes = Rotation.from_quat(bent[:, 3:]).as_matrix()
-    twisted = np.abs(mirror @ axes @ OBJECT_MIRROR - Rotation.from_quat(opposite[:, 3:]).as_matrix())
-    if max(apart.max(), twisted.max()) > TOLERANCE_M:
-        raise ValueError(refusal)
-    return mirror
-
-
-def _finger_source(tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """The finger that takes the place of each after a turn or reflection ``turn`` [3, 3] of the hand [F]."""
-    turned = tips[:, :3] @ turn.T
-    distance = np.linalg.norm(turned[:, None] - tips[None, :, :3], axis=2)
-    source = np.argmin(distance, axis=0)
-    if sorted(source) != list(range(len(tips))) or distance.min(axis=0).max() > TOLERANCE_M:
-        raise ValueError(
-            "the fingers of this hand are not spaced evenly about the vertical; set observation.view to world"
-        )
-    return source
-
-
-def _joint_source(fingers: np.ndarray) -> np.ndarray:
-    """Joints of the fingers, in their order [D]."""
-    return (JOINTS_PER_FINGER * fingers[:, None] + np.arange(JOINTS_PER_FINGER)).ravel()
-
-
-def _joint_signs(turn: np.ndarray, fingers: int) -> np.ndarray:
-    """Factors on joints in a view [D]."""
-    return np.tile(MIRROR_SIGNS if np.linalg.det(turn) < 0.0 else np.ones(JOINTS_PER_FINGER), fingers)
-
-
-def _observation_offset(state: TaskState, turn: np.ndarray, size: int) -> np.ndarray:
-    """What is added in a view to what :func:`_observation_map` makes, ``size`` values.
-
-    An angle is observed as it lies between its limits, from -1 to 1; of one that is turned round these are
-    the limits of the other side.
-    """
-    offset = np.zeros(size)
-    lower, upper = np.asarray(state.hand.lower), np.asarray(state.hand.upper)
-    turned_round = _joint_signs(turn, state.num_fingers) < 0.0
-    columns = teacher_observation_slices(state.num_fingers)["joint_position"]
-    offset[columns] = np.where(turned_round, -2.0 * (upper + lower) / (upper - lower), 0.0)
-    return offset
-
-
-def _observation_map(state: TaskState, tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Matrix [A, A] from an observation in the world frame to that of a view.
-
-    Args:
-        state: The task, for what is observed.
-        tips: Fingertip poses with all angles zero, shape [F, 7].
-        turn: Turn or reflection [3, 3] of the world that makes the view.
-    """
-    parts = observation_parts(state.cfg.observation, state.num_fingers)
-    count, fingers = len(tips), _finger_source(tips, turn)
-    quaternion = _orientation_map(turn)
-    axial = np.linalg.det(turn) * turn  # rotations look the other way in a mirror
-    conjugation = np.eye(4)
-    conjugation[:3, :3] = axial
-    joints = _joint_signs(turn, count)[:, None] * np.eye(JOINTS_PER_FINGER * count)[_joint_source(fingers)]
-    tip_blocks = np.zeros((count, FINGERTIP_VALUES, count, FINGERTIP_VALUES))
-    for finger, old in enumerate(fingers):
-        # q and -q are the same orientation, but a fingertip never shows the other one.
-        sign = np.sign(tips[finger, 3:] @ quaternion @ tips[old, 3:])
-        for begin, block in ((0, turn), (3, sign * quaternion), (7, turn), (10, axial)):
-            end = begin + len(block)
-            tip_blocks[finger, begin:end, old, begin:end] = block
-    blocks = {
-        "joint_position": joints,
-        "joint_velocity": joints,
-        "object_position": turn,
-        "object_orientation": quaternion,
-        "object_velocity": turn,
-        "object_spin": axial,
-        "goal_orientation": quaternion,
-        "relative_orientation": conjugation,
-        "fingertips": tip_blocks.reshape(count * FINGERTIP_VALUES, -1),
-        "previous_action": joints,
-    }
-    slices = teacher_observation_slices(count)
-    if "shape" in parts:
-        directions = np.array(extent_directions(count))
-        back = directions @ turn
-        same = np.argmin(np.linalg.norm(back[:, None] - directions[None], axis=2), axis=1)
-        extents = np.eye(len(directions))[same]
-        blocks |= {
-            "surface": np.kron(np.eye(count)[fingers], turn),
-            "extent": extents,
-            "goal_extent": extents,
-        }
-        first = parts["shape"].start
-        for name, columns in shape_observation_slices(count).items():
-            slices[name] = slice(first + columns.start, first + columns.stop)
-    frames = np.eye(state.cfg.observation.history)
-    blocks |= {
-        "history": np.kron(frames, block_diag(joints, joints, turn, axial)),
-        "dynamics": block_diag(np.kron(np.eye(JOINT_CHANNELS), np.abs(joints)), np.eye(SCALARS)),
-        "truth": block_diag(joints, turn, axial),
-    }
-    slices |= {name: columns for name, columns in parts.items() if name in blocks}
-    size = max(columns.stop for columns in parts.values())
-    matrix = np.zeros((size, size))
-    for name, columns in slices.items():
-        matrix[columns, columns] = blocks[name]
-    matrix[np.abs(matrix) < np.finfo(np.float32).eps] = 0.0
-    return matrix
-
-
-def _orientation_map(turn: np.ndarray) -> np.ndarray:
-    """Matrix [4, 4] from an orientation R, a quaternion xyzw, to ``turn`` R, in a mirror ``turn`` R M."""
-    if np.linalg.det(turn) > 0.0:
-        return _left_product(Rotation.from_matrix(turn).as_quat())
-    # turn R M = (turn M)(M R M), M = OBJECT_MIRROR: M R M turns about the mirrored axis, the other way.
-    mirrored = np.diag([*-np.diag(OBJECT_MIRROR), 1.0])
-    return _left_product(Rotation.from_matrix(turn @ OBJECT_MIRROR).as_quat()) @ mirrored
-
-
-def _left_product(q: np.ndarray) -> np.ndarray:
-    """Matrix [4, 4] of the product q * p of quaternions xyzw."""
-    x, y, z, w = q
-    return np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])

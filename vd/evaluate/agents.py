@@ -1,6 +1,6 @@
 """Agents by name or file, and the task they act in: shared by vd-eval and vd-play."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -19,16 +19,22 @@ from vd.envs.cfg import (
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
-    import torch
-
     from vd.policy import TrainedPolicy
-    from vd.student.saved import SavedStudent
+    from vd.tracking.policy import TrackingPolicy
+    from vd.vision.saved import SavedStudent
 
 BUILT_IN = ("zero", "random")
 """Agents without a file: no action, and uniform noise."""
 
 SHIPPED_POLICIES = {path.stem: path for path in sorted((Path(__file__).parents[1] / "policies").glob("*.pt"))}
 """Trained policies that are installed with the package, by name: ``<hand>-<task>``."""
+
+RENAMED = {
+    "dclaw3-student": "dclaw3-tracking",
+    "dclaw4-table-student": "dclaw4-tracking",
+    "dclaw4-student": "dclaw4-air-tracking",
+}
+"""Former names of installed policies, and what they are called now."""
 
 DEFAULT_POLICY = "dclaw4-cube"
 DEFAULT_HAND = "dclaw4"
@@ -50,7 +56,10 @@ def find_policy(name: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: There is none.
+        ValueError: An installed policy has another name now.
     """
+    if str(name) in RENAMED:
+        raise ValueError(f"the policy {name} is called {RENAMED[str(name)]} now: it tracks a known shape")
     if str(name) in SHIPPED_POLICIES:
         return SHIPPED_POLICIES[str(name)]
     path = Path(name)
@@ -97,12 +106,12 @@ def trained_task(policy: Any) -> ReorientCfg:
     return from_dict(ReorientCfg, policy.task, where="task of the policy")
 
 
-def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | None":
+def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | TrackingPolicy | None":
     """Load a trained policy; None for a built-in agent, which needs the number of actions first.
 
     Args:
-        name: ``zero``, ``random``, the name of an installed policy, a policy or student file, a bundle's
-            folder, or a run's folder.
+        name: ``zero``, ``random``, the name of an installed policy, a policy's file, a bundle's folder, or a
+            run's folder.
         device: Torch device.
 
     Raises:
@@ -112,19 +121,21 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | None"
     if name in BUILT_IN:
         return None
     from vd.policy import load_policy
-    from vd.student.saved import is_student, load_student
+    from vd.tracking.policy import is_tracking, load_tracking
+    from vd.vision.saved import is_student, load_student
 
     path = find_policy(name)
     if is_bundle(path):
         from vd.bundle.store import read_bundle
 
-        bundle = read_bundle(path, device)
-        return bundle.student if bundle.teacher is None else bundle.teacher
+        return read_bundle(path, device).policy
+    if is_tracking(path):
+        return load_tracking(path, device)
     return load_student(path, device) if is_student(path) else load_policy(path, device)
 
 
 def sees_clouds(name: str) -> bool:
-    """Whether a policy is a student.
+    """Whether a policy sees point clouds: a student, or one that tracks.
 
     Raises:
         FileNotFoundError: There is no such policy.
@@ -135,16 +146,17 @@ def sees_clouds(name: str) -> bool:
     if is_bundle(path):
         from vd.bundle.store import read_contract
 
-        return read_contract(path).kind == "student"
-    from vd.student.saved import is_student
+        return read_contract(path).kind != "teacher"
+    from vd.tracking.policy import is_tracking
+    from vd.vision.saved import is_student
 
-    return is_student(path)
+    return is_student(path) or is_tracking(path)
 
 
 def has_second_view(name: str) -> bool:
     """Whether :mod:`vd.evaluate.second_view` is for it.
 
-    It is for teachers that see their goals in views, and students that act by the layers of one.
+    It is for teachers that see their goals in views, and tracking policies of such.
 
     Raises:
         FileNotFoundError: There is no such policy.
@@ -152,10 +164,8 @@ def has_second_view(name: str) -> bool:
     """
     if name in BUILT_IN:
         return False
-    if sees_clouds(name):
-        policy = open_policy(name, "cpu")
-        return is_saved_student(policy) and policy.spec.network.state.views > 0
-    return trained_task(open_policy(name, "cpu")).observation.view != "world"
+    policy = open_policy(name, "cpu")
+    return not is_saved_student(policy) and trained_task(policy).observation.view != "world"
 
 
 def check_second_view(names: Sequence[str]) -> None:
@@ -168,51 +178,22 @@ def check_second_view(names: Sequence[str]) -> None:
     if not any(map(has_second_view, names)):
         raise ValueError(
             "--second-view is for teachers that see their goals in views (observation.view goal or "
-            f"mirrored), as dclaw3-table does, and their students; {', '.join(names)} has no other view, "
+            f"mirrored), as dclaw3-table does, and tracking policies; {', '.join(names)} has no other view, "
             "or no critic to ask"
         )
-
-
-def open_critic(student: "SavedStudent", device: str) -> "Callable[[torch.Tensor], torch.Tensor]":
-    """What a student's teacher expects [N] of observations as a view shows them [N, O].
-
-    The student may have that critic itself; else it is its teacher's, found by its name.
-
-    Raises:
-        ValueError: There is no such teacher here, or it is no teacher, has no critic, or observes other
-            things.
-    """
-    head, name = student.network.state, student.spec.teacher
-    if head is not None and head.critic is not None:
-        return head.value
-    try:
-        teacher = open_teacher(name, device)
-    except (FileNotFoundError, ValueError) as error:
-        raise ValueError(
-            f"--second-view asks the critic of the student's teacher, '{name}', which cannot be read: {error}"
-        ) from error
-    if teacher is None:
-        raise ValueError(f"--second-view asks the critic of the student's teacher; '{name}' has none")
-    if head is not None and teacher.num_observations != student.spec.network.state.values:
-        raise ValueError(
-            f"--second-view asks the critic of the student's teacher; '{name}' observes other things than "
-            "that. Give the student its critic: vd-train follow STUDENT TEACHER"
-        )
-    _ = teacher.critic  # refuses a file without one
-    return teacher.value
 
 
 def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
     """:func:`open_policy` where only a teacher, which sees the simulator's state, will do.
 
     Raises:
-        ValueError: It is a student.
+        ValueError: It sees point clouds.
     """
     from vd.policy import TrainedPolicy
 
     policy = open_policy(name, device)
     if policy is not None and not isinstance(policy, TrainedPolicy):
-        raise ValueError(f"{name} is a student, which sees point clouds; give a teacher, or use vd-eval")
+        raise ValueError(f"{name} sees point clouds; give a teacher, or use vd-eval")
     return policy
 
 
@@ -235,9 +216,18 @@ def is_saved_student(policy: Any | None) -> "TypeGuard[SavedStudent]":
     """Whether what :func:`open_policy` gave is a student."""
     if policy is None:
         return False
-    from vd.student.saved import SavedStudent
+    from vd.vision.saved import SavedStudent
 
     return isinstance(policy, SavedStudent)
+
+
+def is_tracking_policy(policy: Any | None) -> "TypeGuard[TrackingPolicy]":
+    """Whether what :func:`open_policy` gave is a tracking policy."""
+    if policy is None:
+        return False
+    from vd.tracking.policy import TrackingPolicy
+
+    return isinstance(policy, TrackingPolicy)
 
 
 def start_at_rest(yes: bool, no: bool) -> bool | None:
@@ -314,8 +304,8 @@ def task_for(
         ValueError: The teacher does not see its goals in views.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
-    if is_saved_student(policy):
-        # A student, which does not look at its teacher's observation.
+    if is_saved_student(policy) or is_tracking_policy(policy):
+        # Who does not look at its teacher's observation.
         base = replace(base, observation=ObservationCfg())
     elif second_view and policy is not None:
         from vd.evaluate.second_view import with_second_view

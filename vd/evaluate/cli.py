@@ -71,8 +71,8 @@ class EvalCfg:
 
     Writes eval.json (every episode) and eval.html (one page with figures) and prints a table. A single
     teacher is stopped, and its error measured, at the first step at which all success criteria hold.
-    Students, several policies, groups of objects and --in-air are compared side by side: students are stopped
-    by the distance that they predict and, for comparison, by the true one.
+    Camera policies, several policies, groups of objects and --in-air are compared side by side: the former
+    stop by the distance that they predict and, for comparison, by the true one.
 
     --suite paper runs all of the paper's evaluations in simulation and writes paper.json and paper.html, its
     figures beside ours. What is finished is not repeated by the next call.
@@ -117,13 +117,13 @@ class EvalCfg:
     """Ours: aim past the goal while the object is near it; more come within 0.1 rad."""
     second_view: tyro.conf.FlagCreatePairsOff[bool] = False
     """Ours: where a policy has not come to its goal in 3 s, look at it once a second from other fingers'
-    sides, or in the mirror, and go on in the view of which its critic, or that of a student's teacher,
-    expects most."""
+    sides, or in the mirror, and go on in the view of which its critic, or its teacher's, expects
+    most."""
     goals: Goals = "mesh"
-    """What students know shapes and goals by: the exact mesh; 500 exact points, as the paper's; or a scan,
-    points with 4 mm of noise and a fifth missing. A surface is laid through points."""
+    """What camera policies know shapes and goals by: the exact mesh; 500 exact points, as the paper's; or a
+    scan, points with 4 mm of noise and a fifth missing. A surface is laid through points."""
     sensor_errors: bool = True
-    """Cameras of students err as a D415 does: noise, gaps, late images, not quite where it is believed
+    """Cameras of policies err as a D415 does: noise, gaps, late images, not quite where it is believed
     (docs/depth.md). Without: as in their training."""
     sees: Literal["auto", "complete", "rendered"] = "auto"
     """What students see: complete clouds, a depth camera's, or what their stage was trained on."""

@@ -12,7 +12,7 @@ from vd.evaluate.agents import (
     BUILT_IN,
     built_in,
     check_bundle,
-    open_critic,
+    is_tracking_policy,
     open_policy,
     sees_clouds,
     start_at_rest,
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from vd.evaluate.cli import EvalCfg
     from vd.evaluate.comparison import Comparison
     from vd.evaluate.trace import Trace
-    from vd.student.stopping import StoppingRule
+    from vd.stopping import StoppingRule
 
 STUDENT_WORLDS_GPU = 1024
 """Worlds simulated at once by default where a student looks at them: depth images and clouds take memory."""
@@ -70,7 +70,7 @@ def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
     from vd.evaluate.comparison import Comparison, judge
     from vd.evaluate.comparison_page import write_comparison
     from vd.evaluate.result import Protocol
-    from vd.student.symmetry import with_symmetries
+    from vd.tracking.symmetry import with_symmetries
 
     device = resolve_device(cfg.device)
     groups = parse_groups(cfg.object_sets)
@@ -84,7 +84,7 @@ def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
     task, start = None, None
     for name in cfg.agent_names:
         policy = open_policy(name, device)
-        wanted = _task(cfg, policy, everything, worlds)
+        wanted = task_of(cfg, policy, everything, worlds)
         check_bundle(name, wanted)
         if task != wanted:
             print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
@@ -94,8 +94,8 @@ def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
             env.objects = with_symmetries(env.objects, device)
             task, start = wanted, env.state_dict()
         env.load_state_dict(start)
-        actor, kind, sees, rules = _actor(cfg, name, policy, env, device)
-        trace = _run(cfg, env, actor, name, rules, stop_at)
+        actor, kind, sees, rules = actor_of(cfg, name, policy, env, device)
+        trace = run_episodes(cfg, env, actor, name, rules, stop_at)
         protocol = Protocol(
             policy=name,
             objects="",
@@ -139,7 +139,7 @@ def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
     return comparison
 
 
-def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int) -> "ReorientCfg":
+def task_of(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int) -> "ReorientCfg":
     """The task of one policy, in which no state ends an episode but a fall."""
     from vd.evaluate.trace import NEVER_RAD
 
@@ -173,10 +173,12 @@ def _task(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int
     return replace(task, randomisation=exact)
 
 
-def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str) -> tuple[Any, str, str, Any]:
+def actor_of(
+    cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str
+) -> tuple[Any, str, str, Any]:
     """What acts, its kind, what it sees, and its rules to stop, by tolerance."""
     from vd.policy import TrainedPolicy
-    from vd.student.stopping import StoppingRule
+    from vd.stopping import StoppingRule
 
     if name in BUILT_IN:
         return built_in(name, env.num_actions, seed=cfg.seed, device=device), name, "nothing", StoppingRule
@@ -186,11 +188,27 @@ def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str)
 
             return SecondView(env, policy), "teacher", "state", StoppingRule
         return policy, "teacher", "state", StoppingRule
-    from vd.evaluate.student import StudentActor
     from vd.workers import one_thread_without_gpu
 
     assert policy is not None
     one_thread_without_gpu(device)
+    if is_tracking_policy(policy):
+        from vd.evaluate.tracking import TrackingActor
+
+        if cfg.sees == "complete":
+            raise ValueError(f"--sees complete: {name} tracks by a depth camera; leave it out")
+        tracker = TrackingActor(
+            env,
+            policy,
+            goals=cfg.goals,
+            sensor_errors=cfg.sensor_errors,
+            aim=cfg.aim,
+            second_view=cfg.second_view,
+            seed=cfg.seed,
+        )
+        return tracker, "tracking", "rendered clouds", policy.spec.rule_for
+    from vd.evaluate.student import StudentActor
+
     rendered = None if cfg.sees == "auto" else cfg.sees == "rendered"
     actor = StudentActor(
         env,
@@ -198,15 +216,13 @@ def _actor(cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str)
         rendered=rendered,
         goals=cfg.goals,
         sensor_errors=cfg.sensor_errors,
-        aim=cfg.aim,
-        critic=open_critic(policy, device) if cfg.second_view else None,
         seed=cfg.seed,
     )
     sees = "rendered clouds" if actor.rendered else "complete clouds"
     return actor, f"student of stage {policy.spec.stage}", sees, policy.spec.rule_for
 
 
-def _run(
+def run_episodes(
     cfg: "EvalCfg",
     env: Any,
     actor: Any,

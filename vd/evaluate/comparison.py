@@ -17,7 +17,7 @@ from vd.evaluate.statistics import Interval, Unit, choose_unit, rate_intervals
 from vd.evaluate.trace import StopsBy, Trace
 from vd.files import write_json
 from vd.paper import PAPER
-from vd.student.stopping import StoppingRule
+from vd.stopping import StoppingRule
 
 COMPARISON_FORMAT = "visual-dexterity comparison 5"
 OUTCOMES = ("success", "orientation error", "time-out", "object falls")

@@ -1,7 +1,6 @@
-"""What students know of shapes and goals; a leaf, so that a command line can name them at once."""
+"""What camera policies know of shapes and goals; a leaf, so that a command line can name them at once."""
 
 from typing import Literal
 
 Goals = Literal["mesh", "points", "scan"]
-"""What a student knows of a shape and its goal: the exact mesh, 500 exact points of it, or those of a scan.
-"""
+"""What a camera policy knows of a shape and its goal: the mesh, 500 exact points of it, or a scan's."""

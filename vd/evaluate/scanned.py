@@ -6,21 +6,16 @@ are wrong in every step. The surface behind them is laid as through those of a r
 (:mod:`vd.assets_usd.objects.scans`); the true shape is the simulation's alone.
 """
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import torch
-import warp as wp
 
 from vd.assets_usd.objects.geometry import surface_points
 from vd.assets_usd.objects.model import ObjectModel
 from vd.assets_usd.objects.scans import surface_of_scan
+from vd.evaluate.goals import Goals
 from vd.paper import PAPER
-from vd.student.cfg import StudentCfg
-from vd.student.clouds import SceneClouds
-from vd.vision import StudentView
 
 NOISE_M = PAPER.cloud.jitter_std_m
 """Standard deviation of a scanned point along each axis [m]."""
@@ -63,49 +58,23 @@ def known_by_points(item: ObjectModel, points: np.ndarray, device: str) -> Objec
     )
 
 
-class KnownByPoints(StudentView):
-    """What a student sees that knows each object by one set of points."""
+def known_objects(
+    objects: Sequence[ObjectModel], goals: Goals, *, seed: int, device: str
+) -> Sequence[ObjectModel]:
+    """Objects as a policy knows them.
 
-    def __init__(self, env: Any, network: StudentCfg, *, exact: bool, seed: int = 0, **settings: Any):
-        """Lay surfaces through the points.
-
-        Args:
-            env: The environment.
-            network: What of the student concerns its clouds.
-            exact: Take the object's own samples, or a scan of them.
-            seed: Of the scans, and of noise and camera.
-            settings: Those of :class:`vd.vision.StudentView`.
-        """
-        rng = np.random.default_rng(seed)
-        scanned = [
-            known_by_points(
-                item, item.surface_points if exact else scan(item.surface_points, rng), env.device
-            )
-            for item in env.objects
-        ]
-        super().__init__(env, network, seed=seed, known=scanned, **settings)
-        scene = env.scene
-        self._scanned = SceneClouds(
-            env.hand,
-            scanned,
-            link_body=scene.link_body,
-            object_body=scene.object_body,
-            world_object=scene.world_object,
-            world_scale=scene.world_scale,
-            device=env.device,
+    Args:
+        objects: The true ones.
+        goals: By the mesh: as they are; else by their samples, or a scan of these.
+        seed: Of the scans.
+        device: Warp device.
+    """
+    if goals == "mesh":
+        return objects
+    rng = np.random.default_rng(seed)
+    return [
+        known_by_points(
+            item, item.surface_points if goals == "points" else scan(item.surface_points, rng), device
         )
-
-    def points(self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None) -> torch.Tensor:
-        """Clouds as of the base class, with the scanned goal in its columns."""
-        points = super().points(frame, worlds)
-        goal = self._scanned.goal
-        scanned = torch.empty((len(points), self._scanned.item.start, 3), device=self.device)
-        self._scanned.write(
-            wp.from_torch(scanned, dtype=wp.vec3),
-            wp.from_torch(frame["body_q"].contiguous(), dtype=wp.transform),
-            wp.from_torch(frame["goal_quat"].contiguous(), dtype=wp.quat),
-            with_object=False,
-            worlds=None if worlds is None else wp.from_torch(worlds.int()),
-        )
-        points[:, goal] = scanned[:, goal]
-        return points
+        for item in objects
+    ]

@@ -1,27 +1,127 @@
-"""A student at work in an environment."""
+"""Students in an environment: what they see and sense there, and one at work."""
 
-from collections.abc import Callable
-from copy import deepcopy
-from dataclasses import replace
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 import warp as wp
 
+from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict
-from vd.evaluate.agents import trained_task
 from vd.evaluate.goals import Goals
-from vd.evaluate.scanned import KnownByPoints
-from vd.evaluate.second_view import GoalClock, StudentSecondView
+from vd.evaluate.scanned import known_objects
+from vd.evaluate.senses import EnvironmentSenses
+from vd.kernels.observations import teacher_observation_slices
+from vd.quaternions import canonical, relative_rotation, rotation_distance
 from vd.sensors.cfg import DepthCameraCfg
-from vd.student.saved import SavedStudent
-from vd.vision import StudentView
+from vd.tracking.symmetry import nearest_goal, symmetries_of_worlds
+from vd.vision.cfg import NoiseCfg, StudentCfg
+from vd.vision.saved import SavedStudent
+from vd.vision.sight import Frame, Sight
+from vd.vision.sites import Sites
 
 PRETRAINED, RENDERED = 0, 2
 """Stages of the training: those of encoders that cannot act, and of depth cameras."""
 CLOUDS = 256
 """Clouds through the network at once: their features take one or two gigabytes."""
+
+
+class StudentView:
+    """What students see in every world of an environment, and what only their training knows.
+
+    Args:
+        env: The environment.
+        network: What of the student concerns its clouds.
+        rendered: See by a depth camera; else complete clouds.
+        depth: Settings of the camera.
+        camera: Pose of its optical frame in the hand's base frame, position [m] and quaternion xyzw; that of
+            the hand's camera by default.
+        goals: The objects as their goals are shown; as they are by default.
+        noise: Noise of training; None where there will be none.
+        batch: Clouds of a training batch at most.
+        seed: Of noise and camera.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        network: StudentCfg,
+        *,
+        rendered: bool,
+        depth: DepthCameraCfg | None = None,
+        camera: Sequence[float] | None = None,
+        goals: Sequence[ObjectModel] | None = None,
+        noise: NoiseCfg | None = None,
+        batch: int = 0,
+        seed: int = 0,
+    ):
+        scene = env.scene
+        self.sight = Sight(
+            env.hand,
+            env.objects,
+            network,
+            complete=not rendered,
+            world_object=scene.world_object,
+            world_scale=scene.world_scale,
+            goals=goals,
+            noise=noise,
+            batch=batch,
+            seed=seed,
+            device=env.device,
+        )
+        self.senses = EnvironmentSenses(
+            env, env.hand.camera.at(camera) if rendered else None, depth, seed=seed
+        )
+        self._cfg, self._columns = env.cfg.observation, teacher_observation_slices(env.num_fingers)
+        self._symmetry = symmetries_of_worlds(env.objects, scene.world_object, env.device)
+        self._object_pose = wp.to_torch(env.sim.body_q)[:, scene.object_body]
+        self._goal = wp.to_torch(env.goal_quat)
+
+    def frame(self) -> Frame:
+        """What there is to see before the next action, and the true ``distance`` to the goal [rad] [N].
+
+        That is the angle to what looks like the goal, if that is nearer.
+        """
+        frame = self.sight.frame(self.senses.read(), self._object_pose)
+        return frame | {"distance": rotation_distance(*self._towards())}
+
+    def observation(self, observed: torch.Tensor) -> torch.Tensor:
+        """A teacher's observation [N, O], world frame: of all that looks like the goal the nearest is it.
+
+        The rotation to it is less than half a turn, as at the beginning of every goal of its training.
+        """
+        orientation, goal = self._towards()
+        turn = relative_rotation(orientation, goal)
+        kept = canonical(turn)
+        goal = torch.where((kept == turn).all(dim=-1, keepdim=True), goal, -goal)
+        changed = observed.clone()
+        changed[:, self._columns["goal_orientation"]] = canonical(goal) if self._cfg.canonical else goal
+        changed[:, self._columns["relative_orientation"]] = kept
+        return changed
+
+    def sites(
+        self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None, *, augment: bool
+    ) -> tuple[Sites, ...]:
+        """Voxels of frames (:meth:`vd.vision.sight.Sight.sites`)."""
+        return self.sight.sites(frame, worlds, augment=augment)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Random states and what the camera remembers, as NumPy arrays."""
+        return {name: array.numpy().copy() for name, array in self._stateful().items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`state_dict` gave."""
+        for name, array in self._stateful().items():
+            array.assign(state[name])
+
+    def _towards(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """True orientation of each world's object, and the nearest that looks like its goal [N, 4]."""
+        orientation = self._object_pose[:, 3:]
+        return orientation, nearest_goal(orientation, self._goal, self._symmetry)
+
+    def _stateful(self) -> dict[str, wp.array]:
+        camera = self.senses.camera
+        return {"noise": self.sight.rng} | ({} if camera is None else camera.stateful())
 
 
 class StudentActor:
@@ -42,8 +142,6 @@ class StudentActor:
         rendered: bool | None = None,
         goals: Goals = "mesh",
         sensor_errors: bool = False,
-        aim: bool | None = None,
-        critic: Callable[[torch.Tensor], torch.Tensor] | None = None,
         seed: int = 0,
     ):
         """Open its eyes in every world.
@@ -54,14 +152,10 @@ class StudentActor:
             rendered: See by a depth camera, or complete clouds; as its stage was trained by default.
             goals: What it knows shapes and goals by (:mod:`vd.evaluate.scanned`).
             sensor_errors: Give its camera the errors of a real one, in place of those of its training.
-            aim: Whether it aims past near goals; None: if its file says so, or the environment.
-            critic: What its teacher's critic expects (:func:`vd.evaluate.agents.open_critic`), to look twice
-                at goals (:mod:`vd.evaluate.second_view`).
             seed: Of the errors of camera and scans.
 
         Raises:
-            ValueError: It is one of stage 0, which cannot act, or of another hand, or is to aim and does not
-                look for its object.
+            ValueError: It is one of stage 0, which cannot act, or of another hand.
         """
         spec = student.spec
         if spec.stage == PRETRAINED:
@@ -73,32 +167,22 @@ class StudentActor:
             )
         self.env, self.num_actions, self._student = env, spec.num_actions, student.network
         self.rendered = spec.stage == RENDERED if rendered is None else rendered
-        network = spec.network
-        if env.cfg.aim.enabled:
-            network = replace(network, aim=env.cfg.aim)
-        if aim is not None:
-            network = replace(network, aim=replace(network.aim, enabled=aim))
-        network.validate()
         depth = from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
         if sensor_errors:
             depth = depth.with_errors()
-        seen: Any = StudentView if goals == "mesh" else partial(KnownByPoints, exact=goals == "points")
-        self._view = seen(env, network, rendered=self.rendered, depth=depth, camera=spec.camera, seed=seed)
-        self._second = None
-        if critic is not None:
-            self._student = deepcopy(self._student)  # its views are changed
-            self._second = StudentSecondView(
-                GoalClock.of(env), self._student.state, trained_task(student), critic
-            )
+        self._view = StudentView(
+            env,
+            spec.network,
+            rendered=self.rendered,
+            depth=depth,
+            camera=spec.camera,
+            goals=known_objects(env.objects, goals, seed=seed, device=env.device),
+            seed=seed,
+        )
         self._hidden = self._student.initial_hidden(env.num_worlds)
         self._steps = wp.to_torch(env.step_count)
         self.predicted = self._hidden.new_zeros(env.num_worlds)
         self.active = torch.ones(env.num_worlds, dtype=torch.bool, device=self._hidden.device)
-
-    @property
-    def looks_twice(self) -> bool:
-        """Whether it has a second view of goals that it does not reach."""
-        return self._second is not None
 
     def act(self, _observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] for what is seen now; the teacher's observation is not looked at.
@@ -110,11 +194,7 @@ class StudentActor:
         senses = self._student.senses(frame)
         mean = frame["action"].new_zeros(frame["action"].shape)
         with torch.no_grad():
-            if self._second is not None:
-                self._second.begin_step()
             for rows in self.active.nonzero().flatten().split(CLOUDS):
-                if self._second is not None:
-                    self._second.rows = rows
                 seen = {key: value[rows] for key, value in frame.items()}
                 sites = self._view.sites(seen, rows, augment=False)
                 output = self._student.act(sites[0], senses[rows], self._hidden[rows], *sites[1:])

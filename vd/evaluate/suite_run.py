@@ -20,8 +20,6 @@ from vd.evaluate.agents import (
     BUILT_IN,
     find_policy,
     has_second_view,
-    is_saved_student,
-    open_policy,
     sees_clouds,
 )
 from vd.evaluate.compare import compare, parse_groups
@@ -209,12 +207,7 @@ def _tasks(cfg: "EvalCfg", result: SuiteResult) -> list["_Task"]:
     """Everything that is to be measured. All names are looked up here, before anything slow."""
     short = labels(result.policies)
     views = {name: has_second_view(name) for name in result.policies}
-    prints = {
-        (name, looks): fingerprint(name, second_view=looks)
-        for name in result.policies
-        for looks in {condition.second_view for condition in result.conditions}
-        if views[name] or not looks
-    }
+    prints = {name: fingerprint(name) for name in result.policies}
     tasks = []
     for condition in result.conditions:
         objects = result.objects[condition.objects]
@@ -224,7 +217,7 @@ def _tasks(cfg: "EvalCfg", result: SuiteResult) -> list["_Task"]:
             one = settings(cfg, condition, name, objects)
             one = replace(one, output=cfg.output / condition.name / short[name].replace("/", "-"))
             text = f"{condition.title}: {short[name]} ({objects.text})"
-            tasks.append(_Task(condition.name, name, one, prints[name, condition.second_view], text))
+            tasks.append(_Task(condition.name, name, one, prints[name], text))
     return tasks
 
 
@@ -392,10 +385,8 @@ def object_groups(objects: tuple[str, ...], *, quick: bool) -> dict[Group, Objec
     return groups
 
 
-def fingerprint(name: str, *, second_view: bool = False) -> str:
+def fingerprint(name: str) -> str:
     """What tells the content of a policy from others: its file's SHA-256, or the name of a built-in agent.
-
-    Of a student that looks twice its teacher's file counts too, if it asks the critic there.
 
     Raises:
         FileNotFoundError: There is no such policy.
@@ -407,11 +398,6 @@ def fingerprint(name: str, *, second_view: bool = False) -> str:
     for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
         if file.is_file():
             digest.update(file.read_bytes())
-    if second_view and sees_clouds(name) and has_second_view(name):
-        student = open_policy(name, "cpu")
-        assert is_saved_student(student) and student.network.state is not None  # or it has no second view
-        if student.network.state.critic is None:
-            digest.update(fingerprint(student.spec.teacher).encode())
     return digest.hexdigest()
 
 

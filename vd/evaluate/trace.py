@@ -17,7 +17,7 @@ from vd.evaluate.result import Episode
 from vd.evaluate.rollout import episode_rounds, unit_quats
 from vd.evaluate.statistics import rotation_angle, symmetric_error
 from vd.paper import PAPER
-from vd.student.stopping import StoppingRule
+from vd.stopping import StoppingRule
 
 HOLD_S = 2.0
 """For how long a hand holds its object after a stop, before it is looked at again [s] (ours)."""

@@ -69,7 +69,7 @@ class PlayCfg:
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
     aim: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Aim past the goal while the object is near it: more come within 0.1 rad. Some students do so anyway."""
+    """Aim past the goal while the object is near it: more come within 0.1 rad. Some policies do so anyway."""
     second_view: tyro.conf.FlagCreatePairsOff[bool] = False
     """Where a policy has not come to its goal in 3 s, look at it in other views (vd-eval --help)."""
     stop_tolerance: float = PAPER.success.rotation_rad
@@ -250,7 +250,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         check_bundle,
         check_second_view,
         is_saved_student,
-        open_critic,
+        is_tracking_policy,
         open_policy,
         task_for,
     )
@@ -286,8 +286,11 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
     if is_saved_student(trained):
         from vd.evaluate.student import StudentActor
 
-        critic = open_critic(trained, device) if cfg.second_view else None
-        return env, StudentActor(env, trained, critic=critic, seed=cfg.seed), device
+        return env, StudentActor(env, trained, seed=cfg.seed), device
+    if is_tracking_policy(trained):
+        from vd.evaluate.tracking import TrackingActor
+
+        return env, TrackingActor(env, trained, second_view=cfg.second_view, seed=cfg.seed), device
     if cfg.second_view and isinstance(trained, TrainedPolicy):
         from vd.evaluate.second_view import SecondView
 

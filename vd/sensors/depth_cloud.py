@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 import warp as wp
 
-from vd.assets_usd.hand_data import CameraModel, compose
+from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, compose
 from vd.kernels.depth_cloud import (
     choose_points_kernel,
     count_points_kernel,
@@ -17,9 +17,6 @@ from vd.kernels.depth_views import View
 from vd.kernels.raycast import TILE_COLUMNS, TILE_ROWS
 from vd.kernels.rng import init_rng_kernel
 from vd.paper import PAPER
-
-BASE_IN_WORLD = (0.0, 0.0, PAPER.scene.hand_height_m, 0.0, 1.0, 0.0, 0.0)
-"""Pose of a real hand's base over its table: palm down, as in the simulator (without needing it)."""
 
 
 def make_views(camera: CameraModel, focal_scale: Sequence[float] | np.ndarray, device: str) -> wp.array:

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from vd.assets_usd.hand_data import BASE_IN_WORLD
 from vd.assets_usd.hand_model import HandModel, open_stage
 from vd.assets_usd.objects.model import ObjectModel
 from vd.paper import PAPER
@@ -68,7 +69,7 @@ class Scene:
 
 def hand_mount() -> wp.transform:
     """Pose of the hand's base in the world: palm down, turned pi about +y."""
-    return wp.transform(wp.vec3(0.0, 0.0, PAPER.scene.hand_height_m), wp.quat(0.0, 1.0, 0.0, 0.0))
+    return wp.transform(*BASE_IN_WORLD)
 
 
 def assign_objects(num_worlds: int, num_objects: int) -> np.ndarray:

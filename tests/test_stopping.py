@@ -1,0 +1,127 @@
+"""The stopping rule: what it stops, and how its bounds are chosen."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from vd.evaluate.trace import Trace
+from vd.stopping import StoppingRule, StoppingRules, calibrate
+from vd.train.tracker import calibrate_trace
+
+TOLERANCE = 0.4
+
+
+def outcome(predicted, norm, true, alive, distance, limit):
+    """Shares of episodes that stop right and wrong, step by step."""
+    right = wrong = 0
+    for episode in range(true.shape[1]):
+        for step in range(true.shape[0]):
+            if not alive[step, episode]:
+                continue
+            if predicted[step, episode] < distance and norm[step, episode] < limit:
+                right += true[step, episode] <= TOLERANCE
+                wrong += true[step, episode] > TOLERANCE
+                break
+    return right / true.shape[1], wrong / true.shape[1]
+
+
+def episodes(seed, *, bias=0.0, noise=0.1, steps=40, count=60):
+    """Objects that near the goal while the action calms down, seen with an error."""
+    rng = np.random.default_rng(seed)
+    start, floor = rng.uniform(1.0, 3.0, count), rng.uniform(0.0, 0.8, count)
+    decay = np.exp(-np.arange(steps)[:, None] / 8.0)
+    true = floor + (start - floor) * decay + 0.05 * rng.random((steps, count))
+    norm = 0.2 + 2.0 * decay * rng.random((steps, count))
+    predicted = np.clip(true + bias + noise * rng.standard_normal((steps, count)), 0.0, None)
+    alive = np.arange(steps)[:, None] < rng.integers(5, 80, count)
+    return predicted, norm, true, alive
+
+
+def test_both_bounds_have_to_hold():
+    rule = StoppingRule(distance_rad=0.3, action_norm=1.0)
+    predicted = torch.tensor([0.2, 0.2, 0.4, 0.3])
+    action = torch.tensor([[0.5, 0.5], [2.0, 0.0], [0.1, 0.1], [0.0, 0.0]])
+    assert rule.stops(predicted, action).tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize(("seed", "bias"), [(0, 0.0), (1, 0.25), (2, -0.25)])
+def test_the_rule_gives_what_it_says_and_nothing_on_a_grid_is_better(seed, bias):
+    data = episodes(seed, bias=bias)
+    found = calibrate(*data, tolerance_rad=TOLERANCE)
+    right, wrong = outcome(*data, found.rule.distance_rad, found.rule.action_norm)
+    assert (found.success, found.wrong) == (pytest.approx(right), pytest.approx(wrong))
+    for distance, limit in itertools.product(np.arange(1, 25) / 24 * 0.8, np.linspace(0.3, 2.2, 6)):
+        # the other grid has no action bounds in common: allow for what lies between two of them
+        assert outcome(*data, distance, limit)[0] <= found.success + 2 / 60
+    assert found.success <= found.reachable and found.episodes == 60
+
+
+def test_a_predictor_that_says_too_much_gets_a_wider_bound():
+    high, low = (calibrate(*episodes(3, bias=bias, noise=0.0)).rule for bias in (0.3, -0.1))
+    assert high.distance_rad > low.distance_rad
+
+
+def test_steps_after_a_fall_count_for_nothing():
+    predicted, norm, true, alive = episodes(4)
+    cut = calibrate(predicted, norm, true, alive)
+    true, predicted = np.where(alive, true, 0.0), np.where(alive, predicted, 0.0)
+    assert calibrate(predicted, norm, true, alive) == cut
+
+
+def test_nothing_to_calibrate_on_is_an_error():
+    predicted, norm, true, alive = episodes(5)
+    with pytest.raises(ValueError, match="no episode has a step"):
+        calibrate(predicted, norm, true, np.zeros_like(alive))
+    with pytest.raises(ValueError, match="no rule stops any of 60 episodes"):
+        calibrate(predicted, norm, true + 2.0, alive)
+
+
+def test_each_tolerance_has_the_rule_that_was_calibrated_for_it():
+    spec = StoppingRules(stopping=StoppingRule(0.3, 2.0))
+    assert spec.rule_for(TOLERANCE) == spec.stopping
+    assert spec.rule_for(0.1) == StoppingRule(0.1, 2.0), "nothing better is known"
+    precise = dataclasses.replace(spec, precise=StoppingRule(0.07, 1.0))
+    assert precise.rule_for(0.1) == precise.precise and precise.rule_for(0.4) == spec.stopping
+    assert precise.rule_for(0.2) == StoppingRule(0.2, 2.0)
+    other = dataclasses.replace(precise, tolerance_rad=0.2)
+    assert other.rule_for(0.2) == other.stopping and other.rule_for(0.4) == StoppingRule(0.4, 2.0)
+    known = dataclasses.replace(other, calibrated_on="cube: 8 episodes")
+    assert known.calibrated_for(0.2) and known.calibrated_for(0.1) and not known.calibrated_for(0.4)
+    assert not spec.calibrated_for(TOLERANCE), "the paper's bounds are of no episodes"
+
+
+def test_a_rule_for_less_is_stricter():
+    """Predictions with an error of 0.03 rad: asked for 0.1 rad, a bound of 0.1 stops too many outside."""
+    data = episodes(7, noise=0.03)
+    wide, near = calibrate(*data), calibrate(*data, tolerance_rad=0.1)
+    assert near.rule.distance_rad < 0.1 < wide.rule.distance_rad and near.success > 0.0
+
+
+def test_a_recorded_trace_gives_the_same_rule():
+    """2 objects, 30 episodes each; NaN after their ends, as a trace has it."""
+    predicted, norm, true, alive = episodes(6)
+    alive[0] = False  # before the first action there is nothing to stop
+    steps = 1 + alive.sum(axis=0)
+
+    def traced(values):
+        whole = np.concatenate([values, np.full((1, values.shape[1]), 9.0)]).T.reshape(2, 30, -1)
+        ends = np.arange(whole.shape[-1]) < steps.reshape(2, 30, 1)
+        return np.where(ends, whole, np.nan)
+
+    quats = np.zeros((2, 30, 4))
+    trace = Trace(
+        quats,
+        quats,
+        error=traced(true),
+        exact=traced(true),
+        action_norm=traced(norm),
+        predicted=traced(predicted),
+        steps=steps.reshape(2, 30),
+        fell=np.zeros((2, 30), dtype=bool),
+    )
+    assert calibrate_trace(trace) == calibrate(predicted, norm, true, alive)
+    with pytest.raises(ValueError, match="predicts no distance"):
+        calibrate_trace(dataclasses.replace(trace, predicted=None))

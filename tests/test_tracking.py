@@ -1,0 +1,365 @@
+"""Tracking policies: what they observe of a scene, how their teachers act on it, their files and commands."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+from scipy.spatial.transform import Rotation
+from sensed_world import state_of
+
+from vd.aim import AimCfg
+from vd.assets_usd.hands import load_hand
+from vd.assets_usd.objects.model import load_set
+from vd.config import to_dict
+from vd.deploy.pilot import TrackingPilot
+from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
+from vd.envs.reorient import ReorientEnv
+from vd.evaluate import cli
+from vd.evaluate.agents import RENAMED, SHIPPED_POLICIES, find_policy, open_policy, sees_clouds, task_for
+from vd.evaluate.comparison import Comparison
+from vd.evaluate.senses import EnvironmentSenses
+from vd.evaluate.trace import Trace
+from vd.evaluate.tracking import TrackingActor
+from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.shapes import shape_observation_size
+from vd.policy import PolicySpec, TrainedPolicy, load_policy, perceptron
+from vd.senses import Senses
+from vd.sensors.cfg import DepthCameraCfg
+from vd.tracking.observer import UNSEEN, Observer
+from vd.tracking.policy import TrackingPolicy, TrackingSpec, is_tracking, load_tracking, tracking_export
+from vd.tracking.tracker import NEAREST, Tracker
+from vd.tracking.views import AFTER_S, EVERY_S
+from vd.train.checkpoint import save_checkpoint
+from vd.train.cli import main as vd_train
+
+TRACKERS = sorted(RENAMED.values())
+WORLDS = 12
+EXACT = RandomisationCfg(enabled=False)
+CLOSE_RAD = 0.15
+"""A rotation that was found, from a camera's points."""
+
+
+def observer_of(env: ReorientEnv, *, aim: AimCfg | None = None) -> Observer:
+    return Observer(
+        env.hand,
+        env.objects,
+        env.num_observations,
+        world_object=env.scene.world_object,
+        world_scale=env.scene.world_scale,
+        camera=env.hand.camera,
+        aim=aim or AimCfg(),
+        control_hz=env.cfg.sim.control_hz,
+        device="cpu",
+    )
+
+
+@pytest.fixture(scope="module")
+def env():
+    """Cubes that were let go, hands that moved."""
+    cfg = ReorientCfg(
+        hand="dclaw3",
+        num_worlds=3,
+        objects=("cube",),
+        seed=1,
+        observation=ObservationCfg(shape="full"),
+        randomisation=EXACT,
+    )
+    made = ReorientEnv(cfg, "cpu")
+    torch.manual_seed(0)
+    for _ in range(3):
+        wp.to_torch(made.action).uniform_(-1.0, 1.0)
+        made.step(made.action)
+    return made
+
+
+def test_it_observes_what_its_teacher_does(env):
+    """All but the object is the environment's own; the object is found near where it is."""
+    senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()), observer_of(env)
+    observed, angle = observer(replace(senses.read(), fresh=torch.ones(3, dtype=torch.bool)))
+    true, columns = wp.to_torch(env.world_observation), teacher_observation_slices(env.num_fingers)
+    for name in ("joint_position", "joint_velocity", "fingertips", "previous_action"):
+        torch.testing.assert_close(observed[:, columns[name]], true[:, columns[name]], atol=2e-5, rtol=1e-4)
+    torch.testing.assert_close(
+        observed[:, columns["object_position"]], true[:, columns["object_position"]], atol=6e-3, rtol=0.0
+    )
+    for name in (*UNSEEN, "object_velocity", "object_spin"):  # a first look knows no motion
+        assert not observed[:, columns[name]].any()
+    assert [float(observer.known[columns[name]].sum()) for name in UNSEEN] == [0.0, 0.0]
+    # A cube looks the same from 24 sides: the angle to the goal is that of the nearest of them.
+    group, pose = Rotation.create_group("O"), env.object_pose()
+    for world, goal in enumerate(env.goal_quat.numpy()):
+        found = Rotation.from_quat(observer.found.orientation[world].numpy())
+        assert (Rotation.from_quat(pose[world, 3:7]).inv() * found * group).magnitude().min() < CLOSE_RAD
+        least = (found * group * Rotation.from_quat(goal).inv()).magnitude().min()
+        assert least == pytest.approx(float(angle[world]), abs=1e-3)
+        told = Rotation.from_quat(observed[world, columns["relative_orientation"]].numpy())
+        assert told.magnitude() == pytest.approx(float(angle[world]), abs=1e-3)
+
+
+def test_the_shape_of_a_true_pose_is_as_the_environment_observes_it(env):
+    senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()).read(), observer_of(env)
+    observer(senses)
+    pose = torch.tensor(env.object_pose()[:, :7])
+    truly = replace(observer.found, position=pose[:, :3], orientation=pose[:, 3:])
+    exact = observer._shape(truly, senses.goal_quat)
+    observed = wp.to_torch(env.world_observation)[:, -shape_observation_size(env.num_fingers) :]
+    torch.testing.assert_close(exact, observed, atol=1e-4, rtol=0.0)
+
+
+def test_motion_is_that_between_two_looks():
+    env = ReorientEnv(ReorientCfg(num_worlds=1, objects=("cube",), seed=1, randomisation=EXACT), "cpu")
+    senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()), observer_of(env)
+    observer(senses.read())
+    wp.to_torch(env.step_count).fill_(1)
+    body_q, item = wp.to_torch(env.sim.body_q), env.scene.object_body
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.1])
+    body_q[:, item, 3:] = torch.tensor((turn * Rotation.from_quat(body_q[:, item, 3:].numpy())).as_quat())
+    body_q[:, item, :3] += torch.tensor([0.01, 0.0, 0.0])
+    observer(senses.read())
+    np.testing.assert_allclose(observer.found.velocity[0], [12.0 * 0.01, 0.0, 0.0], atol=0.05)
+    np.testing.assert_allclose(observer.found.spin[0], [0.0, 0.0, 12.0 * 0.1], atol=0.5)
+
+
+def test_who_aims_is_told_a_near_goal_farther_and_the_angle_as_it_is(env):
+    """The cube of one world is 0.2 rad from its goal, those of the others as far as a cube can be."""
+    senses = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()).read()
+    senses, plain = replace(senses, fresh=torch.ones(3, dtype=torch.bool)), observer_of(env)
+    plain(senses)
+    believed = Rotation.from_quat(plain.found.orientation.numpy())
+    turn = Rotation.from_rotvec([[0.0, 0.0, 0.2], [np.pi / 4.0, 0.0, 0.0], [0.0, np.pi / 4.0, 0.0]])
+    senses = replace(senses, goal_quat=torch.tensor((turn * believed).as_quat(), dtype=torch.float32))
+    column = teacher_observation_slices(env.num_fingers)["relative_orientation"]
+    aims = AimCfg(enabled=True, past_rad=0.3, within_rad=0.5)
+    (exact, angle), (aimed, same) = (observer_of(env, aim=aim)(senses) for aim in (AimCfg(), aims))
+    torch.testing.assert_close(angle, same, atol=2e-3, rtol=0.0)
+    turns = [Rotation.from_quat(values[:, column].numpy()).magnitude() for values in (exact, aimed)]
+    np.testing.assert_allclose(turns[0], angle, atol=2e-3)
+    np.testing.assert_allclose(turns[1] - turns[0], [0.3, 0.0, 0.0], atol=4e-3)
+
+
+@pytest.fixture(scope="module", params=["dclaw3 goal", "dclaw4 goal", "dclaw3 mirrored", "dclaw4 world"])
+def teacher(request):
+    """A teacher of random weights, whose observation is not normalised by nature."""
+    hand, view = request.param.split()
+    observation = ObservationCfg(view=view)
+    task = ReorientCfg(hand=hand, objects=("cube",), num_worlds=1, observation=observation)
+    columns = teacher_observation_slices(load_hand(hand).num_fingers)
+    spec = PolicySpec(
+        columns["previous_action"].stop, columns["joint_position"].stop, (16, 8), "elu", "gaussian", True
+    )
+    torch.manual_seed(0)
+    actor, critic = (
+        {f"mlp.{name}": value for name, value in perceptron(part).state_dict().items()}
+        | {
+            "obs_normalizer._mean": torch.randn(1, spec.num_observations),
+            "obs_normalizer._std": 0.5 + torch.rand(1, spec.num_observations),
+        }
+        for part in (spec, replace(spec, num_actions=1))
+    )
+    return TrainedPolicy(spec, actor, task=to_dict(task), critic=critic)
+
+
+def tracker_of(
+    teacher: TrainedPolicy, monkeypatch, world: torch.Tensor, angle: torch.Tensor, **settings
+) -> Tracker:
+    """A tracker that observes what it is told."""
+    hand, worlds = load_hand(teacher.hand), len(world)
+    policy = TrackingPolicy(teacher, TrackingSpec())
+    tracker = Tracker(
+        policy, hand, load_set("cube"), hand.camera, world_object=np.zeros(worlds, dtype=int), **settings
+    )
+    monkeypatch.setattr(Observer, "__call__", lambda self, senses: (world, angle))
+    return tracker
+
+
+def at_step(joints: int, step: int) -> Senses:
+    """Senses of which only the time of the goal counts."""
+    none = torch.zeros(WORLDS, joints)
+    return Senses(none, none, none, none, none, none, torch.full((WORLDS,), step, dtype=torch.int32))
+
+
+def observations(teacher: TrainedPolicy, angle: torch.Tensor) -> torch.Tensor:
+    """Random observations in the world frame of objects that far from their goals."""
+    torch.manual_seed(1)
+    world = torch.randn(WORLDS, teacher.num_observations)
+    half = 0.5 * angle[:, None]
+    axis = torch.nn.functional.normalize(torch.randn(WORLDS, 3), dim=-1)
+    columns = teacher_observation_slices(teacher.num_actions // 3)
+    world[:, columns["relative_orientation"]] = torch.cat([half.sin() * axis, half.cos()], dim=-1)
+    return world
+
+
+def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_camera_shows(
+    teacher, monkeypatch
+):
+    angle = torch.full((WORLDS,), 2.0)
+    world = observations(teacher, angle)
+    tracker = tracker_of(teacher, monkeypatch, world, angle)
+    decision, maps = tracker.step(at_step(teacher.num_actions, 0)), tracker._maps
+    assert torch.equal(decision.angle, angle)
+    seen = world if maps is None else maps.take(world, maps.choose(world))
+    told, columns = seen.clone(), teacher_observation_slices(teacher.num_actions // 3)
+    for name in UNSEEN:
+        told[:, columns[name]] = teacher.network.offset[:, columns[name]]
+    action = teacher.act(told)
+    action = action if maps is None else maps.world_action(action, maps.choose(world))
+    torch.testing.assert_close(decision.action, action)
+    assert (teacher.act(seen) - teacher.act(told)).abs().max() > 1e-3
+
+
+def test_other_views_of_far_goals_are_selected_after_a_while_and_kept(teacher, monkeypatch):
+    angle = torch.where(torch.arange(WORLDS) < 3, 0.3, 2.0)
+    world = observations(teacher, angle)
+    if teacher.task["observation"]["view"] == "world":
+        with pytest.raises(ValueError, match="does not see its goals in views"):
+            tracker_of(teacher, monkeypatch, world, angle, second_view=True)
+        return
+    tracker = tracker_of(teacher, monkeypatch, world, angle, second_view=True)
+    maps, joints, hz = tracker._maps, teacher.num_actions, ReorientCfg().sim.control_hz
+    fingers, nearest, better = maps.fingers, maps.choose(world).tolist(), []
+    for row in range(WORLDS):
+        near = maps.nearness(world[row]).reshape(-1, fingers).argmax(dim=1)
+        offered = [int(near[0]), int(near[1]) + fingers] if len(near) == 2 else range(fingers)
+        seen = [tracker._guessed(maps.take(world[row : row + 1], torch.tensor([view]))) for view in offered]
+        better.append(list(offered)[int(np.argmax([float(teacher.value(one)[0]) for one in seen]))])
+    assert better[3:] != nearest[3:]
+    late = round(AFTER_S * hz)
+    for step in range(round((AFTER_S + EVERY_S) * hz)):
+        tracker.step(at_step(joints, step))
+        taken = torch.where(tracker._selected == NEAREST, torch.tensor(nearest), tracker._selected).tolist()
+        assert taken == nearest[:3] + (better if step >= late else nearest)[3:]
+    # With a new goal it begins anew.
+    again = at_step(joints, step + 1)
+    again.goal_steps[4] = 0
+    tracker.step(again)
+    assert tracker._selected[4] == NEAREST and (tracker._selected[5:] != NEAREST).all()
+
+
+@pytest.mark.parametrize("observation", [{"history": 5}, {"dynamics": "actor"}])
+def test_a_teacher_that_observes_what_no_camera_shows_is_refused(observation):
+    policy = load_policy(find_policy("dclaw3-table"))
+    policy.task["observation"] |= observation
+    with pytest.raises(ValueError, match="knows the present state alone"):
+        TrackingPolicy(policy, TrackingSpec())
+
+
+@pytest.mark.parametrize("name", TRACKERS)
+def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
+    path = SHIPPED_POLICIES[name]
+    policy = load_tracking(path)
+    assert sees_clouds(name) and is_tracking(path) and path.stat().st_size < 2.6e6
+    assert policy.spec.calibrated_on and "/" not in policy.spec.teacher + policy.spec.calibrated_on
+    teacher = load_policy(find_policy(policy.spec.teacher))
+    observation = torch.randn(5, teacher.num_observations)
+    assert torch.equal(policy.teacher.act(observation), teacher.act(observation))
+    assert torch.equal(policy.teacher.value(observation), teacher.value(observation))
+
+
+def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):
+    policy = load_tracking(SHIPPED_POLICIES["dclaw3-tracking"])
+    moved = replace(policy, spec=replace(policy.spec, camera=(0.1, 0.0, 0.2, 0.0, 0.0, 0.0, 1.0)))
+    save_checkpoint(tmp_path / "tracking.pt", tracking_export(moved))
+    assert load_tracking(tmp_path / "tracking.pt").spec == moved.spec
+    state = torch.load(tmp_path / "tracking.pt", weights_only=True)
+    torch.save({**state, "tracking": {"gone": 1}}, tmp_path / "other.pt")
+    with pytest.raises(ValueError, match=r"other\.pt: TrackingSpec has no field gone"):
+        load_tracking(tmp_path / "other.pt")
+
+
+@pytest.mark.parametrize("name", sorted(RENAMED))
+def test_a_former_name_is_refused_with_the_new_one(name, capsys, tmp_path):
+    assert cli.main([name, "--output", str(tmp_path)]) == 1
+    assert RENAMED[name] in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["calibrate", "follow"])
+def test_a_former_command_is_refused_with_the_new_one(command, capsys):
+    assert vd_train([command, "student.pt"]) == 2
+    assert "vd-train tracker" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_a_pilot_decides_on_a_hand_as_in_the_simulator():
+    """An episode of the policy; the deploy side is given joints, goal and image, nothing else."""
+    policy = open_policy("dclaw3-tracking", "cpu")
+    task = task_for(
+        policy,
+        hand=None,
+        objects=("cube",),
+        num_worlds=1,
+        seed=3,
+        stop_tolerance_rad=0.4,
+        max_goal_angle_rad=None,
+        episode_s=3.0,
+        randomised=False,
+        success_ends_episode=False,
+    )
+    env = ReorientEnv(task, "cpu")
+    actor, pilot = TrackingActor(env, policy), TrackingPilot(policy, env.hand, env.objects[0])
+    pilot.begin()
+    for step in range(env.max_episode_steps):
+        sensed = state_of(env)
+        action = actor.act(wp.to_torch(env.observation))
+        image = actor._senses.camera.depth.numpy()[0].copy()
+        decision = pilot.decide(replace(sensed, depth=image))
+        np.testing.assert_allclose(decision.action, action[0], atol=1e-3, err_msg=f"step {step}")
+        assert decision.distance == pytest.approx(float(actor.predicted[0]), abs=1e-4)
+        env.step(wp.from_torch(action.contiguous()))
+    with pytest.raises(ValueError, match="there is no image"):
+        pilot.decide(sensed)
+
+
+@pytest.mark.slow
+def test_an_evaluation_in_the_air_by_scans_with_views_selected(tmp_path, capsys):
+    flags = ["--in-air", "--goals", "scan", "--episodes", "1", "--device", "cpu", "--episode-s", "0.5"]
+    assert cli.main(["dclaw3-tracking", *flags, "--second-view", "--output", str(tmp_path)]) == 0
+    by_prediction = Comparison.read(tmp_path / "eval.json").rows[0]
+    assert (by_prediction.kind, by_prediction.sees) == ("tracking", "rendered clouds")
+    protocol = by_prediction.result.protocol
+    assert protocol.goals == "scan" and protocol.sensor_errors and protocol.second_view and protocol.in_air
+    assert "symmetry-view selection" in (tmp_path / "eval.html").read_text()
+    assert (
+        cli.main(["dclaw3-tracking", "--sees", "complete", "--device", "cpu", "--output", str(tmp_path)]) == 1
+    )
+    assert "tracks by a depth camera" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_it_is_shown(tmp_path):
+    from vd.play.cli import PlayCfg, record_video
+
+    assert record_video(PlayCfg(policy="dclaw3-tracking", seconds=0.5, device="cpu"), tmp_path / "m.png") == 6
+
+
+def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def spy(cfg, env, actor, *_others):
+        asked.append((cfg, actor._tracker._selection is not None))
+        seen = np.zeros((1, 1, 4))
+        norms, quat = np.array([[[0.0, 0.5, 0.4, 0.3]]]), np.zeros((1, 1, 4))
+        return Trace(quat, quat, seen, seen, norms, seen, np.full((1, 1), 4), np.zeros((1, 1), bool))
+
+    monkeypatch.setattr("vd.evaluate.compare.run_episodes", spy)
+    path = tmp_path / "tracking.pt"
+    flags = ["tracker", "dclaw3-table", "--objects", "cube", "--episodes", "1", "--device", "cpu"]
+    flags += ["--output", str(path)]
+    assert vd_train(flags) == 0
+    policy, (cfg, selects) = load_tracking(path), asked[-1]
+    assert policy.spec.calibrated_on == "cube: 1 episodes, goals by points, tolerance 0.4 rad, seed 1000"
+    assert policy.spec.teacher == "dclaw3-table" and policy.spec.precise is not None
+    assert 0.0 < policy.spec.stopping.action_norm < 1.0 and not policy.spec.aim.enabled
+    assert cfg.sensor_errors and cfg.goals == "points" and not cfg.aim and not selects
+    capsys.readouterr()
+    assert vd_train([*flags, "--aim", "--second-view", "--in-air", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["episodes"] == 1
+    spec, (cfg, selects) = load_tracking(path).spec, asked[-1]
+    assert spec.aim.enabled and cfg.aim and cfg.in_air and selects
+    assert all(
+        words in spec.calibrated_on for words in ("in the air", "aimed past near goals", "views selected")
+    )
+    assert vd_train(["tracker", "dclaw3-tracking", *flags[2:]]) == 1
+    assert "give a teacher" in capsys.readouterr().err

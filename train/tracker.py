@@ -1,0 +1,209 @@
+"""``vd-train tracker``: let a teacher act by a camera, and choose when it stops; nothing is learned."""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from vd.evaluate.cli import EvalCfg
+from vd.evaluate.goals import Goals
+from vd.files import check_file
+from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.evaluate.trace import Trace
+    from vd.stopping import Calibration
+    from vd.tracking.policy import TrackingPolicy, TrackingSpec
+
+
+@dataclass
+class TrackerCfg:
+    """Write a tracking policy: a teacher that acts by a depth camera, on objects of known shape.
+
+    It finds the object among the camera's points. Nothing is learned; its stopping rules are chosen on
+    episodes with objects of validation, those of vd-eval with the same flags.
+    """
+
+    teacher: Annotated[str, tyro.conf.Positional]
+    """The teacher: a policy.pt, a run's folder, or the name of an installed one."""
+    objects: tuple[str, ...]
+    """Object sets to choose the stopping rules on, not those of the training."""
+    output: Path = Path("tracking.pt")
+    """File to write."""
+    camera: tuple[float, float, float, float, float, float, float] | None = None
+    """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m] and
+    quaternion xyzw; the hand's own camera by default."""
+    episodes: int = 256
+    """Episodes; rounded up to as many of each object."""
+    tolerance_rad: float = PAPER.success.rotation_rad
+    """Largest true distance that counts as right [rad]; a rule for 0.1 rad is always chosen too."""
+    episode_s: float | None = None
+    """Length of an episode [s]; that of the paper's tests by default: 10, with --in-air 15."""
+    randomise: bool = False
+    """Domain randomisation and disturbances."""
+    in_air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Take the table away, as vd-eval --in-air does: the rule of a policy that is to hold its object."""
+    goals: Goals = "points"
+    """What it knows shapes by: mesh, points (500 exact ones, as the paper's) or scan."""
+    sensor_errors: bool = EvalCfg.sensor_errors
+    """Its camera errs as a D415 does."""
+    aim: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Let it aim past the goal while the object is near it, here and from now on."""
+    second_view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Select symmetry views where a goal is not reached in 3 s: the rule of a policy that is to fly so."""
+    num_worlds: int | None = None
+    """Worlds simulated at once; as of vd-eval by default."""
+    seed: int = 1000
+    """Of starts, goals and sensor errors."""
+    device: str = "auto"
+    """cpu, cuda:0, ... or auto."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print the outcome as JSON."""
+
+
+def tracker_command(arguments: Sequence[str], _started: float) -> int:
+    """``vd-train tracker``; the exit status."""
+    cfg = tyro.cli(TrackerCfg, args=arguments, prog="vd-train tracker")
+    check_file(cfg.output)
+
+    from vd.evaluate.agents import check_names
+
+    check_names([cfg.teacher], cfg.objects)
+    from vd.config import to_dict
+    from vd.tracking.policy import tracking_export
+    from vd.train.checkpoint import save_checkpoint
+    from vd.train.progress import waiting
+
+    with waiting("running the episodes", not cfg.json):
+        policy, found, precise = make_tracker(cfg)
+    save_checkpoint(cfg.output, tracking_export(policy))
+    if cfg.json:
+        print(json.dumps(to_dict(found) | {"precise": precise and to_dict(precise)}, indent=1))
+        return 0
+    for result in (found, precise):
+        if result is None:
+            print(f"{cfg.output}: no rule stops any within {PAPER.success.precise_rad:g} rad: none for it")
+            continue
+        rule = result.rule
+        print(
+            f"{cfg.output}: stop below {rule.distance_rad:.3f} rad and an action norm of "
+            f"{rule.action_norm:.3f}. Of {result.episodes} episodes {result.success:.1%} stop within "
+            f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} came that near"
+        )
+    return 0
+
+
+def make_tracker(cfg: TrackerCfg) -> tuple["TrackingPolicy", "Calibration", "Calibration | None"]:
+    """A tracking policy with its stopping rules.
+
+    One is for the tolerance, one for that of the paper's precise variant, from the same episodes.
+
+    Returns:
+        The policy, and what either rule gave; None for the precise one where no rule stops any episode so
+        near its goal.
+
+    Raises:
+        ValueError: The teacher is none, or observes what no camera shows, or has no views to select, or no
+            rule stops any episode within the tolerance.
+    """
+    from vd.aim import AimCfg
+    from vd.device import resolve_device
+    from vd.evaluate.agents import open_teacher, policy_name
+    from vd.tracking.policy import TrackingPolicy, TrackingSpec
+    from vd.warp_quiet import quiet_warp
+
+    quiet_warp()
+    device = resolve_device(cfg.device)
+    teacher = open_teacher(cfg.teacher, device)
+    if teacher is None:
+        raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
+    spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera, aim=AimCfg(enabled=cfg.aim))
+    policy = TrackingPolicy(teacher, spec)
+    trace = _episodes(cfg, policy, device)
+    found = calibrate_trace(trace, tolerance_rad=cfg.tolerance_rad)
+    try:
+        precise = calibrate_trace(trace, tolerance_rad=PAPER.success.precise_rad)
+    except ValueError:  # of a policy that never came so near there is nothing to learn
+        precise = None
+    return TrackingPolicy(teacher, _with_rules(spec, cfg, found, precise)), found, precise
+
+
+def calibrate_trace(trace: "Trace", *, tolerance_rad: float = PAPER.success.rotation_rad) -> "Calibration":
+    """The stopping rule that suits recorded episodes.
+
+    Args:
+        trace: Episodes of a policy that predicts its distance, T steps.
+        tolerance_rad: Largest true distance that counts as right [rad].
+
+    Raises:
+        ValueError: The policy predicts none, or no rule stops any episode within the tolerance.
+    """
+    import numpy as np
+
+    from vd.stopping import calibrate
+
+    if trace.predicted is None:
+        raise ValueError("the policy predicts no distance; there is no rule to choose")
+    after = np.arange(trace.error.shape[-1])
+    running = (after > 0) & (after < trace.steps[..., None])
+    values = trace.predicted, trace.action_norm, trace.error, running
+    return calibrate(*(value.reshape(-1, len(after)).T for value in values), tolerance_rad=tolerance_rad)
+
+
+def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace":
+    """Episodes that nothing stops."""
+    from vd.assets_usd.objects.model import load_set
+    from vd.envs.reorient import ReorientEnv
+    from vd.evaluate.cli import worlds_for
+    from vd.evaluate.compare import STUDENT_WORLDS_GPU, actor_of, run_episodes, task_of
+    from vd.tracking.symmetry import with_symmetries
+
+    count = len(load_set(list(cfg.objects)))
+    each = math.ceil(cfg.episodes / count)
+    limit = None if device == "cpu" else STUDENT_WORLDS_GPU
+    worlds = cfg.num_worlds or worlds_for(count, each, device, limit=limit)
+    evaluation = EvalCfg(
+        policies=(cfg.teacher,),
+        objects=cfg.objects,
+        episodes=each,
+        no_at_rest=True,
+        episode_s=cfg.episode_s,
+        randomise=cfg.randomise,
+        in_air=cfg.in_air,
+        goals=cfg.goals,
+        sensor_errors=cfg.sensor_errors,
+        aim=cfg.aim,
+        second_view=cfg.second_view,
+        seed=cfg.seed,
+        device=device,
+    )
+    env = ReorientEnv(task_of(evaluation, policy, cfg.objects, worlds), device)
+    env.objects = with_symmetries(env.objects, device)
+    actor, _, _, rules = actor_of(evaluation, cfg.teacher, policy, env, device)
+    trace = run_episodes(evaluation, env, actor, cfg.teacher, rules, math.inf)
+    env.close()
+    return trace
+
+
+def _with_rules(
+    spec: "TrackingSpec", cfg: TrackerCfg, found: "Calibration", precise: "Calibration | None"
+) -> "TrackingSpec":
+    """A description with the rules that were found, and what on."""
+    parts = [f"{', '.join(Path(item).name for item in cfg.objects)}: {found.episodes} episodes"]
+    parts += [] if cfg.goals == "mesh" else [f"goals by {cfg.goals}"]
+    parts += ["in the air"] if cfg.in_air else []
+    parts += [] if cfg.sensor_errors else ["without sensor errors"]
+    parts += ["aimed past near goals"] if cfg.aim else []
+    parts += ["views selected"] if cfg.second_view else []
+    parts += [f"tolerance {cfg.tolerance_rad:g} rad", f"seed {cfg.seed}"]
+    return replace(
+        spec,
+        stopping=found.rule,
+        tolerance_rad=cfg.tolerance_rad,
+        precise=None if precise is None else precise.rule,
+        calibrated_on=", ".join(parts),
+    )

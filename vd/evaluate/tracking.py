@@ -1,0 +1,74 @@
+"""A tracking policy at work in an environment."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+import warp as wp
+
+from vd.evaluate.goals import Goals
+from vd.evaluate.scanned import known_objects
+from vd.evaluate.senses import EnvironmentSenses
+from vd.tracking.policy import TrackingPolicy
+from vd.tracking.tracker import Tracker
+
+
+class TrackingActor:
+    """A tracking policy in every world of an environment.
+
+    Attributes:
+        num_actions: D.
+        predicted: Angle that it found before the latest action [rad], shape [N].
+        active: Where it acts, bool [N]; elsewhere its actions are 0.
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        policy: TrackingPolicy,
+        *,
+        goals: Goals = "mesh",
+        sensor_errors: bool = False,
+        aim: bool | None = None,
+        second_view: bool = False,
+        seed: int = 0,
+    ):
+        """Open its eyes in every world.
+
+        Args:
+            env: The environment.
+            policy: The policy.
+            goals: What it knows shapes and goals by (:mod:`vd.evaluate.scanned`).
+            sensor_errors: Give its camera the errors of a real one.
+            aim: Whether it aims past near goals; None: if its file says so, or the environment.
+            second_view: Select symmetry views by its teacher's critic.
+            seed: Of the errors of camera and scans.
+
+        Raises:
+            ValueError: It is of another hand, or has no views to select.
+        """
+        scene, own = env.scene, env.cfg.aim if env.cfg.aim.enabled else policy.spec.aim
+        camera, depth = env.hand.camera.at(policy.spec.camera), policy.spec.depth
+        self.num_actions = policy.num_actions
+        depth = depth.with_errors() if sensor_errors else depth
+        self._senses = EnvironmentSenses(env, camera, depth, seed=seed)
+        self._tracker = Tracker(
+            policy,
+            env.hand,
+            known_objects(env.objects, goals, seed=seed, device=env.device),
+            camera,
+            world_object=scene.world_object,
+            world_scale=scene.world_scale,
+            aim=own if aim is None else replace(own, enabled=aim),
+            second_view=second_view,
+            device=env.device,
+        )
+        place = wp.device_to_torch(env.device)
+        self.predicted = torch.zeros(env.num_worlds, device=place)
+        self.active = torch.ones(env.num_worlds, dtype=torch.bool, device=place)
+
+    def act(self, _observation: torch.Tensor) -> torch.Tensor:
+        """Mean actions [N, D] for what is sensed now; the teacher's observation is not looked at."""
+        decision = self._tracker.step(self._senses.read())
+        self.predicted.copy_(decision.angle)
+        return decision.action.masked_fill(~self.active[:, None], 0.0)

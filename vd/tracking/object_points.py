@@ -1,0 +1,34 @@
+"""Which of a camera's points are the object's: those of voxels that neither are the hand's nor touch one."""
+
+import torch
+import warp as wp
+
+from vd.clouds import spread
+from vd.kernels.coordinate_maps import beside
+from vd.kernels.voxels import coordinates, voxelise_marked
+
+
+def object_points(
+    points: wp.array, hand: wp.array, voxel_m: float, most: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Centres of the object's voxels.
+
+    The hand's own samples leave gaps, so a voxel that touches one of them, by a corner at least, is taken for
+    the hand's too.
+
+    Args:
+        points: Clouds [m]: the hand's own samples, then what the camera sees, NaN for none, vec3 [N, P].
+        hand: Column at which the hand's samples end, int32 [1].
+        voxel_m: Side of a voxel [m].
+        most: M, voxels of a cloud at most.
+
+    Returns:
+        Centres [m], zeros where a cloud has fewer, shape [N, M', 3] with M' <= M, and how many there are,
+        int32 [N]. Waits for the device.
+    """
+    keys, marks = voxelise_marked(points, voxel_m, hand)
+    of_hand = wp.to_torch(marks)[:, 0] > 0
+    free = ~of_hand
+    touches = wp.to_torch(beside(keys, wp.from_torch(free), wp.from_torch(of_hand)))
+    centres, present = spread(wp.to_torch(coordinates(keys)), free & ~touches, points.shape[0], most)
+    return voxel_m * centres, present.sum(dim=(1, 2)).int()

@@ -1,0 +1,201 @@
+"""From joints and a camera's points to what a teacher would observe: of the simulator and of a robot alike.
+
+The object is found by its known shape among the camera's points (:mod:`vd.tracking.registration`) and
+followed. N hands, D joints, G fingers, K camera points. World frame unless said otherwise: z up; metres,
+radians, quaternions xyzw.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from vd.aim import AimCfg
+from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, HandModel
+from vd.assets_usd.objects.model import ObjectModel
+from vd.clouds import HandKinematics, SceneClouds
+from vd.kernels.aim import aim_kernel
+from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
+from vd.kernels.shapes import (
+    ORIENTATIONS,
+    extent_directions,
+    extent_kernel,
+    shape_observation_size,
+    shape_observation_slices,
+    surface_kernel,
+)
+from vd.paper import PAPER
+from vd.quaternions import canonical, product, relative_rotation, rotated, rotation_distance
+from vd.senses import Senses
+from vd.tracking.fingertips import Fingertips
+from vd.tracking.object_points import object_points
+from vd.tracking.registration import POINTS, Registration
+from vd.tracking.symmetry import nearest_goal, symmetries_of_worlds
+
+UNSEEN = ("object_orientation", "goal_orientation")
+"""Orientations in the axes of the object's file, which no camera shows: zeros stand for them."""
+LEAP_RAD = 0.5
+"""A larger turn in one step is another belief, not a motion."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """The object as it is found."""
+
+    orientation: torch.Tensor
+    """[N, 4]."""
+    position: torch.Tensor
+    """[m] [N, 3]."""
+    velocity: torch.Tensor
+    """[m/s] [N, 3]; zero where it is not known."""
+    spin: torch.Tensor
+    """Angular velocity [rad/s] [N, 3]; zero where it is not known."""
+
+
+class Observer:
+    """Follows the object of each hand, and makes of it and of the joints a teacher's observation.
+
+    Args:
+        hand: The hand.
+        objects: The objects, as their shapes are known.
+        num_observations: O, values that the teacher observes: its state, and with more the object's shape.
+        world_object: Object of each hand [N].
+        world_scale: Size factor of each hand's object [N].
+        camera: What sees them, posed in the base frame.
+        aim: Where goals are said to be while they are near.
+        control_hz: Control steps a second.
+        device: Warp device.
+    """
+
+    def __init__(
+        self,
+        hand: HandModel,
+        objects: Sequence[ObjectModel],
+        num_observations: int,
+        *,
+        world_object: np.ndarray,
+        world_scale: np.ndarray,
+        camera: CameraModel,
+        aim: AimCfg,
+        control_hz: float,
+        device: str,
+    ):
+        self._hand, self._aim, self._rate, self._device = hand, aim, control_hz, device
+        place, links = wp.device_to_torch(device), np.arange(len(hand.link_names))
+
+        def array(values: Any, dtype: Any) -> wp.array:
+            return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+        worlds: dict[str, Any] = {"world_object": world_object, "world_scale": world_scale, "device": device}
+        self._kinematics = HandKinematics(hand, link_body=links, base=BASE_IN_WORLD, device=device)
+        self._hand_cloud = SceneClouds(hand, (), link_body=links, object_body=-1, **worlds)
+        self._hand_end = array([self._hand_cloud.ends[1]], wp.int32)
+        self._registration = Registration(objects, camera=camera, **worlds)
+        self._before = self._registration.pose[:, 0].clone()
+        self._symmetry = symmetries_of_worlds(objects, world_object, device)
+        self._fingertips = Fingertips(hand, place)
+        self._links = wp.empty((len(world_object), len(links)), dtype=wp.transform, device=device)
+        self._goal = wp.empty(len(world_object), dtype=wp.quat, device=device)
+        self._base = torch.tensor(BASE_IN_WORLD, dtype=torch.float32, device=place)
+        limits = np.stack([hand.lower, hand.upper])
+        self._lower, self._upper = torch.tensor(limits, dtype=torch.float32, device=place)
+        self._columns = teacher_observation_slices(hand.num_fingers)
+        self._size, state = num_observations, teacher_observation_size(hand.num_fingers)
+        self._columns["shape"] = slice(state, num_observations)
+        surfaces = np.stack([item.surface_points for item in objects])
+        self._shapes = [array(surfaces, wp.vec3), array(world_object, wp.int32), array(world_scale, float)]
+        self._tips = [array(hand.tip_link, wp.int32), array(hand.tip_frame, wp.transform)]
+        self._directions = array(extent_directions(hand.num_fingers), wp.vec3)
+        known = torch.ones(num_observations, device=place)
+        for name in UNSEEN:
+            known[self._columns[name]] = 0.0
+        self.found: Found | None = None
+        """What was found at the last look."""
+        self.known = known
+        """1 for the values that are observed, 0 for those of :data:`UNSEEN` [O]."""
+
+    def __call__(self, senses: Senses) -> tuple[torch.Tensor, torch.Tensor]:
+        """Look once.
+
+        Args:
+            senses: What is sensed.
+
+        Returns:
+            The teacher's observation in the world frame [N, O], and the angle from the object to its goal
+            [rad] [N]. Of the orientations that look like the wanted one (:mod:`.symmetry`) the nearest is
+            the goal: which of them it is, nobody can see.
+        """
+        self._kinematics.write(wp.from_torch(senses.joint_q.contiguous()), self._links)
+        found = self.found = self._find(senses)
+        goal = nearest_goal(found.orientation, senses.goal_quat, self._symmetry)
+        angle = rotation_distance(found.orientation, goal)
+        if self._aim.enabled:
+            goal = self._aimed(found.orientation, goal)
+        parts = {
+            "joint_position": 2.0 * (senses.joint_q - self._lower) / (self._upper - self._lower) - 1.0,
+            "joint_velocity": PAPER.observation.velocity_scale * senses.joint_qd,
+            "object_position": found.position,
+            "object_velocity": found.velocity,
+            "object_spin": PAPER.observation.velocity_scale * found.spin,
+            "relative_orientation": canonical(relative_rotation(found.orientation, goal)),
+            "fingertips": self._fingertips(senses.joint_q, senses.joint_qd),
+            "previous_action": senses.action,
+        }
+        if self._columns["shape"].start < self._size:
+            parts["shape"] = self._shape(found, goal)
+        observation = torch.zeros((len(angle), self._size), device=angle.device)
+        for name, values in parts.items():
+            observation[:, self._columns[name]] = values
+        return observation, angle
+
+    def _find(self, senses: Senses) -> Found:
+        """Find the objects among the camera's points, or follow them; links are posed."""
+        first = self._hand_cloud.ends[1]
+        cloud = torch.empty((len(senses.points), first + senses.points.shape[1], 3), device=self._base.device)
+        points = wp.from_torch(cloud, dtype=wp.vec3)
+        self._hand_cloud.write(points, self._links, self._goal, with_object=False)
+        cloud[:, first:] = senses.points
+        seen, count = object_points(points, self._hand_end, PAPER.cloud.voxel_m, POINTS)
+        followed, before = self._registration, self._before
+        followed.look(seen, count, fresh=senses.fresh, points=senses.points)
+        pose, base, turn = followed.pose[:, 0], self._base, self._base[3:].expand(len(seen), 4)
+        # A first look knows no motion.
+        known = (followed.looks > 1) & (rotation_distance(pose[:, 3:], before[:, 3:]) < LEAP_RAD)
+        moves = self._rate * known[:, None].float()
+        step = relative_rotation(pose[:, 3:], before[:, 3:])
+        found = Found(
+            orientation=product(turn, pose[:, 3:]),
+            position=base[:3] + rotated(turn, pose[:, :3]),
+            velocity=moves * rotated(turn, pose[:, :3] - before[:, :3]),
+            spin=moves * 2.0 * rotated(turn, step[:, :3] * step[:, 3:].sign()),  # of a small angle
+        )
+        before.copy_(pose)
+        return found
+
+    def _aimed(self, orientation: torch.Tensor, goal_quat: torch.Tensor) -> torch.Tensor:
+        """Orientations to aim at [N, 4], for those of objects and goals [N, 4]."""
+        aimed = torch.empty_like(orientation)
+        pose = wp.from_torch(orientation.contiguous())
+        goal = wp.from_torch(goal_quat.contiguous(), dtype=wp.quat)
+        inputs = [self._aim.past_rad, self._aim.within_rad, 0, pose, goal]
+        self._launch(aim_kernel, len(aimed), inputs, wp.from_torch(aimed, dtype=wp.quat))
+        return aimed
+
+    def _shape(self, found: Found, goal_quat: torch.Tensor) -> torch.Tensor:
+        """The shape's values, as the environment computes those of true poses (:mod:`vd.kernels.shapes`)."""
+        fingers, worlds = self._hand.num_fingers, len(found.orientation)
+        values = torch.empty((worlds, shape_observation_size(fingers)), device=self._base.device)
+        slices = shape_observation_slices(fingers)
+        pose = wp.from_torch(torch.cat([found.position, found.orientation], dim=1))
+        goal, out = wp.from_torch(goal_quat.contiguous(), dtype=wp.quat), wp.from_torch(values)
+        surface = [*self._shapes, *self._tips, 0, slices["surface"].start, pose, self._links]
+        self._launch(surface_kernel, (worlds, fingers), surface, out)
+        extent = [*self._shapes, self._directions, 0, slices["extent"].start, pose, goal]
+        self._launch(extent_kernel, (worlds, ORIENTATIONS, len(self._directions)), extent, out)
+        return values
+
+    def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list[Any], output: wp.array) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=[output], device=self._device)

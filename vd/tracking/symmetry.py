@@ -1,0 +1,219 @@
+"""The rotations that map a shape onto itself, as far as a depth camera could tell.
+
+Registration proposes them: the shape's own samples are looked for, from many rotations. The whole surface
+decides, and that they form a group. A shape's own file may declare them, as those of our solids do. Object
+frame; quaternions xyzw.
+"""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+import warp as wp
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.objects.geometry import random_surface_points
+from vd.assets_usd.objects.model import ObjectModel
+from vd.kernels.shape_grids import off_mesh_kernel
+from vd.quaternions import product, rotation_distance
+from vd.tracking.registration import POINTS, Registration
+
+OFF_M, OFF_SHARE = 0.003, 0.01
+"""A turned shape looks the same if at most this share of its surface is farther than this from where the
+surface was [m]: a depth camera's points are off by 2 to 3 mm, and a hundredth is the edge of a lid. Of 159
+imported training meshes 72 have a symmetry then, with half of the distance 28, with twice 83."""
+DENSE = 2000
+"""Points of the surface that this is measured on: the share is then known to 0.4 % (two standard errors)."""
+GRID = 32
+"""Grid points along a side of the distances on which rotations are looked for (:mod:`.registration`)."""
+STEPS, EVERY = 12, 2
+"""Steps of each rotation that is tried, and every so many-th sample they look at."""
+APART_RAD = 0.12
+"""Least angle between two symmetries: a solid of revolution has some fifty."""
+BESIDE_RAD = 0.4
+"""Rotations nearer to each other than this are neighbours; those tried are some 0.25 rad apart."""
+AROUND_RAD = 2.0
+"""Rotations that neighbour the identity, one after the other, as far as this go around."""
+CLOSED_RAD = 0.2
+"""A product of two symmetries is one that was found if it is no farther than this from it."""
+MOST = 128
+"""Symmetries of a shape at most: a ball has more."""
+
+
+_found: dict[bytes, np.ndarray] = {}
+"""Symmetries of the shapes that were asked for before: looking for those of one takes a processor 0.3 s."""
+
+
+def symmetries(objects: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
+    """Symmetries of shapes, the identity first: quaternions [S, 4] for each.
+
+    Args:
+        objects: The shapes.
+        device: Warp device.
+    """
+    keys = [_key(item) for item in objects]
+    unknown = {}
+    for key, item in zip(keys, objects, strict=True):
+        if len(item.symmetry) > 1:
+            _found[key] = np.asarray(item.symmetry, dtype=np.float32)
+        elif key not in _found:
+            unknown[key] = item
+    if unknown:
+        _found.update(zip(unknown, _search(list(unknown.values()), device), strict=True))
+    return [_found[key] for key in keys]
+
+
+def with_symmetries(objects: Sequence[ObjectModel], device: str) -> list[ObjectModel]:
+    """Objects that declare their symmetries."""
+    found = symmetries(objects, device)
+    return [replace(item, symmetry=turns) for item, turns in zip(objects, found, strict=True)]
+
+
+def symmetries_of_worlds(
+    objects: Sequence[ObjectModel], world_object: np.ndarray, device: str
+) -> torch.Tensor:
+    """Symmetries of the object of each world [N, S, 4], the identity where a shape has fewer than another.
+
+    Args:
+        objects: The shapes.
+        world_object: Object of each world, shape [N].
+        device: Warp device.
+    """
+    found = symmetries(objects, device)
+    turns = np.zeros((len(found), max(map(len, found)), 4), dtype=np.float32)
+    turns[..., 3] = 1.0
+    for row, own in zip(turns, found, strict=True):
+        row[: len(own)] = own
+    return torch.tensor(turns[np.asarray(world_object)], device=wp.device_to_torch(device))
+
+
+def equivalent_goals(goal: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
+    """Orientations that look like the wanted one.
+
+    Args:
+        goal: Wanted orientations [N, 4].
+        turns: Symmetries of each world's shape [N, S, 4].
+
+    Returns:
+        Orientations [N, S, 4], the wanted one first.
+    """
+    return product(goal[:, None].expand_as(turns), turns)
+
+
+def nearest_goal(orientation: torch.Tensor, goal: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
+    """Of the orientations that look like the wanted one the nearest [N, 4]; arguments [N, 4], [N, S, 4]."""
+    goals = equivalent_goals(goal, turns)
+    angle = rotation_distance(orientation[:, None].expand_as(goals), goals)
+    best = angle.argmin(dim=1)
+    return goals[torch.arange(len(goals), device=goals.device), best]
+
+
+def _key(item: ObjectModel) -> bytes:
+    """What tells one shape from another."""
+    parts = (item.vertices, item.faces, item.surface_points)
+    return hashlib.sha1(b"".join(np.ascontiguousarray(part).tobytes() for part in parts)).digest()
+
+
+def _search(items: Sequence[ObjectModel], device: str) -> list[np.ndarray]:
+    """Symmetries of shapes: what registration of each with itself finds, measured on the whole surface."""
+    itself = Registration(
+        items,
+        world_object=np.arange(len(items)),
+        world_scale=np.ones(len(items)),
+        camera=None,
+        device=device,
+        grid=GRID,
+    )
+    # Samples are in an order in which any leading part of them is evenly spread.
+    place = wp.device_to_torch(device)
+    seen = torch.tensor(np.stack([item.surface_points[:POINTS] for item in items]), device=place)
+    count = torch.full((len(items),), seen.shape[1], dtype=torch.int32, device=place)
+    poses, misfits = itself.tried(seen, count, steps=STEPS, every=EVERY)
+    found = []
+    for item, turns, misfit in zip(items, poses[..., 3:].cpu().numpy(), misfits.cpu().numpy(), strict=True):
+        surface = _Surface(item, device)
+        # Where no more than a hundredth is off by more, the mean square is less, but for a few outliers.
+        likely = _apart(turns[misfit.argsort()[: int((misfit < OFF_M**2).sum())]])
+        off = surface.share_off(likely)
+        same = likely[np.argsort(off, kind="stable")][: int((off <= OFF_SHARE).sum())]
+        found.append(_closed(_distinct(same), surface))
+    return found
+
+
+class _Surface:
+    """The surface of a shape, and how much of it a turn takes off itself."""
+
+    def __init__(self, item: ObjectModel, device: str):
+        self._device, rng = device, np.random.default_rng(0)
+        self._mesh = wp.Mesh(
+            wp.array(item.vertices, dtype=wp.vec3, device=device),
+            wp.array(item.faces.ravel(), dtype=wp.int32, device=device),
+        )
+        self._points = random_surface_points(item.vertices, item.faces, DENSE, rng)
+
+    def share_off(self, turns: np.ndarray) -> np.ndarray:
+        """Share of the surface that is more than :data:`OFF_M` from it when turned by turns [R, 4], [R]."""
+        if not len(turns):
+            return np.zeros(0)
+        turned = np.einsum("rij,pj->rpi", Rotation.from_quat(turns).as_matrix(), self._points)
+        points = wp.array(turned, dtype=wp.vec3, device=self._device)
+        mesh = wp.full(len(turns), self._mesh.id, dtype=wp.uint64, device=self._device)
+        off = wp.empty(points.shape, dtype=float, device=self._device)
+        wp.launch(off_mesh_kernel, off.shape, inputs=[points, mesh], outputs=[off], device=self._device)
+        return (off.numpy() > OFF_M).mean(axis=1)
+
+
+def _distinct(turns: np.ndarray) -> np.ndarray:
+    """Symmetries among the rotations that fit, best first [R, 4]: the identity, then others [S, 4].
+
+    A small turn of any shape fits too, and so do turns that differ little from a symmetry. Of rotations that
+    neighbour each other only the best counts, unless those that neighbour the identity go around: then the
+    shape is one of revolution, and all count.
+    """
+    chosen = _apart(np.concatenate([np.array([[0.0, 0.0, 0.0, 1.0]], dtype=np.float32), turns]))
+    angle = _angles(chosen[:, None], chosen[None])
+    _, family = connected_components(angle < BESIDE_RAD)
+    if angle[0, family == family[0]].max() > AROUND_RAD:
+        return chosen
+    return chosen[np.sort(np.unique(family, return_index=True)[1])]
+
+
+def _apart(turns: np.ndarray) -> np.ndarray:
+    """Of rotations [R, 4] those that differ from all before them, :data:`MOST` at most."""
+    chosen = turns[:1]
+    for turn in turns[1:]:
+        if len(chosen) < MOST and _angles(chosen, turn).min() > APART_RAD:
+            chosen = np.concatenate([chosen, turn[None]])
+    return chosen
+
+
+def _closed(turns: np.ndarray, surface: _Surface) -> np.ndarray:
+    """A group of rotations [S, 4]: products that were missed are added, what has others is left out.
+
+    Symmetries form a group: where the product of two is none, one of them only nearly is. Those of a ball are
+    too many to be one; then all stay.
+    """
+    growing = True
+    while True:
+        each = torch.tensor(turns).expand(len(turns), -1, -1)
+        products = product(each.transpose(0, 1), each).numpy()
+        missed = _angles(products[:, :, None], turns).min(axis=2) > CLOSED_RAD
+        if not missed.any() or len(turns) == MOST:
+            return turns
+        if growing:
+            new = _apart(products[missed])
+            new = new[surface.share_off(new) <= OFF_SHARE][: MOST - len(turns)]
+            growing = len(new) > 0
+            turns = np.concatenate([turns, new])
+            continue
+        wrong = missed.sum(axis=0) + missed.sum(axis=1)
+        worst = len(turns) - 1 - int(np.argmax(wrong[::-1]))  # the last of equals fits least
+        turns = np.delete(turns, worst, axis=0)
+
+
+def _angles(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Angles between quaternions [.., 4] [rad]."""
+    return 2.0 * np.arccos(np.minimum(np.abs((first * second).sum(axis=-1)), 1.0))
