@@ -22,7 +22,7 @@ from vd.evaluate.agents import check_names
 from vd.files import check_folder
 from vd.paper import PAPER
 
-CAMERA_POLICY = "dclaw4-table-student"
+CAMERA_POLICY = "dclaw4-tracking"
 """Installed policy that finds the object by camera."""
 UNSEEN, UNSEEN_ONE = "procedural-heldout-4-seed0", "procedural-heldout-1-seed0"
 """Built-in objects of kinds that no policy was trained on: those of the first part, and that of the twin."""
