@@ -125,6 +125,7 @@ def void_step_kernel(
     # Out:
     reward: wp.array[float],
     reward_terms: wp.array2d[float],
+    still: wp.array[wp.int32],
     success: wp.array[wp.int32],
     fell: wp.array[wp.int32],
 ):
@@ -134,6 +135,7 @@ def void_step_kernel(
         failed: 1 where this step failed, shape [N].
         reward: Reward, shape [N]; written where it failed, like those below.
         reward_terms: Its terms, shape [N, T].
+        still: 1 where all of success held but the rotation's threshold, shape [N].
         success: 1 where the goal was reached, shape [N].
         fell: 1 where the object was lost, shape [N].
     """
@@ -143,5 +145,6 @@ def void_step_kernel(
     reward[world] = 0.0
     for i in range(reward_terms.shape[1]):
         reward_terms[world, i] = 0.0
+    still[world] = 0
     success[world] = 0
     fell[world] = 0

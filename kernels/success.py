@@ -57,6 +57,7 @@ def success_kernel(
     must_lift_in: wp.array[int],
     # Out:
     rotation_error_out: wp.array[float],
+    still_out: wp.array[int],
     success_out: wp.array[int],
     fell_out: wp.array[int],
 ):
@@ -74,6 +75,7 @@ def success_kernel(
         table_force_in: Magnitude of the object's force on the table [N], shape [N].
         must_lift_in: 1 where the object must not touch the table for success, shape [N].
         rotation_error_out: Angle between object and goal [rad], shape [N].
+        still_out: 1 where all of success holds but the rotation's threshold, shape [N].
         success_out: 1 where the goal is reached, shape [N].
         fell_out: 1 where the object is lost, shape [N].
     """
@@ -93,16 +95,17 @@ def success_kernel(
         action_norm += smoothed_in[world, joint] * smoothed_in[world, joint]
 
     error = rotation_angle(rotation_difference(orientation, goal_quat_in[world]))
-    success = (
-        error <= limits.rotation
-        and within(wp.sqrt(joint_speed), limits.joint_speed)
+    still = (
+        within(wp.sqrt(joint_speed), limits.joint_speed)
         and within(wp.length(velocity), limits.object_speed)
         and within(wp.length(spin), limits.object_spin)
         and within(wp.sqrt(action_norm), limits.action_norm)
         and not (must_lift_in[world] != 0 and table_force_in[world] > limits.table_contact_force)
     )
+    success = still and error <= limits.rotation
     fell = limits.fall_distance > 0.0 and wp.length(position - limits.fall_center) >= limits.fall_distance
 
     rotation_error_out[world] = error
+    still_out[world] = wp.where(still, 1, 0)
     success_out[world] = wp.where(success, 1, 0)
     fell_out[world] = wp.where(fell, 1, 0)

@@ -93,6 +93,7 @@ def evaluate(device, state, reward=None, success=None):
     }
     reached = {
         "error": unwritten(worlds, float, device),
+        "still": unwritten(worlds, int, device),
         "success": unwritten(worlds, int, device),
         "fell": unwritten(worlds, int, device),
     }
@@ -117,7 +118,7 @@ def evaluate(device, state, reward=None, success=None):
         inputs=[
             settings_array(RewardParams, device, **{**REWARD, **(reward or {})}),
             *(arrays[name] for name in ("q", "qd", "tips", "effort", "table_force", "clearance")),
-            *reached.values(),
+            *(reached[name] for name in ("error", "success", "fell")),
             arrays["previous_error"],
         ],
         outputs=list(paid.values()),
@@ -129,7 +130,7 @@ def evaluate(device, state, reward=None, success=None):
 
 
 def oracle(state, reward, success):
-    """Terms, error, success and fall by the equations; and how near each world is to any threshold."""
+    """Terms, error, stillness, success and fall by the equations; how near each world is to a threshold."""
     s = {name: np.asarray(value, np.float64) for name, value in state.items()}
     joints = s["effort"].shape[1]
     position, orientation = s["q"][:, joints : joints + 3], s["q"][:, joints + 3 :]
@@ -151,11 +152,11 @@ def oracle(state, reward, success):
     }
     contact_margin = s["table_force"] - reward["table_contact_force"]
     height_margin = s["tips"][..., 2] - reward["height_limit"]
-    reached = margins["rotation"] >= 0
+    still = (contact_margin <= 0) | (s["must_lift"] == 0)
     for name in STILLNESS:
         if success[name] > 0:
-            reached &= margins[name] >= 0
-    reached &= (contact_margin <= 0) | (s["must_lift"] == 0)
+            still &= margins[name] >= 0
+    reached = still & (margins["rotation"] >= 0)
     fell = (success["fall_distance"] > 0) & (fall_distance >= success["fall_distance"])
     terms = np.stack(
         [
@@ -174,7 +175,7 @@ def oracle(state, reward, success):
     near = np.abs(np.stack([*margins.values(), contact_margin, fall_distance - success["fall_distance"]]))
     # The float32 asin is good to 1e-3 rad near pi, far from any tolerance used here.
     decided = (near.min(axis=0) > 1e-5) & (np.abs(height_margin).min(axis=1) > 1e-6)
-    return terms, error, reached, fell, decided
+    return terms, error, still, reached, fell, decided
 
 
 @st.composite
@@ -216,9 +217,10 @@ def test_terms_match_the_equations(device, state, form, clip, progress, lift, sc
     reward |= {"lift": lift[0], "lift_height": lift[1]}
     success = {**SUCCESS, "rotation": tolerance, **dict.fromkeys(disabled, 0.0)}
     out = evaluate(device, state, reward, success)
-    terms, error, reached, fell, decided = oracle(state, reward, success)
+    terms, error, still, reached, fell, decided = oracle(state, reward, success)
     np.testing.assert_allclose(out["error"], error, atol=2e-3)
     np.testing.assert_array_equal(out["previous_error"], out["error"])
+    np.testing.assert_array_equal(out["still"][decided], still[decided])
     np.testing.assert_array_equal(out["success"][decided], reached[decided])
     np.testing.assert_array_equal(out["fell"][decided], fell[decided])
     tolerances = np.array([0, 3e-3, 1e-5, 1e-3, 0, 0, 0, 20 * 2e-3, 1e-5])

@@ -145,9 +145,10 @@ def test_a_failed_step_is_put_back_and_counts_for_nothing(device):
         device_array([1.0, np.nan, 1.0], float, device),
         device_array([[1.0], [np.nan], [1.0]], float, device),
     )
-    success, fell = (device_array([1, 1, 1], int, device) for _ in range(2))
-    wp.launch(void_step_kernel, dim=3, inputs=[failed], outputs=[reward, terms, success, fell], device=device)
-    for array in (reward, terms, success, fell):
+    still, success, fell = (device_array([1, 1, 1], int, device) for _ in range(3))
+    outputs = [reward, terms, still, success, fell]
+    wp.launch(void_step_kernel, dim=3, inputs=[failed], outputs=outputs, device=device)
+    for array in outputs:
         np.testing.assert_array_equal(array.numpy().ravel(), [1, 0, 1])
 
 

@@ -114,6 +114,8 @@ class ReorientEnv:
         """Terms of the reward, unscaled, shape [N, T]."""
         self.rotation_error = zeros(n)
         """Angle to the goal at the end of the step, before resets [rad], shape [N]."""
+        self.still = zeros(n, dtype=wp.int32)
+        """1 where all of success holds but the rotation's threshold, shape [N]."""
         self.success = zeros(n, dtype=wp.int32)
         """1 where the goal was reached in this step, shape [N]."""
         self.fell = zeros(n, dtype=wp.int32)
@@ -284,7 +286,7 @@ class ReorientEnv:
                 sim.table_force,
                 self.must_lift,
             ],
-            outputs=[self.rotation_error, self.success, self.fell],
+            outputs=[self.rotation_error, self.still, self.success, self.fell],
             device=self.device,
         )
         wp.launch(
@@ -311,7 +313,7 @@ class ReorientEnv:
                 void_step_kernel,
                 dim=n,
                 inputs=[sim.failed],
-                outputs=[self.reward, self.reward_terms, self.success, self.fell],
+                outputs=[self.reward, self.reward_terms, self.still, self.success, self.fell],
                 device=self.device,
             )
         wp.launch(
