@@ -213,7 +213,7 @@ def turn_unseen(demo: Demo) -> dict[str, Any]:
         ["vd-play", *options, "--cells", "4", "--seconds", str(FILM_S), "--video", film],
     )
     from vd.evaluate.comparison import Comparison
-    from vd.evaluate.report import percent
+    from vd.evaluate.comparison_page import percent
 
     rows = Comparison.read(demo.folder("eval.json")).rows
     result = next(row.result for row in rows if row.stopped_by == "prediction")

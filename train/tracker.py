@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from vd.evaluate.cli import EvalCfg
+from vd.evaluate.cfg import EvalCfg
 from vd.evaluate.goals import Goals
 from vd.files import check_file
 from vd.paper import PAPER
@@ -158,8 +158,7 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
     """Episodes that nothing stops."""
     from vd.assets_usd.objects.model import load_set
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.cli import worlds_for
-    from vd.evaluate.compare import STUDENT_WORLDS_GPU, actor_of, run_episodes, task_of
+    from vd.evaluate.compare import STUDENT_WORLDS_GPU, actor_of, run_episodes, task_of, worlds_for
     from vd.tracking.symmetry import with_symmetries
 
     count = len(load_set(list(cfg.objects)))

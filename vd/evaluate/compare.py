@@ -1,9 +1,9 @@
-"""Run several policies through the same episodes, and judge each by its prediction and the true distance."""
+"""Run policies through the same episodes, and judge each by the rules that stop it."""
 
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,38 +18,23 @@ from vd.evaluate.agents import (
     start_at_rest,
     task_for,
 )
+from vd.evaluate.cfg import LOG_EVERY_S, WORLDS_CPU, WORLDS_GPU, EvalCfg, parse_groups
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
-    from vd.evaluate.cli import EvalCfg
     from vd.evaluate.comparison import Comparison
+    from vd.evaluate.result import Protocol
     from vd.evaluate.trace import Trace
     from vd.stopping import StoppingRule
 
 STUDENT_WORLDS_GPU = 1024
 """Worlds simulated at once by default where a student looks at them: depth images and clouds take memory."""
+_PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
 
 
-def parse_groups(objects: Sequence[str]) -> dict[str, tuple[str, ...]]:
-    """Object sets by the name of their group: ``NAME=SET`` is of that group, others of ``objects``.
-
-    Raises:
-        ValueError: A group has no set.
-    """
-    groups: dict[str, tuple[str, ...]] = {}
-    for item in objects:
-        name, equals, sets = item.partition("=")
-        if not equals:
-            name, sets = "objects", item
-        if not name or not sets:
-            raise ValueError(f"--objects: '{item}' has to be NAME=SET, such as training=procedural-150-seed0")
-        groups[name] = (*groups.get(name, ()), sets)
-    return groups
-
-
-def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
-    """Run a comparison and write its JSON and page into ``cfg.output``.
+def compare(cfg: EvalCfg, stop_at: float = math.inf) -> "Comparison":
+    """Run an evaluation and write its JSON and page into ``cfg.output``.
 
     Args:
         cfg: Settings of the command line.
@@ -66,10 +51,8 @@ def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
     from vd.assets_usd.objects.sheet import pictures
     from vd.device import resolve_device
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.cli import software, worlds_for
     from vd.evaluate.comparison import Comparison, judge
     from vd.evaluate.comparison_page import write_comparison
-    from vd.evaluate.result import Protocol
     from vd.tracking.symmetry import with_symmetries
 
     device = resolve_device(cfg.device)
@@ -96,27 +79,7 @@ def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
         env.load_state_dict(start)
         actor, kind, sees, rules = actor_of(cfg, name, policy, env, device)
         trace = run_episodes(cfg, env, actor, name, rules, stop_at)
-        protocol = Protocol(
-            policy=name,
-            objects="",
-            hand=wanted.hand,
-            hand_layer=wanted.hand_layer,
-            episodes=cfg.episodes,
-            seed=cfg.seed,
-            max_goal_angle_rad=cfg.max_goal_angle,
-            stop_tolerance_rad=cfg.stop_tolerance,
-            episode_s=wanted.episode_s,
-            control_hz=wanted.sim.control_hz,
-            randomised=cfg.randomise,
-            at_rest=wanted.start.at_rest,
-            goals_about_vertical=wanted.start.at_rest and wanted.goal.about_vertical,
-            in_air=cfg.in_air,
-            table_friction=cfg.table_friction,
-            goals=cfg.goals,
-            sensor_errors=cfg.sensor_errors and sees == "rendered clouds",
-            aim=cfg.aim,
-            second_view=cfg.second_view and name not in BUILT_IN,
-        )
+        protocol = _protocol(cfg, name, wanted, sees)
         index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
             chosen = [index[member] for member in members[group]]
@@ -133,13 +96,13 @@ def compare(cfg: "EvalCfg", stop_at: float = math.inf) -> "Comparison":
             rows += found
             predictions += [] if prediction is None else [prediction]
     env.close()
-    comparison = Comparison(tuple(rows), tuple(predictions), software=software(device))
+    comparison = Comparison(tuple(rows), tuple(predictions), software=_software(device))
     comparison.write(cfg.output / "eval.json")
     write_comparison(comparison, cfg.output / "eval.html", pictures=pictures(env.objects))
     return comparison
 
 
-def task_of(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: int) -> "ReorientCfg":
+def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], worlds: int) -> "ReorientCfg":
     """The task of one policy, in which no state ends an episode but a fall."""
     from vd.evaluate.trace import NEVER_RAD
 
@@ -152,16 +115,17 @@ def task_of(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: i
         stop_tolerance_rad=NEVER_RAD,
         max_goal_angle_rad=cfg.max_goal_angle,
         episode_s=cfg.limit_s,
-        randomised=cfg.randomise,
+        randomised=cfg.randomised,
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
         aim=cfg.aim,
         second_view=cfg.second_view,
+        condition=cfg.randomisation,
     )
     if cfg.table_friction is not None:
         task = replace(task, table_friction=cfg.table_friction)
-    if cfg.randomise:
+    if cfg.randomised:
         return task
     # Noise that is switched off anyway, and would keep a teacher and its student from sharing the worlds.
     exact = replace(
@@ -173,9 +137,35 @@ def task_of(cfg: "EvalCfg", policy: Any | None, sets: tuple[str, ...], worlds: i
     return replace(task, randomisation=exact)
 
 
-def actor_of(
-    cfg: "EvalCfg", name: str, policy: Any | None, env: Any, device: str
-) -> tuple[Any, str, str, Any]:
+def _protocol(cfg: EvalCfg, name: str, task: "ReorientCfg", sees: str) -> "Protocol":
+    """How the episodes of one policy are run; its objects are those of a group."""
+    from vd.evaluate.result import Protocol
+
+    return Protocol(
+        policy=name,
+        objects="",
+        hand=task.hand,
+        hand_layer=task.hand_layer,
+        episodes=cfg.episodes,
+        seed=cfg.seed,
+        max_goal_angle_rad=cfg.max_goal_angle,
+        stop_tolerance_rad=cfg.stop_tolerance,
+        episode_s=task.episode_s,
+        control_hz=task.sim.control_hz,
+        randomised=cfg.randomised,
+        at_rest=task.start.at_rest,
+        goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
+        in_air=cfg.in_air,
+        table_friction=cfg.table_friction,
+        goals=cfg.goals,
+        sensor_errors=cfg.sensor_errors and sees == "rendered clouds",
+        aim=cfg.aim,
+        second_view=cfg.second_view and name not in BUILT_IN,
+        condition=cfg.condition,
+    )
+
+
+def actor_of(cfg: EvalCfg, name: str, policy: Any | None, env: Any, device: str) -> tuple[Any, str, str, Any]:
     """What acts, its kind, what it sees, and its rules to stop, by tolerance."""
     from vd.policy import TrainedPolicy
     from vd.stopping import StoppingRule
@@ -223,7 +213,7 @@ def actor_of(
 
 
 def run_episodes(
-    cfg: "EvalCfg",
+    cfg: EvalCfg,
     env: Any,
     actor: Any,
     name: str,
@@ -238,7 +228,6 @@ def run_episodes(
     import numpy as np
     from tqdm import tqdm
 
-    from vd.evaluate.cli import LOG_EVERY_S
     from vd.evaluate.comparison import ways_to_stop
     from vd.evaluate.result import air_table_steps
     from vd.evaluate.rollout import draw_starts_and_goals
@@ -269,8 +258,23 @@ def run_episodes(
             starts=starts,
             goals=goals,
             table_steps=air_table_steps(env.cfg.sim.control_hz) if cfg.in_air else None,
-            held=[(way.rule, way.by) for way in ways],
+            held=[(way.rule, way.by) for way in ways if way.by != "success"],
             on_step=stepped,
         )
     env.check()
     return trace
+
+
+def worlds_for(num_objects: int, episodes: int, device: str, *, limit: int | None = None) -> int:
+    """Worlds to simulate at once: the same number for every object, at most one for each episode."""
+    limit = limit or (WORLDS_CPU if device == "cpu" else WORLDS_GPU)
+    return num_objects * max(1, min(episodes, limit // num_objects))
+
+
+def _software(device: str) -> dict[str, str]:
+    """The device and the versions of what runs."""
+    import warp as wp
+
+    from vd.versions import installed_versions
+
+    return {"device": wp.get_device(device).name} | installed_versions(_PACKAGES)

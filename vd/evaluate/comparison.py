@@ -1,4 +1,4 @@
-"""Several policies on several groups of objects, each stopped by its own prediction and by the true distance.
+"""What an evaluation found: one policy or several on groups of objects, each stopped in several ways.
 
 Angles are radians, times seconds.
 """
@@ -19,7 +19,7 @@ from vd.files import write_json
 from vd.paper import PAPER
 from vd.stopping import StoppingRule
 
-COMPARISON_FORMAT = "visual-dexterity comparison 5"
+COMPARISON_FORMAT = "visual-dexterity evaluation 6"
 OUTCOMES = ("success", "orientation error", "time-out", "object falls")
 """Classes of episodes: stopped within the tolerance of the very goal, stopped outside of it, never stopped,
 lost."""
@@ -28,7 +28,8 @@ BOUNDS_RAD = (PAPER.success.precise_rad, PAPER.success.rotation_rad)
 SCATTER = 2000
 """Pairs of predicted and true distance that are kept for a figure."""
 
-StoppedBy = Literal["prediction", "true distance"]
+StoppedBy = Literal["prediction", "true distance", "success criteria of training"]
+SUCCESS: StoppedBy = "success criteria of training"
 OWN_NORM = "its own bound of the action"
 """Mark of rows that are ours: stopped by the bound of the action's norm that a student's file has."""
 
@@ -115,6 +116,15 @@ class Comparison:
     def warnings(self) -> dict[str, str]:
         """What may be wrong with objects, by name."""
         return {name: words for row in self.rows for name, words in row.result.warnings.items()}
+
+    def summary(self) -> dict[str, Any]:
+        """What is written, as JSON, without episodes and states."""
+        found = to_dict(self)
+        for row in found["rows"]:
+            del row["result"]["episodes"]
+        for entry in found["predictions"]:
+            del entry["true_rad"], entry["predicted_rad"]
+        return found
 
     def write(self, path: Path) -> None:
         """Write as JSON, atomically."""
@@ -204,6 +214,7 @@ def ways_to_stop(
 
     They are the bounds of the distance that it predicts, if it does, and of the true one, both with the
     released code's bound of the action's norm; and, as ours, its own bound of the norm where that is another.
+    What predicts nothing is stopped by the success criteria of training, too.
 
     Args:
         rules: The policy's own rule for a tolerance [rad].
@@ -216,6 +227,8 @@ def ways_to_stop(
         ways.insert(0, Way("prediction", replace(own, action_norm=norm), "predicted"))
         if own.action_norm != norm:
             ways.append(Way("prediction", own, "predicted", OWN_NORM))
+    else:
+        ways.append(Way(SUCCESS, StoppingRule(tolerance_rad, norm), "success"))
     return ways
 
 

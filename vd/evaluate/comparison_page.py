@@ -1,4 +1,4 @@
-"""A comparison as one HTML page, its figures, and lines for a terminal."""
+"""An evaluation as one HTML page, its figures, and lines for a terminal."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,10 +6,19 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from vd.evaluate.comparison import BOUNDS_RAD, OUTCOMES, Comparison, Row
-from vd.evaluate.plots import BLUE, GREEN, GREY, ORANGE, ecdf
-from vd.evaluate.report import aligned, goals_text, number, percent, shown_name, starts_text
-from vd.evaluate.statistics import chance_cdf
+from vd.evaluate.comparison import OUTCOMES, SUCCESS, Comparison, Row
+from vd.evaluate.plots import (
+    BLUE,
+    GREEN,
+    GREY,
+    HEADLINE_TOLERANCE_RAD,
+    ORANGE,
+    drawn_note,
+    ecdf,
+    violin_figure,
+)
+from vd.evaluate.result import TOLERANCES_RAD, Protocol
+from vd.evaluate.statistics import CHANCE_MEAN_RAD, Interval, chance_cdf
 from vd.evaluate.trace import HOLD_S
 from vd.page import write_html
 from vd.paper import PAPER
@@ -47,11 +56,31 @@ _BOUND_HEADER = (
 _OBJECT_HEADER = (
     "object",
     "episodes",
-    *(f"<= {bound} rad" for bound in BOUNDS_RAD),
-    "<= 0.4 up to symmetry",
+    *(f"<= {tolerance:g} rad" for tolerance in TOLERANCES_RAD),
+    f"<= {HEADLINE_TOLERANCE_RAD:g} up to symmetry",
     "median error [rad]",
+    "stopped",
+    "time to stop [s]",
     "fell",
 )
+
+
+def shown_name(text: str) -> str:
+    """Names, separated by commas, as a page prints them: of an absolute path its last two parts."""
+    parts = (Path(name) for name in text.split(", "))
+    return ", ".join("/".join(p.parts[-2:]) if p.is_absolute() else str(p) for p in parts)
+
+
+def percent(interval: Interval) -> str:
+    """``12.3 % (10.1 to 14.9)``."""
+    return f"{100 * interval.value:.1f} % ({100 * interval.low:.1f} to {100 * interval.high:.1f})"
+
+
+def number(interval: Interval | None) -> str:
+    """``0.41 (0.38 to 0.45)``, or a dash for None."""
+    if interval is None:
+        return "–"  # noqa: RUF001
+    return f"{interval.value:.2f} ({interval.low:.2f} to {interval.high:.2f})"
 
 
 def labels(names: tuple[str, ...]) -> dict[str, str]:
@@ -85,6 +114,7 @@ def write_comparison(comparison: Comparison, path: Path, *, pictures: bytes | No
     write_html(
         path,
         "comparison.html",
+        title=_title(comparison),
         lead=_lead(comparison),
         success_header=_HEADER,
         success=[_cells(row, short) for row in rows],
@@ -98,10 +128,21 @@ def write_comparison(comparison: Comparison, path: Path, *, pictures: bytes | No
         bound_header=_BOUND_HEADER,
         bounds=_bound_cells(comparison, short),
         warnings=comparison.warnings,
+        violins=[
+            (violin_figure(row.result), _heading(row, short), drawn_note(row.result))
+            for row in _headlines(comparison)
+        ],
         objects=[(_heading(row, short), _object_cells(row)) for row in rows],
         object_header=_OBJECT_HEADER,
         protocol=_protocol(comparison),
+        chance_mean=f"{CHANCE_MEAN_RAD:.2f}",
+        units={row.result.overall.unit for row in rows},
     )
+
+
+def _headlines(comparison: Comparison) -> list[Row]:
+    """The first row of each policy on each group."""
+    return list({(row.policy, row.group): row for row in reversed(comparison.rows)}.values())[::-1]
 
 
 def _heading(row: Row, short: dict[str, str]) -> str:
@@ -113,13 +154,40 @@ def _object_cells(row: Row) -> list[tuple[str, ...]]:
         (
             summary.name,
             str(summary.episodes),
-            *(percent(summary.success[str(bound)]) for bound in BOUNDS_RAD),
-            percent(summary.symmetric[str(PAPER.success.rotation_rad)]),
+            *(percent(rate) for rate in summary.success.values()),
+            percent(summary.symmetric[str(HEADLINE_TOLERANCE_RAD)]),
             number(summary.median_error_rad),
+            percent(summary.stop_rate),
+            number(summary.time_to_success_s),
             percent(summary.drop_rate),
         )
-        for summary in row.result.per_object
+        for summary in (row.result.overall, *row.result.per_object)
     ]
+
+
+def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
+    """Rows of cells as lines of text: the first ``words`` columns flush left, the others right."""
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if column < words else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    )
+
+
+def terminal_text(comparison: Comparison) -> str:
+    """Tables, those by object too if there is one policy, warnings and what was asked, for a terminal."""
+    short = labels(comparison.policies)
+    parts = [terminal_table(comparison)]
+    if len(comparison.policies) == 1:
+        parts += [
+            f"{_heading(row, short)}\n{aligned([_OBJECT_HEADER, *_object_cells(row)], words=1)}"
+            for row in _headlines(comparison)
+        ]
+    parts += [f"warning {name}: {words}" for name, words in comparison.warnings.items()]
+    return "\n\n".join([*parts, _lead(comparison)])
 
 
 def terminal_table(comparison: Comparison) -> str:
@@ -140,14 +208,12 @@ def in_order(rows: Sequence[Row]) -> list[Row]:
 
 def ours(row: Row) -> str:
     """What of a row's conditions is ours, not the paper's; empty: nothing."""
-    protocol = row.result.protocol
-    found = [row.ours] if row.ours else []
-    for name, text in (
-        ("second_view", "symmetry-view selection"),
-        ("aim", "aims past near goals"),
-    ):
-        found += [text] if getattr(protocol, name) else []
-    return ", ".join(found)
+    return ", ".join(text for text in (row.ours, _marks(row.result.protocol)) if text)
+
+
+def _marks(protocol: Protocol) -> str:
+    named = {"second_view": "symmetry-view selection", "aim": "aims past near goals"}
+    return ", ".join(text for name, text in named.items() if getattr(protocol, name))
 
 
 def ecdf_figure(comparison: Comparison) -> Figure:
@@ -157,12 +223,14 @@ def ecdf_figure(comparison: Comparison) -> Figure:
     colour = dict(zip(comparison.policies, COLOURS * len(comparison.policies), strict=False))
     for axes, group in zip(panels, comparison.groups, strict=True):
         rows = [row for row in comparison.rows if row.group == group]
-        students = {row.policy for row in rows if row.stopped_by == "prediction"}
+        own = {row.policy: row for row in reversed(rows)}
         for row in (row for row in rows if not row.ours):
-            other = row.policy in students and row.stopped_by == "true distance"
+            other = row is not own[row.policy]
             style = {"linestyle": "--", "linewidth": 1.2} if other else {"linewidth": 2.0}
             label = None if other else _named(row, short)
             ecdf(axes, row.result.errors().ravel(), color=colour[row.policy], label=label, **style)
+        starts = rows[0].result.start_errors().ravel()
+        ecdf(axes, starts, color=GREY, linewidth=1.0, linestyle="-.", label="object left at its start")
         axes.plot(angle, chance_cdf(angle), color=GREY, linestyle=":", label="uniform, no symmetry")
         axes.axvline(rows[0].result.protocol.stop_tolerance_rad, color=GREY, linewidth=0.6)
         axes.set(xlim=(0.0, np.pi), ylim=(0.0, 1.0), xlabel="error at the stop or end [rad]")
@@ -285,13 +353,39 @@ def _bound_cells(comparison: Comparison, short: dict[str, str]) -> list[tuple[st
     ]
 
 
+def starts_text(protocol: Protocol) -> str:
+    """How episodes start, in words."""
+    if protocol.at_rest:
+        return "at rest on the table, as the environment draws them"
+    return "dropped into the hand, uniform on SO(3)"
+
+
+def goals_text(protocol: Protocol) -> str:
+    """Where goals lie, in words."""
+    angle = protocol.max_goal_angle_rad
+    if protocol.goals_about_vertical:
+        return f"turned about the vertical by at most {angle:g} rad"
+    return "uniform on SO(3)" if angle >= np.pi - 1e-6 else f"uniform within {angle:g} rad of the start"
+
+
 def _lead(comparison: Comparison) -> str:
+    """What was asked: place, episodes, starts, goals, stop and randomisation."""
     protocol = comparison.rows[0].result.protocol
-    place = "in the air" if protocol.in_air else "on the table"
-    return (
-        f"{len(comparison.policies)} policies, {place}: starts {starts_text(protocol)}; goals "
-        f"{goals_text(protocol)}; {protocol.episodes} for each object"
-    )
+    asked = [
+        f"{shown_name(protocol.hand_name)} {'in the air' if protocol.in_air else 'on the table'}",
+        f"{protocol.episodes} episodes of each object",
+        f"starts {starts_text(protocol)}",
+        f"goals {goals_text(protocol)}",
+        f"stop within {protocol.stop_tolerance_rad:g} rad",
+        f"randomisation {protocol.randomisation_text}",
+    ]
+    return "; ".join(asked + ([f"ours: {marks}"] if (marks := _marks(protocol)) else []))
+
+
+def _title(comparison: Comparison) -> str:
+    if len(comparison.policies) > 1:
+        return f"Comparison of {len(comparison.policies)} policies"
+    return f"Evaluation of {shown_name(comparison.policies[0])}"
 
 
 def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
@@ -316,8 +410,10 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
     by_group = {row.group: row.result.protocol.objects for row in comparison.rows}
     rows += [(f"objects: {name}", shown_name(sets)) for name, sets in by_group.items()]
     short = labels(comparison.policies)
+    if any(row.stopped_by == SUCCESS for row in comparison.rows):
+        rows.append((SUCCESS, f"error at most {protocol.stop_tolerance_rad:g} rad, fingers and object still"))
     for row in in_order(comparison.rows):
-        if row.stopped_by == "prediction" or row.kind == "teacher":
+        if row.stopped_by == "prediction" or (row.kind == "teacher" and row.stopped_by != SUCCESS):
             rule = f"distance {row.rule.distance_rad:.3g} rad, action norm {row.rule.action_norm:.3g}"
             errs = ", which err as a real camera does" if row.result.protocol.sensor_errors else ""
             mark = f"; ours: {ours(row)}" if ours(row) else ""

@@ -1,10 +1,9 @@
-"""Figures of an evaluation: error distributions and success by object."""
+"""Figures of an evaluation: error distributions, together and by object."""
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from vd.evaluate.result import TOLERANCES_RAD, EvalResult
-from vd.evaluate.statistics import chance_cdf
+from vd.evaluate.result import EvalResult
 
 # Violins and bars get unreadable beyond this many objects; the worst and best halves are drawn then.
 MAX_OBJECTS_DRAWN = 30
@@ -13,35 +12,6 @@ BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8a8f98"
 # A violin of fewer points than this shows the kernel, not the data.
 MIN_VIOLIN_POINTS = 8
 HEADLINE_TOLERANCE_RAD = 0.4
-
-
-def ecdf_figure(result: EvalResult) -> Figure:
-    """Share of episodes that ended within each error, beside chance and beside doing nothing."""
-    figure, axes = _axes(8.0, 4.4)
-    errors, starts = result.errors(), result.start_errors()
-    if 1 < len(errors) <= MAX_OBJECTS_DRAWN:
-        for index, one in enumerate(errors):
-            label = "each object" if index == 0 else None
-            ecdf(axes, one, color=BLUE, alpha=0.22, linewidth=0.8, label=label)
-    ecdf(axes, errors.ravel(), color=BLUE, linewidth=2.2, label="all episodes")
-    ecdf(axes, starts.ravel(), color=ORANGE, linewidth=1.4, linestyle="--", label="object left at its start")
-    angle = np.linspace(0.0, np.pi, 200)
-    axes.plot(
-        angle,
-        chance_cdf(angle),
-        color=GREY,
-        linewidth=1.4,
-        linestyle=":",
-        label="uniform on SO(3), no symmetry",
-    )
-    for tolerance in TOLERANCES_RAD:
-        axes.axvline(tolerance, color=GREY, linewidth=0.6, alpha=0.6)
-        axes.text(tolerance, 1.015, f"{tolerance:g}", ha="center", fontsize=8, color=GREY)
-    axes.set(xlim=(0.0, np.pi), ylim=(0.0, 1.0))
-    axes.set_xlabel("orientation error at the end or stop [rad]")
-    axes.set_ylabel("share of episodes")
-    axes.legend(frameon=False, loc="lower right", fontsize=9)
-    return figure
 
 
 def violin_figure(result: EvalResult) -> Figure:
@@ -70,29 +40,6 @@ def violin_figure(result: EvalResult) -> Figure:
     axes.set_yticks(positions, [result.object_names[index] for index in chosen], fontsize=8)
     axes.set(xlim=(0.0, np.pi), ylim=(-0.7, len(chosen) - 0.3))
     axes.set_xlabel("orientation error at the end or stop [rad]; the mark is the median, drops as pi")
-    return figure
-
-
-def success_figure(result: EvalResult) -> Figure:
-    """Success within the headline tolerance of each object with its interval."""
-    key = str(HEADLINE_TOLERANCE_RAD)
-    rates = np.array([summary.success[key].value for summary in result.per_object])
-    chosen = _chosen(-rates)
-    figure, axes = _axes(8.0, 1.1 + 0.3 * len(chosen))
-    positions = np.arange(len(chosen))[::-1]
-    for position, index in zip(positions, chosen, strict=True):
-        interval = result.per_object[index].success[key]
-        axes.plot([interval.low, interval.high], [position] * 2, color=BLUE, linewidth=2.0, alpha=0.5)
-        axes.plot([interval.value], [position], "o", color=BLUE, markersize=5)
-    overall = result.overall.success[key]
-    axes.axvspan(overall.low, overall.high, color=GREEN, alpha=0.15, linewidth=0)
-    axes.axvline(overall.value, color=GREEN, linewidth=1.4, label="all objects, 95 % interval")
-    axes.axvline(result.overall.chance[key], color=GREY, linewidth=1.4, linestyle=":", label="chance")
-    axes.set_yticks(positions, [result.object_names[index] for index in chosen], fontsize=8)
-    axes.set(ylim=(-0.7, len(chosen) - 0.3))
-    axes.set_xlim(left=min(0.0, axes.get_xlim()[0]))
-    axes.set_xlabel(f"success within {HEADLINE_TOLERANCE_RAD} rad")
-    axes.legend(frameon=False, fontsize=8, loc="best")
     return figure
 
 

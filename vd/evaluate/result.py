@@ -1,18 +1,15 @@
-"""What an evaluation found: the episodes, and the summary computed from them; both as JSON.
+"""Episodes of one policy as one rule ends them, and the summary computed from them.
 
 Angles are radians, times seconds, quaternions xyzw.
 """
 
-import json
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 
 from vd.assets_usd.objects.model import ObjectModel
-from vd.config import from_dict, to_dict
 from vd.evaluate.goals import Goals
 from vd.evaluate.statistics import (
     Interval,
@@ -24,13 +21,10 @@ from vd.evaluate.statistics import (
     rate_intervals,
     rotation_angle,
 )
-from vd.files import write_json
 from vd.paper import PAPER
 
 TOLERANCES_RAD = (0.1, 0.2, 0.4, 0.8)
 """Errors at which success is reported; the paper's figures use 0.1, 0.4 and 0.8."""
-
-FORMAT_VERSION = 2
 
 
 def air_table_steps(control_hz: float) -> int:
@@ -57,8 +51,7 @@ class Episode:
     steps: int
     """Control steps simulated."""
     stopped: bool
-    """All success criteria (orientation and stillness) held at the last step, or the rule that was asked for
-    stopped it there."""
+    """The rule that was asked for stopped it at the last step."""
     fell: bool
     """The object left the hand."""
 
@@ -72,7 +65,6 @@ class Episode:
 class Protocol:
     """How the episodes were run."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"nudge": False, "explore": False}
     policy: str
     """Checkpoint path, or the name of a built-in agent."""
     objects: str
@@ -141,7 +133,7 @@ class Summary:
     symmetric: dict[str, Interval]
     """The same up to the object's symmetry."""
     stop_rate: Interval
-    """Share of episodes in which all success criteria held at once."""
+    """Share of episodes that the rule stopped."""
     drop_rate: Interval
     """Share of episodes in which the object was dropped."""
     median_error_rad: Interval
@@ -158,7 +150,7 @@ class Summary:
 
 @dataclass(frozen=True)
 class EvalResult:
-    """An evaluation: protocol, episodes and summaries."""
+    """Protocol, episodes and summaries."""
 
     protocol: Protocol
     object_names: tuple[str, ...]
@@ -169,9 +161,6 @@ class EvalResult:
     """In the order of ``object_names``."""
     episodes: tuple[Episode, ...]
     """K x M episodes, object by object."""
-    format_version: int = FORMAT_VERSION
-    software: dict[str, str] = field(default_factory=dict)
-    """Versions of what ran."""
     warnings: dict[str, str] = field(default_factory=dict)
     """By name of an object: what its import says may be wrong with it."""
 
@@ -186,25 +175,6 @@ class EvalResult:
         errors = rotation_angle(*quats)
         return errors.reshape(len(self.object_names), -1)
 
-    def write(self, path: Path) -> None:
-        """Write the result as JSON, atomically."""
-        write_json(path, to_dict(self))
-
-    @staticmethod
-    def read(path: Path) -> "EvalResult":
-        """Read a result that :meth:`write` wrote.
-
-        Raises:
-            ValueError: Not such a file, or of another format version.
-        """
-        values: Any = json.loads(Path(path).read_text())
-        version = values.get("format_version") if isinstance(values, dict) else None
-        if version != FORMAT_VERSION:
-            raise ValueError(
-                f"{path}: format_version is {version}, this version reads {FORMAT_VERSION}; run vd-eval again"
-            )
-        return from_dict(EvalResult, values)
-
 
 def warnings_of(objects: Iterable[ObjectModel]) -> dict[str, str]:
     """What the import of objects says may be wrong with them, by name; nothing of those without a warning."""
@@ -217,17 +187,15 @@ def summarise(
     episodes: tuple[Episode, ...],
     *,
     resample: Literal["auto", "object", "episode"] = "auto",
-    software: dict[str, str] | None = None,
     warnings: dict[str, str] | None = None,
 ) -> EvalResult:
-    """Compute every rate, median and interval of an evaluation.
+    """Compute every rate, median and interval of some episodes.
 
     Args:
         protocol: How it was run.
         object_names: K names.
         episodes: K x M episodes, object by object.
         resample: What intervals speak about: ``object``, ``episode``, or by the number of objects.
-        software: Versions to record.
         warnings: What may be wrong with objects, by name.
     """
     by_object = [episodes[i : i + protocol.episodes] for i in range(0, len(episodes), protocol.episodes)]
@@ -244,7 +212,6 @@ def summarise(
             for name, group in zip(object_names, by_object, strict=True)
         ),
         episodes=episodes,
-        software=software or {},
         warnings=warnings or {},
     )
 

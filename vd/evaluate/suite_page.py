@@ -7,8 +7,15 @@ from matplotlib.figure import Figure
 
 from vd.evaluate import plots
 from vd.evaluate.comparison import Row
-from vd.evaluate.comparison_page import ecdf_figure, labels, outcome_figure, scatter_figure
-from vd.evaluate.report import aligned, number, shown_name
+from vd.evaluate.comparison_page import (
+    aligned,
+    ecdf_figure,
+    labels,
+    number,
+    outcome_figure,
+    scatter_figure,
+    shown_name,
+)
 from vd.evaluate.statistics import Interval
 from vd.evaluate.suite import CLAIMS, NO_STUDENT, OUT_OF_TIME, Claim, Condition, own_row, within
 from vd.evaluate.suite_plots import distance_figure, friction_figure, object_outcomes_figure

@@ -23,9 +23,8 @@ from vd.evaluate.agents import (
     sees_clouds,
 )
 from vd.evaluate.compare import compare, parse_groups
-from vd.evaluate.comparison import Comparison
-from vd.evaluate.comparison_page import labels
-from vd.evaluate.report import shown_name
+from vd.evaluate.comparison import SUCCESS, Comparison
+from vd.evaluate.comparison_page import labels, shown_name
 from vd.evaluate.statistics import Interval
 from vd.evaluate.suite import (
     CLAIMS,
@@ -111,7 +110,10 @@ class SuiteResult:
         return {group: pictures(load_set(list(objects.sets))) for group, objects in self.objects.items()}
 
     def merged(self, *conditions: str) -> Comparison | None:
-        """The comparisons of conditions as one of all policies and groups; None if there is none."""
+        """The comparisons of conditions as one of all policies and groups; None if there is none.
+
+        Without the success criteria of training: the paper's evaluations do not ask for stillness.
+        """
         parts = [
             self.found[condition, policy]
             for condition in conditions
@@ -121,7 +123,7 @@ class SuiteResult:
         if not parts:
             return None
         return Comparison(
-            rows=tuple(row for part in parts for row in part.rows),
+            rows=tuple(row for part in parts for row in part.rows if row.stopped_by != SUCCESS),
             predictions=tuple(entry for part in parts for entry in part.predictions),
             software=parts[0].software,
         )

@@ -21,9 +21,9 @@ from vd.stopping import StoppingRule
 
 HOLD_S = 2.0
 """For how long a hand holds its object after a stop, before it is looked at again [s] (ours)."""
-StopsBy = Literal["predicted", "exact", "error"]
-"""The distance that a rule asks for: a student's prediction, or the true one to the very goal, or to what
-looks like it."""
+StopsBy = Literal["predicted", "exact", "error", "success"]
+"""What a rule asks for: a distance, which is a student's prediction, or the true one to the very goal, or to
+what looks like it; or the success criteria of training, which are the true one and stillness."""
 NEVER_RAD = 1e-9
 """Orientation tolerance that no state meets: an environment with it stops no episode."""
 
@@ -58,6 +58,8 @@ class Trace:
         predicted: What a student predicts of ``error`` there; None for other policies [K, M, T + 1].
         steps: Steps to the fall or the time limit [K, M].
         fell: Whether the object was lost [K, M].
+        still: Whether hand and object are as still after t steps as success asks; None: not known
+            [K, M, T + 1].
         holds: What came after the stops, of the rules that were to be held.
     """
 
@@ -69,6 +71,7 @@ class Trace:
     predicted: np.ndarray | None
     steps: np.ndarray
     fell: np.ndarray
+    still: np.ndarray | None = None
     holds: list[Hold] = field(default_factory=list)
 
     def of(self, objects: Sequence[int]) -> "Trace":
@@ -89,19 +92,28 @@ class Trace:
 
         Args:
             rule: Bounds of distance and action norm.
-            by: The distance it asks for.
+            by: What it asks for; of success the bound of the action's norm is the environment's.
 
         Returns:
             Steps to the stop, fall or time limit, and whether the rule stopped it, shape [K, M] each.
+
+        Raises:
+            ValueError: The record does not have what it asks for.
         """
-        distance = {"predicted": self.predicted, "exact": self.exact, "error": self.error}[by]
-        if distance is None:
-            raise ValueError("only a student predicts distances; stop by the true distance")
+        last = self.steps - 1  # nobody acts on, or predicts, the state after the last step
         with np.errstate(invalid="ignore"):  # NaN stops nothing
-            stops = (distance < rule.distance_rad) & (self.action_norm < rule.action_norm)
+            if by == "success":
+                if self.still is None:
+                    raise ValueError("this record does not know what is still; stop by the true distance")
+                stops = (self.exact <= rule.distance_rad) & self.still
+                last = self.steps - self.fell  # but the environment sees it; a fall is no success
+            else:
+                distance = {"predicted": self.predicted, "exact": self.exact, "error": self.error}[by]
+                if distance is None:
+                    raise ValueError("only a student predicts distances; stop by the true distance")
+                stops = (distance < rule.distance_rad) & (self.action_norm < rule.action_norm)
         stops[..., 0] = False  # before the first action there is nothing to stop
-        after = np.arange(stops.shape[-1])
-        stops &= after < self.steps[..., None]  # nobody sees the state after the last step
+        stops &= np.arange(stops.shape[-1]) <= last[..., None]
         stopped: np.ndarray = np.asarray(stops.any(axis=-1))
         return np.where(stopped, stops.argmax(axis=-1), self.steps), stopped
 
@@ -141,13 +153,15 @@ def record(
 ) -> Trace:
     """Run a policy and write down what happens.
 
-    Errors are up to the symmetry that ``env.objects`` declare.
+    Errors are up to the symmetry that ``env.objects`` declare. All rounds are drawn before the first step,
+    since how often worlds reset depends on the policy and moves the random streams: so starts, goals and
+    noise depend on the environment's configuration (seed and number of worlds included), not on the policy.
 
     Args:
         env: An environment that no state ends (``success.rotation_rad`` of NEVER_RAD), as it was built.
         policy: What acts; one with ``predicted`` is a student, and is told where it need not act any more.
         episodes: M.
-        starts: Initial orientations [K, M, 4]; None: the environment draws them, all before the first step.
+        starts: Initial orientations [K, M, 4]; None: the environment draws them.
         goals: Goal orientations [K, M, 4], with ``starts``.
         table_steps: Steps after which the table is taken away; None: never.
         held: Rules whose stops are to be held for HOLD_S.
@@ -167,25 +181,18 @@ def record(
         predicted=np.full((*shape, length), np.nan) if predicts else None,
         steps=np.full(shape, env.max_episode_steps),
         fell=np.zeros(shape, dtype=bool),
+        still=np.zeros((*shape, length), dtype=bool),
         holds=[Hold(rule, by, np.full(shape, np.nan), np.full(shape, np.nan)) for rule, by in held],
     )
-    rounds = episode_rounds(world_object, *shape)
-    drawn = []
-    if starts is None:
-        for _ in rounds:
-            env.reset()
-            drawn.append(env.state_dict())
-    for index, numbers in enumerate(rounds):
+    rounds, drawn = episode_rounds(world_object, *shape), []
+    for numbers in rounds:
+        chosen = world_object, np.maximum(numbers, 0)
+        env.reset(*(None if quat is None else quat[chosen].astype(np.float32) for quat in (starts, goals)))
+        drawn.append(env.state_dict())
+    for numbers, state in zip(rounds, drawn, strict=True):
         if table_steps is not None:
             env.sim.place_table(present=True)
-        if starts is None:
-            env.load_state_dict(drawn[index])
-        else:
-            assert goals is not None
-            chosen = world_object, np.maximum(numbers, 0)
-            env.reset(
-                object_quat=starts[chosen].astype(np.float32), goal_quat=goals[chosen].astype(np.float32)
-            )
+        env.load_state_dict(state)
         stops = [_Stops(env, hold) for hold in trace.holds]
         _record_round(env, policy, numbers, trace, symmetry, table_steps, on_step, stops)
         for one in stops:
@@ -206,8 +213,8 @@ class _Stops:
     def look(self, step: int, trace: Trace, worlds: np.ndarray, place: tuple[np.ndarray, np.ndarray]) -> None:
         """Keep the states of worlds, those of ``place``, that the rule stops after ``step`` steps."""
         rule, by = self._hold.rule, self._hold.by
-        distance = {"predicted": trace.predicted, "exact": trace.exact, "error": trace.error}[by]
-        assert distance is not None
+        distance = {"predicted": trace.predicted, "exact": trace.exact, "error": trace.error}.get(by)
+        assert distance is not None  # what success criteria stop is not held
         near = distance[(*place, step)] < rule.distance_rad
         stops = near & (trace.action_norm[(*place, step)] < rule.action_norm) & (self._after[worlds] < 0)
         if step == 0 or not stops.any():
@@ -294,10 +301,13 @@ def _record_round(
         env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
         quat = unit_quats(env.object_pose_end.numpy()[:, 3:7])[worlds]
         _write_errors(trace, symmetry, living, step + 1, quat[alive], goal[alive])
-        fell = (env.fell.numpy()[worlds] != 0) & alive
-        trace.fell[place[0][fell], place[1][fell]] = True
-        trace.steps[place[0][fell], place[1][fell]] = step + 1
-        alive &= ~fell
+        assert trace.still is not None
+        trace.still[(*living, step + 1)] = env.still.numpy()[worlds][alive] != 0
+        ended = (env.done.numpy()[worlds] != 0) & alive
+        last = place[0][ended], place[1][ended]
+        trace.fell[last] = env.fell.numpy()[worlds][ended] != 0
+        trace.steps[last] = step + 1
+        alive &= ~ended
         on_step()
         if not alive.any():
             return

@@ -16,7 +16,7 @@ import tyro
 from vd import interrupt
 from vd.device import resolve_device
 from vd.evaluate.agents import DEFAULT_POLICY, LAYER_HELP, check_names, episode_limit_s, start_at_rest
-from vd.evaluate.cli import POLICY_HELP
+from vd.evaluate.cfg import POLICY_HELP
 from vd.files import check_file
 from vd.hand_log import is_log
 from vd.paper import PAPER
@@ -173,7 +173,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     from tqdm import tqdm
 
     from vd.evaluate.agents import built_in
-    from vd.evaluate.cli import LOG_EVERY_S
+    from vd.evaluate.cfg import LOG_EVERY_S
     from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 

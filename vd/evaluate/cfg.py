@@ -1,0 +1,224 @@
+"""What ``vd-eval`` is told."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from vd.evaluate.agents import LAYER_HELP, SHIPPED_POLICIES, episode_limit_s, start_at_rest
+from vd.evaluate.conditions import CONDITIONS, Condition
+from vd.evaluate.goals import Goals
+from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.envs.cfg import RandomisationCfg
+
+# Worlds simulated at once by default: enough to keep the device busy, few enough to fit anywhere.
+WORLDS_CPU, WORLDS_GPU = 64, 8192
+# Seconds between progress lines where they go to a file.
+LOG_EVERY_S = 10.0
+DEFAULT_OBJECTS = ("cube",)
+OF_THE_SUITE = (
+    "episodes",
+    "max_goal_angle",
+    "at_rest",
+    "no_at_rest",
+    "stop_tolerance",
+    "episode_s",
+    "in_air",
+    "aim",
+    "table_friction",
+    "condition",
+    "goals",
+    "sensor_errors",
+    "second_view",
+    "sees",
+)
+"""Settings that a suite decides."""
+POLICY_HELP = (
+    "A policy.pt or student.pt, a checkpoint, the folder of a bundle or of a run, or the name of an "
+    f"installed policy: {', '.join(SHIPPED_POLICIES)}."
+)
+"""What names a policy on a command line."""
+
+
+@dataclass
+class EvalCfg:
+    """Evaluate policies: every object from the same starts to the same goals, whatever the policy.
+
+    Objects fall into the hand from orientations uniform on SO(3), or, with --at-rest, lie on the table.
+
+    Writes eval.json (every episode) and eval.html (one page with figures) and prints tables. Episodes are
+    recorded to their ends; rules that stop them are applied to the record. Camera policies stop by the
+    distance that they predict and, for comparison, by the true one; others by the true one and, as a second
+    row, at the first step at which all success criteria of training hold, stillness included.
+
+    --suite paper runs all of the paper's evaluations in simulation and writes paper.json and paper.html, its
+    figures beside ours. What is finished is not repeated by the next call.
+    """
+
+    policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = ()
+    agent: str | None = None
+    """zero or random, alone or beside policies."""
+    suite: Literal["paper"] | None = None
+    """Run the paper's evaluations, on the installed policies if none is named. --objects training=FOLDER
+    held-out=FOLDER names the objects; without, our procedural sets stand for them."""
+    quick: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Of the suite only a part, with few objects and episodes: minutes on two CPU cores."""
+    jobs: int = 1
+    """Of a suite, evaluations side by side, each in a process of its own, spread over the GPUs."""
+    objects: tuple[str, ...] = ()
+    """Object sets by name, folders or files (vd-assets makes them); cube by default. NAME=SET puts one into a
+    group, which gets figures of its own: training=FOLDER held-out=FOLDER symmetric=symmetric."""
+    episodes: int = 20
+    """Starts and goals of every object."""
+    hand: str | None = None
+    """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
+    hand_layer: Annotated[str | None, tyro.conf.arg(help=LAYER_HELP)] = None
+    seed: int = 0
+    """Seed of starts, goals and everything else random."""
+    max_goal_angle: float = math.pi
+    """Goals are within this angle [rad] of the start; pi is all of SO(3)."""
+    at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Start at rest on the table; the default is as trained, and a drop for --agent zero and random. The
+    environment draws such starts and their goals; they depend on --num-worlds too."""
+    no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Start from a drop, whatever the training."""
+    stop_tolerance: float = PAPER.success.rotation_rad
+    """An episode stops below this error [rad]; 0.1 for the paper's precise variant."""
+    episode_s: float | None = None
+    """Time limit of an episode [s]; 10 by default, 15 with --in-air."""
+    in_air: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
+    table_friction: float | None = None
+    """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
+    aim: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Ours: aim past the goal while the object is near it; more come within 0.1 rad."""
+    second_view: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Ours: where a policy has not come to its goal in 3 s, look at it once a second from other fingers'
+    sides, or in the mirror, and go on in the view of which its critic, or its teacher's, expects
+    most."""
+    goals: Goals = "mesh"
+    """What camera policies know shapes and goals by: the exact mesh; 500 exact points, as the paper's; or a
+    scan, points with 4 mm of noise and a fifth missing. A surface is laid through points."""
+    sensor_errors: bool = True
+    """Cameras of policies err as a D415 does: noise, gaps, late images, not quite where it is believed
+    (docs/depth.md). Without: as in their training."""
+    sees: Literal["auto", "complete", "rendered"] = "auto"
+    """What students see: complete clouds, a depth camera's, or what their stage was trained on."""
+    randomise: bool = False
+    """Randomise dynamics and add noise and disturbances as in training."""
+    condition: Condition | None = None
+    """Evaluate in a named condition, whatever the training: nominal; s3, Table S3; hard, the same with forces
+    that last a control step; mixed, Table S3 with friction, backlash, late commands and observations;
+    observation-late and command-late, 83 ms and nothing else."""
+    resample: Literal["auto", "object", "episode"] = "auto"
+    """What intervals speak about: objects (from 8 of them) or episodes within objects."""
+    num_worlds: int | None = None
+    """Worlds simulated at once; by default as many as episodes, up to 64 on a CPU and 8192 on a GPU (1024
+    with students)."""
+    device: str = "auto"
+    """auto, cpu or cuda:N."""
+    output: Path = Path("runs/eval")
+    """Folder for eval.json and eval.html."""
+    json: bool = False
+    """Print protocol and summaries as JSON instead of the table."""
+
+    @property
+    def agent_names(self) -> tuple[str, ...]:
+        """What is evaluated, each once.
+
+        Raises:
+            ValueError: Nothing is named.
+        """
+        names = tuple(dict.fromkeys((*self.policies, *([] if self.agent is None else [self.agent]))))
+        if not names and self.suite is not None:
+            return tuple(SHIPPED_POLICIES)
+        if not names:
+            raise ValueError(
+                "name a policy: a file, --agent zero, --agent random, or an installed policy "
+                f"({', '.join(SHIPPED_POLICIES)})"
+            )
+        return names
+
+    @property
+    def object_sets(self) -> tuple[str, ...]:
+        """The sets of ``objects``, the default included."""
+        return self.objects or DEFAULT_OBJECTS
+
+    @property
+    def limit_s(self) -> float:
+        """Time limit of an episode [s]."""
+        return episode_limit_s(self.episode_s, in_air=self.in_air)
+
+    @property
+    def randomisation(self) -> "RandomisationCfg | None":
+        """What is drawn; None: as trained, if at all."""
+        return None if self.condition is None else CONDITIONS[self.condition]
+
+    @property
+    def randomised(self) -> bool:
+        """Whether anything is drawn."""
+        return self.randomise if self.randomisation is None else self.randomisation.enabled
+
+    def validate(self) -> None:
+        """Raise ValueError naming the flag and the remedy."""
+        if self.episodes < 1:
+            raise ValueError(f"--episodes is {self.episodes}; at least 1 is needed")
+        if not 0.0 < self.max_goal_angle <= math.pi + 1e-6:
+            raise ValueError(
+                f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
+            )
+        if not 0.0 < self.stop_tolerance <= math.pi:
+            raise ValueError(
+                f"--stop-tolerance is {self.stop_tolerance}; it must be above 0 and at most pi rad"
+            )
+        if self.limit_s <= 0.0:
+            raise ValueError(f"--episode-s is {self.episode_s}; it must be positive")
+        if self.table_friction is not None and self.randomise:
+            raise ValueError("--table-friction and --randomise exclude each other; give one of them")
+        if self.condition is not None and (self.randomise or self.table_friction is not None):
+            raise ValueError("--condition excludes --randomise and --table-friction; give one of them")
+        if self.table_friction is not None and self.table_friction < 0.0:
+            raise ValueError(f"--table-friction is {self.table_friction}; it must not be negative")
+        self._validate_suite()
+        start_at_rest(self.at_rest, self.no_at_rest)
+        if self.num_worlds is not None and self.num_worlds < 1:
+            raise ValueError(
+                f"--num-worlds is {self.num_worlds}; at least one world for each object is needed"
+            )
+
+    def _validate_suite(self) -> None:
+        if self.jobs < 1:
+            raise ValueError(f"--jobs is {self.jobs}; at least 1 is needed")
+        if self.suite is None:
+            if self.quick:
+                raise ValueError("--quick is of a suite; add --suite paper, or lower --episodes")
+            if self.jobs > 1:
+                raise ValueError("--jobs is of a suite; add --suite paper, or leave it out")
+            return
+        default = EvalCfg()
+        for name in OF_THE_SUITE:
+            if getattr(self, name) != getattr(default, name):
+                flag = name.replace("_", "-")
+                raise ValueError(f"--{flag} is decided by --suite {self.suite}; leave it out")
+
+
+def parse_groups(objects: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Object sets by the name of their group: ``NAME=SET`` is of that group, others of ``objects``.
+
+    Raises:
+        ValueError: A group has no set.
+    """
+    groups: dict[str, tuple[str, ...]] = {}
+    for item in objects:
+        name, equals, sets = item.partition("=")
+        if not equals:
+            name, sets = "objects", item
+        if not name or not sets:
+            raise ValueError(f"--objects: '{item}' has to be NAME=SET, such as training=procedural-150-seed0")
+        groups[name] = (*groups.get(name, ()), sets)
+    return groups
