@@ -8,9 +8,10 @@ import pytest
 from test_evaluate_report import PNG, read_page
 from test_evaluate_trace import compared, protocol
 
-from vd.evaluate import suite_run
+from vd.evaluate import suite_result, suite_run
 from vd.evaluate.agents import SHIPPED_POLICIES
-from vd.evaluate.cli import EvalCfg, main
+from vd.evaluate.cfg import EvalCfg
+from vd.evaluate.cli import main
 from vd.evaluate.comparison import Comparison, outcome_shares
 from vd.evaluate.result import Episode, summarise
 from vd.evaluate.suite import (
@@ -68,7 +69,8 @@ def asked(monkeypatch, found):
         return comparison
 
     monkeypatch.setattr(suite_run, "compare", compare)
-    monkeypatch.setattr(suite_run, "sees_clouds", lambda name: name == STUDENT)
+    for module in (suite_run, suite_result):
+        monkeypatch.setattr(module, "sees_clouds", lambda name: name == STUDENT)
     monkeypatch.setattr(suite_run, "has_second_view", lambda name: name == TEACHER)
     monkeypatch.setattr(suite_run.SuiteResult, "pictures", {"training": PNG})
     monkeypatch.setattr(suite_run, "fingerprint", lambda name, **_: f"weights of {name}")

@@ -1,7 +1,7 @@
 """The suite as one HTML page, and its table for a terminal."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -19,19 +19,17 @@ from vd.evaluate.comparison_page import (
 from vd.evaluate.statistics import Interval
 from vd.evaluate.suite import CLAIMS, NO_STUDENT, OUT_OF_TIME, Claim, Condition, own_row, within
 from vd.evaluate.suite_plots import distance_figure, friction_figure, object_outcomes_figure
+from vd.evaluate.suite_result import SuiteResult
 from vd.evaluate.trace import HOLD_S
 from vd.page import write_html
 from vd.paper import PAPER
-
-if TYPE_CHECKING:
-    from vd.evaluate.suite_run import SuiteResult
 
 NOTHING = "–"  # noqa: RUF001
 LEAST_POINTS = 30
 """Episodes that did not lose their object, below which errors by distance are not drawn."""
 
 
-def write_suite(result: "SuiteResult", path: Path) -> None:
+def write_suite(result: SuiteResult, path: Path) -> None:
     """Write the page."""
     named = {condition.name: condition.title for condition in result.conditions}
     everything = result.merged(*named)
@@ -60,7 +58,7 @@ def write_suite(result: "SuiteResult", path: Path) -> None:
     )
 
 
-def _figures(result: "SuiteResult") -> list[tuple[tuple[str, ...], list[tuple[str, ...]]]]:
+def _figures(result: SuiteResult) -> list[tuple[tuple[str, ...], list[tuple[str, ...]]]]:
     """A table for each condition, header and rows: those of the paper, then what is ours."""
     return [
         (
@@ -75,12 +73,12 @@ def _figures(result: "SuiteResult") -> list[tuple[tuple[str, ...], list[tuple[st
     ]
 
 
-def out_of_time(result: "SuiteResult") -> str:
+def out_of_time(result: SuiteResult) -> str:
     """What the reduced suite had no time for."""
     return f"{len(result.late)} evaluations are {OUT_OF_TIME}."
 
 
-def terminal_table(result: "SuiteResult") -> str:
+def terminal_table(result: SuiteResult) -> str:
     """Every figure of the paper beside that of every policy, for a terminal."""
     named = {condition.name: condition for condition in result.conditions}
     table: list[tuple[str, ...]] = [("condition", "figure", "paper", *_columns(result))]
@@ -104,18 +102,18 @@ def paper_text(claim: Claim) -> str:
     return f"below {value[0]:g}"
 
 
-def _columns(result: "SuiteResult") -> tuple[str, ...]:
+def _columns(result: SuiteResult) -> tuple[str, ...]:
     """Headings of the policies' columns, and first one for students where there is none."""
     return (*(() if result.students else ("students",)), *labels(result.policies).values())
 
 
-def _cells(result: "SuiteResult", claim: Claim, condition: Condition) -> tuple[str, ...]:
+def _cells(result: SuiteResult, claim: Claim, condition: Condition) -> tuple[str, ...]:
     """The paper's figure and that of each column of :func:`_columns`."""
     ours = (_cell(result, claim, condition, name) for name in result.policies)
     return (paper_text(claim), *(() if result.students else (NO_STUDENT,)), *ours)
 
 
-def _cell(result: "SuiteResult", claim: Claim, condition: Condition, policy: str) -> str:
+def _cell(result: SuiteResult, claim: Claim, condition: Condition, policy: str) -> str:
     if (condition.name, policy) in result.failed:
         return "failed"
     if (condition.name, policy) not in result.found:
@@ -140,13 +138,13 @@ def _share(value: float, *interval: float) -> str:
     return f"{texts[0]} %" + (f" ({texts[1]} to {texts[2]})" if interval else "")
 
 
-def _own(result: "SuiteResult", condition: str, policy: str) -> Row | None:
+def _own(result: SuiteResult, condition: str, policy: str) -> Row | None:
     """The row of a policy's own rule."""
     comparison = result.found.get((condition, policy))
     return None if comparison is None else own_row(comparison)
 
 
-def _errors(result: "SuiteResult") -> dict[str, Any]:
+def _errors(result: SuiteResult) -> dict[str, Any]:
     """Figures of the errors on the table."""
     table = result.merged("training", "held-out", "symmetric")
     short = labels(result.policies)
@@ -165,7 +163,7 @@ def _errors(result: "SuiteResult") -> dict[str, Any]:
     }
 
 
-def _frictions(result: "SuiteResult") -> Figure | None:
+def _frictions(result: SuiteResult) -> Figure | None:
     measure = within(plots.HEADLINE_TOLERANCE_RAD)
     nominal = [c for c in result.conditions if c.name == "held-out"]
     tables = [*nominal, *(c for c in result.conditions if c.table_friction is not None)]
@@ -184,7 +182,7 @@ def _frictions(result: "SuiteResult") -> Figure | None:
     return friction_figure(rates) if rates else None
 
 
-def _air(result: "SuiteResult") -> dict[str, Any]:
+def _air(result: SuiteResult) -> dict[str, Any]:
     """Figures of the outcomes in the air, and of each policy by object and by distance."""
     air = result.merged("air", "air-training")
     short = labels(result.policies)
@@ -204,7 +202,7 @@ def _air(result: "SuiteResult") -> dict[str, Any]:
     }
 
 
-def _students(result: "SuiteResult") -> dict[str, Figure | None]:
+def _students(result: SuiteResult) -> dict[str, Figure | None]:
     """Figures that only students have."""
     predicted = result.merged("air", "air-training") if result.students else None
     scanned = result.merged("scanned-goals") if result.students else None
@@ -214,7 +212,7 @@ def _students(result: "SuiteResult") -> dict[str, Figure | None]:
     }
 
 
-def _lead(result: "SuiteResult") -> str:
+def _lead(result: SuiteResult) -> str:
     short = labels(result.policies)
     kinds = {row.policy: row.kind for part in result.found.values() for row in part.rows}
     named = (

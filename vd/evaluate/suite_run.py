@@ -10,10 +10,10 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from vd.config import to_dict
 from vd.evaluate.agents import (
@@ -22,31 +22,25 @@ from vd.evaluate.agents import (
     has_second_view,
     sees_clouds,
 )
-from vd.evaluate.compare import compare, parse_groups
-from vd.evaluate.comparison import SUCCESS, Comparison
+from vd.evaluate.cfg import EvalCfg, parse_groups
+from vd.evaluate.compare import compare
+from vd.evaluate.comparison import Comparison
 from vd.evaluate.comparison_page import labels, shown_name
-from vd.evaluate.statistics import Interval
 from vd.evaluate.suite import (
-    CLAIMS,
     CONDITIONS,
-    NO_STUDENT,
     OUT_OF_TIME,
     OWN_SETS,
     QUICK_EPISODES,
     QUICK_OBJECTS,
     QUICK_S,
     QUICK_STUDENT_EPISODES,
-    Claim,
     Condition,
     Group,
 )
 from vd.evaluate.suite_page import write_suite
+from vd.evaluate.suite_result import Objects, SuiteResult
 from vd.files import make_folder, write_json
-from vd.paper import PAPER
 from vd.workers import run_tasks
-
-if TYPE_CHECKING:
-    from vd.evaluate.cli import EvalCfg
 
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
@@ -59,111 +53,7 @@ LOG_FILE = "log.txt"
 _NOT_MEASURED = ("output", "device", "json", "num_worlds", "jobs")
 
 
-@dataclass(frozen=True)
-class Objects:
-    """The objects of one group.
-
-    Attributes:
-        sets: What vd-eval is given: sets, or chosen files of them.
-        text: The same for a reader.
-        own: Whether they are our procedural ones, since no others were given.
-    """
-
-    sets: tuple[str, ...]
-    text: str
-    own: bool
-
-
-@dataclass
-class SuiteResult:
-    """What the suite measured.
-
-    Attributes:
-        policies: Names, in order.
-        objects: By group.
-        conditions: Those that were asked for.
-        quick: Whether this is the reduced suite.
-        found: Comparison of one policy by the names of condition and policy.
-        failed: Why a condition could not be measured, likewise.
-        late: Conditions and policies for which there was no time.
-    """
-
-    policies: tuple[str, ...]
-    objects: dict[Group, Objects]
-    conditions: tuple[Condition, ...]
-    quick: bool
-    found: dict[tuple[str, str], Comparison] = field(default_factory=dict)
-    failed: dict[tuple[str, str], str] = field(default_factory=dict)
-    late: list[tuple[str, str]] = field(default_factory=list)
-
-    @property
-    def students(self) -> tuple[str, ...]:
-        """Those of the policies that are students."""
-        return tuple(name for name in self.policies if sees_clouds(name))
-
-    @cached_property
-    def pictures(self) -> dict[Group, bytes]:
-        """PNG with the objects of each group."""
-        from vd.assets_usd.objects.model import load_set
-        from vd.assets_usd.objects.sheet import pictures
-
-        return {group: pictures(load_set(list(objects.sets))) for group, objects in self.objects.items()}
-
-    def merged(self, *conditions: str) -> Comparison | None:
-        """The comparisons of conditions as one of all policies and groups; None if there is none.
-
-        Without the success criteria of training: the paper's evaluations do not ask for stillness.
-        """
-        parts = [
-            self.found[condition, policy]
-            for condition in conditions
-            for policy in self.policies
-            if (condition, policy) in self.found
-        ]
-        if not parts:
-            return None
-        return Comparison(
-            rows=tuple(row for part in parts for row in part.rows if row.stopped_by != SUCCESS),
-            predictions=tuple(entry for part in parts for entry in part.predictions),
-            software=parts[0].software,
-        )
-
-    def summary(self) -> dict[str, Any]:
-        """The paper's figures beside ours, as JSON."""
-        names = {condition.name for condition in self.conditions}
-        return {
-            "quick": self.quick,
-            "objects": {group: to_dict(objects) for group, objects in self.objects.items()},
-            "students": list(self.students) or NO_STUDENT,
-            "figures": [self._figure(claim) for claim in CLAIMS if claim.condition in names],
-            "failed": [
-                {"condition": condition, "policy": policy, "why": why}
-                for (condition, policy), why in self.failed.items()
-            ],
-            "out of time": [list(pair) for pair in self.late],
-        }
-
-    def _figure(self, claim: Claim) -> dict[str, Any]:
-        def value(comparison: Comparison) -> Any:
-            found = claim.of(comparison)
-            return to_dict(found) if isinstance(found, Interval) else found
-
-        return {
-            "figure": claim.text,
-            "condition": claim.condition,
-            "unit": claim.unit,
-            "stopped_by": claim.stopped_by,
-            "paper": None if claim.paper is None else list(getattr(PAPER.results, claim.paper)),
-            "source": claim.source,
-            "ours": {
-                policy: value(self.found[claim.condition, policy])
-                for policy in self.policies
-                if (claim.condition, policy) in self.found
-            },
-        }
-
-
-def run_suite(cfg: "EvalCfg", *, say: Callable[[str], object] | None = None) -> SuiteResult:
+def run_suite(cfg: EvalCfg, *, say: Callable[[str], object] | None = None) -> SuiteResult:
     """Run what is not there yet, and write the page and its figures into ``cfg.output``.
 
     Args:
@@ -205,7 +95,7 @@ def run_suite(cfg: "EvalCfg", *, say: Callable[[str], object] | None = None) -> 
     return result
 
 
-def _tasks(cfg: "EvalCfg", result: SuiteResult) -> list["_Task"]:
+def _tasks(cfg: EvalCfg, result: SuiteResult) -> list["_Task"]:
     """Everything that is to be measured. All names are looked up here, before anything slow."""
     short = labels(result.policies)
     views = {name: has_second_view(name) for name in result.policies}
@@ -235,7 +125,7 @@ class _Task:
 
     condition: str
     policy: str
-    cfg: "EvalCfg"
+    cfg: EvalCfg
     weights: str
     """Fingerprint of the policy."""
     text: str
@@ -303,7 +193,7 @@ def _keep(task: _Task, failure: str, result: SuiteResult, progress: _Progress) -
 
 
 def _run_together(
-    tasks: Sequence[_Task], cfg: "EvalCfg", result: SuiteResult, progress: _Progress, stop_at: float
+    tasks: Sequence[_Task], cfg: EvalCfg, result: SuiteResult, progress: _Progress, stop_at: float
 ) -> None:
     """Evaluate in processes side by side, those of students first, which take longest."""
     import warp as wp
@@ -332,7 +222,7 @@ def _run_together(
     )
 
 
-def settings(cfg: "EvalCfg", condition: Condition, policy: str, objects: Objects) -> "EvalCfg":
+def settings(cfg: EvalCfg, condition: Condition, policy: str, objects: Objects) -> EvalCfg:
     """The evaluation of one policy under a condition: what ``vd-eval`` would be told."""
     episodes, most = condition.episodes, QUICK_EPISODES
     if sees_clouds(policy):
