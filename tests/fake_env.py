@@ -59,6 +59,7 @@ class FakeEnv:
         self.observation = zeros((n, self.num_observations))
         self.reward, self.reward_terms = zeros(n), zeros((n, 3))
         self.success, self.fell = zeros(n, wp.int32), zeros(n, wp.int32)
+        self.still, self.smoothed = zeros(n, wp.int32), zeros((n, self.num_actions))
         self.timed_out, self.done = zeros(n, wp.int32), zeros(n, wp.int32)
         self.rotation_error, self.goal_quat = zeros(n), zeros(n, wp.quat)
         self.step_count, self.goals_reached = zeros(n, wp.int32), zeros(n, wp.int32)
@@ -105,6 +106,7 @@ class FakeEnv:
         timed_out = (steps >= self.max_episode_steps) & ~success & ~fell
         done = success | fell | timed_out
         for array, value in (
+            (self.still, still),
             (self.success, success),
             (self.fell, fell),
             (self.timed_out, timed_out),

@@ -8,11 +8,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from fake_env import FakeObject
-from test_evaluate_rollout import CUBE, result_of
+from test_evaluate_rollout import CUBE, rows_of
 
-from vd.evaluate.plots import MAX_OBJECTS_DRAWN, ecdf_figure, violin_figure
-from vd.evaluate.report import terminal_table, warning_lines, write_report
-from vd.evaluate.result import EvalResult
+from vd.evaluate.comparison import Comparison
+from vd.evaluate.comparison_page import ecdf_figure, terminal_text, write_comparison
+from vd.evaluate.plots import MAX_OBJECTS_DRAWN, violin_figure
 
 PNG = b"\x89PNG\r\n\x1a\n"
 
@@ -45,27 +45,35 @@ def read_page(path):
 
 
 @pytest.fixture(scope="module")
-def result():
-    return result_of(
-        [FakeObject("a"), FakeObject("b<i>", CUBE), FakeObject("c")], episodes=12, fall_at={0: 1}
+def found():
+    """One policy."""
+    objects = [FakeObject("a"), FakeObject("b<i>", CUBE, ("open: a sheet",)), FakeObject("c")]
+    return Comparison(tuple(rows_of(objects, episodes=12, fall_at={0: 1})), (), software={"torch": "2"})
+
+
+def page_of(found, path, **changes):
+    """The page of an evaluation whose protocol is changed."""
+    rows = (
+        replace(row, result=replace(row.result, protocol=replace(row.result.protocol, **changes)))
+        for row in found.rows
     )
+    write_comparison(replace(found, rows=tuple(rows)), path, pictures=PNG)
+    return read_page(path)
 
 
-def test_objects_with_warnings_are_listed(tmp_path, result):
-    doubtful = replace(result, warnings={"b<i>": "open: a sheet"})
-    doubtful.write(tmp_path / "eval.json")
-    write_report(EvalResult.read(tmp_path / "eval.json"), tmp_path / "report.html")
-    text, _ = read_page(tmp_path / "report.html")
+def test_objects_with_warnings_are_listed(tmp_path, found):
+    text, _ = page_of(found, tmp_path / "eval.html")
     assert "Objects with warnings" in text and "b&lt;i&gt;" in text and "open: a sheet" in text
-    assert warning_lines(doubtful.warnings) == ["warning b<i>: open: a sheet"]
-    write_report(result, tmp_path / "report.html")
-    assert "with warnings" not in read_page(tmp_path / "report.html")[0]
+    assert "warning b<i>: open: a sheet" in terminal_text(found)
+    without = replace(
+        found, rows=tuple(replace(r, result=replace(r.result, warnings={})) for r in found.rows)
+    )
+    assert "with warnings" not in page_of(without, tmp_path / "eval.html")[0]
 
 
-def test_report_is_one_offline_file_with_three_figures(tmp_path, result):
-    write_report(result, tmp_path / "report.html")
-    text, references = read_page(tmp_path / "report.html")
-    assert references.tags.count("img") == 3
+def test_the_page_is_one_offline_file_with_figures(tmp_path, found):
+    text, references = page_of(found, tmp_path / "eval.html")
+    assert references.tags.count("img") == 4, "outcomes, objects, all errors, those of each object"
     assert not {"script", "link", "iframe"} & set(references.tags)
     assert all(address.startswith("data:image/png;base64,") for address in references.addresses)
     for address in references.addresses:
@@ -74,22 +82,19 @@ def test_report_is_one_offline_file_with_three_figures(tmp_path, result):
     assert "@import" not in text and "url(" not in text
 
 
-def test_report_prints_rates_with_their_intervals_and_escapes_names(tmp_path, result):
-    write_report(result, tmp_path / "report.html")
-    text, _ = read_page(tmp_path / "report.html")
-    drop = result.overall.drop_rate
+def test_the_page_prints_rates_with_their_intervals_and_escapes_names(tmp_path, found):
+    text, _ = page_of(found, tmp_path / "eval.html")
+    drop = found.rows[0].result.overall.drop_rate
     interval = f"({100 * drop.low:.1f} to {100 * drop.high:.1f})"
     assert f"{100 * drop.value:.1f}\N{NO-BREAK SPACE}% <small>{interval}</small>" in text
     assert "b&lt;i&gt;" in text and "<i>" not in text
-    assert f"chance {100 * result.overall.chance['0.4']:.2f}" in text
-    assert "over the episodes of each object" in text
+    assert "over the episodes of each object" in text and "over whole objects" not in text
+    assert "Evaluation of zero" in text and "success criteria of training" in text
 
 
-def test_report_says_which_task_it_was(tmp_path, result):
+def test_the_page_says_which_task_it_was(tmp_path, found):
     def text_of(**changes):
-        changed = replace(result, protocol=replace(result.protocol, **changes))
-        write_report(changed, tmp_path / "task.html")
-        return read_page(tmp_path / "task.html")[0]
+        return page_of(found, tmp_path / "task.html", **changes)[0]
 
     dropped = text_of()
     assert "dropped into the hand" in dropped and "at rest" not in dropped
@@ -97,35 +102,37 @@ def test_report_says_which_task_it_was(tmp_path, result):
     assert "at rest on the table" in resting and "within 1 rad of the start" in resting
     turned = text_of(at_rest=True, max_goal_angle_rad=1.0, goals_about_vertical=True)
     assert "turned about the vertical by at most 1 rad" in turned
+    assert "randomisation mixed" in text_of(condition="mixed", randomised=True)
 
 
-def test_ecdf_ends_at_one_minus_the_drop_rate(result):
-    axes = ecdf_figure(result).axes[0]
-    pooled = next(line for line in axes.lines if line.get_label() == "all episodes")
-    assert pooled.get_ydata()[-1] == pytest.approx(1 - 1 / 36)
-    assert np.all(np.diff(pooled.get_ydata()) >= 0)
+def test_ecdf_ends_at_one_minus_the_drop_rate(found):
+    own = ecdf_figure(found).axes[0].lines[0]
+    assert own.get_label() == "zero"
+    assert own.get_ydata()[-1] == pytest.approx(1 - 1 / 36)
+    assert np.all(np.diff(own.get_ydata()) >= 0)
 
 
 def test_many_objects_are_thinned_to_a_readable_number():
-    many = result_of([FakeObject(f"o{i}") for i in range(MAX_OBJECTS_DRAWN + 12)], episodes=3)
+    many = rows_of([FakeObject(f"o{i}") for i in range(MAX_OBJECTS_DRAWN + 12)], episodes=3)[0].result
     assert len(violin_figure(many).axes[0].get_yticks()) == MAX_OBJECTS_DRAWN
     assert many.overall.unit == "object"
 
 
-def test_terminal_table_is_aligned(result):
-    lines = terminal_table(result).splitlines()
-    assert len({len(line) for line in lines}) == 1
-    assert len(lines) == 1 + 1 + 3
+def test_the_terminal_shows_every_rule_and_every_object_of_a_single_policy(found):
+    ways, objects, *_ = terminal_text(found).split("\n\n")
+    assert len(ways.splitlines()) == 1 + 2
+    heading, *lines = objects.splitlines()
+    assert heading == "zero, objects, stopped by true distance"
+    assert len({len(line) for line in lines}) == 1 and len(lines) == 1 + 1 + 3
+    two = replace(found, rows=found.rows + tuple(replace(row, policy="random") for row in found.rows))
+    assert "<= 0.8 rad" not in terminal_text(two)
 
 
-def test_pages_print_no_absolute_paths(tmp_path, result):
+def test_pages_print_no_absolute_paths(tmp_path, found):
+    rows = tuple(replace(row, policy="/home/me/runs/a/policy.pt") for row in found.rows)
     where = dict(
         policy="/home/me/runs/a/policy.pt", objects="/data/meshes/mugs, cube", hand="/opt/my/hand.usda"
     )
-    write_report(
-        replace(result, protocol=replace(result.protocol, **where)), tmp_path / "r.html", pictures=PNG
-    )
-    text, references = read_page(tmp_path / "r.html")
+    text, _ = page_of(replace(found, rows=rows), tmp_path / "r.html", **where)
     assert not any(root in text for root in ("/home", "/data", "/opt"))
     assert "a/policy.pt" in text and "meshes/mugs, cube" in text and "my/hand.usda" in text
-    assert references.tags.count("img") == 4, "the objects too"

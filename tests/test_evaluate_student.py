@@ -192,7 +192,7 @@ def test_students_and_teacher_side_by_side(tmp_path, capsys):
         ("teacher", "state"),
         ("zero", "nothing"),
     }
-    assert len(comparison.rows) == 2 * (2 + 2 + 1 + 1) and len(comparison.predictions) == 4
+    assert len(comparison.rows) == 2 * (2 + 2 + 2 + 2) and len(comparison.predictions) == 4
     alone, both = (next(row for row in comparison.rows if row.group == g) for g in comparison.groups)
     assert alone.result.object_names == ("cuboid",) and both.result.object_names == ("cube", "cuboid")
     assert [e.error_rad for e in alone.result.episodes] == [e.error_rad for e in both.result.episodes[2:]]

@@ -11,7 +11,7 @@ from fake_env import FakeEnv, FakeObject
 from scipy.spatial.transform import Rotation
 
 from vd.evaluate.compare import parse_groups
-from vd.evaluate.comparison import OUTCOMES, OWN_NORM, Comparison, judge, ways_to_stop
+from vd.evaluate.comparison import OUTCOMES, OWN_NORM, SUCCESS, Comparison, judge, ways_to_stop
 from vd.evaluate.comparison_page import labels, terminal_table, write_comparison
 from vd.evaluate.result import Protocol
 from vd.evaluate.trace import NEVER_RAD, record
@@ -47,7 +47,6 @@ class Turner:
 
 def fake_env(objects=(FakeObject("a"),), worlds=1, steps=12, **settings):
     env = FakeEnv(objects, num_worlds=worlds, max_episode_steps=steps, tolerance=NEVER_RAD, **settings)
-    env.smoothed = wp.zeros((worlds, env.num_actions), dtype=float, device="cpu")
     env.table = []
     env.sim.place_table = lambda present: env.table.append((int(env.step_count.numpy()[0]), present))
     return env
@@ -148,7 +147,6 @@ class HeldEnv(FakeEnv):
     def __init__(self, *args, lost=(), **settings):
         super().__init__(*args, **settings)
         self.cfg.success = SimpleNamespace(fall_m=0.24)
-        self.smoothed = wp.zeros((self.num_worlds, self.num_actions), dtype=float, device="cpu")
         self.lost, self.tables = lost, []
         self.sim.place_table = lambda present: None
         self.sim.place_tables = lambda count, last: self.tables.append((count.numpy()[0], last.numpy()[0]))
@@ -220,20 +218,39 @@ def test_success_is_reported_at_the_stop_and_after_the_hold():
     assert [row.held.value for row in rows] == [0.75, 0.75, 0.75]
 
 
+def test_what_predicts_nothing_is_judged_by_the_success_criteria_of_training_too():
+    """It comes within 0.4 rad after five steps and is not still before the seventh."""
+    trace = traced(policy={"until": 6})
+    told = dict(kind="teacher", sees="state", group="g", rules=lambda _: StoppingRule())
+    rows, _ = judge(trace, protocol("p", 1), [FakeObject("a")], **told)
+    assert [row.stopped_by for row in rows] == ["true distance", SUCCESS]
+    assert [row.result.episodes[0].steps for row in rows] == [5, 7]
+    assert rows[1].result.episodes[0].error_rad == pytest.approx(0.25, abs=1e-5)
+    assert rows[1].stops_within["0.1"].value == 0.0 and rows[1].held is None
+    with pytest.raises(ValueError, match="does not know what is still"):
+        replace(trace, still=None).ends(StoppingRule(), "success")
+
+
+def test_a_world_whose_step_failed_ends_there():
+    """The simulator puts it back and lets its time run out; what follows is of another episode."""
+    env = fake_env(worlds=2)
+    step = env.step
+
+    def failing(action):
+        count = int(env.step_count.numpy()[0])
+        step(action)
+        env.done.numpy()[0] |= count == 2
+
+    env.step = failing
+    trace = record(env, Turner(env), 2, **goal_ahead(0.85, 1, 2))
+    assert trace.steps.tolist() == [[3, 12]] and not trace.fell.any()
+    assert np.isnan(trace.exact[0, 0, 4:]).all()
+
+
 def test_the_table_goes_and_comes_back():
     env = fake_env(worlds=1, steps=6)
     record(env, Turner(env), 2, **goal_ahead(1.0, 1, 2), table_steps=2)
     assert env.table == [(0, True), (2, False), (0, True), (2, False), (0, True)]
-
-
-def test_starts_that_the_environment_draws_are_the_same_for_any_policy():
-    traces = []
-    for until in (0, 100):
-        env = fake_env(worlds=2, steps=4)
-        traces.append(record(env, Turner(env, until=until), 6))
-    np.testing.assert_allclose(traces[0].start_quat, traces[1].start_quat)
-    np.testing.assert_allclose(traces[0].goal_quat, traces[1].goal_quat)
-    assert len(np.unique(traces[0].start_quat[0, :, 0])) == 6
 
 
 def protocol(name, episodes, **changes):
@@ -339,7 +356,7 @@ def test_page_and_file(tmp_path):
     ):
         assert word in html
     assert "/home" not in html and "/data" not in html
-    assert html.count("<img") == 4 and "http" not in html.replace("http://www.w3.org", "")
+    assert html.count("<img") == 5 and "http" not in html.replace("http://www.w3.org", "")
     assert "orientation error" in terminal_table(comparison)
     (tmp_path / "x.json").write_text('{"format": 1}')
     with pytest.raises(ValueError, match="run vd-eval again"):

@@ -236,7 +236,7 @@ def test_video_of_the_real_environment(tmp_path):
 @pytest.mark.slow
 def test_evaluation_of_the_real_environment(tmp_path):
     from vd.evaluate.cli import main
-    from vd.evaluate.result import EvalResult
+    from vd.evaluate.comparison import Comparison
 
     flags = [
         "--agent",
@@ -251,10 +251,11 @@ def test_evaluation_of_the_real_environment(tmp_path):
         "cpu",
     ]
     assert main([*flags, "--output", str(tmp_path)]) == 0
-    result = EvalResult.read(tmp_path / "eval.json")
+    rows = Comparison.read(tmp_path / "eval.json").rows
+    result = rows[0].result
     assert len(result.episodes) == 4
     assert all(episode.steps == 6 or episode.stopped or episode.fell for episode in result.episodes)
     assert (tmp_path / "eval.html").stat().st_size > 20_000
     # The same again gives the same: starts, goals and, on a CPU, every error.
     assert main([*flags, "--output", str(tmp_path / "again")]) == 0
-    assert EvalResult.read(tmp_path / "again" / "eval.json").episodes == result.episodes
+    assert Comparison.read(tmp_path / "again" / "eval.json").rows == rows
