@@ -89,6 +89,7 @@ def test_the_page_prints_rates_with_their_intervals_and_escapes_names(tmp_path, 
     assert f"{100 * drop.value:.1f}\N{NO-BREAK SPACE}% <small>{interval}</small>" in text
     assert "b&lt;i&gt;" in text and "<i>" not in text
     assert "over the episodes of each object" in text and "over whole objects" not in text
+    assert "0.4 rad in 0.34 %" in text, "by chance"
     assert "Evaluation of zero" in text and "success criteria of training" in text
 
 

@@ -135,6 +135,7 @@ def write_comparison(comparison: Comparison, path: Path, *, pictures: bytes | No
         objects=[(_heading(row, short), _object_cells(row)) for row in rows],
         object_header=_OBJECT_HEADER,
         protocol=_protocol(comparison),
+        chance={f"{float(name):g}": 100.0 * share for name, share in rows[0].result.overall.chance.items()},
         chance_mean=f"{CHANCE_MEAN_RAD:.2f}",
         units={row.result.overall.unit for row in rows},
     )
