@@ -258,7 +258,8 @@ class _Stops:
 
 def _rows(array: wp.array, worlds: int) -> torch.Tensor:
     """An array of all worlds with a row for each, sharing its memory."""
-    return wp.to_torch(array).view(worlds, -1)
+    rows = wp.to_torch(array).view(worlds, -1)
+    return rows.view(torch.int32) if rows.dtype == torch.uint32 else rows  # torch cannot index the other
 
 
 def _int_arrays(env: Any, *values: Any) -> list[wp.array]:
