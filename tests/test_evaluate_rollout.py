@@ -11,7 +11,7 @@ from vd.evaluate.result import TOLERANCES_RAD, Protocol, summarise
 from vd.evaluate.rollout import draw_starts_and_goals
 from vd.evaluate.statistics import rotation_angle
 from vd.evaluate.trace import NEVER_RAD, record
-from vd.student.stopping import StoppingRule
+from vd.stopping import StoppingRule
 
 CONTROL_HZ = 12.0
 CUBE = Rotation.create_group("O").as_quat()

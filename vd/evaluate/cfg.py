@@ -119,7 +119,7 @@ class EvalCfg:
     """What intervals speak about: objects (from 8 of them) or episodes within objects."""
     num_worlds: int | None = None
     """Worlds simulated at once; by default as many as episodes, up to 64 on a CPU and 8192 on a GPU (1024
-    with students)."""
+    with camera policies)."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
     output: Path = Path("runs/eval")

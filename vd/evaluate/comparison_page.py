@@ -44,7 +44,7 @@ _HEADER = (
 """Of the headline, which is against the very goal but for one column."""
 _REST_HEADER = ("policy", "objects", "stopped by", *OUTCOMES[1:], "time to stop [s]")
 _BOUND_HEADER = (
-    "student",
+    "policy",
     "objects",
     "bound [rad]",
     "near and seen so",
@@ -405,7 +405,7 @@ def _protocol(comparison: Comparison) -> list[tuple[str, str]]:
         rows.append(("friction of the table", f"{protocol.table_friction:g}"))
     known = {"mesh": "the exact mesh", "points": "500 exact points", "scan": "500 points of a scan"}
     if comparison.predictions:
-        rows.append(("students know shapes and goals by", known[protocol.goals]))
+        rows.append(("camera policies know shapes and goals by", known[protocol.goals]))
     norm = f"{PAPER.success.action_norm:g}, as in the released code"
     rows.append(("stops", f"bound of the action's norm {norm}"))
     by_group = {row.group: row.result.protocol.objects for row in comparison.rows}
