@@ -1,4 +1,4 @@
-"""What a policy remembers of its own observations, and how the true state differs from what it sees.
+"""What a policy remembers of its own observations.
 
 World frame (z up), quaternions xyzw. A frame is told by how the scene differed from the present one, so that
 it needs neither the goal nor the axes of the object's file, and small changes are of order one: joint
@@ -25,11 +25,6 @@ POSE_VALUES = 6
 def frame_size(joints: int) -> int:
     """Values of one frame of the history, H."""
     return 2 * joints + POSE_VALUES
-
-
-def truth_size(joints: int) -> int:
-    """Values by which the true state differs from what is seen: joints, object's way, rotation."""
-    return joints + POSE_VALUES
 
 
 @wp.func
@@ -159,43 +154,4 @@ def history_kernel(
     seen = seen_rotation(world, rotation_column, observation, goal_quat_in[world])
     turn = small_rotation(read_quat(row, 2 * joints + 3, past_in), seen)
     out = write_vec3(world, out + 2 * joints, way / wp.static(POSITION_UNIT_M), observation)
-    write_vec3(world, out, turn / wp.static(ROTATION_UNIT_RAD), observation)
-
-
-@wp.kernel
-def truth_kernel(
-    # Model:
-    joint_lower: wp.array[float],
-    joint_upper: wp.array[float],
-    position_column: int,
-    rotation_column: int,
-    column: int,
-    # In:
-    joint_q_in: wp.array2d[float],
-    goal_quat_in: wp.array[wp.quat],
-    # In/Out:
-    observation: wp.array2d[float],
-):
-    """How the true state differs from what is observed, for a critic, in the units of a frame. Launch: [N].
-
-    Args:
-        joint_lower: Lower joint limits [rad], shape [D].
-        joint_upper: Upper joint limits [rad], shape [D].
-        position_column: Column of the object's position.
-        rotation_column: Column of its rotation from the goal.
-        column: First of the D + 6 columns: joint positions, object's way, rotation.
-        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
-        goal_quat_in: The goal as it is observed, shape [N].
-        observation: Observation in the world frame, shape [N, *].
-    """
-    world = wp.tid()
-    joints = joint_lower.shape[0]
-    for joint in range(joints):
-        span = joint_upper[joint] - joint_lower[joint]
-        position = 2.0 * (joint_q_in[world, joint] - joint_lower[joint]) / span - 1.0
-        observation[world, column + joint] = (position - observation[world, joint]) / wp.static(JOINT_UNIT)
-    way = read_vec3(world, joints, joint_q_in) - read_vec3(world, position_column, observation)
-    seen = seen_rotation(world, rotation_column, observation, goal_quat_in[world])
-    turn = small_rotation(read_quat(world, joints + 3, joint_q_in), seen)
-    out = write_vec3(world, column + joints, way / wp.static(POSITION_UNIT_M), observation)
     write_vec3(world, out, turn / wp.static(ROTATION_UNIT_RAD), observation)

@@ -158,7 +158,7 @@ def told(env: ReorientEnv, name: str) -> np.ndarray:
 @pytest.mark.parametrize("view", ["world", "goal"])
 def test_dynamics_are_told_in_the_order_of_the_joints_that_are_seen(view):
     random = dataclasses.replace(CONDITIONS["mixed"], force_probability=0.0)
-    env = make(randomisation=random, observation=ObservationCfg(dynamics="actor", view=view))
+    env = make(randomisation=random, observation=ObservationCfg(dynamics="critic", view=view))
     run(env, 2)
     rows = env.sim.servo.parameters.numpy().reshape(WORLDS, 9, -1)
     order, drawn = np.tile(np.arange(9), (WORLDS, 1)), env.randomiser
@@ -193,21 +193,48 @@ def test_only_the_critic_is_told_and_nothing_varies_where_nothing_is_drawn():
     plain = make(randomisation=RandomisationCfg(enabled=False))
     assert env.num_observations == plain.num_observations
     np.testing.assert_array_equal(run(env, 3)["seen"], run(plain, 3)["seen"])
-    np.testing.assert_allclose(env.privileged.numpy(), 0.0, atol=2e-4)
-    assert env.privileged.shape[1] == dynamics.dynamics_size(9) + history.truth_size(9)
+    np.testing.assert_allclose(told(env, "dynamics"), 0.0, atol=2e-4)
+    np.testing.assert_array_equal(told(env, "present"), env.observation.numpy())
+    assert env.privileged.shape[1] == dynamics.dynamics_size(9) + env.num_observations
+    assert env.num_present == env.num_observations and plain.num_present == 0
 
 
-def test_the_critic_is_told_the_way_from_what_is_seen_to_what_is_true():
-    env = make(randomisation=late(STEP_S), observation=ObservationCfg(dynamics="critic", file_axes=False))
-    out = run(env, 5)
-    truth, before, now = told(env, "truth"), out["state"][-2], out["state"][-1]
-    span = np.asarray(env.hand.upper) - np.asarray(env.hand.lower)
-    joints = 2.0 * (now - before)[:, :9] / span / history.JOINT_UNIT
-    way = (now - before)[:, 9:12] / history.POSITION_UNIT_M
-    turn = (Rotation.from_quat(now[:, 12:16]) * Rotation.from_quat(before[:, 12:16]).inv()).as_quat(True)
-    wanted = np.hstack([joints, way, 2.0 * turn[:, :3] / history.ROTATION_UNIT_RAD])
-    np.testing.assert_allclose(truth, wanted, atol=1e-3)
-    assert np.abs(wanted).max() > 0.1
+@pytest.mark.parametrize("view", ["world", "goal", "mirrored"])
+def test_the_critic_is_told_the_present_as_it_would_be_seen_at_once_and_without_noise(view):
+    seen = ObservationCfg(shape="full", view=view, history=2)
+    random = late(STEP_S, observation_noise_std=0.1)
+    env = make(randomisation=random, observation=dataclasses.replace(seen, dynamics="critic"))
+    exact = make(observation=dataclasses.replace(seen, history=0))
+    run(env, 5)
+    out = run(exact, 5)["seen"][-1]
+    assert env.num_present == exact.num_observations
+    np.testing.assert_allclose(env.privileged.numpy()[:, -env.num_present :], out, atol=1e-5)
+    assert np.abs(env.observation.numpy()[:, : env.num_present] - out).max() > 0.1
+
+
+def test_a_share_of_the_worlds_stays_nominal():
+    mixed = CONDITIONS["mixed"]
+    random = dataclasses.replace(mixed, nominal_share=0.5, redraw_s=0.0, force_probability=1.0)
+    env = make(randomisation=random, num_worlds=8, episode_s=0.25)
+    for _ in range(4):  # new episodes draw again, and it is the same worlds that do not
+        rows = env.sim.servo.parameters.numpy().reshape(8, 9, -1)
+        varied = {
+            "stiffness": env.randomiser.kp.numpy()[:, 0] != np.float32(env.hand.kp[0]),
+            "friction": env.randomiser.hand_friction.numpy() != np.float32(0.8),
+            "mass": env.randomiser.object_mass.numpy() != np.float32(0.1),
+            "delay": rows[:, 0, actuators.COMMAND_DELAY] != 0.0,
+            "backlash": rows[:, 0, actuators.BACKLASH_WIDTH] != 0.0,
+            "latency": env.observer.seen.latency.numpy() != 0.0,
+        }
+        first = varied["latency"]
+        assert first.sum() == 4
+        for name, worlds in varied.items():
+            assert worlds.tolist() == first.tolist(), name
+        for _ in range(3):
+            env.action.fill_(0.2)
+            env.step(env.action)
+        assert (np.linalg.norm(env.randomiser.force.numpy(), axis=1) > 0.0).tolist() == first.tolist()
+    assert env.timed_out.numpy().all(), "episodes ended on the way"
 
 
 def test_a_saved_memory_goes_on_exactly():
@@ -262,6 +289,7 @@ def test_a_force_gives_its_impulse_in_the_time_it_acts(force_s, share, sim):
         ({"observation": ObservationCfg(history=-1)}, "observation.history"),
         ({"randomisation": late(0.7)}, "randomisation.observation_latency_s"),
         ({"randomisation": RandomisationCfg(force_s=0.0)}, "randomisation.force_s"),
+        ({"randomisation": RandomisationCfg(nominal_share=1.5)}, "randomisation.nominal_share"),
     ],
 )
 def test_settings_that_cannot_work_are_named(changes, message):

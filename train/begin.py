@@ -92,7 +92,13 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
             "was trained with"
         ) from error
     run = replace(base.run, run_dir=Path("runs") / f"from-{Path(name).stem}")
-    return replace(base, run=run, ppo=replace(ppo, critic_warmup_iterations=None), policy=policy, env=env)
+    return replace(
+        base,
+        run=run,
+        ppo=replace(ppo, critic_warmup_iterations=None, imitation_iterations=0),
+        policy=policy,
+        env=env,
+    )
 
 
 def warmup_iterations(state: Mapping[str, Any], wanted: int | None) -> int:

@@ -169,6 +169,8 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
         load_checkpoint(init, flag="--init")  # a damaged one is refused before anything is built
     if cfg.init is None and cfg.init_stage is not None:
         raise ValueError("--init-stage says where a run with --init begins; leave it out, or give --init")
+    if cfg.init is None and cfg.ppo.imitation_iterations:
+        raise ValueError("--ppo.imitation-iterations imitates the policy that --init names; give --init too")
 
     import torch
 
@@ -266,7 +268,8 @@ def _print_begin(cfg: TeacherCfg, runner: "TeacherRunner") -> None:
     if runner.new_inputs:
         print(f"{runner.new_inputs} observed values are new to the networks and start without effect")
     if runner.critic_warmup:
-        print(f"the critic learns alone for {runner.critic_warmup} iterations, the actor stays as it is")
+        actor = "stays as it is" if runner.imitation is None else "imitates what it began from"
+        print(f"the critic learns alone for {runner.critic_warmup} iterations, the actor {actor}")
     for difference in runner.unlike:
         print(f"the policy was trained with other observations or actions: {difference}")
 

@@ -56,6 +56,12 @@ class PpoCfg:
     """Iterations at the begin of a run in which the critic learns alone; the actor acts and stays as it is.
     None: as many as what --init begins from needs, 50 without a critic, 3 without an optimiser, else 0."""
 
+    imitation_iterations: int = 0
+    """Iterations after --init in which the actor imitates, in what it does itself, the policy that it began
+    from, which sees the present state and shape (--env.observation.dynamics); the critic learns alone."""
+    imitation_learning_rate: float = 1e-3
+    """The actor's rate at the begin of that; it falls to zero."""
+
 
 @dataclass
 class PolicyCfg:
@@ -130,6 +136,7 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
         "--ppo.epochs": ppo.epochs,
         "--ppo.actor-learning-rate": ppo.actor_learning_rate,
         "--ppo.critic-learning-rate": ppo.critic_learning_rate,
+        "--ppo.imitation-learning-rate": ppo.imitation_learning_rate,
         "--ppo.desired-kl": ppo.desired_kl,
         "--ppo.clip": ppo.clip,
         "--ppo.grad-norm": ppo.grad_norm,
@@ -144,10 +151,13 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
         if not value > 0:
             raise ValueError(f"{flag} is {value}; it has to be positive")
     run.check_kept()
-    if ppo.critic_warmup_iterations is not None and ppo.critic_warmup_iterations < 0:
-        raise ValueError(
-            f"--ppo.critic-warmup-iterations is {ppo.critic_warmup_iterations}; it has to be zero or positive"
-        )
+    iterations = {
+        "--ppo.critic-warmup-iterations": ppo.critic_warmup_iterations or 0,
+        "--ppo.imitation-iterations": ppo.imitation_iterations,
+    }
+    for flag, count in iterations.items():
+        if count < 0:
+            raise ValueError(f"{flag} is {count}; it has to be zero or positive")
     if ppo.bound_coefficient < 0.0:
         raise ValueError(f"--ppo.bound-coefficient is {ppo.bound_coefficient}; it has to be zero or positive")
     for flag, share in {"--ppo.gamma": ppo.gamma, "--ppo.gae-lambda": ppo.gae_lambda}.items():

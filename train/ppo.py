@@ -23,6 +23,8 @@ ACTION_BOUND = 1.0
 """The environment clips actions to this; a mean beyond it changes nothing but how far it is to come back."""
 STATISTICS = ("surrogate", "value", "entropy", "kl", "clip_fraction", "grad_norm", "beyond_bound")
 """What every minibatch reports."""
+OBSERVED = "observed "
+"""How the names of samples begin that are observations, before that of their group."""
 ACTOR_GROUP, CRITIC_GROUP = 0, 1
 """Optimiser groups. rsl-rl reads the learning rate it reports from group 0, so the actor is first."""
 
@@ -64,6 +66,7 @@ class TeacherPPO(PPO):
             advantages, which would unlearn an actor that has learned; so it learns alone first. The actor's
             gradients go through Adam meanwhile, at a rate of zero: its first step then has moments to go by,
             where one without would move every weight by the whole rate, whatever its gradient.
+        samples: The latest rollout as rows, by name; observations begin with :data:`OBSERVED`.
     """
 
     optimizer: Any
@@ -87,7 +90,7 @@ class TeacherPPO(PPO):
         self.actor_learns = True
         self._parameters = [*self.actor.parameters(), *self.critic.parameters()]
         # The rollout as rows of samples, in the same memory in every update, and the rows of a minibatch.
-        self._samples: dict[str, torch.Tensor] = {}
+        self.samples: dict[str, torch.Tensor] = {}
         self._rows = torch.zeros(self._minibatch_size, dtype=torch.long, device=self.device)
         self._gradients = Recorded(
             self._compute_gradients,
@@ -124,7 +127,7 @@ class TeacherPPO(PPO):
         group = self.optimizer.param_groups[ACTOR_GROUP]
         group["lr"] = self.learning_rate if self.actor_learns else 0.0
         self._take_samples()
-        steps = torch.stack([self._minibatch_step(rows) for rows in self._minibatches()])
+        steps = torch.stack([self._minibatch_step(rows) for rows in self.minibatches()])
         group["lr"] = self.learning_rate
         if self.actor_learns:
             if self.schedule == "adaptive":
@@ -152,14 +155,14 @@ class TeacherPPO(PPO):
             "advantages": storage.advantages.flatten(),
             "returns": storage.returns.flatten(),
         }
-        rollout |= {f"observed {key}": value.flatten(0, 1) for key, value in storage.observations.items()}
+        rollout |= {OBSERVED + key: value.flatten(0, 1) for key, value in storage.observations.items()}
         rollout |= {f"old {i}": value.flatten(0, 1) for i, value in enumerate(storage.distribution_params)}
-        if not self._samples:
-            self._samples = {name: torch.empty_like(tensor) for name, tensor in rollout.items()}
+        if not self.samples:
+            self.samples = {name: torch.empty_like(tensor) for name, tensor in rollout.items()}
         for name, tensor in rollout.items():
-            self._samples[name].copy_(tensor)
+            self.samples[name].copy_(tensor)
 
-    def _minibatches(self) -> Iterator[torch.Tensor]:
+    def minibatches(self) -> Iterator[torch.Tensor]:
         """Rows of samples, permuted anew in every epoch; a remainder is left out at random."""
         samples, size = self.storage.num_envs * self.storage.num_transitions_per_env, self._minibatch_size
         for _ in range(self.num_learning_epochs):
@@ -184,10 +187,8 @@ class TeacherPPO(PPO):
         Returns:
             :data:`STATISTICS`, shape [7], on the device.
         """
-        batch = {name: tensor[self._rows] for name, tensor in self._samples.items()}
-        observed = {
-            name.removeprefix("observed "): t for name, t in batch.items() if name.startswith("observed ")
-        }
+        batch = {name: tensor[self._rows] for name, tensor in self.samples.items()}
+        observed = {name.removeprefix(OBSERVED): t for name, t in batch.items() if name.startswith(OBSERVED)}
         observations = TensorDict(observed, batch_size=[len(self._rows)])
         old = tuple(tensor for name, tensor in batch.items() if name.startswith("old "))
         # Without the sample that the actor's own forward pass would draw.

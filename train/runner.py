@@ -31,10 +31,11 @@ from vd.train.checkpoint import (
 from vd.train.config import ACTIVATION, PolicyCfg, PpoCfg, RunCfg, rsl_rl_config, validate
 from vd.train.distributed import Processes, join_processes, watch_iteration
 from vd.train.ending import EndRequest, Interrupted, TrainingDivergedError
+from vd.train.imitate import IMITATED, Imitation, begin_imitation, resumed_imitation
 from vd.train.metrics import GoalWindow, ProgressFile, StepMeans
 from vd.train.ppo import TeacherPPO
 from vd.train.progress import ProgressLine
-from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
+from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv, all_values
 from vd.train.widen import new_inputs, widen
 
 POLICY_NAME = "policy.pt"
@@ -64,6 +65,7 @@ class TeacherRunner(OnPolicyRunner):
         new_episodes: Why the checkpoint that was loaded could not restore the worlds; empty if it did.
         new_inputs: Observed values that the networks of that checkpoint did not read.
         critic_warmup: Iterations left in which the critic learns alone (``PpoCfg.critic_warmup_iterations``).
+        imitation: What the actor does meanwhile, if anything (``PpoCfg.imitation_iterations``).
         begun: Whether this run began from another one's networks, in this process.
         unlike: What observations and actions mean otherwise than to the policy that the run began from.
         damaged: Newer checkpoints than the one that was loaded, and what is wrong with them.
@@ -103,6 +105,7 @@ class TeacherRunner(OnPolicyRunner):
         self.new_episodes = ""
         self.new_inputs = 0
         self.critic_warmup = ppo.critic_warmup_iterations or 0
+        self.imitation: Imitation | None = None
         self.begun = False
         self.unlike: list[str] = []
         self.damaged: dict[Path, str] = {}
@@ -216,6 +219,8 @@ class TeacherRunner(OnPolicyRunner):
         collected = time.perf_counter()
         self.alg.actor_learns = self.critic_warmup == 0
         losses = self.alg.update()
+        if self.imitation is not None and self.critic_warmup:
+            losses |= self.imitation.update(self.critic_warmup / self.ppo.imitation_iterations)
         self.critic_warmup = max(0, self.critic_warmup - 1)
         self._check_update(losses)
         end = time.perf_counter()
@@ -302,6 +307,7 @@ class TeacherRunner(OnPolicyRunner):
         check_fit(state, self._spec(), self.task, path)
         self.unlike = unlike(state["task"], self.task)
         warmup = warmup_iterations(state, self.ppo.critic_warmup_iterations)
+        before = state
         state = self._widened(state)
         state = without_worlds(completed(state, self.alg.save() | {"window": self._window.state_dict()}))
         if stage is not None:
@@ -309,9 +315,9 @@ class TeacherRunner(OnPolicyRunner):
         self._restore(state, path, None, True)
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.begun, self.new_episodes = True, "it is of another run"
-        self.critic_warmup = warmup
-        self._best = None
-        self._window = self._new_window()
+        self.imitation = begin_imitation(self.alg, self.ppo, self.env.num_present, before, path)
+        self.critic_warmup = warmup if self.imitation is None else self.ppo.imitation_iterations
+        self._best, self._window = None, self._new_window()
 
     def _restore(self, state: dict[str, Any], path: str, load_cfg: dict | None, strict: bool) -> dict:
         """Take over a checkpoint that was read; see :meth:`load`."""
@@ -327,6 +333,7 @@ class TeacherRunner(OnPolicyRunner):
             self.env_steps = state["env_steps"]
             self._elapsed_s = state["elapsed_s"]
             self.critic_warmup = state.get("critic_warmup", 0)
+            self.imitation = resumed_imitation(self.alg, self.ppo, self.env.num_present, state)
             self._best = tuple(state["best"]) if state["best"] is not None else None
             self._window.load_state_dict(state["window"])
             self._load_worlds(state["ranks"])
@@ -368,7 +375,7 @@ class TeacherRunner(OnPolicyRunner):
         if self.is_distributed:
             ranks = [None] * self.gpu_world_size
             torch.distributed.all_gather_object(ranks, mine)
-        return self.alg.save() | {
+        state = {
             "iter": self.current_learning_iteration,
             "infos": infos,
             "env_steps": self.env_steps,
@@ -381,6 +388,9 @@ class TeacherRunner(OnPolicyRunner):
             "learner": {"ppo": to_dict(self.ppo), "policy": to_dict(self.policy_cfg)},
             "task": self.task,
         }
+        if self.imitation is not None and self.critic_warmup:
+            state[IMITATED] = self.imitation.teacher.state_dict()
+        return self.alg.save() | state
 
     def _spec(self) -> PolicySpec:
         """Shape of the actor."""
@@ -420,7 +430,7 @@ class TeacherRunner(OnPolicyRunner):
         storage = self.alg.storage
         # In the order in which a step makes them.
         tensors = (
-            ("observations", torch.cat((_all_values(storage.observations), _all_values(latest)[None]))),
+            ("observations", torch.cat((all_values(storage.observations), all_values(latest)[None]))),
             ("values", storage.values),
             ("actions", storage.actions),
             ("rewards", storage.rewards),
@@ -487,8 +497,3 @@ class TeacherRunner(OnPolicyRunner):
         """
         if self.is_distributed:
             torch.distributed.destroy_process_group()
-
-
-def _all_values(observations: TensorDict) -> torch.Tensor:
-    """Everything that is observed [..., O + P]."""
-    return torch.cat(tuple(observations.values()), dim=-1)

@@ -44,6 +44,7 @@ class ReorientVecEnv(VecEnv):
     Attributes:
         num_envs: Worlds N.
         num_actions: Actions D.
+        num_present: Values of the present state and shape, the last of those that the critic alone reads.
         max_episode_length: Control steps of an episode.
         device: Torch device of every tensor.
         cfg: The environment's configuration as a dictionary.
@@ -58,6 +59,7 @@ class ReorientVecEnv(VecEnv):
             self._world, self._view = wp.to_torch(env.world_observation), wp.to_torch(env.views.view)
         self.num_envs = env.num_worlds
         self.num_actions = env.num_actions
+        self.num_present = env.num_present
         self.max_episode_length = env.max_episode_steps
         self.device = str(wp.device_to_torch(env.device))
         self.cfg: dict[str, Any] = to_dict(env.cfg)
@@ -201,3 +203,8 @@ class ReorientVecEnv(VecEnv):
     def close(self) -> None:
         """Release the simulation."""
         self.env.close()
+
+
+def all_values(observations: TensorDict) -> torch.Tensor:
+    """Everything that is observed [..., O + P]."""
+    return torch.cat(tuple(observations.values()), dim=-1)

@@ -245,10 +245,10 @@ def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
     from vd.kernels.shapes import shape_observation_size
 
     seen = task.observation
-    if seen.history or seen.dynamics == "actor":
+    if seen.history:
         raise ContractError(
-            f"observation.history is {seen.history} and observation.dynamics {seen.dynamics}: a robot's loop "
-            "does not observe these yet; bundle a policy without"
+            f"observation.history is {seen.history}: a robot's loop does not remember yet; bundle a policy "
+            "without"
         )
     slices = teacher_observation_slices(hand.num_fingers)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}

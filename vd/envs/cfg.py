@@ -101,9 +101,9 @@ class ObservationCfg:
     history: int = 0
     """Ours: past control steps that are remembered, each with joint positions, action, and the object's way
     and rotation since (vd/kernels/history.py): from them a policy can tell how late and stiff its hand is."""
-    dynamics: Literal["none", "critic", "actor"] = "none"
-    """Ours, privileged: who is told what was drawn (gains, delay, friction and backlash of joints, frictions,
-    mass, latency). The critic is then also told how the true state differs from what is seen."""
+    dynamics: Literal["none", "critic"] = "none"
+    """Ours, privileged: whether the critic is told what was drawn (gains, delay, friction and backlash of
+    joints, frictions, mass, latency), and the present state and shape, without noise."""
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
@@ -303,6 +303,9 @@ class RandomisationCfg:
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old the state is that the policy sees [s], drawn for each episode, to the nearest physics step.
     Rewards and success are of the true state."""
+    nominal_share: float = 0.0
+    """Ours: share of the worlds, the same ones throughout, that keep nominal masses, joints and frictions and
+    get neither forces nor latency. Sizes and noise are drawn there too."""
     redraw_s: float = PAPER.randomisation.redraw_s
     """Gains and frictions are drawn anew at the first reset after this time [s]."""
 
@@ -325,6 +328,10 @@ class RandomisationCfg:
             raise ValueError(
                 f"randomisation.observation_latency_s is {low:g} {high:g}; it has to rise within 0 and "
                 f"{MAX_LATENCY_S:g}"
+            )
+        if not 0.0 <= self.nominal_share <= 1.0:
+            raise ValueError(
+                f"randomisation.nominal_share is {self.nominal_share:g}; it has to lie within 0 and 1"
             )
         if self.force_s <= 0.0:
             raise ValueError(f"randomisation.force_s is {self.force_s:g}; it has to be positive")

@@ -1,5 +1,6 @@
 """What the policy observes: state, shape, memory, and what a critic or a teacher is told."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import warp as wp
@@ -12,7 +13,7 @@ from vd.envs.symmetry import Views
 from vd.envs.task_state import TaskState
 from vd.kernels.aim import aim_kernel
 from vd.kernels.dynamics import dynamics_kernel
-from vd.kernels.history import forget_kernel, history_kernel, remember_kernel, truth_kernel
+from vd.kernels.history import forget_kernel, history_kernel, remember_kernel
 from vd.kernels.observations import teacher_observation_kernel, teacher_observation_slices
 from vd.paper import PAPER
 
@@ -35,7 +36,7 @@ class Observer:
         self._state, self._drawn = state, drawn
         cfg, n, device = state.cfg.observation, state.num_worlds, state.device
         self.parts = observation_parts(cfg, state.num_fingers)
-        self.num_observations = actor_size(cfg, self.parts)
+        self.num_observations = actor_size(self.parts)
         self.seen = SeenState(state)
         width = max(columns.stop for columns in self.parts.values())
 
@@ -46,7 +47,7 @@ class Observer:
         self.views = Views(state, self.all_values) if cfg.view != "world" else None
         if self.views is not None:
             self.world_values = self.views.observation
-        self.shapes = ShapeObserver(state, self.seen, self.world_values) if shapes else None
+        self.shapes = ShapeObserver(state) if shapes else None
         slices = teacher_observation_slices(state.num_fingers)
         self._pose_columns = [slices["object_position"].start, slices["relative_orientation"].start]
         self._action_column = slices["previous_action"].start
@@ -60,6 +61,10 @@ class Observer:
             materials.friction, materials.friction, state.cfg.table_friction, materials.object_mass_kg
         )
         self._no_servo = zeros(0, 0)
+        self._exact: list[Any] = []
+        if "present" in self.parts:
+            settings = state.parameters.exact_observation
+            self._exact = [settings, zeros(n, slices["previous_action"].stop), zeros(n, dtype=wp.uint32)]
 
     def split(self, values: wp.array) -> tuple[wp.array, wp.array]:
         """What the actor reads [N, O], and what the critic reads besides [N, A - O], of everything [N, A]."""
@@ -70,7 +75,7 @@ class Observer:
 
     def begin(self, mask: wp.array) -> None:
         """Begin the episodes of the worlds of ``mask`` [N], after their state was reset."""
-        self.seen.begin(mask)
+        self.seen.begin(mask, self._drawn.nominal_of(mask))
         if self._frames:
             self._launch(forget_kernel, [mask], [self._count])
 
@@ -97,6 +102,27 @@ class Observer:
                 state.goal_quat,
             ]
             self._launch(aim_kernel, inputs, [state.aimed_quat])
+        noise = state.parameters.observation, self._drawn.observation_offset, state.rng
+        self._observe_state(self.seen.arrays, noise, self.world_values)
+        if "present" in self.parts:
+            sim = state.sim
+            true = [sim.joint_q, sim.joint_qd, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
+            self._observe_state(true, self._exact, self.world_values[:, self.parts["present"].start :])
+        self._observe_history()
+        self._tell()
+        if self.views is not None:
+            self.views.observe()
+
+    def _observe_state(self, seen: Sequence[Any], noise: Sequence[Any], out: wp.array) -> None:
+        """Write state and shape to the first columns of ``out``.
+
+        Args:
+            seen: As :attr:`SeenState.arrays`.
+            noise: Settings of the observation, constant errors [N, *], random streams [N].
+            out: Observation in the world frame, shape [N, *].
+        """
+        state = self._state
+        settings, offset, rng = noise
         self._launch(
             teacher_observation_kernel,
             [
@@ -105,22 +131,18 @@ class Observer:
                 state.fingers.tip_body,
                 state.fingers.tip_offset,
                 self._body_com,
-                state.parameters.observation,
-                *self.seen.arrays,
+                settings,
+                *seen,
                 state.aimed_quat,
                 state.smoothed,
-                self._drawn.observation_offset,
-                state.rng,
+                offset,
+                rng,
             ],
-            [self.world_values],
+            [out],
         )
         if "shape" in self.parts:
             assert self.shapes is not None
-            self.shapes.launch()
-        self._observe_history()
-        self._tell()
-        if self.views is not None:
-            self.views.observe()
+            self.shapes.launch(seen, out)
 
     @property
     def _remembered(self) -> list[int]:
@@ -145,7 +167,7 @@ class Observer:
             )
 
     def _tell(self) -> None:
-        """Write what was drawn, and how the true state differs from what is seen."""
+        """Write what was drawn."""
         if "dynamics" not in self.parts:
             return
         state, drawn = self._state, self._drawn
@@ -166,9 +188,6 @@ class Observer:
             ],
             [self.world_values],
         )
-        columns = [*self._pose_columns, self.parts["truth"].start]
-        inputs = [state.lower, state.upper, *columns, state.sim.joint_q, state.aimed_quat]
-        self._launch(truth_kernel, inputs, [self.world_values])
 
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint, by name."""

@@ -48,13 +48,16 @@ class TaskParameters:
             step_rad=cfg.action.scale_rad_s * cfg.sim.control_dt,
             noise_std=on * random.action_noise_std,
         )
-        self.observation = array(
-            ObservationParams,
-            velocity_scale=PAPER.observation.velocity_scale,
-            noise_mean=on * random.observation_noise_mean,
-            noise_std=on * random.observation_noise_std,
-            file_axes=float(cfg.observation.file_axes),
-            canonical=float(cfg.observation.canonical),
+        self.observation, self.exact_observation = (
+            array(
+                ObservationParams,
+                velocity_scale=PAPER.observation.velocity_scale,
+                noise_mean=noise * random.observation_noise_mean,
+                noise_std=noise * random.observation_noise_std,
+                file_axes=float(cfg.observation.file_axes),
+                canonical=float(cfg.observation.canonical),
+            )
+            for noise in (on, 0.0)
         )
         self.start = array(
             StartParams, position=wp.vec3(*scene.object_start_m), noise=scene.object_start_noise_m
@@ -69,20 +72,22 @@ class TaskParameters:
             decay=random.force_decay,
         )
         materials = PAPER.materials
-        fixed = not random.enabled
 
-        def span(value: tuple[float, float], nominal: float) -> wp.vec2:
-            return wp.vec2(nominal, nominal) if fixed else wp.vec2(*value)
+        def ranges(drawn: bool) -> wp.array:
+            def span(value: tuple[float, float], nominal: float) -> wp.vec2:
+                return wp.vec2(*value) if drawn else wp.vec2(nominal, nominal)
 
-        self.randomisation = array(
-            RandomisationParams,
-            friction=span(random.friction, materials.friction),
-            table_friction=span(random.table_friction, cfg.table_friction),
-            link_mass_scale=span(random.link_mass_scale, 1.0),
-            object_mass=span(random.object_mass_kg, materials.object_mass_kg),
-            action_offset_std=on * random.action_offset_std,
-            observation_offset_std=on * random.observation_offset_std,
-        )
+            return array(
+                RandomisationParams,
+                friction=span(random.friction, materials.friction),
+                table_friction=span(random.table_friction, cfg.table_friction),
+                link_mass_scale=span(random.link_mass_scale, 1.0),
+                object_mass=span(random.object_mass_kg, materials.object_mass_kg),
+                action_offset_std=drawn * random.action_offset_std,
+                observation_offset_std=drawn * random.observation_offset_std,
+            )
+
+        self.randomisation, self.nominal = ranges(random.enabled), ranges(False)
         self.reward = array(RewardParams)
         self.success = array(SuccessParams)
         self.goal = array(GoalParams)

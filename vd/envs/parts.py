@@ -2,7 +2,7 @@
 
 from vd.envs.cfg import ObservationCfg
 from vd.kernels.dynamics import dynamics_size
-from vd.kernels.history import frame_size, truth_size
+from vd.kernels.history import frame_size
 from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
 from vd.kernels.shapes import shape_observation_size
 
@@ -10,16 +10,19 @@ from vd.kernels.shapes import shape_observation_size
 def observation_parts(cfg: ObservationCfg, fingers: int) -> dict[str, slice]:
     """Columns of the parts of an observation, in order, those included that only the critic reads.
 
-    state, shape, history (frame by frame), dynamics, truth; parts that are off are missing.
+    state, shape, history (frame by frame), dynamics, present (state and shape without latency and noise);
+    parts that are off are missing.
     """
     joints = teacher_observation_slices(fingers)["joint_position"].stop
     told = cfg.dynamics != "none"
+    state = teacher_observation_size(fingers)
+    shape = shape_observation_size(fingers) if cfg.shape != "none" else 0
     sizes = {
-        "state": teacher_observation_size(fingers),
-        "shape": shape_observation_size(fingers) if cfg.shape != "none" else 0,
+        "state": state,
+        "shape": shape,
         "history": cfg.history * frame_size(joints),
         "dynamics": dynamics_size(joints) if told else 0,
-        "truth": truth_size(joints) if told else 0,
+        "present": state + shape if told else 0,
     }
     parts, start = {}, 0
     for name, size in sizes.items():
@@ -29,7 +32,6 @@ def observation_parts(cfg: ObservationCfg, fingers: int) -> dict[str, slice]:
     return parts
 
 
-def actor_size(cfg: ObservationCfg, parts: dict[str, slice]) -> int:
+def actor_size(parts: dict[str, slice]) -> int:
     """Values that the actor reads, the first of all."""
-    told = ("truth",) if cfg.dynamics == "actor" else ("dynamics", "truth")
-    return max(columns.stop for name, columns in parts.items() if name not in told)
+    return max(columns.stop for name, columns in parts.items() if name not in ("dynamics", "present"))

@@ -1,9 +1,11 @@
 """The shape of each world's object: its points on the device, what a teacher sees of it, how high it is."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import warp as wp
 
-from vd.envs.latency import SeenState
 from vd.envs.task_state import TaskState
 from vd.kernels.observations import teacher_observation_size
 from vd.kernels.shapes import (
@@ -22,12 +24,10 @@ class ShapeObserver:
 
     Args:
         state: The task.
-        seen: The state that observations are made of.
-        out: Observation, shape [N, A].
     """
 
-    def __init__(self, state: TaskState, seen: SeenState, out: wp.array):
-        self._state, self._seen, self._out = state, seen, out
+    def __init__(self, state: TaskState):
+        self._state = state
         device = state.device
         points = np.stack([item.surface_points for item in state.objects])
         self._points = wp.array(points, dtype=wp.vec3, device=device)
@@ -57,10 +57,10 @@ class ShapeObserver:
             device=state.device,
         )
 
-    def launch(self) -> None:
-        """Write the values of the state that is seen, and of the goal."""
-        state, out = self._state, self._out
-        _, _, joint_q, _, body_q, _ = self._seen.arrays
+    def launch(self, seen: Sequence[Any], out: wp.array) -> None:
+        """Write the values of a state (``SeenState.arrays``), and of the goal, to ``out``, shape [N, *]."""
+        state = self._state
+        _, _, joint_q, _, body_q, _ = seen
         wp.launch(
             surface_kernel,
             dim=(state.num_worlds, state.num_fingers),

@@ -82,7 +82,7 @@ def view_tables(hand: HandModel, observation: ObservationCfg, view: View) -> Vie
     return ViewTables(
         source=source,
         factor=np.take_along_axis(maps, source, axis=2),
-        offset=np.stack([_observation_offset(hand, turn, maps.shape[1]) for turn in turns]),
+        offset=np.stack([_observation_offset(hand, observation, turn) for turn in turns]),
         joints=np.stack(order),
         sign=np.stack([_joint_signs(turn, fingers) for turn in turns]),
         # An axis of rotation looks the other way in a mirror.
@@ -144,17 +144,19 @@ def _joint_signs(turn: np.ndarray, fingers: int) -> np.ndarray:
     return np.tile(MIRROR_SIGNS if np.linalg.det(turn) < 0.0 else np.ones(JOINTS_PER_FINGER), fingers)
 
 
-def _observation_offset(hand: HandModel, turn: np.ndarray, size: int) -> np.ndarray:
-    """What is added in a view to what :func:`_observation_map` makes, ``size`` values.
+def _observation_offset(hand: HandModel, observation: ObservationCfg, turn: np.ndarray) -> np.ndarray:
+    """What is added in a view to what :func:`_observation_map` makes [A].
 
     An angle is observed as it lies between its limits, from -1 to 1; of one that is turned round these are
     the limits of the other side.
     """
-    offset = np.zeros(size)
+    parts = observation_parts(observation, hand.num_fingers)
+    offset = np.zeros(max(columns.stop for columns in parts.values()))
     lower, upper = np.asarray(hand.lower), np.asarray(hand.upper)
     turned_round = _joint_signs(turn, hand.num_fingers) < 0.0
     columns = teacher_observation_slices(hand.num_fingers)["joint_position"]
-    offset[columns] = np.where(turned_round, -2.0 * (upper + lower) / (upper - lower), 0.0)
+    for part in {"state", "present"} & parts.keys():
+        offset[parts[part]][columns] = np.where(turned_round, -2.0 * (upper + lower) / (upper - lower), 0.0)
     return offset
 
 
@@ -210,13 +212,16 @@ def _observation_map(observation: ObservationCfg, tips: np.ndarray, turn: np.nda
     blocks |= {
         "history": np.kron(frames, block_diag(joints, joints, turn, axial)),
         "dynamics": block_diag(np.kron(np.eye(JOINT_CHANNELS), np.abs(joints)), np.eye(SCALARS)),
-        "truth": block_diag(joints, turn, axial),
     }
     slices |= {name: columns for name, columns in parts.items() if name in blocks}
     size = max(columns.stop for columns in parts.values())
     matrix = np.zeros((size, size))
     for name, columns in slices.items():
         matrix[columns, columns] = blocks[name]
+    if "present" in parts:
+        again = parts["present"]
+        seen = slice(again.stop - again.start)
+        matrix[again, again] = matrix[seen, seen]
     matrix[np.abs(matrix) < np.finfo(np.float32).eps] = 0.0
     return matrix
 

@@ -1,0 +1,137 @@
+"""An actor that sees late imitates what it was when it saw the present state."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from train_dummy import SMALL_PPO, DummyEnv, make_runner
+
+from vd.policy import load_policy
+from vd.train.checkpoint import find_checkpoint
+from vd.train.cli import main
+from vd.train.config import PolicyCfg
+from vd.train.metrics import read_progress
+
+NETWORK = PolicyCfg(hidden=(32, 32), distribution="state-dependent", initial_std=0.2, std_range=(0.05, 0.5))
+IMITATING = replace(SMALL_PPO, imitation_iterations=60)
+
+
+class LateEnv(DummyEnv):
+    """The dummy in which a target moves a little in every step, seen a step late and, after it, once more."""
+
+    num_observations = 7
+    num_privileged = 6
+    num_present = 5
+    fall_probability = 0.0
+    reach = 0.02
+    late = 1
+
+    def _observe(self) -> None:
+        past = getattr(self, "_past", [self._target] * 2)
+        begins = np.abs(self._target - past[0]).max(axis=1, keepdims=True) > 0.15
+        self._past = [self._target.copy(), *(np.where(begins, self._target, target) for target in past[:2])]
+
+        def shown(target: np.ndarray) -> np.ndarray:
+            return np.hstack([target, np.abs(target), np.ones((self.num_worlds, 1), np.float32)])
+
+        now, late, later = self._past
+        seen = late if self.late else now
+        self.observation.assign(np.hstack([shown(seen), late - later]))
+        self.privileged.assign(np.hstack([np.zeros((self.num_worlds, 1), np.float32), shown(now)]))
+
+    def step(self, action) -> None:
+        """Move the target, then as the dummy."""
+        self._way = getattr(self, "_way", np.float32(0.1) * np.sign(self._draw(self.num_worlds)))
+        self._way = np.where(np.abs(self._target + self._way) > 0.8, -self._way, self._way)
+        self._target = self._target + self._way
+        super().step(action)
+
+
+class PromptEnv(LateEnv):
+    """The same seen at once, and without the way, by whom is to be imitated."""
+
+    num_observations, num_privileged, num_present, late = 5, 0, 0, 0
+
+    def _observe(self) -> None:
+        target = self._target
+        self.observation.assign(
+            np.hstack([target, np.abs(target), np.ones((self.num_worlds, 1), np.float32)])
+        )
+
+
+@pytest.fixture(scope="module")
+def taught(tmp_path_factory):
+    """A policy that acts on the present target."""
+    folder = tmp_path_factory.mktemp("teacher")
+    runner = make_runner(folder, env=PromptEnv(num_worlds=32), policy=NETWORK)
+    runner.learn(60)
+    return folder / "policy.pt"
+
+
+def test_an_actor_that_sees_late_comes_to_what_its_teacher_does_by_its_history(taught, tmp_path):
+    runner = make_runner(tmp_path, env=LateEnv(num_worlds=32), policy=NETWORK, ppo=IMITATING)
+    runner.begin_from(str(taught))
+    assert runner.critic_warmup == 60 and runner.new_inputs == 8, "2, and 6 of the critic"
+
+    def apart() -> float:
+        seen = runner.env.get_observations()
+        with torch.no_grad():
+            wanted = load_policy(taught).act(seen["privileged"][:, -5:])
+            return float((runner.alg.actor(seen) - wanted).square().mean())
+
+    frozen = {k: v.clone() for k, v in runner.imitation.teacher.state_dict().items()}
+    runner.learn(3)
+    before = apart()
+    runner.learn(57)
+    rows = read_progress(tmp_path / "progress.jsonl")
+    losses = [row["loss/imitation"] for row in rows]
+    assert losses[-1] < 0.4 * losses[0] and apart() < 0.5 * before, (losses[0], losses[-1], before, apart())
+    assert runner.alg.actor.state_dict()["mlp.0.weight"][:, 5:].abs().max() > 0.05, "the history is used"
+    for name, value in runner.imitation.teacher.state_dict().items():
+        assert torch.equal(value, frozen[name]), name
+
+
+def test_ppo_goes_on_from_there_with_its_own_rates_and_small_first_steps(taught, tmp_path):
+    ppo = replace(IMITATING, imitation_iterations=10, actor_learning_rate=1e-4)
+    runner = make_runner(tmp_path, env=LateEnv(num_worlds=32), policy=NETWORK, ppo=ppo)
+    runner.begin_from(str(taught))
+    runner.learn(10)
+    before = {name: value.clone() for name, value in runner.alg.actor.named_parameters()}
+    runner.learn(1)
+    rows = read_progress(tmp_path / "progress.jsonl")
+    assert [row["critic_warmup"] for row in rows[-2:]] == [0, 0] and "loss/imitation" not in rows[-1]
+    assert rows[-1]["actor_learning_rate"] == 1e-4 and rows[-1]["loss/kl"] < 0.01
+    steps = SMALL_PPO.epochs * runner.alg.num_mini_batches
+    after = runner.alg.actor.named_parameters()
+    moved = torch.cat([(value.detach() - before[name]).abs().flatten() for name, value in after])
+    assert 0.0 < moved.mean() < 0.3 * steps * 1e-4, "Adam knows how large gradients are"
+
+
+def test_a_run_that_was_stopped_on_the_way_goes_on_imitating_the_same(taught, tmp_path):
+    def runner():
+        env = LateEnv(num_worlds=32)
+        return make_runner(tmp_path, env=env, policy=NETWORK, ppo=IMITATING, save_every=1)
+
+    first = runner()
+    first.begin_from(str(taught))
+    first.learn(4)
+    again = runner()
+    again.load(str(find_checkpoint(tmp_path, "latest")))
+    assert again.critic_warmup == 56 and again.imitation is not None
+    for name, value in first.imitation.teacher.state_dict().items():
+        assert torch.equal(value, again.imitation.teacher.state_dict()[name]), name
+    again.learn(1)
+    assert read_progress(tmp_path / "progress.jsonl")[-1]["loss/imitation"] > 0.0
+
+
+def test_it_is_refused_without_a_policy_or_without_the_present(taught, tmp_path, capsys):
+    flags = ["--ppo.imitation-iterations", "5", "--run-dir", str(tmp_path / "run"), "--device", "cpu"]
+    assert main(["teacher", "--preset", "cube", *flags]) == 1
+    assert "--ppo.imitation-iterations imitates the policy that --init names" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+    runner = make_runner(tmp_path, env=PromptEnv(num_worlds=4), policy=NETWORK, ppo=IMITATING)
+    with pytest.raises(
+        ValueError, match=r"is told 0 of the present; give --env\.observation\.dynamics critic"
+    ):
+        runner.begin_from(str(taught))
