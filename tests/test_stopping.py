@@ -53,10 +53,23 @@ def test_the_rule_gives_what_it_says_and_nothing_on_a_grid_is_better(seed, bias)
     found = calibrate(*data, tolerance_rad=TOLERANCE)
     right, wrong = outcome(*data, found.rule.distance_rad, found.rule.action_norm)
     assert (found.success, found.wrong) == (pytest.approx(right), pytest.approx(wrong))
-    for distance, limit in itertools.product(np.arange(1, 25) / 24 * 0.8, np.linspace(0.3, 2.2, 6)):
-        # the other grid has no action bounds in common: allow for what lies between two of them
-        assert outcome(*data, distance, limit)[0] <= found.success + 2 / 60
+    as_the_paper = outcome(*data, found.rule.distance_rad, 1.0)[0]
+    for distance in np.arange(1, 25) / 24 * 0.8:
+        assert outcome(*data, distance, 1.0)[0] <= as_the_paper
+    for limit in np.linspace(0.3, 2.2, 6):
+        # this grid has no action bounds in common: allow for what lies between two of them
+        assert outcome(*data, found.rule.distance_rad, limit)[0] <= found.success + 2 / 60
     assert found.success <= found.reachable and found.episodes == 60
+
+
+def test_hands_that_are_never_still_get_both_bounds_together():
+    predicted, norm, true, alive = episodes(6, bias=0.2)
+    found = calibrate(predicted, norm + 1.0, true, alive)
+    shares = [
+        outcome(predicted, norm + 1.0, true, alive, distance, limit)[0]
+        for distance, limit in itertools.product(np.arange(1, 25) / 24 * 0.8, np.linspace(1.3, 3.2, 6))
+    ]
+    assert found.rule.action_norm > 1.0 and max(shares) <= found.success + 2 / 60
 
 
 def test_a_predictor_that_says_too_much_gets_a_wider_bound():

@@ -192,7 +192,7 @@ def test_every_sample_is_used_once_an_epoch(tmp_path):
             runner.alg.process_env_step(observation, reward, done, extras)
     wanted = runner.alg.storage.actions_log_prob.flatten().sort().values
     runner.alg._take_samples()
-    batches = [runner.alg._samples["log_prob"][rows] for rows in runner.alg._minibatches()]
+    batches = [runner.alg.samples["log_prob"][rows] for rows in runner.alg.minibatches()]
     assert len(batches) == 2 * 4
     for epoch in (batches[:4], batches[4:]):
         assert torch.equal(torch.cat(epoch).sort().values, wanted)
@@ -335,7 +335,7 @@ def test_what_gradients_are_computed_from_stays_where_it_is_in_memory(tmp_path):
     """A recorded graph reads the addresses of the recording, whatever an attribute has become since."""
 
     def read(alg) -> dict[str, int]:
-        tensors = dict(alg._samples) | {"rows": alg._rows}
+        tensors = dict(alg.samples) | {"rows": alg._rows}
         for name, network in (("actor", alg.actor), ("critic", alg.critic)):
             tensors |= {f"{name}.{key}": tensor for key, tensor in network.named_parameters()}
             tensors |= {f"{name}.{key}": tensor for key, tensor in network.named_buffers()}
@@ -378,7 +378,7 @@ def test_a_recorded_graph_gives_the_gradients_of_every_minibatch(tmp_path):
         _after_a_rollout(make_runner(tmp_path, ppo=ppo, policy=TIGHTENING, device="cuda:0")).alg
         for ppo in (SMALL_PPO, graphed)
     )
-    assert torch.equal(plain._samples["actions"], recorded._samples["actions"])
+    assert torch.equal(plain.samples["actions"], recorded.samples["actions"])
     for rows in (*torch.randperm(128, device="cuda:0").split(64), torch.arange(64, device="cuda:0")):
         for alg in (plain, recorded):
             alg.actor.distribution.set_floor(0.1)

@@ -99,7 +99,7 @@ def begin_imitation(
     if present != read:
         raise ValueError(
             f"--ppo.imitation-iterations: {path} reads {read} values, and the critic is told {present} of "
-            "the present; give --env.observation.dynamics critic, and --init a policy of state and shape alone"
+            "the present; give --env.observation.dynamics critic, and --init a policy of state and shape"
         )
     return Imitation(learner, present, ppo.imitation_learning_rate)
 

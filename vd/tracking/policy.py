@@ -45,10 +45,10 @@ class TrackingPolicy:
     def __post_init__(self) -> None:
         """Raise ``ValueError`` for a teacher that observes what no camera shows."""
         seen = from_dict(ReorientCfg, self.task, where="task of the policy").observation
-        if seen.history or seen.dynamics == "actor":
+        if seen.history:
             raise ValueError(
                 "a tracking policy knows the present state alone; its teacher observes more "
-                f"(observation.history {seen.history}, dynamics {seen.dynamics})"
+                f"(observation.history {seen.history})"
             )
 
     @property
