@@ -53,13 +53,13 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "vd.train": ("vd.deploy",),
     "vd.deploy": ("vd.train",),
 }
-# Modules that still import each other in a circle; no new ones.
-IN_CIRCLES = {
-    *(f"vd.assets_usd.objects.{name}" for name in ("model", "procedural", "sets")),
-    *(f"vd.gap.{name}" for name in ("recording", "recording_checks", "crowd", "rollout")),
-    *(f"vd.gap.{name}" for name in ("chance", "clock", "consensus", "select")),
-    *(f"vd.deploy.{name}" for name in ("score", "score_page")),
-}
+# Modules that import each other, at once, inside functions or for types: none but these. The search for
+# a gap calls itself with samples weighted, or with another's effects; its rewrite takes it apart.
+KNOWN_CIRCLES = [
+    {"vd.gap.select", "vd.gap.chance", "vd.gap.clock", "vd.gap.consensus"},
+    {"vd.assets_usd.objects.model", "vd.assets_usd.objects.procedural", "vd.assets_usd.objects.sets"},
+    {"vd.deploy.score", "vd.deploy.score_page"},
+]
 # Libraries that one part keeps to itself.
 OWNED_LIBRARIES = {"pxr": "vd.assets_usd", "coacd": "vd.assets_usd", "rsl_rl": "vd.train"}
 # Libraries whose import takes seconds: help must not wait for them.
@@ -110,17 +110,18 @@ def test_imports_go_one_way():
     assert not wrong, "\n".join(wrong)
 
 
-def test_no_module_imports_itself_by_way_of_others():
-    files = dict(modules())
+def test_no_modules_import_each_other():
+    names = dict(modules())
     graph = nx.DiGraph(
-        (module, name)
-        for module, path in files.items()
-        for name in imports(path) & files.keys()
-        if name != module
+        (module, name) for module, path in names.items() for name in imports(path) & names.keys() - {module}
     )
-    circles = [sorted(circle) for circle in nx.strongly_connected_components(graph) if len(circle) > 1]
-    new = [circle for circle in circles if not set(circle) <= IN_CIRCLES]
-    assert not new, "\n".join(map(str, new))
+    circles = [circle for circle in nx.strongly_connected_components(graph) if len(circle) > 1]
+    wrong = [
+        "\n".join(f"{a} imports {b}" for a, b in graph.subgraph(c).edges)
+        for c in circles
+        if c not in KNOWN_CIRCLES
+    ]
+    assert not wrong, "in circles:\n" + "\n\n".join(wrong)
 
 
 def test_kernels_import_nothing_but_warp():
