@@ -55,11 +55,7 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
 }
 # Modules that import each other, at once, inside functions or for types: none but these. The search for
 # a gap calls itself with samples weighted, or with another's effects; its rewrite takes it apart.
-KNOWN_CIRCLES = [
-    {"vd.gap.select", "vd.gap.chance", "vd.gap.clock", "vd.gap.consensus"},
-    {"vd.assets_usd.objects.model", "vd.assets_usd.objects.procedural", "vd.assets_usd.objects.sets"},
-    {"vd.deploy.score", "vd.deploy.score_page"},
-]
+KNOWN_CIRCLES = [{"vd.gap.select", "vd.gap.chance", "vd.gap.clock", "vd.gap.consensus"}]
 # Libraries that one part keeps to itself.
 OWNED_LIBRARIES = {"pxr": "vd.assets_usd", "coacd": "vd.assets_usd", "rsl_rl": "vd.train"}
 # Libraries whose import takes seconds: help must not wait for them.
