@@ -304,7 +304,7 @@ def _sizes(good: "list[ImportResult]") -> str:
 
 def run_show(command: Show) -> int:
     """Draw a contact sheet."""
-    from vd.assets_usd.objects.model import load_set
+    from vd.assets_usd.objects.sets import load_set
     from vd.assets_usd.objects.sheet import SheetStyle, contact_sheet
 
     models = load_set(command.sets)

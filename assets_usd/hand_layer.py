@@ -167,7 +167,7 @@ def read_servo(
             rows[:, parameter.column] = baseline[parameter.name]
     for index, joint in enumerate(joints):
         where = f"{source}: {joint.GetPath()}"
-        effects: dict[str, set[str]] = {}
+        valued: dict[str, set[str]] = {}
         ranges: list[tuple[str, str, str]] = []
         for attribute in joint.GetAuthoredPropertiesInNamespace(NAMESPACE):
             name = attribute.GetName()
@@ -178,19 +178,28 @@ def read_servo(
                 ranges.append((name, effect, parameter.name))
             else:
                 rows[index, parameter.column] = _checked(where, name, parameter, value)
-                if effect != BASELINE_GROUP:
-                    effects.setdefault(effect, set()).add(parameter.name)
-        for effect, authored in effects.items():
-            missing = _missing(effect, authored)
-            if missing:
-                raise HandError(
-                    f"{where}: {effect} lacks '{NAMESPACE}:{effect}:{missing[0]}'; "
-                    f"author it, or remove {effect}"
-                )
-        for name, effect, parameter_name in ranges:
-            if effect != BASELINE_GROUP and parameter_name not in effects.get(effect, ()):
-                raise HandError(f"{where}: '{name}' is an interval without a value; author the value too")
+                valued.setdefault(effect, set()).add(parameter.name)
+        valued.pop(BASELINE_GROUP, None)
+        _check_complete(where, valued, ranges)
     return rows, intervals
+
+
+def _check_complete(where: str, effects: dict[str, set[str]], ranges: list[tuple[str, str, str]]) -> None:
+    """Refuse an effect without one of its parameters, or an interval without its value.
+
+    Args:
+        where: File and joint, for errors.
+        effects: Names of the parameters that have a value, by effect.
+        ranges: Attribute, effect and parameter of each interval.
+    """
+    for effect, authored in effects.items():
+        if missing := _missing(effect, authored):
+            raise HandError(
+                f"{where}: {effect} lacks '{NAMESPACE}:{effect}:{missing[0]}'; author it, or remove {effect}"
+            )
+    for name, effect, parameter in ranges:
+        if effect != BASELINE_GROUP and parameter not in effects.get(effect, ()):
+            raise HandError(f"{where}: '{name}' is an interval without a value; author the value too")
 
 
 def _parse(where: str, name: str) -> tuple[str, Parameter, bool]:

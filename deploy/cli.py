@@ -49,7 +49,7 @@ COMMANDS = {
         "vd.deploy.shadow", "ShadowCfg", "shadow", "compare what the policy saw with what the simulator shows"
     ),
     "score": Entry(
-        "vd.deploy.score", "ScoreCfg", "score", "the object's error at each stop, by motion capture"
+        "vd.deploy.score_command", "ScoreCfg", "score", "the object's error at each stop, by motion capture"
     ),
 }
 """The commands by name."""

@@ -25,10 +25,11 @@ from vd.assets_usd.objects.geometry import (
     surface_points,
 )
 from vd.assets_usd.objects.meshes import GUESSED_UNITS, LONGEST_SIDE_M, UNITS_M, MeshError
-from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectError, ObjectModel, build_model, load_set
+from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectError, ObjectModel, build_model
 from vd.assets_usd.objects.reading import load_points
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.scans import Surface, surface_of_scan
+from vd.assets_usd.objects.sets import load_set
 from vd.paper import PAPER
 
 SCAN_SUFFIXES = (".ply", ".obj", ".glb")

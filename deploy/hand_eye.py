@@ -209,6 +209,32 @@ def consensus(views: Views, *, seed: int = 0) -> tuple[HandEye, np.ndarray]:
     crowded = [rows for rows in _groups(views).values() if len(rows) >= LEAST_OF_FINGER]
     if not crowded:
         raise HandEyeError(f"no finger has {LEAST_OF_FINGER} views of its marker; take more")
+    rough, why = _rough(views, crowded, generator)
+    best: tuple[HandEye, np.ndarray] | None = None
+    for camera in rough[:REFINED]:
+        rows = np.flatnonzero(_judge(views, camera, ROUGH_PX)[1])
+        try:
+            for limit in (ROUGH_PX, INLIER_PX, INLIER_PX):
+                found = refine(views.chosen(rows), camera)
+                camera, rows = found.camera, _agreeing(views, found, limit)
+        except (HandEyeError, ValueError):  # too few views, or some behind the camera
+            continue
+        if best is None or len(rows) > len(best[1]):
+            best = (found, rows)
+    if best is None:
+        raise HandEyeError(why)
+    if len(best[1]) < max(LEAST_VIEWS, len(views) / 2):
+        raise HandEyeError(
+            f"only {len(best[1])} of {len(views)} views agree with each other; check the marker's side, "
+            "that it sits firmly, that fingers and their motors are numbered as in the calibration, and light"
+        )
+    return best
+
+
+def _rough(
+    views: Views, crowded: list[np.ndarray], generator: np.random.Generator
+) -> tuple[list[np.ndarray], str]:
+    """Cameras of triples of views of one finger, the best first, and why there are none if there are none."""
     rough: list[tuple[float, np.ndarray]] = []
     why = "the views do not determine the camera; move more joints, over more of their range"
     for _ in range(DRAWS):
@@ -220,25 +246,7 @@ def consensus(views: Views, *, seed: int = 0) -> tuple[HandEye, np.ndarray]:
             why = str(error)
             continue
         rough.append((_judge(views, camera, ROUGH_PX)[2], camera))
-    best: tuple[HandEye, np.ndarray] | None = None
-    for _, camera in sorted(rough, key=lambda option: option[0])[:REFINED]:
-        rows = np.flatnonzero(_judge(views, camera, ROUGH_PX)[1])
-        try:
-            for limit in (ROUGH_PX, INLIER_PX, INLIER_PX):
-                found = refine(views.chosen(rows), camera)
-                camera, rows = found.camera, _agreeing(views, found, limit)
-        except (HandEyeError, ValueError):  # too few views, or some behind the camera
-            continue
-        if best is None or len(rows) > len(best[1]):
-            best = (found, rows)
-    if not rough or best is None:
-        raise HandEyeError(why)
-    if len(best[1]) < max(LEAST_VIEWS, len(views) / 2):
-        raise HandEyeError(
-            f"only {len(best[1])} of {len(views)} views agree with each other; check the marker's side, "
-            "that it sits firmly, that fingers and their motors are numbered as in the calibration, and light"
-        )
-    return best
+    return [camera for _, camera in sorted(rough, key=lambda option: option[0])], why
 
 
 def _sides(views: Views, rows: np.ndarray, found: HandEye) -> tuple[list[np.ndarray], list[np.ndarray]]:

@@ -10,7 +10,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
@@ -234,18 +234,7 @@ def _fly(
         log = LogWriter(
             folder,
             hand,
-            {
-                "policy": flight.name,
-                "kind": flight.kind,
-                "twin": cfg.twin,
-                "object": {"name": item.name, "set": cfg.object},
-                "goals": [[float(value) for value in goal] for goal in goals],
-                "control_hz": flight.task.sim.control_hz,
-                "stopping": vars(pilot.rule),
-                "tolerance_rad": cfg.tolerance_rad,
-                "second_view": cfg.second_view,
-                "action": vars(flight.task.action),
-            },
+            _description(cfg, flight, item, goals),
             servo={"model": cfg.motor, "p_gain": P_GAIN, "d_gain": D_GAIN},
             truth=link is not None,
         )
@@ -286,6 +275,24 @@ def _fly(
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
             report(folder, steps, pacer.missed, times)
     return int(reason == "lost")
+
+
+def _description(
+    cfg: RunCfg, flight: "Flight", item: "ObjectModel", goals: Sequence[np.ndarray]
+) -> dict[str, Any]:
+    """What a run's log says of it beside its steps."""
+    return {
+        "policy": flight.name,
+        "kind": flight.kind,
+        "twin": cfg.twin,
+        "object": {"name": item.name, "set": cfg.object},
+        "goals": [[float(value) for value in goal] for goal in goals],
+        "control_hz": flight.task.sim.control_hz,
+        "stopping": vars(flight.pilot.rule),
+        "tolerance_rad": cfg.tolerance_rad,
+        "second_view": cfg.second_view,
+        "action": vars(flight.task.action),
+    }
 
 
 def place(safe: SafeHand, pose: np.ndarray, link: "TwinLink | None", *, yes: bool) -> None:

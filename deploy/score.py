@@ -5,20 +5,16 @@ object's symmetry. Trials whose markers were lost at the stop are discarded; tri
 error, and count as failures in the shares.
 """
 
-import json
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.deploy.goals import one_object
-from vd.deploy.mocap import Mocap, MocapError, read_mocap
+from vd.deploy.mocap import Mocap, MocapError
 from vd.evaluate.result import TOLERANCES_RAD
 from vd.evaluate.statistics import Interval, median_interval, rate_intervals, symmetric_error
-from vd.hand_log import HandLog, read_log
+from vd.hand_log import HandLog
 
 NEAR_S = 0.1
 """Farthest sample [s] from a stop that counts for it: the object rests, and lost markers come back late."""
@@ -29,31 +25,6 @@ LEAST_OVERLAP = 0.5
 LEAST_FALL = 0.5
 """The best offset's disagreement over the typical one, above which no offset stands out."""
 NO_SYMMETRY = np.array([[0.0, 0.0, 0.0, 1.0]])
-
-
-@dataclass(frozen=True)
-class ScoreCfg:
-    """Score a run by motion capture."""
-
-    log: Annotated[Path, tyro.conf.Positional]
-    """Folder that vd-deploy wrote."""
-    mocap: Path
-    """Export of the motion capture: CSV with time, x, y, z, qx, qy, qz, qw, tracked; or OptiTrack's."""
-    body: str | None = None
-    """Rigid body, of an export with several."""
-    offset_s: float | None = None
-    """Time of the motion capture at the log's beginning [s]. By default times are seconds since 1970; of a
-    clock of its own the offset is found at which errors agree best with the policy's predictions."""
-    up: Literal["z", "y"] = "z"
-    """Axis of the motion capture that points up; OptiTrack's is y unless it is exported otherwise."""
-    world: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """Turn from the motion capture's frame, made z up, to the hand's world frame, quaternion xyzw."""
-    marker: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    """The object's frame in that of its rigid body, quaternion xyzw: how the markers were defined on it."""
-    page: Path | None = None
-    """HTML page to write."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print JSON."""
 
 
 @dataclass(frozen=True)
@@ -119,20 +90,6 @@ class Score:
             "median_rad": None if self.median is None else asdict(self.median),
             "within": [{"tolerance_rad": t, **asdict(interval)} for t, interval in self.within],
         }
-
-
-def score(cfg: ScoreCfg) -> int:
-    """Print the table; 1 if no trial could be scored."""
-    log = read_log(cfg.log)
-    symmetry = one_object(log.run["object"]["set"]).symmetry
-    mocap = in_world(read_mocap(cfg.mocap, cfg.body), up=cfg.up, world=cfg.world, marker=cfg.marker)
-    result = score_run(log, mocap, symmetry, offset_s=cfg.offset_s)
-    if cfg.page is not None:
-        from vd.deploy.score_page import write_page
-
-        write_page(cfg.page, result, symmetry)
-    print(json.dumps(result.record(), indent=1) if cfg.json else "\n".join(lines(result)))
-    return 0 if result.scored else 1
 
 
 def in_world(mocap: Mocap, *, up: str, world: tuple[float, ...], marker: tuple[float, ...]) -> Mocap:

@@ -256,7 +256,7 @@ class TwinCommand:
         """The object that is named."""
         if self.object is None:
             return None
-        from vd.assets_usd.objects.model import load_set
+        from vd.assets_usd.objects.sets import load_set
 
         found = load_set(self.object)
         if len(found) > 1:

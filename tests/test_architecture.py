@@ -21,6 +21,7 @@ PACKAGE_DIRS: dict[str, str] = PROJECT["tool"]["setuptools"]["package-dir"]
 DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
 MAX_LINES = 600
+MAX_FUNCTION_LINES = 80
 LEAVES = ("vd.paper", "vd.files", "vd.aim", "vd.interrupt")
 SHARED = ("vd.config", "vd.policy", "vd.clouds", "vd.quaternions", "vd.senses", "vd.stopping", "vd.views")
 """What camera policies share; no simulator."""
@@ -53,13 +54,11 @@ FORBIDDEN: dict[str, tuple[str, ...]] = {
     "vd.train": ("vd.deploy",),
     "vd.deploy": ("vd.train",),
 }
-# Modules that still import each other in a circle; no new ones.
-IN_CIRCLES = {
-    *(f"vd.assets_usd.objects.{name}" for name in ("model", "procedural", "sets")),
-    *(f"vd.gap.{name}" for name in ("recording", "recording_checks", "crowd", "rollout")),
-    *(f"vd.gap.{name}" for name in ("chance", "clock", "consensus", "select")),
-    *(f"vd.deploy.{name}" for name in ("score", "score_page")),
-}
+# Modules that import each other, at once, inside functions or for types: none but these. The search for
+# a gap calls itself with samples weighted, or with another's effects; its rewrite takes it apart.
+KNOWN_CIRCLES = [{"vd.gap.select", "vd.gap.chance", "vd.gap.clock", "vd.gap.consensus"}]
+# Functions that are longer than others may be, until the gap search is rebuilt.
+KNOWN_LONG = {("vd.gap.select", "explain")}
 # Libraries that one part keeps to itself.
 OWNED_LIBRARIES = {"pxr": "vd.assets_usd", "coacd": "vd.assets_usd", "rsl_rl": "vd.train"}
 # Libraries whose import takes seconds: help must not wait for them.
@@ -110,17 +109,18 @@ def test_imports_go_one_way():
     assert not wrong, "\n".join(wrong)
 
 
-def test_no_module_imports_itself_by_way_of_others():
-    files = dict(modules())
+def test_no_modules_import_each_other():
+    names = dict(modules())
     graph = nx.DiGraph(
-        (module, name)
-        for module, path in files.items()
-        for name in imports(path) & files.keys()
-        if name != module
+        (module, name) for module, path in names.items() for name in imports(path) & names.keys() - {module}
     )
-    circles = [sorted(circle) for circle in nx.strongly_connected_components(graph) if len(circle) > 1]
-    new = [circle for circle in circles if not set(circle) <= IN_CIRCLES]
-    assert not new, "\n".join(map(str, new))
+    circles = [circle for circle in nx.strongly_connected_components(graph) if len(circle) > 1]
+    wrong = [
+        "\n".join(f"{a} imports {b}" for a, b in graph.subgraph(c).edges)
+        for c in circles
+        if c not in KNOWN_CIRCLES
+    ]
+    assert not wrong, "in circles:\n" + "\n\n".join(wrong)
 
 
 def test_kernels_import_nothing_but_warp():
@@ -148,6 +148,24 @@ def test_files_are_short():
         if (n := len(path.read_text().splitlines())) > MAX_LINES
     }
     assert not long, f"over {MAX_LINES} lines: {long}"
+
+
+def test_functions_are_short():
+    long = {
+        (module, node.name): lines
+        for module, path in modules()
+        if not within(module, "vd.kernels")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+        and (lines := node.end_lineno - node.lineno + 1 - docstring_lines(node)) > MAX_FUNCTION_LINES
+    }
+    assert long.keys() == KNOWN_LONG, f"over {MAX_FUNCTION_LINES} lines, docstring apart: {long}"
+
+
+def docstring_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Lines of a function's docstring."""
+    first = function.body[0]
+    return first.end_lineno - first.lineno + 1 if ast.get_docstring(function) is not None else 0
 
 
 def subcommands() -> list[tuple[str, str]]:

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from vd.assets_usd import cli
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.assets_usd.objects.sheet import WARNING, contact_sheet
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.bench.cli import StudentCommand
 from vd.bench.student import measure_training, open_network, take_turns
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from student_dummy import TINY
 
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.bundle import is_bundle
 from vd.bundle.contract import ContractError, check_hand
 from vd.bundle.store import read_bundle, read_contract, write_student, write_teacher, write_tracking

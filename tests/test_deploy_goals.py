@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.deploy.goals import GoalError, goal_cloud, one_object, read_goals, scan_object
 from vd.deploy.observation import Sensed, senses_of
 from vd.vision.cfg import PRESETS

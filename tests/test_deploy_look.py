@@ -5,7 +5,7 @@ import numpy as np
 from vd.assets_usd.camera_layer import write_camera_layer
 from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.config import to_dict
 from vd.deploy.flight import Flight, look, make_flight
 from vd.deploy.observation import Sensed

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.bench.depth import bench_scene
 from vd.deploy.camera import CameraError, StaleCamera
 from vd.deploy.camera_twin import CameraTwin

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.deploy.log import LogWriter
 from vd.deploy.mocap import MocapError, read_mocap
-from vd.deploy.score import ScoreCfg, find_offset, in_world, score, score_run
+from vd.deploy.score import find_offset, in_world, score_run
+from vd.deploy.score_command import ScoreCfg, score
 from vd.evaluate.statistics import rotation_angle
 from vd.hand_log import JOINT_CHANNELS, STEP_COLUMNS, read_log
 

@@ -6,7 +6,7 @@ import warp as wp
 from sensed_world import state_of
 
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.deploy.flight import make_flight, mirror_task
 from vd.deploy.mirror import Mirror
 from vd.deploy.observation import Sensed

@@ -11,7 +11,7 @@ import warp as wp
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.bench.depth import NewtonCamera, bench_scene, pose
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg

@@ -8,7 +8,8 @@ import pytest
 
 from vd.assets_usd.objects import procedural, sets
 from vd.assets_usd.objects.geometry import Hull
-from vd.assets_usd.objects.model import ObjectError, load_set, read_object, write_object
+from vd.assets_usd.objects.model import ObjectError, read_object, write_object
+from vd.assets_usd.objects.sets import load_set
 from vd.paper import PAPER
 
 

@@ -6,8 +6,9 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from vd.assets_usd.objects.geometry import mesh_volume, random_surface_points, surface_points
-from vd.assets_usd.objects.model import SURFACE_POINTS, load_set
+from vd.assets_usd.objects.model import SURFACE_POINTS
 from vd.assets_usd.objects.scans import smooth, surface_of_scan
+from vd.assets_usd.objects.sets import load_set
 from vd.evaluate.scanned import known_by_points, scan
 from vd.tracking.registration import Registration
 from vd.tracking.symmetry import symmetries

@@ -7,7 +7,7 @@ import pytest
 import warp as wp
 
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.kernels import actuators as servo
 from vd.paper import PAPER
 from vd.sim.actuators import has_effects

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.decompose import DecomposeSettings
 from vd.assets_usd.objects.geometry import Hull
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.bench.physics import GRAVITY, SmallScene, bounce, pinch, rest, slide
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg

@@ -7,7 +7,7 @@ import warp as wp
 
 from vd.assets_usd.hand_data import compose
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.clouds import HandKinematics, SceneClouds
 from vd.paper import PAPER
 from vd.sim.scene import hand_mount

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from student_dummy import weights
 
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.config import to_dict
 from vd.quaternions import relative_rotation, rotation_distance
 from vd.sensors.cfg import DepthCameraCfg

@@ -12,7 +12,7 @@ from sensed_world import state_of
 
 from vd.aim import AimCfg
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import load_set
+from vd.assets_usd.objects.sets import load_set
 from vd.config import to_dict
 from vd.deploy.pilot import TrackingPilot
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg

@@ -10,7 +10,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import ObjectModel, load_set
+from vd.assets_usd.objects.model import ObjectModel
+from vd.assets_usd.objects.sets import load_set
 from vd.tracking.registration import KEPT, POINTS, ROTATIONS, Registration, even_rotations
 
 SPACING_RAD = 0.3

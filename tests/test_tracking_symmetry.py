@@ -9,7 +9,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.geometry import surface_points
-from vd.assets_usd.objects.model import IDENTITY, ObjectModel, load_set
+from vd.assets_usd.objects.model import IDENTITY, ObjectModel
+from vd.assets_usd.objects.sets import load_set
 from vd.tracking.symmetry import APART_RAD, CLOSED_RAD, MOST, nearest_goal, symmetries
 
 NEAR_RAD = 0.05

@@ -193,9 +193,7 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     )
     simulation.dump_dir = cfg.run.run_dir
     env = ReorientVecEnv(simulation, second_view=cfg.second_view)
-    deadline = None
-    if cfg.run.max_minutes is not None:
-        deadline = (time.monotonic() if started is None else started) + 60.0 * cfg.run.max_minutes
+    deadline = cfg.run.deadline(started)
     runner = TeacherRunner(
         env, cfg.ppo, cfg.policy, cfg.run, task=to_dict(cfg.env), device=device, deadline=deadline
     )

@@ -4,6 +4,7 @@ Defaults are the paper's (Table S1), or its released code's where the paper says
 """
 
 import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,6 +107,16 @@ class RunCfg:
     --save-every: vd-train average takes their mean."""
     tensorboard: bool = True
     """Write TensorBoard files (tensorboard --logdir RUN-DIR)."""
+
+    def deadline(self, started: float | None) -> float | None:
+        """``time.monotonic()`` at which a run that began at ``started`` has to end; None: no limit.
+
+        Args:
+            started: ``time.monotonic()``; now by default.
+        """
+        if self.max_minutes is None:
+            return None
+        return (time.monotonic() if started is None else started) + 60.0 * self.max_minutes
 
     def check_kept(self) -> None:
         """Refuse checkpoints to be kept that are never written.

@@ -117,7 +117,7 @@ def precompile(
     import torch
     import warp as wp
 
-    from vd.assets_usd.objects.model import load_set
+    from vd.assets_usd.objects.sets import load_set
     from vd.sim.pair_order import sort_pairs
 
     wp.init()

@@ -156,7 +156,7 @@ def calibrate_trace(trace: "Trace", *, tolerance_rad: float = PAPER.success.rota
 
 def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace":
     """Episodes that nothing stops."""
-    from vd.assets_usd.objects.model import load_set
+    from vd.assets_usd.objects.sets import load_set
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.compare import STUDENT_WORLDS_GPU, actor_of, run_episodes, task_of, worlds_for
     from vd.tracking.symmetry import with_symmetries

@@ -64,62 +64,92 @@ def run_tasks(
     Returns:
         The tasks left over.
     """
-    waiting, end = deque(range(len(tasks))), time.monotonic() + stop_after_s
-    workers: list[_Worker] = []
-    context = get_context("spawn")  # Warp and a CUDA context do not survive a fork
-
-    def start() -> _Worker:
-        mine, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(work, theirs, os.getpid()), daemon=True)
-        process.start()
-        theirs.close()
-        return _Worker(process, mine)
-
-    def give(worker: _Worker) -> None:
-        worker.task, worker.begun = waiting.popleft(), time.monotonic()
-        worker.pipe.send(tasks[worker.task])
-
-    def replace(worker: _Worker, why: str) -> None:
-        worker.process.kill()
-        worker.process.join()
-        worker.pipe.close()
-        workers.remove(worker)
-        finished(tasks[worker.task], None, why)
-        if waiting:
-            workers.append(start())
-            give(workers[-1])
-
+    end = time.monotonic() + stop_after_s
+    pool = _Pool(work, tasks, finished, limit_s)
     try:
         with _environment(gpu):
             for _ in range(min(jobs, len(tasks))):
-                workers.append(start())
-                give(workers[-1])
-            while any(worker.task >= 0 for worker in workers) and time.monotonic() < end:
-                busy = [worker for worker in workers if worker.task >= 0]
-                ready = connection.wait([worker.pipe for worker in busy], LONGEST_WAIT_S)
-                for worker in busy:
-                    if worker.pipe in ready:
-                        try:
-                            result = worker.pipe.recv()
-                        except (EOFError, OSError):
-                            replace(worker, "its process died: out of memory, or killed")
-                            continue
-                        finished(tasks[worker.task], result, "")
-                        worker.task = -1
-                        if waiting:
-                            give(worker)
-                    elif time.monotonic() - worker.begun > limit_s:
-                        replace(worker, f"it took longer than {limit_s:.0f} s")
-        return len(waiting) + sum(worker.task >= 0 for worker in workers)
+                pool.start()
+            while pool.busy and time.monotonic() < end:
+                pool.look()
+        return len(pool.waiting) + len(pool.busy)
     finally:
-        for worker in workers:
-            if worker.task >= 0:
-                worker.process.kill()
+        pool.stop()
+
+
+class _Pool:
+    """The workers of :func:`run_tasks`, whose arguments it takes, and the tasks that wait for them."""
+
+    def __init__(
+        self,
+        work: Callable[[Any], Any],
+        tasks: Sequence[Any],
+        finished: Callable[[Any, Any, str], None],
+        limit_s: float,
+    ):
+        self.waiting = deque(range(len(tasks)))
+        self._work, self._tasks, self._finished, self._limit_s = work, tasks, finished, limit_s
+        self._workers: list[_Worker] = []
+        self._context = get_context("spawn")  # Warp and a CUDA context do not survive a fork
+
+    @property
+    def busy(self) -> list[_Worker]:
+        """Workers that have a task."""
+        return [worker for worker in self._workers if worker.task >= 0]
+
+    def start(self) -> None:
+        """Start a worker and give it a task."""
+        mine, theirs = self._context.Pipe()
+        process = self._context.Process(target=_serve, args=(self._work, theirs, os.getpid()), daemon=True)
+        process.start()
+        theirs.close()
+        self._workers.append(_Worker(process, mine))
+        self._give(self._workers[-1])
+
+    def look(self) -> None:
+        """Wait for workers that have finished or died, at most ``LONGEST_WAIT_S``, and for those too slow."""
+        busy = self.busy
+        ready = connection.wait([worker.pipe for worker in busy], LONGEST_WAIT_S)
+        for worker in busy:
+            if worker.pipe in ready:
+                self._receive(worker)
+            elif time.monotonic() - worker.begun > self._limit_s:
+                self._replace(worker, f"it took longer than {self._limit_s:.0f} s")
+
+    def stop(self) -> None:
+        """End all workers, those at work at once."""
+        for worker in self.busy:
+            worker.process.kill()
+        for worker in self._workers:
             worker.pipe.close()  # an idle worker ends when it sees this
-        for worker in workers:
+        for worker in self._workers:
             worker.process.join(GRACE_S)
             if worker.process.is_alive():
                 worker.process.kill()
+
+    def _give(self, worker: _Worker) -> None:
+        worker.task, worker.begun = self.waiting.popleft(), time.monotonic()
+        worker.pipe.send(self._tasks[worker.task])
+
+    def _receive(self, worker: _Worker) -> None:
+        try:
+            result = worker.pipe.recv()
+        except (EOFError, OSError):
+            self._replace(worker, "its process died: out of memory, or killed")
+            return
+        self._finished(self._tasks[worker.task], result, "")
+        worker.task = -1
+        if self.waiting:
+            self._give(worker)
+
+    def _replace(self, worker: _Worker, why: str) -> None:
+        worker.process.kill()
+        worker.process.join()
+        worker.pipe.close()
+        self._workers.remove(worker)
+        self._finished(self._tasks[worker.task], None, why)
+        if self.waiting:
+            self.start()
 
 
 def _serve(work: Callable[[Any], Any], pipe: connection.Connection, parent: int) -> None:

@@ -12,7 +12,7 @@ Everything that is not geometry or physics (licence, source, errors, symmetries)
 the root prim under ``visualDexterity``. Files are binary crates (``.usd``): 150 objects are a few MB.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -370,39 +370,3 @@ def read_object(path: Path) -> ObjectModel:
 def object_files(folder: Path) -> list[Path]:
     """The object files of a set's folder, sorted by name."""
     return sorted(p for p in Path(folder).iterdir() if p.suffix in SUFFIXES and not p.name.startswith("."))
-
-
-def load_set(names_or_paths: str | Path | Iterable[str | Path]) -> list[ObjectModel]:
-    """Load objects: files, folders of files, or names of sets, in the order given.
-
-    Args:
-        names_or_paths: One entry or several. A name stands for a built-in set (``cube``, ``cuboid``,
-            ``symmetric``, ``procedural-150-seed0``, ``procedural-heldout``), authored into the asset
-            cache on first use, or for an imported set's folder there.
-
-    Raises:
-        ObjectError: An entry is neither, a folder holds no object, or two objects share a name.
-    """
-    from vd.assets_usd.objects.sets import set_folder
-
-    entries = [names_or_paths] if isinstance(names_or_paths, str | Path) else list(names_or_paths)
-    if not entries:
-        raise ObjectError("no object set was named; for example: cube, procedural-150-seed0, or a folder")
-    files: list[Path] = []
-    for entry in entries:
-        path = Path(entry).expanduser()
-        if path.is_file():
-            files.append(path)
-            continue
-        folder = path if path.is_dir() else set_folder(str(entry))
-        found = object_files(folder)
-        if not found:
-            raise ObjectError(f"{folder}: no object file (*.usd); make some with: vd-assets import MESHES")
-        files += found
-    models = [read_object(p) for p in dict.fromkeys(files)]
-    seen: dict[str, Path] = {}
-    for model, path in zip(models, dict.fromkeys(files), strict=True):
-        if model.name in seen:
-            raise ObjectError(f"{path}: object {model.name} is also in {seen[model.name]}; leave one out")
-        seen[model.name] = path
-    return models

@@ -6,7 +6,14 @@ import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from vd.assets_usd.objects.model import ObjectError, ObjectModel, object_files, read_origin, write_object
+from vd.assets_usd.objects.model import (
+    ObjectError,
+    ObjectModel,
+    object_files,
+    read_object,
+    read_origin,
+    write_object,
+)
 from vd.files import make_folder, writing
 
 HELD_OUT_COUNT = 30
@@ -67,7 +74,7 @@ def write_set(folder: Path, models: list[ObjectModel]) -> list[Path]:
 
 
 def check_sets(names_or_paths: Iterable[str | Path]) -> None:
-    """Refuse what :func:`vd.assets_usd.objects.model.load_set` would not find, without reading or making it.
+    """Refuse what :func:`load_set` would not find, without reading or making it.
 
     Raises:
         ObjectError: An entry is neither a path nor a set; the message lists the sets there are.
@@ -137,3 +144,37 @@ def set_folder(name: str) -> Path:
     finally:
         shutil.rmtree(aside, ignore_errors=True)
     return folder
+
+
+def load_set(names_or_paths: str | Path | Iterable[str | Path]) -> list[ObjectModel]:
+    """Load objects: files, folders of files, or names of sets, in the order given.
+
+    Args:
+        names_or_paths: One entry or several. A name stands for a built-in set (``cube``, ``cuboid``,
+            ``symmetric``, ``procedural-150-seed0``, ``procedural-heldout``), authored into the asset
+            cache on first use, or for an imported set's folder there.
+
+    Raises:
+        ObjectError: An entry is neither, a folder holds no object, or two objects share a name.
+    """
+    entries = [names_or_paths] if isinstance(names_or_paths, str | Path) else list(names_or_paths)
+    if not entries:
+        raise ObjectError("no object set was named; for example: cube, procedural-150-seed0, or a folder")
+    files: list[Path] = []
+    for entry in entries:
+        path = Path(entry).expanduser()
+        if path.is_file():
+            files.append(path)
+            continue
+        folder = path if path.is_dir() else set_folder(str(entry))
+        found = object_files(folder)
+        if not found:
+            raise ObjectError(f"{folder}: no object file (*.usd); make some with: vd-assets import MESHES")
+        files += found
+    models = [read_object(p) for p in dict.fromkeys(files)]
+    seen: dict[str, Path] = {}
+    for model, path in zip(models, dict.fromkeys(files), strict=True):
+        if model.name in seen:
+            raise ObjectError(f"{path}: object {model.name} is also in {seen[model.name]}; leave one out")
+        seen[model.name] = path
+    return models

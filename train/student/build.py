@@ -1,7 +1,6 @@
 """From a configuration to a runner: teacher, worlds, network, and where a student begins."""
 
 import os
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -79,7 +78,7 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         ValueError: The settings do not fit each other, or the student to begin from.
     """
     from vd.device import resolve_device
-    from vd.train.checkpoint import damaged_after, find_checkpoint, set_aside
+    from vd.train.checkpoint import find_checkpoint
 
     validate(cfg)
     rank, folder = int(os.environ.get("RANK", "0")), cfg.run.run_dir
@@ -129,9 +128,6 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         learner: Learner = _pretrainer(cfg, own_task, student, world_size)
     else:
         learner = _dagger(cfg, own_task, student, teacher, world_size, fresh=checkpoint is None)
-    deadline = None
-    if cfg.run.max_minutes is not None:
-        deadline = (time.monotonic() if started is None else started) + 60.0 * cfg.run.max_minutes
     spec = StudentSpec(
         network=cfg.network,
         num_actions=teacher.num_actions,
@@ -147,18 +143,26 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         depth=to_dict(cfg.depth),
         device=device,
         processes=join_processes(device) if world_size > 1 else Processes(0, 0, 1),
-        deadline=deadline,
+        deadline=cfg.run.deadline(started),
     )
     if checkpoint is not None:
         runner.load(checkpoint)
     if rank == 0:
         # After all that can refuse: settings that a run cannot have must not take the place of its own.
-        saved = to_dict(replace(cfg, resume=None))
-        saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
-        write_json(folder / CONFIG_NAME, saved)
-        runner.damaged = damaged_after(folder, checkpoint, "student")
-        set_aside(runner.damaged)
+        _take_folder(cfg, runner, checkpoint)
     return runner
+
+
+def _take_folder(cfg: StudentTrainCfg, runner: "StudentRunner", checkpoint: Path | None) -> None:
+    """Save the configuration in the run's folder, and set aside what is damaged after the checkpoint."""
+    from vd.train.checkpoint import damaged_after, set_aside
+
+    folder = cfg.run.run_dir
+    saved = to_dict(replace(cfg, resume=None))
+    saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
+    write_json(folder / CONFIG_NAME, saved)
+    runner.damaged = damaged_after(folder, checkpoint, "student")
+    set_aside(runner.damaged)
 
 
 def check_start(cfg: StudentTrainCfg) -> None:
@@ -245,7 +249,7 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
 
 def _pretrainer(cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", world_size: int) -> Any:
     from vd.assets_usd.hands import load_hand
-    from vd.assets_usd.objects.model import load_set
+    from vd.assets_usd.objects.sets import load_set
     from vd.envs.objects import object_scales
     from vd.train.student.pretrain import Pretrainer, RandomScenes
 

@@ -145,24 +145,16 @@ class StudentRunner:
         if self.is_distributed:
             for value in self.learner.network.state_dict().values():
                 torch.distributed.broadcast(value, 0)
-        log = (
-            ProgressFile(self.run.run_dir, tensorboard=self.run.tensorboard, done=first)
-            if self.is_main
-            else None
-        )
         progress = ProgressLine(total, done=first, enabled=self.is_main, summary=summary, details=details)
         saved = -1
         with contextlib.ExitStack() as stack:
-            if log is not None:
+            log: ProgressFile | None = None
+            if self.is_main:
+                log = ProgressFile(self.run.run_dir, tensorboard=self.run.tensorboard, done=first)
                 stack.callback(log.close)
             stack.enter_context(self._end.signals(progress.note))
             stack.enter_context(progress)
-            while self.iteration < total:
-                if self.is_distributed:
-                    watch_iteration()
-                row = self._iterate()
-                if row is None:
-                    break
+            while self.iteration < total and (row := self._iterate()) is not None:
                 if log is not None:
                     log.write(row)
                 progress.update(row, self._end.time_left(self.iteration - first, total - self.iteration))
@@ -213,7 +205,9 @@ class StudentRunner:
             set_random_state(mine["random"], self.device)
 
     def _iterate(self) -> dict[str, Any] | None:
-        """One iteration; its row for ``progress.jsonl``."""
+        """One iteration; its row for ``progress.jsonl``, or None if it was ended within."""
+        if self.is_distributed:
+            watch_iteration()
         start = time.perf_counter()
         try:
             # With several processes all must do the same collectives, so they stop between iterations.

@@ -110,7 +110,7 @@ class PhysicsCommand:
 
     def run(self) -> int:
         """Measure and print."""
-        from vd.assets_usd.objects.model import load_set
+        from vd.assets_usd.objects.sets import load_set
         from vd.bench.physics import bounce, pinch, rest, slide
         from vd.sim.cfg import SimCfg
 
@@ -160,7 +160,7 @@ class DepthCommand:
         """Measure and print."""
         import warp as wp
 
-        from vd.assets_usd.objects.model import load_set
+        from vd.assets_usd.objects.sets import load_set
         from vd.bench.depth import measure
         from vd.files import write_json
 
@@ -206,7 +206,7 @@ class StudentCommand:
         """Measure and print."""
         import warp as wp
 
-        from vd.assets_usd.objects.model import load_set
+        from vd.assets_usd.objects.sets import load_set
         from vd.bench.student import measure_latency, measure_training
         from vd.evaluate.agents import SHIPPED_POLICIES
         from vd.files import write_json

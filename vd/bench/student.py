@@ -274,6 +274,48 @@ class Scenes:
         self.clouds.write(self.points, self.body_q, self.goal)
 
 
+class _Stopwatch:
+    """Times of parts of the work on a device.
+
+    Attributes:
+        marks: Times [ms] by the part's name.
+    """
+
+    def __init__(self, place: torch.device):
+        self.place = place
+        self.marks: dict[str, list[float]] = {}
+
+    def stop(self, name: str, start: float) -> float:
+        """A part that began at ``start`` is done; the time now [s]."""
+        if self.place.type == "cuda":
+            torch.cuda.synchronize(self.place)
+        now = time.perf_counter()
+        self.marks.setdefault(name, []).append(1e3 * (now - start))
+        return now
+
+    def seconds(self, function: Callable[[], None], calls: int) -> float:
+        """Time of a call [s], the mean of several after one that does not count."""
+        function()
+        self.marks.clear()
+        start = time.perf_counter()
+        for _ in range(calls):
+            function()
+        self.stop("all", start)
+        return (time.perf_counter() - start) / calls
+
+
+def _build_maps(sites: Sites, stages: int, pooled: int) -> None:
+    """All maps that an encoder of so many stages, the first of them pooled, will ask for."""
+    for i in range(stages):
+        _ = sites.strided, i and sites.strided_back
+        sites = sites.coarser
+        if i < pooled:
+            _ = sites.windows
+            sites = sites.coarser
+        _ = sites.neighbours
+    _ = sites.offsets
+
+
 def measure_training(
     objects: Sequence[ObjectModel],
     network: str,
@@ -307,36 +349,19 @@ def measure_training(
     voxelise = Voxeliser(net.cfg.voxel_m, noise=NoiseCfg(), clouds=clouds, seed=seed, device=device)
     senses = torch.zeros(steps, worlds, net.num_senses, device=place)
     on_gpu = place.type == "cuda"
-    ends = scenes.clouds.ends if "marks" in net.cfg.encoder.inputs else ()
-    marks: dict[str, list[float]] = {}
+    encoder = net.cfg.encoder
+    ends = scenes.clouds.ends if "marks" in encoder.inputs else ()
+    watch = _Stopwatch(place)
     sizes: list[int] = []
-
-    def stop(name: str, start: float) -> float:
-        if on_gpu:
-            torch.cuda.synchronize(place)
-        now = time.perf_counter()
-        marks.setdefault(name, []).append(1e3 * (now - start))
-        return now
-
-    def build(sites: Sites) -> None:
-        """All maps that the network will ask for."""
-        for i in range(len(net.cfg.encoder.channels)):
-            _ = sites.strided, i and sites.strided_back
-            sites = sites.coarser
-            if i < net.cfg.encoder.pooled_stages:
-                _ = sites.windows
-                sites = sites.coarser
-            _ = sites.neighbours
-        _ = sites.offsets
 
     def prepare(start: float, *, augment: bool) -> tuple[Sites, float]:
         scenes.write()
-        start = stop("points", start)
+        start = watch.stop("points", start)
         sites = voxelise(scenes.points, augment=augment, ends=ends)
-        start = stop("voxels", start)
-        build(sites)
+        start = watch.stop("voxels", start)
+        _build_maps(sites, len(encoder.channels), encoder.pooled_stages)
         sizes.append(len(sites))
-        return sites, stop("maps", start)
+        return sites, watch.stop("maps", start)
 
     def minibatch() -> None:
         net.train()
@@ -344,9 +369,9 @@ def measure_training(
         with torch.autocast(place.type, dtype=torch.bfloat16, enabled=half):
             output = net(net.encode(sites).unflatten(0, (steps, worlds)), senses, net.initial_hidden(worlds))
             loss = output.mean.square().mean() + output.log_std.mean() + output.distance.square().mean()
-        start = stop("forward", start)
+        start = watch.stop("forward", start)
         loss.backward()
-        stop("backward", start)
+        watch.stop("backward", start)
         net.zero_grad()
 
     def act() -> None:
@@ -355,26 +380,17 @@ def measure_training(
             sites, _ = prepare(time.perf_counter(), augment=False)
             net.act(sites, senses[0].repeat(steps, 1), net.initial_hidden(clouds))
 
-    def seconds(function: Callable[[], None]) -> float:
-        function()
-        marks.clear()
-        start = time.perf_counter()
-        for _ in range(calls):
-            function()
-        stop("all", start)
-        return (time.perf_counter() - start) / calls
-
-    acting = seconds(act)
+    acting = watch.seconds(act, calls)
     if on_gpu:
         torch.cuda.reset_peak_memory_stats(place)
-    training = seconds(minibatch)
+    training = watch.seconds(minibatch, calls)
     return TrainingRow(
         network=network,
         precision="bfloat16" if half else "float32",
         clouds=clouds,
         voxels=float(np.mean(sizes)) / clouds,
         clouds_per_s=clouds / training,
-        parts_ms={name: float(np.mean(times)) for name, times in marks.items() if name != "all"},
+        parts_ms={name: float(np.mean(times)) for name, times in watch.marks.items() if name != "all"},
         act_clouds_per_s=clouds / acting,
         memory_gb=torch.cuda.max_memory_allocated(place) / 1e9 if on_gpu else 0.0,
     )

@@ -52,7 +52,7 @@ def student_golden(student: "SavedStudent", hand: HandModel) -> Golden:
     borders of voxels; ``previous_action`` [T, D]; ``joint_qd`` [T, D] [rad/s]. Outputs: ``action`` [T, D] and
     ``distance`` [T, H] [rad].
     """
-    from vd.assets_usd.objects.model import load_set
+    from vd.assets_usd.objects.sets import load_set
     from vd.sim.scene import hand_mount
 
     rng = np.random.default_rng(0)

@@ -264,7 +264,6 @@ class ReorientEnv:
 
     def launch_step(self) -> None:
         """Launch every kernel of a control step; :meth:`step` replays them as one graph."""
-        n, d, p = self.num_worlds, self.num_actions, self.parameters
         sim = self.sim
         self.observer.remember()
         self._apply_action()
@@ -277,6 +276,22 @@ class ReorientEnv:
         self.fingers.measure(self.randomiser.kp, self.randomiser.kd)
         if self._lifts and self.observer.shapes is not None:
             self.observer.shapes.measure_clearance(self.clearance)
+        self._judge()
+        self._end_episodes()
+        wp.launch(
+            record_step_kernel,
+            dim=self.num_worlds,
+            inputs=[sim.joint_q, self.num_actions],
+            outputs=[self.object_pose_end],
+            device=self.device,
+        )
+        self.randomiser.redraw(self._reset)
+        self._reset_worlds()
+        self.observe()
+
+    def _judge(self) -> None:
+        """Success and reward of the step, before resets."""
+        n, p, sim = self.num_worlds, self.parameters, self.sim
         wp.launch(
             success_kernel,
             dim=n,
@@ -319,9 +334,12 @@ class ReorientEnv:
                 outputs=[self.reward, self.reward_terms, self.still, self.success, self.fell],
                 device=self.device,
             )
+
+    def _end_episodes(self) -> None:
+        """Which episodes end and which goals are new, and counts of goals."""
         wp.launch(
             episode_kernel,
-            dim=n,
+            dim=self.num_worlds,
             inputs=[
                 self.success,
                 self.fell,
@@ -336,21 +354,11 @@ class ReorientEnv:
         )
         wp.launch(
             count_goals_kernel,
-            dim=n,
+            dim=self.num_worlds,
             inputs=[self.success, self.fell, self.done],
             outputs=[self.goal_counts],
             device=self.device,
         )
-        wp.launch(
-            record_step_kernel,
-            dim=n,
-            inputs=[sim.joint_q, d],
-            outputs=[self.object_pose_end],
-            device=self.device,
-        )
-        self.randomiser.redraw(self._reset)
-        self._reset_worlds()
-        self.observe()
 
     def _reset_worlds(self, *, use_start: bool = False, use_goal: bool = False) -> None:
         """Reset the worlds of ``_reset``, give a goal to those of ``_new_goal`` too."""

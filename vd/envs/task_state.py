@@ -7,7 +7,8 @@ import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import ObjectModel, load_set
+from vd.assets_usd.objects.model import ObjectModel
+from vd.assets_usd.objects.sets import load_set
 from vd.envs.cfg import ReorientCfg
 from vd.envs.fingers import Fingers
 from vd.envs.objects import object_scales

@@ -47,7 +47,7 @@ def compare(cfg: EvalCfg, stop_at: float = math.inf) -> "Comparison":
         TimeoutError: It was to give up.
     """
     quiet_warp()
-    from vd.assets_usd.objects.model import load_set
+    from vd.assets_usd.objects.sets import load_set
     from vd.assets_usd.objects.sheet import pictures
     from vd.device import resolve_device
     from vd.envs.reorient import ReorientEnv

@@ -57,7 +57,7 @@ class SuiteResult:
     @cached_property
     def pictures(self) -> dict[Group, bytes]:
         """PNG with the objects of each group."""
-        from vd.assets_usd.objects.model import load_set
+        from vd.assets_usd.objects.sets import load_set
         from vd.assets_usd.objects.sheet import pictures
 
         return {group: pictures(load_set(list(objects.sets))) for group, objects in self.objects.items()}

@@ -6,18 +6,24 @@ parameters of every candidate, start, fold and joint.
 """
 
 import threading
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from vd.gap.rollout import Call, Rollouts
+
+class Rollouts(Protocol):
+    """What answers several calls by one launch (:class:`vd.gap.rollout.Rollouts`)."""
+
+    def simulate(self, calls: Sequence[Any]) -> list[np.ndarray]:
+        """The answers, in order."""
+        ...
 
 
 class _Waiting:
     """A call that waits for its answer."""
 
-    def __init__(self, rollouts: "Rollouts", call: "Call"):
+    def __init__(self, rollouts: Rollouts, call: Any):
         self.rollouts, self.call = rollouts, call
         self.answer: np.ndarray | Exception | None = None
 
@@ -46,7 +52,7 @@ class Crowd:
             self._working -= 1
             self._launch_if_all_wait()
 
-    def simulate(self, rollouts: "Rollouts", call: "Call") -> np.ndarray:
+    def simulate(self, rollouts: Rollouts, call: Any) -> np.ndarray:
         """The answer to a call, once the others that are at work have made theirs.
 
         Raises:

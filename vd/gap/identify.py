@@ -8,6 +8,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -115,8 +116,6 @@ def identify(
     Raises:
         ValueError: A joint is not recorded or its finger was never excited.
     """
-    import cma
-
     excited = {joint for trajectory in recording.trajectories for joint in trajectory.joints}
     names = tuple(name for name in recording.joints if name in excited) if joints is None else tuple(joints)
     missing = [name for name in names if name not in recording.joints]
@@ -129,15 +128,8 @@ def identify(
     slots = len(tracks)
     replay = HandReplay(recording, hand, np.tile(tracks, (population, 1)), dt=dt, device=device)
 
-    bounds = {p.column: (p.lower, p.upper) for p in BASELINE}
     members = {f: [j for j in chosen if j // JOINTS_PER_FINGER == f] for f in fingers}
-    searches = {}
-    for f in fingers:
-        centre = np.log(base[np.ix_(members[f], SEARCHED)]).flatten()
-        low = np.log([bounds[c][0] for _ in members[f] for c in SEARCHED])
-        high = np.log([bounds[c][1] for _ in members[f] for c in SEARCHED])
-        options = {"popsize": population, "seed": seed + f + 1, "bounds": [low, high], "verbose": -9}
-        searches[f] = cma.CMAEvolutionStrategy(np.clip(centre, low, high), SEARCH_SPREAD, options)
+    searches = {f: _search(base[members[f]], population, seed + f + 1) for f in fingers}
     samples = {
         f: sum(len(recording.trajectories[i].time) for i in tracks[:, f] if i >= 0) * len(scored)
         for f in fingers
@@ -183,6 +175,24 @@ def identify(
         rollouts=rollouts,
         seconds=time.perf_counter() - began,
     )
+
+
+def _search(start: np.ndarray, population: int, seed: int) -> Any:
+    """CMA-ES on the logarithms of the searched parameters of a finger's joints.
+
+    Args:
+        start: Servo parameters of its joints, shape [J, P].
+        population: Candidates of a generation.
+        seed: Seed of the search.
+    """
+    import cma
+
+    bounds = {p.column: (p.lower, p.upper) for p in BASELINE}
+    centre = np.log(start[:, SEARCHED]).flatten()
+    low = np.log([bounds[c][0] for _ in start for c in SEARCHED])
+    high = np.log([bounds[c][1] for _ in start for c in SEARCHED])
+    options = {"popsize": population, "seed": seed, "bounds": [low, high], "verbose": -9}
+    return cma.CMAEvolutionStrategy(np.clip(centre, low, high), SEARCH_SPREAD, options)
 
 
 def write_drives(

@@ -6,12 +6,10 @@ The checks of :mod:`vd.gap.recording` on values, beside those on the form of the
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from vd.gap.recording import Recording, Trajectory
+from vd.gap.motions import Recording, Trajectory
 
 COMMAND_TIME = "t_command"
 """Optional column: when the commands of a row were sent [s], if not at the row's time stamp."""
@@ -158,7 +156,7 @@ def unwrapped(
     return (whole + apart, whole) if max(np.abs(shift).max() for shift in moved) > math.pi else None
 
 
-def check_motion(recording: "Recording") -> None:
+def check_motion(recording: Recording) -> None:
     """Some command moves, and where one does the position answers it: not dead, not before it, not a copy."""
     if not any(np.ptp(t.command, axis=0).any() for t in recording.trajectories):
         raise RecordingError(
@@ -178,7 +176,7 @@ def check_motion(recording: "Recording") -> None:
                 raise RecordingError(f"{recording.path}: column 'position.{joint}' {why}")
 
 
-def _check_alive(recording: "Recording", told: "list[Trajectory]", j: int) -> None:
+def _check_alive(recording: Recording, told: list[Trajectory], j: int) -> None:
     """The encoder of a joint answers commands that move."""
     count, joint = recording.encoder_resolution_rad, recording.joints[j]
     answers = np.array([np.ptp(t.position[:, j]) for t in told])
@@ -193,7 +191,7 @@ def _check_alive(recording: "Recording", told: "list[Trajectory]", j: int) -> No
     )
 
 
-def _answer_fault(told: "list[Trajectory]", j: int, count: float) -> str:
+def _answer_fault(told: list[Trajectory], j: int, count: float) -> str:
     """What is wrong with a joint's positions as an answer to its commands, in every motion; or nothing."""
     pairs = [(t.command[:, j], t.position[:, j]) for t in told]
     if any(all(np.abs(p[k:] - c[: len(c) - k]).max() <= count for c, p in pairs) for k in range(COPY_ROWS)):
@@ -211,7 +209,7 @@ def _answer_fault(told: "list[Trajectory]", j: int, count: float) -> str:
     return ""
 
 
-def _lead(t: "Trajectory", j: int) -> float:
+def _lead(t: Trajectory, j: int) -> float:
     """By how much the positions of a joint come before its commands [s]; 0 if they do not, clearly."""
     step = max(float(np.median(np.diff(t.time))), LEAD_STEP_S)
     reach = int(LEAD_S / step)
@@ -230,7 +228,7 @@ def _lead(t: "Trajectory", j: int) -> float:
     return lead * step if lead > LEAD_SAMPLES and miss[best] < LEAD_MISS * miss[reach:].min() else 0.0
 
 
-def check_units(recording: "Recording") -> None:
+def check_units(recording: Recording) -> None:
     """Small motions in degrees show in the size of a count, other units of speed in the positions."""
     for j, joint in enumerate(recording.joints):
         _check_speed(recording, j)
@@ -247,7 +245,7 @@ def check_units(recording: "Recording") -> None:
             )
 
 
-def _check_speed(recording: "Recording", j: int) -> None:
+def _check_speed(recording: Recording, j: int) -> None:
     """The recorded velocity of a joint adds up to its motion."""
     sums, moved = [np.zeros(0)], [np.zeros(0)]
     for t in recording.trajectories:

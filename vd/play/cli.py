@@ -243,7 +243,7 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
 def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
     """Environment with at least one world for each object, trained agent if one is named, device."""
     quiet_warp()
-    from vd.assets_usd.objects.model import load_set
+    from vd.assets_usd.objects.sets import load_set
     from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.agents import (

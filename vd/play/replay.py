@@ -8,7 +8,8 @@ import numpy as np
 
 from vd.assets_usd.hand_model import HandModel
 from vd.assets_usd.hands import load_hand
-from vd.assets_usd.objects.model import ObjectModel, load_set
+from vd.assets_usd.objects.model import ObjectModel
+from vd.assets_usd.objects.sets import load_set
 from vd.hand_log import HandLog, LogError
 from vd.play.video import GOAL_SHARE, SINGLE_CELL, Composer, Snapshot, write_frames
 from vd.render import OUT_OF_SIGHT, Renderer

@@ -103,10 +103,7 @@ class DepthCamera:
         """Focal lengths, principal point [pixel] and range [m] of each camera, shape [N]."""
         self.extrinsics = wp.array(_extrinsics(camera, generator, cfg, n), dtype=wp.transform, device=device)
         """Optical frame of each camera in the frame of the body that carries it, shape [N]."""
-        self._believed = self.extrinsics
-        if cfg.position_noise_m > 0.0 or cfg.rotation_noise_rad > 0.0:
-            nominal = np.concatenate([camera.position, camera.quaternion])
-            self._believed = wp.array(np.tile(nominal, (n, 1)), dtype=wp.transform, device=device)
+        self._believed = _believed(camera, cfg, self.extrinsics)
         self.sensors = wp.array([_sensor(cfg.sensor, camera)] * n, dtype=DepthSensorParams, device=device)
         """Sensor settings of each camera; used if any was on at the start, shape [N]."""
         delay = generator.uniform(*cfg.latency_s, size=n) / frame_s
@@ -338,6 +335,14 @@ def _extrinsics(
     turn = Rotation.from_rotvec(cfg.rotation_noise_rad * generator.standard_normal((n, 3)))
     position = camera.position + cfg.position_noise_m * generator.standard_normal((n, 3))
     return np.concatenate([position, (Rotation.from_quat(camera.quaternion) * turn).as_quat()], axis=1)
+
+
+def _believed(camera: CameraModel, cfg: DepthCameraCfg, extrinsics: wp.array) -> wp.array:
+    """Extrinsics as calibrated, before they are randomised; the same array if they are not."""
+    if not (cfg.position_noise_m > 0.0 or cfg.rotation_noise_rad > 0.0):
+        return extrinsics
+    nominal = np.concatenate([camera.position, camera.quaternion])
+    return wp.array(np.tile(nominal, (len(extrinsics), 1)), dtype=wp.transform, device=extrinsics.device)
 
 
 def _sensor(cfg: DepthSensorCfg, camera: CameraModel) -> DepthSensorParams:

@@ -60,7 +60,7 @@ def replay(path: Path, *, device: str = "cpu") -> Iterator[str]:
         ValueError: The file is not a dump; says what is missing.
     """
     from vd.assets_usd.hands import load_hand
-    from vd.assets_usd.objects.model import load_set
+    from vd.assets_usd.objects.sets import load_set
     from vd.sim.scene import build_scene
 
     try:

@@ -1,0 +1,95 @@
+"""The motions of one machine, as they were recorded. SI units, radians, seconds."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+TELEMETRY = ("velocity", "current", "pwm", "voltage", "temperature")
+"""Optional columns per joint: rad/s, A, [-1, 1], V, deg C."""
+CHANNELS = ("command", "position", *TELEMETRY, "enabled")
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """One excitation and its answer; arrays have a row per time stamp and a column per joint.
+
+    Attributes:
+        file: Name of the CSV file in the recording's folder.
+        excitation: Kind of motion (steps, sine_0.50hz ...); the unit of held-out splits.
+        joints: Joints that were excited, a subset of the recording's.
+        conditions: What was varied on purpose (``p_gain``, ``payload_kg``, ``supply_v`` ...).
+        time: Time stamps [T] [s], float64, starting at 0 (:meth:`piece`: later).
+        command: Commanded positions [T, J] [rad].
+        position: Measured positions [T, J] [rad].
+        velocity: Measured velocities [T, J] [rad/s], or None; NaN for joints without the column.
+        current: Motor currents [T, J] [A], or None, as all telemetry.
+        pwm: Duty cycles [T, J] in [-1, 1], or None.
+        voltage: Supply voltages [T, J] [V], or None.
+        temperature: Motor temperatures [T, J] [deg C], or None.
+        command_time: When the commands were sent [T] [s], in the time of ``time``; None: at the time stamps.
+        unwrapped: Joints whose command and position jumped by whole turns in the file, and here do not.
+        enabled: Whether the servo's torque is on [T, J] bool; all true where not recorded.
+    """
+
+    file: str
+    excitation: str
+    joints: tuple[str, ...]
+    conditions: dict[str, float | str]
+    time: np.ndarray
+    command: np.ndarray
+    position: np.ndarray
+    enabled: np.ndarray
+    velocity: np.ndarray | None = None
+    current: np.ndarray | None = None
+    pwm: np.ndarray | None = None
+    voltage: np.ndarray | None = None
+    temperature: np.ndarray | None = None
+    command_time: np.ndarray | None = None
+    unwrapped: tuple[str, ...] = ()
+
+    @property
+    def sent(self) -> np.ndarray:
+        """When the commands were sent [T] [s]."""
+        return self.time if self.command_time is None else self.command_time
+
+    def piece(self, first: int, end: int) -> "Trajectory":
+        """Samples ``first`` to ``end`` (not included), with the times that they have in the whole."""
+        arrays = {name: getattr(self, name) for name in ("time", "command_time", *CHANNELS)}
+        return replace(self, **{name: a[first:end] for name, a in arrays.items() if a is not None})
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Trajectories of one machine.
+
+    Attributes:
+        path: Folder.
+        model: ``servo``, ``pendulum``, a hand's name, or a USD file beside ``recording.json``.
+        joints: Names of the columns.
+        servo: What is known of the servo (model, gains, supply ...).
+        encoder_resolution_rad: Size of an encoder count [rad].
+        trajectories: The trajectories.
+    """
+
+    path: Path
+    model: str
+    joints: tuple[str, ...]
+    servo: dict[str, Any]
+    encoder_resolution_rad: float
+    trajectories: tuple[Trajectory, ...]
+
+    def subset(self, indices: Sequence[int]) -> "Recording":
+        """The same recording with only these trajectories, in this order."""
+        return replace(self, trajectories=tuple(self.trajectories[i] for i in indices))
+
+    def cut(self, pieces: Mapping[int, tuple[int, int]]) -> "Recording":
+        """The same recording with pieces in the place of some trajectories.
+
+        Args:
+            pieces: Index of the trajectory -> samples ``(first, end)``.
+        """
+        parts = enumerate(self.trajectories)
+        return replace(self, trajectories=tuple(t.piece(*pieces[i]) if i in pieces else t for i, t in parts))
