@@ -10,7 +10,6 @@ from vd.envs.randomise import Randomiser
 from vd.envs.shapes import ShapeObserver
 from vd.envs.symmetry import Views
 from vd.envs.task_state import TaskState
-from vd.kernels.aim import aim_kernel
 from vd.kernels.dynamics import dynamics_kernel
 from vd.kernels.history import forget_kernel, history_kernel, remember_kernel, truth_kernel
 from vd.kernels.observations import teacher_observation_kernel, teacher_observation_slices
@@ -79,7 +78,7 @@ class Observer:
         if self._frames:
             self._launch(
                 remember_kernel,
-                [*self._remembered, self._frames, self.world_values, self._state.aimed_quat],
+                [*self._remembered, self._frames, self.world_values, self._state.goal_quat],
                 [self._head, self._count, self._past],
             )
 
@@ -87,16 +86,6 @@ class Observer:
         """Write the observation of the present state. Device work only."""
         state = self._state
         self.seen.recall()
-        if state.cfg.aim.enabled:
-            aim = state.cfg.aim
-            inputs = [
-                aim.past_rad,
-                aim.within_rad,
-                state.num_actions + 3,
-                self.seen.arrays[2],
-                state.goal_quat,
-            ]
-            self._launch(aim_kernel, inputs, [state.aimed_quat])
         self._launch(
             teacher_observation_kernel,
             [
@@ -107,7 +96,7 @@ class Observer:
                 self._body_com,
                 state.parameters.observation,
                 *self.seen.arrays,
-                state.aimed_quat,
+                state.goal_quat,
                 state.smoothed,
                 self._drawn.observation_offset,
                 state.rng,
@@ -135,7 +124,7 @@ class Observer:
                     *self._remembered,
                     self._frames,
                     self.parts["history"].start,
-                    self._state.aimed_quat,
+                    self._state.goal_quat,
                     self._head,
                     self._count,
                     self._past,
@@ -167,7 +156,7 @@ class Observer:
             [self.world_values],
         )
         columns = [*self._pose_columns, self.parts["truth"].start]
-        inputs = [state.lower, state.upper, *columns, state.sim.joint_q, state.aimed_quat]
+        inputs = [state.lower, state.upper, *columns, state.sim.joint_q, state.goal_quat]
         self._launch(truth_kernel, inputs, [self.world_values])
 
     def stateful(self) -> dict[str, wp.array]:
