@@ -91,7 +91,6 @@ class Shadow:
     """
 
     def __init__(self, log: "HandLog", policy: str | None = None):
-        from vd.aim import AimCfg
         from vd.assets_usd.hands import load_hand
         from vd.deploy.action import ActionFilter
         from vd.deploy.flight import STILL, mirror_task
@@ -123,7 +122,6 @@ class Shadow:
                 world_object=np.zeros(1, dtype=int),
                 world_scale=np.ones(1),
                 camera=camera,
-                aim=AimCfg(),
                 control_hz=task.sim.control_hz,
                 device="cpu",
             )

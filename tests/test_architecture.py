@@ -22,7 +22,7 @@ DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 
 MAX_LINES = 600
 MAX_FUNCTION_LINES = 80
-LEAVES = ("vd.paper", "vd.files", "vd.aim", "vd.interrupt")
+LEAVES = ("vd.paper", "vd.files", "vd.interrupt")
 SHARED = ("vd.config", "vd.policy", "vd.clouds", "vd.quaternions", "vd.senses", "vd.stopping", "vd.views")
 """What camera policies share; no simulator."""
 DESCRIPTIONS = ("vd.envs.cfg", "vd.envs.view_tables", "vd.sensors.cfg")
@@ -31,7 +31,6 @@ DESCRIPTIONS = ("vd.envs.cfg", "vd.envs.view_tables", "vd.sensors.cfg")
 ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.paper": (),
     "vd.files": (),
-    "vd.aim": (),
     "vd.interrupt": (),
     "vd.kernels": ("vd.kernels",),
     "vd.assets_usd": (*LEAVES, "vd.kernels", "vd.assets_usd"),

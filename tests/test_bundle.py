@@ -113,6 +113,9 @@ def test_a_tracking_policy_comes_back(tmp_path, hand, camera):
         "hand" if camera is None else "policy"
     )
     check_hand(read_contract(tmp_path / "tracking"), hand, "it")
+    edit(tmp_path / "tracking", lambda values: values["network"].update(aim={"enabled": True}))
+    with pytest.warns(UserWarning, match=r"network\.aim\.enabled is True; this version ignores it"):
+        assert read_bundle(tmp_path / "tracking").policy.spec == original.spec
 
 
 def test_another_hand_is_refused_by_field(teacher_bundle, hand, capsys):

@@ -116,11 +116,11 @@ def test_the_conditions_are_the_papers():
 
 
 def test_the_headline_has_the_papers_conditions_and_what_is_ours_is_marked():
-    """A real camera's errors, neither view selection nor aiming; what students know of goals is said."""
+    """A real camera's errors and no view selection; what students know of goals is said."""
     objects = suite_run.Objects(("x",), "x", False)
     for condition in CONDITIONS:
         cfg = suite_run.settings(EvalCfg(), condition, TEACHER, objects)
-        plain = cfg.sensor_errors and not (cfg.second_view or cfg.aim)
+        plain = cfg.sensor_errors and not cfg.second_view
         assert plain == (not condition.mark), condition.name
         assert cfg.goals == condition.goals
     known = {c.name: c.goals for c in CONDITIONS}
@@ -129,7 +129,7 @@ def test_the_headline_has_the_papers_conditions_and_what_is_ours_is_marked():
     assert "--second-view" in looks.flags and looks.mark.startswith("ours")
     assert looks.concerns(student=True, views=True) and not looks.concerns(student=True, views=False)
     default = EvalCfg()
-    assert default.sensor_errors and not (default.second_view or default.aim)
+    assert default.sensor_errors and not default.second_view
 
 
 def test_the_reduced_suite_ends_in_its_time_and_shows_what_it_has(tmp_path, asked, monkeypatch):

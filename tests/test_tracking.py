@@ -10,7 +10,6 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 from sensed_world import state_of
 
-from vd.aim import AimCfg
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.config import to_dict
@@ -42,7 +41,7 @@ CLOSE_RAD = 0.15
 """A rotation that was found, from a camera's points."""
 
 
-def observer_of(env: ReorientEnv, *, aim: AimCfg | None = None) -> Observer:
+def observer_of(env: ReorientEnv) -> Observer:
     return Observer(
         env.hand,
         env.objects,
@@ -50,7 +49,6 @@ def observer_of(env: ReorientEnv, *, aim: AimCfg | None = None) -> Observer:
         world_object=env.scene.world_object,
         world_scale=env.scene.world_scale,
         camera=env.hand.camera,
-        aim=aim or AimCfg(),
         control_hz=env.cfg.sim.control_hz,
         device="cpu",
     )
@@ -121,23 +119,6 @@ def test_motion_is_that_between_two_looks():
     observer(senses.read())
     np.testing.assert_allclose(observer.found.velocity[0], [12.0 * 0.01, 0.0, 0.0], atol=0.05)
     np.testing.assert_allclose(observer.found.spin[0], [0.0, 0.0, 12.0 * 0.1], atol=0.5)
-
-
-def test_who_aims_is_told_a_near_goal_farther_and_the_angle_as_it_is(env):
-    """The cube of one world is 0.2 rad from its goal, those of the others as far as a cube can be."""
-    senses = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()).read()
-    senses, plain = replace(senses, fresh=torch.ones(3, dtype=torch.bool)), observer_of(env)
-    plain(senses)
-    believed = Rotation.from_quat(plain.found.orientation.numpy())
-    turn = Rotation.from_rotvec([[0.0, 0.0, 0.2], [np.pi / 4.0, 0.0, 0.0], [0.0, np.pi / 4.0, 0.0]])
-    senses = replace(senses, goal_quat=torch.tensor((turn * believed).as_quat(), dtype=torch.float32))
-    column = teacher_observation_slices(env.num_fingers)["relative_orientation"]
-    aims = AimCfg(enabled=True, past_rad=0.3, within_rad=0.5)
-    (exact, angle), (aimed, same) = (observer_of(env, aim=aim)(senses) for aim in (AimCfg(), aims))
-    torch.testing.assert_close(angle, same, atol=2e-3, rtol=0.0)
-    turns = [Rotation.from_quat(values[:, column].numpy()).magnitude() for values in (exact, aimed)]
-    np.testing.assert_allclose(turns[0], angle, atol=2e-3)
-    np.testing.assert_allclose(turns[1] - turns[0], [0.3, 0.0, 0.0], atol=4e-3)
 
 
 @pytest.fixture(scope="module", params=["dclaw3 goal", "dclaw4 goal", "dclaw3 mirrored", "dclaw4 world"])
@@ -350,15 +331,13 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
     policy, (cfg, selects) = load_tracking(path), asked[-1]
     assert policy.spec.calibrated_on == "cube: 1 episodes, goals by points, tolerance 0.4 rad, seed 1000"
     assert policy.spec.teacher == "dclaw3-table" and policy.spec.precise is not None
-    assert 0.0 < policy.spec.stopping.action_norm < 1.0 and not policy.spec.aim.enabled
-    assert cfg.sensor_errors and cfg.goals == "points" and not cfg.aim and not selects
+    assert 0.0 < policy.spec.stopping.action_norm < 1.0
+    assert cfg.sensor_errors and cfg.goals == "points" and not selects
     capsys.readouterr()
-    assert vd_train([*flags, "--aim", "--second-view", "--in-air", "--json"]) == 0
+    assert vd_train([*flags, "--second-view", "--in-air", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["episodes"] == 1
     spec, (cfg, selects) = load_tracking(path).spec, asked[-1]
-    assert spec.aim.enabled and cfg.aim and cfg.in_air and selects
-    assert all(
-        words in spec.calibrated_on for words in ("in the air", "aimed past near goals", "views selected")
-    )
+    assert cfg.in_air and selects
+    assert all(words in spec.calibrated_on for words in ("in the air", "views selected"))
     assert vd_train(["tracker", "dclaw3-tracking", *flags[2:]]) == 1
     assert "give a teacher" in capsys.readouterr().err

@@ -327,6 +327,7 @@ def test_files_from_before_a_field_went_are_read_if_it_was_off():
     before = to_dict(PRESETS["gpu"]())
     before["env"]["success"]["no_table_contact"] = False
     before["env"]["caught"] = {"after_s": 2.0, "beyond_rad": 0.4, "go_on_share": 0.0}
+    before["env"]["aim"] = {"enabled": False, "past_rad": 0.3, "within_rad": 0.3}
     before["env"]["focus"] = {"success": {}, "share": 0.7}
     before["run"]["keep_last"] = 3
     assert from_dict(TeacherCfg, before) == PRESETS["gpu"]()
@@ -340,6 +341,9 @@ def test_files_from_before_a_field_went_are_read_if_it_was_off():
         on["env"][group][field] = value
         with pytest.raises(ValueError, match=rf"env\.{group}\.{field} is .*, and this version has only"):
             from_dict(TeacherCfg, on)
+    before["env"]["aim"]["enabled"] = True
+    with pytest.warns(UserWarning, match=r"env\.aim\.enabled is True; this version ignores it"):
+        assert from_dict(TeacherCfg, before) == PRESETS["gpu"]()
 
 
 def test_configuration_errors_name_the_path_of_the_field():

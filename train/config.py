@@ -162,15 +162,14 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
         if not value > 0:
             raise ValueError(f"{flag} is {value}; it has to be positive")
     run.check_kept()
-    iterations = {
+    not_negative = {
         "--ppo.critic-warmup-iterations": ppo.critic_warmup_iterations or 0,
         "--ppo.imitation-iterations": ppo.imitation_iterations,
+        "--ppo.bound-coefficient": ppo.bound_coefficient,
     }
-    for flag, count in iterations.items():
-        if count < 0:
-            raise ValueError(f"{flag} is {count}; it has to be zero or positive")
-    if ppo.bound_coefficient < 0.0:
-        raise ValueError(f"--ppo.bound-coefficient is {ppo.bound_coefficient}; it has to be zero or positive")
+    for flag, value in not_negative.items():
+        if value < 0:
+            raise ValueError(f"{flag} is {value}; it has to be zero or positive")
     for flag, share in {"--ppo.gamma": ppo.gamma, "--ppo.gae-lambda": ppo.gae_lambda}.items():
         if not 0.0 <= share <= 1.0:
             raise ValueError(f"{flag} is {share}; it has to be in [0, 1]")

@@ -31,7 +31,7 @@ gpu, under torchrun multi-gpu, and cpu-demo where there is no GPU. Short forms: 
 physics, reward, success and of the ranges of Table S3 too."""
 
 _RARE = {
-    "env": "sim action aim reward success visuals table_friction",
+    "env": "sim action reward success visuals table_friction",
     "env.curriculum.tightening": "joint_speed_rad_s object_speed_m_s object_spin_rad_s action_norm",
     "env.randomisation": "stiffness_scale damping_scale link_mass_scale friction table_friction restitution "
     "object_scale object_scale_count object_mass_kg action_noise_std action_offset_std "

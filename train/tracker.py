@@ -51,8 +51,6 @@ class TrackerCfg:
     """What it knows shapes by: mesh, points (500 exact ones, as the paper's) or scan."""
     sensor_errors: bool = EvalCfg.sensor_errors
     """Its camera errs as a D415 does."""
-    aim: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Let it aim past the goal while the object is near it, here and from now on."""
     second_view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Select symmetry views where a goal is not reached in 3 s: the rule of a policy that is to fly so."""
     num_worlds: int | None = None
@@ -110,7 +108,6 @@ def make_tracker(cfg: TrackerCfg) -> tuple["TrackingPolicy", "Calibration", "Cal
         ValueError: The teacher is none, or observes what no camera shows, or has no views to select, or no
             rule stops any episode within the tolerance.
     """
-    from vd.aim import AimCfg
     from vd.device import resolve_device
     from vd.evaluate.agents import open_teacher, policy_name
     from vd.tracking.policy import TrackingPolicy, TrackingSpec
@@ -121,7 +118,7 @@ def make_tracker(cfg: TrackerCfg) -> tuple["TrackingPolicy", "Calibration", "Cal
     teacher = open_teacher(cfg.teacher, device)
     if teacher is None:
         raise ValueError(f"{cfg.teacher} has no layers; give a trained teacher")
-    spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera, aim=AimCfg(enabled=cfg.aim))
+    spec = TrackingSpec(teacher=policy_name(cfg.teacher), camera=cfg.camera)
     policy = TrackingPolicy(teacher, spec)
     trace = _episodes(cfg, policy, device)
     found = calibrate_trace(trace, tolerance_rad=cfg.tolerance_rad)
@@ -175,7 +172,6 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
         in_air=cfg.in_air,
         goals=cfg.goals,
         sensor_errors=cfg.sensor_errors,
-        aim=cfg.aim,
         second_view=cfg.second_view,
         seed=cfg.seed,
         device=device,
@@ -196,7 +192,6 @@ def _with_rules(
     parts += [] if cfg.goals == "mesh" else [f"goals by {cfg.goals}"]
     parts += ["in the air"] if cfg.in_air else []
     parts += [] if cfg.sensor_errors else ["without sensor errors"]
-    parts += ["aimed past near goals"] if cfg.aim else []
     parts += ["views selected"] if cfg.second_view else []
     parts += [f"tolerance {cfg.tolerance_rad:g} rad", f"seed {cfg.seed}"]
     return replace(

@@ -3,12 +3,20 @@
 import dataclasses
 import types
 import typing
+import warnings
 from collections.abc import Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True)
+class Dropped:
+    """In ``RETIRED``: a field that changed nothing of what a file is. Values other than this leave a note."""
+
+    value: Any
 
 
 def to_dict(value: Any) -> Any:
@@ -41,7 +49,7 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
         where: Dotted path of ``values``, for error messages.
 
     A class that lost a field says so in ``RETIRED``: by name the value that means what is now always so, of a
-    group that went the values of those fields that say so.
+    group that went the values of those fields that say so. Others are refused, but for :class:`Dropped`.
 
     Raises:
         ValueError: A field that ``cls`` does not have, one that is needed and absent, or a value of the wrong
@@ -70,6 +78,9 @@ def _without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], wher
         value, wanted = values[name], retired[name]
         if isinstance(wanted, Mapping) and wanted and isinstance(value, Mapping):
             _without_retired(value, wanted, f"{where}.{name}")
+        elif isinstance(wanted, Dropped):
+            if value != wanted.value:
+                warnings.warn(f"{where}.{name} is {value!r}; this version ignores it", stacklevel=2)
         elif to_dict(value) != wanted:
             raise ValueError(
                 f"{where}.{name} is {value!r}, and this version has only {wanted!r}; take the version that "

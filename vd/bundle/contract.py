@@ -180,7 +180,7 @@ class Contract:
     kind: Kind
     interface: Interface
     network: dict[str, Any]
-    """What rebuilds the network: PolicySpec or StudentCfg; of a tracking policy the former and its aim."""
+    """What rebuilds the network: PolicySpec or StudentCfg; of a tracking policy the former, as ``policy``."""
     stopping: StoppingPart | None
     provenance: Provenance
     software: dict[str, str]

@@ -129,7 +129,7 @@ def write_tracking(folder: Path, policy: "TrackingPolicy", hand: HandModel) -> C
             depth=spec.depth,
             camera=spec.camera,
         ),
-        network={"policy": to_dict(teacher.spec), "aim": to_dict(spec.aim)},
+        network={"policy": to_dict(teacher.spec)},
         stopping=_stopping(spec),
         provenance=replace(
             _provenance(policy.task, spec.teacher, None, teacher.iteration, teacher.env_steps),
@@ -261,16 +261,15 @@ def _build(contract: Contract, weights: dict[str, torch.Tensor], device: str) ->
 
 def _tracking(contract: Contract, weights: dict[str, torch.Tensor], device: str) -> "TrackingPolicy":
     """The tracking policy of a contract with weights."""
-    from vd.aim import AimCfg
     from vd.tracking.policy import TrackingPolicy, TrackingSpec
 
-    source = contract.provenance
+    source, network = contract.provenance, dict(contract.network)
     parts: dict[str, dict[str, torch.Tensor]] = {"actor": {}, "critic": {}}
     for name, value in weights.items():
         part, _, inside = name.partition(".")
         parts[part][inside] = value
     teacher = TrainedPolicy(
-        from_dict(PolicySpec, contract.network["policy"], where="network.policy"),
+        from_dict(PolicySpec, network.pop("policy"), where="network.policy"),
         parts["actor"],
         task=source.task,
         iteration=source.iterations,
@@ -278,10 +277,10 @@ def _tracking(contract: Contract, weights: dict[str, torch.Tensor], device: str)
         device=device,
         critic=parts["critic"] or None,
     )
-    spec = TrackingSpec(
+    spec = replace(
+        from_dict(TrackingSpec, network, where="network"),
         teacher=source.teacher,
         depth=from_dict(DepthCameraCfg, source.depth, where="provenance.depth"),
-        aim=from_dict(AimCfg, contract.network["aim"], where="network.aim"),
         **_settings(contract),
     )
     return TrackingPolicy(teacher, spec)

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from math import pi
 from typing import Any, ClassVar, Literal
 
-from vd.aim import AimCfg
+from vd.config import Dropped
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
@@ -345,6 +345,7 @@ class ReorientCfg:
     """The in-hand reorientation task: hand, objects, worlds and all terms."""
 
     RETIRED: ClassVar[dict[str, Any]] = {
+        "aim": {"enabled": Dropped(False)},
         "caught": {"go_on_share": 0.0},
         "nudge": {"enabled": False},
         "explore": {"enabled": False},
@@ -381,7 +382,6 @@ class ReorientCfg:
     start: StartCfg = field(default_factory=StartCfg)
     goal: GoalCfg = field(default_factory=GoalCfg)
     table: TableCfg = field(default_factory=TableCfg)
-    aim: AimCfg = field(default_factory=AimCfg)
     curriculum: CurriculumCfg = field(default_factory=CurriculumCfg)
     randomisation: RandomisationCfg = field(default_factory=RandomisationCfg)
 
@@ -397,7 +397,6 @@ class ReorientCfg:
         self.randomisation.validate()
         self.curriculum.validate()
         self.table.validate()
-        self.aim.validate()
         if self.start.at_rest and self.start.poses < 1:
             raise ValueError(f"start.at_rest needs start.poses >= 1 (now {self.start.poses})")
         if self.failures_per_million < 0.0:

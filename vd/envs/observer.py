@@ -11,7 +11,6 @@ from vd.envs.randomise import Randomiser
 from vd.envs.shapes import ShapeObserver
 from vd.envs.symmetry import Views
 from vd.envs.task_state import TaskState
-from vd.kernels.aim import aim_kernel
 from vd.kernels.dynamics import dynamics_kernel
 from vd.kernels.history import forget_kernel, history_kernel, remember_kernel
 from vd.kernels.observations import teacher_observation_kernel, teacher_observation_slices
@@ -84,7 +83,7 @@ class Observer:
         if self._frames:
             self._launch(
                 remember_kernel,
-                [*self._remembered, self._frames, self.world_values, self._state.aimed_quat],
+                [*self._remembered, self._frames, self.world_values, self._state.goal_quat],
                 [self._head, self._count, self._past],
             )
 
@@ -92,16 +91,6 @@ class Observer:
         """Write the observation of the present state. Device work only."""
         state = self._state
         self.seen.recall()
-        if state.cfg.aim.enabled:
-            aim = state.cfg.aim
-            inputs = [
-                aim.past_rad,
-                aim.within_rad,
-                state.num_actions + 3,
-                self.seen.arrays[2],
-                state.goal_quat,
-            ]
-            self._launch(aim_kernel, inputs, [state.aimed_quat])
         noise = state.parameters.observation, self._drawn.observation_offset, state.rng
         self._observe_state(self.seen.arrays, noise, self.world_values)
         if "present" in self.parts:
@@ -133,7 +122,7 @@ class Observer:
                 self._body_com,
                 settings,
                 *seen,
-                state.aimed_quat,
+                state.goal_quat,
                 state.smoothed,
                 offset,
                 rng,
@@ -157,7 +146,7 @@ class Observer:
                     *self._remembered,
                     self._frames,
                     self.parts["history"].start,
-                    self._state.aimed_quat,
+                    self._state.goal_quat,
                     self._head,
                     self._count,
                     self._past,

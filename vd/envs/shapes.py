@@ -89,7 +89,7 @@ class ShapeObserver:
                 state.num_actions,
                 self._extent_column,
                 joint_q,
-                state.aimed_quat,
+                state.goal_quat,
             ],
             outputs=[out],
             device=state.device,

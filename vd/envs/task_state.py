@@ -46,8 +46,6 @@ class TaskState:
     """Moving average of the applied actions, shape [N, D]."""
     goal_quat: wp.array
     """Wanted orientation of the object, shape [N]."""
-    aimed_quat: wp.array
-    """The same as it is observed, shape [N]."""
     must_lift: wp.array
     """1 where success asks that the object does not touch the table, shape [N]."""
     rng: wp.array
@@ -113,7 +111,6 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
         upper=wp.array(hand.upper, dtype=float, device=device),
         smoothed=wp.zeros((n, hand.num_joints), dtype=float, device=device),
         goal_quat=goal,
-        aimed_quat=wp.zeros(n, dtype=wp.quat, device=device) if cfg.aim.enabled else goal,
         must_lift=wp.array(must_lift(cfg), dtype=wp.int32, device=device),
         rng=rng,
     )

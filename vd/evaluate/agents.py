@@ -5,7 +5,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
-from vd.aim import AimCfg
 from vd.bundle import is_bundle
 from vd.config import from_dict
 from vd.envs.cfg import (
@@ -271,7 +270,6 @@ def task_for(
     success_ends_episode: bool,
     at_rest: bool | None = None,
     hand_layer: str | None = None,
-    aim: bool = False,
     second_view: bool = False,
     condition: RandomisationCfg | None = None,
 ) -> ReorientCfg:
@@ -295,7 +293,6 @@ def task_for(
         at_rest: Start at rest on the table rather than from a drop; None: as trained.
         hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is, None: as
             trained.
-        aim: Whether it is told to turn past a goal that is near.
         second_view: Whether a teacher looks twice at goals (:mod:`vd.evaluate.second_view`); a student needs
             nothing of the task for that.
         condition: What is drawn, in place of ``randomised`` (:mod:`vd.evaluate.conditions`).
@@ -329,6 +326,5 @@ def task_for(
         else replace(base.goal, max_angle_rad=max_goal_angle_rad),
         curriculum=CurriculumCfg(),
         table=TableCfg(),
-        aim=AimCfg(enabled=aim),
         randomisation=condition or replace(base.randomisation, enabled=randomised),
     )

@@ -29,7 +29,6 @@ OF_THE_SUITE = (
     "stop_tolerance",
     "episode_s",
     "in_air",
-    "aim",
     "table_friction",
     "condition",
     "goals",
@@ -95,8 +94,6 @@ class EvalCfg:
     """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
     table_friction: float | None = None
     """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
-    aim: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Ours: aim past the goal while the object is near it; more come within 0.1 rad."""
     second_view: tyro.conf.FlagCreatePairsOff[bool] = False
     """Ours: where a policy has not come to its goal in 3 s, look at it once a second from other fingers'
     sides, or in the mirror, and go on in the view of which its critic, or its teacher's, expects

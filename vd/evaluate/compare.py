@@ -119,7 +119,6 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], worlds: int
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        aim=cfg.aim,
         second_view=cfg.second_view,
         condition=cfg.randomisation,
     )
@@ -159,7 +158,6 @@ def _protocol(cfg: EvalCfg, name: str, task: "ReorientCfg", sees: str) -> "Proto
         table_friction=cfg.table_friction,
         goals=cfg.goals,
         sensor_errors=cfg.sensor_errors and sees == "rendered clouds",
-        aim=cfg.aim,
         second_view=cfg.second_view and name not in BUILT_IN,
         condition=cfg.condition,
     )
@@ -192,7 +190,6 @@ def actor_of(cfg: EvalCfg, name: str, policy: Any | None, env: Any, device: str)
             policy,
             goals=cfg.goals,
             sensor_errors=cfg.sensor_errors,
-            aim=cfg.aim,
             second_view=cfg.second_view,
             seed=cfg.seed,
         )

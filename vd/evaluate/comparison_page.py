@@ -213,8 +213,7 @@ def ours(row: Row) -> str:
 
 
 def _marks(protocol: Protocol) -> str:
-    named = {"second_view": "symmetry-view selection", "aim": "aims past near goals"}
-    return ", ".join(text for name, text in named.items() if getattr(protocol, name))
+    return "symmetry-view selection" if protocol.second_view else ""
 
 
 def ecdf_figure(comparison: Comparison) -> Figure:

@@ -5,7 +5,7 @@ Angles are radians, times seconds, quaternions xyzw.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -65,6 +65,7 @@ class Episode:
 class Protocol:
     """How the episodes were run."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"aim": False}
     policy: str
     """Checkpoint path, or the name of a built-in agent."""
     objects: str
@@ -100,8 +101,6 @@ class Protocol:
     """What students know shapes and goals by."""
     sensor_errors: bool = False
     """Cameras of students have the errors of a real one."""
-    aim: bool = False
-    """The policy is told to turn past a goal that is near."""
     second_view: bool = False
     """A goal that is not reached is looked at in other views (:mod:`vd.evaluate.second_view`)."""
     condition: str | None = None

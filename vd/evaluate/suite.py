@@ -61,7 +61,6 @@ class Condition:
         goals: What students know shapes and goals by. A teacher's are orientations: only the mesh's are its.
         sensor_errors: Cameras of students have the errors of a real one.
         second_view: Symmetry-view selection, for policies that have views.
-        aim: Aim past near goals.
         mark: What of it is not the paper's; empty for the headline.
         quick: Part of the reduced suite.
     """
@@ -77,7 +76,6 @@ class Condition:
     goals: Goals = "mesh"
     sensor_errors: bool = True
     second_view: bool = False
-    aim: bool = False
     mark: str = ""
     quick: bool = True
 
@@ -90,7 +88,6 @@ class Condition:
         flags += [] if self.goals == "mesh" else [f"--goals {self.goals}"]
         flags += [] if self.sensor_errors else ["--no-sensor-errors"]
         flags += ["--second-view"] if self.second_view else []
-        flags += ["--aim"] if self.aim else []
         return " ".join(flags)
 
     def concerns(self, *, student: bool, views: bool) -> bool:
@@ -178,13 +175,11 @@ CONDITIONS = (
             mark=mark,
             quick=False,
             second_view=name in ("second-view", "before"),
-            aim=name in ("aim", "before"),
             sensor_errors=name != "before",
         )
         for name, mark in (
             ("second-view", "ours: symmetry-view selection"),
-            ("aim", "ours: aiming past near goals"),
-            ("before", "ours: both, and a perfect camera, as before these conditions"),
+            ("before", "ours: view selection, and a perfect camera, as before these conditions"),
         )
     ),
 )

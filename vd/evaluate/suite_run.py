@@ -243,7 +243,6 @@ def settings(cfg: EvalCfg, condition: Condition, policy: str, objects: Objects) 
         table_friction=condition.table_friction,
         goals=condition.goals,
         sensor_errors=condition.sensor_errors,
-        aim=condition.aim,
     )
 
 

@@ -1,6 +1,5 @@
 """A tracking policy at work in an environment."""
 
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -29,7 +28,6 @@ class TrackingActor:
         *,
         goals: Goals = "mesh",
         sensor_errors: bool = False,
-        aim: bool | None = None,
         second_view: bool = False,
         seed: int = 0,
     ):
@@ -40,15 +38,13 @@ class TrackingActor:
             policy: The policy.
             goals: What it knows shapes and goals by (:mod:`vd.evaluate.scanned`).
             sensor_errors: Give its camera the errors of a real one.
-            aim: Whether it aims past near goals; None: if its file says so, or the environment.
             second_view: Select symmetry views by its teacher's critic.
             seed: Of the errors of camera and scans.
 
         Raises:
             ValueError: It is of another hand, or has no views to select.
         """
-        scene, own = env.scene, env.cfg.aim if env.cfg.aim.enabled else policy.spec.aim
-        camera, depth = env.hand.camera.at(policy.spec.camera), policy.spec.depth
+        scene, camera, depth = env.scene, env.hand.camera.at(policy.spec.camera), policy.spec.depth
         self.num_actions = policy.num_actions
         depth = depth.with_errors() if sensor_errors else depth
         self._senses = EnvironmentSenses(env, camera, depth, seed=seed)
@@ -59,7 +55,6 @@ class TrackingActor:
             camera,
             world_object=scene.world_object,
             world_scale=scene.world_scale,
-            aim=own if aim is None else replace(own, enabled=aim),
             second_view=second_view,
             device=env.device,
         )

@@ -68,8 +68,6 @@ class PlayCfg:
     """Start at rest on the table; the default is as trained, and a drop for --agent zero and random."""
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
-    aim: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Aim past the goal while the object is near it: more come within 0.1 rad. Some policies do so anyway."""
     second_view: tyro.conf.FlagCreatePairsOff[bool] = False
     """Where a policy has not come to its goal in 3 s, look at it in other views (vd-eval --help)."""
     stop_tolerance: float = PAPER.success.rotation_rad
@@ -276,7 +274,6 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         success_ends_episode=False,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        aim=cfg.aim,
         second_view=cfg.second_view,
     )
     if cfg.in_air:

@@ -13,11 +13,9 @@ import numpy as np
 import torch
 import warp as wp
 
-from vd.aim import AimCfg
 from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.clouds import HandKinematics, SceneClouds
-from vd.kernels.aim import aim_kernel
 from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
 from vd.kernels.shapes import (
     ORIENTATIONS,
@@ -65,7 +63,6 @@ class Observer:
         world_object: Object of each hand [N].
         world_scale: Size factor of each hand's object [N].
         camera: What sees them, posed in the base frame.
-        aim: Where goals are said to be while they are near.
         control_hz: Control steps a second.
         device: Warp device.
     """
@@ -79,11 +76,10 @@ class Observer:
         world_object: np.ndarray,
         world_scale: np.ndarray,
         camera: CameraModel,
-        aim: AimCfg,
         control_hz: float,
         device: str,
     ):
-        self._hand, self._aim, self._rate, self._device = hand, aim, control_hz, device
+        self._hand, self._rate, self._device = hand, control_hz, device
         place, links = wp.device_to_torch(device), np.arange(len(hand.link_names))
 
         def array(values: Any, dtype: Any) -> wp.array:
@@ -132,8 +128,6 @@ class Observer:
         found = self.found = self._find(senses)
         goal = nearest_goal(found.orientation, senses.goal_quat, self._symmetry)
         angle = rotation_distance(found.orientation, goal)
-        if self._aim.enabled:
-            goal = self._aimed(found.orientation, goal)
         parts = {
             "joint_position": 2.0 * (senses.joint_q - self._lower) / (self._upper - self._lower) - 1.0,
             "joint_velocity": PAPER.observation.velocity_scale * senses.joint_qd,
@@ -174,15 +168,6 @@ class Observer:
         )
         before.copy_(pose)
         return found
-
-    def _aimed(self, orientation: torch.Tensor, goal_quat: torch.Tensor) -> torch.Tensor:
-        """Orientations to aim at [N, 4], for those of objects and goals [N, 4]."""
-        aimed = torch.empty_like(orientation)
-        pose = wp.from_torch(orientation.contiguous())
-        goal = wp.from_torch(goal_quat.contiguous(), dtype=wp.quat)
-        inputs = [self._aim.past_rad, self._aim.within_rad, 0, pose, goal]
-        self._launch(aim_kernel, len(aimed), inputs, wp.from_torch(aimed, dtype=wp.quat))
-        return aimed
 
     def _shape(self, found: Found, goal_quat: torch.Tensor) -> torch.Tensor:
         """The shape's values, as the environment computes those of true poses (:mod:`vd.kernels.shapes`)."""

@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 
-from vd.aim import AimCfg
-from vd.config import from_dict, to_dict
+from vd.config import Dropped, from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.policy import TrainedPolicy, policy_of, read_state
 from vd.sensors.cfg import DepthCameraCfg
@@ -20,14 +19,13 @@ TRACKING_FORMAT = "visual-dexterity tracking 1"
 class TrackingSpec(StoppingRules):
     """What a tracking policy is besides its teacher."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"aim": {"enabled": Dropped(False)}}
     teacher: str = ""
     """Name of that teacher."""
     camera: tuple[float, ...] | None = None
     """Pose of the optical frame in the base frame, position [m] and quaternion xyzw; None: the hand's."""
     depth: DepthCameraCfg = field(default_factory=DepthCameraCfg)
     """Points and crop of the camera's clouds."""
-    aim: AimCfg = field(default_factory=AimCfg)
-    """Whether it acts as if its goal were a little farther while that is near."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from vd.aim import AimCfg
 from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict
@@ -43,7 +42,6 @@ class Tracker:
         camera: What sees them, posed in the base frame.
         world_object: Object of each hand [N]; the first by default, of one hand.
         world_scale: Size factor of each hand's object [N]; 1 by default.
-        aim: Whether and how to aim past near goals; as the policy's file says by default.
         second_view: Select symmetry views by the teacher's critic where a goal is not reached.
         device: Warp device.
 
@@ -64,7 +62,6 @@ class Tracker:
         *,
         world_object: np.ndarray | None = None,
         world_scale: np.ndarray | None = None,
-        aim: AimCfg | None = None,
         second_view: bool = False,
         device: str = "cpu",
     ):
@@ -83,7 +80,6 @@ class Tracker:
             world_object=objects_of,
             world_scale=np.ones(len(objects_of)) if world_scale is None else world_scale,
             camera=camera,
-            aim=policy.spec.aim if aim is None else aim,
             control_hz=task.sim.control_hz,
             device=device,
         )

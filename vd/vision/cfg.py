@@ -3,8 +3,7 @@
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
-from vd.aim import AimCfg
-from vd.config import to_dict
+from vd.config import Dropped
 from vd.paper import PAPER
 
 DistancePlace = Literal["before", "after"]
@@ -126,7 +125,7 @@ class StateCfg:
 class StudentCfg:
     """The student's network; presets are below."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"aim": to_dict(AimCfg())}
+    RETIRED: ClassVar[dict[str, Any]] = {"aim": {"enabled": Dropped(False)}}
     encoder: EncoderCfg = field(default_factory=EncoderCfg)
     """From voxels to an embedding."""
     voxel_m: float = PAPER.cloud.voxel_m
