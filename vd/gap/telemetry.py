@@ -59,7 +59,8 @@ def vetoes(recording: Recording, chain: Chain, spec: JointSpec, rows: np.ndarray
         result["supply_sag"] = reason
     reason, late = _plain_duty(recording, chain, spec, trajectories, rows[spec.joint])
     if reason:
-        result.update(dict.fromkeys({*UPSTREAM, REFERENCE_SIDE} - {late}, reason))
+        others = (name for name in (*UPSTREAM, REFERENCE_SIDE) if name != late)
+        result.update(dict.fromkeys(others, reason))
     return result
 
 
