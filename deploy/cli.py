@@ -71,13 +71,19 @@ def usage() -> str:
     return USAGE.format(run=RUN.summary, commands="\n".join(lines))
 
 
-def _is_policy(text: str) -> bool:
-    """Whether it is a file, a folder or an installed policy."""
+def _no_policy(text: str) -> str:
+    """Why it is no file, no folder and no installed policy; "" if it is one."""
     if Path(text).exists():
-        return True
-    from vd.evaluate.agents import SHIPPED_POLICIES
+        return ""
+    from vd.evaluate.agents import find_policy
 
-    return text in SHIPPED_POLICIES
+    try:
+        find_policy(text)
+    except FileNotFoundError:
+        return f"no command and no policy {text!r}; commands are {', '.join(COMMANDS)}"
+    except ValueError as error:  # it has another name now
+        return str(error)
+    return ""
 
 
 @interrupt.command("vd-deploy")
@@ -91,11 +97,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments[0] in COMMANDS:
         name = arguments.pop(0)
         entry = COMMANDS[name]
-    elif not arguments[0].startswith("-") and not _is_policy(arguments[0]):
-        print(
-            f"vd-deploy: no command and no policy {arguments[0]!r}; commands are {', '.join(COMMANDS)}",
-            file=sys.stderr,
-        )
+    elif not arguments[0].startswith("-") and (wrong := _no_policy(arguments[0])):
+        print(f"vd-deploy: {wrong}", file=sys.stderr)
         return FAILED
     import tyro
 

@@ -12,7 +12,9 @@ from sensed_world import state_of
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
+from vd.bench.cli import StudentCommand
 from vd.config import to_dict
+from vd.deploy.cli import main as vd_deploy
 from vd.deploy.pilot import TrackingPilot
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
@@ -255,10 +257,26 @@ def test_a_former_name_is_refused_with_the_new_one(name, capsys, tmp_path):
     assert RENAMED[name] in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["calibrate", "follow"])
-def test_a_former_command_is_refused_with_the_new_one(command, capsys):
+@pytest.mark.parametrize("name", sorted(RENAMED))
+def test_other_commands_tell_a_former_name_too(name, capsys):
+    assert vd_deploy([name, "--twin"]) == 1
+    assert RENAMED[name] in capsys.readouterr().err
+    with pytest.raises(ValueError, match=RENAMED[name]):
+        StudentCommand(networks=("lean", name)).run()
+
+
+@pytest.mark.parametrize(
+    ("command", "word"),
+    [
+        ("calibrate", "vd-train tracker"),
+        ("follow", "vd-train tracker"),
+        ("noise", "'noise' is no more; nothing takes its place"),
+        ("profile", "'profile' is no more; nothing takes its place"),
+    ],
+)
+def test_a_former_command_is_refused_with_the_new_one(command, word, capsys):
     assert vd_train([command, "student.pt"]) == 2
-    assert "vd-train tracker" in capsys.readouterr().err
+    assert word in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -148,8 +148,10 @@ def load_checkpoint(
     """
     state = read_state(path, device, remedy=f"give {flag} another file of its folder")
     if not {f"{network}_state_dict", *_NEEDED[network]} <= state.keys():
+        command = "teacher" if network == "actor" else network
         raise ValueError(
-            f"{path} holds no {network}; give {flag} a file that vd-train wrote in {CHECKPOINT_FOLDER}/"
+            f"{path} holds no {network}; give {flag} a file that vd-train {command} wrote in "
+            f"{CHECKPOINT_FOLDER}/"
         )
     return _restored(state)
 

@@ -51,7 +51,8 @@ checkpoint, progress.jsonl for the curve so far: vd-train teacher --run-dir FOLD
 vd-train COMMAND --help lists the flags of a command."""
 
 _TRACKER = "vd-train tracker TEACHER --objects SET writes a tracking policy and its stopping rules"
-GONE = {"calibrate": _TRACKER, "follow": _TRACKER}
+_UNUSED = "nothing takes its place, since no training needed it"
+GONE = {"calibrate": _TRACKER, "follow": _TRACKER, "noise": _UNUSED, "profile": _UNUSED}
 """Commands that are no more, and what to do."""
 
 

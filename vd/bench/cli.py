@@ -204,21 +204,24 @@ class StudentCommand:
 
     def run(self) -> int:
         """Measure and print."""
+        from vd.evaluate.agents import find_policy
+        from vd.vision.cfg import PRESETS
+
+        presets = [name for name in self.networks if name in PRESETS]
+        for name in set(self.networks) - set(presets):
+            try:
+                find_policy(name)
+            except FileNotFoundError as error:
+                raise ValueError(
+                    f"--networks {name}: no such preset or policy; choose of {', '.join(PRESETS)}, or give "
+                    "a camera policy"
+                ) from error
         import warp as wp
 
         from vd.assets_usd.objects.sets import load_set
         from vd.bench.student import measure_latency, measure_training
-        from vd.evaluate.agents import SHIPPED_POLICIES
         from vd.files import write_json
-        from vd.vision.cfg import PRESETS
 
-        presets = [name for name in self.networks if name in PRESETS]
-        for name in self.networks:
-            if name not in presets and name not in SHIPPED_POLICIES and not Path(name).exists():
-                raise ValueError(
-                    f"--networks {name}: no such preset or policy; choose of {', '.join(PRESETS)}, or give "
-                    "a camera policy"
-                )
         quiet_warp()
         device = resolve_device(self.device)
         objects = load_set(list(self.objects))

@@ -47,15 +47,18 @@ def compare(cfg: EvalCfg, stop_at: float = math.inf) -> "Comparison":
         TimeoutError: It was to give up.
     """
     quiet_warp()
+    from vd.device import resolve_device
+
+    device = resolve_device(cfg.device)
+    # A file that cannot be used is told before the simulator is imported.
+    policies = {name: open_policy(name, device) for name in cfg.agent_names}
     from vd.assets_usd.objects.sets import load_set
     from vd.assets_usd.objects.sheet import pictures
-    from vd.device import resolve_device
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.comparison import Comparison, judge
     from vd.evaluate.comparison_page import write_comparison
     from vd.tracking.symmetry import with_symmetries
 
-    device = resolve_device(cfg.device)
     groups = parse_groups(cfg.object_sets)
     everything = tuple(dict.fromkeys(s for sets in groups.values() for s in sets))
     members = {name: [item.name for item in load_set(list(sets))] for name, sets in groups.items()}
@@ -65,8 +68,7 @@ def compare(cfg: EvalCfg, stop_at: float = math.inf) -> "Comparison":
     rows, predictions = [], []
     env: Any = None
     task, start = None, None
-    for name in cfg.agent_names:
-        policy = open_policy(name, device)
+    for name, policy in policies.items():
         wanted = task_of(cfg, policy, everything, worlds)
         check_bundle(name, wanted)
         if task != wanted:

@@ -9,7 +9,7 @@ radians, errors are of the recorded joint position, intervals are 95 %.
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -318,10 +318,6 @@ class Report:
             return set(group[1:]) <= {*same.get(group[0], ()), *both}
 
         return tuple(group for group in self.ambiguous if not closed(group))
-
-    def with_closing(self, closing: Closing) -> "Report":
-        """The same report with what the closing simulation showed."""
-        return replace(self, closing=closing)
 
 
 @dataclass(frozen=True)
