@@ -40,7 +40,7 @@ $(STAMP): pyproject.toml constraints.txt
 	  echo 'No Python 3.11 or 3.12 found. Install one (Debian, Ubuntu: apt install python3.11 python3.11-venv;' >&2; \
 	  echo 'elsewhere: pyenv install 3.11) or name it: make PYTHON=/path/to/python3.11' >&2; exit 1; }
 	@test -n "$(TORCH_INDEX)" || command -v nvidia-smi >/dev/null || \
-	  echo 'No GPU found. If pip chooses the CUDA build of torch below (gigabytes), stop it and set TORCH_INDEX, see README.'
+	  echo 'No GPU found. If pip chooses the CUDA build of torch below (gigabytes), stop it and set TORCH_INDEX, see docs/install.md.'
 	test -x $(BIN)/pip || "$(PYTHON)" -m venv --clear $(VENV)
 	$(BIN)/pip install -c constraints.txt setuptools
 	$(BIN)/pip install -c constraints.txt $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX)) torch

@@ -265,6 +265,15 @@ def test_other_commands_tell_a_former_name_too(name, capsys):
         StudentCommand(networks=("lean", name)).run()
 
 
+def test_what_has_no_checkpoints_does_not_speak_of_resuming(monkeypatch, capsys):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vd.train.tracker.tracker_command", interrupted)
+    assert vd_train(["tracker", "dclaw3-table"]) == 130
+    assert "stopped at once\n" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("command", "word"),
     [

@@ -139,7 +139,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"vd-train: {error}\n(VD_DEBUG=1 shows where)", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("vd-train: stopped at once; --resume goes on from the last checkpoint", file=sys.stderr)
+        hint = "; --resume goes on from the last checkpoint" if arguments[0] in ("teacher", "student") else ""
+        print(f"vd-train: stopped at once{hint}", file=sys.stderr)
         return interrupt.INTERRUPTED
 
 
