@@ -10,7 +10,8 @@ from train_dummy import SMALL_PPO, DummyEnv, make_runner
 from vd.policy import load_policy
 from vd.train.checkpoint import find_checkpoint
 from vd.train.cli import main
-from vd.train.config import PolicyCfg
+from vd.train.config import PolicyCfg, PpoCfg
+from vd.train.imitate import IMITATED, resumed_imitation
 from vd.train.metrics import read_progress
 
 NETWORK = PolicyCfg(hidden=(32, 32), distribution="state-dependent", initial_std=0.2, std_range=(0.05, 0.5))
@@ -123,6 +124,11 @@ def test_a_run_that_was_stopped_on_the_way_goes_on_imitating_the_same(taught, tm
         assert torch.equal(value, again.imitation.teacher.state_dict()[name]), name
     again.learn(1)
     assert read_progress(tmp_path / "progress.jsonl")[-1]["loss/imitation"] > 0.0
+
+
+def test_a_run_that_goes_on_without_imitating_has_none():
+    """Its share that is left was divided by no iterations."""
+    assert resumed_imitation(None, PpoCfg(imitation_iterations=0), 3, {IMITATED: {}}) is None
 
 
 def test_it_is_refused_without_a_policy_or_without_the_present(taught, tmp_path, capsys):

@@ -1,6 +1,6 @@
 """One policy of the mean weights of several that went on from the same one.
 
-Once a policy is learned, an update is nearly all noise (docs/training.md), and every run ends somewhere
+Once a policy is learned, an update is nearly all noise (docs/lessons.md), and every run ends somewhere
 around what it has learned, not at it. Their mean is nearer to that. Weights of runs that began apart are not
 alike, and their mean is nothing; so it has to be judged, like any policy.
 """

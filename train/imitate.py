@@ -107,8 +107,8 @@ def begin_imitation(
 def resumed_imitation(
     learner: TeacherPPO, ppo: PpoCfg, present: int, state: Mapping[str, Any]
 ) -> Imitation | None:
-    """The imitation that a checkpoint was in; None: it was over, or there was none."""
-    if IMITATED not in state:
+    """The imitation that a checkpoint was in; None: it was over, or there was none, or it is turned off."""
+    if IMITATED not in state or not ppo.imitation_iterations:
         return None
     imitation = Imitation(learner, present, ppo.imitation_learning_rate)
     imitation.teacher.load_state_dict(state[IMITATED])

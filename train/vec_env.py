@@ -20,7 +20,7 @@ PRIVILEGED_GROUP = "privileged"
 
 
 class ReorientVecEnv(VecEnv):
-    """N worlds of a :class:`vd.envs.ReorientEnv` behind rsl-rl's interface.
+    """N worlds of a :class:`vd.envs.reorient.ReorientEnv` behind rsl-rl's interface.
 
     Rewards and flags are torch views of the environment's Warp arrays, without a copy. Observations
     are copied once, on the device: rsl-rl stores the observation of a step only *after* the next step has

@@ -103,7 +103,7 @@ class EvalCfg:
     scan, points with 4 mm of noise and a fifth missing. A surface is laid through points."""
     sensor_errors: bool = True
     """Cameras of policies err as a D415 does: noise, gaps, late images, not quite where it is believed
-    (docs/depth.md). Without: as in their training."""
+    (docs/concepts/perception.md). Without: as in their training."""
     sees: Literal["auto", "complete", "rendered"] = "auto"
     """What students see: complete clouds, a depth camera's, or what their stage was trained on."""
     randomise: bool = False

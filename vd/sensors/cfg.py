@@ -27,7 +27,7 @@ LATENCY_S = (1.0 / 30.0, 2.0 / 30.0)
 read (an assumption; the data sheet gives none)."""
 POSITION_NOISE_M, ROTATION_NOISE_RAD = 0.001, 0.002
 """What a calibration leaves of the camera's place along and about each axis: 2 mm in the median at an object
-half a metre away, as of 20 views of one finger (docs/camera.md)."""
+half a metre away, as of 20 views of one finger."""
 
 
 @dataclass(frozen=True)
