@@ -220,7 +220,7 @@ class TeacherRunner(OnPolicyRunner):
         self.alg.actor_learns = self.critic_warmup == 0
         losses = self.alg.update()
         if self.imitation is not None and self.critic_warmup:
-            losses |= self.imitation.update(self.critic_warmup / self.ppo.imitation_iterations)
+            losses |= self.imitation.update(min(1.0, self.critic_warmup / self.ppo.imitation_iterations))
         self.critic_warmup = max(0, self.critic_warmup - 1)
         self._check_update(losses)
         end = time.perf_counter()

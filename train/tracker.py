@@ -25,7 +25,7 @@ class TrackerCfg:
     """Write a tracking policy: a teacher that acts by a depth camera, on objects of known shape.
 
     It finds the object among the camera's points. Nothing is learned; its stopping rules are chosen on
-    episodes with objects of validation, those of vd-eval with the same flags.
+    episodes with objects of validation, those of vd-eval with the same flags and --goals points.
     """
 
     teacher: Annotated[str, tyro.conf.Positional]
