@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, canonical_quat, compose, invert
+from vd.assets_usd.hand_data import canonical_quat
 from vd.assets_usd.objects.geometry import (
     convex_hull,
     random_surface_points,
@@ -30,7 +30,6 @@ from vd.assets_usd.objects.reading import load_points
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.scans import Surface, surface_of_scan
 from vd.assets_usd.objects.sets import load_set
-from vd.paper import PAPER
 
 SCAN_SUFFIXES = (".ply", ".obj", ".glb")
 """Files that are taken as scans."""
@@ -103,18 +102,6 @@ def scan_object(path: Path, unit: str | None = None, *, seed: int = 0) -> Object
         )
     except ObjectError as error:
         raise GoalError(f"{path}: {error}; scan it from more sides") from error
-
-
-def goal_cloud(item: ObjectModel, quat: np.ndarray) -> np.ndarray:
-    """The goal's cloud as a student sees it: in the hand's base frame, behind the palm, [500, 3] [m].
-
-    Args:
-        item: The object.
-        quat: Wanted orientation in the world frame, xyzw [4].
-    """
-    base = invert(np.array(BASE_IN_WORLD))
-    turn = compose(base, np.array([0.0, 0.0, 0.0, *quat]))[3:]
-    return Rotation.from_quat(turn).apply(item.surface_points) + PAPER.cloud.goal_position_m
 
 
 def read_goals(texts: Sequence[str]) -> list[np.ndarray]:

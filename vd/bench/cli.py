@@ -208,7 +208,7 @@ class StudentCommand:
         from vd.vision.cfg import PRESETS
 
         presets = [name for name in self.networks if name in PRESETS]
-        for name in set(self.networks) - set(presets):
+        for name in (name for name in self.networks if name not in presets):
             try:
                 find_policy(name)
             except FileNotFoundError as error:
