@@ -52,7 +52,7 @@ class PpoCfg:
     """Optimiser: the paper says Adam, its code uses AdamW."""
     cuda_graph: bool = False
     """Record forward and backward pass of a minibatch once as a CUDA graph, and replay it: where launching
-    some hundred kernels takes longer than running them, as on busy processors. On one GPU; else ignored."""
+    some hundred kernels takes longer than running them, as on busy processors. Ignored on a CPU."""
     critic_warmup_iterations: int | None = None
     """Iterations at the begin of a run in which the critic learns alone; the actor acts and stays as it is.
     None: as many as what --init begins from needs, 50 without a critic, 3 without an optimiser, else 0."""

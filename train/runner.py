@@ -15,7 +15,7 @@ from tensordict import TensorDict
 from vd.config import to_dict
 from vd.envs.curriculum import blend
 from vd.policy import PolicySpec, policy_export
-from vd.train.begin import at_stage, check_fit, completed, unlike, warmup_iterations
+from vd.train.begin import at_stage, completed, fitting, unlike, warmup_iterations
 from vd.train.checkpoint import (
     BEST_NAME,
     CHECKPOINT_FOLDER,
@@ -304,7 +304,7 @@ class TeacherRunner(OnPolicyRunner):
             ValueError: The file is damaged, of another hand or of another network.
         """
         state = load_checkpoint(Path(path), self.device, flag="--init")
-        check_fit(state, self._spec(), self.task, path)
+        state = fitting(state, self._spec(), self.task, path)
         self.unlike = unlike(state["task"], self.task)
         warmup = warmup_iterations(state, self.ppo.critic_warmup_iterations)
         before = state
