@@ -53,36 +53,28 @@ class SeenState:
             [self._head, self._ring],
         )
 
-    def begin(self, mask: wp.array, nominal: wp.array | None) -> None:
-        """Draw the latency of the environments of ``mask`` [N], whose past is their present state.
-
-        Args:
-            mask: 1 where an episode begins, shape [N].
-            nominal: 1 where it is seen at once, among those, shape [N]; None: nowhere.
-        """
+    def begin(self, mask: wp.array) -> None:
+        """Draw the latency of the environments of ``mask`` [N], whose past is their present state."""
         if not self.is_late:
             return
         state, sim = self._state, self._state.sim
         measured = self._measured(sim.joint_q, sim.joint_qd)
         now = [*measured, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
-        for envs, span in ((mask, state.cfg.randomisation.observation_latency_s), (nominal, (0.0, 0.0))):
-            if envs is None:
-                continue
-            wp.launch(
-                begin_latency_kernel,
-                dim=state.num_envs,
-                inputs=[
-                    wp.vec2(*span),
-                    state.num_actions,
-                    self._slots,
-                    state.fingers.tip_body,
-                    envs,
-                    *now,
-                    state.rng,
-                ],
-                outputs=[self.latency, self._ring],
-                device=state.device,
-            )
+        wp.launch(
+            begin_latency_kernel,
+            dim=state.num_envs,
+            inputs=[
+                wp.vec2(*state.cfg.randomisation.observation_latency_s),
+                state.num_actions,
+                self._slots,
+                state.fingers.tip_body,
+                mask,
+                *now,
+                state.rng,
+            ],
+            outputs=[self.latency, self._ring],
+            device=state.device,
+        )
 
     def recall(self) -> None:
         """Refresh :attr:`arrays`."""
