@@ -6,9 +6,9 @@ import torch
 from fake_env import FakeEnv, FakeObject
 from scipy.spatial.transform import Rotation
 
-from vd.evaluate.result import TOLERANCES_RAD, Protocol, judge
+from vd.evaluate.result import Protocol, judge
 from vd.evaluate.rollout import draw_starts_and_goals
-from vd.evaluate.statistics import rotation_angle
+from vd.evaluate.statistics import TOLERANCES_RAD, rotation_angle
 from vd.evaluate.trace import NEVER_RAD, record
 from vd.stopping import StoppingRule
 
@@ -74,7 +74,7 @@ def test_only_the_first_episode_of_a_world_in_a_round_counts():
     assert env.resets == 2  # one of the constructor, one round
 
 
-@pytest.mark.parametrize("worlds", [3, 5, 12, 40])
+@pytest.mark.parametrize("envs", [3, 5, 12, 40])
 def test_every_start_and_goal_is_run_once_whatever_the_number_of_worlds(envs):
     objects = [FakeObject("a"), FakeObject("b", CUBE), FakeObject("c")]
     drawn = [draw_starts_and_goals(o.name, 4, seed=1) for o in objects]

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from vd.evaluate.plots import ecdf_figure
-from vd.evaluate.result import OUTCOMES, SUCCESS, TOLERANCES_RAD, Protocol, Result, Row, Summary
-from vd.evaluate.statistics import Interval
+from vd.evaluate.result import OUTCOMES, SUCCESS, Protocol, Result, Row, Summary
+from vd.evaluate.statistics import TOLERANCES_RAD, Interval
 from vd.evaluate.trace import HOLD_S
 from vd.page import write_html
 from vd.paper import PAPER

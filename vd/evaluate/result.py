@@ -14,6 +14,7 @@ import numpy as np
 from vd.config import from_dict, to_dict
 from vd.evaluate.goals import Goals
 from vd.evaluate.statistics import (
+    TOLERANCES_RAD,
     Interval,
     Unit,
     choose_unit,
@@ -28,8 +29,6 @@ from vd.paper import PAPER
 from vd.stopping import StoppingRule
 
 RESULT_FORMAT = "visual-dexterity evaluation 7"
-TOLERANCES_RAD = (0.1, 0.2, 0.4, 0.8)
-"""Errors at which success is reported; the paper's figures use 0.1, 0.4 and 0.8."""
 BOUNDS_RAD = (PAPER.success.precise_rad, PAPER.success.rotation_rad)
 """Bounds on the distance at which predictions are judged, as in the paper."""
 OUTCOMES = ("success", "orientation error", "time-out", "object falls")

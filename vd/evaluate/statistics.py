@@ -23,6 +23,8 @@ from scipy.special import expit, logit
 Unit = Literal["object", "episode"]
 
 CONFIDENCE = 0.95
+TOLERANCES_RAD = (0.1, 0.2, 0.4, 0.8)
+"""Errors at which success is reported; the paper's figures use 0.1, 0.4 and 0.8."""
 # How much objects differ is not known from fewer than this.
 MIN_CLUSTERS = 8
 # Draws for chance on a symmetric object, for which no closed form is used: 0.5 % at a rate of one half.
