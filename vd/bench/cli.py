@@ -39,16 +39,10 @@ class SimCommand:
     """Numbers of environments to measure."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets, mixed over the environments."""
-    hand: str = "dclaw4"
-    """Hand."""
     device: str = "auto"
     """Warp device; auto is the first GPU, or else the CPU."""
-    randomise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Domain randomisation on."""
-    policy: str | None = None
-    """Name or file of a teacher whose mean actions are taken, in the task it was trained in (hand and
-    randomisation are then that task's); by default a network with random weights closes the hand now and
-    then."""
+    policy: str = "dclaw4-table"
+    """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
     allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
     """Also step Newton's own Allegro example with as many environments, with a hand of boxes of that size."""
     json: Path | None = None
@@ -56,24 +50,21 @@ class SimCommand:
 
     def run(self) -> int:
         """Measure and print."""
-        device = resolve_device(self.device)
-        teacher = None
-        if self.policy is not None:
-            from vd.evaluate.agents import open_teacher
+        from vd.evaluate.agents import open_teacher
 
-            teacher = open_teacher(self.policy, device)
+        device = resolve_device(self.device)
+        teacher = open_teacher(self.policy, device)
+        if teacher is None:
+            raise ValueError(f"--policy {self.policy} has no network; give a teacher")
         quiet_warp()
         report((self._row(envs, device, teacher) for envs in self.envs), device, self.json)
         return 0
 
-    def _row(self, envs: int, device: str, teacher: Any | None) -> dict[str, Any]:
+    def _row(self, envs: int, device: str, teacher: Any) -> dict[str, Any]:
         from vd.bench.allegro import allegro_rate
-        from vd.bench.sim import measure, task, teacher_task
+        from vd.bench.sim import measure, teacher_task
 
-        if teacher is None:
-            cfg = task(self.objects, envs, self.hand, self.randomise)
-        else:
-            cfg = teacher_task(teacher, self.objects, envs)
+        cfg = teacher_task(teacher, self.objects, envs)
         row: dict[str, Any] = dataclasses.asdict(measure(cfg, device, teacher=teacher))
         if not self.allegro:
             return row

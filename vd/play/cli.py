@@ -3,7 +3,10 @@
 ``vd-play LOG`` replays a run on a hand.
 """
 
+import contextlib
+import importlib
 import math
+import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -27,6 +30,15 @@ if TYPE_CHECKING:
     from vd.play.session import Session
 
 VIDEO_SECONDS = 10.0
+SLOWEST_MODULES = (
+    "newton._src.solvers.mujoco.kernels",
+    "mujoco_warp._src.smooth",
+    "newton._src.sim.articulation",
+    "newton._src.sensors.sensor_camera_render.camera_utils",
+    "newton._src.geometry.bvh",
+    "mujoco_warp._src.set_const",
+)
+"""Kernels that take longest to compile on a CPU, a third of a first start (found by Warp's own log)."""
 # A CPU simulates this many environments about in real time.
 FAST_WORLDS_CPU = 16
 
@@ -186,6 +198,17 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     return count
 
 
+def compile_side_by_side() -> None:
+    """Compile what takes longest on a CPU with all cores, in place of one module after the other."""
+    import warp as wp
+
+    for name in SLOWEST_MODULES:
+        with contextlib.suppress(ImportError):  # they are not public, and may move
+            importlib.import_module(name)
+    modules = [wp.get_module(name) for name in SLOWEST_MODULES if name in sys.modules]
+    wp.force_load("cpu", modules, max_workers=os.cpu_count())
+
+
 def serve(cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C; the page is there, and says so, while the scene is being built."""
     _serve(lambda: open_session(cfg), cfg)
@@ -231,6 +254,8 @@ def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
 
     device = resolve_device(cfg.device)
     trained = open_policy(cfg.agent_name, device)  # a file that cannot be used is told before anything slow
+    if device == "cpu":
+        compile_side_by_side()
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv
