@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -322,18 +322,19 @@ Command = (
 
 
 @interrupt.command("vd-bench")
-def main() -> None:
-    """Entry point of ``vd-bench``."""
-    command = tyro.cli(Command, prog="vd-bench", description=__doc__)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``vd-bench``; returns the exit status."""
+    command = tyro.cli(Command, args=arguments, prog="vd-bench", description=__doc__)
     try:
         if isinstance(command, GapCommand):
             check_folder(command.out)
         elif not isinstance(command, ReplayCommand) and command.json is not None:
             check_file(command.json)
-        sys.exit(command.run())
+        return command.run()
     except (ValueError, OSError) as error:
-        sys.exit(f"vd-bench: {error}")
+        print(f"vd-bench: {error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -170,13 +170,11 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     """
     from tqdm import tqdm
 
-    from vd.evaluate.agents import built_in
     from vd.evaluate.cfg import LOG_EVERY_S
     from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
-    env, trained, device = _open(cfg, num_envs=cfg.cells)
-    policy = trained or built_in(cfg.agent_name, env.num_actions, seed=cfg.seed, device=device)
+    env, policy = _open(cfg, num_envs=cfg.cells)
     envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
     renderer = Renderer(
@@ -185,7 +183,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
         width=width,
         height=height,
         goal_size=round(GOAL_SHARE * height),
-        device=device,
+        device=env.device,
     )
     rate = env.cfg.sim.control_hz
     steps = max(1, round(cfg.seconds * rate))
@@ -230,12 +228,10 @@ def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> No
 
 
 def open_session(cfg: PlayCfg) -> "Session":
-    """The environment and agents behind the viewer."""
-    from vd.play.session import Session, agent_choices
+    """The environment and policy behind the viewer."""
+    from vd.play.session import Session
 
-    env, trained, device = _open(cfg, num_envs=1)
-    agents = agent_choices(cfg.agent_name, trained, env.num_actions, seed=cfg.seed, device=device)
-    return Session(env, agents, cfg.agent_name, seed=cfg.seed)
+    return Session(*_open(cfg, num_envs=1), seed=cfg.seed)
 
 
 def spread(world_object: Sequence[int], cells: int) -> list[int]:
@@ -248,9 +244,9 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
     return sorted(world for _, world in islice(sorted(rank), cells))
 
 
-def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
-    """Environment with at least one world for each object, trained agent if one is named, device."""
-    from vd.evaluate.agents import check_bundle, is_saved_student, is_tracking_policy, open_policy, task_for
+def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any]:
+    """Environment with at least one world for each object, and what acts in it."""
+    from vd.evaluate.agents import check_bundle, open_policy, task_for
 
     device = resolve_device(cfg.device)
     trained = open_policy(cfg.agent_name, device)  # a file that cannot be used is told before anything slow
@@ -259,6 +255,7 @@ def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv
+    from vd.evaluate.compare import actor_of
 
     count = len(load_set(list(cfg.objects)))
     if device == "cpu" and count > FAST_WORLDS_CPU:
@@ -281,15 +278,7 @@ def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
         task = replace(task, table=TableCfg(away_share=1.0))
     check_bundle(cfg.agent_name, task)
     env = ReorientEnv(task, device)
-    if is_saved_student(trained):
-        from vd.evaluate.student import StudentActor
-
-        return env, StudentActor(env, trained, seed=cfg.seed), device
-    if is_tracking_policy(trained):
-        from vd.evaluate.tracking import TrackingActor
-
-        return env, TrackingActor(env, trained, seed=cfg.seed), device
-    return env, trained, device
+    return env, actor_of(cfg.agent_name, trained, env, seed=cfg.seed)[0]
 
 
 if __name__ == "__main__":
