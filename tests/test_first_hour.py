@@ -43,7 +43,7 @@ def test_a_wrong_name_is_refused_before_anything_slow_is_imported(line, said, tm
 
 
 def refused(line, said, folder, heavy):
-    """Run a command in a folder, which refuses with these words; returns what it has imported of ``heavy``."""
+    """Run a command in a folder, which refuses with these words; returns what it imported of ``heavy``."""
     command, *arguments = shlex.split(line)
     module = SCRIPTS[command].partition(":")[0]
     run = [sys.executable, "-c", RUN.format(heavy=heavy), module, *arguments]
