@@ -235,14 +235,14 @@ def _bound_cells(result: Result, short: dict[str, str]) -> list[tuple[str, ...]]
             short[row.policy],
             row.group,
             row.condition or NOTHING,
-            f"{bound.bound_rad:g}",
-            share(bound.seen),
-            share(bound.right),
+            bound,
+            share(row.prediction.seen[bound]),
+            share(row.prediction.right[bound]),
             f"{row.prediction.mean_error_rad:.2f}",
         )
         for row in result.rows
         if row.prediction is not None and row.headline
-        for bound in row.prediction.bounds
+        for bound in row.prediction.seen
     ]
 
 

@@ -116,7 +116,8 @@ def record(
 ) -> Iterator[np.ndarray]:
     """Reset, run a policy, and draw the start and every control step.
 
-    A frame is drawn while the next step is simulated. So the kernels of both are compiled at the same time.
+    On a CPU a frame is drawn while the next step is simulated. So the kernels of both are compiled at the
+    same time.
 
     Args:
         env: The environment.
@@ -143,6 +144,8 @@ def record(
     with ThreadPoolExecutor(max_workers=1) as pool:
         for _ in range(steps):
             frame = pool.submit(draw, snapshots)
+            if str(env.device) != "cpu":  # what others launch would become part of the step's graph
+                frame.result()
             act(env, policy)
             snapshots = watcher.read()
             yield frame.result()
