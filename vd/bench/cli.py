@@ -43,8 +43,8 @@ class SimCommand:
     """Warp device; auto is the first GPU, or else the CPU."""
     policy: str = "dclaw4-table"
     """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
-    allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Also step Newton's own Allegro example with as many environments, with a hand of boxes of that size."""
+    allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Also step Newton's own Allegro example with as many environments; it downloads its hand (17.8 MB)."""
     json: Path | None = None
     """Write the rows to this file as JSON."""
 

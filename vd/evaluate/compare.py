@@ -78,8 +78,9 @@ def compare(cfg: EvalCfg, condition: str = "", stop_at: float = math.inf) -> "Re
             env.objects = with_symmetries(env.objects, device)
             task, start = wanted, env.state_dict()
         env.load_state_dict(start)
-        settings = {"goals": cfg.goals, "sensor_errors": cfg.sensor_errors, "seed": cfg.seed}
-        actor, kind, sees, rules = actor_of(name, policy, env, **settings)
+        actor, kind, sees, rules = actor_of(
+            name, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
+        )
         trace = run_episodes(cfg, env, actor, name, rules, stop_at)
         index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
