@@ -94,7 +94,7 @@ def test_a_prediction_stops_where_it_says_and_the_truth_is_scored():
     (by_truth,) = trace.episodes(StoppingRule(0.2, 2.0), "error")
     assert by_prediction.steps == 4 and by_prediction.error_rad == pytest.approx(0.45, abs=1e-5)
     assert by_truth.steps == 7 and by_truth.error_rad == pytest.approx(0.15, abs=1e-5)
-    with pytest.raises(ValueError, match="only a student predicts"):
+    with pytest.raises(ValueError, match="only camera policies predict"):
         traced().episodes(StoppingRule(), "predicted")
 
 

@@ -125,7 +125,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         task = replace(task, table_friction=cfg.table_friction)
     if cfg.randomised:
         return task
-    # Noise that is switched off anyway, and would keep a teacher and its student from sharing environments.
+    # Noise that is switched off anyway, and would keep a teacher and a tracker from sharing environments.
     exact = replace(
         task.randomisation,
         observation_noise_mean=0.0,
