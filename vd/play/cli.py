@@ -174,7 +174,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
-    env, policy = _open(cfg, num_envs=cfg.cells)
+    env, policy = _open(cfg, _policy(cfg), num_envs=cfg.cells)
     envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
     renderer = Renderer(
@@ -209,7 +209,8 @@ def compile_side_by_side() -> None:
 
 def serve(cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C; the page is there, and says so, while the scene is being built."""
-    _serve(lambda: open_session(cfg), cfg)
+    trained = _policy(cfg)
+    _serve(lambda: open_session(cfg, trained), cfg)
 
 
 def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> None:
@@ -227,11 +228,11 @@ def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> No
         page.viewer.close()
 
 
-def open_session(cfg: PlayCfg) -> "Session":
+def open_session(cfg: PlayCfg, trained: Any) -> "Session":
     """The environment and policy behind the viewer."""
     from vd.play.session import Session
 
-    return Session(*_open(cfg, num_envs=1), seed=cfg.seed)
+    return Session(*_open(cfg, trained, num_envs=1), seed=cfg.seed)
 
 
 def spread(world_object: Sequence[int], cells: int) -> list[int]:
@@ -244,12 +245,18 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
     return sorted(world for _, world in islice(sorted(rank), cells))
 
 
-def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any]:
+def _policy(cfg: PlayCfg) -> Any:
+    """What is trained; a file that cannot be used is told before anything slow."""
+    from vd.evaluate.agents import open_policy
+
+    return open_policy(cfg.agent_name, resolve_device(cfg.device))
+
+
+def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
     """Environment with at least one world for each object, and what acts in it."""
-    from vd.evaluate.agents import check_bundle, open_policy, task_for
+    from vd.evaluate.agents import check_bundle, task_for
 
     device = resolve_device(cfg.device)
-    trained = open_policy(cfg.agent_name, device)  # a file that cannot be used is told before anything slow
     if device == "cpu":
         compile_side_by_side()
     from vd.assets_usd.objects.sets import load_set
