@@ -58,14 +58,6 @@ def test_an_encoder_serves_another_hand_and_a_policy_does_not(saved):
         begin_from(path, Student(TINY, ACTIONS + 1), "cpu")
 
 
-def test_a_head_for_another_teachers_observation_adds_nothing_to_begin_with(saved):
-    """What was added to the actions of another teacher is not taken over."""
-    path, there = saved(1, replace(TINY, state=HEAD))
-    here = Student(replace(TINY, state=replace(HEAD, hidden=(9,))), ACTIONS)
-    assert begin_from(path, here, "cpu") == ["mean", "state"]
-    assert same(here, there, "memory") and not here.mean.weight.any() and not here.mean.bias.any()
-
-
 def test_another_network_is_refused_but_for_what_an_encoder_does_not_need(saved):
     wider = replace(TINY, memory=8)
     path, _ = saved(1)
