@@ -95,21 +95,14 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     return replace(
         base,
         run=run,
-        ppo=replace(ppo, critic_warmup_iterations=None, imitation_iterations=0),
+        ppo=replace(ppo, imitation_iterations=0),
         policy=policy,
         env=env,
     )
 
 
-def warmup_iterations(state: Mapping[str, Any], wanted: int | None) -> int:
-    """Iterations in which the critic is to learn alone after a begin from ``state``.
-
-    Args:
-        state: Checkpoint or exported policy.
-        wanted: What ``--ppo.critic-warmup-iterations`` asks for; None: what the state needs.
-    """
-    if wanted is not None:
-        return wanted
+def warmup_iterations(state: Mapping[str, Any]) -> int:
+    """Iterations in which the critic has to learn alone after a begin from a checkpoint or policy."""
     if "critic_state_dict" not in state:
         return CRITIC_WARMUP
     if "optimizer_state_dict" not in state:

@@ -81,7 +81,7 @@ class TrainingLoop:
         first = saved = self.iteration
         total = self.total_iterations if iterations is None else first + iterations
         self._begin()
-        progress = ProgressLine(total, done=first, enabled=self.is_main)
+        progress = ProgressLine(total, enabled=self.is_main)
         with contextlib.ExitStack() as stack:
             log: ProgressFile | None = None
             if self.is_main:

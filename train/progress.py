@@ -1,15 +1,11 @@
-"""The live progress of a run: two lines and a bar on a terminal, lines now and then elsewhere."""
+"""The live progress of a run: two lines on a terminal, in place, and two lines now and then elsewhere."""
 
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from types import TracebackType
 from typing import Any
 
-from rich.console import Console, Group
-from rich.live import Live
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.spinner import Spinner
+from rich.console import Console
 from rich.text import Text
 
 BUILDING = "building the environments (the first start compiles the kernels: a minute or two)"
@@ -75,15 +71,13 @@ def details(row: Mapping[str, Any]) -> str:
 
 @contextmanager
 def waiting(message: str, enabled: bool = True) -> Iterator[None]:
-    """Show ``message`` with the time passed while the block runs; without a terminal, the message once."""
+    """Show ``message`` while the block runs; without a terminal, the message once."""
     console = Console(quiet=not enabled)
     if not console.is_terminal:
         console.print(f"{message} ...", highlight=False)
         yield
         return
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        progress.add_task(message, total=None)
+    with console.status(message):
         yield
 
 
@@ -92,50 +86,35 @@ class ProgressLine:
 
     Args:
         total: Iterations of the whole run.
-        done: Iterations already done by earlier runs.
         enabled: Show anything (false on all ranks but the first).
     """
 
-    def __init__(self, total: int, *, done: int = 0, enabled: bool = True) -> None:
+    def __init__(self, total: int, *, enabled: bool = True) -> None:
         self._total, self._console = total, Console(quiet=not enabled)
-        self._bar = Progress(TextColumn("{task.percentage:5.1f} %"), BarColumn(bar_width=None))
-        self._task = self._bar.add_task("train", total=total, completed=done)
-        self._live: Live | None = None
-        self._printed = -PLAIN_INTERVAL_S
-        self._unprinted: tuple[str, str] | None = None
+        self._status = self._console.status(FIRST)
+        self._printed, self._unprinted = -PLAIN_INTERVAL_S, ""
 
     def __enter__(self) -> "ProgressLine":
         if self._console.is_terminal:
-            self._live = Live(Spinner("dots", FIRST), console=self._console, refresh_per_second=4)
-            self._live.start()
+            self._status.start()
         else:
             self.note(FIRST)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._live is not None:
-            self._live.stop()
-        else:
-            self._print()
+    def __exit__(self, *_: object) -> None:
+        self._status.stop()
+        if self._unprinted:
+            self.note(self._unprinted)
 
     def update(self, row: dict[str, Any], left_s: float) -> None:
         """Show an iteration."""
-        main, more = summary(row, self._total, left_s), details(row)
-        if self._live is not None:
-            self._bar.update(self._task, completed=row["iteration"])
-            self._live.update(Group(Text(main), Text(more, "dim"), self._bar))
-            return
-        self._unprinted = main, more
-        if time.monotonic() - self._printed >= PLAIN_INTERVAL_S:
-            self._print()
+        self._unprinted = f"{summary(row, self._total, left_s)}\n  {details(row)}"
+        if self._console.is_terminal:
+            self._status.update(Text(self._unprinted))
+        elif time.monotonic() - self._printed >= PLAIN_INTERVAL_S:
+            self.note(self._unprinted)
+            self._printed, self._unprinted = time.monotonic(), ""
 
     def note(self, message: str) -> None:
         """Print a message above the line."""
         self._console.print(message, highlight=False, soft_wrap=True)
-
-    def _print(self) -> None:
-        if self._unprinted is not None:
-            self.note("\n  ".join(self._unprinted))
-            self._printed, self._unprinted = time.monotonic(), None

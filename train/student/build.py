@@ -10,7 +10,7 @@ from vd.envs.cfg import ReorientCfg
 from vd.files import check_folder
 from vd.paper import PAPER
 from vd.train.flags import write_config
-from vd.train.student.config import PRETRAINING, RENDERED, STUDENT_NAME, SYNTHETIC, StudentTrainCfg
+from vd.train.student.config import PRETRAINING, RENDERED, StudentTrainCfg
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
@@ -19,15 +19,6 @@ if TYPE_CHECKING:
     from vd.train.student.pretrain import Pretrainer
     from vd.train.student.runner import StudentRunner
     from vd.vision.network import Student
-
-
-def default_init(stage: int, run_dir: Path) -> Path | None:
-    """The student of stage 1 beside a folder of stage 2 (``.../stage1/student.pt``), if there is one."""
-    if stage != RENDERED:
-        return None
-    name = run_dir.name.replace(f"stage{RENDERED}", f"stage{SYNTHETIC}")
-    path = run_dir.with_name(name) / STUDENT_NAME
-    return path if name != run_dir.name and path.is_file() else None
 
 
 def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
@@ -80,8 +71,8 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         raise ValueError(
             "--teacher is missing; give the policy to imitate: a policy.pt, a run's folder, or a name"
         )
-    if checkpoint is None:
-        check_start(cfg)
+    if cfg.stage == RENDERED and cfg.init is None and checkpoint is None:
+        raise ValueError("--stage 2 begins from a student of an earlier stage; give it as --init")
 
     import torch
 
@@ -137,30 +128,6 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         # After all that can refuse: settings that a run cannot have must not take the place of its own.
         write_config(cfg)
     return runner
-
-
-def check_start(cfg: StudentTrainCfg) -> None:
-    """Refuse to begin stage 2 from random weights without being told to.
-
-    Raises:
-        FileNotFoundError: ``--init`` is no file.
-        ValueError: There is nothing to begin from, or only a pre-trained encoder.
-    """
-    if cfg.init is None:
-        if cfg.stage == RENDERED and not cfg.from_scratch:
-            raise ValueError(
-                "stage 2 begins from a student of stage 1: give it as --init, or as student.pt in "
-                f"{cfg.run.out.with_name(f'stage{SYNTHETIC}')}; --from-scratch begins without one"
-            )
-        return
-    from vd.vision.saved import read_student, saved_spec
-
-    stage = saved_spec(read_student(cfg.init), cfg.init).stage
-    if cfg.stage == RENDERED and stage == PRETRAINING and not cfg.from_scratch:
-        raise ValueError(
-            f"--init {cfg.init} is of stage 0: its encoder is trained, its policy is not. Give a student of "
-            "stage 1, or add --from-scratch"
-        )
 
 
 def begin_from(path: Path, student: "Student", device: str) -> list[str]:

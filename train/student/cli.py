@@ -10,7 +10,7 @@ import tyro
 
 from vd import interrupt
 from vd.train.flags import normalise, saved_config, value_of
-from vd.train.student.build import build_student, default_init
+from vd.train.student.build import build_student
 from vd.train.student.config import PRESETS, PRETRAINING, STUDENT_NAME, Stage, StudentTrainCfg
 
 HELP = """Train the student: imitate the teacher from point clouds.
@@ -76,12 +76,10 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
 
     A pre-trained one has an encoder to give, whatever else it needed to be trained.
     """
-    given, run_dir = value_of(arguments, "--init"), value_of(arguments, "--out")
-    if given is None and "--from-scratch" in arguments:
+    given = value_of(arguments, "--init")
+    if given is None:
         return base
-    path = Path(given) if given else default_init(base.stage, Path(run_dir) if run_dir else base.run.out)
-    if path is None:
-        return base
+    path = Path(given)
     from vd.vision.saved import read_student, saved_spec
 
     spec = saved_spec(read_student(path), path)
