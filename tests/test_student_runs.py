@@ -30,7 +30,6 @@ from vd.vision.cfg import LEAN, NoiseCfg, StudentCfg
 from vd.vision.saved import load_student, read_student
 
 NETWORK = StudentCfg(voxel_m=0.01)
-SEPARATE = replace(NETWORK, goal="separate")
 
 
 @pytest.fixture(scope="module")
@@ -50,18 +49,17 @@ def steps(env, view, count=6):
     frames, seen = [], []
     for _ in range(count):
         frames.append(view.frame())
-        seen.append([sites.coordinates.clone() for sites in view.sites(frames[-1], augment=False)])
+        seen.append(view.sites(frames[-1], augment=False).coordinates.clone())
         env.action.assign(rng.uniform(-1, 1, (2, 9)).astype(np.float32))
         env.step(env.action)
     return frames, seen
 
 
 @pytest.mark.parametrize("rendered", [False, True])
-@pytest.mark.parametrize("network", [NETWORK, SEPARATE], ids=["merged", "separate"])
-def test_recorded_frames_show_what_was_seen(env, rendered, network):
+def test_recorded_frames_show_what_was_seen(env, rendered):
     """Later steps change nothing; rows of chosen worlds are those worlds' clouds."""
     env.reset()
-    view = StudentView(env, network, rendered=rendered, depth=DepthCameraCfg(points=500))
+    view = StudentView(env, NETWORK, rendered=rendered, depth=DepthCameraCfg(points=500))
     frames, seen = steps(env, view)
     worlds = torch.tensor([1, 0, 1])
     times = [0, 3, 5]
@@ -69,11 +67,10 @@ def test_recorded_frames_show_what_was_seen(env, rendered, network):
         name: torch.stack([frames[t][name][w] for t, w in zip(times, worlds.tolist(), strict=True)])
         for name in frames[0]
     }
-    for part, sites in enumerate(view.sites(rows, worlds, augment=False)):
-        for row, (time, world) in enumerate(zip(times, worlds.tolist(), strict=True)):
-            found = sites.coordinates[sites.coordinates[:, 0] == row][:, 1:]
-            then = seen[time][part]
-            assert torch.equal(found, then[then[:, 0] == world][:, 1:])
+    sites = view.sites(rows, worlds, augment=False)
+    for row, (time, world) in enumerate(zip(times, worlds.tolist(), strict=True)):
+        found = sites.coordinates[sites.coordinates[:, 0] == row][:, 1:]
+        assert torch.equal(found, seen[time][seen[time][:, 0] == world][:, 1:])
 
 
 def test_a_frame_holds_the_true_distance_and_the_action_before_it(env):
@@ -116,13 +113,11 @@ def test_a_camera_sees_a_part_of_the_scene_from_where_it_is(env):
 def test_a_cloud_without_a_seen_point_has_the_hand_and_goal_only(env):
     env.reset()
     nothing = DepthCameraCfg(points=100, crop_m=(5.0, 6.0))
-    view = StudentView(env, SEPARATE, rendered=True, depth=nothing)
+    view = StudentView(env, NETWORK, rendered=True, depth=nothing)
     frame = view.frame()
     assert torch.isnan(frame["points"]).all()
-    scene, goal = view.sites(frame, augment=False)
-    assert len(scene) > 500 and len(goal) > 100
-    origin = (scene.coordinates[:, 1:] == 0).all(dim=1)
-    assert not origin.any()
+    sites = view.sites(frame, augment=False)
+    assert sites.marks.any(dim=1).all() and (sites.marks.sum(dim=0) > 100).all()
 
 
 def test_the_hand_is_seen_where_the_encoders_say(env):
@@ -146,9 +141,9 @@ def test_random_states_of_a_view_come_back(env):
     one, two = (StudentView(env, NETWORK, rendered=True, noise=always, seed=seed) for seed in (0, 1))
     frame = one.frame()
     two.load_state_dict(one.state_dict())
-    drawn = [view.sites(frame, augment=True)[0].coordinates for view in (one, two)]
+    drawn = [view.sites(frame, augment=True).coordinates for view in (one, two)]
     assert torch.equal(*drawn)
-    assert not torch.equal(one.sites(frame, augment=True)[0].coordinates, drawn[0])
+    assert not torch.equal(one.sites(frame, augment=True).coordinates, drawn[0])
 
 
 @pytest.fixture
@@ -226,11 +221,10 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     small = ["--preset", "cpu-demo", "--num-worlds", "2", "--dagger.rollout-steps", "3", "--no-tensorboard"]
     small += ["--dagger.validation-worlds", "1"]
     small += ["--task.at-rest", "False"]  # the search for poses at rest takes long
-    both = ["--network.turn.vectors", "4", "--network.senses", "action", "position", "velocity"]
-    first = ["student", *small, *both, "--run-dir", str(tmp_path / "stage1")]
+    first = ["student", *small, "--run-dir", str(tmp_path / "stage1")]
     assert main([*first, "--max-steps", "6"]) == 0
     (row,) = read_progress(tmp_path / "stage1" / "progress.jsonl")
-    assert all(row[f"loss/{name}"] > 0.0 for name in ("imitation", "distance", "pose", "state", "match"))
+    assert all(row[f"loss/{name}"] > 0.0 for name in ("imitation", "distance", "pose"))
     second = ["student", *small, "--stage", "2", "--run-dir", str(tmp_path / "stage2")]
     assert main([*second, "--max-steps", "6"]) == 0
     assert "begins with the weights of" in capsys.readouterr().out
@@ -241,29 +235,19 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     path = tmp_path / "stage2" / "student.pt"
     saved = load_student(path)
     assert saved.spec.stage == 2 and saved.spec.teacher == "dclaw4-cube"
-    network = saved.spec.network
-    teacher = open_teacher("dclaw4-cube", "cpu")
-    assert teacher is not None
-    assert network.turn.vectors == 4 and network.state.values == teacher.num_observations
-    assert saved.network.state is not None and saved.network.state.fitted
     assert saved.depth["points"] == 2000 and saved.task["randomisation"]["observation_noise_std"] == 0.0
     assert read_student(path)["iter"] == 2
 
 
 @pytest.mark.slow
-def test_a_teacher_of_views_is_imitated_in_those_that_the_student_chooses(tmp_path):
+def test_a_teacher_of_views_is_imitated_in_the_world_frame(tmp_path):
     small = ["--preset", "cpu-demo", "--num-worlds", "3", "--dagger.rollout-steps", "3", "--no-tensorboard"]
     small += ["--dagger.validation-worlds", "1", "--task.at-rest", "False", "--objects", "cube"]
     folder = tmp_path / "stage1"
     flags = ["student", *small, "--teacher", "dclaw3-table", "--run-dir", str(folder), "--max-steps", "9"]
     assert main(flags) == 0
     saved, teacher = load_student(folder / "student.pt"), open_teacher("dclaw3-table", "cpu")
-    head = saved.network.state
-    assert teacher is not None and head is not None and head.views is not None and head.fitted
-    assert len(head.views) == 3 and torch.equal(head.view_offset, teacher.network.offset[0])
     assert trained_task(saved).observation == replace(trained_task(teacher).observation, view="world")
-    (row,) = read_progress(folder / "progress.jsonl")
-    assert row["loss/state"] > 0.0
 
 
 PROCESS = """
