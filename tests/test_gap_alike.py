@@ -8,7 +8,7 @@ import pytest
 from test_gap_fit import TRUE, problem_of, recorded
 from test_gap_judge import FLOOR, made_up
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap import consensus, judge
 from vd.gap.chain import candidates
 from vd.gap.coordinates import Coordinate, Scales

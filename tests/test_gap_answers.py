@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_gap_fit import recorded
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.answers import FOLDER, Answers, digest_of
 from vd.gap.coordinates import Coordinate
 from vd.gap.joint_fit import JointFit

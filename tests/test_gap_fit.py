@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import vd.gap.fit
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.chain import candidates, chains
 from vd.gap.coordinates import coordinate
 from vd.gap.descent import Descent, LeastSquares
@@ -301,7 +301,7 @@ def test_bootstrap_draws_whole_trajectories() -> None:
 
 
 def test_what_the_baseline_fits_is_no_candidate() -> None:
-    from vd.kernels.effects import EFFECTS
+    from vd.kernels.servo.effects import EFFECTS
 
     (bare,) = chains(blank())
     (pendulum,) = chains(blank("pendulum"))

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.consensus import agree, no_spring, share
 from vd.gap.coordinates import Coordinate
 from vd.gap.explanation import Accepted, Explanation, intervals

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_gap_judge import made_up
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.assets_usd.hands import load_hand
 from vd.gap import finger_masses
 from vd.gap.chain import Chain, chains

@@ -8,7 +8,7 @@ import pytest
 from test_gap_fit import TRUE, blank, recorded
 from test_gap_judge import FLOOR, made_up
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.chain import chains
 from vd.gap.coordinates import Coordinate, Scales
 from vd.gap.explanation import Trial
@@ -22,7 +22,7 @@ from vd.gap.statistics import resamples
 from vd.gap.telemetry import vetoes
 from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain, find
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 SMALL = ("command_delay", "coulomb_friction", "torque_saturation", "thermal_drift", "command_filter")
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from test_gap_fit import TRUE, recorded
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.assemble import curves
 from vd.gap.chain import chains
 from vd.gap.crowd import Crowd

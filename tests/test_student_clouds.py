@@ -21,7 +21,7 @@ def assets():
 
 
 def scene(assets, device, *, scales=(1.0,)):
-    """Clouds of worlds that differ in the size of the object, and their (equal) poses."""
+    """Clouds of environments that differ in the size of the object, and their (equal) poses."""
     hand, objects = assets
     links = len(hand.link_names)
     clouds = SceneClouds(
@@ -76,11 +76,11 @@ def test_rows_are_of_their_worlds_which_differ_in_size(assets, device):
         size = np.ptp(points[:, part], axis=1)
         np.testing.assert_allclose(size[1], 1.05 * size[0], rtol=1e-4)
     np.testing.assert_array_equal(*points[:, clouds.hand])
-    worlds = wp.array([1, 0, 1], dtype=wp.int32, device=device)
+    envs = wp.array([1, 0, 1], dtype=wp.int32, device=device)
     again = [
         wp.array(np.repeat(a.numpy()[:1], 3, axis=0), dtype=a.dtype, device=device) for a in (body_q, goal)
     ]
-    np.testing.assert_array_equal(written(clouds, *again, worlds=worlds), points[[1, 0, 1]])
+    np.testing.assert_array_equal(written(clouds, *again, envs=envs), points[[1, 0, 1]])
 
 
 def test_without_the_object_its_columns_are_left_to_a_camera(assets, device):

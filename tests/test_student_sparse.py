@@ -9,7 +9,7 @@ import torch
 import warp as wp
 
 import vd.vision
-from vd.kernels.voxels import voxelise
+from vd.kernels.sparse.voxels import voxelise
 from vd.vision import sparse
 from vd.vision.sites import Sites
 from vd.vision.sparse import SparseConv3d, SparseMaxPool3d, global_pool, parts

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.task.observations import teacher_observation_slices
 from vd.views import ViewMaps
 
 WORLDS = 48
@@ -21,7 +21,7 @@ def env(request):
         ReorientCfg(
             hand=request.param[0],
             objects=("cuboid",),
-            num_worlds=WORLDS,
+            num_envs=WORLDS,
             randomisation=RandomisationCfg(enabled=False),
             observation=ObservationCfg(shape="full", view=request.param[1]),
         ),
