@@ -292,7 +292,7 @@ def _export(arguments: list[str], _started: float) -> int:
             raise ValueError(
                 f"{cfg.checkpoint} is a student, which goes on with --init; leave --resumable out"
             )
-        save_checkpoint(cfg.output, student_export(read_student(cfg.checkpoint), small=True))
+        save_checkpoint(cfg.output, student_export(read_student(cfg.checkpoint)))
         print(cfg.output)
         return 0
     if cfg.output.suffix == ".onnx":
@@ -328,9 +328,12 @@ def _bundle(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(BundleCfg, args=arguments, prog="vd-train bundle")
     check_folder(cfg.output.parent)
 
-    from vd.bundle.write import write_bundle
+    from vd.bundle.store import write_bundle
+    from vd.evaluate.agents import find_policy, open_policy
 
-    contract = write_bundle(cfg.policy, cfg.output)
+    policy = open_policy(str(find_policy(cfg.policy)), "cpu")
+    assert policy is not None  # a file was found
+    contract = write_bundle(policy, cfg.output)
     if cfg.json:
         print(json.dumps(to_dict(contract), indent=1))
     else:

@@ -11,7 +11,7 @@ from vd.config import to_dict
 from vd.envs.state import saved_stage
 from vd.evaluate.second_view import view_maps
 from vd.paper import PAPER
-from vd.tracking.views import ViewSelection
+from vd.views import ViewSelection
 
 OBSERVATION_GROUP = "policy"
 """What actor and critic both read; all there is in the paper."""

@@ -5,119 +5,137 @@ from the rotation as it is known: a teacher acts as well so, and nothing has to 
 values of the observation, D actions. World frame: z up; quaternions xyzw.
 """
 
-from typing import Any
+from collections.abc import Callable
 
 import torch
-from torch import nn
 
 from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import ObservationCfg, View
-from vd.envs.view_tables import ViewTables, view_tables
+from vd.envs.view_tables import TERMS, ViewTables, view_tables
 from vd.kernels.task.observations import JOINTS_PER_FINGER, teacher_observation_slices
+from vd.policy import TrainedPolicy
 
-TERMS = 4
-"""Most values that a value of a view is made of, those of a quaternion."""
-BUFFERS = ("source", "factor", "offset", "joints", "sign", "sector")
-"""What views are made of."""
+AFTER_S = 3.0
+"""Time after which a goal that is not reached is looked at again [s] (ours): four in five are by then."""
+EVERY_S = 1.0
+"""Between two looks [s] (ours). Chosen with AFTER_S on 636 episodes, judged on others."""
 
 
-class ViewMaps(nn.Module):
+class ViewMaps:
     """From observations in the world frame to views, and from actions in views to the world's joints.
 
-    They map nothing to nothing until :meth:`adopt`.
-
     Args:
-        views: F, as many as the hand has fingers, or twice that with those in the mirror.
-        values: O.
-        num_actions: D.
+        tables: What the views are made of.
+        first: Views that :meth:`choose` chooses from, the first ones; all by default.
+        device: Torch device.
 
     Attributes:
-        first: Views that :meth:`choose` chooses from, the first ones.
+        fingers: Fingers of the hand: as many as there are views without those in the mirror.
     """
 
-    source: torch.Tensor
-    factor: torch.Tensor
-    offset: torch.Tensor
-    joints: torch.Tensor
-    sign: torch.Tensor
-    sector: torch.Tensor
+    def __init__(
+        self, tables: ViewTables, *, first: int | None = None, device: str | torch.device = "cpu"
+    ) -> None:
+        def array(values: object, dtype: torch.dtype) -> torch.Tensor:
+            return torch.as_tensor(values).to(device=device, dtype=dtype)
 
-    def __init__(self, views: int, values: int, num_actions: int) -> None:
-        super().__init__()
-        self.first = views
-        self.register_buffer("source", torch.zeros((views, values, TERMS), dtype=torch.long))
-        self.register_buffer("factor", torch.zeros((views, values, TERMS)))
-        self.register_buffer("offset", torch.zeros((views, values)))
-        self.register_buffer("joints", torch.zeros((views, num_actions), dtype=torch.long))
-        self.register_buffer("sign", torch.ones((views, num_actions)))
-        self.register_buffer("sector", torch.zeros((views, 3)))
-        self._turn = teacher_observation_slices(num_actions // JOINTS_PER_FINGER)["relative_orientation"]
-        self._register_load_state_dict_pre_hook(self._complete)
+        self._source, self._joints = (array(v, torch.long) for v in (tables.source, tables.joints))
+        self._factor, self._offset, self._sign, self._sector = (
+            array(v, torch.float32) for v in (tables.factor, tables.offset, tables.sign, tables.sector)
+        )
+        self._first, self.fingers = first, self._joints.shape[1] // JOINTS_PER_FINGER
+        self._turn = teacher_observation_slices(self.fingers)["relative_orientation"]
 
     def __len__(self) -> int:
-        return len(self.sector)
-
-    @property
-    def fingers(self) -> int:
-        """Fingers of the hand: as many as there are views without those in the mirror."""
-        return self.joints.shape[1] // JOINTS_PER_FINGER
+        return len(self._sector)
 
     @classmethod
-    def of(cls, hand: HandModel, seen: ObservationCfg, view: View) -> "ViewMaps":
+    def of(
+        cls, hand: HandModel, seen: ObservationCfg, view: View, device: str | torch.device = "cpu"
+    ) -> "ViewMaps":
         """The views of a hand: those of ``view``, of which those of ``seen.view`` are chosen from.
 
         Args:
             hand: The hand.
             seen: What its teacher observes.
             view: What goals may be seen in.
+            device: Torch device.
         """
-        tables = view_tables(hand, seen, view)
-        views, values = tables.offset.shape
-        maps = cls(views, values, hand.num_joints)
-        maps.adopt(tables)
-        maps.first = seen.views(hand.num_fingers)
-        return maps
-
-    def adopt(self, tables: ViewTables) -> None:
-        """Take over the tables of a hand."""
-        for name in BUFFERS:
-            buffer = getattr(self, name)
-            buffer.copy_(torch.as_tensor(getattr(tables, name), dtype=buffer.dtype))
+        return cls(view_tables(hand, seen, view), first=seen.views(hand.num_fingers), device=device)
 
     def choose(self, observation: torch.Tensor) -> torch.Tensor:
         """Views [..] of observations [.., O]: the axis of the wanted rotation is in their sector."""
-        return self.nearness(observation)[..., : self.first].argmax(dim=-1)
+        return self.nearness(observation)[..., : self._first].argmax(dim=-1)
 
     def nearness(self, observation: torch.Tensor) -> torch.Tensor:
         """How near to the middle of each view's sector that axis is [.., F], the larger the nearer."""
         turn = observation[..., self._turn]
         # Observed is the object from the goal; wanted is the other way, by less than half a turn.
         axis = torch.where(turn[..., 3:] < 0.0, turn[..., :3], -turn[..., :3])
-        return axis @ self.sector.T
+        return axis @ self._sector.T
 
     def take(self, observation: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
         """Observations [.., O] as views [..] show them."""
-        values = observation.gather(-1, self.source[view].flatten(-2)).unflatten(-1, (-1, TERMS))
-        return (self.factor[view] * values).sum(dim=-1) + self.offset[view]
+        values = observation.gather(-1, self._source[view].flatten(-2)).unflatten(-1, (-1, TERMS))
+        return (self._factor[view] * values).sum(dim=-1) + self._offset[view]
 
     def world_action(self, action: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
         """Actions [.., D] of views [..] with the joints in the world's order."""
-        return self.sign[view] * action.gather(-1, self.joints[view])
+        return self._sign[view] * action.gather(-1, self._joints[view])
 
-    def world_moments(self, mean: torch.Tensor, std: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and standard deviation of values in the world frame [O], from those in a view [O].
 
-        Every view is taken to be as likely as the others, and its values to be uncorrelated.
+class InViews:
+    """A teacher of views that is told the world frame and acts in it, each time by the nearest view.
+
+    Args:
+        policy: The teacher.
+        maps: Its views.
+    """
+
+    def __init__(self, policy: TrainedPolicy, maps: ViewMaps) -> None:
+        self.num_actions, self._policy, self._maps = policy.num_actions, policy, maps
+
+    def act(self, observation: torch.Tensor) -> torch.Tensor:
+        """Mean actions [N, D] for observations in the world frame [N, O]."""
+        view = self._maps.choose(observation)
+        return self._maps.world_action(self._policy.act(self._maps.take(observation, view)), view)
+
+
+class ViewSelection:
+    """Selects symmetry views by a critic, for goals that are not reached.
+
+    A policy of views knows a scene that is turned from finger to finger, or seen in the mirror, as another
+    scene: where it is stuck in one it may not be in the other, and what its critic expects of each says where
+    to go on.
+
+    Args:
+        maps: The views of the hand, all that may be selected.
+        control_hz: Control steps a second.
+    """
+
+    def __init__(self, maps: ViewMaps, control_hz: float) -> None:
+        self.maps = maps
+        self._after, self._every = round(AFTER_S * control_hz), round(EVERY_S * control_hz)
+
+    def due(self, goal_steps: torch.Tensor) -> torch.Tensor:
+        """Worlds that look again if they are far [N], so many control steps after their goal was new [N]."""
+        late = goal_steps - self._after
+        return (late >= 0) & (late % self._every == 0)
+
+    def better(self, world: torch.Tensor, value: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
+        """Views [M] of which most is expected.
+
+        Those of a hand that is its own mirror image are two: that in whose sector the goal lies now, and that
+        in the mirror; of another hand all.
+
+        Args:
+            world: Observations in the world frame [M, O].
+            value: What a critic expects [M] of observations as a view shows them [M, O].
         """
-        views, values, _ = self.source.shape
-        maps = mean.new_zeros((views, values, values)).scatter_add(2, self.source, self.factor)
-        means = torch.einsum("kvw,kv->kw", maps, mean - self.offset)  # maps are orthogonal
-        variance = torch.einsum("kvw,v->kw", maps.square(), std.square()) + means.square()
-        centre = means.mean(dim=0)
-        return centre, (variance.mean(dim=0) - centre.square()).clamp(min=0.0).sqrt()
-
-    def _complete(self, state: dict[str, Any], prefix: str, *_: Any) -> None:
-        """Students from before there were mirrors have neither signs nor offsets."""
-        if prefix + "joints" in state:
-            state.setdefault(prefix + "sign", torch.ones_like(self.sign))
-            state.setdefault(prefix + "offset", torch.zeros_like(self.offset))
+        fingers = self.maps.fingers
+        views = torch.arange(fingers, device=world.device)[:, None].expand(-1, len(world))
+        if len(self.maps) > fingers:
+            near = self.maps.nearness(world).unflatten(-1, (2, fingers)).argmax(dim=-1)
+            views = torch.stack((near[:, 0], near[:, 1] + fingers))
+        expected = torch.stack([value(self.maps.take(world, view)) for view in views])
+        return views.gather(0, expected.argmax(dim=0, keepdim=True))[0]

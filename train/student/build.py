@@ -22,7 +22,6 @@ from vd.warp_quiet import quiet_warp
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
     from vd.train.student.runner import Learner, StudentRunner
-    from vd.vision.cfg import StateCfg
     from vd.vision.network import Student
 
 CONFIG_NAME = "config.json"
@@ -62,7 +61,8 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
         observation_noise_std=0.0,
         observation_offset_std=0.0,
     )
-    return replace(task, randomisation=exact)
+    # It is labelled in the world frame; the teacher's views are chosen for it (InViews).
+    return replace(task, randomisation=exact, observation=replace(task.observation, view="world"))
 
 
 def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "StudentRunner":
@@ -107,11 +107,6 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     device = cfg.run.device
     teacher = load_policy(find_policy(cfg.teacher), device)
     task = student_task(teacher, cfg)
-    if checkpoint is None:
-        cfg = replace(cfg, network=replace(cfg.network, state=state_head(cfg, teacher)))
-    if cfg.network.state.views:
-        # The teacher's views are the student's to choose.
-        task = replace(task, observation=replace(task.observation, view="world"))
     one_thread_without_gpu(device)
     # The network is the same in all processes, what they draw is not.
     torch.manual_seed(cfg.task.seed)
@@ -189,34 +184,10 @@ def check_start(cfg: StudentTrainCfg) -> None:
         )
 
 
-def state_head(cfg: StudentTrainCfg, teacher: "TrainedPolicy") -> "StateCfg":
-    """The head for what the teacher observes: a student that acts already keeps to having one, or none."""
-    from vd.vision.cfg import StateCfg
-    from vd.vision.saved import read_student, saved_spec
-
-    wanted = cfg.dagger.state_weight > 0.0
-    if cfg.init is not None and saved_spec(read_student(cfg.init), cfg.init).stage != PRETRAINING:
-        wanted = cfg.network.state.values > 0
-    if not wanted:
-        return StateCfg()
-    return head_of(teacher)
-
-
-def head_of(teacher: "TrainedPolicy") -> "StateCfg":
-    """The head that estimates what a teacher observes, in the views that it was trained in."""
-    from vd.evaluate.agents import trained_task
-    from vd.kernels.task.observations import JOINTS_PER_FINGER
-    from vd.vision.state import state_cfg
-
-    observation = trained_task(teacher).observation
-    return state_cfg(teacher.spec, views=observation.views(teacher.num_actions // JOINTS_PER_FINGER))
-
-
 def begin_from(path: Path, student: "Student", device: str) -> list[str]:
     """Take over the weights of another student, as far as they fit.
 
-    Of one that acts, only the layers for what its teacher observes may be of other sizes. Of a pre-trained
-    one the encoder is what counts: all else may be of another hand, or another network.
+    Of a pre-trained one the encoder is what counts: all else may be of another hand, or another network.
 
     Returns:
         Parts of the network that begin anew, wholly or in part.
@@ -234,14 +205,10 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
             f"{path} moves {spec.num_actions} joints, the teacher {student.num_actions}; "
             "give a student of the same hand, or one of stage 0"
         )
-    other = to_dict(replace(spec.network, state=student.cfg.state)) != to_dict(student.cfg)
     own, theirs = student.state_dict(), state["student_state_dict"]
-    if spec.network.state != student.cfg.state:
-        # Actions were read from the memory alone, or added to those of another teacher.
-        theirs = {name: value for name, value in theirs.items() if not name.startswith(("state.", "mean."))}
     fits = {key: value for key, value in theirs.items() if key in own and own[key].shape == value.shape}
     anew = sorted({name.split(".")[0] for name in own.keys() - fits.keys()})
-    if other and (acts or "encoder" in anew):
+    if spec.network != student.cfg and (acts or "encoder" in anew):
         raise ValueError(f"{path} is of another network than --network says; leave those flags out")
     student.load_state_dict(fits, strict=False)
     return anew
@@ -282,13 +249,11 @@ def _dagger(
     import torch
 
     from vd.envs.reorient import ReorientEnv
-    from vd.envs.symmetry import WorldOrder
-    from vd.envs.view_tables import view_tables
     from vd.evaluate.agents import trained_task
     from vd.evaluate.student import StudentView
     from vd.train.student.dagger import Dagger
-    from vd.train.student.every_view import EveryView
     from vd.train.vec_env import ReorientVecEnv
+    from vd.views import InViews, ViewMaps
 
     simulation = ReorientEnv(task, cfg.run.device)
     if simulation.num_observations != teacher.num_observations:
@@ -311,18 +276,8 @@ def _dagger(
         batch=cfg.dagger.minibatch_envs * cfg.dagger.rollout_steps,
         seed=task.seed,
     )
-    labels: Any = WorldOrder(teacher, simulation.views)
-    state = student.state
-    if state is not None:
-        seen_in = trained_task(teacher).observation.view
-        tables = (
-            view_tables(simulation.hand, simulation.cfg.observation, seen_in)
-            if state.views is not None
-            else None
-        )
-        if fresh and state.adopt(teacher.network, tables):
-            # What is added to the actions of another teacher's layers is of no use to these.
-            student.forget_correction()
-        if state.views is not None:
-            labels = EveryView(teacher, state.views)
+    labels: TrainedPolicy | InViews = teacher
+    seen = trained_task(teacher).observation
+    if seen.view != "world":
+        labels = InViews(teacher, ViewMaps.of(simulation.hand, seen, seen.view, env.device))
     return Dagger(env, view, student, labels, cfg.dagger, world_size=world_size)

@@ -103,7 +103,7 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
     assert camera is None or len(camera) == 7
     network = spec.network
     if spec.stage == PRETRAINING:
-        sees = {name: getattr(network, name) for name in ("encoder", "voxel_m", "goal")}
+        sees = {name: getattr(network, name) for name in ("encoder", "voxel_m")}
         network = replace(base.network, **sees)
     return replace(
         base, init=path, network=network, camera=camera, teacher=base.teacher or spec.teacher or None

@@ -11,7 +11,7 @@ from vd.config import Renamed
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.train.config import RunCfg
-from vd.vision.cfg import LEAN, PAPER_NETWORK, EncoderCfg, NoiseCfg, StudentCfg
+from vd.vision.cfg import LEAN, PAPER_NETWORK, SMALL, NoiseCfg, StudentCfg
 
 Stage = Literal[0, 1, 2]
 PresetName = Literal["gpu", "paper", "cpu-demo", "cpu-overfit"]
@@ -33,6 +33,8 @@ class DaggerCfg:
     RETIRED: ClassVar[dict[str, Any]] = {
         "minibatch_worlds": Renamed("minibatch_envs"),
         "validation_worlds": Renamed("validation_envs"),
+        "state_weight": 0.0,
+        "match_weight": 0.0,
     }
     minibatch_envs: int = PAPER.dagger.synthetic_minibatch
     """Environments of an optimiser step on one GPU, whole sequences each."""
@@ -58,13 +60,6 @@ class DaggerCfg:
     """Weight of the squared error of where the object is, and how it is turned from the goal, predicted from
     the embedding by a head of the training alone. The teacher acts by these; labels alone teach the encoder
     to see them much later. 0, as in the released code: no such head."""
-    state_weight: float = 0.0
-    """Weight of the squared error of an estimate of the teacher's observation, normalised, on which the
-    teacher's own layers act (:mod:`vd.vision.state`). 0, as in the released code: no such head. A student
-    to begin from decides for itself whether it has one."""
-    match_weight: float = 0.0
-    """Weight of how far points of the object are found from where they are on the goal, for a network whose
-    points look for each other (``--network.turn.match``)."""
     clip_labels: bool = False
     """Clip the teacher's mean to [-1, 1], where the environment clips actions; the released code does not."""
     teacher_share: float = PAPER.dagger.teacher_share
@@ -93,6 +88,7 @@ class DaggerCfg:
 class PretrainCfg:
     """Stage 0: random joints, objects, poses and goals, without simulation."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"embedding": "single", "match_weight": 0.0}
     batch: int = 512
     """Clouds of an optimiser step on one GPU."""
     steps: int = 50
@@ -107,16 +103,12 @@ class PretrainCfg:
     """Gradient norm is clipped to this."""
     distance: Literal["scalar", "6d"] = "scalar"
     """Predict the angle to the goal, or the relative rotation by two columns of its matrix (Zhou 2019)."""
-    embedding: Literal["single", "split"] = "single"
-    """All predictions from the whole embedding, or each from parts of it: object, goal, hand."""
     category_weight: float = 1.0
     """Weight of the cross-entropy of the object's category; 0 leaves the prediction out."""
     distance_weight: float = 1.0
     """Weight of the squared error of the distance (or of the two columns); 0 leaves it out."""
     joint_weight: float = 1.0
     """Weight of the squared error of joint positions, scaled to [-1, 1]; 0 leaves it out."""
-    match_weight: float = 0.0
-    """Weight of how far points are found from where they are on the goal, as in imitation."""
     near_share: float = 0.0
     """Share of goals at an angle uniform in [0, pi]. The others are uniform on SO(3), where near goals are
     rare: 1 in 300 lies within 0.4 rad."""
@@ -204,8 +196,6 @@ SHORT_ROLLOUTS = DaggerCfg(
     grad_norm=1.0,
     imitation="squared",
     pose_weight=2.0,
-    state_weight=2.0,
-    match_weight=1.0,
     clip_labels=True,
     teacher_share=1.0,
     teacher_share_last=0.2,
@@ -244,7 +234,6 @@ def gpu(stage: Stage) -> StudentTrainCfg:
             decay_after_steps=1000,
             amsgrad=False,
             distance="6d",
-            match_weight=1.0,
             near_share=0.5,
             precision="bf16",
         ),
@@ -273,7 +262,7 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
             batch=64, steps=10, learning_rate=1e-3, amsgrad=False, distance="6d", near_share=0.5
         ),
         task=StudentTaskCfg(num_envs=16),
-        network=SMALL_NETWORK,
+        network=SMALL,
         depth=DepthCameraCfg(points=2000),
     )
 
@@ -301,16 +290,6 @@ def cpu_overfit(stage: Stage) -> StudentTrainCfg:
         task=replace(start.task, num_envs=1),
     )
 
-
-SMALL_NETWORK = StudentCfg(
-    encoder=EncoderCfg(channels=(16, 32, 32), blocks=1, embedding=64),
-    voxel_m=0.01,
-    action_hidden=16,
-    memory=64,
-    head_hidden=64,
-    distance_hidden=32,
-)
-"""A hundredth of the paper's network, on voxels of 1 cm."""
 
 PRESETS: dict[str, Callable[[Stage], StudentTrainCfg]] = {
     "gpu": gpu,
@@ -350,8 +329,6 @@ def validate(cfg: StudentTrainCfg) -> None:
     weights = {
         "--dagger.distance-weight": dagger.distance_weight,
         "--dagger.pose-weight": dagger.pose_weight,
-        "--dagger.state-weight": dagger.state_weight,
-        "--dagger.match-weight": dagger.match_weight,
         "--dagger.teacher-share-iterations": dagger.teacher_share_iterations,
         "--dagger.warmup-steps": dagger.warmup_steps,
         "--dagger.decay-after-steps": dagger.decay_after_steps,
@@ -360,7 +337,6 @@ def validate(cfg: StudentTrainCfg) -> None:
         "--pretrain.category-weight": pretrain.category_weight,
         "--pretrain.distance-weight": pretrain.distance_weight,
         "--pretrain.joint-weight": pretrain.joint_weight,
-        "--pretrain.match-weight": pretrain.match_weight,
     }
     for flag, value in weights.items():
         if value < 0:

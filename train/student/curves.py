@@ -26,7 +26,6 @@ PANELS = (
     ("student/rotation_error", "mean error of the predicted rotation\nfrom the goal, stage 0 [rad]", 1.0),
     ("student/joint_error", "error of joint positions,\nroot mean square [rad]", 1.0),
     ("loss/imitation", "imitation loss", 1.0),
-    ("loss/state", "loss of the estimated observation", 1.0),
     ("steps_per_s", "control steps (stage 0: clouds) per second", 1.0),
 )
 """Quantity, title and factor of each panel; those that no run has are left out."""

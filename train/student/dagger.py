@@ -21,24 +21,18 @@ from vd.train.student.losses import (
     distance_loss,
     imitation_figures,
     imitation_loss,
-    in_view,
-    match_loss,
     poses,
 )
 from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer, scheduled
 from vd.train.student.rollout import UNCLIPPED, Rollout, moved, rollout_bytes, taken
 from vd.train.student.rotations import angle_between
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
-from vd.vision.match import Matches
 from vd.vision.network import Student, StudentOutput
 from vd.vision.sites import Sites
-from vd.vision.state import StateHead
 
 CHECKPOINT_ROLLOUT_BYTES = 2**28
 """Kept rollouts that are larger together, those with camera points, are not written into checkpoints: a run
 that goes on from one begins with the rollouts to come."""
-FIT_BATCHES = 16
-"""Minibatches of the first rollout that the first estimate of the teacher's observation is fitted to."""
 LOWER_RATES = "lower --dagger.learning-rate or --dagger.grad-norm, or take --dagger.precision fp32"
 """Remedy for a network that diverges."""
 
@@ -56,7 +50,7 @@ class View(Protocol):
 
     def sites(
         self, frame: Mapping[str, torch.Tensor], envs: torch.Tensor | None = None, *, augment: bool
-    ) -> tuple[Sites, ...]:
+    ) -> Sites:
         """Voxels of frames [R, ...] of the given environments [R]."""
         ...
 
@@ -86,8 +80,7 @@ class Dagger:
         env: The environments.
         view: What the student sees of them.
         student: The network.
-        teacher: Labels observations of ``env``, once [N, D] or in each view that the student may take
-            [N, F, D]: then the label of a state is that of the view the student takes.
+        teacher: Labels observations of ``env`` [N, D].
         cfg: Settings.
         world_size: Processes of the run: gradients are averaged over them.
     """
@@ -114,8 +107,6 @@ class Dagger:
             "imitation": 1.0,
             "distance": cfg.distance_weight,
             "pose": cfg.pose_weight,
-            "state": cfg.state_weight,
-            "match": cfg.match_weight,
         }
         """Weights of the losses."""
         self.network = nn.ModuleList([student, *([] if self.pose is None else [self.pose])])
@@ -163,9 +154,6 @@ class Dagger:
         if self.cfg.validation_envs and len(self._held_out) < self._episode_rollouts:
             held_out = torch.arange(self._learned_worlds, self.env.num_envs, device=self.device)
             self._held_out.append(taken([rollout], held_out))
-        state = self.student.state
-        if state is not None and not state.fitted:
-            self._fit_state(state, rollout)
         losses = self.update(list(self._kept))
         learned = time.perf_counter()
         figures = self.validate()
@@ -203,7 +191,6 @@ class Dagger:
         taught = torch.rand((envs, 1), device=self.device) < self.teacher_share()
         frames: dict[str, torch.Tensor] = {}
         labels: list[torch.Tensor] = []
-        wanted: list[torch.Tensor] = []
         means: list[torch.Tensor] = []
         done = torch.zeros((cfg.rollout_steps, envs), dtype=torch.bool, device=self.device)
         with torch.no_grad():
@@ -212,26 +199,23 @@ class Dagger:
                 if stopping():
                     self._means.clear()
                     return None
-                frame, observed = self.view.frame(), self.view.observation(observation[OBSERVATION_GROUP])
-                if self.student.state is not None:
-                    frame["observation"] = observed
+                frame = self.view.frame()
                 for name, value in frame.items():
                     if step == 0:
                         # A tenth of a millimetre is lost of camera points, and half of the memory won.
                         dtype = torch.half if name in UNCLIPPED else value.dtype
                         frames[name] = value.new_empty((cfg.rollout_steps, *value.shape), dtype=dtype)
                     frames[name][step] = value
-                labels.append(self._label(observed))
-                sites = self.view.sites(frame, augment=True)
-                senses = self.student.senses(frame)
-                output = self.student(self._look(sites)[0][None], senses[None], self._hidden)
+                labels.append(self._label(self.view.observation(observation[OBSERVATION_GROUP])))
+                embedding = self._encode(self.view.sites(frame, augment=True))
+                known = self.student.proprioception(frame)
+                output = self.student(embedding[None], known[None], self._hidden)
                 action, std = output.mean[0], output.log_std[0].exp()
                 means.append(action)
-                wanted.append(in_view(labels[-1], output.view[0]))
                 error = (output.distance[0, :, -1] - frame["distance"]).abs().mean()
                 if cfg.imitation == "likelihood":
                     action = action + std * torch.randn_like(action)
-                action = torch.where(taught, in_view(labels[-1], self._true_view(observed)), action)
+                action = torch.where(taught, labels[-1], action)
                 observation, _, ended, extras = self.env.step(action)
                 done[step] = ended.bool()
                 self._hidden = output.hidden.masked_fill(done[step, :, None], 0.0)
@@ -242,7 +226,7 @@ class Dagger:
                 self._means.add(log | {"policy/std": std.mean()})
         rollout = Rollout(frames, torch.stack(labels), done, first, torch.arange(envs, device=self.device))
         own = ~taught[:, 0] if not bool(taught.all()) else taught[:, 0]
-        self._figures = imitation_figures("student", torch.stack(means)[:, own], torch.stack(wanted)[:, own])
+        self._figures = imitation_figures("student", torch.stack(means)[:, own], rollout.label[:, own])
         self._check_rollout(rollout)
         return rollout
 
@@ -263,10 +247,10 @@ class Dagger:
         means, wanted, errors, turns = [], [], [], []
         with torch.no_grad():
             for part in self._held_out:
-                output, embedding, _ = self._run(part, hidden, augment=False)
+                output, embedding = self._run(part, hidden, augment=False)
                 hidden = output.hidden.masked_fill(part.done[-1, :, None], 0.0)
                 means.append(output.mean)
-                wanted.append(in_view(part.label, output.view))
+                wanted.append(part.label)
                 if self.pose is not None:
                     turns.append(angle_between(self.pose(embedding)[..., 3:], poses(part.frames)[..., 3:]))
                 errors.append((output.distance[..., -1] - part.frames["distance"]).abs())
@@ -307,25 +291,15 @@ class Dagger:
 
     def losses(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Losses of sequences by name, with new noise on their clouds; their weights are in ``weights``."""
-        output, embedding, matches = self._run(rollout, rollout.hidden, augment=True)
+        output, embedding = self._run(rollout, rollout.hidden, augment=True)
         found = {
             "imitation": imitation_loss(
-                output,
-                in_view(rollout.label, output.view),
-                self.cfg.imitation,
-                bounded=self.cfg.clip_labels,
+                output, rollout.label, self.cfg.imitation, bounded=self.cfg.clip_labels
             ),
             "distance": distance_loss(output.distance, rollout.frames["distance"]),
         }
         if self.pose is not None:
-            error = self.pose(embedding) - poses(rollout.frames)
-            found["pose"] = error.square().mean()
-        if self.student.state is not None:
-            error = output.state - self.student.state.target(rollout.frames["observation"])
-            found["state"] = error.square().mean()
-        if matches is not None and self.cfg.match_weight > 0.0:
-            poses_of = (rollout.frames[name].flatten(0, 1) for name in ("body_q", "goal_quat"))
-            found["match"] = match_loss(matches, *poses_of)
+            found["pose"] = (self.pose(embedding) - poses(rollout.frames)).square().mean()
         return found
 
     def state_dict(self) -> dict[str, Any]:
@@ -396,50 +370,26 @@ class Dagger:
         label = self.teacher.act(observation)
         return label.clamp(-1.0, 1.0) if self.cfg.clip_labels else label
 
-    def _true_view(self, observation: torch.Tensor) -> torch.Tensor:
-        """The view that each state calls for [N]: the one in which the teacher acts itself."""
-        state = self.student.state
-        if state is None or state.views is None:
-            return torch.zeros(len(observation), dtype=torch.long, device=self.device)
-        return state.views.choose(observation)
-
-    def _look(self, sites: tuple[Sites, ...]) -> tuple[torch.Tensor, Matches | None]:
-        """Embeddings and matches; what follows the encoder is small, and stays in single precision."""
+    def _encode(self, sites: Sites) -> torch.Tensor:
+        """Embeddings; what follows the encoder is small, and stays in single precision."""
         with autocast(self.device, self.cfg.precision):
-            embedding, matches = self.student.look(*sites)
-        return embedding.float(), matches
+            embedding = self.student.encode(sites)
+        return embedding.float()
 
     def _run(
         self, rollout: Rollout, hidden: torch.Tensor, *, augment: bool
-    ) -> tuple[StudentOutput, torch.Tensor, Matches | None]:
+    ) -> tuple[StudentOutput, torch.Tensor]:
         """What the student says to sequences of frames, with memory before the first of them [N, G].
 
         Returns:
-            That, the embeddings of the clouds [T, N, E], and the matches of the T N clouds.
+            That, and the embeddings of the clouds [T, N, E].
         """
         steps, count = rollout.done.shape
         flat = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
         sites = self.view.sites(flat, rollout.envs.repeat(steps), augment=augment)
-        embedding, matches = self._look(sites)
-        embedding = embedding.view(steps, count, -1)
-        output = self.student(embedding, self.student.senses(rollout.frames), hidden, rollout.done)
-        return output, embedding, matches
-
-    def _fit_state(self, state: StateHead, rollout: Rollout) -> None:
-        """Let the estimate of the teacher's observation begin with the best one in least squares."""
-        self.student.train()  # as in the updates that follow
-        seen, observed = [], []
-        envs = torch.arange(self._learned_worlds, device=self.device)
-        with torch.no_grad():
-            for some in envs.split(self.cfg.minibatch_envs)[:FIT_BATCHES]:
-                part = taken([rollout], some)
-                output, _, _ = self._run(part, part.hidden, augment=True)
-                seen.append(output.seen.flatten(0, 1))
-                observed.append(part.frames["observation"].flatten(0, 1))
-        state.fit(torch.cat(seen), torch.cat(observed))
-        if self._world_size > 1:
-            for weight in state.estimate.parameters():
-                torch.distributed.broadcast(weight.data, 0)
+        embedding = self._encode(sites).view(steps, count, -1)
+        known = self.student.proprioception(rollout.frames)
+        return self.student(embedding, known, hidden, rollout.done), embedding
 
     def _minibatch_step(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """One optimiser step; its losses and the gradient's norm, on the device."""

@@ -23,12 +23,10 @@ from vd.sensors.surfaces import hand_surfaces
 from vd.sim.scene import hand_mount
 from vd.train.ending import TrainingDivergedError
 from vd.train.student.config import PretrainCfg
-from vd.train.student.losses import match_loss
 from vd.train.student.optimise import all_finite, autocast, descend, make_optimizer, scheduled
 from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
 from vd.vision.cfg import NoiseCfg, StudentCfg
 from vd.vision.network import Student
-from vd.vision.sight import voxels
 from vd.vision.sites import Sites
 from vd.vision.voxels import Voxeliser
 
@@ -38,8 +36,6 @@ HEAD_HIDDEN = PAPER.student.distance_hidden
 """Width of the prediction heads, as of the student's distance head."""
 LOWER_RATES = "lower --pretrain.learning-rate or --pretrain.grad-norm, or take --pretrain.precision fp32"
 """Remedy for a network that diverges."""
-EMBEDDING_PARTS = 3
-"""Parts of a split embedding: object, goal, hand."""
 
 
 class RandomScenes:
@@ -82,7 +78,7 @@ class RandomScenes:
     ) -> None:
         links = len(hand.link_names)
         self._objects, self._batch, self._near_share = len(objects), batch, near_share
-        self._device, self._network = torch.device(wp.device_to_torch(device)), network
+        self._device = torch.device(wp.device_to_torch(device))
         self._scales, self._augment = len(scales), noise is not None
         # A "world" for each object in each size.
         world_object = np.repeat(np.arange(len(objects)), len(scales))
@@ -91,6 +87,7 @@ class RandomScenes:
         self._clouds = SceneClouds(
             hand, objects, world_object=world_object, world_scale=world_scale, **placed
         )
+        self._marks = self._clouds.ends if network.marked else ()
         self._kinematics = HandKinematics(hand, link_body=np.arange(links), base=hand_mount(), device=device)
         self._voxelise = Voxeliser(network.voxel_m, noise=noise, clouds=batch, seed=seed, device=device)
         self._body_q = wp.zeros((batch, links + 1), dtype=wp.transform, device=device)
@@ -127,13 +124,12 @@ class RandomScenes:
         self.joint_scale_rad = 0.5 * self._span
         """Radians of one unit of scaled joint positions [D]."""
 
-    def draw(self) -> tuple[tuple[Sites, ...], dict[str, torch.Tensor]]:
+    def draw(self) -> tuple[Sites, dict[str, torch.Tensor]]:
         """A batch of scenes.
 
         Returns:
             Voxels, and the targets: ``category`` [R], ``distance`` [R] [rad], ``rotation`` [R, 6] (first two
-            columns of the matrix of q_object conj(q_goal)), ``joints`` [R, D] in [-1, 1]; and what they are
-            of, ``body_q`` [R, B, 7], the object last, and ``goal`` [R, 4], until the next batch.
+            columns of the matrix of q_object conj(q_goal)), ``joints`` [R, D] in [-1, 1].
         """
         count, device = self._batch, self._device
         share = torch.rand((count, len(self._lower)), device=device)
@@ -161,21 +157,12 @@ class RandomScenes:
             rows[:, first:] = torch.nan
             seen = wp.to_torch(self._camera.points)
             rows[:, first : first + seen.shape[1]] = seen.masked_fill(unseen[:, None, None], torch.nan)
-        sites = voxels(
-            wp.to_torch(self._points),
-            self._clouds.ends,
-            self._voxelise,
-            network=self._network,
-            augment=self._augment,
-            complete=self._camera is None,
-        )
+        sites = self._voxelise(self._points, augment=self._augment, ends=self._marks)
         targets = {
             "category": envs // self._scales,
             "distance": rotation_distance(orientation, goal),
             "rotation": two_columns(relative_rotation(orientation, goal)),
             "joints": 2.0 * share - 1.0,
-            "body_q": wp.to_torch(self._body_q),
-            "goal": goal,
         }
         return sites, targets
 
@@ -193,57 +180,40 @@ class RandomScenes:
 
 
 class PretrainHeads(nn.Module):
-    """Predictions from an embedding, or from its parts; heads whose weight in the loss is 0 are left out.
+    """Predictions from an embedding; heads whose weight in the loss is 0 are left out.
 
-    The scalar distance from a whole embedding is predicted by the student's own head, if it has one before
-    its memory, which then is trained already when imitation begins.
+    The scalar distance is predicted by the student's own head, if it has one before its memory, which then is
+    trained already when imitation begins.
 
     Args:
         student: The student.
-        cfg: Which predictions, from what.
+        cfg: Which predictions.
         objects: O.
     """
 
     def __init__(self, student: Student, cfg: PretrainCfg, objects: int) -> None:
         super().__init__()
-        width = student.cfg.encoder.embedding
-        self._split = cfg.embedding == "split"
-        part = width // EMBEDDING_PARTS if self._split else width
-        own = "before" in student.distance and cfg.distance == "scalar" and not self._split
+        scalar = cfg.distance == "scalar"
         sizes = {
-            "category": (part, objects, cfg.category_weight),
-            "joints": (width - 2 * part if self._split else width, student.num_actions, cfg.joint_weight),
-            "distance": (2 * part if self._split else width, 1, cfg.distance_weight),
+            "category": (objects, cfg.category_weight),
+            "joints": (student.num_actions, cfg.joint_weight),
+            "distance" if scalar else "rotation": (1 if scalar else 6, cfg.distance_weight),
         }
-        if cfg.distance == "6d":
-            sizes["rotation"] = (sizes["distance"][0], 6, cfg.distance_weight)
-        if own or cfg.distance == "6d":
+        self._student_head = scalar and "before" in student.distance and cfg.distance_weight > 0.0
+        if self._student_head:
             del sizes["distance"]
-        self._student_head = own and cfg.distance_weight > 0.0
-        self._part = part
+        width = student.cfg.encoder.embedding
         self.heads = nn.ModuleDict(
             {
-                name: nn.Sequential(
-                    nn.Linear(inputs, HEAD_HIDDEN), nn.GELU(), nn.Linear(HEAD_HIDDEN, outputs)
-                )
-                for name, (inputs, outputs, weight) in sizes.items()
+                name: nn.Sequential(nn.Linear(width, HEAD_HIDDEN), nn.GELU(), nn.Linear(HEAD_HIDDEN, outputs))
+                for name, (outputs, weight) in sizes.items()
                 if weight > 0.0
             }
         )
 
     def forward(self, embedding: torch.Tensor, student: Student) -> dict[str, torch.Tensor]:
         """Predictions by name for embeddings [R, E]."""
-        part = self._part
-        inputs = {name: embedding for name in ("category", "distance", "rotation", "joints")}
-        if self._split:
-            pair = embedding[:, : 2 * part]
-            inputs = {
-                "category": embedding[:, :part],
-                "distance": pair,
-                "rotation": pair,
-                "joints": embedding[:, 2 * part :],
-            }
-        predictions = {name: head(inputs[name]) for name, head in self.heads.items()}
+        predictions = {name: head(embedding) for name, head in self.heads.items()}
         if self._student_head:
             predictions["distance"] = student.distance["before"](embedding)
         return predictions
@@ -302,12 +272,12 @@ class Pretrainer:
         return figures
 
     def losses(
-        self, sites: tuple[Sites, ...], targets: dict[str, torch.Tensor]
+        self, sites: Sites, targets: dict[str, torch.Tensor]
     ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
         """Weighted loss of a batch, and figures to log."""
         cfg = self.cfg
-        with autocast(sites[0].device, cfg.precision):
-            embedding, matches = self.student.look(*sites)
+        with autocast(sites.device, cfg.precision):
+            embedding = self.student.encode(sites)
         predictions = self.heads(embedding.float(), self.student)
         total = targets["distance"].new_zeros(())
         figures: dict[str, torch.Tensor] = {}
@@ -333,10 +303,6 @@ class Pretrainer:
             total = total + cfg.joint_weight * error.square().mean()
             radians = (error.detach() * self.scenes.joint_scale_rad).square().mean().sqrt()
             figures |= {"student/joint_error": radians, "loss/joints": error.detach().square().mean()}
-        if matches is not None and cfg.match_weight > 0.0:
-            loss = match_loss(matches, targets["body_q"], targets["goal"])
-            total = total + cfg.match_weight * loss
-            figures |= {"loss/match": loss.detach()}
         return total, figures
 
     def state_dict(self) -> dict[str, Any]:

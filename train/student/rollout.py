@@ -20,7 +20,7 @@ class Rollout:
     frames: dict[str, torch.Tensor]
     """Frames before each step, tensors [T, N, ...]."""
     label: torch.Tensor
-    """The teacher's mean action of each state [T, N, D], or one in each of its views [T, N, F, D]."""
+    """The teacher's mean action of each state [T, N, D]."""
     done: torch.Tensor
     """Where the goal or the episode ended with the step [T, N], bool."""
     hidden: torch.Tensor

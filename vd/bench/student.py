@@ -121,9 +121,9 @@ class StudentStep:
         )
         size = self._clouds.item.start + self._camera.cloud.points.shape[1]
         self._points = wp.empty((1, size), dtype=wp.vec3, device="cpu")
-        self._marks = self._clouds.ends if "marks" in net.cfg.encoder.inputs else ()
+        self._marks = self._clouds.ends if net.cfg.marked else ()
         self._voxelise = Voxeliser(net.cfg.voxel_m)
-        self._senses, self._hidden = torch.zeros(1, net.num_senses), net.initial_hidden(1)
+        self._known, self._hidden = torch.zeros(1, net.num_proprioception), net.initial_hidden(1)
         self.parts: Parts = {"points": self._see, "voxels": self._cells, "maps and network": self._act}
 
     def _see(self) -> None:
@@ -136,7 +136,7 @@ class StudentStep:
         self._sites = self._voxelise(self._points, ends=self._marks)
 
     def _act(self) -> None:
-        self._hidden = self._net.act(self._sites, self._senses, self._hidden).hidden
+        self._hidden = self._net.act(self._sites, self._known, self._hidden).hidden
 
 
 class TrackingStep:
@@ -347,10 +347,10 @@ def measure_training(
     place = torch.device(wp.device_to_torch(wp.get_device(device)))
     net = Student(PRESETS[network], load_hand(hand).num_joints).to(place)
     voxelise = Voxeliser(net.cfg.voxel_m, noise=NoiseCfg(), clouds=clouds, seed=seed, device=device)
-    senses = torch.zeros(steps, envs, net.num_senses, device=place)
+    known = torch.zeros(steps, envs, net.num_proprioception, device=place)
     on_gpu = place.type == "cuda"
     encoder = net.cfg.encoder
-    ends = scenes.clouds.ends if "marks" in encoder.inputs else ()
+    ends = scenes.clouds.ends if net.cfg.marked else ()
     watch = _Stopwatch(place)
     sizes: list[int] = []
 
@@ -367,7 +367,7 @@ def measure_training(
         net.train()
         sites, start = prepare(time.perf_counter(), augment=True)
         with torch.autocast(place.type, dtype=torch.bfloat16, enabled=half):
-            output = net(net.encode(sites).unflatten(0, (steps, envs)), senses, net.initial_hidden(envs))
+            output = net(net.encode(sites).unflatten(0, (steps, envs)), known, net.initial_hidden(envs))
             loss = output.mean.square().mean() + output.log_std.mean() + output.distance.square().mean()
         start = watch.stop("forward", start)
         loss.backward()
@@ -378,7 +378,7 @@ def measure_training(
         net.eval()
         with torch.inference_mode(), torch.autocast(place.type, dtype=torch.bfloat16, enabled=half):
             sites, _ = prepare(time.perf_counter(), augment=False)
-            net.act(sites, senses[0].repeat(steps, 1), net.initial_hidden(clouds))
+            net.act(sites, known[0].repeat(steps, 1), net.initial_hidden(clouds))
 
     acting = watch.seconds(act, calls)
     if on_gpu:

@@ -14,8 +14,7 @@ from vd.envs.cfg import ObservationCfg
 from vd.envs.reorient import ReorientEnv
 from vd.paper import PAPER
 from vd.policy import TrainedPolicy
-from vd.tracking.views import ViewSelection
-from vd.views import ViewMaps
+from vd.views import ViewMaps, ViewSelection
 
 
 def with_second_view(seen: ObservationCfg) -> ObservationCfg:
@@ -47,9 +46,7 @@ def view_maps(env: ReorientEnv) -> ViewMaps:
         raise ValueError(
             f"observation.view is {env.cfg.observation.view}; a second view is there with either or mirrored"
         )
-    maps = ViewMaps(len(env.views.tables.sector), env.num_observations, env.num_actions)
-    maps.adopt(env.views.tables)
-    return maps.to(wp.device_to_torch(env.device))
+    return ViewMaps(env.views.tables, device=wp.device_to_torch(env.device))
 
 
 class SecondView:

@@ -15,8 +15,7 @@ from vd.paper import PAPER
 from vd.senses import Senses
 from vd.tracking.observer import Observer
 from vd.tracking.policy import TrackingPolicy
-from vd.tracking.views import ViewSelection
-from vd.views import ViewMaps
+from vd.views import ViewMaps, ViewSelection
 
 NEAREST = -1
 """In place of a view: that in whose sector the goal is believed to lie."""
@@ -89,7 +88,7 @@ class Tracker:
         self._selection: ViewSelection | None = None
         if seen.view != "world":
             view = "either" if second_view and seen.view == "goal" else seen.view
-            self._maps = ViewMaps.of(hand, seen, view).to(place)
+            self._maps = ViewMaps.of(hand, seen, view, place)
         if second_view:
             if self._maps is None:
                 raise ValueError(
