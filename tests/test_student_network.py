@@ -10,6 +10,7 @@ import torch
 import warp as wp
 
 from vd.config import from_dict, to_dict
+from vd.paper import PAPER
 from vd.vision.cfg import LEAN, PAPER_NETWORK, PRESETS, EncoderCfg, StudentCfg
 from vd.vision.network import Student, voxel_features
 from vd.vision.voxels import Voxeliser
@@ -116,7 +117,7 @@ def test_places_and_marks_are_read_where_asked_for(device):
     net, points = student(cfg, device), clouds(2)
     scene = sites(points, device)
     found = voxel_features(scene, cfg.encoder, cfg.voxel_m).cpu().numpy()
-    assert found.shape == (len(scene), 6) and (found[:, 0] == cfg.encoder.feature).all()
+    assert found.shape == (len(scene), 6) and (found[:, 0] == PAPER.cloud.feature).all()
     coordinates = scene.coordinates.cpu().numpy()
     np.testing.assert_allclose(found[:, 1:4], (coordinates[:, 1:] + 0.5) * 0.05, atol=1e-6)
     expected = np.zeros((len(scene), 2))

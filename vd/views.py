@@ -118,24 +118,29 @@ class ViewSelection:
         self._after, self._every = round(AFTER_S * control_hz), round(EVERY_S * control_hz)
 
     def due(self, goal_steps: torch.Tensor) -> torch.Tensor:
-        """Worlds that look again if they are far [N], so many control steps after their goal was new [N]."""
+        """Environments to look again if far [N], so many control steps after their goal was new [N]."""
         late = goal_steps - self._after
         return (late >= 0) & (late % self._every == 0)
 
+    def of(self, world: torch.Tensor) -> torch.Tensor:
+        """Views to choose from [C, M] for observations in the world frame [M, O].
+
+        They are, of a hand that is its own mirror image, the view in whose sector the goal lies now and that
+        in the mirror; else all views.
+        """
+        fingers = self.maps.fingers
+        if len(self.maps) > fingers:
+            near = self.maps.nearness(world).unflatten(-1, (2, fingers)).argmax(dim=-1)
+            return torch.stack((near[:, 0], near[:, 1] + fingers))
+        return torch.arange(fingers, device=world.device)[:, None].expand(-1, len(world))
+
     def better(self, world: torch.Tensor, value: Callable[[torch.Tensor], torch.Tensor]) -> torch.Tensor:
         """Views [M] of which most is expected.
-
-        Those of a hand that is its own mirror image are two: that in whose sector the goal lies now, and that
-        in the mirror; of another hand all.
 
         Args:
             world: Observations in the world frame [M, O].
             value: What a critic expects [M] of observations as a view shows them [M, O].
         """
-        fingers = self.maps.fingers
-        views = torch.arange(fingers, device=world.device)[:, None].expand(-1, len(world))
-        if len(self.maps) > fingers:
-            near = self.maps.nearness(world).unflatten(-1, (2, fingers)).argmax(dim=-1)
-            views = torch.stack((near[:, 0], near[:, 1] + fingers))
+        views = self.of(world)
         expected = torch.stack([value(self.maps.take(world, view)) for view in views])
         return views.gather(0, expected.argmax(dim=0, keepdim=True))[0]

@@ -128,7 +128,7 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | Track
     if is_bundle(path):
         from vd.bundle.store import read_bundle
 
-        return read_bundle(path, device).policy
+        return read_bundle(path, device)
     if is_tracking(path):
         return load_tracking(path, device)
     return load_student(path, device) if is_student(path) else load_policy(path, device)
