@@ -123,11 +123,6 @@ class TrainedPolicy:
         self._critic, self._device = critic, device
 
     @property
-    def has_critic(self) -> bool:
-        """Whether the file has one."""
-        return self._critic is not None
-
-    @property
     def critic_weights(self) -> dict[str, torch.Tensor]:
         """State of its critic; empty if the file has none."""
         return self._critic or {}
@@ -263,6 +258,15 @@ def _tensors_finite(value: Any) -> Iterator[bool]:
     elif isinstance(value, (dict, list, tuple)):
         for item in value.values() if isinstance(value, dict) else value:
             yield from _tensors_finite(item)
+
+
+def holds(path: Path, part: str) -> bool:
+    """Whether a file of torch is a dictionary with such a key, as far as it can be read."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception:  # whoever reads it says what is wrong with it
+        return False
+    return isinstance(state, dict) and part in state
 
 
 def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:

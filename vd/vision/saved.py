@@ -4,10 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from vd.config import from_dict
-from vd.policy import read_state
+from vd.policy import holds, read_state
 from vd.stopping import StoppingRules
 from vd.vision.cfg import StudentCfg
 from vd.vision.network import Student
@@ -50,11 +48,7 @@ class SavedStudent:
 
 def is_student(path: Path) -> bool:
     """Whether a file is a student, as far as it can be read."""
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception:  # whoever reads it says what is wrong with it
-        return False
-    return isinstance(state, dict) and "student_state_dict" in state
+    return holds(path, "student_state_dict")
 
 
 def student_export(state: dict[str, Any]) -> dict[str, Any]:

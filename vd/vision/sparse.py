@@ -162,10 +162,6 @@ class SparseConv3d(nn.Module):
         back = sites.strided_back if self.stride == 2 and features.requires_grad else None
         return _Convolution.apply(features, self.weight, table, back)
 
-    def extra_repr(self) -> str:
-        """Sizes, for ``print``."""
-        return f"{self.weight.shape[1]}, {self.weight.shape[2]}, stride={self.stride}"
-
 
 class SparseMaxPool3d(nn.Module):
     """Largest value in each 2x2x2 window, stride 2, over its occupied cells."""
