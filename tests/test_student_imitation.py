@@ -331,7 +331,7 @@ def test_other_worlds_start_anew(tmp_path):
     make_student_runner(tmp_path).learn(2)
     again = make_student_runner(tmp_path, make_dagger(envs=6))
     again.load(list_checkpoints(tmp_path)[-1])
-    assert "8 worlds" in again.new_episodes
+    assert "8 environments" in again.new_episodes
     again.learn(1)
     assert again.iteration == 3
 

@@ -29,6 +29,7 @@ RENAMED = {
     "--goal-s": "--episode-s",
     "--air": "--in-air",
     "--num-worlds": "--num-envs",
+    "--network.senses": "--network.proprioception",
 }
 """Flags of earlier versions, and what they are called in all commands."""
 

@@ -30,16 +30,11 @@ class NoiseCfg:
     def validate(self) -> None:
         """Raise ``ValueError`` for what cannot be drawn, naming the field."""
         low, high = self.dropout_ratio
-        for name, value in (
-            ("jitter_probability", self.jitter_probability),
-            ("dropout_probability", self.dropout_probability),
-            ("dropout_ratio", low),
-            ("dropout_ratio", high),
-        ):
-            if not 0.0 <= value <= 1.0:
-                raise ValueError(f"noise.{name} = {value} must lie in [0, 1]")
-        if low > high:
-            raise ValueError(f"noise.dropout_ratio = {self.dropout_ratio} must be (low, high)")
+        for name in ("jitter_probability", "dropout_probability"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"noise.{name} = {getattr(self, name)} must lie in [0, 1]")
+        if not 0.0 <= low <= high <= 1.0:
+            raise ValueError(f"noise.dropout_ratio = {self.dropout_ratio} must be (low, high) within [0, 1]")
         if not self.jitter_std_m >= 0.0:
             raise ValueError(f"noise.jitter_std_m = {self.jitter_std_m} must not be negative")
 
