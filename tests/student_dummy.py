@@ -100,9 +100,7 @@ def make_dagger(
     )
 
 
-def make_student_runner(
-    run_dir, dagger: Dagger | None = None, *, deadline=None, processes=None, **run
-) -> StudentRunner:
+def make_student_runner(run_dir, dagger: Dagger | None = None, *, deadline=None, **run) -> StudentRunner:
     """A runner around :func:`make_dagger`."""
     dagger = dagger or make_dagger()
     settings = RunCfg(out=run_dir, device="cpu", **{"save_every": 2, "tensorboard": False, **run})
@@ -113,7 +111,6 @@ def make_student_runner(
         task={"hand": "dummy"},
         depth=to_dict(STILL),
         device="cpu",
-        processes=processes,
         deadline=deadline,
     )
 

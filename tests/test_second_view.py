@@ -11,11 +11,10 @@ import warp as wp
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
-from vd.evaluate.second_view import SecondView, view_maps
+from vd.evaluate.second_view import SecondView
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
-from vd.tracking.views import AFTER_S, EVERY_S, ViewSelection
-from vd.train.vec_env import ReorientVecEnv
+from vd.tracking.views import AFTER_S, EVERY_S
 
 WORLDS = 8
 CFG = ReorientCfg(
@@ -160,29 +159,6 @@ def test_actions_are_the_policys_in_the_view_that_was_taken(env):
     torch.testing.assert_close(action, policy.act(wp.to_torch(env.observation)))
 
 
-def test_a_training_draws_one_of_these_views(env):
-    after = round(AFTER_S * env.cfg.sim.control_hz)
-    still, drawn = torch.zeros(WORLDS, env.num_actions), set()
-    torch.manual_seed(0)
-    for seed in range(2):
-        begin(env, seed)
-        learner, first = ReorientVecEnv(env, second_view=True), env.views.view.numpy().copy()
-        for _ in range(after - 1):
-            learner.step(still)
-        np.testing.assert_array_equal(env.views.view.numpy(), first)
-        wp.to_torch(env.goal_steps)[0] = 0  # has come to a goal, and is not due
-        observed = learner.step(still)[0]["policy"]
-        view, others = env.views.view.numpy(), ViewSelection(view_maps(env), env.cfg.sim.control_hz)
-        assert view[0] == first[0]
-        world = wp.to_torch(env.world_observation)
-        offered = others.of(world).numpy()
-        assert all(view[row] in offered[:, row] for row in range(1, WORLDS))
-        drawn |= {int(np.flatnonzero(offered[:, row] == view[row])[0]) for row in range(1, WORLDS)}
-        taken = others.maps.take(world, torch.tensor(view))
-        torch.testing.assert_close(observed, taken, atol=1e-5, rtol=1e-5)
-    assert drawn == set(range(len(offered))), "each of them"
-
-
 def test_a_policy_without_a_critic_or_an_environment_of_one_view_is_refused(env):
     policy = teacher_of(env)
     with pytest.raises(ValueError, match="no critic; export it again"):
@@ -198,14 +174,12 @@ def test_the_command_refuses_policies_that_have_no_second_view(tmp_path, capsys)
     assert "dclaw4-cube has no other view" in capsys.readouterr().err
 
 
-def test_a_training_has_its_views_from_the_task_and_looks_twice_by_its_own_flag(tmp_path, capsys):
+def test_a_training_does_not_take_the_view_of_evaluations(tmp_path, capsys):
     from vd.train.cli import main as train
 
     flags = ["--preset", "cpu-demo", "--out", str(tmp_path / "run"), "--device", "cpu"]
     assert train(["teacher", *flags, "--env.observation.view", "either"]) == 1
     assert "train with goal" in capsys.readouterr().err
-    assert train(["teacher", *flags, "--env.observation.view", "world", "--second-view"]) == 1
-    assert "observation.view world" in capsys.readouterr().err
 
 
 def test_an_evaluation_says_that_it_selected_views(tmp_path):

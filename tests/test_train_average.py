@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from train_dummy import SMALL_POLICY, SMALL_PPO, make_runner
 
 from vd.evaluate.agents import SHIPPED_POLICIES
@@ -47,14 +46,6 @@ def test_weights_of_actor_and_critic_are_means(siblings, tmp_path, capsys):
             np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5, atol=1e-6, err_msg=name)
     assert mean["env_steps"] == states[-1]["env_steps"] and "optimizer_state_dict" not in mean
     assert load_policy(output).critic_weights
-
-
-def test_a_policy_given_twice_counts_twice(siblings, tmp_path):
-    average_policies([str(siblings[0]), str(siblings[0]), str(siblings[1])], tmp_path / "mean.pt")
-    name = "mlp.0.weight"
-    one, other = (load_checkpoint(path)["actor_state_dict"][name] for path in siblings[:2])
-    found = load_checkpoint(tmp_path / "mean.pt")["actor_state_dict"][name]
-    torch.testing.assert_close(found, (2.0 * one + other) / 3.0)
 
 
 def test_a_critic_that_not_all_have_is_left_out(siblings, tmp_path):

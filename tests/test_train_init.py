@@ -55,7 +55,7 @@ def test_a_run_begun_from_a_policy_acts_as_it_and_says_how_long_the_critic_learn
     path = _export(tmp_path / "first", critic=critic)
     runner = _begun(tmp_path / "second", path)
     assert runner.critic_warmup == warmup and runner.new_inputs == 0
-    assert runner.current_learning_iteration == 3 and runner.env_steps == 3 * 128
+    assert runner.iteration == 3 and runner.env_steps == 3 * 128
     observation = runner.env.get_observations()
     with torch.no_grad():
         assert torch.allclose(
@@ -74,10 +74,9 @@ def test_a_run_begun_from_a_policy_acts_as_it_and_says_how_long_the_critic_learn
 
 
 @pytest.mark.parametrize("schedule", ["fixed", "adaptive"])
-@pytest.mark.parametrize("optimizer", ["adam", "adamw"])
-def test_only_the_critic_learns_while_it_warms_up(tmp_path, schedule, optimizer):
+def test_only_the_critic_learns_while_it_warms_up(tmp_path, schedule):
     path = _export(tmp_path / "first", critic=False)
-    runner = _begun(tmp_path / "second", path, warmup=2, schedule=schedule, optimizer=optimizer)
+    runner = _begun(tmp_path / "second", path, warmup=2, schedule=schedule)
     actor, critic, rate = _state(runner.alg.actor), _state(runner.alg.critic), runner.alg.learning_rate
     runner.learn(2)
     assert _same(actor, _state(runner.alg.actor)) == list(actor)
@@ -132,17 +131,6 @@ def test_a_run_that_stops_while_the_critic_warms_up_goes_on_with_it(tmp_path):
     assert "critic_state_dict" in policy_export(load_checkpoint(find_checkpoint(tmp_path / "part", "latest")))
 
 
-def test_a_whole_checkpoint_needs_no_warm_up_unless_asked(tmp_path):
-    make_runner(tmp_path, policy=NORMALISING).learn(1)
-    best = find_checkpoint(tmp_path, "best")
-    assert _begun(tmp_path / "second", best).critic_warmup == 0
-    assert _begun(tmp_path / "third", best, warmup=5).critic_warmup == 5
-    asked = replace(SMALL_PPO, critic_warmup_iterations=2)
-    assert make_runner(tmp_path / "new", ppo=asked).critic_warmup == 2
-    with pytest.raises(ValueError, match=r"--ppo\.critic-warmup-iterations is -1"):
-        make_runner(tmp_path / "bad", ppo=replace(SMALL_PPO, critic_warmup_iterations=-1))
-
-
 @pytest.mark.parametrize(
     ("tightened", "asked", "wanted"),
     [(True, None, (1.0, 1.0)), (False, None, (1.0, 0.0)), (True, (0.5, 0.0), (0.5, 0.0))],
@@ -165,9 +153,9 @@ def test_a_policy_that_does_not_say_how_far_it_came_has_come_to_the_end(tmp_path
 def test_what_does_not_fit_is_named_with_the_flag_that_would(tmp_path):
     path = _export(tmp_path / "first")
     for policy, message in (
-        (replace(NORMALISING, hidden=(8,)), r"have --policy\.hidden 16 16.*give --policy\.hidden 16 16"),
-        (replace(NORMALISING, distribution="gaussian"), r"give --policy\.distribution state-dependent"),
-        (SMALL_POLICY, r"give --policy\.normalise-observations, or leave --preset out"),
+        (replace(NORMALISING, hidden=(8,)), r"has --policy\.hidden \(16, 16\), and this run \(8,\)"),
+        (replace(NORMALISING, distribution="gaussian"), r"has --policy\.distribution state-dependent"),
+        (SMALL_POLICY, r"has --policy\.normalise-observations True.*leave --preset out"),
     ):
         runner = make_runner(tmp_path / "other", policy=policy)
         with pytest.raises(ValueError, match=message):
@@ -185,7 +173,7 @@ def test_what_does_not_fit_is_named_with_the_flag_that_would(tmp_path):
     state["policy"]["num_observations"] = 9
     save_checkpoint(path, state)
     runner = make_runner(tmp_path / "less", policy=NORMALISING)
-    with pytest.raises(ValueError, match=r"reads 9 values and this run observes 5.*--hand dummy"):
+    with pytest.raises(ValueError, match=r"reads 9 values and this run observes 5.*leave --preset out"):
         runner.begin_from(str(path))
 
 
@@ -287,13 +275,3 @@ def test_what_observations_and_actions_mean_is_compared():
     assert unlike(older, other) == []
     other["observation"]["file_axes"] = False
     assert unlike(older, other) == ["env.observation.file_axes True, here False"]
-
-
-def test_policies_keep_their_critic_when_they_are_exported_and_are_small(tmp_path):
-    make_runner(tmp_path).learn(1)
-    shipped = load_checkpoint(tmp_path / "policy.pt")
-    assert main(["export", str(tmp_path / "policy.pt"), str(tmp_path / "again.pt")]) == 0
-    again = load_checkpoint(tmp_path / "again.pt")
-    assert again.keys() == shipped.keys() >= {"actor_state_dict", "critic_state_dict", "stage", "learner"}
-    assert "optimizer_state_dict" not in again and "ranks" not in again
-    assert _same(again["critic_state_dict"], shipped["critic_state_dict"]) == list(again["critic_state_dict"])

@@ -18,9 +18,11 @@ MOMENTS_WARMUP = 3
 """Iterations of it where only the optimiser is missing: about a hundred steps, for Adam's second moment."""
 FINE_KL, FINE_LEARNING_RATE = 0.03, 1e-4
 """Divergence and first rate of a policy that has learned, for one that does not say how it was trained."""
+NETWORK = ("hidden", "distribution", "normalise_observations")
+"""Settings of ``PolicyCfg`` that a network's shape decides."""
 _APPENDED = {"history": 0, "dynamics": "none"}
 """Settings of the observation whose values come last, as they are in a policy without them."""
-_SENSES = ("fingertip", "hand_layer", "sim", "action", "observation")
+_SENSES = ("hand", "fingertip", "hand_layer", "sim", "action", "observation")
 """Parts of a task that say what a policy's observations and actions mean."""
 
 
@@ -81,10 +83,8 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
         else:
             spec = from_dict(PolicySpec, state["policy"], where="policy")
             ppo = replace(base.ppo, desired_kl=FINE_KL, actor_learning_rate=FINE_LEARNING_RATE)
-            policy = replace(base.policy, **_networks(spec))
-            if (
-                spec.distribution == "gaussian"
-            ):  # it has learned its std, and whatever bounds it had are unknown
+            policy = replace(base.policy, **{name: getattr(spec, name) for name in NETWORK})
+            if spec.distribution == "gaussian":  # it has learned its std; what bounds it had is unknown
                 policy = replace(policy, std_range=PolicyCfg().std_range, quiet_std=None)
     except ValueError as error:
         raise ValueError(
@@ -124,7 +124,7 @@ def completed(state: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     A policy without a stage of the curriculum has come to the end of it.
 
     Args:
-        state: The policy, of as many observations as the run; a whole checkpoint passes unchanged.
+        state: The policy, widened for the run; a whole checkpoint passes unchanged.
         own: Networks, optimiser and window of the run: ``critic_state_dict``, ``optimizer_state_dict``,
             ``window``.
     """
@@ -166,13 +166,14 @@ def at_stage(state: dict[str, Any], stage: tuple[float, float]) -> dict[str, Any
     return state | {"ranks": [rank | {"env": rank["env"] | moved} for rank in state["ranks"]]}
 
 
-def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, Any], path: str) -> None:
-    """Refuse networks that a run cannot take over, with the flag that would let it.
+def check_fit(
+    state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, Any], path: str | Path
+) -> None:
+    """Refuse networks that a run cannot take over, with the remedy.
 
     Raises:
         ValueError: Another hand, or networks of another shape.
     """
-    from vd.envs.cfg import ObservationCfg
     from vd.policy import PolicySpec
 
     found = from_dict(PolicySpec, state["policy"], where="policy")
@@ -182,33 +183,29 @@ def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, A
             f"--init: {path} moves {found.num_actions} joints of {hand}, and this run's hand, {here}, has "
             f"{spec.num_actions}; give --hand {hand}"
         )
-    if found.activation != spec.activation:
-        raise ValueError(f"--init: {path} has {found.activation} units, this version {spec.activation} alone")
-    wanted, given = _networks(found), _networks(spec)
-    for name, value in wanted.items():
-        if value != given[name]:
+    remedy = "give the policy's settings, or leave --preset out, which takes them over"
+    for name in ("activation", *NETWORK):
+        theirs, ours = getattr(found, name), getattr(spec, name)
+        if theirs != ours:
             flag = f"--policy.{name.replace('_', '-')}"
-            words = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-            raise ValueError(
-                f"--init: the networks of {path} have {flag} {words}, those of this run {given[name]}; "
-                f"give {_as_flag(flag, value, words)}, or leave --preset out to go on with its settings"
-            )
-    seen = from_dict(ObservationCfg, state["task"].get("observation", {}), where="task.observation")
+            raise ValueError(f"--init: {path} has {flag} {theirs}, and this run {ours}; {remedy}")
     before, now = (
         {name: t.get("observation", {}).get(name, default) for name, default in _APPENDED.items()}
         for t in (state["task"], task)
     )
     if before not in (_APPENDED, now):
+        flags = [
+            " ".join(f"--env.observation.{name} {value}" for name, value in one.items())
+            for one in (before, now)
+        ]
         raise ValueError(
-            f"--init: {path} observes {_flags(before)} and this run {_flags(now)}; only a policy "
-            "without them can go on with others: give those of the policy"
+            f"--init: {path} observes {flags[0]} and this run {flags[1]}; only a policy without them can go "
+            f"on with others: {remedy}"
         )
     if found.num_observations > spec.num_observations:
-        observed = _flags(to_dict(seen))
         raise ValueError(
             f"--init: {path} reads {found.num_observations} values and this run observes "
-            f"{spec.num_observations}, but a run can only go on with more; give what it was trained with: "
-            f"--hand {hand} {observed}"
+            f"{spec.num_observations}, but a run can only go on with more: {remedy}"
         )
 
 
@@ -226,24 +223,6 @@ def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
     )
     before = {k: default[k] for k in now if k in default} | before
     return [f"{k} {before[k]}, here {now[k]}" for k in before if k in now and before[k] != now[k]]
-
-
-def _networks(spec: "PolicySpec") -> dict[str, Any]:
-    """The settings of ``PolicyCfg`` that a network's shape decides."""
-    names = ("hidden", "distribution", "normalise_observations")
-    return {name: getattr(spec, name) for name in names}
-
-
-def _flags(settings: Mapping[str, Any]) -> str:
-    return " ".join(f"--env.observation.{name} {value}" for name, value in settings.items())
-
-
-def _as_flag(flag: str, value: Any, words: str) -> str:
-    """``flag`` as it is typed."""
-    if isinstance(value, bool):
-        group, _, name = flag.rpartition(".")
-        return flag if value else f"{group}.no-{name}"
-    return f"{flag} {words}"
 
 
 def _leaves(values: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:

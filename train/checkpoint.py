@@ -3,13 +3,14 @@
 import os
 import random
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from vd.files import atomic_path, writing
+from vd.files import atomic_path
 from vd.policy import read_state
 
 CHECKPOINT_FOLDER = "checkpoints"
@@ -72,40 +73,20 @@ def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") ->
 
 
 def _newest_sound(files: list[Path], network: str) -> Path:
-    """The last of ``files`` that can be read."""
+    """The last of ``files`` that can be read; those after it are named on stderr."""
     reasons = []
     for path in reversed(files):
-        reason = damage(path, network)
-        if not reason:
-            return path
-        reasons.append(reason)
+        try:
+            load_checkpoint(path, network=network)
+        except ValueError as error:
+            reasons.append(str(error).partition(";")[0])
+            continue
+        if reasons and os.environ.get("RANK", "0") == "0":
+            print(f"{'; '.join(reasons)}; {path.name}, which is sound, takes its place", file=sys.stderr)
+        return path
     raise ValueError(
         f"--resume: no checkpoint is sound ({', '.join(reasons)}); start anew with another --out"
     )
-
-
-def damage(path: Path, network: str = "actor") -> str:
-    """What is wrong with a checkpoint; empty if it is sound."""
-    try:
-        load_checkpoint(path, network=network)
-    except ValueError as error:
-        return str(error).partition(";")[0]
-    return ""
-
-
-def damaged_after(run_dir: Path, checkpoint: Path | None, network: str = "actor") -> dict[Path, str]:
-    """Damaged checkpoints that are newer than the one a run goes on from, and what is wrong with each."""
-    if checkpoint is None:
-        return {}
-    newer = [path for path in list_checkpoints(run_dir) if _iteration_of(path) > _iteration_of(checkpoint)]
-    return {path: reason for path in newer if (reason := damage(path, network))}
-
-
-def set_aside(damaged: dict[Path, str]) -> None:
-    """Rename damaged checkpoints, so that they are no longer taken for the latest."""
-    for path in damaged:
-        with writing(path):
-            path.rename(path.with_name(f"{path.name}.damaged"))
 
 
 def prune_checkpoints(run_dir: Path, newest: int, every: int | None = None) -> None:

@@ -7,6 +7,7 @@ state, in the states that it comes to itself (DAgger, Ross et al. 2011).
 
 from collections.abc import Mapping
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -79,7 +80,7 @@ class Imitation:
 
 
 def begin_imitation(
-    learner: TeacherPPO, ppo: PpoCfg, present: int, state: Mapping[str, Any], path: str
+    learner: TeacherPPO, ppo: PpoCfg, present: int, state: Mapping[str, Any], path: str | Path
 ) -> Imitation | None:
     """What the actor of a run does first that begins from another; None: it stays as it is.
 

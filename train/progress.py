@@ -1,7 +1,7 @@
-"""The live progress of a run: one line in place on a terminal, a line now and then elsewhere."""
+"""The live progress of a run: two lines and a bar on a terminal, lines now and then elsewhere."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
@@ -12,15 +12,27 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.spinner import Spinner
 from rich.text import Text
 
+BUILDING = "building the environments (the first start compiles the kernels: a minute or two)"
 FIRST = "first iteration ..."
 PLAIN_INTERVAL_S = 10.0
 """Time between lines when the output is a file or a pipe."""
+FIGURES = {
+    "success_per_goal": "success {:.1%} of goals",
+    "task/difficulty": "difficulty {:.2f}",
+    "task/tightness": "tightness {:.2f}",
+    "mean_reward": "reward {:.3f}",
+    "task/rotation_error": "error {:.2f} rad",
+    "action_std": "std {:.3f}",
+    "student/action_error": "action error {:.3f}",
+    "student/category": "category right {:.1%}",
+    "student/distance_error": "distance error {:.2f} rad",
+    "student/joint_error": "joint error {:.2f} rad",
+}
+"""What the first line says of an iteration, as far as its row has it."""
 
 
-def format_duration(seconds: float | None) -> str:
-    """``h:mm:ss``, or ``?`` if unknown."""
-    if seconds is None:
-        return "?"
+def format_duration(seconds: float) -> str:
+    """``h:mm:ss``."""
     minutes, second = divmod(int(max(seconds, 0.0)), 60)
     hours, minute = divmod(minutes, 60)
     return f"{hours}:{minute:02d}:{second:02d}"
@@ -34,11 +46,7 @@ def format_steps(count: float) -> str:
     return f"{count:.0f}"
 
 
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{100.0 * value:.1f} %"
-
-
-def summary(row: Mapping[str, Any], total: int, left_s: float | None) -> str:
+def summary(row: Mapping[str, Any], total: int, left_s: float) -> str:
     """The main figures of an iteration in one line.
 
     Args:
@@ -46,20 +54,23 @@ def summary(row: Mapping[str, Any], total: int, left_s: float | None) -> str:
         total: Iterations of the whole run.
         left_s: Estimated time left [s].
     """
-    return (
-        f"iteration {row['iteration']}/{total} | {format_steps(row['env_steps'])} steps, "
-        f"{format_steps(row['steps_per_s'])}/s | success {_percent(row['success_per_goal'])} of goals | "
-        f"stage {row['task/difficulty']:.2f} {row['task/tightness']:.2f} | "
-        f"reward {row['mean_reward']:.3f} | error {row['task/rotation_error']:.2f} rad | "
-        f"std {row['action_std']:.3f} | left {format_duration(left_s)}"
-    )
+    parts = [
+        f"iteration {row['iteration']}/{total}",
+        f"{format_steps(row['env_steps'])} steps, {format_steps(row['steps_per_s'])}/s",
+        *(text.format(row[key]) for key, text in FIGURES.items() if row.get(key) is not None),
+        f"left {format_duration(left_s)}",
+    ]
+    return " | ".join(parts)
 
 
-def reward_line(row: Mapping[str, Any]) -> str:
-    """The reward terms of an iteration: mean per control step."""
-    terms = {key.removeprefix("reward/"): value for key, value in row.items() if key.startswith("reward/")}
-    terms.pop("total", None)
-    return "rewards per step: " + "  ".join(f"{name} {value:+.3f}" for name, value in terms.items())
+def details(row: Mapping[str, Any]) -> str:
+    """The terms of the reward of an iteration, mean per control step, or else its losses."""
+    for group in ("reward/", "loss/"):
+        terms = {k.removeprefix(group): v for k, v in row.items() if k.startswith(group) and v is not None}
+        terms.pop("total", None)
+        if terms:
+            return f"{group[:-1]}: " + "  ".join(f"{name} {value:+.3f}" for name, value in terms.items())
+    return ""
 
 
 @contextmanager
@@ -76,12 +87,6 @@ def waiting(message: str, enabled: bool = True) -> Iterator[None]:
         yield
 
 
-Summary = Callable[[Mapping[str, Any], int, float | None], str]
-"""Main figures in a line: of a row of ``progress.jsonl``, all iterations and the time left [s]."""
-Details = Callable[[Mapping[str, Any]], str]
-"""More figures in a second line."""
-
-
 class ProgressLine:
     """Shows the latest iteration; a context manager.
 
@@ -89,37 +94,22 @@ class ProgressLine:
         total: Iterations of the whole run.
         done: Iterations already done by earlier runs.
         enabled: Show anything (false on all ranks but the first).
-        summary: Writes the first line.
-        details: Writes the second line.
     """
 
-    def __init__(
-        self,
-        total: int,
-        *,
-        done: int = 0,
-        enabled: bool = True,
-        summary: Summary = summary,
-        details: Details = reward_line,
-    ) -> None:
-        self._total, self._enabled = total, enabled
-        self._summary, self._details = summary, details
-        self._console = Console()
-        self._bar = Progress(
-            TextColumn("{task.percentage:5.1f} %"), BarColumn(bar_width=None), console=self._console
-        )
+    def __init__(self, total: int, *, done: int = 0, enabled: bool = True) -> None:
+        self._total, self._console = total, Console(quiet=not enabled)
+        self._bar = Progress(TextColumn("{task.percentage:5.1f} %"), BarColumn(bar_width=None))
         self._task = self._bar.add_task("train", total=total, completed=done)
         self._live: Live | None = None
         self._printed = -PLAIN_INTERVAL_S
-        self._last: tuple[dict[str, Any], float | None] | None = None
-        self._last_printed = False
+        self._unprinted: tuple[str, str] | None = None
 
     def __enter__(self) -> "ProgressLine":
-        if self._enabled and self._console.is_terminal:
+        if self._console.is_terminal:
             self._live = Live(Spinner("dots", FIRST), console=self._console, refresh_per_second=4)
             self._live.start()
-        elif self._enabled:
-            self._console.print(FIRST)
+        else:
+            self.note(FIRST)
         return self
 
     def __exit__(
@@ -127,32 +117,25 @@ class ProgressLine:
     ) -> None:
         if self._live is not None:
             self._live.stop()
-        elif self._enabled and self._last is not None and not self._last_printed:
+        else:
             self._print()
 
-    def update(self, row: dict[str, Any], left_s: float | None) -> None:
+    def update(self, row: dict[str, Any], left_s: float) -> None:
         """Show an iteration."""
-        if not self._enabled:
-            return
-        self._last, self._last_printed = (row, left_s), False
+        main, more = summary(row, self._total, left_s), details(row)
         if self._live is not None:
             self._bar.update(self._task, completed=row["iteration"])
-            self._live.update(
-                Group(
-                    Text(self._summary(row, self._total, left_s)), Text(self._details(row), "dim"), self._bar
-                )
-            )
-        elif time.monotonic() - self._printed >= PLAIN_INTERVAL_S:
+            self._live.update(Group(Text(main), Text(more, "dim"), self._bar))
+            return
+        self._unprinted = main, more
+        if time.monotonic() - self._printed >= PLAIN_INTERVAL_S:
             self._print()
 
     def note(self, message: str) -> None:
         """Print a message above the line."""
-        if self._enabled:
-            self._console.print(message, highlight=False, soft_wrap=True)
+        self._console.print(message, highlight=False, soft_wrap=True)
 
     def _print(self) -> None:
-        assert self._last is not None
-        row, left_s = self._last
-        self._console.print(self._summary(row, self._total, left_s), highlight=False, soft_wrap=True)
-        self._console.print("  " + self._details(row), highlight=False, soft_wrap=True)
-        self._printed, self._last_printed = time.monotonic(), True
+        if self._unprinted is not None:
+            self.note("\n  ".join(self._unprinted))
+            self._printed, self._unprinted = time.monotonic(), None

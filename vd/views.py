@@ -13,7 +13,6 @@ from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import ObservationCfg, View
 from vd.envs.view_tables import TERMS, ViewTables, view_tables
 from vd.kernels.task.observations import JOINTS_PER_FINGER, teacher_observation_slices
-from vd.policy import TrainedPolicy
 
 AFTER_S = 3.0
 """Time after which a goal that is not reached is looked at again [s] (ours): four in five are by then."""
@@ -82,23 +81,6 @@ class ViewMaps:
     def world_action(self, action: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
         """Actions [.., D] of views [..] with the joints in the world's order."""
         return self._sign[view] * action.gather(-1, self._joints[view])
-
-
-class InViews:
-    """A teacher of views that is told the world frame and acts in it, each time by the nearest view.
-
-    Args:
-        policy: The teacher.
-        maps: Its views.
-    """
-
-    def __init__(self, policy: TrainedPolicy, maps: ViewMaps) -> None:
-        self.num_actions, self._policy, self._maps = policy.num_actions, policy, maps
-
-    def act(self, observation: torch.Tensor) -> torch.Tensor:
-        """Mean actions [N, D] for observations in the world frame [N, O]."""
-        view = self._maps.choose(observation)
-        return self._maps.world_action(self._policy.act(self._maps.take(observation, view)), view)
 
 
 class ViewSelection:

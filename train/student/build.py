@@ -3,29 +3,22 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from vd.config import to_dict
 from vd.envs.cfg import ReorientCfg
-from vd.files import check_folder, write_json
+from vd.files import check_folder
 from vd.paper import PAPER
-from vd.train.student.config import (
-    PRETRAINING,
-    RENDERED,
-    STUDENT_NAME,
-    SYNTHETIC,
-    StudentTrainCfg,
-    validate,
-)
+from vd.train.flags import write_config
+from vd.train.student.config import PRETRAINING, RENDERED, STUDENT_NAME, SYNTHETIC, StudentTrainCfg
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
-    from vd.train.student.runner import Learner, StudentRunner
+    from vd.train.student.dagger import Dagger
+    from vd.train.student.pretrain import Pretrainer
+    from vd.train.student.runner import StudentRunner
     from vd.vision.network import Student
-
-CONFIG_NAME = "config.json"
-"""The resolved configuration, in the run's folder, written before the first iteration."""
 
 
 def default_init(stage: int, run_dir: Path) -> Path | None:
@@ -49,11 +42,10 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
         num_envs=chosen.num_envs,
         seed=chosen.seed,
         stop_tolerance_rad=PAPER.success.rotation_rad,
-        max_goal_angle_rad=chosen.max_goal_angle_rad,
+        max_goal_angle_rad=None,
         episode_s=trained.episode_s,
-        randomised=trained.randomisation.enabled if chosen.randomise is None else chosen.randomise,
+        randomised=trained.randomisation.enabled,
         success_ends_episode=False,
-        at_rest=chosen.at_rest,
     )
     exact = replace(
         task.randomisation,
@@ -61,7 +53,7 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
         observation_noise_std=0.0,
         observation_offset_std=0.0,
     )
-    # It is labelled in the world frame; the teacher's views are chosen for it (InViews).
+    # In the world frame, where the student sees; the teacher's views are chosen from what is observed there.
     return replace(task, randomisation=exact, observation=replace(task.observation, view="world"))
 
 
@@ -80,11 +72,10 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     from vd.device import resolve_device
     from vd.train.checkpoint import find_checkpoint
 
-    validate(cfg)
-    rank, folder = int(os.environ.get("RANK", "0")), cfg.run.out
-    check_folder(folder)
-    cfg = replace(cfg, run=replace(cfg.run, device=resolve_device(cfg.run.device)))
-    checkpoint = find_checkpoint(folder, cfg.resume, "student")
+    cfg.validate()
+    check_folder(cfg.run.out)
+    device = resolve_device(cfg.run.device)
+    checkpoint = find_checkpoint(cfg.run.out, cfg.resume, "student")
     if cfg.teacher is None:
         raise ValueError(
             "--teacher is missing; give the policy to imitate: a policy.pt, a run's folder, or a name"
@@ -98,13 +89,12 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     quiet_warp()
     from vd.evaluate.agents import find_policy, policy_name
     from vd.policy import load_policy
-    from vd.train.distributed import Processes, join_processes
     from vd.train.student.runner import StudentRunner
     from vd.vision.network import Student
     from vd.vision.saved import StudentSpec
     from vd.workers import one_thread_without_gpu
 
-    device = cfg.run.device
+    rank, world_size = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
     teacher = load_policy(find_policy(cfg.teacher), device)
     task = student_task(teacher, cfg)
     one_thread_without_gpu(device)
@@ -117,12 +107,14 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         if anew and rank == 0:
             print(f"of {cfg.init} these do not fit, and begin anew: {', '.join(anew)}")
     torch.manual_seed(cfg.task.seed + rank)
-    world_size = int(os.environ.get("WORLD_SIZE", "1"))
     own_task = replace(task, seed=cfg.task.seed + rank)
     if cfg.stage == PRETRAINING:
-        learner: Learner = _pretrainer(cfg, own_task, student, world_size)
+        learner: Pretrainer | Dagger = _pretrainer(cfg, own_task, student, device, world_size)
     else:
-        learner = _dagger(cfg, own_task, student, teacher, world_size, fresh=checkpoint is None)
+        learner = _dagger(cfg, own_task, student, teacher, device, world_size)
+        if checkpoint is None and not cfg.dagger.reset:  # or all episodes would time out at once
+            steps = learner.env.episode_length_buf
+            learner.env.episode_length_buf = torch.randint_like(steps, learner.env.max_episode_length)
     spec = StudentSpec(
         network=cfg.network,
         num_actions=teacher.num_actions,
@@ -137,27 +129,14 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         task=to_dict(task),
         depth=to_dict(cfg.depth),
         device=device,
-        processes=join_processes(device) if world_size > 1 else Processes(0, 0, 1),
         deadline=cfg.run.deadline(started),
     )
     if checkpoint is not None:
         runner.load(checkpoint)
     if rank == 0:
         # After all that can refuse: settings that a run cannot have must not take the place of its own.
-        _take_folder(cfg, runner, checkpoint)
+        write_config(cfg)
     return runner
-
-
-def _take_folder(cfg: StudentTrainCfg, runner: "StudentRunner", checkpoint: Path | None) -> None:
-    """Save the configuration in the run's folder, and set aside what is damaged after the checkpoint."""
-    from vd.train.checkpoint import damaged_after, set_aside
-
-    folder = cfg.run.out
-    saved = to_dict(replace(cfg, resume=None))
-    saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
-    write_json(folder / CONFIG_NAME, saved)
-    runner.damaged = damaged_after(folder, checkpoint, "student")
-    set_aside(runner.damaged)
 
 
 def check_start(cfg: StudentTrainCfg) -> None:
@@ -187,7 +166,8 @@ def check_start(cfg: StudentTrainCfg) -> None:
 def begin_from(path: Path, student: "Student", device: str) -> list[str]:
     """Take over the weights of another student, as far as they fit.
 
-    Of a pre-trained one the encoder is what counts: all else may be of another hand, or another network.
+    One that acts has to be of the same network and hand. Of a pre-trained one the encoder is what counts: all
+    else may be of another hand, or another network.
 
     Returns:
         Parts of the network that begin anew, wholly or in part.
@@ -214,7 +194,9 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
     return anew
 
 
-def _pretrainer(cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", world_size: int) -> Any:
+def _pretrainer(
+    cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", device: str, world_size: int
+) -> "Pretrainer":
     from vd.assets_usd.hands import load_hand
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.objects import object_scales
@@ -226,13 +208,10 @@ def _pretrainer(cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", wor
         objects,
         cfg.network,
         scales=object_scales(task.randomisation),
-        near_share=cfg.pretrain.near_share,
         noise=cfg.noise,
-        rendered_share=cfg.pretrain.rendered_share,
-        depth=cfg.depth,
         batch=cfg.pretrain.batch,
         seed=task.seed,
-        device=cfg.run.device,
+        device=device,
     )
     return Pretrainer(scenes, student, len(objects), cfg.pretrain, world_size=world_size)
 
@@ -242,30 +221,23 @@ def _dagger(
     task: ReorientCfg,
     student: "Student",
     teacher: "TrainedPolicy",
+    device: str,
     world_size: int,
-    *,
-    fresh: bool,
-) -> Any:
-    import torch
-
+) -> "Dagger":
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.agents import trained_task
     from vd.evaluate.student import StudentView
-    from vd.train.student.dagger import Dagger
+    from vd.train.student.dagger import Dagger, WorldTeacher
     from vd.train.vec_env import ReorientVecEnv
-    from vd.views import InViews, ViewMaps
+    from vd.views import ViewMaps
 
-    simulation = ReorientEnv(task, cfg.run.device)
+    simulation = ReorientEnv(task, device)
     if simulation.num_observations != teacher.num_observations:
         raise ValueError(
             f"the teacher observes {teacher.num_observations} values, its environments give "
             f"{simulation.num_observations}; take a policy of this version"
         )
     simulation.dump_dir = cfg.run.out
-    env = ReorientVecEnv(simulation)
-    if fresh and not cfg.dagger.reset:
-        steps = env.episode_length_buf
-        env.episode_length_buf = torch.randint_like(steps, high=int(env.max_episode_length))
     view = StudentView(
         simulation,
         cfg.network,
@@ -276,8 +248,8 @@ def _dagger(
         batch=cfg.dagger.minibatch_envs * cfg.dagger.rollout_steps,
         seed=task.seed,
     )
-    labels: TrainedPolicy | InViews = teacher
-    seen = trained_task(teacher).observation
+    seen, maps = trained_task(teacher).observation, None
     if seen.view != "world":
-        labels = InViews(teacher, ViewMaps.of(simulation.hand, seen, seen.view, env.device))
-    return Dagger(env, view, student, labels, cfg.dagger, world_size=world_size)
+        maps = ViewMaps.of(simulation.hand, seen, device)
+    labels = WorldTeacher(teacher, maps)
+    return Dagger(ReorientVecEnv(simulation), view, student, labels, cfg.dagger, world_size=world_size)

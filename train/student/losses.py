@@ -40,30 +40,20 @@ def imitation_loss(
     return (0.5 * scaled.square() + output.log_std + 0.5 * math.log(2.0 * math.pi)).sum(dim=-1).mean()
 
 
-def distance_loss(predicted: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
-    """Squared error of predictions [T, N, H] of the rotation distance [T, N], in rad^2; the mean over all."""
-    return (predicted - true[..., None]).square().mean()
-
-
-def unexplained(predicted: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
-    """Share left of the variance of ``true`` [T, N, D] over steps and environments: 1 for a constant."""
-    rest = (true - true.mean(dim=(0, 1))).square().mean()
-    return (predicted - true).square().mean() / rest.clamp(min=torch.finfo(rest.dtype).tiny)
-
-
-def imitation_figures(prefix: str, mean: torch.Tensor, label: torch.Tensor) -> dict[str, torch.Tensor]:
-    """How far the student's mean actions are from labels [T, N, D], beside what says nothing of the state.
+def imitation_figures(mean: torch.Tensor, label: torch.Tensor) -> dict[str, torch.Tensor]:
+    """How far the student's mean actions are from labels [T, N, D].
 
     Returns:
-        Scalars on the device: ``action_error``, the root mean square of the difference of what the
-        environment makes of both; ``zero_error``, the same of no action; ``unexplained``, the share of the
-        labels' variance that is left (1: no better than the best constant action).
+        Scalars on the device: ``student/action_error``, the root mean square of the difference of what the
+        environment makes of both, and ``student/unexplained``, the share of the labels' variance that is left
+        (1: no better than the best constant action).
     """
     mean, label = mean.clamp(-1.0, 1.0), label.clamp(-1.0, 1.0)
+    error = (mean - label).square().mean()
+    spread = (label - label.mean(dim=(0, 1))).square().mean()
     return {
-        f"{prefix}/action_error": (mean - label).square().mean().sqrt(),
-        f"{prefix}/zero_error": label.square().mean().sqrt(),
-        f"{prefix}/unexplained": unexplained(mean, label),
+        "student/action_error": error.sqrt(),
+        "student/unexplained": error / spread.clamp(min=torch.finfo(spread.dtype).tiny),
     }
 
 

@@ -6,11 +6,9 @@ import torch
 from torch import nn
 
 
-def make_optimizer(
-    network: nn.Module, learning_rate: float, *, amsgrad: bool = True
-) -> torch.optim.Optimizer:
-    """AdamW, with amsgrad as in the released code."""
-    return torch.optim.AdamW(network.parameters(), lr=learning_rate, amsgrad=amsgrad)
+def make_optimizer(networks: nn.Module, *, amsgrad: bool = False) -> torch.optim.Optimizer:
+    """AdamW; its rate is set before each step."""
+    return torch.optim.AdamW(networks.parameters(), amsgrad=amsgrad)
 
 
 def scheduled(rate: float, step: int, *, warmup: int = 0, decay_after: int = 0) -> float:
@@ -34,9 +32,11 @@ def autocast(device: torch.device, precision: str) -> torch.autocast:
 
 
 def descend(
-    network: nn.Module,
+    networks: nn.Module,
     optimizer: torch.optim.Optimizer,
     loss: torch.Tensor,
+    *,
+    rate: float,
     grad_norm: float,
     world_size: int = 1,
 ) -> torch.Tensor:
@@ -45,24 +45,32 @@ def descend(
     Returns:
         Norm of the gradient before clipping, a scalar on the device.
     """
+    optimizer.param_groups[0]["lr"] = rate
     optimizer.zero_grad()
     loss.backward()
-    parameters = list(network.parameters())
+    parameters = list(networks.parameters())
     if world_size > 1:
         # Every process has to take part with every weight, also one whose loss does not reach it.
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
-        flat = torch.cat([gradient.flatten() for gradient in gradients])
+        flat = nn.utils.parameters_to_vector(gradients)
         torch.distributed.all_reduce(flat)
-        flat /= world_size
-        parts = flat.split([p.numel() for p in parameters])
-        for parameter, part in zip(parameters, parts, strict=True):
-            if parameter.grad is not None:
-                parameter.grad.copy_(part.view_as(parameter))
+        nn.utils.vector_to_parameters(flat / world_size, gradients)
     norm = nn.utils.clip_grad_norm_(parameters, grad_norm)
     optimizer.step()
     return norm.detach()
 
 
-def all_finite(network: nn.Module) -> bool:
-    """Whether all weights are; one wait for the device."""
-    return math.isfinite(float(torch.stack([p.detach().sum() for p in network.parameters()]).sum()))
+def share_statistics(student: nn.Module, world_size: int) -> None:
+    """Let all processes use the batch statistics of the first; each has averaged its own."""
+    if world_size > 1:
+        for buffer in student.buffers():
+            torch.distributed.broadcast(buffer, 0)
+
+
+def read_means(figures: dict[str, torch.Tensor], world_size: int) -> dict[str, float]:
+    """Scalars, averaged over the processes; waits for the device."""
+    values = torch.stack(tuple(figures.values()))
+    if world_size > 1:
+        torch.distributed.all_reduce(values)
+        values /= world_size
+    return dict(zip(figures, values.tolist(), strict=True))
