@@ -38,7 +38,7 @@ def env(request):
 
 @pytest.fixture
 def maps(env):
-    return ViewMaps.of(env.hand, env.cfg.observation, env.cfg.observation.view)
+    return ViewMaps(env.hand, env.cfg.observation)
 
 
 def test_views_are_chosen_seen_and_acted_in_as_in_the_simulator(env, maps):
