@@ -25,7 +25,7 @@ VOXEL_M = 0.01
 TINY = StudentCfg(
     encoder=EncoderCfg(channels=(8, 16), blocks=1, pooled_stages=0, embedding=16, inputs=("constant",)),
     voxel_m=VOXEL_M,
-    senses=("action",),
+    proprioception=("action",),
     action_hidden=4,
     memory=16,
     head_hidden=16,
@@ -72,7 +72,7 @@ class DummyView:
         for axis in range(2):
             points[:, axis, :, axis] = along[:, axis]
             points[:, axis, :, 2] = 0.1 * axis
-        return (self._voxelise(points.flatten(1, 2).contiguous(), augment=augment),)
+        return self._voxelise(points.flatten(1, 2).contiguous(), augment=augment)
 
     def state_dict(self) -> dict[str, Any]:
         """Random state, and the action that the dummy environment does not keep."""

@@ -6,6 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.model import ObjectModel
+from vd.play.video import write_frames
 from vd.render import Camera, Renderer
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0]
@@ -162,27 +163,14 @@ def frames(count, height=64, width=96):
     return (np.full((height, width, 3), value, np.uint8) for value in ramp)
 
 
-@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
-def test_video_decodes_to_its_frames(tmp_path, suffix):
-    from vd.play.video import write_frames
-
-    path = tmp_path / f"clip{suffix}"
-    assert write_frames(path, frames(17), 12.0) == 17
-    decoded = iio.imread(path)
+def test_video_decodes_to_its_frames(tmp_path):
+    assert write_frames(tmp_path / "clip.mp4", frames(17), 12.0) == 17
+    decoded = iio.imread(tmp_path / "clip.mp4")
     assert decoded.shape[:3] == (17, 64, 96)
     np.testing.assert_allclose(decoded.reshape(17, -1).mean(axis=1), np.linspace(0, 255, 17), atol=6)
 
 
-def test_sheet_shows_six_moments(tmp_path):
-    from vd.play.video import write_frames
-
-    write_frames(tmp_path / "sheet.png", frames(30), 12.0)
-    assert iio.imread(tmp_path / "sheet.png").shape == (2 * 64, 3 * 96, 3)
-
-
 def test_unknown_suffix_and_empty_recordings_are_refused_and_leave_nothing(tmp_path):
-    from vd.play.video import write_frames
-
     with pytest.raises(ValueError, match=r"cannot write '.webm' files; use .mp4"):
         write_frames(tmp_path / "x.webm", frames(2), 12.0)
     with pytest.raises(ValueError, match="no frames"):

@@ -6,14 +6,11 @@ import pytest
 import torch
 from student_dummy import TINY, make_student_runner
 
-from vd.policy import PolicySpec
 from vd.train.student.build import begin_from
 from vd.vision.cfg import StudentCfg
 from vd.vision.network import Student
-from vd.vision.state import state_cfg
 
 ACTIONS = 3
-HEAD = state_cfg(PolicySpec(100, ACTIONS, (8,), "elu", "gaussian", False))
 
 
 @pytest.fixture

@@ -46,7 +46,7 @@ def steps(env, view, count=6):
     frames, seen = [], []
     for _ in range(count):
         frames.append(view.frame())
-        seen.append([sites.coordinates.clone() for sites in view.sites(frames[-1], augment=False)])
+        seen.append(view.sites(frames[-1], augment=False).coordinates.clone())
         env.action.assign(rng.uniform(-1, 1, (2, 9)).astype(np.float32))
         env.step(env.action)
     return frames, seen
@@ -64,11 +64,10 @@ def test_recorded_frames_show_what_was_seen(env, rendered):
         name: torch.stack([frames[t][name][w] for t, w in zip(times, envs.tolist(), strict=True)])
         for name in frames[0]
     }
-    for part, sites in enumerate(view.sites(rows, envs, augment=False)):
-        for row, (time, world) in enumerate(zip(times, envs.tolist(), strict=True)):
-            found = sites.coordinates[sites.coordinates[:, 0] == row][:, 1:]
-            then = seen[time][part]
-            assert torch.equal(found, then[then[:, 0] == world][:, 1:])
+    sites = view.sites(rows, envs, augment=False)
+    for row, (time, world) in enumerate(zip(times, envs.tolist(), strict=True)):
+        found = sites.coordinates[sites.coordinates[:, 0] == row][:, 1:]
+        assert torch.equal(found, seen[time][seen[time][:, 0] == world][:, 1:])
 
 
 def test_a_frame_holds_the_true_distance_and_the_action_before_it(env):
@@ -114,7 +113,7 @@ def test_a_cloud_without_a_seen_point_has_the_hand_and_goal_only(env):
     view = StudentView(env, NETWORK, rendered=True, depth=nothing)
     frame = view.frame()
     assert torch.isnan(frame["points"]).all()
-    (sites,) = view.sites(frame, augment=False)
+    sites = view.sites(frame, augment=False)
     assert len(sites) > 600
     origin = (sites.coordinates[:, 1:] == 0).all(dim=1)
     assert not origin.any()
@@ -141,9 +140,9 @@ def test_random_states_of_a_view_come_back(env):
     one, two = (StudentView(env, NETWORK, rendered=True, noise=always, seed=seed) for seed in (0, 1))
     frame = one.frame()
     two.load_state_dict(one.state_dict())
-    drawn = [view.sites(frame, augment=True)[0].coordinates for view in (one, two)]
+    drawn = [view.sites(frame, augment=True).coordinates for view in (one, two)]
     assert torch.equal(*drawn)
-    assert not torch.equal(one.sites(frame, augment=True)[0].coordinates, drawn[0])
+    assert not torch.equal(one.sites(frame, augment=True).coordinates, drawn[0])
 
 
 @pytest.fixture
@@ -191,7 +190,7 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     """Stage 1 by imitation of an installed teacher of views, stage 2 from it, resumed."""
     small = ["--preset", "cpu-demo", "--num-envs", "2", "--dagger.rollout-steps", "3", "--no-tensorboard"]
     small += ["--teacher", "dclaw3-table", "--objects", "cube"]
-    first = ["student", *small, "--network.senses", "action", "position", "velocity"]
+    first = ["student", *small, "--network.proprioception", "action", "position"]
     assert main([*first, "--out", str(tmp_path / "stage1"), "--max-steps", "6"]) == 0
     (row,) = read_progress(tmp_path / "stage1" / "progress.jsonl")
     assert all(row[f"loss/{name}"] > 0.0 for name in ("imitation", "distance", "pose"))
@@ -207,7 +206,7 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     path = tmp_path / "stage2" / "student.pt"
     saved = load_student(path)
     assert saved.spec.stage == 2 and saved.spec.teacher == "dclaw3-table" and saved.iteration == 2
-    assert saved.spec.network.senses == ("action", "position", "velocity")
+    assert saved.spec.network.proprioception == ("action", "position")
     assert saved.depth["points"] == 2000 and saved.task["randomisation"]["observation_noise_std"] == 0.0
     assert saved.task["observation"]["view"] == "world"
 

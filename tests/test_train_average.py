@@ -45,14 +45,14 @@ def test_weights_of_actor_and_critic_are_means(siblings, tmp_path, capsys):
             expected = np.mean([state[network][name].double().numpy() for state in states], axis=0)
             np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5, atol=1e-6, err_msg=name)
     assert mean["env_steps"] == states[-1]["env_steps"] and "optimizer_state_dict" not in mean
-    assert load_policy(output).has_critic
+    assert load_policy(output).critic_weights
 
 
 def test_a_critic_that_not_all_have_is_left_out(siblings, tmp_path):
     state = load_checkpoint(siblings[0])
     save_checkpoint(tmp_path / "blind.pt", {k: v for k, v in state.items() if k != "critic_state_dict"})
     average_policies([str(siblings[1]), str(tmp_path / "blind.pt")], tmp_path / "mean.pt")
-    assert not load_policy(tmp_path / "mean.pt").has_critic
+    assert not load_policy(tmp_path / "mean.pt").critic_weights
 
 
 def test_policies_that_mean_something_else_are_refused_by_what_differs(siblings, tmp_path, capsys):

@@ -277,7 +277,7 @@ def _export(arguments: list[str], _started: float) -> int:
             )
         student = read_student(cfg.checkpoint)
         saved_spec(student, cfg.checkpoint)  # refuses one that nothing reads any more
-        save_checkpoint(cfg.output, student_export(student, small=True))
+        save_checkpoint(cfg.output, student_export(student))
         print(cfg.output)
         return 0
     if cfg.output.suffix == ".onnx":
@@ -313,9 +313,12 @@ def _bundle(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(BundleCfg, args=arguments, prog="vd-train bundle")
     check_folder(cfg.output.parent)
 
-    from vd.bundle.write import write_bundle
+    from vd.bundle.store import write_bundle
+    from vd.evaluate.agents import find_policy, open_policy
 
-    contract = write_bundle(cfg.policy, cfg.output)
+    policy = open_policy(str(find_policy(cfg.policy)), "cpu")
+    assert policy is not None  # a file was found
+    contract = write_bundle(policy, cfg.output)
     if cfg.json:
         print(json.dumps(to_dict(contract), indent=1))
     else:

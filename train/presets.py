@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from vd.config import Dropped
 from vd.envs.cfg import (
     CurriculumCfg,
     GoalCfg,
@@ -31,7 +32,7 @@ TRAINING_SET = ("procedural-150-seed0",)
 class TeacherCfg:
     """Train the teacher: PPO on the simulator's state."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None, "second_view": False}
+    RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None, "second_view": Dropped(False)}
     preset: PresetName = "paper"
     """Settings to start from; every other flag overrides one of them. By default what learns on this
     machine."""

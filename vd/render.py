@@ -200,7 +200,6 @@ class Renderer:
         height: Height of a cell's picture [pixel].
         goal_size: Side of the square picture of the goal [pixel].
         camera: Where from.
-        samples: Rays a pixel; 4 smooths edges and takes about twice as long.
         shadows: Cast shadows.
         device: Warp device; the CPU is quick enough for video (see ``tests/test_render.py``).
     """
@@ -214,7 +213,6 @@ class Renderer:
         height: int = 400,
         goal_size: int = 144,
         camera: Camera | None = None,
-        samples: int = 1,
         shadows: bool = True,
         device: str = "cpu",
     ):
@@ -225,23 +223,12 @@ class Renderer:
         self._sensor = SensorCamera(self.pictured.model)
         self._sensor.create_default_light(enable_shadows=shadows, direction=_light(self.camera))
         self._sensor.set_ambient_light(SKY, GROUND)
-        antialiasing = SensorCamera.AntiAliasing.MSAA if samples > 1 else SensorCamera.AntiAliasing.NONE
-        self._config = SensorCamera.RenderConfig(enable_shadows=shadows, anti_aliasing=antialiasing)
+        self._config = SensorCamera.RenderConfig(enable_shadows=shadows)
         radius = max(float(np.linalg.norm(item.vertices, axis=1).max()) for item in objects)
         goal_camera = self.camera.aimed_at((0.0, 0.0, 0.0), radius)
-        self._scene_view = _View(
-            self._sensor, self.camera, width, height, samples, range(cells), BACKGROUND, device
-        )
-        self._goal_view = _View(
-            self._sensor,
-            goal_camera,
-            goal_size,
-            goal_size,
-            samples,
-            range(cells, 2 * cells),
-            BACKGROUND,
-            device,
-        )
+        self._scene_view = _View(self._sensor, self.camera, (width, height), range(cells), device)
+        goals, square = range(cells, 2 * cells), (goal_size, goal_size)
+        self._goal_view = _View(self._sensor, goal_camera, square, goals, device)
 
     def render(
         self, joint_q: np.ndarray, goal_quat: np.ndarray, table: np.ndarray | bool = True
@@ -285,21 +272,16 @@ class _View:
         self,
         sensor: SensorCamera,
         camera: Camera,
-        width: int,
-        height: int,
-        samples: int,
+        size: tuple[int, int],
         envs: Sequence[int],
-        background: int,
         device: str,
     ):
         self._sensor = sensor
-        self._rays = SensorCamera.compute_camera_rays_pinhole(
-            width, height, camera_fov=camera.fov, sample_count=samples, device=device
-        )
+        self._rays = SensorCamera.compute_camera_rays_pinhole(*size, camera_fov=camera.fov, device=device)
         self._transforms = wp.array([camera.transform] * len(envs), dtype=wp.transformf, device=device)
         self._worlds = wp.array(list(envs), dtype=wp.int32, device=device)
-        self._image = sensor.allocate_image_color(len(envs), width, height)
-        self._clear = SensorCamera.ClearData(clear_color=background)
+        self._image = sensor.allocate_image_color(len(envs), *size)
+        self._clear = SensorCamera.ClearData(clear_color=BACKGROUND)
 
     def draw(self, state: newton.State, config: SensorCamera.RenderConfig) -> np.ndarray:
         """RGB bytes of every world, shape [environments, height, width, 3]."""

@@ -217,6 +217,6 @@ def _dagger(
     )
     seen, maps = trained_task(teacher).observation, None
     if seen.view != "world":
-        maps = ViewMaps.of(simulation.hand, seen, seen.view).to(device)
+        maps = ViewMaps(simulation.hand, seen, device)
     labels = WorldTeacher(teacher, maps)
     return Dagger(ReorientVecEnv(simulation), view, student, labels, cfg.dagger, world_size=world_size)

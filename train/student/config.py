@@ -11,7 +11,7 @@ from vd.config import Dropped, Renamed
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.train.config import RunCfg, require_positive, require_share
-from vd.vision.cfg import LEAN, PAPER_NETWORK, EncoderCfg, NoiseCfg, StudentCfg
+from vd.vision.cfg import LEAN, PAPER_NETWORK, SMALL, NoiseCfg, StudentCfg
 
 Stage = Literal[0, 1, 2]
 PresetName = Literal["gpu", "paper", "cpu-demo"]
@@ -264,19 +264,9 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
         dagger=replace(SHORT_ROLLOUTS, minibatch_envs=4, epochs=4, keep_rollouts=50),
         pretrain=PretrainCfg(batch=64, steps=10, decay_after_steps=0),
         task=StudentTaskCfg(num_envs=16),
-        network=SMALL_NETWORK,
+        network=SMALL,
         depth=DepthCameraCfg(points=2000),
     )
 
-
-SMALL_NETWORK = StudentCfg(
-    encoder=EncoderCfg(channels=(16, 32, 32), blocks=1, embedding=64),
-    voxel_m=0.01,
-    action_hidden=16,
-    memory=64,
-    head_hidden=64,
-    distance_hidden=32,
-)
-"""A hundredth of the paper's network, on voxels of 1 cm."""
 
 PRESETS: dict[str, Callable[[Stage], StudentTrainCfg]] = {"gpu": gpu, "paper": paper, "cpu-demo": cpu_demo}

@@ -174,7 +174,8 @@ class Dagger:
                 label = self.teacher.act(self.view.observation(observation[OBSERVATION_GROUP]))
                 labels.append(label.clamp(-1.0, 1.0) if cfg.clip_labels else label)
                 embedding = self._encode(self.view.sites(frame, augment=True))
-                output = self.student(embedding[None], self.student.senses(frame)[None], self._hidden)
+                known = self.student.proprioception(frame)
+                output = self.student(embedding[None], known[None], self._hidden)
                 action, std = output.mean[0], output.log_std[0].exp()
                 means.append(action)
                 error = (output.distance[0, :, -1] - frame["distance"]).abs().mean()
@@ -222,8 +223,8 @@ class Dagger:
         flat = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
         sites = self.view.sites(flat, rollout.envs.repeat(steps), augment=True)
         embedding = self._encode(sites).view(steps, count, -1)
-        senses = self.student.senses(rollout.frames)
-        output = self.student(embedding, senses, rollout.hidden, rollout.done)
+        known = self.student.proprioception(rollout.frames)
+        output = self.student(embedding, known, rollout.hidden, rollout.done)
         error = output.distance - rollout.frames["distance"][..., None]
         found = {
             "imitation": imitation_loss(
@@ -295,10 +296,10 @@ class Dagger:
                 frames[name] = value.new_empty((self.cfg.rollout_steps, *value.shape), dtype=dtype)
             frames[name][step] = value
 
-    def _encode(self, sites: tuple[Sites, ...]) -> torch.Tensor:
+    def _encode(self, sites: Sites) -> torch.Tensor:
         """Embeddings of clouds; what follows the encoder is small, and stays in single precision."""
         with autocast(self.device, self.cfg.precision):
-            return self.student.encode(*sites).float()
+            return self.student.encode(sites).float()
 
     def _minibatch_step(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """One optimiser step; its losses and the gradient's norm, on the device."""

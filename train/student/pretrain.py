@@ -31,7 +31,6 @@ from vd.train.student.optimise import (
 from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
 from vd.vision.cfg import NoiseCfg, StudentCfg
 from vd.vision.network import Student
-from vd.vision.sight import voxels
 from vd.vision.sites import Sites
 from vd.vision.voxels import Voxeliser
 
@@ -74,7 +73,7 @@ class RandomScenes:
     ) -> None:
         links = len(hand.link_names)
         self._objects, self._batch = len(objects), batch
-        self._device, self._network = torch.device(wp.device_to_torch(device)), network
+        self._device = torch.device(wp.device_to_torch(device))
         self._scales, self._augment = len(scales), noise is not None
         # A "world" for each object in each size.
         self._clouds = SceneClouds(
@@ -86,6 +85,7 @@ class RandomScenes:
             object_body=links,
             device=device,
         )
+        self._marks = self._clouds.ends if network.marked else ()
         self._kinematics = HandKinematics(hand, link_body=np.arange(links), base=hand_mount(), device=device)
         self._voxelise = Voxeliser(network.voxel_m, noise=noise, clouds=batch, seed=seed, device=device)
         self._body_q = wp.zeros((batch, links + 1), dtype=wp.transform, device=device)
@@ -99,7 +99,7 @@ class RandomScenes:
         self.joint_scale_rad = 0.5 * self._span
         """Radians of one unit of scaled joint positions [D]."""
 
-    def draw(self) -> tuple[tuple[Sites, ...], dict[str, torch.Tensor]]:
+    def draw(self) -> tuple[Sites, dict[str, torch.Tensor]]:
         """A batch of scenes.
 
         Returns:
@@ -123,14 +123,7 @@ class RandomScenes:
             wp.from_torch(goal.contiguous(), dtype=wp.quat),
             envs=wp.from_torch(envs.int()),
         )
-        sites = voxels(
-            wp.to_torch(self._points),
-            self._clouds.ends,
-            self._voxelise,
-            network=self._network,
-            augment=self._augment,
-            complete=True,
-        )
+        sites = self._voxelise(self._points, augment=self._augment, ends=self._marks)
         targets = {
             "category": envs // self._scales,
             "distance": rotation_distance(orientation, goal),
@@ -202,11 +195,11 @@ class Pretrainer:
         return dict(figures)
 
     def losses(
-        self, sites: tuple[Sites, ...], targets: dict[str, torch.Tensor]
+        self, sites: Sites, targets: dict[str, torch.Tensor]
     ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
         """Losses of a batch by name, and figures to log."""
-        with autocast(sites[0].device, self.cfg.precision):
-            embedding = self.student.encode(*sites).float()
+        with autocast(sites.device, self.cfg.precision):
+            embedding = self.student.encode(sites).float()
         found = {name: head(embedding) for name, head in self.heads.items()}
         losses = {
             "category": nn.functional.cross_entropy(found["category"], targets["category"]),

@@ -1,14 +1,13 @@
 """Newton's own Allegro example, stepped with its own settings, as the yardstick of ``vd-bench sim``.
 
 Always the example's code: its solver, contact numbers, drives, motion, substeps and CUDA graph. Its hand is
-one of boxes, of the Allegro's size, a person's file of the hand, or, where that is asked for, the example's
-own asset of 17.8 MB, which Newton downloads. SI units, quaternions xyzw.
+one of boxes, of the Allegro's size, in place of an asset of 17.8 MB that Newton would download. SI units,
+quaternions xyzw.
 """
 
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +19,6 @@ from scipy.spatial.transform import Rotation
 
 FRAMES = 24
 """Timed frames of the example (1/50 s each, eight physics steps)."""
-
-FROM_NEWTON = "newton-assets/wonik_allegro"
-"""What a row calls the example's own asset."""
-OF_BOXES = "boxes of the Allegro's size"
-"""What a row calls the hand that is made here."""
 
 HAND_POSE = wp.transform(wp.vec3(0.0, 0.0, 1.0), wp.quat(0.21643, 0.706218, -0.648166, 0.185191))
 """Where the example holds its asset's base; it writes the rotation again in every physics step."""
@@ -78,51 +72,32 @@ class AllegroRate:
     """Physics steps per second over all environments."""
     dt_s: float
     """Length of its physics step [s]."""
-    hand: str
-    """Which hand it had: :data:`FROM_NEWTON`, a file's name or :data:`OF_BOXES`."""
 
 
-def allegro_rate(envs: int, device: str, *, file: Path | None = None, fetch: bool = False) -> AllegroRate:
-    """Physics steps per second of the example over all environments.
-
-    Args:
-        envs: World count.
-        device: Warp device.
-        file: URDF of an Allegro hand, in its maker's frame, in place of the boxes.
-        fetch: Let Newton download the example's asset, which is then the hand.
+def allegro_rate(envs: int, device: str) -> AllegroRate:
+    """Physics steps per second of the example over so many environments.
 
     Raises:
         RuntimeError: The example cannot run here: it is not installed, or fails on this device.
-        ValueError: The file cannot be the hand.
     """
-    if file is not None and not (file.suffix == ".urdf" and file.is_file()):
-        raise ValueError(f"--allegro-file {file}: no such file, or its name does not end in .urdf")
     # A yardstick that is missing must not end the benchmark, for whatever reason it is missing.
     try:
-        with wp.ScopedDevice(device):
-            if file is not None:
-                with _in_place_of_the_asset(lambda builder: _add_file(builder, file)):
-                    return _measure(envs, device, file.name)
-            if fetch:
-                with redirect_stdout(sys.stderr):  # standard output is for the rows
-                    return _measure(envs, device, FROM_NEWTON)
-            with _in_place_of_the_asset(add_hand_of_boxes):
-                return _measure(envs, device, OF_BOXES)
+        with wp.ScopedDevice(device), hand_of_boxes():
+            example = make_example(envs)
+            seconds = [_seconds(example, device) for _ in range(2)][1]  # the first time kernels are loaded
     except Exception as error:
         raise RuntimeError(f"Newton's Allegro example cannot run here: {error}") from error
+    return AllegroRate(envs * FRAMES * example.sim_substeps / seconds, example.sim_dt)
 
 
-def _measure(envs: int, device: str, hand: str) -> AllegroRate:
-    example = make_example(envs)
-    for _ in range(FRAMES):
-        example.step()
+def _seconds(example: Any, device: str) -> float:
+    """Time of the frames [s]."""
     wp.synchronize_device(device)
     start = time.perf_counter()
     for _ in range(FRAMES):
         example.step()
     wp.synchronize_device(device)
-    elapsed = time.perf_counter() - start
-    return AllegroRate(envs * FRAMES * example.sim_substeps / elapsed, example.sim_dt, hand)
+    return time.perf_counter() - start
 
 
 def make_example(envs: int) -> Any:
@@ -135,11 +110,11 @@ def make_example(envs: int) -> Any:
 
 
 @contextmanager
-def _in_place_of_the_asset(add_hand: Callable[[newton.ModelBuilder], None]) -> Iterator[None]:
-    """The example meanwhile gets what ``add_hand`` puts into its builder where it reads its asset."""
+def hand_of_boxes() -> Iterator[None]:
+    """The example meanwhile gets the hand of boxes where it reads its asset."""
     replaced = {
         (newton.utils, "download_asset"): lambda *_args, **_kwargs: Path(),
-        (newton.ModelBuilder, "add_usd"): lambda builder, *_args, **_kwargs: add_hand(builder),
+        (newton.ModelBuilder, "add_usd"): lambda builder, *_args, **_kwargs: add_hand_of_boxes(builder),
     }
     before = {place: getattr(*place) for place in replaced}
     try:
@@ -149,14 +124,6 @@ def _in_place_of_the_asset(add_hand: Callable[[newton.ModelBuilder], None]) -> I
     finally:
         for place, function in before.items():
             setattr(*place, function)
-
-
-def _add_file(builder: newton.ModelBuilder, file: Path) -> None:
-    """A hand from a file and the cube."""
-    first = builder.joint_count
-    builder.add_urdf(str(file), xform=HAND_POSE, floating=False, enable_self_collisions=False)
-    _turn_palm_up(builder, first)
-    _add_cube(builder)
 
 
 def add_hand_of_boxes(builder: newton.ModelBuilder) -> None:

@@ -32,29 +32,11 @@ WARM_UP_STEPS = 36
 
 
 @dataclass(frozen=True)
-class KernelRow:
-    """What one kernel takes of a control step."""
-
-    kernel: str
-    """Its name, as Warp reports it."""
-    launches: int
-    """Launches in the step."""
-    seconds: float
-    """Device time of all of them [s]."""
-    share: float
-    """Of the device time of all kernels, in [0, 1]."""
-
-
-@dataclass(frozen=True)
 class SimRow:
     """One measured configuration."""
 
-    scene: str
-    """What was simulated."""
     envs: int
     """Environments side by side."""
-    jacobian: str
-    """How the solver keeps the constraints' Jacobian: dense or sparse."""
     physics_only: float
     """Control steps/s of the physics alone, over all environments."""
     whole_step: float
@@ -74,8 +56,6 @@ class SimRow:
     """Contacts per world, mean over environments at the end."""
     rows_max: int
     """Most constraint rows in any world at the end."""
-    kernels: tuple[KernelRow, ...]
-    """Every kernel of a control step, the longest first; none on the CPU, not measured."""
 
 
 def seconds_per_call(
@@ -142,26 +122,18 @@ def teacher_policy(env: ReorientEnv, policy: "TrainedPolicy") -> Callable[[], No
     return act
 
 
-def kernel_rows(env: ReorientEnv) -> tuple[KernelRow, ...]:
-    """Device time of one control step by kernel, by a timer around every launch.
+def own_share(env: ReorientEnv) -> float:
+    """Share of our kernels in the device time of one control step on a GPU, by a timer around every launch.
 
     Launched without the graph, in which the passes of a solver's loop cannot be told apart; idle gaps do not
     count.
     """
     with wp.ScopedTimer("step", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True) as timer:
         env.launch_step()
-    seconds: dict[str, list[float]] = {}
-    for result in timer.timing_results:  # "forward kernel NAME_HASH", milliseconds
-        seconds.setdefault(result.name.split()[-1], []).append(1e-3 * result.elapsed)
-    total = sum(map(sum, seconds.values()))
-    rows = [KernelRow(name, len(times), sum(times), sum(times) / total) for name, times in seconds.items()]
-    return tuple(sorted(rows, key=lambda row: row.seconds, reverse=True))
-
-
-def own_share(rows: tuple[KernelRow, ...]) -> float:
-    """Share of our kernels in the device time of a step."""
     own = tuple(f"{name}_" for name in own_kernel_names())
-    return sum((row.share for row in rows if row.kernel.startswith(own)), start=0.0)
+    # Warp reports "forward kernel NAME_HASH".
+    times = [(result.name.split()[-1].startswith(own), result.elapsed) for result in timer.timing_results]
+    return float(sum(elapsed for ours, elapsed in times if ours) / sum(elapsed for _, elapsed in times))
 
 
 def own_kernel_names() -> set[str]:
@@ -169,8 +141,8 @@ def own_kernel_names() -> set[str]:
     import vd.kernels
 
     names = set()
-    for info in pkgutil.iter_modules(vd.kernels.__path__):
-        module = importlib.import_module(f"vd.kernels.{info.name}")
+    for info in pkgutil.walk_packages(vd.kernels.__path__, "vd.kernels."):
+        module = importlib.import_module(info.name)
         names |= {value.key for value in vars(module).values() if isinstance(value, wp.Kernel)}
     return names
 
@@ -182,7 +154,6 @@ def measure(
     teacher: "TrainedPolicy | None" = None,
     calls: int = 24,
     seed: int = 0,
-    label: str = "mixed",
 ) -> SimRow:
     """Measure one configuration; raises if any contact was lost.
 
@@ -192,7 +163,6 @@ def measure(
         teacher: A policy trained in that task, on the device; a stand-in for an untrained one if None.
         calls: Control steps to time, each way.
         seed: Of the stand-in.
-        label: Name of the row's scene.
     """
     begin = time.perf_counter()
     on_gpu = device != "cpu"
@@ -229,22 +199,18 @@ def measure(
     env.check()
     data = solver.mjw_data
     contacts, rows = float(data.nacon.numpy()[0]), int(np.max(data.nefc.numpy()))
-    kernels = kernel_rows(env) if on_gpu else ()
     n = cfg.num_envs
     return SimRow(
-        scene=label,
         envs=n,
-        jacobian=cfg.sim.jacobian,
         physics_only=n / physics_s,
         whole_step=n / step_s,
         with_policy=n / (policy_s + step_s),
         pair_order_gain=unsorted_s / physics_s,
-        own_kernels=own_share(kernels),
+        own_kernels=own_share(env) if on_gpu else 0.0,
         memory_gb=memory,
         start_s=start_s,
         contacts_mean=contacts / n,
         rows_max=rows,
-        kernels=kernels,
     )
 
 

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from vd.evaluate.result import Episode
 from vd.evaluate.rollout import episode_rounds, unit_quats
 from vd.evaluate.statistics import rotation_angle, symmetric_error
 from vd.paper import PAPER
@@ -26,6 +25,34 @@ StopsBy = Literal["predicted", "exact", "error", "success"]
 what looks like it; or the success criteria of training, which are the true one and stillness."""
 NEVER_RAD = 1e-9
 """Orientation tolerance that no state meets: an environment with it stops no episode."""
+
+
+def air_table_steps(control_hz: float) -> int:
+    """Control steps at this rate [Hz] after which the paper's in-air test takes the table away."""
+    return round(PAPER.scene.air_table_s * control_hz)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One start and one goal of one object, to its end or stop."""
+
+    object_index: int
+    start_quat: tuple[float, float, float, float]
+    """Object orientation at the reset."""
+    goal_quat: tuple[float, float, float, float]
+    """Goal orientation."""
+    start_error_rad: float
+    """Orientation error at the reset, up to the object's symmetry."""
+    error_rad: float
+    """Orientation error at the last step of the episode, up to the object's symmetry."""
+    exact_error_rad: float
+    """The same to the very goal, which is what counts."""
+    steps: int
+    """Control steps simulated."""
+    stopped: bool
+    """The rule that was asked for stopped it at the last step."""
+    fell: bool
+    """The object left the hand."""
 
 
 @dataclass(frozen=True)

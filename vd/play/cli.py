@@ -40,21 +40,17 @@ class PlayCfg:
     """
 
     policy: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = None
-    agent: str | None = None
-    """zero, random, or the same as POLICY."""
     hand: str | None = None
     """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
     hand_layer: Annotated[str | None, tyro.conf.arg(help=LAYER_HELP)] = None
     objects: tuple[str, ...] = ("cube",)
     """Object sets by name, folders or files; the viewer offers each object."""
     video: Path | None = None
-    """Write this file and exit: .mp4, .gif, or .png for six moments."""
+    """Write this file, .mp4, and exit."""
     seconds: float = VIDEO_SECONDS
     """Length of the video [s]."""
     cells: int = 1
     """Environments side by side in the video, of different objects as far as there are."""
-    samples: int = 1
-    """Rays a pixel in the video; 4 smooths edges."""
     port: int = 8080
     """Port of the viewer."""
     host: str = "127.0.0.1"
@@ -65,11 +61,9 @@ class PlayCfg:
     """Goals are within this angle [rad] of the object's orientation; pi is all of SO(3). By default as
     trained, and pi without a policy."""
     at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Start at rest on the table; the default is as trained, and a drop for --agent zero and random."""
+    """Start at rest on the table; the default is as trained, and a drop for zero and random."""
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
-    second_view: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Where a policy has not come to its goal in 3 s, look at it in other views (vd-eval --help)."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float | None = None
@@ -83,14 +77,8 @@ class PlayCfg:
 
     @property
     def agent_name(self) -> str:
-        """Which agent begins.
-
-        Raises:
-            ValueError: Two are named.
-        """
-        if self.policy is not None and self.agent is not None:
-            raise ValueError("name one agent: a policy, or --agent zero or --agent random")
-        return self.policy or self.agent or DEFAULT_POLICY
+        """Which agent begins."""
+        return self.policy or DEFAULT_POLICY
 
     @property
     def limit_s(self) -> float:
@@ -110,8 +98,8 @@ class PlayCfg:
             raise ValueError(
                 f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
             )
-        if self.video is not None and self.video.suffix.lower() not in (".mp4", ".gif", ".png"):
-            raise ValueError(f"--video is {self.video}; use a name that ends in .mp4, .gif or .png")
+        if self.video is not None and self.video.suffix.lower() != ".mp4":
+            raise ValueError(f"--video is {self.video}; use a name that ends in .mp4")
 
 
 @interrupt.command("vd-play")
@@ -156,7 +144,7 @@ def replay(cfg: PlayCfg) -> int:
         shown = Replay(log)
         _serve(lambda: ReplaySession(shown), cfg)
         return 0
-    frames = film(log, cfg.video, samples=cfg.samples)
+    frames = film(log, cfg.video)
     print(f"{cfg.video} ({frames} frames)")
     return 0
 
@@ -185,7 +173,6 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
         width=width,
         height=height,
         goal_size=round(GOAL_SHARE * height),
-        samples=cfg.samples,
         device=device,
     )
     rate = env.cfg.sim.control_hz
@@ -240,27 +227,17 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
 
 def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
     """Environment with at least one world for each object, trained agent if one is named, device."""
-    quiet_warp()
+    from vd.evaluate.agents import check_bundle, is_saved_student, is_tracking_policy, open_policy, task_for
+
+    device = resolve_device(cfg.device)
+    trained = open_policy(cfg.agent_name, device)  # a file that cannot be used is told before anything slow
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.agents import (
-        check_bundle,
-        check_second_view,
-        is_saved_student,
-        is_tracking_policy,
-        open_policy,
-        task_for,
-    )
-    from vd.policy import TrainedPolicy
 
-    device = resolve_device(cfg.device)
     count = len(load_set(list(cfg.objects)))
     if device == "cpu" and count > FAST_WORLDS_CPU:
         print(f"vd-play: {count} objects are {count} environments, slow on a CPU; name fewer with --objects")
-    if cfg.second_view:
-        check_second_view([cfg.agent_name])
-    trained = open_policy(cfg.agent_name, device)
     task = task_for(
         trained,
         hand=cfg.hand,
@@ -274,7 +251,6 @@ def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
         success_ends_episode=False,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        second_view=cfg.second_view,
     )
     if cfg.in_air:
         task = replace(task, table=TableCfg(away_share=1.0))
@@ -287,11 +263,7 @@ def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
     if is_tracking_policy(trained):
         from vd.evaluate.tracking import TrackingActor
 
-        return env, TrackingActor(env, trained, second_view=cfg.second_view, seed=cfg.seed), device
-    if cfg.second_view and isinstance(trained, TrainedPolicy):
-        from vd.evaluate.second_view import SecondView
-
-        return env, SecondView(env, trained), device
+        return env, TrackingActor(env, trained, seed=cfg.seed), device
     return env, trained, device
 
 

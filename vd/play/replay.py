@@ -90,18 +90,17 @@ class Replay:
 
     def frames(self, renderer: Renderer) -> Iterator[np.ndarray]:
         """Draw one frame for each control step, RGB bytes [height, width, 3]."""
-        composer = Composer(BARS, 1)
+        composer = Composer(1)
         for shot in self.snapshots:
             yield composer.frame(renderer.render(shot.joint_q[None], shot.goal_quat[None]), [shot])
 
 
-def film(log: HandLog, path: Path, *, samples: int = 1) -> int:
+def film(log: HandLog, path: Path) -> int:
     """Write the film of a log; returns the number of frames.
 
     Args:
         log: The log.
-        path: .mp4, .gif, or .png for six moments.
-        samples: Rays a pixel; 4 smooths edges.
+        path: .mp4.
 
     Raises:
         LogError: Hand or object are not here.
@@ -113,7 +112,6 @@ def film(log: HandLog, path: Path, *, samples: int = 1) -> int:
         width=width,
         height=height,
         goal_size=round(GOAL_SHARE * height),
-        samples=samples,
     )
     return write_frames(path, shown.frames(renderer), shown.control_hz)
 

@@ -1,6 +1,6 @@
 """A running environment with an agent that can be exchanged: what the viewer shows and its buttons change."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -81,9 +81,9 @@ class Session:
 
 
 def agent_choices(
-    named: str, policy: Any | None, num_actions: int, *, seed: int, device: str, others: Sequence[str] = ()
+    named: str, policy: Any | None, num_actions: int, *, seed: int, device: str
 ) -> dict[str, Callable[[], Any]]:
-    """Agents the viewer offers: the one that was named, other policy files beside it, zero and random.
+    """Agents the viewer offers: the one that was named, zero and random.
 
     Args:
         named: Name or path of the agent to begin with.
@@ -91,15 +91,12 @@ def agent_choices(
         num_actions: D.
         seed: Of the random agent.
         device: Torch device.
-        others: More policy files.
     """
-    from vd.evaluate.agents import BUILT_IN, built_in, open_teacher
+    from vd.evaluate.agents import BUILT_IN, built_in
 
     choices: dict[str, Callable[[], Any]] = {}
     if policy is not None:
         choices[named] = lambda: policy
-    for other in others:
-        choices.setdefault(other, partial(open_teacher, other, device))
     for name in BUILT_IN:
         choices[name] = partial(built_in, name, num_actions, seed=seed, device=device)
     return choices
