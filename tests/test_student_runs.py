@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from student_dummy import make_student_runner
+from student_dummy import make_dagger
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
@@ -150,7 +150,7 @@ def stage(tmp_path):
     """Writes a student of a stage, beside a folder for the next."""
 
     def write(number):
-        runner = make_student_runner(tmp_path / f"stage{number}")
+        runner = make_dagger(tmp_path / f"stage{number}")
         runner.spec = replace(runner.spec, stage=number, teacher="dclaw3-table")
         runner.save()
         return tmp_path / f"stage{number}" / "student.pt"
@@ -218,16 +218,15 @@ import torch
 torch.set_num_threads(1)
 sys.path.insert(0, {tests!r})
 from types import SimpleNamespace
-from student_dummy import make_dagger, make_student_runner, weights
+from student_dummy import make_dagger, weights
 from train_dummy import DummyEnv
 import vd.train.student.dagger as dagger_module
 DummyEnv.scene = SimpleNamespace(object_body=1)
 dagger_module.poses = lambda frames: frames["target"].repeat(1, 1, 5)[..., :9]
 rank, folder = int(os.environ["RANK"]), Path({folder!r})
-dagger = make_dagger(seed=rank, world_size=2, pose_weight=1.0)  # other environments; other weights at first
-runner = make_student_runner(folder, dagger)
+runner = make_dagger(folder, seed=rank, pose_weight=1.0)  # other environments; other weights at first
 runner.learn(2)
-result = [weights(dagger.network).tolist(), float(dagger.collect().label.sum())]
+result = [weights(runner.networks).tolist(), float(runner.collect().label.sum())]
 (folder / f"rank{{rank}}.json").write_text(json.dumps(result))
 runner.shutdown()
 """

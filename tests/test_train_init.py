@@ -221,7 +221,7 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("name", ["dclaw3-table", "dclaw4-table", "dclaw4-cube"])
+@pytest.mark.parametrize("name", ["dclaw3-table", "dclaw4-table"])
 def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
     cfg = parse_teacher(["--init", name, "--objects", "cube", "--num-envs", "8"])
     state = load_checkpoint(SHIPPED_POLICIES[name])

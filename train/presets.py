@@ -194,18 +194,7 @@ def cpu_demo() -> TeacherCfg:
         preset="cpu-demo",
         run=RunCfg(out=Path("runs/cpu-demo"), device="cpu", max_steps=200_000, save_every=10),
         # Many optimiser steps per sample: samples are what a CPU is short of.
-        ppo=PpoCfg(
-            rollout_steps=8,
-            minibatch_size=256,
-            epochs=5,
-            actor_learning_rate=1e-3,
-            schedule="adaptive",
-            desired_kl=0.02,
-            clip=0.2,
-            gamma=0.97,
-            value_coefficient=1.0,
-            entropy_coefficient=1e-3,
-        ),
+        ppo=replace(SHORT_ROLLOUTS, minibatch_size=256, actor_learning_rate=1e-3),
         policy=PolicyCfg(
             hidden=(256, 128, 64),
             distribution="state-dependent",

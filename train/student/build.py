@@ -3,7 +3,7 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vd.config import to_dict
 from vd.envs.cfg import ReorientCfg
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
     from vd.train.student.dagger import Dagger
     from vd.train.student.pretrain import Pretrainer
-    from vd.train.student.runner import StudentRunner
     from vd.vision.network import Student
 
 
@@ -48,7 +47,7 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
     return replace(task, randomisation=exact, observation=replace(task.observation, view="world"))
 
 
-def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "StudentRunner":
+def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Pretrainer | Dagger":
     """Build environments, student and learner as ``cfg`` says, save the configuration, and resume if asked.
 
     Args:
@@ -80,12 +79,11 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     quiet_warp()
     from vd.evaluate.agents import find_policy, policy_name
     from vd.policy import load_policy
-    from vd.train.student.runner import StudentRunner
     from vd.vision.network import Student
     from vd.vision.saved import StudentSpec
     from vd.workers import one_thread_without_gpu
 
-    rank, world_size = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+    rank = int(os.environ.get("RANK", "0"))
     teacher = load_policy(find_policy(cfg.teacher), device)
     task = student_task(teacher, cfg)
     one_thread_without_gpu(device)
@@ -99,29 +97,27 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
             print(f"of {cfg.init} these do not fit, and begin anew: {', '.join(anew)}")
     torch.manual_seed(cfg.task.seed + rank)
     own_task = replace(task, seed=cfg.task.seed + rank)
+    kept: dict[str, Any] = {
+        "spec": StudentSpec(
+            network=cfg.network,
+            num_actions=teacher.num_actions,
+            stage=cfg.stage,
+            teacher=policy_name(str(cfg.teacher)),
+            camera=cfg.camera,
+        ),
+        "task": to_dict(task),
+        "depth": to_dict(cfg.depth),
+        "device": device,
+        "deadline": cfg.run.deadline(started),
+    }
+    runner: Pretrainer | Dagger
     if cfg.stage == PRETRAINING:
-        learner: Pretrainer | Dagger = _pretrainer(cfg, own_task, student, device, world_size)
+        runner = _pretrainer(cfg, own_task, student, kept)
     else:
-        learner = _dagger(cfg, own_task, student, teacher, device, world_size)
+        runner = _dagger(cfg, own_task, student, teacher, kept)
         if checkpoint is None and not cfg.dagger.reset:  # or all episodes would time out at once
-            steps = learner.env.episode_length_buf
-            learner.env.episode_length_buf = torch.randint_like(steps, learner.env.max_episode_length)
-    spec = StudentSpec(
-        network=cfg.network,
-        num_actions=teacher.num_actions,
-        stage=cfg.stage,
-        teacher=policy_name(str(cfg.teacher)),
-        camera=cfg.camera,
-    )
-    runner = StudentRunner(
-        learner,
-        cfg.run,
-        spec=spec,
-        task=to_dict(task),
-        depth=to_dict(cfg.depth),
-        device=device,
-        deadline=cfg.run.deadline(started),
-    )
+            steps = runner.env.episode_length_buf
+            runner.env.episode_length_buf = torch.randint_like(steps, runner.env.max_episode_length)
     if checkpoint is not None:
         runner.load(checkpoint)
     if rank == 0:
@@ -162,7 +158,7 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
 
 
 def _pretrainer(
-    cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", device: str, world_size: int
+    cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", kept: dict[str, Any]
 ) -> "Pretrainer":
     from vd.assets_usd.hands import load_hand
     from vd.assets_usd.objects.sets import load_set
@@ -178,9 +174,9 @@ def _pretrainer(
         noise=cfg.noise,
         batch=cfg.pretrain.batch,
         seed=task.seed,
-        device=device,
+        device=kept["device"],
     )
-    return Pretrainer(scenes, student, len(objects), cfg.pretrain, world_size=world_size)
+    return Pretrainer(scenes, student, len(objects), cfg.pretrain, cfg.run, **kept)
 
 
 def _dagger(
@@ -188,8 +184,7 @@ def _dagger(
     task: ReorientCfg,
     student: "Student",
     teacher: "TrainedPolicy",
-    device: str,
-    world_size: int,
+    kept: dict[str, Any],
 ) -> "Dagger":
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.agents import trained_task
@@ -198,7 +193,7 @@ def _dagger(
     from vd.train.vec_env import ReorientVecEnv
     from vd.views import ViewMaps
 
-    simulation = ReorientEnv(task, device)
+    simulation = ReorientEnv(task, kept["device"])
     if simulation.num_observations != teacher.num_observations:
         raise ValueError(
             f"the teacher observes {teacher.num_observations} values, its environments give "
@@ -217,6 +212,6 @@ def _dagger(
     )
     seen, maps = trained_task(teacher).observation, None
     if seen.view != "world":
-        maps = ViewMaps(simulation.hand, seen, device)
+        maps = ViewMaps(simulation.hand, seen, kept["device"])
     labels = WorldTeacher(teacher, maps)
-    return Dagger(ReorientVecEnv(simulation), view, student, labels, cfg.dagger, world_size=world_size)
+    return Dagger(ReorientVecEnv(simulation), view, student, labels, cfg.dagger, cfg.run, **kept)

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -53,11 +54,12 @@ def student_command(arguments: list[str], started: float) -> int:
     from vd.evaluate.agents import check_names
 
     check_names([] if cfg.teacher is None else [cfg.teacher], cfg.task.objects)
-    from vd.train.progress import BUILDING, waiting
+    from vd.train.progress import BUILDING
 
-    with waiting(BUILDING, os.environ.get("RANK", "0") == "0"):
-        runner = build_student(cfg, started=started)
-    folder, say = cfg.run.out, print if runner.is_main else (lambda _: None)
+    main_process = os.environ.get("RANK", "0") == "0"
+    folder, say = cfg.run.out, partial(print, flush=True) if main_process else (lambda _: None)
+    say(BUILDING)
+    runner = build_student(cfg, started=started)
     if runner.iteration:
         say(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
         if runner.new_episodes:
