@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import tomllib
+import warnings
 from pathlib import Path
 
 import pytest
@@ -81,3 +82,17 @@ def test_a_command_below_nohup_outlives_its_terminal():
         assert goes_on() == 0
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_a_warning_is_a_line_of_the_command_without_the_source(capsys):
+    @interrupt.command("vd-some")
+    def warns() -> int:
+        warnings.showwarning("a field is ignored", UserWarning, "config.py", 93)
+        return 0
+
+    before = warnings.formatwarning
+    try:
+        assert warns() == 0
+    finally:
+        warnings.formatwarning = before
+    assert "vd-some: a field is ignored\n" in capsys.readouterr().err

@@ -72,8 +72,8 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
         raise ValueError(f"--init: {path} does not say how it was trained; add --preset")
     try:
         env = from_dict(ReorientCfg, state["task"], where="task")
-        learner = state["learner"]
-        ppo = from_dict(PpoCfg, learner["ppo"], where="learner.ppo")
+        learner, how = state["learner"], {"critic_warmup_iterations": None, "imitation_iterations": 0}
+        ppo = from_dict(PpoCfg, learner["ppo"] | how, where="learner.ppo")  # how it began is its own
         policy = from_dict(PolicyCfg, learner["policy"], where="learner.policy")
     except ValueError as error:
         raise ValueError(
@@ -84,7 +84,7 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     return replace(
         base,
         run=run,
-        ppo=replace(ppo, imitation_iterations=0),
+        ppo=ppo,
         policy=policy,
         env=env,
     )

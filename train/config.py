@@ -27,7 +27,7 @@ class PpoCfg:
     RETIRED: ClassVar[dict[str, Any]] = {
         "optimizer": "adam",
         "critic_warmup_iterations": Dropped(None),
-        "imitation_learning_rate": 1e-3,
+        "imitation_learning_rate": Dropped(1e-3),
     }
     rollout_steps: int = PAPER.teacher.rollout_steps
     """Control steps of every world between two updates."""
