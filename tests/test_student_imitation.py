@@ -15,8 +15,8 @@ from vd.train.cli import main
 from vd.train.ending import Interrupted, TrainingDivergedError
 from vd.train.metrics import read_progress
 from vd.train.student.losses import imitation_figures, imitation_loss, poses
-from vd.train.student.optimise import scheduled
 from vd.train.student.rollout import taken
+from vd.train.student.runner import scheduled
 from vd.vision.cfg import NoiseCfg
 from vd.vision.saved import load_student
 

@@ -18,13 +18,11 @@ from vd.train.ending import TrainingDivergedError, check_update
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import DaggerCfg
 from vd.train.student.losses import POSE_VALUES, imitation_figures, imitation_loss, poses
-from vd.train.student.optimise import autocast, read_means, scheduled, share_statistics
 from vd.train.student.rollout import UNCLIPPED, Rollout, taken
-from vd.train.student.runner import StudentRunner
+from vd.train.student.runner import StudentRunner, scheduled
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 from vd.views import ViewMaps
 from vd.vision.network import Student
-from vd.vision.sites import Sites
 
 CHECKPOINT_ROLLOUT_BYTES = 2**28
 """Kept rollouts that are larger together, those with camera points, are not written into checkpoints: a run
@@ -104,8 +102,7 @@ class Dagger(StudentRunner):
         rollout = self.collect()
         if rollout is None:
             return None
-        size = self.processes.world_size
-        means = self._means.read(size) | read_means(self._figures, size)
+        means = self._means.read(self.processes.world_size) | self._read(self._figures)
         collected = time.perf_counter()
         self._kept.append(rollout)
         losses = self.update(list(self._kept))
@@ -149,7 +146,7 @@ class Dagger(StudentRunner):
                 self._record(frames, frame, step)
                 label = self.teacher.act(self.view.observation(observation[OBSERVATION_GROUP]))
                 labels.append(label.clamp(-1.0, 1.0) if cfg.clip_labels else label)
-                embedding = self._encode(self.view.sites(frame, augment=True))
+                embedding = self._encode(self.view.sites(frame, augment=True), cfg.precision)
                 known = self.student.proprioception(frame)
                 output = self.student(embedding[None], known[None], self._hidden)
                 action, std = output.mean[0], output.log_std[0].exp()
@@ -176,7 +173,7 @@ class Dagger(StudentRunner):
         self.student.train()
         batches = self.minibatches(len(rollouts))
         steps = [self._minibatch_step(taken(rollouts, sequences)) for sequences in batches]
-        share_statistics(self.student, self.processes.world_size)
+        self._share_statistics()
         means = torch.stack([torch.stack(tuple(step.values())) for step in steps]).mean(dim=0)
         losses = dict(zip(steps[0], means.tolist(), strict=True))
         check_update(losses, self.networks, LOWER_RATES)
@@ -198,7 +195,7 @@ class Dagger(StudentRunner):
         steps, count = rollout.done.shape
         flat = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
         sites = self.view.sites(flat, rollout.envs.repeat(steps), augment=True)
-        embedding = self._encode(sites).view(steps, count, -1)
+        embedding = self._encode(sites, self.cfg.precision).view(steps, count, -1)
         known = self.student.proprioception(rollout.frames)
         output = self.student(embedding, known, rollout.hidden, rollout.done)
         error = output.distance - rollout.frames["distance"][..., None]
@@ -257,18 +254,15 @@ class Dagger(StudentRunner):
                 frames[name] = value.new_empty((self.cfg.rollout_steps, *value.shape), dtype=dtype)
             frames[name][step] = value
 
-    def _encode(self, sites: Sites) -> torch.Tensor:
-        """Embeddings of clouds; what follows the encoder is small, and stays in single precision."""
-        with autocast(torch.device(self.device), self.cfg.precision):
-            return self.student.encode(sites).float()
-
     def _minibatch_step(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """One optimiser step; its losses and the gradient's norm, on the device."""
         cfg, losses = self.cfg, self.losses(rollout)
         total = torch.stack([self.weights[name] * loss for name, loss in losses.items()]).sum()
-        self._steps_done += 1
         rate = scheduled(
-            cfg.learning_rate, self._steps_done, warmup=cfg.warmup_steps, decay_after=cfg.decay_after_steps
+            cfg.learning_rate,
+            self._steps_done + 1,
+            warmup=cfg.warmup_steps,
+            decay_after=cfg.decay_after_steps,
         )
         norm = self._descend(total, rate=rate, grad_norm=cfg.grad_norm)
         return {f"loss/{name}": loss.detach() for name, loss in losses.items()} | {"loss/grad_norm": norm}

@@ -21,9 +21,8 @@ from vd.sim.scene import hand_mount
 from vd.train.config import RunCfg
 from vd.train.ending import check_update
 from vd.train.student.config import PretrainCfg
-from vd.train.student.optimise import autocast, read_means, scheduled, share_statistics
 from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
-from vd.train.student.runner import StudentRunner
+from vd.train.student.runner import StudentRunner, scheduled
 from vd.vision.cfg import NoiseCfg, StudentCfg
 from vd.vision.network import Student
 from vd.vision.sites import Sites
@@ -179,8 +178,8 @@ class Pretrainer(StudentRunner):
                 return None
             rows.append(self._step())
         means = {name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]}
-        share_statistics(self.student, self.processes.world_size)
-        figures = read_means(means, self.processes.world_size)
+        self._share_statistics()
+        figures = self._read(means)
         check_update(figures, self.networks, LOWER_RATES)
         return dict(figures)
 
@@ -188,8 +187,7 @@ class Pretrainer(StudentRunner):
         self, sites: Sites, targets: dict[str, torch.Tensor]
     ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
         """Losses of a batch by name, and figures to log."""
-        with autocast(sites.device, self.cfg.precision):
-            embedding = self.student.encode(sites).float()
+        embedding = self._encode(sites, self.cfg.precision)
         found = {name: head(embedding) for name, head in self.heads.items()}
         losses = {
             "category": nn.functional.cross_entropy(found["category"], targets["category"]),
@@ -226,9 +224,8 @@ class Pretrainer(StudentRunner):
 
     def _step(self) -> dict[str, torch.Tensor]:
         losses, figures = self.losses(*self.scenes.draw())
-        self._steps_done += 1
         cfg, total = self.cfg, torch.stack(tuple(losses.values())).sum()
-        rate = scheduled(cfg.learning_rate, self._steps_done, decay_after=cfg.decay_after_steps)
+        rate = scheduled(cfg.learning_rate, self._steps_done + 1, decay_after=cfg.decay_after_steps)
         norm = self._descend(total, rate=rate, grad_norm=PAPER.dagger.grad_norm)
         logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
         return figures | logged | {"loss/grad_norm": norm}

@@ -1,5 +1,6 @@
 """What imitation and pre-training share: the training loop of a student, its checkpoints and its file."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,9 @@ from vd.train.checkpoint import load_checkpoint, save_checkpoint
 from vd.train.config import RunCfg
 from vd.train.loop import TrainingLoop
 from vd.train.student.config import STUDENT_NAME
-from vd.train.student.optimise import descend
 from vd.vision.network import Student
 from vd.vision.saved import StudentSpec, student_export
+from vd.vision.sites import Sites
 
 
 class StudentRunner(TrainingLoop):
@@ -76,9 +77,45 @@ class StudentRunner(TrainingLoop):
             ) from error
 
     def _descend(self, loss: torch.Tensor, *, rate: float, grad_norm: float) -> torch.Tensor:
-        """One optimiser step; the gradient's norm."""
-        size = self.processes.world_size
-        return descend(self.networks, self.optimizer, loss, rate=rate, grad_norm=grad_norm, world_size=size)
+        """One optimiser step on the gradient of ``loss``, averaged over processes and clipped.
+
+        Returns:
+            Norm of the gradient before clipping, a scalar on the device.
+        """
+        self._steps_done += 1
+        self.optimizer.param_groups[0]["lr"] = rate
+        self.optimizer.zero_grad()
+        loss.backward()
+        parameters = list(self.networks.parameters())
+        if self.is_distributed:
+            # Every process has to take part with every weight, also one whose loss does not reach it.
+            gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in parameters]
+            flat = nn.utils.parameters_to_vector(gradients)
+            torch.distributed.all_reduce(flat)
+            nn.utils.vector_to_parameters(flat / self.processes.world_size, gradients)
+        norm = nn.utils.clip_grad_norm_(parameters, grad_norm)
+        self.optimizer.step()
+        return norm.detach()
+
+    def _read(self, figures: dict[str, torch.Tensor]) -> dict[str, float]:
+        """Scalars, averaged over the processes; waits for the device."""
+        values = torch.stack(tuple(figures.values()))
+        if self.is_distributed:
+            torch.distributed.all_reduce(values)
+            values /= self.processes.world_size
+        return dict(zip(figures, values.tolist(), strict=True))
+
+    def _share_statistics(self) -> None:
+        """Let all processes use the batch statistics of the first; each has averaged its own."""
+        if self.is_distributed:
+            for buffer in self.student.buffers():
+                torch.distributed.broadcast(buffer, 0)
+
+    def _encode(self, sites: Sites, precision: str) -> torch.Tensor:
+        """Embeddings of clouds; with ``bf16`` by products in half precision. What follows is small."""
+        half = torch.autocast(torch.device(self.device).type, torch.bfloat16, enabled=precision == "bf16")
+        with half:
+            return self.student.encode(sites).float()
 
     def _begin(self) -> None:
         if self.is_distributed:
@@ -110,3 +147,18 @@ class StudentRunner(TrainingLoop):
 
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:
         save_checkpoint(self.run.out / STUDENT_NAME, student_export(state))
+
+
+def scheduled(rate: float, step: int, *, warmup: int = 0, decay_after: int = 0) -> float:
+    """Learning rate of an optimiser step, counted from 1.
+
+    Args:
+        rate: After the warm-up and until the decay.
+        step: Number of the step.
+        warmup: Steps over which it rises from 0, linearly.
+        decay_after: Step after which it falls as 1 / sqrt(steps); 0: never.
+    """
+    factor = min(1.0, step / max(1, warmup))
+    if decay_after:
+        factor *= min(1.0, math.sqrt(decay_after / max(1, step)))
+    return factor * rate
