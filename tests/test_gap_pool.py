@@ -1,7 +1,8 @@
-"""Calls one after the other, in processes, and in threads that simulate together."""
+"""Fits one after the other, in processes, in threads that simulate together, and from what was kept of them."""
 
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -12,9 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_gap_fit import TRUE, recorded
+from gap_recordings import TRUE, made_up, recorded
 
 import vd.kernels.actuators as servo
+from vd.gap.answers import Answers, digest_of
 from vd.gap.assemble import curves
 from vd.gap.chain import chains
 from vd.gap.crowd import Crowd
@@ -27,7 +29,7 @@ from vd.gap.workflow import baseline_of
 EFFECTS = ("coulomb_friction", "backlash", "load_friction")
 
 
-def answers(team: Team, spec: JointSpec) -> list[Any]:
+def fits(team: Team, spec: JointSpec) -> list[Any]:
     base = team.bench.chains[0].start_row.copy()
     for column, value in TRUE.items():
         base[0, column] = 1.1 * value
@@ -47,21 +49,20 @@ def problem(extra: dict[int, float], crowd: Crowd | None = None) -> tuple[Bench,
 
 
 def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
-    hidden = {servo.COULOMB_TORQUE: 0.06}
-    bench, spec = problem(hidden)
+    extra = {servo.COULOMB_TORQUE: 0.06}
+    bench, spec = problem(extra)
     with Team(bench, workers=1) as team:
-        alone, simulated = answers(team, spec), team.simulated
-        again = answers(team, spec)
+        alone, simulated = fits(team, spec), team.simulated
+        again = fits(team, spec)
         assert team.simulated == simulated, "a call that was made before is not made again"
         assert all(one is other for one, other in zip(alone, again, strict=True))
     crowd = Crowd()
-    with Team(problem(hidden, crowd)[0], workers=1) as team:
-        together = answers(team, spec)
+    with Team(problem(extra, crowd)[0], workers=1) as team:
+        together = fits(team, spec)
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one.x, other.x)
         np.testing.assert_array_equal(one.held_out, other.held_out)
     assert team.simulated == simulated, "every call counts its own"
-    assert team.spent["fit"][0] == simulated
     # Start and end, three steps of a Jacobian and two sets of trials; two of the refits, whose first
     # Jacobian is known; one prediction.
     assert crowd.launches <= 2 + 3 * 3 + (2 * 3 - 1) + 1
@@ -70,7 +71,7 @@ def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
 PARENT = """
 import time
 import multiprocessing
-from test_gap_team import problem
+from test_gap_pool import problem
 from vd.gap.team import Team
 
 if __name__ == "__main__":
@@ -85,8 +86,7 @@ ENDING_S = 120.0
 """Time for orphans to end."""
 
 
-@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGKILL])
-def test_workers_end_with_whom_they_work_for(ending: signal.Signals, tmp_path: Path) -> None:
+def test_workers_end_with_whom_they_work_for(tmp_path: Path) -> None:
     script = tmp_path / "parent.py"
     script.write_text(PARENT)
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
@@ -97,7 +97,7 @@ def test_workers_end_with_whom_they_work_for(ending: signal.Signals, tmp_path: P
         lines = iter(parent.stdout)
         workers = [int(pid) for pid in next(line for line in lines if line[:1].isdigit()).split()]
         assert len(workers) == 2 and all(map(runs, workers))
-        parent.send_signal(ending)
+        parent.send_signal(signal.SIGKILL)
         parent.wait()
         end = time.monotonic() + ENDING_S
         while any(map(runs, workers)) and time.monotonic() < end:
@@ -120,24 +120,12 @@ def test_a_worker_that_is_killed_ends_the_run_with_what_to_change() -> None:
     bench, spec = problem({})
     others = multiprocessing.active_children()
     with Team(bench, workers=2) as team:
-        answers(team, spec)
+        fits(team, spec)
         for process in multiprocessing.active_children():
             if process not in others:
                 process.kill()
         with pytest.raises(ChildProcessError, match=r"one of 2 processes was killed.*memory"):
             team.run(spec, [("scales", {"row": bench.chains[0].start_row[0], "residual": 0.03})])
-
-
-def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
-    bench, spec = problem({servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2})
-    recording, (chain,) = bench.recording, bench.chains
-    rows = chain.start_row.copy()
-    for column, value in {**TRUE, servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2}.items():
-        rows[0, column] = value
-    exact = Rollouts(chain, recording, dt=STEP_S / 32).predict(rows[None])[0]
-    drawn = curves(recording, bench, [("j", spec, rows)])
-    searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
-    assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)
 
 
 def test_a_failure_reaches_all_who_wait() -> None:
@@ -166,3 +154,42 @@ def test_whoever_stops_does_not_wait_for_the_other_joints() -> None:
         parallel(work, [0, 1])
     assert not ended
     released.set()
+
+
+def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
+    bench, spec = problem({servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2})
+    recording, (chain,) = bench.recording, bench.chains
+    rows = chain.start_row.copy()
+    for column, value in {**TRUE, servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2}.items():
+        rows[0, column] = value
+    exact = Rollouts(chain, recording, dt=STEP_S / 32).predict(rows[None])[0]
+    drawn = curves(recording, bench, [("j", spec, rows)])
+    searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
+    assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)
+
+
+def test_equal_calls_have_one_digest_and_others_another() -> None:
+    call = ("fit", {"base": np.arange(3.0), "starts": [{"kp": 1.0, "kd": 2.0}], "fit": made_up((), 1.0)})
+    same = {"fit": made_up((), 1.0), "starts": [{"kd": 2.0, "kp": np.float64(1.0)}], "base": np.arange(3.0)}
+    assert digest_of(call) == digest_of(("fit", same)) == digest_of(pickle.loads(pickle.dumps(call)))
+    others = [
+        ("fits", call[1]),
+        ("fit", {**call[1], "base": np.arange(3)}),
+        ("fit", {**call[1], "starts": [{"kp": 1.0}, {"kd": 2.0}]}),
+        ("fit", {**call[1], "fit": made_up((), 1.1)}),
+    ]
+    assert len({digest_of(other) for other in (call, *others)}) == len(others) + 1
+
+
+def test_fits_that_are_kept_are_of_one_recording_and_those_that_are_damaged_none(tmp_path: Path) -> None:
+    Answers(tmp_path / "a", "one").add("q", [made_up((), 1.0), 0.5])
+    again = Answers(tmp_path / "a", "one")
+    assert "q" in again and again["q"][0].coordinates == made_up((), 1.0).coordinates
+    assert "q" not in Answers(tmp_path / "a", "another")
+    (file,) = (tmp_path / "a").iterdir()
+    whole = file.read_bytes()
+    for content in (whole[: len(whole) // 2], b"", pickle.dumps(print)):
+        file.write_bytes(content)
+        assert "q" not in Answers(tmp_path / "a", "one"), "nor is anything run that a file asks for"
+    again.forget()
+    assert not (tmp_path / "a").exists()
