@@ -152,8 +152,8 @@ class HandModel:
         effort: Torque limits [D] [N m].
         velocity_limit: Speed limits [D] [rad/s].
         armature: Rotor inertia about each axis [D] [kg m^2].
-        servo: Servo model of each joint [D, P], P = PARAMETER_COLUMNS of :mod:`vd.kernels.actuators`: drive,
-            speed limit, armature, and every effect that the USD authors; SI units, radians.
+        servo: Servo model of each joint [D, P], P = PARAMETER_COLUMNS of :mod:`vd.kernels.servo.actuators`:
+            drive, speed limit, armature, and every effect that the USD authors; SI units, radians.
         servo_interval: 95 % interval (low, high) of each number of ``servo`` [D, P, 2], NaN where none is
             known.
         link_mass: Masses [L] [kg].

@@ -6,7 +6,7 @@ The layer holds ``over`` prims for the hand's joints, ``/dclaw3/f0_j1`` for exam
   ``drive:angular:physics:stiffness`` and ``damping`` (per degree), ``newton:velocityLimit`` (degrees per
   second) and ``newton:armature``,
 * every effect, ``vd:<effect>:<parameter>`` (double, SI units, radians), by the names of
-  :data:`vd.kernels.effects.EFFECTS`,
+  :data:`vd.kernels.servo.effects.EFFECTS`,
 * 95 % intervals, ``vd:<effect>:<parameter>:ci95`` (float2: low, high; SI units, radians), with ``baseline``
   as the effect for stiffness, damping, speed limit and armature (``vd:baseline:kp:ci95``).
 
@@ -23,8 +23,8 @@ from pxr import Gf, Sdf, Tf, Usd
 
 from vd.assets_usd.hand_data import HandError, HandModel
 from vd.files import atomic_path
-from vd.kernels.actuators import PARAMETER_COLUMNS
-from vd.kernels.effects import BASELINE, EFFECTS, Parameter, neutral_row
+from vd.kernels.servo.actuators import PARAMETER_COLUMNS
+from vd.kernels.servo.effects import BASELINE, EFFECTS, Parameter, neutral_row
 
 __all__ = ["LAYER_FORMAT", "Estimate", "HandError", "add_layer", "read_servo", "write_layer"]
 
@@ -151,7 +151,8 @@ def read_servo(
 
     Args:
         joints: Joint prims [D].
-        baseline: Values of the parameters of :data:`vd.kernels.effects.BASELINE` by name, [D] each, SI units.
+        baseline: Values of the parameters of :data:`vd.kernels.servo.effects.BASELINE` by name, [D] each, SI
+            units.
         source: The file to name in errors.
 
     Returns:

@@ -21,35 +21,51 @@ class Entry(NamedTuple):
     summary: str
 
 
-RUN = Entry("vd.deploy.run", "RunCfg", "run", "drive the hand with a policy")
+RUN = Entry("vd.deploy.loop.run", "RunCfg", "run", "drive the hand with a policy")
 COMMANDS = {
     "scan": Entry(
-        "vd.deploy.scan", "ScanCfg", "scan", "which motors are on the line, and what is wrong with them"
+        "vd.deploy.hardware.scan",
+        "ScanCfg",
+        "scan",
+        "which motors are on the line, and what is wrong with them",
     ),
     "check": Entry(
-        "vd.deploy.check", "CheckCfg", "check", "preflight: everything that must be right before it moves"
+        "vd.deploy.hardware.check",
+        "CheckCfg",
+        "check",
+        "preflight: everything that must be right before it moves",
     ),
     "calibrate": Entry(
-        "vd.deploy.calibrate",
+        "vd.deploy.camera.calibrate",
         "CalibrateCfg",
         "calibrate",
         "find where the camera is, by markers on fingertips",
     ),
     "reboot": Entry(
-        "vd.deploy.maintain",
+        "vd.deploy.hardware.maintain",
         "RebootCfg",
         "reboot",
         "restart a motor: clears its error, and its count of turns",
     ),
-    "set-id": Entry("vd.deploy.maintain", "SetIdCfg", "set_id", "give a motor another ID"),
-    "set-baud": Entry("vd.deploy.maintain", "SetBaudCfg", "set_baud", "give a motor another baud rate"),
-    "home": Entry("vd.deploy.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"),
-    "record": Entry("vd.deploy.record", "RecordCfg", "record", "record motions for vd-gap"),
+    "set-id": Entry("vd.deploy.hardware.maintain", "SetIdCfg", "set_id", "give a motor another ID"),
+    "set-baud": Entry(
+        "vd.deploy.hardware.maintain", "SetBaudCfg", "set_baud", "give a motor another baud rate"
+    ),
+    "home": Entry(
+        "vd.deploy.hardware.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"
+    ),
+    "record": Entry("vd.deploy.hardware.record", "RecordCfg", "record", "record motions for vd-gap"),
     "shadow": Entry(
-        "vd.deploy.shadow", "ShadowCfg", "shadow", "compare what the policy saw with what the simulator shows"
+        "vd.deploy.loop.shadow",
+        "ShadowCfg",
+        "shadow",
+        "compare what the policy saw with what the simulator shows",
     ),
     "score": Entry(
-        "vd.deploy.score_command", "ScoreCfg", "score", "the object's error at each stop, by motion capture"
+        "vd.deploy.loop.score_command",
+        "ScoreCfg",
+        "score",
+        "the object's error at each stop, by motion capture",
     ),
 }
 """The commands by name."""

@@ -102,7 +102,7 @@ def constants() -> str:
 
 def effects() -> str:
     """The effects of the servo model with their parameters."""
-    from vd.kernels.effects import EFFECTS
+    from vd.kernels.servo.effects import EFFECTS
 
     rows = (
         (f"`{effect.name}`", effect.meaning, f"`vd:{effect.name}:{p.name}`", p.unit, f"{p.typical:g}")
@@ -114,7 +114,7 @@ def effects() -> str:
 
 def registers() -> str:
     """The registers of a motor that the preflight compares."""
-    from vd.deploy.registers import REGISTERS
+    from vd.deploy.hardware.registers import REGISTERS
 
     rows = ((f"`{one.name}`", one.why, "refused" if one.remedy else "set") for one in REGISTERS)
     return _table(("register", "with another value", "what we do"), rows)

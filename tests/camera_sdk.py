@@ -4,8 +4,8 @@ from types import ModuleType
 
 import pytest
 
-from vd.deploy.camera import CameraError
-from vd.deploy.realsense import sdk
+from vd.deploy.camera.camera import CameraError
+from vd.deploy.camera.realsense import sdk
 
 
 def camera_sdk() -> ModuleType:

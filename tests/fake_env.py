@@ -1,8 +1,8 @@
 """A test double of the environment: objects turn as the action says, without physics.
 
 The first three actions of a world are its object's angular velocity [rad/s, world frame]; ``fall_at`` makes
-chosen worlds drop their object. Everything evaluation and viewing read is there, with the meaning it has in
-``vd.envs``.
+chosen environments drop their object. Everything evaluation and viewing read is there, with the meaning it
+has in ``vd.envs``.
 """
 
 from dataclasses import dataclass, field
@@ -31,7 +31,7 @@ class FakeEnv:
     def __init__(
         self,
         objects=(FakeObject(),),
-        num_worlds=1,
+        num_envs=1,
         max_episode_steps=24,
         tolerance=0.4,
         fall_at=None,
@@ -41,7 +41,7 @@ class FakeEnv:
         self.objects = list(objects)
         self.hand = hand or FakeHand(f"dclaw{fingers}")
         self.device = "cpu"
-        self.num_worlds = n = num_worlds
+        self.num_envs = n = num_envs
         self.num_actions, self.num_observations = 3 * fingers, 8
         self.max_episode_steps = max_episode_steps
         self.cfg = SimpleNamespace(
@@ -70,30 +70,30 @@ class FakeEnv:
         self.reset()
 
     def reset(self, object_quat=None, goal_quat=None):
-        """Reset all worlds."""
-        self._restart(np.arange(self.num_worlds), object_quat, goal_quat)
+        """Reset all environments."""
+        self._restart(np.arange(self.num_envs), object_quat, goal_quat)
         self.resets += 1
         self._publish()
 
     def has_table(self):
         """Tables stay."""
-        return np.ones(self.num_worlds, dtype=bool)
+        return np.ones(self.num_envs, dtype=bool)
 
-    def _restart(self, worlds, object_quat=None, goal_quat=None):
+    def _restart(self, envs, object_quat=None, goal_quat=None):
         if object_quat is None:
-            object_quat = Rotation.random(len(worlds), rng=self._rng).as_quat()
+            object_quat = Rotation.random(len(envs), rng=self._rng).as_quat()
         if goal_quat is None:
-            goal_quat = Rotation.random(len(worlds), rng=self._rng).as_quat()
-        self.goal_quat.numpy()[worlds] = goal_quat
+            goal_quat = Rotation.random(len(envs), rng=self._rng).as_quat()
+        self.goal_quat.numpy()[envs] = goal_quat
         if not hasattr(self, "_quat"):
-            self._quat = np.tile(IDENTITY, (self.num_worlds, 1))
-        self._quat[worlds] = object_quat
-        self.step_count.numpy()[worlds] = 0
+            self._quat = np.tile(IDENTITY, (self.num_envs, 1))
+        self._quat[envs] = object_quat
+        self.step_count.numpy()[envs] = 0
 
     def step(self, action):
         """Turn the objects for one control step."""
         a = action.numpy()
-        assert a.shape == (self.num_worlds, self.num_actions) and a.dtype == np.float32
+        assert a.shape == (self.num_envs, self.num_actions) and a.dtype == np.float32
         turned = Rotation.from_rotvec(a[:, :3] * self.control_dt) * Rotation.from_quat(self._quat)
         self._quat = turned.as_quat()
         steps = self.step_count.numpy()
@@ -101,7 +101,7 @@ class FakeEnv:
         goal = Rotation.from_quat(self.goal_quat.numpy())
         error = (goal * turned.inv()).magnitude()
         still = np.linalg.norm(a[:, :3], axis=1) <= self.still_speed
-        fell = np.array([steps[w] == self.fall_at.get(w, -1) for w in range(self.num_worlds)])
+        fell = np.array([steps[w] == self.fall_at.get(w, -1) for w in range(self.num_envs)])
         success = (error <= self.tolerance) & still & ~fell
         timed_out = (steps >= self.max_episode_steps) & ~success & ~fell
         done = success | fell | timed_out
@@ -122,7 +122,7 @@ class FakeEnv:
         self._publish()
 
     def _pose(self):
-        return np.concatenate([np.tile([0.0, 0.0, 0.08], (self.num_worlds, 1)), self._quat], axis=1)
+        return np.concatenate([np.tile([0.0, 0.0, 0.08], (self.num_envs, 1)), self._quat], axis=1)
 
     def object_pose(self):
         """Present poses."""

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.chain import chains
 from vd.gap.coordinates import Coordinate
 from vd.gap.design import design

@@ -11,13 +11,13 @@ import numpy as np
 from simulated_clock import SimulatedClock
 
 from vd.assets_usd.hand_model import HandModel
-from vd.deploy.bus import BAUD_RATE, MotorBus
-from vd.deploy.connect import MOTOR
-from vd.deploy.control_table import MODELS, to_angle
-from vd.deploy.joints import Joints
-from vd.deploy.line import MotorLine
-from vd.deploy.motor import Motor
-from vd.deploy.plant import Plant
+from vd.deploy.hardware.bus import BAUD_RATE, MotorBus
+from vd.deploy.hardware.connect import MOTOR
+from vd.deploy.hardware.control_table import MODELS, to_angle
+from vd.deploy.hardware.joints import Joints
+from vd.deploy.twin.line import MotorLine
+from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.plant import Plant
 
 BYTE_S = 10.0 / BAUD_RATE
 """Eight bits, a start bit and a stop bit."""

@@ -31,7 +31,7 @@ TINY = StudentCfg(
     head_hidden=16,
     distance_hidden=8,
 )
-QUICK = DaggerCfg(rollout_steps=6, minibatch_worlds=4, epochs=2, learning_rate=3e-3)
+QUICK = DaggerCfg(rollout_steps=6, minibatch_envs=4, epochs=2, learning_rate=3e-3)
 STILL = NoiseCfg(jitter_probability=0.0, dropout_probability=0.0)
 
 
@@ -63,7 +63,7 @@ class DummyView:
         """As it is."""
         return observed.clone()
 
-    def sites(self, frame, worlds=None, *, augment):
+    def sites(self, frame, envs=None, *, augment):
         """Voxels of the bars."""
         self.asked.append(augment)
         length = 0.12 * (1.0 + frame["target"])  # [R, 2]
@@ -85,11 +85,11 @@ class DummyView:
 
 
 def make_dagger(
-    *, worlds: int = 8, seed: int = 0, noise: NoiseCfg | None = STILL, world_size: int = 1, **settings
+    *, envs: int = 8, seed: int = 0, noise: NoiseCfg | None = STILL, world_size: int = 1, **settings
 ) -> Dagger:
     """An imitation learner on the dummy, deterministic from ``seed``."""
     torch.manual_seed(seed)
-    env = DummyEnv(num_worlds=worlds, seed=seed)
+    env = DummyEnv(num_envs=envs, seed=seed)
     return Dagger(
         ReorientVecEnv(env),
         DummyView(env, noise=noise),
@@ -105,7 +105,7 @@ def make_student_runner(
 ) -> StudentRunner:
     """A runner around :func:`make_dagger`."""
     dagger = dagger or make_dagger()
-    settings = RunCfg(run_dir=run_dir, device="cpu", **{"save_every": 2, "tensorboard": False, **run})
+    settings = RunCfg(out=run_dir, device="cpu", **{"save_every": 2, "tensorboard": False, **run})
     return StudentRunner(
         dagger,
         settings,

@@ -25,7 +25,7 @@ def test_all_kernels_of_a_step_count_as_ours():
 
 def test_sim_rows_add_up(tmp_path, capsys):
     out = tmp_path / "rows.json"
-    SimCommand(worlds=(4,), objects=("cube",), hand="dclaw3", device="cpu", allegro=False, json=out).run()
+    SimCommand(envs=(4,), objects=("cube",), hand="dclaw3", device="cpu", allegro=False, json=out).run()
     (row,) = json.loads(out.read_text())["rows"]
     assert row["worlds"] == 4 and row["rows_max"] > 0
     # The step alone is what is left when the policy's time is taken off; how fast either is depends on what
@@ -36,7 +36,7 @@ def test_sim_rows_add_up(tmp_path, capsys):
 
 def test_a_dense_jacobian_has_a_row_beside_the_sparse_one(capsys):
     SimCommand(
-        worlds=(2,),
+        envs=(2,),
         objects=("cube",),
         hand="dclaw3",
         device="cpu",
@@ -50,7 +50,7 @@ def test_a_dense_jacobian_has_a_row_beside_the_sparse_one(capsys):
 
 def test_a_teacher_acts_in_its_own_task(tmp_path, capsys):
     SimCommand(
-        worlds=(4,), objects=("cube",), hand="dclaw3", policy="dclaw4-cube", device="cpu", allegro=False
+        envs=(4,), objects=("cube",), hand="dclaw3", policy="dclaw4-cube", device="cpu", allegro=False
     ).run()
     (row,) = (json.loads(line) for line in capsys.readouterr().out.splitlines())
     assert row["with_policy"] > 0.0 and row["contacts_mean"] > 0.0
@@ -91,7 +91,7 @@ def offline(monkeypatch):
 
 def test_the_allegro_example_runs_with_a_hand_of_boxes_and_without_the_network(offline, tmp_path):
     out = tmp_path / "rows.json"
-    SimCommand(worlds=(2,), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
+    SimCommand(envs=(2,), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
     (row,) = json.loads(out.read_text())["rows"]
     assert row["allegro_hand"] == "boxes of the Allegro's size"
     assert row["allegro_dt_s"] == pytest.approx(1.0 / 400.0)
@@ -146,7 +146,7 @@ def test_a_file_that_cannot_be_an_allegro_hand_is_refused(tmp_path):
 def test_a_missing_allegro_example_is_reported_in_the_row(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "newton.examples.robot.example_robot_allegro_hand", None)
     out = tmp_path / "rows.json"
-    SimCommand(worlds=(2,), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
+    SimCommand(envs=(2,), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
     (row,) = json.loads(out.read_text())["rows"]
     assert row["physics_only"] > 0.0 and "cannot run here" in row["allegro"]
     assert "allegro_physics_steps_s" not in row

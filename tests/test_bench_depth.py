@@ -11,7 +11,7 @@ from vd.bench.cli import DepthCommand
 def test_rows_hold_rates_and_agreement(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(depth, "LEAST_TIME_S", 0.01)
     out = tmp_path / "depth.json"
-    DepthCommand(worlds=(1, 2), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
+    DepthCommand(envs=(1, 2), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
     report = json.loads(out.read_text())
     assert [row["worlds"] for row in report["rows"]] == [1, 2]
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == report["rows"]
@@ -29,7 +29,7 @@ def test_an_image_of_something_else_would_show(monkeypatch, tmp_path):
     monkeypatch.setattr(depth, "LEAST_TIME_S", 0.01)
     monkeypatch.setattr(depth, "newton_rays", lambda camera, device: _wide(camera, device))
     out = tmp_path / "depth.json"
-    DepthCommand(worlds=(1,), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
+    DepthCommand(envs=(1,), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
     (row,) = json.loads(out.read_text())["rows"]
     assert row["different"] > 0.1
 

@@ -20,7 +20,7 @@ from vd.bench.gap_score import (
     score,
 )
 from vd.gap.hidden_plant import OUTSIDE
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 TRUTH = {
     "noise_floor_rad": 5e-4,

@@ -30,7 +30,7 @@ def test_latency_rows(tmp_path, capsys):
 
 
 def test_training_row(device):
-    row = measure_training(load_set("cube"), "lean", device, hand="dclaw3", worlds=2, steps=2, calls=1)
+    row = measure_training(load_set("cube"), "lean", device, hand="dclaw3", envs=2, steps=2, calls=1)
     assert row.clouds == 4 and 1000 < row.voxels < 7000
     assert set(row.parts_ms) == {"points", "voxels", "maps", "forward", "backward"}
     # parts are of the minibatch alone, and nothing of it is left out

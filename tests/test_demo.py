@@ -16,7 +16,7 @@ from test_evaluate_trace import compared
 from test_gap_report import sample_curves, sample_report
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy.log import LogWriter
+from vd.deploy.loop.log import LogWriter
 from vd.evaluate.comparison import Comparison
 from vd.gap.report import write_report
 from vd.hand_log import JOINT_CHANNELS
@@ -34,7 +34,7 @@ def option(line: list[str], flag: str) -> Path:
 
 def leave_evaluation(line: list[str]) -> None:
     rows, prediction = compared()
-    Comparison(tuple(rows), (prediction,)).write(option(line, "--output") / "eval.json")
+    Comparison(tuple(rows), (prediction,)).write(option(line, "--out") / "eval.json")
 
 
 def leave_report(line: list[str]) -> None:
@@ -60,8 +60,8 @@ def leave_training(line: list[str]) -> None:
     rows = [
         {"env_steps": 1000 * k, "goals_per_episode": goals} for k, goals in enumerate((None, 5.0, 4.5, 9.9))
     ]
-    option(line, "--run-dir").mkdir()
-    (option(line, "--run-dir") / PROGRESS_FILE).write_text("\n".join(map(json.dumps, rows)))
+    option(line, "--out").mkdir()
+    (option(line, "--out") / PROGRESS_FILE).write_text("\n".join(map(json.dumps, rows)))
 
 
 LEAVE = {
@@ -70,7 +70,7 @@ LEAVE = {
     "vd-gap run": leave_report,
     "vd-deploy": leave_flight,
     "vd-train teacher": leave_training,
-    "vd-train curves": lambda line: option(line, "--output").write_bytes(PNG),
+    "vd-train curves": lambda line: option(line, "--out").write_bytes(PNG),
 }
 """What stands in for each command: it leaves the files that the page is made of."""
 

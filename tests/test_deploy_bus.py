@@ -17,7 +17,7 @@ from simulated_clock import SimulatedClock  # noqa: E402
 from simulated_hand import simulated_bus  # noqa: E402
 
 from vd.assets_usd.hands import load_hand  # noqa: E402
-from vd.deploy.answers import (  # noqa: E402
+from vd.deploy.hardware.answers import (  # noqa: E402
     STATE_ADDRESS,
     STATE_BYTES,
     Answer,
@@ -26,15 +26,15 @@ from vd.deploy.answers import (  # noqa: E402
     SilentError,
     StateCheck,
 )
-from vd.deploy.bus import MotorBus  # noqa: E402
-from vd.deploy.control_table import MODELS, HardwareError, table, to_angle, to_counts  # noqa: E402
-from vd.deploy.joints import uncalibrated  # noqa: E402
-from vd.deploy.line import Faults, MotorLine  # noqa: E402
-from vd.deploy.motor import Motor  # noqa: E402
-from vd.deploy.packets import ALERT, Failure, Instruction, Packet, PacketReader, encode  # noqa: E402
-from vd.deploy.plant import FirstOrderPlant  # noqa: E402
-from vd.deploy.registers import MotorSettings  # noqa: E402
-from vd.deploy.twin import Twin, spoil  # noqa: E402
+from vd.deploy.hardware.bus import MotorBus  # noqa: E402
+from vd.deploy.hardware.control_table import MODELS, HardwareError, table, to_angle, to_counts  # noqa: E402
+from vd.deploy.hardware.joints import uncalibrated  # noqa: E402
+from vd.deploy.hardware.packets import ALERT, Failure, Instruction, Packet, PacketReader, encode  # noqa: E402
+from vd.deploy.hardware.registers import MotorSettings  # noqa: E402
+from vd.deploy.twin.line import Faults, MotorLine  # noqa: E402
+from vd.deploy.twin.motor import Motor  # noqa: E402
+from vd.deploy.twin.plant import FirstOrderPlant  # noqa: E402
+from vd.deploy.twin.twin import Twin, spoil  # noqa: E402
 
 IDS = (10, 11, 12)
 MODEL = "XH430-V210"
@@ -435,7 +435,7 @@ def test_the_twin_survives_broken_instructions(bus, twin):
     goals = [motor.get("goal_position") for motor in twin.motors]
     rng = random.Random(3)
     item = table(MODELS[MODEL])["goal_position"]
-    from vd.deploy.packets import BROADCAST, Instruction, Packet, encode
+    from vd.deploy.hardware.packets import BROADCAST, Instruction, Packet, encode
 
     rows = b"".join(bytes([id]) + item.to_bytes(2500) for id in IDS)
     start = item.address.to_bytes(2, "little") + (4).to_bytes(2, "little")
@@ -453,7 +453,7 @@ def test_the_twin_survives_broken_instructions(bus, twin):
 
 
 def test_the_twin_is_a_process_of_its_own():
-    command = [sys.executable, "-m", "vd.deploy.twin", "--ids", "1", "2", "--model", "XM430-W210"]
+    command = [sys.executable, "-m", "vd.deploy.twin.twin", "--ids", "1", "2", "--model", "XM430-W210"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     try:
         assert process.stdout is not None

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.camera_layer import read_camera, write_camera_layer
 from vd.assets_usd.hand_data import BASE_IN_WORLD, HandError, Intrinsics, compose, invert
 from vd.assets_usd.hands import load_hand
-from vd.deploy.calibrate import CalibrateCfg, Shot, calibrate, misplaced, object_place, save_views
-from vd.deploy.calibration_poses import plan, seat
-from vd.deploy.calibration_twin import SLIP, CalibrationTwin
-from vd.deploy.hand_eye import HandEyeError, Views, dual_quaternions, project, refine, solve, square
-from vd.deploy.markers import MarkerFinder, draw
-from vd.deploy.realsense import RealSenseCfg
+from vd.deploy.camera.calibrate import CalibrateCfg, Shot, calibrate, misplaced, object_place, save_views
+from vd.deploy.camera.calibration_poses import plan, seat
+from vd.deploy.camera.hand_eye import HandEyeError, Views, dual_quaternions, project, refine, solve, square
+from vd.deploy.camera.markers import MarkerFinder, draw
+from vd.deploy.camera.realsense import RealSenseCfg
+from vd.deploy.twin.calibration_twin import SLIP, CalibrationTwin
 
 pytest.importorskip("cv2", reason="OpenCV is not installed (extra: hardware)")
 

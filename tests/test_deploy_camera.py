@@ -8,7 +8,7 @@ import pytest
 
 from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
-from vd.deploy.camera import MAX_AGE_S, DepthFrame, StaleCamera, check_fresh
+from vd.deploy.camera.camera import MAX_AGE_S, DepthFrame, StaleCamera, check_fresh
 
 
 def test_a_device_gives_the_lens_and_the_hand_the_place():

@@ -8,8 +8,8 @@ from simulated_clock import SimulatedClock
 
 from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
-from vd.deploy.camera import DepthFrame, StaleCamera
-from vd.deploy.check_camera import camera_findings
+from vd.deploy.camera.camera import DepthFrame, StaleCamera
+from vd.deploy.camera.check_camera import camera_findings
 
 PLACE = load_hand("dclaw3").camera
 

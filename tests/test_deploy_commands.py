@@ -17,21 +17,23 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 from simulated_hand import simulated_bus
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy import check, child, cli, home, record
-from vd.deploy.connect import MOTOR, Connection, HandOptions, connect
-from vd.deploy.control_table import MODELS
-from vd.deploy.faults import BEFORE, MOVING, try_fault, try_preflight
-from vd.deploy.joints import uncalibrated
-from vd.deploy.limits import SafetyCfg
-from vd.deploy.maintain import SetBaudCfg, set_baud
-from vd.deploy.motion import reset_pose
-from vd.deploy.motor import Motor
-from vd.deploy.newton_hand import NewtonHand
-from vd.deploy.plant import Drive
-from vd.deploy.realsense import RealSenseCfg
-from vd.deploy.safety import StoppedError
-from vd.deploy.scan import FoundMotor, ScanCfg, differences, find, scan
-from vd.deploy.twin import Twin
+from vd.deploy import cli
+from vd.deploy.camera.realsense import RealSenseCfg
+from vd.deploy.hardware import check, home, record
+from vd.deploy.hardware.connect import MOTOR, Connection, HandOptions, connect
+from vd.deploy.hardware.control_table import MODELS
+from vd.deploy.hardware.joints import uncalibrated
+from vd.deploy.hardware.maintain import SetBaudCfg, set_baud
+from vd.deploy.hardware.motion import reset_pose
+from vd.deploy.hardware.scan import FoundMotor, ScanCfg, differences, find, scan
+from vd.deploy.safety.limits import SafetyCfg
+from vd.deploy.safety.safety import StoppedError
+from vd.deploy.twin import child
+from vd.deploy.twin.faults import BEFORE, MOVING, try_fault, try_preflight
+from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.newton_hand import NewtonHand
+from vd.deploy.twin.plant import Drive
+from vd.deploy.twin.twin import Twin
 from vd.gap.recording import read_recording
 from vd.sim.cfg import SimCfg
 
@@ -332,7 +334,7 @@ def test_options_and_commands_that_cannot_be_are_refused(capsys):
 
 def test_an_installed_policy_may_come_first(monkeypatch):
     flown = []
-    monkeypatch.setattr("vd.deploy.run.run", lambda cfg: flown.append(cfg) or 0)
+    monkeypatch.setattr("vd.deploy.loop.run.run", lambda cfg: flown.append(cfg) or 0)
     assert cli.main(["dclaw3-table", "--hand", "dclaw3", "--twin"]) == cli.OK
     assert flown[0].policy == "dclaw3-table" and flown[0].twin
 

@@ -12,24 +12,24 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 from simulated_hand import simulated_bus
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy import record
-from vd.deploy.action import ActionFilter
 from vd.deploy.clock import Pacer
-from vd.deploy.connect import Connection
-from vd.deploy.joints import uncalibrated
-from vd.deploy.log import LogWriter
-from vd.deploy.loop import ControlLoop, LoopCfg
-from vd.deploy.motion import move
-from vd.deploy.newton_hand import NewtonHand
-from vd.deploy.pilot import Decision
-from vd.deploy.safety import SafeHand
+from vd.deploy.hardware import record
+from vd.deploy.hardware.connect import Connection
+from vd.deploy.hardware.joints import uncalibrated
+from vd.deploy.hardware.motion import move
+from vd.deploy.loop.action import ActionFilter
+from vd.deploy.loop.log import LogWriter
+from vd.deploy.loop.loop import ControlLoop, LoopCfg
+from vd.deploy.loop.pilot import Decision
+from vd.deploy.safety.safety import SafeHand
+from vd.deploy.twin.newton_hand import NewtonHand
 from vd.envs.cfg import ReorientCfg
 from vd.gap import cli as gap
 from vd.gap.chain import chains
 from vd.gap.recording import read_recording
 from vd.gap.rollout import Rollouts
 from vd.gap.workflow import explain
-from vd.kernels.actuators import COMMAND_DELAY
+from vd.kernels.servo.actuators import COMMAND_DELAY
 from vd.sim.cfg import SimCfg
 from vd.stopping import StoppingRule
 
@@ -98,7 +98,7 @@ class Waving:
         return Decision(0.8 * np.sin(0.4 * self._step + np.arange(9.0)), float("nan"))
 
 
-def fly(folder, plant_hand, goal_s):
+def fly(folder, plant_hand, episode_s):
     """The log of a flight without an object."""
     hand = load_hand("dclaw3")
     joints = uncalibrated(hand)
@@ -110,7 +110,7 @@ def fly(folder, plant_hand, goal_s):
             move(safe, np.tile([0.0, 0.3, -0.5], 3), 0.5)
             log = LogWriter(folder, hand, run, servo={}, clock=bus.clock)
             pacer, actions = Pacer(12.0, bus.clock), ActionFilter(hand, ReorientCfg())
-            loop = ControlLoop(safe, Waving(bus.clock), actions, pacer, log, LoopCfg(goal_s, 0.0))
+            loop = ControlLoop(safe, Waving(bus.clock), actions, pacer, log, LoopCfg(episode_s, 0.0))
             loop.run([np.array([0.0, 0.0, 0.0, 1.0])])
         log.finish("done")
     return folder

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy.control_table import MODELS
-from vd.deploy.joints import CalibrationError, Joints, read_joints, uncalibrated
-from vd.deploy.motor import Motor
-from vd.deploy.newton_hand import NewtonHand
-from vd.deploy.plant import Drive
-from vd.deploy.twin import Twin
-from vd.kernels.actuators import COULOMB_TORQUE
+from vd.deploy.hardware.control_table import MODELS
+from vd.deploy.hardware.joints import CalibrationError, Joints, read_joints, uncalibrated
+from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.newton_hand import NewtonHand
+from vd.deploy.twin.plant import Drive
+from vd.deploy.twin.twin import Twin
+from vd.kernels.servo.actuators import COULOMB_TORQUE
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
@@ -125,7 +125,7 @@ def test_what_is_no_calibration_is_refused_with_file_and_field(hand, turned, tmp
 
 def test_the_simulated_hand_moves_through_the_bus(hand, turned):
     pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
-    from vd.deploy.bus import MotorBus
+    from vd.deploy.hardware.bus import MotorBus
 
     motors = [Motor(MODELS[MODEL], id) for id in turned.ids]
     with (

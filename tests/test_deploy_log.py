@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy.log import LogWriter
+from vd.deploy.loop.log import LogWriter
 from vd.gap.recording import read_recording
 from vd.hand_log import JOINT_CHANNELS, STEP_COLUMNS, STEPS_FILE, TRUTH_COLUMNS, LogError, is_log, read_log
 
@@ -86,7 +86,7 @@ def test_a_log_cut_short_is_read_to_its_last_whole_row(folder):
 def test_the_loop_does_not_wait_for_the_disk(tmp_path, monkeypatch):
     log = LogWriter(tmp_path / "log", load_hand("dclaw3"), {"goals": GOALS}, servo={})
     busy, write = threading.Event(), os.write
-    monkeypatch.setattr("vd.deploy.log.os.write", lambda *a: busy.wait(60.0) and write(*a))
+    monkeypatch.setattr("vd.deploy.loop.log.os.write", lambda *a: busy.wait(60.0) and write(*a))
     joints = dict.fromkeys(JOINT_CHANNELS, np.zeros(9))
     for step in range(3):
         now = log.started_s + step
@@ -102,7 +102,7 @@ def test_a_full_disk_is_told(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     log = LogWriter(tmp_path / "log", load_hand("dclaw3"), {"goals": GOALS}, servo={})
-    monkeypatch.setattr("vd.deploy.log.os.write", full)
+    monkeypatch.setattr("vd.deploy.loop.log.os.write", full)
     with pytest.raises(OSError, match=r"cannot write .*log: its disk is full; free some space"):
         log.finish("done")
 

@@ -7,9 +7,9 @@ from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.config import to_dict
-from vd.deploy.flight import Flight, look, make_flight
-from vd.deploy.observation import Sensed
-from vd.deploy.pilot import StudentPilot
+from vd.deploy.loop.flight import Flight, look, make_flight
+from vd.deploy.loop.observation import Sensed
+from vd.deploy.loop.pilot import StudentPilot
 from vd.envs.cfg import ReorientCfg
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRule

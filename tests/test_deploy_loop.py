@@ -13,15 +13,15 @@ from vd.assets_usd.hands import load_hand
 from vd.bundle.store import write_student
 from vd.config import to_dict
 from vd.deploy import cli
-from vd.deploy.action import ActionFilter
-from vd.deploy.answers import HandState
 from vd.deploy.clock import Pacer
-from vd.deploy.log import LogWriter
-from vd.deploy.loop import ControlLoop, LoopCfg
-from vd.deploy.pilot import Decision, TeacherPilot
-from vd.deploy.run_page import FILM_FILE, PAGE_FILE, goal_results, summary_line
-from vd.deploy.safety import StoppedError
-from vd.deploy.twin_link import TwinState
+from vd.deploy.hardware.answers import HandState
+from vd.deploy.loop.action import ActionFilter
+from vd.deploy.loop.log import LogWriter
+from vd.deploy.loop.loop import ControlLoop, LoopCfg
+from vd.deploy.loop.pilot import Decision, TeacherPilot
+from vd.deploy.loop.run_page import FILM_FILE, PAGE_FILE, goal_results, summary_line
+from vd.deploy.safety.safety import StoppedError
+from vd.deploy.twin.twin_link import TwinState
 from vd.envs.cfg import ReorientCfg
 from vd.hand_log import read_log
 from vd.paper import PAPER
@@ -129,7 +129,7 @@ def test_the_grid_stays_where_it_was_whatever_is_late():
 
 def test_it_acts_until_the_policy_has_arrived_then_holds_and_goes_on(parts):
     hand, pilot, actions, pacer, log = parts
-    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=10.0, hold_s=0.5), truth=Truth())
+    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(episode_s=10.0, hold_s=0.5), truth=Truth())
     assert loop.run([GOAL, GOAL]) == ["stopped", "stopped"]
     log.finish("done")
     read = read_log(log.folder)
@@ -168,7 +168,7 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
     truth = None if turned is None else Truth(quat=tuple(quat))
     if truth is None:
         log = LogWriter(log.folder / "real", load_hand("dclaw3"), log._run, servo={}, clock=hand.clock)
-    ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=limit_s, hold_s=0.2), truth=truth).run(
+    ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(episode_s=limit_s, hold_s=0.2), truth=truth).run(
         [GOAL]
     )
     log.finish("done")
@@ -181,11 +181,11 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
 def test_a_goal_that_is_not_reached_ends_by_its_time_and_a_lost_object_the_run(parts):
     hand, pilot, actions, pacer, log = parts
     pilot.start = 9.0
-    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=1.0, hold_s=0.0), truth=Truth())
+    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), truth=Truth())
     assert loop.run([GOAL]) == ["time limit"]
     assert len(pilot.seen) == 12
     away = Truth((0.3, 0.0, 0.03))
-    lost = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=1.0, hold_s=0.0), truth=away)
+    lost = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), truth=away)
     assert lost.run([GOAL, GOAL]) == ["lost"]
 
 
@@ -206,7 +206,7 @@ def test_missed_deadlines_are_counted_and_told(parts):
     hand, pilot, actions, pacer, log = parts
     hand.work = [0.01, 0.01, 0.1, 0.01]
     pilot.start = 9.0
-    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(goal_s=0.5, hold_s=0.0))
+    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(episode_s=0.5, hold_s=0.0))
     loop.run([GOAL])
     look = [False, False]
     assert hand.missed == [*look, False, False, True, False, False, False] and pacer.missed == 1
@@ -241,7 +241,7 @@ def test_a_teacher_flies_a_twin(tmp_path, capsys, patient):
     """Everything but a real hand: the process of the twin, its bus, limits, policy, log."""
     pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
     folder = tmp_path / "log"
-    flags = ["--hand", "dclaw3", "--twin", "--goal-s", "2", "--hold-s", "0.2", "--log", str(folder)]
+    flags = ["--hand", "dclaw3", "--twin", "--episode-s", "2", "--hold-s", "0.2", "--log", str(folder)]
     goals = ["--goal", "0,0,0,1", "0,0,0.84147,0.5403"]  # the second 2 rad away, so that it takes a while
     status, (out, words) = cli.main([*flags, *patient, *goals]), capsys.readouterr()
     if "loop rate" in words or "asked again" in words:
@@ -294,7 +294,7 @@ def test_a_student_sees_a_twin_through_the_cameras_sdk(tmp_path, capsys, patient
     task, depth = to_dict(ReorientCfg(hand="dclaw3")), to_dict(DepthCameraCfg())
     write_student(tmp_path / "student", SavedStudent(spec, network, task, depth, 0, 0), load_hand("dclaw3"))
     folder = tmp_path / "log"
-    flags = ["--hand", "dclaw3", "--twin", "--sdk", "--images", "--goal-s", "1", "--hold-s", "0"]
+    flags = ["--hand", "dclaw3", "--twin", "--sdk", "--images", "--episode-s", "1", "--hold-s", "0"]
     status = cli.main([*flags, *patient, "--log", str(folder), str(tmp_path / "student")])
     words = capsys.readouterr().err
     if "loop rate" in words or "asked again" in words:

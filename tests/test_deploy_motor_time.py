@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vd.deploy.control_table import TICK_MODULUS
-from vd.deploy.motor_time import measured_at
+from vd.deploy.hardware.control_table import TICK_MODULUS
+from vd.deploy.hardware.motor_time import measured_at
 
 
 @given(seed=st.integers(0, 2**32 - 1), rate=st.floats(-1e-4, 1e-4), begin=st.floats(0.0, 60.0))

@@ -6,7 +6,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vd.deploy.packets import HEADER, LONGEST, Instruction, Packet, PacketReader, crc16, encode, status
+from vd.deploy.hardware.packets import (
+    HEADER,
+    LONGEST,
+    Instruction,
+    Packet,
+    PacketReader,
+    crc16,
+    encode,
+    status,
+)
 
 packets = st.builds(
     Packet,

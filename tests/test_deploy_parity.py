@@ -8,9 +8,9 @@ import torch
 import warp as wp
 from sensed_world import state_of
 
-from vd.deploy.action import ActionFilter
-from vd.deploy.mirror import Mirror
-from vd.deploy.observation import seen_points, senses_of
+from vd.deploy.loop.action import ActionFilter
+from vd.deploy.loop.mirror import Mirror
+from vd.deploy.loop.observation import seen_points, senses_of
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_teacher, task_for, trained_task
@@ -48,7 +48,7 @@ def near_border(points: np.ndarray, side: float) -> int:
 def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered, episode_s):
     """Episodes of random actions; the deploy side is given joints, goal and image, nothing else."""
     nothing = RandomisationCfg(enabled=False)
-    task = ReorientCfg(hand=hand, num_worlds=1, seed=3, episode_s=episode_s, randomisation=nothing)
+    task = ReorientCfg(hand=hand, num_envs=1, seed=3, episode_s=episode_s, randomisation=nothing)
     env = ReorientEnv(task, "cpu")
     network = PRESETS["small"]
     depth = DepthCameraCfg()
@@ -105,7 +105,7 @@ def test_a_teacher_sees_in_the_mirror_what_it_saw(hand):
         policy,
         hand=None,
         objects=("cube",),
-        num_worlds=1,
+        num_envs=1,
         seed=1,
         stop_tolerance_rad=0.4,
         max_goal_angle_rad=None,
@@ -126,7 +126,7 @@ def test_a_mirror_counts_the_steps_of_a_goal_from_its_first_state_on():
     cfg = ReorientCfg(
         hand="dclaw3",
         objects=("cube",),
-        num_worlds=1,
+        num_envs=1,
         randomisation=RandomisationCfg(enabled=False),
         observation=ObservationCfg(view="goal"),
     )
@@ -149,7 +149,7 @@ def test_a_mirror_counts_the_steps_of_a_goal_from_its_first_state_on():
 
 def test_a_mirror_takes_either_quaternion_of_goal_and_object():
     task = trained_task(open_teacher("dclaw3-table", "cpu"))
-    cfg = replace(task, objects=("cube",), num_worlds=1, randomisation=RandomisationCfg(enabled=False))
+    cfg = replace(task, objects=("cube",), num_envs=1, randomisation=RandomisationCfg(enabled=False))
     env, seen = ReorientEnv(cfg, "cpu"), []
     for goal_sign, later_sign in ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0)):
         mirror, state = Mirror(cfg), state_of(env)
@@ -165,4 +165,4 @@ def test_a_mirror_takes_either_quaternion_of_goal_and_object():
 
 def test_a_mirror_wants_one_plain_world_and_the_truth():
     with pytest.raises(ValueError, match="one world"):
-        Mirror(ReorientCfg(num_worlds=2))
+        Mirror(ReorientCfg(num_envs=2))

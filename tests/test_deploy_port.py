@@ -10,12 +10,12 @@ import pytest
 
 pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
-from vd.deploy import port
-from vd.deploy.answers import BusError
-from vd.deploy.bus import MotorBus
-from vd.deploy.control_table import MODELS
-from vd.deploy.motor import Motor
-from vd.deploy.twin import Twin
+from vd.deploy.hardware import port
+from vd.deploy.hardware.answers import BusError
+from vd.deploy.hardware.bus import MotorBus
+from vd.deploy.hardware.control_table import MODELS
+from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.twin import Twin
 
 IDS, MODEL = (10, 11, 12), "XH430-V210"
 
@@ -28,7 +28,7 @@ def twin():
 
 HOLDER = """
 import sys
-from vd.deploy.port import open_port
+from vd.deploy.hardware.port import open_port
 port = open_port(sys.argv[1])
 print("open", flush=True)
 sys.stdin.read()

@@ -17,9 +17,8 @@ from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.bench.depth import bench_scene
-from vd.deploy.camera import CameraError, StaleCamera
-from vd.deploy.camera_twin import CameraTwin
-from vd.deploy.realsense import (
+from vd.deploy.camera.camera import CameraError, StaleCamera
+from vd.deploy.camera.realsense import (
     ClockMap,
     FilterCfg,
     RealSense,
@@ -29,6 +28,7 @@ from vd.deploy.realsense import (
     find_device,
     open_recording,
 )
+from vd.deploy.twin.camera_twin import CameraTwin
 from vd.sensors.cfg import D415, DepthCameraCfg, DepthSensorCfg, StereoImager
 from vd.sensors.depth_camera import DepthCamera
 from vd.sensors.depth_cloud import CameraCloud

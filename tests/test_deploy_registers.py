@@ -15,17 +15,18 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 from simulated_hand import simulated_bus
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy import adapter, check, cli, maintain
-from vd.deploy.answers import BusError, GarbledError
-from vd.deploy.bus import MotorBus
-from vd.deploy.check_registers import register_findings
-from vd.deploy.connect import MOTOR, Connection
-from vd.deploy.control_table import BAUD_RATES, CENTRE, MODELS, RAD_PER_COUNT, table
+from vd.deploy import cli
 from vd.deploy.finding import Finding
-from vd.deploy.joints import uncalibrated
-from vd.deploy.motion import reset_pose
-from vd.deploy.motor import Motor
-from vd.deploy.registers import REGISTERS
+from vd.deploy.hardware import adapter, check, maintain
+from vd.deploy.hardware.answers import BusError, GarbledError
+from vd.deploy.hardware.bus import MotorBus
+from vd.deploy.hardware.check_registers import register_findings
+from vd.deploy.hardware.connect import MOTOR, Connection
+from vd.deploy.hardware.control_table import BAUD_RATES, CENTRE, MODELS, RAD_PER_COUNT, table
+from vd.deploy.hardware.joints import uncalibrated
+from vd.deploy.hardware.motion import reset_pose
+from vd.deploy.hardware.registers import REGISTERS
+from vd.deploy.twin.motor import Motor
 
 FACTORY = {name: item.initial for name, item in table(MODELS[MOTOR]).items()}
 PERIOD_S, STEP_RAD = 0.02, 0.3

@@ -15,10 +15,10 @@ pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 from simulated_hand import energised, push, simulated_bus
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy.joints import Joints, uncalibrated
-from vd.deploy.limits import PERIOD_S, SafetyCfg
-from vd.deploy.motion import move, reset_pose
-from vd.deploy.safety import WATCH_S, SafeHand, StoppedError
+from vd.deploy.hardware.joints import Joints, uncalibrated
+from vd.deploy.hardware.motion import move, reset_pose
+from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
+from vd.deploy.safety.safety import WATCH_S, SafeHand, StoppedError
 
 EXCHANGE_S = 0.006
 """Asking nine motors once: 3.7 ms on the line, and what the program waits for."""

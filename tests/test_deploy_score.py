@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
-from vd.deploy.log import LogWriter
-from vd.deploy.mocap import MocapError, read_mocap
-from vd.deploy.score import find_offset, in_world, score_run
-from vd.deploy.score_command import ScoreCfg, score
+from vd.deploy.loop.log import LogWriter
+from vd.deploy.loop.mocap import MocapError, read_mocap
+from vd.deploy.loop.score import find_offset, in_world, score_run
+from vd.deploy.loop.score_command import ScoreCfg, score
 from vd.evaluate.statistics import rotation_angle
 from vd.hand_log import JOINT_CHANNELS, STEP_COLUMNS, read_log
 
@@ -53,7 +53,7 @@ class Run:
                 now = log.started_s + self.t[here]
                 log.step(now, now, joints, list(values.values()))
             end = self.t[(number + 1) * steps - 1]
-            monkeypatch.setattr("vd.deploy.log.time.monotonic", lambda end=end: log.started_s + end)
+            monkeypatch.setattr("vd.deploy.loop.log.time.monotonic", lambda end=end: log.started_s + end)
             outcome = "time limit" if number == FIFTH_ENDS_BY_TIME else "stopped"
             log.event("stop", goal=number, outcome=outcome, distance=ERRORS[number] + 0.02)
         log.finish("all goals pursued")

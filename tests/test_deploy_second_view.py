@@ -7,10 +7,10 @@ from sensed_world import state_of
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
-from vd.deploy.flight import make_flight, mirror_task
-from vd.deploy.mirror import Mirror
-from vd.deploy.observation import Sensed
-from vd.deploy.pilot import TeacherPilot, TrackingPilot
+from vd.deploy.loop.flight import make_flight, mirror_task
+from vd.deploy.loop.mirror import Mirror
+from vd.deploy.loop.observation import Sensed
+from vd.deploy.loop.pilot import TeacherPilot, TrackingPilot
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_policy

@@ -9,10 +9,10 @@ import pytest
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy import cli
-from vd.deploy.action import ActionFilter
-from vd.deploy.log import LogWriter
-from vd.deploy.mirror import Mirror
-from vd.deploy.shadow import Difference, ShadowCfg, differences, summary
+from vd.deploy.loop.action import ActionFilter
+from vd.deploy.loop.log import LogWriter
+from vd.deploy.loop.mirror import Mirror
+from vd.deploy.loop.shadow import Difference, ShadowCfg, differences, summary
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.evaluate.senses import EnvironmentSenses
 from vd.hand_log import JOINT_CHANNELS, LogError, read_log
@@ -99,7 +99,7 @@ def test_a_log_is_followed_from_before_its_first_step(tmp_path, monkeypatch):
             done["end"] = {"reason": "done"}
         (folder / "run.json").write_text(json.dumps({**run, **done}))
 
-    monkeypatch.setattr("vd.deploy.shadow.time.sleep", grow)
+    monkeypatch.setattr("vd.deploy.loop.shadow.time.sleep", grow)
     found = list(differences(ShadowCfg(folder, follow=True, every=6)))
     assert len(found) == STEPS // 6 and all(one.ok for one in found)
 
@@ -125,9 +125,9 @@ def test_an_object_found_elsewhere_is_told():
 def test_an_image_of_something_else_is_told(tmp_path):
     """The image that the simulator itself renders is the same, one of a moment later is not."""
     folder = write(tmp_path / "log")
-    task = ReorientCfg(hand="dclaw3", num_worlds=1, randomisation=RandomisationCfg(enabled=False))
+    task = ReorientCfg(hand="dclaw3", num_envs=1, randomisation=RandomisationCfg(enabled=False))
     mirror = Mirror(task)
-    from vd.deploy.shadow import _sensed
+    from vd.deploy.loop.shadow import _sensed
 
     camera = EnvironmentSenses(mirror.env, mirror.env.hand.camera, DepthCameraCfg()).camera
     log = read_log(folder)

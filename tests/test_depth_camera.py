@@ -41,7 +41,7 @@ def scenes():
 
 def make(scene, state, **settings):
     return DepthCamera.of_scene(
-        scene, state.body_q.reshape((scene.num_worlds, -1)), DepthCameraCfg(**settings), seed=5
+        scene, state.body_q.reshape((scene.num_envs, -1)), DepthCameraCfg(**settings), seed=5
     )
 
 
@@ -88,7 +88,7 @@ def test_objects_have_the_size_of_their_world(device):
     scene = build_scene(
         hand=load_hand("dclaw3"),
         objects=objects,
-        num_worlds=4,
+        num_envs=4,
         cfg=SimCfg(),
         device=device,
         scales=(0.8, 1.2),

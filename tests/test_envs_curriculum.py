@@ -27,7 +27,7 @@ def make(curriculum: CurriculumCfg, **changes) -> ReorientEnv:
     cfg = ReorientCfg(
         hand="dclaw3",
         objects=("cube",),
-        num_worlds=2,
+        num_envs=2,
         randomisation=RandomisationCfg(enabled=False),
         curriculum=curriculum,
     )
@@ -114,7 +114,7 @@ def test_goals_are_asked_for_more_exactly_as_stillness_tightens():
 def test_what_has_to_be_lifted_gets_its_weight_as_stillness_tightens():
     tightening = dataclasses.replace(TIGHTENING, object_weight=0.01)
     table = TableCfg(lift_share=0.5, away_share=1.0, away_s=(0.01, 0.01))
-    env = make(CurriculumCfg(tightening=tightening), table=table, num_worlds=4)
+    env = make(CurriculumCfg(tightening=tightening), table=table, num_envs=4)
     lifted = env.must_lift.numpy() == 1
     assert sorted(lifted) == [False, False, True, True]
 

@@ -14,7 +14,7 @@ def make(episode_s: float = 10.0) -> ReorientEnv:
     cfg = ReorientCfg(
         hand="dclaw3",
         objects=("cuboid",),
-        num_worlds=WORLDS,
+        num_envs=WORLDS,
         episode_s=episode_s,
         randomisation=RandomisationCfg(enabled=False),
         success=SuccessCfg(

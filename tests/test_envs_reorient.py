@@ -21,8 +21,8 @@ from vd.envs.cfg import (
 )
 from vd.envs.reorient import ReorientEnv
 from vd.envs.table import ALWAYS, must_lift, table_steps
-from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
-from vd.kernels.shapes import (
+from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
+from vd.kernels.task.shapes import (
     EXTENT_CENTRE_M,
     SHAPE_UNIT_M,
     extent_directions,
@@ -40,7 +40,7 @@ STILL = RandomisationCfg(enabled=False)
 
 
 def make(device: str = "cpu", **changes) -> ReorientEnv:
-    cfg = ReorientCfg(hand="dclaw3", objects=("cube",), num_worlds=WORLDS, randomisation=STILL)
+    cfg = ReorientCfg(hand="dclaw3", objects=("cube",), num_envs=WORLDS, randomisation=STILL)
     return ReorientEnv(dataclasses.replace(cfg, **changes), device)
 
 
@@ -49,7 +49,7 @@ def run(env: ReorientEnv, steps: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     seen = []
     for _ in range(steps):
-        env.action.assign(rng.uniform(-1, 1, (env.num_worlds, env.num_actions)).astype(np.float32))
+        env.action.assign(rng.uniform(-1, 1, (env.num_envs, env.num_actions)).astype(np.float32))
         env.step(env.action)
         seen.append(env.observation.numpy().copy())
     env.check()
@@ -111,7 +111,7 @@ def test_height_above_the_table_pays_and_lying_on_it_does_not():
 
 def test_tables_leave_their_share_of_worlds_in_time():
     """In a world that loses its table after 1.5 s the object, at rest until then, falls."""
-    env = make(table=TableCfg(away_share=0.5, away_s=(1.5, 1.5)), num_worlds=4, episode_s=2.5)
+    env = make(table=TableCfg(away_share=0.5, away_s=(1.5, 1.5)), num_envs=4, episode_s=2.5)
     lost = table_steps(env.cfg) < ALWAYS
     assert lost.sum() == 2
     heights, fell, gone = [], np.zeros(4, dtype=int), round(1.5 * env.cfg.sim.control_hz)
@@ -130,7 +130,7 @@ def test_tables_leave_their_share_of_worlds_in_time():
 
 
 def test_times_of_tables_lie_between_their_bounds():
-    cfg = ReorientCfg(num_worlds=1000, table=TableCfg(away_share=0.3, away_s=(1.0, 3.0)))
+    cfg = ReorientCfg(num_envs=1000, table=TableCfg(away_share=0.3, away_s=(1.0, 3.0)))
     steps = table_steps(cfg)
     away = steps < ALWAYS
     assert away.sum() == 300 and steps[away].min() == 12 and steps[away].max() == 36
@@ -141,7 +141,7 @@ def test_times_of_tables_lie_between_their_bounds():
 
 
 def test_worlds_that_must_lift_are_those_that_lose_their_table_first():
-    cfg = ReorientCfg(num_worlds=1000, table=TableCfg(away_share=0.3, lift_share=0.5))
+    cfg = ReorientCfg(num_envs=1000, table=TableCfg(away_share=0.3, lift_share=0.5))
     away, lift = table_steps(cfg) < ALWAYS, must_lift(cfg) == 1
     assert away.sum() == 300 and lift.sum() == 500 and lift[away].all()
     assert not must_lift(dataclasses.replace(cfg, table=TableCfg(away_share=0.3))).any()
@@ -151,9 +151,9 @@ def test_worlds_that_must_lift_are_those_that_lose_their_table_first():
 
 
 def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
-    """Objects at rest on the table, each at its goal: half of the worlds must lift theirs."""
+    """Objects at rest on the table, each at its goal: half of the environments must lift theirs."""
     loose = SuccessCfg(rotation_rad=4.0, joint_speed_rad_s=0.0, action_norm=0.0)
-    env = make(table=TableCfg(lift_share=0.5), success=loose, num_worlds=8)
+    env = make(table=TableCfg(lift_share=0.5), success=loose, num_envs=8)
     lift = must_lift(env.cfg) == 1
     reached = np.zeros(8, dtype=int)
     for _ in range(24):
@@ -305,7 +305,7 @@ def test_a_run_goes_on_without_the_few_worlds_that_fail(tmp_path, effects):
     env.dump_dir = tmp_path
     env.sim.joint_qd.numpy()[:, 0] = np.nan
     env.step(env.action)
-    env.check()  # all worlds in the first step: more than the rate, and few
+    env.check()  # all environments in the first step: more than the rate, and few
     run(env, 5)
     before = env.step_count.numpy().copy()
     env.sim.joint_qd.numpy()[2, 0] = np.nan
@@ -321,7 +321,7 @@ def test_a_run_goes_on_without_the_few_worlds_that_fail(tmp_path, effects):
     for _ in range(40):
         env.sim.joint_qd.numpy()[1, 0] = np.nan
         env.step(env.action)
-    with pytest.raises(SimulationError, match=r"4 of \d+ worlds left the finite numbers"):
+    with pytest.raises(SimulationError, match=r"4 of \d+ environments left the finite numbers"):
         env.check()
 
 
@@ -339,12 +339,12 @@ def test_saved_state_continues_exactly():
 
 def test_state_of_another_size_is_refused():
     state = make().state_dict()
-    with pytest.raises(ValueError, match="num_worlds"):
-        make(num_worlds=2).load_state_dict(state)
+    with pytest.raises(ValueError, match="num_envs"):
+        make(num_envs=2).load_state_dict(state)
 
 
 def test_the_shape_is_seen_behind_the_state_and_changes_nothing_else(device):
-    seeing = {"objects": ("symmetric",), "num_worlds": 14, "observation": ObservationCfg(shape="full")}
+    seeing = {"objects": ("symmetric",), "num_envs": 14, "observation": ObservationCfg(shape="full")}
     random = RandomisationCfg(enabled=True, observation_noise_mean=0.0, observation_noise_std=0.0)
     env = make(device, **seeing, randomisation=random)
     run(env, 3)
@@ -357,7 +357,7 @@ def test_the_shape_is_seen_behind_the_state_and_changes_nothing_else(device):
     extents = EXTENT_CENTRE_M + SHAPE_UNIT_M * observation[:, state:][:, slices["extent"]]
     pose, goal = env.object_pose(), env.goal_quat.numpy()
     assert set(np.round(env.scene.world_scale, 3)) == {0.95, 1.0, 1.05}, "sizes differ"
-    for w in range(env.num_worlds):
+    for w in range(env.num_envs):
         cloud = env.scene.world_scale[w] * env.objects[env.world_object[w]].surface_points.astype(float)
         placed = Rotation.from_quat(pose[w, 3:]).apply(cloud)
         assert extents[w] == pytest.approx((placed @ np.array(extent_directions(3)).T).max(axis=0), abs=1e-5)
@@ -375,7 +375,7 @@ def test_a_blind_teacher_observes_as_before():
 
 
 def test_randomisation_reaches_the_solver():
-    env = make(num_worlds=16, randomisation=RandomisationCfg(enabled=True))
+    env = make(num_envs=16, randomisation=RandomisationCfg(enabled=True))
     model, mujoco = env.sim.model, env.sim.solver.mjw_model
     mass = model.body_mass.numpy().reshape(16, -1)[:, env.scene.object_body]
     low, high = env.cfg.randomisation.object_mass_kg
@@ -390,14 +390,14 @@ def test_randomisation_reaches_the_solver():
 
 def test_objects_weigh_what_their_files_say_where_nothing_is_drawn(tmp_path):
     write_object(tmp_path / "cube.usd", dataclasses.replace(cube(), mass_kg=0.25))
-    env = make(num_worlds=2, objects=(str(tmp_path),))
+    env = make(num_envs=2, objects=(str(tmp_path),))
     assert env.sim.model.body_mass.numpy().reshape(2, -1)[:, env.scene.object_body] == pytest.approx(0.25)
     assert env.randomiser.object_mass.numpy() == pytest.approx(0.25)
 
 
 def test_restitution_is_drawn_and_saved_and_reaches_the_contacts(device):
     bouncy = RandomisationCfg(restitution=(0.5, 0.9))
-    env = make(device, num_worlds=16, randomisation=bouncy)
+    env = make(device, num_envs=16, randomisation=bouncy)
     drawn = env.sim.restitution
     table = drawn.table.numpy()
     assert len(np.unique(table)) == 16 and table.min() >= 0.5 and table.max() <= 0.9
@@ -411,13 +411,13 @@ def test_restitution_is_drawn_and_saved_and_reaches_the_contacts(device):
     run(env, 10)
     state = env.state_dict()
     expected = run(env, 5, seed=2)
-    other = make(device, num_worlds=16, randomisation=bouncy)
+    other = make(device, num_envs=16, randomisation=bouncy)
     other.load_state_dict(state)
     np.testing.assert_array_equal(other.sim.restitution.table.numpy(), drawn.table.numpy())
     if device == "cpu":
         assert np.array_equal(run(other, 5, seed=2), expected)
     with pytest.raises(ValueError, match=r"randomisation\.restitution"):
-        make(device, num_worlds=16, randomisation=RandomisationCfg()).load_state_dict(state)
+        make(device, num_envs=16, randomisation=RandomisationCfg()).load_state_dict(state)
 
 
 def test_without_restitution_nothing_of_it_is_built():
@@ -429,7 +429,7 @@ def test_bad_configurations_name_the_field():
     with pytest.raises(ValueError, match=r"randomisation\.restitution is 0\.5 1\.2"):
         make(randomisation=RandomisationCfg(restitution=(0.5, 1.2)))
     with pytest.raises(ValueError, match="fewer than the"):
-        make(objects=("symmetric",), num_worlds=1)
+        make(objects=("symmetric",), num_envs=1)
     with pytest.raises(ValueError, match="fingertip = 'wet'"):
         make(fingertip="wet")
     with pytest.raises(ValueError, match=r"sim\.physics_hz"):

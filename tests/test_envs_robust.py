@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.conditions import CONDITIONS, EXACT
-from vd.kernels import actuators, dynamics, history
-from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.servo import actuators
+from vd.kernels.task import dynamics, history
+from vd.kernels.task.observations import teacher_observation_slices
 from vd.sim.cfg import SimCfg, coarser
 
 WORLDS = 3
@@ -18,7 +19,7 @@ STEP_S = 1.0 / 12.0
 
 
 def make(**changes) -> ReorientEnv:
-    cfg = ReorientCfg(hand="dclaw3", objects=("cube",), num_worlds=WORLDS, randomisation=EXACT)
+    cfg = ReorientCfg(hand="dclaw3", objects=("cube",), num_envs=WORLDS, randomisation=EXACT)
     return ReorientEnv(dataclasses.replace(cfg, **changes), "cpu")
 
 
@@ -215,8 +216,8 @@ def test_the_critic_is_told_the_present_as_it_would_be_seen_at_once_and_without_
 def test_a_share_of_the_worlds_stays_nominal():
     mixed = CONDITIONS["mixed"]
     random = dataclasses.replace(mixed, nominal_share=0.5, redraw_s=0.0, force_probability=1.0)
-    env = make(randomisation=random, num_worlds=8, episode_s=0.25)
-    for _ in range(4):  # new episodes draw again, and it is the same worlds that do not
+    env = make(randomisation=random, num_envs=8, episode_s=0.25)
+    for _ in range(4):  # new episodes draw again, and it is the same environments that do not
         rows = env.sim.servo.parameters.numpy().reshape(8, 9, -1)
         varied = {
             "stiffness": env.randomiser.kp.numpy()[:, 0] != np.float32(env.hand.kp[0]),
@@ -228,8 +229,8 @@ def test_a_share_of_the_worlds_stays_nominal():
         }
         first = varied["latency"]
         assert first.sum() == 4
-        for name, worlds in varied.items():
-            assert worlds.tolist() == first.tolist(), name
+        for name, envs in varied.items():
+            assert envs.tolist() == first.tolist(), name
         for _ in range(3):
             env.action.fill_(0.2)
             env.step(env.action)

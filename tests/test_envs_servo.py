@@ -13,8 +13,8 @@ from vd.assets_usd.hand_model import read_hand
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.envs.servo import needs_servo, servo_ranges
-from vd.kernels import actuators
-from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.servo import actuators
+from vd.kernels.task.observations import teacher_observation_slices
 from vd.sim.cfg import SimCfg
 
 WORLDS = 4
@@ -45,7 +45,7 @@ def layer(hand, tmp_path):
 
 
 def make(hand_layer: str | None = None, **changes) -> ReorientEnv:
-    cfg = ReorientCfg(hand="dclaw3", hand_layer=hand_layer, num_worlds=WORLDS, randomisation=STILL)
+    cfg = ReorientCfg(hand="dclaw3", hand_layer=hand_layer, num_envs=WORLDS, randomisation=STILL)
     return ReorientEnv(dataclasses.replace(cfg, **changes), "cpu")
 
 
@@ -54,7 +54,7 @@ def run(env: ReorientEnv, steps: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     seen = []
     for _ in range(steps):
-        env.action.assign(rng.uniform(-1, 1, (env.num_worlds, env.num_actions)).astype(np.float32))
+        env.action.assign(rng.uniform(-1, 1, (env.num_envs, env.num_actions)).astype(np.float32))
         env.step(env.action)
         seen.append(env.observation.numpy().copy())
     env.check()
@@ -64,7 +64,7 @@ def run(env: ReorientEnv, steps: int, seed: int = 0) -> np.ndarray:
 def rows(env: ReorientEnv) -> np.ndarray:
     """Servo parameters of every world and joint, [N, D, P]."""
     assert env.sim.servo is not None
-    return env.sim.servo.parameters.numpy().reshape(env.num_worlds, env.num_actions, -1).copy()
+    return env.sim.servo.parameters.numpy().reshape(env.num_envs, env.num_actions, -1).copy()
 
 
 def joints(env: ReorientEnv) -> np.ndarray:
@@ -133,7 +133,7 @@ def test_worlds_draw_from_the_identified_intervals(layer):
         backlash={"width_rad": (0.03, 0.02, 0.05)},
         coulomb_friction={"tau_c_nm": 0.04},
     )
-    env = make(path, num_worlds=24, randomisation=SERVOS)
+    env = make(path, num_envs=24, randomisation=SERVOS)
     drawn = rows(env)
     width = drawn[:, :, actuators.BACKLASH_WIDTH]
     assert len(np.unique(width)) == width.size and width.min() >= 0.02 and width.max() <= 0.05
@@ -152,7 +152,7 @@ def test_worlds_draw_from_the_identified_intervals(layer):
 
 def test_effects_are_drawn_without_a_layer():
     effects = {"command_delay.delay_s": (0.0, 0.04), "encoder_bias.bias_rad": (-0.02, 0.02)}
-    drawn = rows(make(num_worlds=16, randomisation=dataclasses.replace(SERVOS, effects=effects)))
+    drawn = rows(make(num_envs=16, randomisation=dataclasses.replace(SERVOS, effects=effects)))
     for column, (low, high) in (
         (actuators.COMMAND_DELAY, (0.0, 0.04)),
         (actuators.ENCODER_BIAS, (-0.02, 0.02)),

@@ -13,13 +13,13 @@ from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.envs.symmetry import WorldOrder
 from vd.envs.view_tables import SECTOR
-from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.task.observations import teacher_observation_slices
 
 WORLDS = 6
 CFG = ReorientCfg(
     hand="dclaw3",
     objects=("cuboid",),
-    num_worlds=WORLDS,
+    num_envs=WORLDS,
     randomisation=RandomisationCfg(enabled=False),
     observation=ObservationCfg(shape="full", view="goal"),
 )
@@ -66,7 +66,7 @@ def test_turned_worlds_look_and_move_the_same(hand):
     action = rng.uniform(-1, 1, (WORLDS, joints)).astype(np.float32)
     act(env, action)
     after, kept = env.observation.numpy().copy(), env.done.numpy() == 0
-    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the worlds are in different views"
+    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the environments are in different views"
 
     tips = load_hand(hand).tip_poses(np.zeros(joints))
     azimuth = np.arctan2(tips[:, 1], -tips[:, 0])  # the base is upside down, turned about y
@@ -127,7 +127,7 @@ def test_mirrored_worlds_look_and_move_the_same():
     action = rng.uniform(-1, 1, (WORLDS, 9)).astype(np.float32)
     act(env, action)
     after, kept = env.observation.numpy().copy(), env.done.numpy() == 0
-    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the worlds are in different views"
+    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the environments are in different views"
 
     points = env.observer.shapes._points  # drawn at random, so that theirs is another cuboid
     surface = points.numpy().copy()
@@ -177,7 +177,7 @@ def test_a_hand_whose_fingers_lean_is_no_mirror_image():
 
 
 def test_the_axis_of_the_wanted_rotation_is_in_one_sector_when_the_goal_is_new():
-    env = ReorientEnv(dataclasses.replace(CFG, num_worlds=60), "cpu")
+    env = ReorientEnv(dataclasses.replace(CFG, num_envs=60), "cpu")
     pose, goal = env.object_pose()[:, 3:], env.goal_quat.numpy()
     wanted = (Rotation.from_quat(goal) * Rotation.from_quat(pose).inv()).as_rotvec()
     seen = np.stack(
@@ -243,7 +243,7 @@ def test_a_policy_of_views_gives_labels_in_the_order_of_the_world():
 
 def test_with_mirrors_every_wanted_rotation_is_counter_clockwise_from_above():
     mirrored = ObservationCfg(view="mirrored")
-    env = ReorientEnv(dataclasses.replace(CFG, num_worlds=60, observation=mirrored), "cpu")
+    env = ReorientEnv(dataclasses.replace(CFG, num_envs=60, observation=mirrored), "cpu")
     columns = teacher_observation_slices(3)["relative_orientation"]
     of_goal = Rotation.from_quat(env.observation.numpy()[:, columns])  # the object's, from the goal
     wanted = of_goal.inv().as_rotvec()

@@ -26,7 +26,7 @@ def task_of(policy, **changes):
     values = dict(
         hand=None,
         objects=("cube",),
-        num_worlds=2,
+        num_envs=2,
         seed=0,
         stop_tolerance_rad=0.4,
         max_goal_angle_rad=None,
@@ -154,8 +154,8 @@ def test_evaluation_at_rest_of_the_installed_policy_beats_doing_nothing(tmp_path
 
     flags = ["--objects", "cube", "--episodes", "8", "--max-goal-angle", "1.0", "--episode-s", "3"]
     flags += ["--device", "cpu"]
-    assert main(["dclaw4-cube", *flags, "--output", str(tmp_path / "trained")]) == 0
-    assert main(["--agent", "zero", "--at-rest", *flags, "--output", str(tmp_path / "zero")]) == 0
+    assert main(["dclaw4-cube", *flags, "--out", str(tmp_path / "trained")]) == 0
+    assert main(["--agent", "zero", "--at-rest", *flags, "--out", str(tmp_path / "zero")]) == 0
     found = (Comparison.read(tmp_path / name / "eval.json").rows for name in ("trained", "zero"))
     trained, zero = (next(row.result for row in rows if row.stopped_by == SUCCESS) for rows in found)
     assert trained.protocol.at_rest and zero.protocol.at_rest

@@ -44,9 +44,9 @@ def collect(env, policy, starts=None, goals=None, *, episodes=0):
     return record(env, policy, episodes, starts=starts, goals=goals).episodes(StoppingRule(0.4), "success")
 
 
-def quarter_turn_ahead(worlds=1, angle=np.pi / 2):
-    start = np.tile([0.0, 0.0, 0.0, 1.0], (1, worlds, 1))
-    goal = np.tile(Rotation.from_rotvec([0, 0, angle]).as_quat(), (1, worlds, 1))
+def quarter_turn_ahead(envs=1, angle=np.pi / 2):
+    start = np.tile([0.0, 0.0, 0.0, 1.0], (1, envs, 1))
+    goal = np.tile(Rotation.from_rotvec([0, 0, angle]).as_quat(), (1, envs, 1))
     return start, goal
 
 
@@ -77,8 +77,8 @@ def test_a_drop_ends_the_episode_and_fails_at_every_tolerance():
 
 
 def test_only_the_first_episode_of_a_world_in_a_round_counts():
-    env = fake(num_worlds=2, max_episode_steps=24, fall_at={0: 3})  # world 0 goes on dropping every 3 steps
-    starts, goals = quarter_turn_ahead(worlds=2)
+    env = fake(num_envs=2, max_episode_steps=24, fall_at={0: 3})  # world 0 goes on dropping every 3 steps
+    starts, goals = quarter_turn_ahead(envs=2)
     first, second = collect(env, Turn(0.0), starts, goals)
     assert first.fell and first.steps == 3
     assert not second.fell and second.steps == 24
@@ -86,11 +86,11 @@ def test_only_the_first_episode_of_a_world_in_a_round_counts():
 
 
 @pytest.mark.parametrize("worlds", [3, 5, 12, 40])
-def test_every_start_and_goal_is_run_once_whatever_the_number_of_worlds(worlds):
+def test_every_start_and_goal_is_run_once_whatever_the_number_of_worlds(envs):
     objects = [FakeObject("a"), FakeObject("b", CUBE), FakeObject("c")]
     drawn = [draw_starts_and_goals(o.name, 4, seed=1) for o in objects]
     starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
-    episodes = collect(fake(objects, num_worlds=worlds, max_episode_steps=2), Turn(0.0), starts, goals)
+    episodes = collect(fake(objects, num_envs=envs, max_episode_steps=2), Turn(0.0), starts, goals)
     assert [e.object_index for e in episodes] == [0] * 4 + [1] * 4 + [2] * 4
     np.testing.assert_allclose([e.goal_quat for e in episodes], goals.reshape(-1, 4), atol=1e-6)
     # Nothing moves, so the error stays: up to symmetry for the cube.
@@ -103,7 +103,7 @@ def test_every_start_and_goal_is_run_once_whatever_the_number_of_worlds(worlds):
 
 
 def test_episodes_the_environment_draws_are_recorded_as_they_were_run():
-    env = fake([FakeObject("a"), FakeObject("b", CUBE)], num_worlds=4, max_episode_steps=2)
+    env = fake([FakeObject("a"), FakeObject("b", CUBE)], num_envs=4, max_episode_steps=2)
     # Nothing moves: the error at the end is the angle between the start and the goal that are recorded.
     episodes = collect(env, Turn(0.0), episodes=5)
     assert [e.object_index for e in episodes] == [0] * 5 + [1] * 5
@@ -116,8 +116,8 @@ def test_episodes_the_environment_draws_are_recorded_as_they_were_run():
 
 def test_starts_and_goals_the_environment_draws_do_not_depend_on_the_policy():
     def run(speed, fall_at):
-        # Worlds that drop their object reset, and so draw, more often before the second round begins.
-        env = fake([FakeObject("a")], num_worlds=3, max_episode_steps=6, fall_at=fall_at)
+        # Environments that drop their object reset, and so draw, more often before the second round begins.
+        env = fake([FakeObject("a")], num_envs=3, max_episode_steps=6, fall_at=fall_at)
         return collect(env, Turn(speed), episodes=9)
 
     first, second = run(0.0, {0: 1}), run(2.0, {1: 2, 2: 3})
@@ -126,7 +126,7 @@ def test_starts_and_goals_the_environment_draws_do_not_depend_on_the_policy():
 
 
 def test_fewer_worlds_than_objects_is_refused():
-    env = fake([FakeObject("a"), FakeObject("b")], num_worlds=2)
+    env = fake([FakeObject("a"), FakeObject("b")], num_envs=2)
     env.world_object[:] = 0
     with pytest.raises(ValueError, match="no world simulates object 1"):
         collect(env, Turn(0.0), *(np.tile(x, (2, 1, 1)) for x in quarter_turn_ahead()))
@@ -150,11 +150,11 @@ def test_goals_are_uniform_within_the_largest_angle():
     assert (near <= 0.8).mean() == pytest.approx((0.8 - np.sin(0.8)) / (1 - np.sin(1.0)), abs=0.015)
 
 
-def rows_of(objects, episodes=10, worlds=None, fall_at=None, policy=None):
+def rows_of(objects, episodes=10, envs=None, fall_at=None, policy=None):
     """The rows of a policy that predicts nothing: by the true distance, and by the success criteria."""
     drawn = [draw_starts_and_goals(o.name, episodes, seed=1) for o in objects]
     starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
-    env = fake(objects, num_worlds=worlds or len(objects) * episodes, max_episode_steps=4, fall_at=fall_at)
+    env = fake(objects, num_envs=envs or len(objects) * episodes, max_episode_steps=4, fall_at=fall_at)
     trace = record(env, policy or Turn(0.0), episodes, starts=starts, goals=goals)
     protocol = Protocol(
         policy="zero",

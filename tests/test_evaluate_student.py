@@ -29,7 +29,7 @@ from vd.vision.saved import SavedStudent, StudentSpec, student_export
 TASK = ReorientCfg(
     hand="dclaw3",
     objects=("cube",),
-    num_worlds=3,
+    num_envs=3,
     episode_s=0.5,
     success=replace(SuccessCfg(), rotation_rad=NEVER_RAD),
     success_ends_episode=True,
@@ -178,7 +178,7 @@ def test_without_a_table_objects_fall_and_it_comes_back():
 def test_students_and_teacher_side_by_side(tmp_path, capsys):
     students = [save_student(tmp_path / f"stage{n}" / "student.pt", n) for n in (1, 2)]
     flags = ["--objects", "training=cuboid", "both=cube", "both=cuboid", "--episodes", "2", "--device", "cpu"]
-    flags += ["--episode-s", "0.5", "--output", str(tmp_path / "out")]
+    flags += ["--episode-s", "0.5", "--out", str(tmp_path / "out")]
     assert main([*students, "dclaw3-table", "--agent", "zero", *flags, "--json"]) == 0
     printed = json.loads(capsys.readouterr().out)
     comparison = Comparison.read(tmp_path / "out" / "eval.json")
@@ -208,7 +208,7 @@ def test_a_bundled_student_with_scanned_goals_in_the_air(tmp_path, capsys):
     path = str(tmp_path / "bundle")
     assert train(["bundle", save_student(tmp_path / "student.pt", 1), path]) == 0
     flags = ["--in-air", "--goals", "scan", "--episodes", "2", "--device", "cpu", "--episode-s", "2.5"]
-    assert main([path, *flags, "--sees", "rendered", "--output", str(tmp_path / "out")]) == 0
+    assert main([path, *flags, "--sees", "rendered", "--out", str(tmp_path / "out")]) == 0
     assert "object falls" in capsys.readouterr().out
     comparison = Comparison.read(tmp_path / "out" / "eval.json")
     by_prediction, by_truth = comparison.rows

@@ -65,7 +65,7 @@ def asked(monkeypatch, found):
         ]
         told = (replace(prediction, policy=name, group=group),) if student else ()
         comparison = Comparison(tuple(rows), told, software={"device": "a double"})
-        comparison.write(cfg.output / "eval.json")
+        comparison.write(cfg.out / "eval.json")
         return comparison
 
     monkeypatch.setattr(suite_run, "compare", compare)
@@ -78,7 +78,7 @@ def asked(monkeypatch, found):
 
 
 def suite(tmp_path, *policies, **changes):
-    settings = dict(suite="paper", objects=SYMMETRIC, output=tmp_path / "out", device="cpu")
+    settings = dict(suite="paper", objects=SYMMETRIC, out=tmp_path / "out", device="cpu")
     return EvalCfg(policies=policies or (TEACHER,), **{**settings, **changes})
 
 
@@ -87,7 +87,7 @@ def run(cfg):
 
 
 def asked_for(asked):
-    return [(cfg.output.parent.name, cfg.agent_names[0]) for cfg in asked]
+    return [(cfg.out.parent.name, cfg.agent_names[0]) for cfg in asked]
 
 
 def test_every_figure_of_the_paper_is_claimed_once_per_setting_and_has_a_condition():
@@ -219,7 +219,7 @@ def test_an_interruption_keeps_what_was_measured(tmp_path, asked, monkeypatch):
         return whole(cfg)
 
     monkeypatch.setattr(suite_run, "compare", interrupted)
-    arguments = [TEACHER, "--suite", "paper", "--objects", *SYMMETRIC, "--output", str(tmp_path / "out")]
+    arguments = [TEACHER, "--suite", "paper", "--objects", *SYMMETRIC, "--out", str(tmp_path / "out")]
     assert main(arguments) == 130
     assert "not run" in (tmp_path / "out" / "paper.html").read_text()
     monkeypatch.setattr(suite_run, "compare", whole)
@@ -232,7 +232,7 @@ def test_an_interruption_before_anything_was_measured_leaves_a_page_too(tmp_path
         raise KeyboardInterrupt
 
     monkeypatch.setattr(suite_run, "compare", interrupted)
-    arguments = [TEACHER, "--suite", "paper", "--objects", *SYMMETRIC, "--output", str(tmp_path / "out")]
+    arguments = [TEACHER, "--suite", "paper", "--objects", *SYMMETRIC, "--out", str(tmp_path / "out")]
     assert main(arguments) == 130
     assert "Nothing has been measured yet" in read_page(tmp_path / "out" / "paper.html")[0]
 
@@ -246,7 +246,7 @@ def test_a_condition_that_fails_costs_no_other(tmp_path, asked, monkeypatch, cap
         return whole(cfg)
 
     monkeypatch.setattr(suite_run, "compare", fails)
-    arguments = [TEACHER, "--suite", "paper", "--objects", *SYMMETRIC, "--output", str(tmp_path / "out")]
+    arguments = [TEACHER, "--suite", "paper", "--objects", *SYMMETRIC, "--out", str(tmp_path / "out")]
     assert main([*arguments, "--json"]) == 1
     printed = capsys.readouterr()
     assert {entry["condition"] for entry in json.loads(printed.out)["failed"]} == {"air", "air-training"}
@@ -267,9 +267,7 @@ def test_without_a_student_its_figures_are_named_and_not_invented(tmp_path, aske
     assert NO_STUDENT in text and "predicts nothing" in text and "72.3 %" in text
     assert all(address.startswith("data:image/png;base64,") for address in references.addresses)
     assert not {"script", "link", "iframe"} & set(references.tags)
-    assert (
-        main([TEACHER, "--suite", "paper", "--objects", *SYMMETRIC, "--output", str(tmp_path / "out")]) == 0
-    )
+    assert main([TEACHER, "--suite", "paper", "--objects", *SYMMETRIC, "--out", str(tmp_path / "out")]) == 0
     assert NO_STUDENT in capsys.readouterr().out
 
 
@@ -294,7 +292,7 @@ def test_the_reduced_suite_takes_a_spread_of_objects(tmp_path, asked):
         (many / f"{index:02}.usd").touch()
     result = run(suite(tmp_path, objects=(f"training={many}", *SYMMETRIC[1:]), quick=True))
     assert {c.name for c in result.conditions} < {c.name for c in CONDITIONS}
-    (training,) = [cfg for cfg in asked if cfg.output.parent.name == "training"]
+    (training,) = [cfg for cfg in asked if cfg.out.parent.name == "training"]
     assert [item[-6:] for item in training.objects] == [f"{i:02}.usd" for i in range(0, 18, 3)]
     assert training.episodes < next(c.episodes for c in CONDITIONS if c.name == "training")
     assert f"{QUICK_OBJECTS} of the 18" in result.objects["training"].text
@@ -335,7 +333,7 @@ def test_installed_policies_are_taken_where_none_is_named():
     ],
 )
 def test_settings_that_cannot_be_are_refused(flags, message, capsys, tmp_path):
-    assert main([*flags, "--output", str(tmp_path), "--device", "cpu"]) == 1
+    assert main([*flags, "--out", str(tmp_path), "--device", "cpu"]) == 1
     assert message in capsys.readouterr().err
 
 
@@ -389,7 +387,7 @@ def test_on_a_table_of_other_friction_and_in_the_air(tmp_path, monkeypatch, caps
     chosen = tuple(c for c in CONDITIONS if c.name in ("symmetric", "friction-0.05", "air"))
     monkeypatch.setattr(suite_run, "CONDITIONS", chosen)
     flags = ["dclaw4-cube", "--suite", "paper", "--quick", "--jobs", "2", "--device", "cpu"]
-    assert main([*flags, "--objects", *SYMMETRIC, "--output", str(tmp_path), "--json"]) == 0
+    assert main([*flags, "--objects", *SYMMETRIC, "--out", str(tmp_path), "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)["figures"]
     assert {figure["condition"] for figure in figures} == {c.name for c in chosen}
     friction = Comparison.read(tmp_path / "friction-0.05" / "dclaw4-cube" / "eval.json")

@@ -30,23 +30,23 @@ class Turner:
         self.env, self.until, self.steps = env, until, 0
         if offset is not None:
             self.offset = offset
-            self.predicted = torch.zeros(env.num_worlds)
+            self.predicted = torch.zeros(env.num_envs)
 
     def act(self, observation):
-        """The same action in all worlds."""
+        """The same action in all environments."""
         start, goal = observation[:, :4].numpy(), observation[:, 4:8].numpy()
         if hasattr(self, "predicted"):
             true = (Rotation.from_quat(start).inv() * Rotation.from_quat(goal)).magnitude()
             self.predicted[:] = torch.as_tensor(true + self.offset)
         self.steps = int(self.env.step_count.numpy()[0])
-        action = torch.zeros((self.env.num_worlds, self.env.num_actions))
+        action = torch.zeros((self.env.num_envs, self.env.num_actions))
         action[:, 2] = STEP_RAD * 12.0 * (self.steps < self.until)
         wp.to_torch(self.env.smoothed)[:] = 0.5 * action  # a norm of 0.6: within the paper's bound
         return action
 
 
-def fake_env(objects=(FakeObject("a"),), worlds=1, steps=12, **settings):
-    env = FakeEnv(objects, num_worlds=worlds, max_episode_steps=steps, tolerance=NEVER_RAD, **settings)
+def fake_env(objects=(FakeObject("a"),), envs=1, steps=12, **settings):
+    env = FakeEnv(objects, num_envs=envs, max_episode_steps=steps, tolerance=NEVER_RAD, **settings)
     env.table = []
     env.sim.place_table = lambda present: env.table.append((int(env.step_count.numpy()[0]), present))
     return env
@@ -59,7 +59,7 @@ def goal_ahead(angle, objects=1, episodes=1):
 
 
 def traced(angle=0.85, *, objects=(FakeObject("a"),), episodes=1, policy=None, **settings):
-    env = fake_env(objects, worlds=len(objects) * episodes, **settings)
+    env = fake_env(objects, envs=len(objects) * episodes, **settings)
     return record(env, Turner(env, **(policy or {})), episodes, **goal_ahead(angle, len(objects), episodes))
 
 
@@ -150,7 +150,7 @@ class HeldEnv(FakeEnv):
         self.lost, self.tables = lost, []
         self.sim.place_table = lambda present: None
         self.sim.place_tables = lambda count, last: self.tables.append((count.numpy()[0], last.numpy()[0]))
-        self.turned = wp.zeros((self.num_worlds, 4), dtype=float, device="cpu")
+        self.turned = wp.zeros((self.num_envs, 4), dtype=float, device="cpu")
 
     def motion(self):
         """Orientations."""
@@ -174,7 +174,7 @@ class HeldEnv(FakeEnv):
 def test_what_was_stopped_is_held_and_looked_at_again():
     """The rule stops at 0.35 rad of 0.85; in 2 s the object turns on by 0.24 rad, past the goal or away."""
     rule = StoppingRule(0.4, 2.0)
-    env = HeldEnv([FakeObject("a")], num_worlds=3, max_episode_steps=12, tolerance=NEVER_RAD, lost=[1])
+    env = HeldEnv([FakeObject("a")], num_envs=3, max_episode_steps=12, tolerance=NEVER_RAD, lost=[1])
     goals = goal_ahead(0.85, 1, 3)
     goals["goals"][0, 2] = Rotation.from_rotvec([0.0, 0.0, -2.0]).as_quat()
     trace = record(env, Turner(env), 3, **goals, held=[(rule, "exact")], table_steps=8)
@@ -190,7 +190,7 @@ def test_what_was_stopped_is_held_and_looked_at_again():
 
 def test_success_is_reported_at_the_stop_and_after_the_hold():
     objects = [FakeObject("a"), FakeObject("b")]
-    env = HeldEnv(objects, num_worlds=4, max_episode_steps=24, tolerance=NEVER_RAD, lost=[1])
+    env = HeldEnv(objects, num_envs=4, max_episode_steps=24, tolerance=NEVER_RAD, lost=[1])
     rules = ways_to_stop(lambda _: StoppingRule(0.3, 2.5), 0.4, predicts=True)
     assert [(w.stopped_by, w.rule.action_norm, bool(w.ours)) for w in rules] == [
         ("prediction", 1.0, False),
@@ -233,7 +233,7 @@ def test_what_predicts_nothing_is_judged_by_the_success_criteria_of_training_too
 
 def test_a_world_whose_step_failed_ends_there():
     """The simulator puts it back and lets its time run out; what follows is of another episode."""
-    env = fake_env(worlds=2)
+    env = fake_env(envs=2)
     step = env.step
 
     def failing(action):
@@ -248,7 +248,7 @@ def test_a_world_whose_step_failed_ends_there():
 
 
 def test_the_table_goes_and_comes_back():
-    env = fake_env(worlds=1, steps=6)
+    env = fake_env(envs=1, steps=6)
     record(env, Turner(env), 2, **goal_ahead(1.0, 1, 2), table_steps=2)
     assert env.table == [(0, True), (2, False), (0, True), (2, False), (0, True)]
 

@@ -114,13 +114,13 @@ def test_folders_that_cannot_be_made_are_refused_before_anything_is_written(tmp_
 def commands(taken: str) -> dict[str, list[str]]:
     """Command lines whose output would lie below a file."""
     return {
-        "vd-train": ["teacher", "--preset", "gpu", "--run-dir", taken],
-        "vd-train ": ["student", "--teacher", "dclaw4-cube", "--run-dir", taken],
+        "vd-train": ["teacher", "--preset", "gpu", "--out", taken],
+        "vd-train ": ["student", "--teacher", "dclaw4-cube", "--out", taken],
         "vd-train  ": ["export", "x.pt", f"{taken}/x.pt"],
-        "vd-train   ": ["average", "a", "b", "--output", f"{taken}/x.pt"],
+        "vd-train   ": ["average", "a", "b", "--out", f"{taken}/x.pt"],
         "vd-train    ": ["bundle", "dclaw4-cube", f"{taken}/x"],
-        "vd-train     ": ["tracker", "dclaw4-table", "--objects", "cube", "--output", f"{taken}/x.pt"],
-        "vd-eval": ["--agent", "zero", "--output", taken],
+        "vd-train     ": ["tracker", "dclaw4-table", "--objects", "cube", "--out", f"{taken}/x.pt"],
+        "vd-eval": ["--agent", "zero", "--out", taken],
         "vd-play": ["--agent", "zero", "--video", f"{taken}/x.mp4"],
         "vd-gap": ["run", "recording", "--out", taken],
         "vd-gap ": ["identify", "recording", "--out", f"{taken}/x.usda"],

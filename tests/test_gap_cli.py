@@ -32,7 +32,7 @@ from vd.gap.result import (
     TrajectoryError,
 )
 from vd.gap.rollout import Rollouts
-from vd.kernels import actuators
+from vd.kernels.servo import actuators
 
 JOINT = "joint"
 FLOOR = 1e-3

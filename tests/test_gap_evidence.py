@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gap_recordings import COUNT, FLOOR, made_up
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.consensus import share
 from vd.gap.coordinates import Coordinate
 from vd.gap.explanation import Accepted, Explanation, intervals

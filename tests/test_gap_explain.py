@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gap_recordings import recorded
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.answers import FOLDER
 from vd.gap.fit import JointProblem
 from vd.gap.hidden_plant import CABLE, COGGING, OUTSIDE
@@ -16,7 +16,7 @@ from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
 from vd.gap.words import verdict_sentence
 from vd.gap.workflow import explain, find
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 SMALL = ("command_delay", "coulomb_friction", "torque_saturation", "thermal_drift", "command_filter")
 STRIBECK = {servo.STRIBECK_STATIC: 0.13, servo.STRIBECK_SLIDING: 0.07, servo.STRIBECK_SPEED: 0.4}

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.assets_usd.hands import load_hand
 from vd.gap.chain import Chain, chains
 from vd.gap.design import design

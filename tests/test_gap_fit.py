@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gap_recordings import ENCODER_COUNT, TRUE, blank, problem_of, recorded, true_row
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.chain import candidates, chains
 from vd.gap.coordinates import coordinate
 from vd.gap.design import design
@@ -16,7 +16,7 @@ from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import covariance, noise_floor, resamples, rmse
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 NEAR = {"kp": 3.0, "kd": 0.25, "velocity_limit": 7.0, "inertia": 2.5e-3}
 """Where a fit of the servo that all recordings are of may begin."""

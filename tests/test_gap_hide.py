@@ -24,7 +24,7 @@ from vd.gap.recording import read_recording
 from vd.gap.sizes import showing, sized_effect
 from vd.gap.team import JointSpec
 from vd.gap.telemetry import late_side, vetoes
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 
 def test_the_recording_tells_nothing_and_the_truth_lies_beside_it(tmp_path):

@@ -17,7 +17,7 @@ from vd.gap.identify import identify, pack_tracks, write_drives
 from vd.gap.newton import HandReplay, simulate_hand
 from vd.gap.recording import Recording, Trajectory, write_recording
 from vd.gap.rollout import Rollouts
-from vd.kernels import actuators as servo
+from vd.kernels.servo import actuators as servo
 
 HAND = load_hand("dclaw3")
 EFFECTS: dict[str, dict[str, float]] = {

@@ -9,7 +9,7 @@ from vd.gap.hidden_finger import FingerBody
 from vd.gap.hidden_plant import OUTSIDE, STEP_S, Plant, Run, simulate
 from vd.gap.hide import COUPLING, Hiding, machine
 from vd.gap.sizes import effect_at
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 KP, KD, INERTIA = 2.0, 0.1, 4.0e-3
 STEP = 0.4

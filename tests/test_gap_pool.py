@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from gap_recordings import TRUE, made_up, recorded
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.answers import Answers, digest_of
 from vd.gap.assemble import curves
 from vd.gap.chain import chains

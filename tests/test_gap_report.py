@@ -28,8 +28,8 @@ from vd.gap.result import (
     effect_values,
     parameter_columns,
 )
-from vd.kernels import actuators
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo import actuators
+from vd.kernels.servo.effects import EFFECTS
 
 JOINTS = ("f0_j1", "f0_j2", "f0_j3")
 FILES = ("steps_1.csv", "sine_0.50hz.csv", "sine_1.00hz.csv")

@@ -12,7 +12,7 @@ from vd.assets_usd.hands import load_hand
 from vd.gap.chain import GRAVITY_M_S2, chains
 from vd.gap.recording import Recording, Trajectory, read_recording
 from vd.gap.rollout import Rollouts
-from vd.kernels import actuators as servo
+from vd.kernels.servo import actuators as servo
 from vd.sim.scene import hand_mount
 
 

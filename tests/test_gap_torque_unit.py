@@ -20,7 +20,7 @@ from vd.gap.result import (
 )
 from vd.gap.rollout import Rollouts
 from vd.gap.torque_unit import in_known_unit, known_stiffness, relative_torques
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 BASE = {"kp": 3.0, "kd": 0.3, "velocity_limit": 7.0, "inertia": 2e-3}
 JOINTS = ("a", "b")

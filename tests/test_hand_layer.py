@@ -12,8 +12,8 @@ from vd.assets_usd.hand_author import hand_usd
 from vd.assets_usd.hand_data import HandError, HandModel
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hand_model import open_stage, read_hand
-from vd.kernels import actuators
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo import actuators
+from vd.kernels.servo.effects import EFFECTS
 
 HEADER = '#usda 1.0\n(\n    defaultPrim = "dclaw3"\n)\n'
 EVERYTHING = {

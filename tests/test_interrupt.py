@@ -46,6 +46,16 @@ def test_a_command_that_only_knows_that_it_was_interrupted_ends_so_too(number):
     assert end.value.code == STATUS[number]
 
 
+def test_a_flag_of_an_earlier_version_is_refused_with_its_name_of_today(capsys):
+    @interrupt.command("vd-some")
+    def never() -> None:
+        raise AssertionError
+
+    assert never(["thing", "--run_dir=x", "--num-worlds", "3"]) == interrupt.USAGE_ERROR
+    said = capsys.readouterr().err
+    assert "--run-dir is --out now" in said and "--num-worlds is --num-envs now" in said
+
+
 def test_what_a_command_forks_ends_by_the_signal_itself():
     """A pool ends its workers with SIGTERM; they have nothing to say about it."""
 

@@ -104,7 +104,7 @@ def test_wheel_ships_every_policy_that_has_a_name(wheel):
     assert set(sizes) == {f"vd/policies/{path.name}" for path in SHIPPED_POLICIES.values()}
     assert {"dclaw4-cube", "dclaw3-table", "dclaw4-table"} <= set(SHIPPED_POLICIES)
     for name, path in SHIPPED_POLICIES.items():
-        # An export, not a checkpoint: those hold optimiser and worlds, and are larger.
+        # An export, not a checkpoint: those hold optimiser and environments, and are larger.
         assert sizes[f"vd/policies/{name}.pt"] == path.stat().st_size < MAX_POLICY_BYTES
 
 

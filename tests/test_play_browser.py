@@ -150,7 +150,7 @@ def player():
     from vd.play.viewer import PlayViewer, open_page
 
     objects = [box("brick", [0.09, 0.05, 0.03]), box("stick", [0.14, 0.02, 0.02])]
-    env = FakeEnv(objects, num_worlds=2, max_episode_steps=10_000, tolerance=-1.0, hand=load_hand("dclaw3"))
+    env = FakeEnv(objects, num_envs=2, max_episode_steps=10_000, tolerance=-1.0, hand=load_hand("dclaw3"))
     session = Session(env, {"spin": Spin, "still": Still}, "spin")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -32,7 +32,7 @@ class Turn:
 
 
 def make_session(**kwargs):
-    env = FakeEnv([FakeObject("a"), FakeObject("b")], num_worlds=4, max_episode_steps=1000, **kwargs)
+    env = FakeEnv([FakeObject("a"), FakeObject("b")], num_envs=4, max_episode_steps=1000, **kwargs)
     return Session(env, {"turn": lambda: Turn(1.0), "still": lambda: Turn(0.0)}, "turn")
 
 
@@ -79,7 +79,7 @@ def test_reset_shows_the_error_of_the_new_start_and_keeps_counts():
 
 
 def test_watcher_counts_goals_and_drops_of_its_worlds_alone():
-    env = FakeEnv([FakeObject("a")], num_worlds=3, max_episode_steps=1000, tolerance=-1.0, fall_at={1: 2})
+    env = FakeEnv([FakeObject("a")], num_envs=3, max_episode_steps=1000, tolerance=-1.0, fall_at={1: 2})
     watcher = Watcher(env, [2, 1])
     policy = Turn(0.0)
     from vd.play.video import act
@@ -250,12 +250,12 @@ def test_evaluation_of_the_real_environment(tmp_path):
         "--device",
         "cpu",
     ]
-    assert main([*flags, "--output", str(tmp_path)]) == 0
+    assert main([*flags, "--out", str(tmp_path)]) == 0
     rows = Comparison.read(tmp_path / "eval.json").rows
     result = rows[0].result
     assert len(result.episodes) == 4
     assert all(episode.steps == 6 or episode.stopped or episode.fell for episode in result.episodes)
     assert (tmp_path / "eval.html").stat().st_size > 20_000
     # The same again gives the same: starts, goals and, on a CPU, every error.
-    assert main([*flags, "--output", str(tmp_path / "again")]) == 0
+    assert main([*flags, "--out", str(tmp_path / "again")]) == 0
     assert Comparison.read(tmp_path / "again" / "eval.json").rows == rows

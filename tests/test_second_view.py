@@ -12,7 +12,7 @@ from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
 from vd.evaluate.second_view import SecondView, view_maps
-from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.task.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
 from vd.tracking.views import AFTER_S, EVERY_S, ViewSelection
 from vd.train.vec_env import ReorientVecEnv
@@ -21,7 +21,7 @@ WORLDS = 8
 CFG = ReorientCfg(
     hand="dclaw3",
     objects=("cuboid",),
-    num_worlds=WORLDS,
+    num_envs=WORLDS,
     randomisation=RandomisationCfg(enabled=False),
     observation=ObservationCfg(shape="full", view="either"),
 )
@@ -53,7 +53,7 @@ def teacher_of(env: ReorientEnv) -> TrainedPolicy:
 
 
 def begin(env: ReorientEnv, seed: int = 0) -> None:
-    """All worlds at a first step, with their goals far away."""
+    """All environments at a first step, with their goals far away."""
     rng = np.random.default_rng(seed)
     quats = rng.normal(size=(2, WORLDS, 4)).astype(np.float32)
     quats /= np.linalg.norm(quats, axis=-1, keepdims=True)
@@ -194,14 +194,14 @@ def test_a_policy_without_a_critic_or_an_environment_of_one_view_is_refused(env)
 
 
 def test_the_command_refuses_policies_that_have_no_second_view(tmp_path, capsys):
-    assert cli.main(["dclaw4-cube", "--second-view", "--device", "cpu", "--output", str(tmp_path)]) == 1
+    assert cli.main(["dclaw4-cube", "--second-view", "--device", "cpu", "--out", str(tmp_path)]) == 1
     assert "dclaw4-cube has no other view" in capsys.readouterr().err
 
 
 def test_a_training_has_its_views_from_the_task_and_looks_twice_by_its_own_flag(tmp_path, capsys):
     from vd.train.cli import main as train
 
-    flags = ["--preset", "cpu-demo", "--run-dir", str(tmp_path / "run"), "--device", "cpu"]
+    flags = ["--preset", "cpu-demo", "--out", str(tmp_path / "run"), "--device", "cpu"]
     assert train(["teacher", *flags, "--env.observation.view", "either"]) == 1
     assert "train with goal" in capsys.readouterr().err
     assert train(["teacher", *flags, "--env.observation.view", "world", "--second-view"]) == 1
@@ -210,8 +210,8 @@ def test_a_training_has_its_views_from_the_task_and_looks_twice_by_its_own_flag(
 
 def test_an_evaluation_says_that_it_selected_views(tmp_path):
     arguments = ["dclaw3-table", "--objects", "cuboid", "--episodes", "2", "--device", "cpu", "--second-view"]
-    assert cli.main([*arguments, "--episode-s", "0.5", "--output", str(tmp_path)]) == 0
+    assert cli.main([*arguments, "--episode-s", "0.5", "--out", str(tmp_path)]) == 0
     assert "symmetry-view selection" in (tmp_path / "eval.html").read_text()
     both = tmp_path / "both"
-    assert cli.main([*arguments, "--agent", "zero", "--episode-s", "0.5", "--output", str(both)]) == 0
+    assert cli.main([*arguments, "--agent", "zero", "--episode-s", "0.5", "--out", str(both)]) == 0
     assert "symmetry-view selection" in (both / "eval.html").read_text()

@@ -8,7 +8,7 @@ import warp as wp
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
-from vd.kernels import actuators as servo
+from vd.kernels.servo import actuators as servo
 from vd.paper import PAPER
 from vd.sim.actuators import has_effects
 from vd.sim.cfg import SimCfg
@@ -38,9 +38,9 @@ def rows(**columns: float) -> np.ndarray:
 
 
 def simulator(servo_rows: np.ndarray | None, worlds: int = 1) -> Simulator:
-    """Worlds at rest at the task's start, commands at the present positions."""
+    """Environments at rest at the task's start, commands at the present positions."""
     scene = build_scene(
-        hand=HAND, objects=load_set("cube")[:1], num_worlds=worlds, cfg=CFG, device=wp.get_device().alias
+        hand=HAND, objects=load_set("cube")[:1], num_envs=worlds, cfg=CFG, device=wp.get_device().alias
     )
     sim = Simulator(scene, CFG, servo_rows=servo_rows)
     state = sim.joint_q.numpy()

@@ -17,7 +17,7 @@ def joints_of_a_closing_hand(device: str, hand: str, cfg: SimCfg) -> tuple[np.nd
         ReorientCfg(
             hand=hand,
             objects=("cube", "procedural-2-seed0"),
-            num_worlds=WORLDS,
+            num_envs=WORLDS,
             randomisation=RandomisationCfg(enabled=False),
             sim=cfg,
         ),

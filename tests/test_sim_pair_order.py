@@ -19,7 +19,7 @@ def contacts(device: str, *, ordered: bool) -> tuple[np.ndarray, np.ndarray]:
     cfg = ReorientCfg(
         hand="dclaw3",
         objects=("cube", "procedural-2-seed0"),
-        num_worlds=6,
+        num_envs=6,
         randomisation=RandomisationCfg(enabled=False),
     )
     env = ReorientEnv(cfg, device)
@@ -31,7 +31,7 @@ def contacts(device: str, *, ordered: bool) -> tuple[np.ndarray, np.ndarray]:
     env.check()
     data = solver.mjw_data
     worlds = data.contact.worldid.numpy()[: int(data.nacon.numpy()[0])]
-    found = env.sim.joint_q.numpy(), np.bincount(worlds, minlength=cfg.num_worlds)
+    found = env.sim.joint_q.numpy(), np.bincount(worlds, minlength=cfg.num_envs)
     env.close()
     return found
 

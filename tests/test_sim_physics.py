@@ -74,7 +74,7 @@ def sliced(cube, count):
 def test_an_object_of_as_many_parts_as_an_import_makes_fits_beside_a_hand(cube, hand):
     """MuJoCo's masks have 32 bits for who touches whom; parts of one object need none among themselves."""
     item = sliced(cube, DecomposeSettings().max_hulls)
-    scene = build_scene(hand=load_hand(hand), objects=[item], num_worlds=1, cfg=CFG, device="cpu")
+    scene = build_scene(hand=load_hand(hand), objects=[item], num_envs=1, cfg=CFG, device="cpu")
     model = Simulator(scene, CFG).solver.mj_model
     meets = (model.geom_contype[:, None] & model.geom_conaffinity[None]) != 0
     on_object = model.geom_bodyid == model.geom_bodyid[-1]
@@ -181,7 +181,7 @@ def test_velocity_limits_hold(device):
     """A hand told to jump exceeds no joint's speed limit; without the kernel it would."""
     hand = load_hand("dclaw4")
     fast = dataclasses.replace(hand, velocity_limit=np.full_like(hand.velocity_limit, 1.0))
-    scene = build_scene(hand=fast, objects=load_set("cube"), num_worlds=2, cfg=CFG, device=device)
+    scene = build_scene(hand=fast, objects=load_set("cube"), num_envs=2, cfg=CFG, device=device)
     sim = Simulator(scene, CFG)
     target = sim.joint_q.numpy().copy()
     target[:, :12] += 1.0
@@ -241,7 +241,7 @@ def test_restitution_of_zero_is_the_plain_model_to_the_bit(cube):
     hand = load_hand("dclaw3")
     ends = []
     for restitution in (False, True):
-        scene = build_scene(hand=hand, objects=[cube], num_worlds=2, cfg=CFG, device="cpu")
+        scene = build_scene(hand=hand, objects=[cube], num_envs=2, cfg=CFG, device="cpu")
         sim = Simulator(scene, CFG, restitution=restitution)
         velocity = sim.joint_qd.numpy()
         velocity[:, 9:12] = [0.3, 0.0, -2.0]

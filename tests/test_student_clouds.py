@@ -21,7 +21,7 @@ def assets():
 
 
 def scene(assets, device, *, scales=(1.0,)):
-    """Clouds of worlds that differ in the size of the object, and their (equal) poses."""
+    """Clouds of environments that differ in the size of the object, and their (equal) poses."""
     hand, objects = assets
     links = len(hand.link_names)
     clouds = SceneClouds(
@@ -81,11 +81,11 @@ def test_object_and_goal_follow_the_worlds_size(assets, device):
 def test_rows_may_be_of_any_worlds(assets, device):
     clouds, body_q, goal = scene(assets, device, scales=(1.0, 1.05))
     points = written(clouds, body_q, goal)
-    worlds = wp.array([1, 0, 1], dtype=wp.int32, device=device)
+    envs = wp.array([1, 0, 1], dtype=wp.int32, device=device)
     again = [
         wp.array(np.repeat(a.numpy()[:1], 3, axis=0), dtype=a.dtype, device=device) for a in (body_q, goal)
     ]
-    rows = written(clouds, *again, worlds=worlds)
+    rows = written(clouds, *again, envs=envs)
     np.testing.assert_array_equal(rows, points[[1, 0, 1]])
 
 

@@ -33,7 +33,7 @@ def test_the_losses_fall_on_one_rollout():
 
 
 def test_the_student_acts_more_and_more_like_the_teacher(tmp_path):
-    runner = make_student_runner(tmp_path, make_dagger(worlds=16, epochs=4))
+    runner = make_student_runner(tmp_path, make_dagger(envs=16, epochs=4))
     runner.learn(16)
     errors = [row["student/action_error"] for row in read_progress(tmp_path / "progress.jsonl")]
     assert np.mean(errors[-3:]) < 0.6 * np.mean(errors[:3])
@@ -42,7 +42,7 @@ def test_the_student_acts_more_and_more_like_the_teacher(tmp_path):
 @pytest.mark.parametrize("kind", ["likelihood", "squared"])
 def test_gradients_equal_those_of_an_unrolled_loop(kind):
     """The oracle encodes step by step and writes the gates of the memory out; ends of episodes clear it."""
-    dagger = make_dagger(worlds=3, rollout_steps=5, imitation=kind)
+    dagger = make_dagger(envs=3, rollout_steps=5, imitation=kind)
     rollout = dagger.collect()
     rollout.done = torch.tensor([[0, 1, 0], [0, 0, 0], [1, 1, 0], [0, 0, 0], [0, 0, 1]], dtype=torch.bool)
     rollout.hidden = torch.randn(3, TINY.memory)
@@ -86,7 +86,7 @@ def test_gradients_equal_those_of_an_unrolled_loop(kind):
 
 def test_no_gradient_crosses_the_end_of_an_episode():
     """What a world did before its end does not move what is learned after it; in another world it does."""
-    dagger = make_dagger(worlds=2, rollout_steps=4, imitation="squared")
+    dagger = make_dagger(envs=2, rollout_steps=4, imitation="squared")
     rollout = dagger.collect()
     rollout.done = torch.zeros((4, 2), dtype=torch.bool)
     rollout.done[0, 0] = True
@@ -105,7 +105,7 @@ def test_no_gradient_crosses_the_end_of_an_episode():
 
 def test_losses_are_what_they_say():
     torch.manual_seed(0)
-    dagger = make_dagger(worlds=2, rollout_steps=3)
+    dagger = make_dagger(envs=2, rollout_steps=3)
     rollout = dagger.collect()
     frames = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
     embedding = dagger.student.encode(*dagger.view.sites(frames, augment=True)).view(3, 2, -1)
@@ -124,7 +124,7 @@ def test_losses_are_what_they_say():
 
 
 def test_minibatches_hold_every_world_once_a_pass():
-    dagger = make_dagger(worlds=10, minibatch_worlds=4, epochs=3)
+    dagger = make_dagger(envs=10, minibatch_envs=4, epochs=3)
     batches = [batch.tolist() for batch in dagger.minibatches(1)]
     assert [len(batch) for batch in batches] == [4, 4, 2] * 3
     passes = [[world for batch in batches[i : i + 3] for world in batch] for i in (0, 3, 6)]
@@ -133,7 +133,7 @@ def test_minibatches_hold_every_world_once_a_pass():
 
 
 def test_kept_rollouts_are_learned_from_too():
-    dagger = make_dagger(worlds=3, minibatch_worlds=2, keep_rollouts=3, epochs=1)
+    dagger = make_dagger(envs=3, minibatch_envs=2, keep_rollouts=3, epochs=1)
     rollouts = [dagger.collect() for _ in range(2)]
     together = taken(rollouts, torch.tensor([4, 0, 1, 5, 2, 3]))
     parts = [dagger.student.eval() and dagger.losses(one) for one in rollouts]
@@ -191,7 +191,7 @@ def test_the_teacher_acts_in_its_share_which_falls_to_none():
 
 def test_the_teachers_share_can_stay_and_is_drawn_by_world():
     dagger = make_dagger(
-        worlds=40, teacher_share=0.9, teacher_share_last=0.4, teacher_share_iterations=2, rollout_steps=3
+        envs=40, teacher_share=0.9, teacher_share_last=0.4, teacher_share_iterations=2, rollout_steps=3
     )
     assert [dagger.teacher_share() for dagger.iteration in range(4)] == pytest.approx([0.9, 0.65, 0.4, 0.4])
     dagger.iteration = 5
@@ -202,16 +202,16 @@ def test_the_teachers_share_can_stay_and_is_drawn_by_world():
 
 
 def test_nothing_is_learned_from_worlds_that_are_held_out():
-    dagger = make_dagger(worlds=5, minibatch_worlds=2, epochs=2, validation_worlds=2, keep_rollouts=2)
+    dagger = make_dagger(envs=5, minibatch_envs=2, epochs=2, validation_envs=2, keep_rollouts=2)
     drawn = torch.cat(list(dagger.minibatches(2)))
     assert len(drawn) == 6 and set((drawn % 5).tolist()) <= {0, 1, 2} and int(drawn.max()) < 10
-    with pytest.raises(ValueError, match="validation-worlds"):
-        make_dagger(worlds=2, validation_worlds=2)
+    with pytest.raises(ValueError, match="validation-envs"):
+        make_dagger(envs=2, validation_envs=2)
 
 
 def test_the_fixed_set_is_the_first_episode_of_the_worlds_held_out():
     """Its error is that of the student acting through the episode, memory and all, without noise."""
-    dagger = make_dagger(worlds=5, validation_worlds=2, reset=False, imitation="squared", teacher_share=1.0)
+    dagger = make_dagger(envs=5, validation_envs=2, reset=False, imitation="squared", teacher_share=1.0)
     rollouts = math.ceil(dagger.env.max_episode_length / 6)
     rows = [dagger.iterate(lambda: False) for _ in range(rollouts + 2)]
     assert [row["validation/unexplained"] is None for row in rows] == [True] * (rollouts - 1) + [False] * 3
@@ -249,7 +249,9 @@ def test_the_learning_rate_rises_and_falls():
     dagger = make_dagger(learning_rate=1.0, warmup_steps=10, decay_after_steps=100)
     dagger._steps_done = 4
     dagger.update([dagger.collect()])
-    assert dagger.optimizer.param_groups[0]["lr"] == pytest.approx(0.8)  # four steps of 2 worlds each later
+    assert dagger.optimizer.param_groups[0]["lr"] == pytest.approx(
+        0.8
+    )  # four steps of 2 environments each later
 
 
 def test_poses_are_read_from_frames_and_learned(monkeypatch):
@@ -303,7 +305,7 @@ def test_labels_are_clipped_where_asked_for():
 def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
     for reset in (True, False):
         options = {"noise": NoiseCfg(), "reset": reset, "keep_rollouts": 1 if reset else 2}
-        options |= {"validation_worlds": 0 if reset else 2, "warmup_steps": 6}
+        options |= {"validation_envs": 0 if reset else 2, "warmup_steps": 6}
         whole = make_student_runner(tmp_path / f"whole{reset}", make_dagger(**options))
         whole.learn(4)
         make_student_runner(tmp_path / f"parts{reset}", make_dagger(**options)).learn(2)
@@ -327,7 +329,7 @@ def test_curves_of_a_student_are_drawn(tmp_path):
 
 def test_other_worlds_start_anew(tmp_path):
     make_student_runner(tmp_path).learn(2)
-    again = make_student_runner(tmp_path, make_dagger(worlds=6))
+    again = make_student_runner(tmp_path, make_dagger(envs=6))
     again.load(list_checkpoints(tmp_path)[-1])
     assert "8 worlds" in again.new_episodes
     again.learn(1)
@@ -420,7 +422,7 @@ def test_weights_of_another_network_are_refused(tmp_path):
 
 
 def test_half_precision_of_the_encoder_hardly_changes_the_losses():
-    single, half = (make_dagger(worlds=4, precision=precision) for precision in ("fp32", "bf16"))
+    single, half = (make_dagger(envs=4, precision=precision) for precision in ("fp32", "bf16"))
     rollout = single.collect()
     for dagger in (single, half):
         dagger.student.eval()

@@ -151,11 +151,11 @@ def test_senses_are_what_the_configuration_names(device):
         dataclasses.replace(SMALL, senses=("velocity",)).validate()
 
 
-def sequence(net: Student, steps: int, worlds: int):
+def sequence(net: Student, steps: int, envs: int):
     generator = torch.Generator().manual_seed(1)
     device = net.mean.weight.device
-    embedding = torch.randn(steps, worlds, SMALL.encoder.embedding, generator=generator).to(device)
-    return embedding, torch.randn(steps, worlds, ACTIONS, generator=generator).to(device)
+    embedding = torch.randn(steps, envs, SMALL.encoder.embedding, generator=generator).to(device)
+    return embedding, torch.randn(steps, envs, ACTIONS, generator=generator).to(device)
 
 
 def test_sequence_equals_single_steps_with_the_memory_cleared_at_ends(device):

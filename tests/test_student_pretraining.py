@@ -222,7 +222,7 @@ def test_pre_training_goes_on_as_if_it_had_not_stopped(assets, tmp_path):
     def runner(name, seed=0):
         return StudentRunner(
             make(assets, seed=seed, noise=NoiseCfg()),
-            RunCfg(run_dir=tmp_path / name, device="cpu", save_every=1, tensorboard=False),
+            RunCfg(out=tmp_path / name, device="cpu", save_every=1, tensorboard=False),
             spec=StudentSpec(network=NETWORK, num_actions=JOINTS, stage=0),
             task={},
             depth=to_dict(NoiseCfg()),

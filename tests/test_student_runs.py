@@ -38,7 +38,7 @@ def env():
     cfg = ReorientCfg(
         hand="dclaw3",
         objects=("cube", "cuboid"),
-        num_worlds=2,
+        num_envs=2,
         randomisation=RandomisationCfg(enabled=False),
     )
     return ReorientEnv(cfg, "cpu")
@@ -59,18 +59,18 @@ def steps(env, view, count=6):
 @pytest.mark.parametrize("rendered", [False, True])
 @pytest.mark.parametrize("network", [NETWORK, SEPARATE], ids=["merged", "separate"])
 def test_recorded_frames_show_what_was_seen(env, rendered, network):
-    """Later steps change nothing; rows of chosen worlds are those worlds' clouds."""
+    """Later steps change nothing; rows of chosen environments are those worlds' clouds."""
     env.reset()
     view = StudentView(env, network, rendered=rendered, depth=DepthCameraCfg(points=500))
     frames, seen = steps(env, view)
-    worlds = torch.tensor([1, 0, 1])
+    envs = torch.tensor([1, 0, 1])
     times = [0, 3, 5]
     rows = {
-        name: torch.stack([frames[t][name][w] for t, w in zip(times, worlds.tolist(), strict=True)])
+        name: torch.stack([frames[t][name][w] for t, w in zip(times, envs.tolist(), strict=True)])
         for name in frames[0]
     }
-    for part, sites in enumerate(view.sites(rows, worlds, augment=False)):
-        for row, (time, world) in enumerate(zip(times, worlds.tolist(), strict=True)):
+    for part, sites in enumerate(view.sites(rows, envs, augment=False)):
+        for row, (time, world) in enumerate(zip(times, envs.tolist(), strict=True)):
             found = sites.coordinates[sites.coordinates[:, 0] == row][:, 1:]
             then = seen[time][part]
             assert torch.equal(found, then[then[:, 0] == world][:, 1:])
@@ -166,7 +166,7 @@ def stage(tmp_path):
 
 def test_stage_2_does_not_begin_from_nothing_unless_told_to(tmp_path, stage, capsys):
     folder = str(tmp_path / "stage2")
-    flags = ["student", "--stage", "2", "--run-dir", folder, "--device", "cpu", "--teacher", "dclaw3-table"]
+    flags = ["student", "--stage", "2", "--out", folder, "--device", "cpu", "--teacher", "dclaw3-table"]
     assert main(flags) == 1
     error = capsys.readouterr().err
     assert "--from-scratch" in error and str(tmp_path / "stage1") in error
@@ -184,11 +184,11 @@ def test_stage_2_does_not_begin_from_nothing_unless_told_to(tmp_path, stage, cap
 
 def test_stage_2_begins_from_stage_1_beside_it_with_its_network(tmp_path, stage):
     path = stage(1)
-    cfg = parse_student(["--stage", "2", "--run-dir", str(tmp_path / "stage2")])
+    cfg = parse_student(["--stage", "2", "--out", str(tmp_path / "stage2")])
     assert cfg.init == path == default_init(2, tmp_path / "stage2")
     assert cfg.network == TINY and cfg.teacher == "dclaw3-table"
     check_start(cfg)
-    other = ["--stage", "2", "--run-dir", str(tmp_path / "stage2"), "--from-scratch"]
+    other = ["--stage", "2", "--out", str(tmp_path / "stage2"), "--from-scratch"]
     assert parse_student(other).init is None
     assert default_init(1, tmp_path / "stage1") is None
 
@@ -198,8 +198,8 @@ def test_presets_are_valid_and_the_papers_has_its_numbers():
         for number in (0, 1, 2):
             validate(preset(number))
     first, second = (PRESETS["paper"](number) for number in (1, 2))
-    assert (first.task.num_worlds, first.dagger.minibatch_worlds) == (400, 40)
-    assert (second.task.num_worlds, second.dagger.minibatch_worlds) == (260, 20)
+    assert (first.task.num_envs, first.dagger.minibatch_envs) == (400, 40)
+    assert (second.task.num_envs, second.dagger.minibatch_envs) == (260, 20)
     assert (first.dagger.rollout_steps, first.dagger.epochs, first.dagger.imitation) == (80, 4, "likelihood")
     with pytest.raises(ValueError, match="--camera is for --stage 2"):
         validate(replace(first, camera=(0.0,) * 7))
@@ -209,11 +209,11 @@ def test_presets_are_valid_and_the_papers_has_its_numbers():
 
 def test_another_network_or_no_teacher_is_explained(tmp_path, stage, capsys):
     path = stage(1)
-    base = ["student", "--preset", "cpu-demo", "--run-dir", str(tmp_path / "run"), "--device", "cpu"]
+    base = ["student", "--preset", "cpu-demo", "--out", str(tmp_path / "run"), "--device", "cpu"]
     assert main([*base, "--init", str(path), "--network.memory", "32"]) == 1
     assert "moves 2 joints" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-    assert main(["student", "--device", "cpu", "--run-dir", str(tmp_path / "x")]) == 1
+    assert main(["student", "--device", "cpu", "--out", str(tmp_path / "x")]) == 1
     assert "--teacher is missing" in capsys.readouterr().err
     save_checkpoint(tmp_path / "bad.pt", {"spec": 1})
     assert main([*base, "--init", str(tmp_path / "bad.pt")]) == 1
@@ -223,18 +223,18 @@ def test_another_network_or_no_teacher_is_explained(tmp_path, stage, capsys):
 @pytest.mark.slow
 def test_stages_on_the_command_line(tmp_path, capsys):
     """Stage 1 by imitation of an installed teacher, stage 2 from it, resumed."""
-    small = ["--preset", "cpu-demo", "--num-worlds", "2", "--dagger.rollout-steps", "3", "--no-tensorboard"]
-    small += ["--dagger.validation-worlds", "1"]
+    small = ["--preset", "cpu-demo", "--num-envs", "2", "--dagger.rollout-steps", "3", "--no-tensorboard"]
+    small += ["--dagger.validation-envs", "1"]
     small += ["--task.at-rest", "False"]  # the search for poses at rest takes long
     both = ["--network.turn.vectors", "4", "--network.senses", "action", "position", "velocity"]
-    first = ["student", *small, *both, "--run-dir", str(tmp_path / "stage1")]
+    first = ["student", *small, *both, "--out", str(tmp_path / "stage1")]
     assert main([*first, "--max-steps", "6"]) == 0
     (row,) = read_progress(tmp_path / "stage1" / "progress.jsonl")
     assert all(row[f"loss/{name}"] > 0.0 for name in ("imitation", "distance", "pose", "state", "match"))
-    second = ["student", *small, "--stage", "2", "--run-dir", str(tmp_path / "stage2")]
+    second = ["student", *small, "--stage", "2", "--out", str(tmp_path / "stage2")]
     assert main([*second, "--max-steps", "6"]) == 0
     assert "begins with the weights of" in capsys.readouterr().out
-    resume = ["student", "--run-dir", str(tmp_path / "stage2"), "--resume", "--max-steps", "12"]
+    resume = ["student", "--out", str(tmp_path / "stage2"), "--resume", "--max-steps", "12"]
     assert main(resume) == 0
     assert "resumed after iteration 1 of 2" in capsys.readouterr().out
     assert [row["iteration"] for row in read_progress(tmp_path / "stage2" / "progress.jsonl")] == [1, 2]
@@ -252,10 +252,10 @@ def test_stages_on_the_command_line(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_a_teacher_of_views_is_imitated_in_those_that_the_student_chooses(tmp_path):
-    small = ["--preset", "cpu-demo", "--num-worlds", "3", "--dagger.rollout-steps", "3", "--no-tensorboard"]
-    small += ["--dagger.validation-worlds", "1", "--task.at-rest", "False", "--objects", "cube"]
+    small = ["--preset", "cpu-demo", "--num-envs", "3", "--dagger.rollout-steps", "3", "--no-tensorboard"]
+    small += ["--dagger.validation-envs", "1", "--task.at-rest", "False", "--objects", "cube"]
     folder = tmp_path / "stage1"
-    flags = ["student", *small, "--teacher", "dclaw3-table", "--run-dir", str(folder), "--max-steps", "9"]
+    flags = ["student", *small, "--teacher", "dclaw3-table", "--out", str(folder), "--max-steps", "9"]
     assert main(flags) == 0
     saved, teacher = load_student(folder / "student.pt"), open_teacher("dclaw3-table", "cpu")
     head = saved.network.state
@@ -280,7 +280,7 @@ from vd.train.distributed import join_processes
 DummyEnv.scene = SimpleNamespace(object_body=1)
 dagger_module.poses = lambda frames: frames["target"].repeat(1, 1, 5)[..., :9]
 rank, folder = int(os.environ["RANK"]), Path({folder!r})
-dagger = make_dagger(seed=rank, world_size=2, pose_weight=1.0)  # other worlds; other weights at first
+dagger = make_dagger(seed=rank, world_size=2, pose_weight=1.0)  # other environments; other weights at first
 runner = make_student_runner(folder, dagger, processes=join_processes("cpu"))
 runner.learn(2)
 result = [weights(dagger.network).tolist(), float(dagger.collect().label.sum())]
@@ -305,4 +305,4 @@ def test_two_processes_share_gradients_and_keep_their_worlds(tmp_path):
     one, two = (json.loads((tmp_path / f"rank{rank}.json").read_text()) for rank in range(2))
     assert one[0] == two[0] and one[1] != two[1]
     rows = read_progress(tmp_path / "progress.jsonl")
-    assert [row["env_steps"] for row in rows] == [96, 192]  # 2 processes x 8 worlds x 6 steps
+    assert [row["env_steps"] for row in rows] == [96, 192]  # 2 processes x 8 environments x 6 steps

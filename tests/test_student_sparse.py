@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import vd.vision
-from vd.kernels.voxels import voxelise
+from vd.kernels.sparse.voxels import voxelise
 from vd.vision import sparse
 from vd.vision.sites import Sites
 from vd.vision.sparse import SparseConv3d, SparseMaxPool3d, global_pool, parts

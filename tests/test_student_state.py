@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from vd.config import from_dict, to_dict
-from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
+from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
 from vd.policy import MeanAction, PolicySpec, perceptron
 from vd.vision.cfg import StateCfg, StudentCfg
 from vd.vision.network import Student

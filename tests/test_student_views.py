@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.envs.view_tables import ViewTables, view_tables
-from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.task.observations import teacher_observation_slices
 from vd.policy import PolicySpec, TrainedPolicy, perceptron
 from vd.train.student.every_view import EveryView
 from vd.views import ViewMaps
@@ -20,12 +20,12 @@ WORLDS, WIDTH = 48, 8
 
 @pytest.fixture(scope="module", params=[("dclaw3", "goal"), ("dclaw4", "goal"), ("dclaw3", "mirrored")])
 def env(request):
-    """Worlds after some random steps, in views that were chosen for where the objects are then."""
+    """Environments after some random steps, in views that were chosen for where the objects are then."""
     made = ReorientEnv(
         ReorientCfg(
             hand=request.param[0],
             objects=("cuboid",),
-            num_worlds=WORLDS,
+            num_envs=WORLDS,
             randomisation=RandomisationCfg(enabled=False),
             observation=ObservationCfg(shape="full", view=request.param[1]),
         ),

@@ -15,7 +15,7 @@ from vd.assets_usd.objects.sets import load_set
 from vd.bench.cli import StudentCommand
 from vd.config import to_dict
 from vd.deploy.cli import main as vd_deploy
-from vd.deploy.pilot import TrackingPilot
+from vd.deploy.loop.pilot import TrackingPilot
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
@@ -24,8 +24,8 @@ from vd.evaluate.comparison import Comparison
 from vd.evaluate.senses import EnvironmentSenses
 from vd.evaluate.trace import Trace
 from vd.evaluate.tracking import TrackingActor
-from vd.kernels.observations import teacher_observation_slices
-from vd.kernels.shapes import shape_observation_size
+from vd.kernels.task.observations import teacher_observation_slices
+from vd.kernels.task.shapes import shape_observation_size
 from vd.policy import PolicySpec, TrainedPolicy, load_policy, perceptron
 from vd.senses import Senses
 from vd.sensors.cfg import DepthCameraCfg
@@ -61,7 +61,7 @@ def env():
     """Cubes that were let go, hands that moved."""
     cfg = ReorientCfg(
         hand="dclaw3",
-        num_worlds=3,
+        num_envs=3,
         objects=("cube",),
         seed=1,
         observation=ObservationCfg(shape="full"),
@@ -110,7 +110,7 @@ def test_the_shape_of_a_true_pose_is_as_the_environment_observes_it(env):
 
 
 def test_motion_is_that_between_two_looks():
-    env = ReorientEnv(ReorientCfg(num_worlds=1, objects=("cube",), seed=1, randomisation=EXACT), "cpu")
+    env = ReorientEnv(ReorientCfg(num_envs=1, objects=("cube",), seed=1, randomisation=EXACT), "cpu")
     senses, observer = EnvironmentSenses(env, env.hand.camera, DepthCameraCfg()), observer_of(env)
     observer(senses.read())
     wp.to_torch(env.step_count).fill_(1)
@@ -128,7 +128,7 @@ def teacher(request):
     """A teacher of random weights, whose observation is not normalised by nature."""
     hand, view = request.param.split()
     observation = ObservationCfg(view=view)
-    task = ReorientCfg(hand=hand, objects=("cube",), num_worlds=1, observation=observation)
+    task = ReorientCfg(hand=hand, objects=("cube",), num_envs=1, observation=observation)
     columns = teacher_observation_slices(load_hand(hand).num_fingers)
     spec = PolicySpec(
         columns["previous_action"].stop, columns["joint_position"].stop, (16, 8), "elu", "gaussian", True
@@ -149,10 +149,10 @@ def tracker_of(
     teacher: TrainedPolicy, monkeypatch, world: torch.Tensor, angle: torch.Tensor, **settings
 ) -> Tracker:
     """A tracker that observes what it is told."""
-    hand, worlds = load_hand(teacher.hand), len(world)
+    hand, envs = load_hand(teacher.hand), len(world)
     policy = TrackingPolicy(teacher, TrackingSpec())
     tracker = Tracker(
-        policy, hand, load_set("cube"), hand.camera, world_object=np.zeros(worlds, dtype=int), **settings
+        policy, hand, load_set("cube"), hand.camera, world_object=np.zeros(envs, dtype=int), **settings
     )
     monkeypatch.setattr(Observer, "__call__", lambda self, senses: (world, angle))
     return tracker
@@ -253,7 +253,7 @@ def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):
 
 @pytest.mark.parametrize("name", sorted(RENAMED))
 def test_a_former_name_is_refused_with_the_new_one(name, capsys, tmp_path):
-    assert cli.main([name, "--output", str(tmp_path)]) == 1
+    assert cli.main([name, "--out", str(tmp_path)]) == 1
     assert RENAMED[name] in capsys.readouterr().err
 
 
@@ -296,7 +296,7 @@ def test_a_pilot_decides_on_a_hand_as_in_the_simulator():
         policy,
         hand=None,
         objects=("cube",),
-        num_worlds=1,
+        num_envs=1,
         seed=3,
         stop_tolerance_rad=0.4,
         max_goal_angle_rad=None,
@@ -322,15 +322,13 @@ def test_a_pilot_decides_on_a_hand_as_in_the_simulator():
 @pytest.mark.slow
 def test_an_evaluation_in_the_air_by_scans_with_views_selected(tmp_path, capsys):
     flags = ["--in-air", "--goals", "scan", "--episodes", "1", "--device", "cpu", "--episode-s", "0.5"]
-    assert cli.main(["dclaw3-tracking", *flags, "--second-view", "--output", str(tmp_path)]) == 0
+    assert cli.main(["dclaw3-tracking", *flags, "--second-view", "--out", str(tmp_path)]) == 0
     by_prediction = Comparison.read(tmp_path / "eval.json").rows[0]
     assert (by_prediction.kind, by_prediction.sees) == ("tracking", "rendered clouds")
     protocol = by_prediction.result.protocol
     assert protocol.goals == "scan" and protocol.sensor_errors and protocol.second_view and protocol.in_air
     assert "symmetry-view selection" in (tmp_path / "eval.html").read_text()
-    assert (
-        cli.main(["dclaw3-tracking", "--sees", "complete", "--device", "cpu", "--output", str(tmp_path)]) == 1
-    )
+    assert cli.main(["dclaw3-tracking", "--sees", "complete", "--device", "cpu", "--out", str(tmp_path)]) == 1
     assert "tracks by a depth camera" in capsys.readouterr().err
 
 
@@ -353,7 +351,7 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
     monkeypatch.setattr("vd.evaluate.compare.run_episodes", spy)
     path = tmp_path / "tracking.pt"
     flags = ["tracker", "dclaw3-table", "--objects", "cube", "--episodes", "1", "--device", "cpu"]
-    flags += ["--output", str(path)]
+    flags += ["--out", str(path)]
     assert vd_train(flags) == 0
     policy, (cfg, selects) = load_tracking(path), asked[-1]
     assert policy.spec.calibrated_on == "cube: 1 episodes, goals by points, tolerance 0.4 rad, seed 1000"

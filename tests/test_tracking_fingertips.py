@@ -15,7 +15,7 @@ from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel
 from vd.assets_usd.hands import load_hand
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.kernels.observations import FINGERTIP_VALUES, teacher_observation_slices
+from vd.kernels.task.observations import FINGERTIP_VALUES, teacher_observation_slices
 from vd.tracking.fingertips import Fingertips
 
 HANDS = ("dclaw3", "dclaw4")
@@ -53,7 +53,7 @@ def test_poses_and_velocities_are_those_of_the_tree_of_links(name, seed):
 def test_a_teacher_observes_them_so(name):
     """Signs of the quaternions included."""
     exact = RandomisationCfg(enabled=False)
-    env = ReorientEnv(ReorientCfg(hand=name, objects=("cube",), num_worlds=3, randomisation=exact), "cpu")
+    env = ReorientEnv(ReorientCfg(hand=name, objects=("cube",), num_envs=3, randomisation=exact), "cpu")
     torch.manual_seed(0)
     for _ in range(6):
         wp.to_torch(env.action).uniform_(-1.0, 1.0)

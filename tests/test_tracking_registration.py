@@ -52,11 +52,11 @@ def errors(found: torch.Tensor, pose: np.ndarray) -> np.ndarray:
     return (Rotation.from_quat(found.numpy()[:, 3:]) * Rotation.from_quat(pose[:, 3:]).inv()).magnitude()
 
 
-def registration(item: ObjectModel, worlds: int, device: str = "cpu", camera=None) -> Registration:
+def registration(item: ObjectModel, envs: int, device: str = "cpu", camera=None) -> Registration:
     return Registration(
         [item],
-        world_object=np.zeros(worlds, dtype=int),
-        world_scale=np.ones(worlds),
+        world_object=np.zeros(envs, dtype=int),
+        world_scale=np.ones(envs),
         camera=camera,
         device=device,
     )
@@ -89,7 +89,7 @@ def test_distances_are_those_of_the_mesh_where_the_samples_lie_on_it(device):
 
 
 def test_a_shape_is_found_and_followed(device, corner):
-    """Eight worlds, each turned a little from look to look; the second look is of four of them anew."""
+    """Eight environments, each turned a little from look to look; the second look is of four of them anew."""
     found, place = registration(corner, 8, device), torch.device(wp.device_to_torch(device))
     pose, turn = poses(8), Rotation.from_rotvec([0.0, 0.1, 0.05])
     fresh = torch.ones(8, dtype=torch.bool, device=place)
@@ -107,13 +107,13 @@ def test_a_shape_is_found_and_followed(device, corner):
 
 def test_what_falls_is_followed(device, corner):
     """By 8 cm from look to look, and turning: farther than steps from where it was reach."""
-    worlds = 24
-    found, place = registration(corner, worlds, device), torch.device(wp.device_to_torch(device))
-    pose = poses(worlds)
+    envs = 24
+    found, place = registration(corner, envs, device), torch.device(wp.device_to_torch(device))
+    pose = poses(envs)
     pose[:, 2] += 0.2
     rng = np.random.default_rng(1)
-    turn = Rotation.from_rotvec(0.3 * Rotation.random(worlds, rng=rng).apply([1.0, 0.0, 0.0]))
-    fresh = torch.ones(worlds, dtype=torch.bool, device=place)
+    turn = Rotation.from_rotvec(0.3 * Rotation.random(envs, rng=rng).apply([1.0, 0.0, 0.0]))
+    fresh = torch.ones(envs, dtype=torch.bool, device=place)
     for look in range(4):
         seen, count = seen_of(corner, pose, seed=look)
         found.look(seen.to(place), count.to(place), fresh=fresh)
@@ -129,10 +129,10 @@ def test_a_world_is_found_whatever_the_others_are(corner):
     seen, count = seen_of(corner, pose)
     fresh = torch.ones(3, dtype=torch.bool)
     results = []
-    for worlds in (slice(0, 3), slice(0, 3), slice(1, 2)):
-        found = registration(corner, len(pose[worlds]))
+    for envs in (slice(0, 3), slice(0, 3), slice(1, 2)):
+        found = registration(corner, len(pose[envs]))
         for first in (fresh, ~fresh):
-            found.look(seen[worlds], count[worlds], fresh=first[worlds])
+            found.look(seen[envs], count[envs], fresh=first[envs])
         results.append(found.pose)
     assert torch.equal(results[0], results[1])
     assert torch.equal(results[0][1:2], results[2])
@@ -163,18 +163,18 @@ def test_points_of_a_camera_are_needed_with_one_only(corner):
 
 def test_what_would_stand_before_what_is_seen_is_not_believed():
     """Boards with a leg behind them, which does not show: turned over they fit as well, but for the leg."""
-    worlds, camera, rng = 8, load_hand("dclaw3").camera, np.random.default_rng(1)
+    envs, camera, rng = 8, load_hand("dclaw3").camera, np.random.default_rng(1)
     # What is seen are not the samples of the shape, which would tell its sides apart.
     board, other = rng.uniform(-1.0, 1.0, (2, 400, 3)) * [0.05, 0.02, 0.002]
     leg = rng.uniform(-1.0, 1.0, (100, 3)) * [0.004, 0.004, 0.01] + [0.03, 0.0, 0.012]
     item = replace(load_set(["cube"])[0], surface_points=np.float32(np.concatenate([board, leg])))
     facing = Rotation.from_quat(camera.quaternion)
     place = camera.position + facing.apply([0.0, 0.0, 0.55])
-    turns = Rotation.from_rotvec([[0.0, 0.0, angle] for angle in np.linspace(0.0, 3.0, worlds)])
+    turns = Rotation.from_rotvec([[0.0, 0.0, angle] for angle in np.linspace(0.0, 3.0, envs)])
     clouds = [(facing * turn).apply(other) + place for turn in turns]
     points = torch.tensor(np.array(clouds), dtype=torch.float32)
-    count = torch.full((worlds,), POINTS, dtype=torch.int32)
-    found = registration(item, worlds, camera=camera)
-    found.look(points[:, :POINTS], count, fresh=torch.ones(worlds, dtype=torch.bool), points=points)
+    count = torch.full((envs,), POINTS, dtype=torch.int32)
+    found = registration(item, envs, camera=camera)
+    found.look(points[:, :POINTS], count, fresh=torch.ones(envs, dtype=torch.bool), points=points)
     legs = facing.inv() * Rotation.from_quat(found.pose[:, 0, 3:].numpy())
     assert (legs.apply([0.0, 0.0, 1.0])[:, 2] > 0.9).all()

@@ -34,7 +34,7 @@ def siblings(tmp_path) -> list[Path]:
 
 def test_weights_of_actor_and_critic_are_means(siblings, tmp_path, capsys):
     output = tmp_path / "mean.pt"
-    assert main(["average", *map(str, siblings), "--output", str(output)]) == 0
+    assert main(["average", *map(str, siblings), "--out", str(output)]) == 0
     assert str(output) in capsys.readouterr().out
     states = [load_checkpoint(path) for path in siblings]
     mean = load_checkpoint(output)
@@ -67,12 +67,12 @@ def test_a_critic_that_not_all_have_is_left_out(siblings, tmp_path):
 def test_policies_that_mean_something_else_are_refused_by_what_differs(siblings, tmp_path, capsys):
     output = tmp_path / "mean.pt"
     three, four = (str(SHIPPED_POLICIES[name]) for name in ("dclaw3-table", "dclaw4-table"))
-    assert main(["average", three, four, "--output", str(output)]) == 1
+    assert main(["average", three, four, "--out", str(output)]) == 1
     message = capsys.readouterr().err
     assert "dclaw4" in message and "num_actions 9, there 12" in message
-    assert main(["average", str(siblings[0]), "--output", str(output)]) == 1
+    assert main(["average", str(siblings[0]), "--out", str(output)]) == 1
     assert "two policies at least" in capsys.readouterr().err
-    assert main(["average", three, str(tmp_path / "none.pt"), "--output", str(output)]) == 1
+    assert main(["average", three, str(tmp_path / "none.pt"), "--out", str(output)]) == 1
     assert "none.pt" in capsys.readouterr().err
     state = load_checkpoint(siblings[0])
     state["task"] = state["task"] | {"action": {"ema_alpha": 0.5, "scale_rad_s": 3.5}}
@@ -80,6 +80,6 @@ def test_policies_that_mean_something_else_are_refused_by_what_differs(siblings,
     save_checkpoint(action, state)
     state["task"] = state["task"] | {"action": {"ema_alpha": 0.8, "scale_rad_s": 3.5}}
     save_checkpoint(tmp_path / "other.pt", state)
-    assert main(["average", str(action), str(tmp_path / "other.pt"), "--output", str(output)]) == 1
+    assert main(["average", str(action), str(tmp_path / "other.pt"), "--out", str(output)]) == 1
     assert "env.action.ema_alpha 0.5, there 0.8" in capsys.readouterr().err
     assert not output.exists()

@@ -41,17 +41,17 @@ def test_presets_are_the_choices_of_the_flag():
 
 def test_paper_preset_is_the_paper():
     cfg, paper = PRESETS["paper"](), PAPER.teacher
-    assert cfg.env.num_worlds == paper.num_worlds == 32000
+    assert cfg.env.num_envs == paper.num_envs == 32000
     assert (cfg.ppo.rollout_steps, cfg.ppo.epochs) == (8, 12)
-    assert minibatches(cfg.ppo, cfg.env.num_worlds) == 4
-    assert cfg.env.num_worlds * cfg.ppo.rollout_steps // 4 == paper.minibatch_size == 64000
+    assert minibatches(cfg.ppo, cfg.env.num_envs) == 4
+    assert cfg.env.num_envs * cfg.ppo.rollout_steps // 4 == paper.minibatch_size == 64000
     assert (cfg.ppo.actor_learning_rate, cfg.ppo.critic_learning_rate) == (3e-4, 1e-3)
     assert (cfg.ppo.clip, cfg.ppo.gamma, cfg.ppo.gae_lambda) == (0.1, 0.99, 0.95)
     assert (cfg.ppo.schedule, cfg.ppo.optimizer) == ("fixed", "adam")
     assert cfg.policy.hidden == (512, 256, 256)
     assert cfg.policy.distribution == "gaussian" and not cfg.policy.normalise_observations
     seen = ObservationCfg(canonical=True)
-    assert cfg.env == type(cfg.env)(num_worlds=32000, objects=("procedural-150-seed0",), observation=seen), (
+    assert cfg.env == type(cfg.env)(num_envs=32000, objects=("procedural-150-seed0",), observation=seen), (
         "the task is the paper's, by the environment's defaults, on as many objects; signs mean nothing"
     )
     assert all(preset().env.observation.canonical for preset in PRESETS.values()), "in all that is new"
@@ -76,7 +76,7 @@ def test_the_machine_decides_where_no_preset_is_named(monkeypatch, gpus, process
     said: list[str] = []
     cfg = parse_teacher([*flags, "--seed", "5"], say=said.append)
     assert cfg.preset == name and cfg.env.seed == 5
-    assert cfg.ppo == PRESETS[name]().ppo and cfg.run.run_dir == PRESETS[name]().run.run_dir
+    assert cfg.ppo == PRESETS[name]().ppo and cfg.run.out == PRESETS[name]().run.out
     assert len(said) == 1 and f"preset {name}, since none is named" in said[0]
     assert parse_teacher(["--preset", "paper"], say=said.append).ppo == PRESETS["paper"]().ppo
     assert parse_teacher(["--smoke"], say=said.append).smoke and len(said) == 1
@@ -117,7 +117,7 @@ def test_the_recipe_loosens_stillness_that_an_evaluation_asks_for_in_full():
         policy,
         hand=None,
         objects=("cube",),
-        num_worlds=1,
+        num_envs=1,
         seed=0,
         stop_tolerance_rad=success.rotation_rad,
         max_goal_angle_rad=None,
@@ -213,8 +213,8 @@ def test_help_needs_neither_torch_nor_the_simulator():
 def test_flags_override_the_preset_and_short_forms_mean_the_environment():
     cfg = parse_teacher(
         [
-            *("--preset", "gpu", "--hand", "dclaw3", "--objects", "cube", "cuboid", "--num_worlds=128"),
-            *("--seed", "7", "--ppo.epochs", "3", "--env.reward.energy=-1.5", "--run-dir", "runs/x"),
+            *("--preset", "gpu", "--hand", "dclaw3", "--objects", "cube", "cuboid", "--num_envs=128"),
+            *("--seed", "7", "--ppo.epochs", "3", "--env.reward.energy=-1.5", "--out", "runs/x"),
             *("--max-minutes", "2.5", "--hand-layer", "bench/identified.usda"),
             *("--env.randomisation.effects", "backlash.width_rad", "0", "0.03"),
             *("dead_zone.width_rad", "0", "0.1"),
@@ -227,16 +227,16 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
     }
     assert from_dict(TeacherCfg, json.loads(json.dumps(to_dict(cfg)))) == cfg
     assert (cfg.env.hand, cfg.env.objects) == ("dclaw3", ("cube", "cuboid"))
-    assert (cfg.env.num_worlds, cfg.env.seed) == (128, 7)
+    assert (cfg.env.num_envs, cfg.env.seed) == (128, 7)
     assert cfg.env.reward.energy == -1.5 and cfg.ppo.epochs == 3
-    assert cfg.run.run_dir == Path("runs/x") and cfg.run.max_minutes == 2.5
+    assert cfg.run.out == Path("runs/x") and cfg.run.max_minutes == 2.5
     assert cfg.policy == PRESETS["gpu"]().policy
 
 
 def test_smoke_is_small_and_short():
-    cfg = parse_teacher(["--smoke", "--num-worlds", "8"])
-    assert cfg.smoke and cfg.run.device == "cpu" and cfg.run.max_minutes == 1.0 and cfg.env.num_worlds == 8
-    assert smoke().env.num_worlds * smoke().ppo.rollout_steps * 20 > smoke().run.max_steps
+    cfg = parse_teacher(["--smoke", "--num-envs", "8"])
+    assert cfg.smoke and cfg.run.device == "cpu" and cfg.run.max_minutes == 1.0 and cfg.env.num_envs == 8
+    assert smoke().env.num_envs * smoke().ppo.rollout_steps * 20 > smoke().run.max_steps
 
 
 def test_a_smoke_test_leaves_nothing_and_can_be_done_again(tmp_path, monkeypatch, capsys):
@@ -256,35 +256,35 @@ def test_resume_starts_from_the_runs_own_configuration(tmp_path):
         PRESETS["gpu"](), run=dataclasses.replace(PRESETS["gpu"]().run, save_every=17)
     )
     (tmp_path / "config.json").write_text(json.dumps(to_dict(saved)))
-    cfg = parse_teacher(["--run-dir", str(tmp_path), "--resume", "--max-steps", "123"])
+    cfg = parse_teacher(["--out", str(tmp_path), "--resume", "--max-steps", "123"])
     assert cfg.resume == "latest" and cfg.run.save_every == 17 and cfg.run.max_steps == 123
-    assert cfg.env == saved.env and cfg.run.run_dir == tmp_path
-    assert parse_teacher(["--run-dir", str(tmp_path), "--resume", "best"]).resume == "best"
-    auto = ["--preset", "gpu", "--resume", "auto", "--run-dir"]
+    assert cfg.env == saved.env and cfg.run.out == tmp_path
+    assert parse_teacher(["--out", str(tmp_path), "--resume", "best"]).resume == "best"
+    auto = ["--preset", "gpu", "--resume", "auto", "--out"]
     assert parse_teacher([*auto, str(tmp_path)]).run.save_every == 17
     assert parse_teacher([*auto, str(tmp_path / "new")]).ppo == PRESETS["gpu"]().ppo
-    assert parse_teacher(["--smoke", "--resume", "auto", "--run-dir", str(tmp_path / "new")]).smoke
-    with pytest.raises(FileNotFoundError, match="--run-dir"):
-        parse_teacher(["--run-dir", str(tmp_path / "none"), "--resume"])
+    assert parse_teacher(["--smoke", "--resume", "auto", "--out", str(tmp_path / "new")]).smoke
+    with pytest.raises(FileNotFoundError, match="--out"):
+        parse_teacher(["--out", str(tmp_path / "none"), "--resume"])
     (tmp_path / "config.json").write_text('{"ppo": {"epoch": 3}}')
     with pytest.raises(ValueError, match=r"ppo has no field epoch"):
-        parse_teacher(["--run-dir", str(tmp_path), "--resume"])
+        parse_teacher(["--out", str(tmp_path), "--resume"])
 
 
 def test_a_folder_with_a_run_is_not_overwritten(tmp_path, capsys):
     (tmp_path / "checkpoints").mkdir()
     (tmp_path / "checkpoints" / "model_0000001.pt").touch()
-    assert main(["teacher", "--smoke", "--run-dir", str(tmp_path)]) == 1
+    assert main(["teacher", "--smoke", "--out", str(tmp_path)]) == 1
     assert "add --resume" in capsys.readouterr().err
     assert not (tmp_path / "config.json").exists()
 
 
 def test_init_keeps_the_flags_and_names_a_missing_file(tmp_path, capsys):
     start = ["--preset", "gpu", "--init", str(tmp_path / "no.pt"), "--env.observation.shape", "full"]
-    cfg = parse_teacher([*start, "--run-dir", str(tmp_path / "run"), "--resume", "auto"])
+    cfg = parse_teacher([*start, "--out", str(tmp_path / "run"), "--resume", "auto"])
     assert cfg.init == str(tmp_path / "no.pt") and cfg.env.observation.shape == "full"
     assert cfg.ppo == PRESETS["gpu"]().ppo and from_dict(TeacherCfg, to_dict(cfg)) == cfg
-    assert main(["teacher", *start, "--run-dir", str(tmp_path / "run")]) == 1
+    assert main(["teacher", *start, "--out", str(tmp_path / "run")]) == 1
     assert "--init: no policy at" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
@@ -330,6 +330,8 @@ def test_files_from_before_a_field_went_are_read_if_it_was_off():
     before["env"]["aim"] = {"enabled": False, "past_rad": 0.3, "within_rad": 0.3}
     before["env"]["focus"] = {"success": {}, "share": 0.7}
     before["run"]["keep_last"] = 3
+    before["run"]["run_dir"] = before["run"].pop("out")
+    before["env"]["num_worlds"] = before["env"].pop("num_envs")
     assert from_dict(TeacherCfg, before) == PRESETS["gpu"]()
     for group, field, value in (
         ("success", "no_table_contact", True),

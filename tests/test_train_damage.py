@@ -47,9 +47,9 @@ def test_damaged_policies_are_refused_in_words(tmp_path, how, capsys):
     make_runner(tmp_path / "run").learn(1)
     policy = tmp_path / "run" / "policy.pt"
     spoil(policy, how)
-    new = ["--run-dir", str(tmp_path / "new")]
+    new = ["--out", str(tmp_path / "new")]
     for command in (
-        lambda: evaluate([str(policy), "--output", str(tmp_path / "eval")]),
+        lambda: evaluate([str(policy), "--out", str(tmp_path / "eval")]),
         lambda: play([str(policy), "--video", str(tmp_path / "film.mp4")]),
         lambda: train(["teacher", "--init", str(policy), *new]),
         lambda: train(["teacher", "--preset", "gpu", "--init", str(policy), *new]),
@@ -72,7 +72,7 @@ def teacher(*flags: str) -> int:
 
 def test_a_setting_that_is_refused_leaves_a_run_that_can_go_on(tmp_path, monkeypatch, capsys):
     simulating_the_dummy(monkeypatch)
-    run = ["--run-dir", str(tmp_path)]
+    run = ["--out", str(tmp_path)]
     assert teacher("--smoke", *run, "--max-steps", "256") == 0
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     for how in (["--resume"], ["--resume", "auto"]):
@@ -88,7 +88,7 @@ def test_a_setting_that_is_refused_leaves_a_run_that_can_go_on(tmp_path, monkeyp
 )
 def test_a_run_goes_on_from_its_newest_sound_checkpoint(tmp_path, monkeypatch, capsys, how, resume):
     simulating_the_dummy(monkeypatch)
-    run = ["--run-dir", str(tmp_path)]
+    run = ["--out", str(tmp_path)]
     assert teacher("--smoke", *run, "--max-steps", "384") == 0  # 128 an iteration, a checkpoint each
     newest = checkpoint_path(tmp_path, 3)
     spoil(newest, how)
@@ -102,7 +102,7 @@ def test_a_run_goes_on_from_its_newest_sound_checkpoint(tmp_path, monkeypatch, c
         path.write_bytes(b"")
     assert teacher(*run, *resume) == 1
     error = capsys.readouterr().err
-    assert "no checkpoint is sound" in error and "start anew with another --run-dir" in error
+    assert "no checkpoint is sound" in error and "start anew with another --out" in error
 
 
 def test_a_run_of_which_the_best_alone_is_left_is_gone_on_with_and_not_begun_anew(tmp_path):

@@ -34,16 +34,16 @@ class LateEnv(DummyEnv):
         self._past = [self._target.copy(), *(np.where(begins, self._target, target) for target in past[:2])]
 
         def shown(target: np.ndarray) -> np.ndarray:
-            return np.hstack([target, np.abs(target), np.ones((self.num_worlds, 1), np.float32)])
+            return np.hstack([target, np.abs(target), np.ones((self.num_envs, 1), np.float32)])
 
         now, late, later = self._past
         seen = late if self.late else now
         self.observation.assign(np.hstack([shown(seen), late - later]))
-        self.privileged.assign(np.hstack([np.zeros((self.num_worlds, 1), np.float32), shown(now)]))
+        self.privileged.assign(np.hstack([np.zeros((self.num_envs, 1), np.float32), shown(now)]))
 
     def step(self, action) -> None:
         """Move the target, then as the dummy."""
-        self._way = getattr(self, "_way", np.float32(0.1) * np.sign(self._draw(self.num_worlds)))
+        self._way = getattr(self, "_way", np.float32(0.1) * np.sign(self._draw(self.num_envs)))
         self._way = np.where(np.abs(self._target + self._way) > 0.8, -self._way, self._way)
         self._target = self._target + self._way
         super().step(action)
@@ -56,22 +56,20 @@ class PromptEnv(LateEnv):
 
     def _observe(self) -> None:
         target = self._target
-        self.observation.assign(
-            np.hstack([target, np.abs(target), np.ones((self.num_worlds, 1), np.float32)])
-        )
+        self.observation.assign(np.hstack([target, np.abs(target), np.ones((self.num_envs, 1), np.float32)]))
 
 
 @pytest.fixture(scope="module")
 def taught(tmp_path_factory):
     """A policy that acts on the present target."""
     folder = tmp_path_factory.mktemp("teacher")
-    runner = make_runner(folder, env=PromptEnv(num_worlds=32), policy=NETWORK)
+    runner = make_runner(folder, env=PromptEnv(num_envs=32), policy=NETWORK)
     runner.learn(60)
     return folder / "policy.pt"
 
 
 def test_an_actor_that_sees_late_comes_to_what_its_teacher_does_by_its_history(taught, tmp_path):
-    runner = make_runner(tmp_path, env=LateEnv(num_worlds=32), policy=NETWORK, ppo=IMITATING)
+    runner = make_runner(tmp_path, env=LateEnv(num_envs=32), policy=NETWORK, ppo=IMITATING)
     runner.begin_from(str(taught))
     assert runner.critic_warmup == 60 and runner.new_inputs == 8, "2, and 6 of the critic"
 
@@ -95,7 +93,7 @@ def test_an_actor_that_sees_late_comes_to_what_its_teacher_does_by_its_history(t
 
 def test_ppo_goes_on_from_there_with_its_own_rates_and_small_first_steps(taught, tmp_path):
     ppo = replace(IMITATING, imitation_iterations=10, actor_learning_rate=1e-4)
-    runner = make_runner(tmp_path, env=LateEnv(num_worlds=32), policy=NETWORK, ppo=ppo)
+    runner = make_runner(tmp_path, env=LateEnv(num_envs=32), policy=NETWORK, ppo=ppo)
     runner.begin_from(str(taught))
     runner.learn(10)
     before = {name: value.clone() for name, value in runner.alg.actor.named_parameters()}
@@ -111,7 +109,7 @@ def test_ppo_goes_on_from_there_with_its_own_rates_and_small_first_steps(taught,
 
 def test_a_run_that_was_stopped_on_the_way_goes_on_imitating_the_same(taught, tmp_path):
     def runner():
-        env = LateEnv(num_worlds=32)
+        env = LateEnv(num_envs=32)
         return make_runner(tmp_path, env=env, policy=NETWORK, ppo=IMITATING, save_every=1)
 
     first = runner()
@@ -132,11 +130,11 @@ def test_a_run_that_goes_on_without_imitating_has_none():
 
 
 def test_it_is_refused_without_a_policy_or_without_the_present(taught, tmp_path, capsys):
-    flags = ["--ppo.imitation-iterations", "5", "--run-dir", str(tmp_path / "run"), "--device", "cpu"]
+    flags = ["--ppo.imitation-iterations", "5", "--out", str(tmp_path / "run"), "--device", "cpu"]
     assert main(["teacher", "--preset", "cube", *flags]) == 1
     assert "--ppo.imitation-iterations imitates the policy that --init names" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
-    runner = make_runner(tmp_path, env=PromptEnv(num_worlds=4), policy=NETWORK, ppo=IMITATING)
+    runner = make_runner(tmp_path, env=PromptEnv(num_envs=4), policy=NETWORK, ppo=IMITATING)
     with pytest.raises(
         ValueError, match=r"is told 0 of the present; give --env\.observation\.dynamics critic"
     ):

@@ -35,7 +35,7 @@ def _export(folder: Path, *, critic: bool = True, learner: bool = True) -> Path:
 
 def _begun(folder: Path, policy: Path, *, warmup: int | None = None, **options):
     ppo = replace(LEARNED, critic_warmup_iterations=warmup, **options)
-    runner = make_runner(folder, env=DummyEnv(num_worlds=16, seed=7), seed=7, policy=NORMALISING, ppo=ppo)
+    runner = make_runner(folder, env=DummyEnv(num_envs=16, seed=7), seed=7, policy=NORMALISING, ppo=ppo)
     runner.begin_from(str(policy))
     return runner
 
@@ -103,7 +103,7 @@ def test_the_warmed_up_critic_explains_what_the_actor_gets(tmp_path):
     del state["critic_state_dict"]
     save_checkpoint(tmp_path / "first" / "policy.pt", state)
     ppo = replace(LEARNED, critic_warmup_iterations=20)
-    runner = make_runner(tmp_path / "second", env=DummyEnv(num_worlds=64, seed=7), policy=sure, ppo=ppo)
+    runner = make_runner(tmp_path / "second", env=DummyEnv(num_envs=64, seed=7), policy=sure, ppo=ppo)
     runner.begin_from(str(tmp_path / "first" / "policy.pt"))
     runner.learn(20)
     explained = [r["loss/explained_variance"] for r in read_progress(tmp_path / "second" / "progress.jsonl")]
@@ -153,7 +153,7 @@ def test_a_policy_that_does_not_say_how_far_it_came_has_come_to_the_end(tmp_path
     state = load_checkpoint(path)
     state["task"]["curriculum"] = to_dict(CurriculumCfg(tightening=TighteningCfg(enabled=tightened)))
     save_checkpoint(path, state)
-    env = DummyEnv(num_worlds=16)
+    env = DummyEnv(num_envs=16)
     env.cfg = replace(env.cfg, curriculum=CurriculumCfg(enabled=True, tightening=TighteningCfg(enabled=True)))
     runner = make_runner(tmp_path / "second", env=env, policy=NORMALISING)
     runner.begin_from(str(path), asked)
@@ -178,7 +178,7 @@ def test_what_does_not_fit_is_named_with_the_flag_that_would(tmp_path):
 
         def _observe(self) -> None: ...
 
-    runner = make_runner(tmp_path / "hand", env=Larger(num_worlds=4), policy=NORMALISING)
+    runner = make_runner(tmp_path / "hand", env=Larger(num_envs=4), policy=NORMALISING)
     with pytest.raises(ValueError, match="moves 2 joints of dummy, and this run's hand, dummy, has 3"):
         runner.begin_from(str(path))
     state = load_checkpoint(path)
@@ -202,7 +202,7 @@ class Telling(DummyEnv):
 @pytest.mark.parametrize("critic", [True, False])
 def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it_did(tmp_path, critic):
     path = _export(tmp_path / "first", critic=critic)
-    runner = make_runner(tmp_path / "told", env=Telling(num_worlds=16), policy=NORMALISING, ppo=LEARNED)
+    runner = make_runner(tmp_path / "told", env=Telling(num_envs=16), policy=NORMALISING, ppo=LEARNED)
     runner.begin_from(str(path))
     assert runner.new_inputs == 2 * critic and runner.num_observations == 5
     observation, plain = runner.env.get_observations(), load_policy(path)
@@ -218,7 +218,7 @@ def test_a_critic_that_is_told_more_begins_as_before_and_the_actor_reads_what_it
     assert ended.act(observation["policy"]).shape == (16, 2)
     with pytest.raises(ValueError, match="critic was told what no sensor knows"):
         ended.value(observation["policy"])
-    again = make_runner(tmp_path / "told", env=Telling(num_worlds=16), policy=NORMALISING, ppo=LEARNED)
+    again = make_runner(tmp_path / "told", env=Telling(num_envs=16), policy=NORMALISING, ppo=LEARNED)
     again.load(str(find_checkpoint(tmp_path / "told", "latest")))
     assert _same(_state(runner.alg.critic), _state(again.alg.critic)) == list(_state(again.alg.critic))
 
@@ -240,20 +240,20 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert find_start(str(tmp_path / "policy.pt")) == tmp_path / "policy.pt"
     with pytest.raises(FileNotFoundError, match=r"--init: no policy at .*installed policy: dclaw3"):
         find_start(str(tmp_path / "none"))
-    assert main(["teacher", "--init", "dclaw3-tracking", "--run-dir", str(tmp_path / "run")]) == 1
+    assert main(["teacher", "--init", "dclaw3-tracking", "--out", str(tmp_path / "run")]) == 1
     assert "holds no actor; give --init" in capsys.readouterr().err
-    assert main(["teacher", "--init-stage", "1", "0", "--run-dir", str(tmp_path / "run")]) == 1
+    assert main(["teacher", "--init-stage", "1", "0", "--out", str(tmp_path / "run")]) == 1
     assert "--init-stage says where a run with --init begins" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize("name", ["dclaw3-table", "dclaw4-table", "dclaw4-cube"])
 def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
-    cfg = parse_teacher(["--init", name, "--objects", "cube", "--num-worlds", "8"])
+    cfg = parse_teacher(["--init", name, "--objects", "cube", "--num-envs", "8"])
     state = load_checkpoint(SHIPPED_POLICIES[name])
-    assert cfg.env.objects == ("cube",) and cfg.env.num_worlds == 8
+    assert cfg.env.objects == ("cube",) and cfg.env.num_envs == 8
     trained = trained_task(load_policy(SHIPPED_POLICIES[name]))
-    assert replace(cfg.env, objects=trained.objects, num_worlds=trained.num_worlds) == trained
+    assert replace(cfg.env, objects=trained.objects, num_envs=trained.num_envs) == trained
     for field in ("hidden", "distribution", "normalise_observations"):
         wanted = state["policy"][field]
         assert getattr(cfg.policy, field) == (tuple(wanted) if isinstance(wanted, list) else wanted)

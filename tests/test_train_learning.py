@@ -20,7 +20,7 @@ from vd.train.vec_env import ReorientVecEnv
 
 @pytest.fixture
 def env() -> ReorientVecEnv:
-    return ReorientVecEnv(DummyEnv(num_worlds=4))
+    return ReorientVecEnv(DummyEnv(num_envs=4))
 
 
 def test_vec_env_contract(env):
@@ -93,7 +93,7 @@ def test_success_is_done_and_only_a_pure_time_out_bootstraps(env):
 
 
 def test_time_out_adds_the_discounted_value_of_the_stored_observation(tmp_path):
-    runner = make_runner(tmp_path, env=DummyEnv(num_worlds=4))
+    runner = make_runner(tmp_path, env=DummyEnv(num_envs=4))
     _fixed_flags(runner.env, success=[1, 0, 0, 0], fell=[0, 1, 0, 0], timed_out=[0, 0, 1, 0])
     observation = runner.env.get_observations()
     with torch.inference_mode():
@@ -118,7 +118,7 @@ def test_staggering_sets_the_environments_own_counter(env):
 def test_learns_to_follow_the_target(tmp_path, distribution):
     ppo = dataclasses.replace(SMALL_PPO, minibatch_size=128)
     policy = dataclasses.replace(SMALL_POLICY, distribution=distribution)
-    runner = make_runner(tmp_path, env=DummyEnv(num_worlds=64), ppo=ppo, policy=policy, save_every=100)
+    runner = make_runner(tmp_path, env=DummyEnv(num_envs=64), ppo=ppo, policy=policy, save_every=100)
     runner.learn(25)
     rows = read_progress(tmp_path / "progress.jsonl")
     first, last = rows[0], rows[-1]
@@ -280,7 +280,7 @@ def test_policy_equals_the_actor_it_came_from(tmp_path, distribution, normalise)
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU to see copies to the host")
 def test_a_step_copies_nothing_to_the_host():
-    env = ReorientVecEnv(DummyEnv(num_worlds=4, device="cuda:0"))
+    env = ReorientVecEnv(DummyEnv(num_envs=4, device="cuda:0"))
     env.env.step = lambda _action: None  # the dummy itself works on the host
     torch.cuda.set_sync_debug_mode("error")
     try:
@@ -393,7 +393,7 @@ def test_a_recorded_graph_gives_the_gradients_of_every_minibatch(tmp_path):
 @needs_gpu
 def test_a_run_with_a_recorded_graph_learns_saves_and_goes_on(tmp_path):
     ppo = dataclasses.replace(SMALL_PPO, minibatch_size=128, cuda_graph=True, schedule="adaptive")
-    env = DummyEnv(num_worlds=64, device="cuda:0")
+    env = DummyEnv(num_envs=64, device="cuda:0")
     runner = make_runner(tmp_path, env=env, ppo=ppo, policy=NORMALISING, device="cuda:0", save_every=25)
     runner.learn(25)
     rows = read_progress(tmp_path / "progress.jsonl")

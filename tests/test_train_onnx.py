@@ -18,12 +18,12 @@ def test_onnxruntime_gives_the_same_actions_for_any_number_of_worlds(tmp_path, n
     assert "the same actions within" in capsys.readouterr().out
     policy = load_policy(SHIPPED_POLICIES[name])
     session = onnxruntime.InferenceSession(str(tmp_path / "policy.onnx"))
-    for worlds in (1, 7):
+    for envs in (1, 7):
         # observations of the size they have, not of size 1
-        noise = torch.randn(worlds, policy.num_observations, generator=torch.Generator().manual_seed(0))
+        noise = torch.randn(envs, policy.num_observations, generator=torch.Generator().manual_seed(0))
         observation = policy.network.offset + policy.network.scale * noise
         (found,) = session.run(["action"], {"observation": observation.numpy()})
-        assert found.shape == (worlds, policy.num_actions)
+        assert found.shape == (envs, policy.num_actions)
         np.testing.assert_allclose(found, policy.act(observation).numpy(), atol=1e-4)
 
 

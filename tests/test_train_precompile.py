@@ -89,11 +89,11 @@ def test_a_training_is_taken_through_all_that_it_launches(
     flags = ["--preset", "gpu", "--hand", "dclaw3", "--objects", "cube"]
     assert main(["precompile", "kernels", *flags]) == 0
     for part in (
-        "vd.kernels.actions",
-        "vd.kernels.observations",
-        "vd.kernels.rewards",
-        "vd.kernels.resets",
-        "vd.kernels.symmetry",
+        "vd.kernels.task.actions",
+        "vd.kernels.task.observations",
+        "vd.kernels.task.rewards",
+        "vd.kernels.task.resets",
+        "vd.kernels.task.symmetry",
         "vd.kernels.pair_order",
         "ccd_kernel",
         "linesearch",

@@ -1,4 +1,4 @@
-"""A run of several processes: the same parameters, own worlds, and errors and hangs of one of them."""
+"""A run of several processes: the same parameters, own environments, and errors and hangs of one of them."""
 
 import json
 import os
@@ -23,7 +23,7 @@ from train_dummy import DummyEnv, make_runner
 from vd.train.checkpoint import find_checkpoint
 import os
 rank, folder = int(os.environ["RANK"]), Path({folder!r})
-runner = make_runner(folder, env=DummyEnv(num_worlds=8, seed=rank), seed=rank, save_every=2)
+runner = make_runner(folder, env=DummyEnv(num_envs=8, seed=rank), seed=rank, save_every=2)
 runner.learn(2)
 torch.manual_seed(100 + rank)
 runner.load(str(find_checkpoint(folder, "latest")))
@@ -69,7 +69,7 @@ def test_two_processes_keep_the_same_parameters_and_their_own_worlds(tmp_path):
     assert [row["iteration"] for row in read_progress(tmp_path / "progress.jsonl")] == [1, 2]
 
     # One process goes on with what two have begun.
-    alone = make_runner(tmp_path, env=DummyEnv(num_worlds=8))
+    alone = make_runner(tmp_path, env=DummyEnv(num_envs=8))
     alone.load(str(find_checkpoint(tmp_path, "latest")))
     assert alone.new_episodes == "it is of 2 processes, this run has 1"
     assert alone.env_steps == one["steps"] and alone.env.env.stage.difficulty == pytest.approx(0.02)
@@ -89,7 +89,7 @@ sys.path.insert(0, {tests!r})
 from train_dummy import DummyEnv, make_runner
 from vd.train.distributed import ending_together
 rank = int(os.environ["RANK"])
-env = DummyEnv(num_worlds=8, seed=rank)
+env = DummyEnv(num_envs=8, seed=rank)
 runner = make_runner(Path({folder!r}), env=env, seed=rank)
 def check():
     if rank == 0 and env.steps >= 16:
@@ -134,7 +134,7 @@ from vd.train import distributed, watchdog
 distributed.COLLECTIVE_TIMEOUT = timedelta(seconds=6)
 watchdog.REPORT_AFTER_S, watchdog.PUBLISH_EVERY_S = 1.5, 0.2
 rank = int(os.environ["RANK"])
-env = DummyEnv(num_worlds=8, seed=rank)
+env = DummyEnv(num_envs=8, seed=rank)
 runner = make_runner(Path({folder!r}), env=env, seed=rank)
 def check():
     if rank == 1 and env.steps >= 16:

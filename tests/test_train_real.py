@@ -25,11 +25,11 @@ TIMING = ("elapsed_s", "steps_per_s", "collect_s", "learn_s")
 
 
 def _train(run_dir: Path, iterations: int, resume: str | None = None) -> TeacherRunner:
-    """A few iterations of a few worlds on the CPU, with randomisation and curriculum on."""
+    """A few iterations of a few environments on the CPU, with randomisation and curriculum on."""
     cfg = smoke()
     task = replace(
         cfg.env,
-        num_worlds=8,
+        num_envs=8,
         start=replace(cfg.env.start, poses=2),
         randomisation=replace(cfg.env.randomisation, enabled=True),
         curriculum=replace(cfg.env.curriculum, enabled=True, raise_at=0.0, lower_at=0.0),
@@ -37,7 +37,7 @@ def _train(run_dir: Path, iterations: int, resume: str | None = None) -> Teacher
     cfg = replace(
         cfg,
         resume=resume,
-        run=replace(cfg.run, run_dir=run_dir, max_minutes=None),
+        run=replace(cfg.run, out=run_dir, max_minutes=None),
         ppo=replace(cfg.ppo, rollout_steps=4, minibatch_size=16),
         env=task,
     )
@@ -68,9 +68,9 @@ def test_what_is_learned_in_coarser_physics_is_judged_in_the_default(tmp_path):
     cfg = smoke()
     cfg = replace(
         cfg,
-        run=replace(cfg.run, run_dir=tmp_path, max_minutes=None, coarse_physics=True),
+        run=replace(cfg.run, out=tmp_path, max_minutes=None, coarse_physics=True),
         ppo=replace(cfg.ppo, rollout_steps=4, minibatch_size=16),
-        env=replace(cfg.env, num_worlds=4),
+        env=replace(cfg.env, num_envs=4),
     )
     runner = build_teacher(cfg)
     assert runner.env.env.cfg.sim == coarser(SimCfg()) != SimCfg()
@@ -80,8 +80,8 @@ def test_what_is_learned_in_coarser_physics_is_judged_in_the_default(tmp_path):
 
 @pytest.mark.slow
 def test_a_run_that_has_nothing_left_to_do_does_not_speak_of_a_policy(tmp_path, capsys):
-    flags = ["--init", "dclaw4-cube", "--num-worlds", "4", "--ppo.minibatch-size", "4", "--device", "cpu"]
-    assert main(["teacher", *flags, "--max-steps", "32", "--run-dir", str(tmp_path)]) == 0
+    flags = ["--init", "dclaw4-cube", "--num-envs", "4", "--ppo.minibatch-size", "4", "--device", "cpu"]
+    assert main(["teacher", *flags, "--max-steps", "32", "--out", str(tmp_path)]) == 0
     assert "nothing was trained" in (told := capsys.readouterr().out) and "raise it" in told
     assert not (tmp_path / "policy.pt").exists()
 
@@ -93,7 +93,7 @@ def test_a_blind_run_goes_on_with_shape_and_memory_and_its_policy_is_evaluated(t
 
     from vd.evaluate.cli import main as evaluate
 
-    flags = ["teacher", "--smoke", "--num-worlds", "4", "--max-steps", "32", "--run-dir"]
+    flags = ["teacher", "--smoke", "--num-envs", "4", "--max-steps", "32", "--out"]
     assert main([*flags, str(tmp_path / "blind"), "--save-every", "1"]) == 0
     checkpoint = checkpoint_path(tmp_path / "blind", 1)
     cfg = smoke()
@@ -101,8 +101,8 @@ def test_a_blind_run_goes_on_with_shape_and_memory_and_its_policy_is_evaluated(t
     cfg = replace(
         cfg,
         init=checkpoint,
-        run=replace(cfg.run, run_dir=tmp_path / "seeing"),
-        env=replace(cfg.env, num_worlds=4, observation=observation),
+        run=replace(cfg.run, out=tmp_path / "seeing"),
+        env=replace(cfg.env, num_envs=4, observation=observation),
     )
     runner = build_teacher(cfg)
     before, simulation = load_policy(checkpoint).num_observations, runner.env.env
@@ -116,16 +116,16 @@ def test_a_blind_run_goes_on_with_shape_and_memory_and_its_policy_is_evaluated(t
     policy = load_policy(tmp_path / "seeing" / "policy.pt")
     assert policy.task["observation"]["shape"] == "full" and policy.task["observation"]["history"] == 2
     assert np.isfinite(policy.act(wp.to_torch(runner.env.env.observation)).numpy()).all()
-    arguments = ["--episodes", "1", "--num-worlds", "1", "--episode-s", "0.5", "--device", "cpu"]
-    arguments += ["--condition", "mixed", "--output"]
+    arguments = ["--episodes", "1", "--num-envs", "1", "--episode-s", "0.5", "--device", "cpu"]
+    arguments += ["--condition", "mixed", "--out"]
     assert evaluate([str(tmp_path / "seeing"), *arguments, str(tmp_path / "eval")]) == 0
 
 
 @pytest.mark.slow
 def test_the_command_trains_saves_on_sigterm_and_resumes(tmp_path):
-    command = [sys.executable, "-m", "vd.train.cli", "teacher", "--run-dir", str(tmp_path)]
+    command = [sys.executable, "-m", "vd.train.cli", "teacher", "--out", str(tmp_path)]
     run = subprocess.Popen(
-        [*command, "--smoke", "--num-worlds", "4", "--max-steps", "100000", "--max-minutes", "5"],
+        [*command, "--smoke", "--num-envs", "4", "--max-steps", "100000", "--max-minutes", "5"],
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
     )
     progress = tmp_path / PROGRESS_FILE
@@ -137,9 +137,9 @@ def test_the_command_trains_saves_on_sigterm_and_resumes(tmp_path):
     assert run.wait(timeout=300) == 143
     done = read_progress(progress)[-1]["iteration"]
     config = json.loads((tmp_path / "config.json").read_text())
-    assert config["env"]["num_worlds"] == 4
+    assert config["env"]["num_envs"] == 4
 
     steps = (done + 1) * 4 * config["ppo"]["rollout_steps"]
-    assert main(["teacher", "--run-dir", str(tmp_path), "--resume", "--max-steps", str(steps)]) == 0
+    assert main(["teacher", "--out", str(tmp_path), "--resume", "--max-steps", str(steps)]) == 0
     assert [row["iteration"] for row in read_progress(progress)] == list(range(1, done + 2))
     assert load_policy(tmp_path / "policy.pt").hand == "dclaw3"

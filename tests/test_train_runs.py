@@ -53,7 +53,7 @@ def test_three_and_three_more_equal_six(tmp_path, schedule):
 
     part = tmp_path / "part"
     make_runner(part, ppo=ppo).learn(3)
-    resumed = make_runner(part, ppo=ppo, env=DummyEnv(num_worlds=16, seed=99), seed=99)
+    resumed = make_runner(part, ppo=ppo, env=DummyEnv(num_envs=16, seed=99), seed=99)
     resumed.load(str(find_checkpoint(part, "latest")))
     assert resumed.current_learning_iteration == 3
     resumed.learn(3)
@@ -185,7 +185,7 @@ def test_random_states_are_restored():
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_saves_and_the_run_goes_on(tmp_path, number):
-    env = DummyEnv(num_worlds=16)
+    env = DummyEnv(num_envs=16)
     runner = make_runner(tmp_path, env=env, save_every=100)
     step, handler = env.step, signal.getsignal(number)
 
@@ -207,7 +207,7 @@ def test_a_signal_saves_and_the_run_goes_on(tmp_path, number):
 
 
 def test_limits_of_steps_and_time(tmp_path):
-    runner = make_runner(tmp_path / "steps", max_steps=300)  # 16 worlds x 8 steps = 128 an iteration
+    runner = make_runner(tmp_path / "steps", max_steps=300)  # 16 environments x 8 steps = 128 an iteration
     runner.learn()
     assert runner.current_learning_iteration == 3 and runner.env_steps == 384
     timed = make_runner(tmp_path / "time", deadline=time.monotonic(), save_every=100)
@@ -217,14 +217,14 @@ def test_limits_of_steps_and_time(tmp_path):
 
 
 def test_environment_is_checked_and_its_curriculum_moved_once_an_iteration(tmp_path):
-    env = DummyEnv(num_worlds=16)
+    env = DummyEnv(num_envs=16)
     make_runner(tmp_path, env=env).learn(3)
     assert env.checks == env.updates == 3
 
 
 @pytest.mark.parametrize("where", ["observation", "reward"])
 def test_nan_from_the_simulation_stops_before_the_update(tmp_path, where):
-    env = DummyEnv(num_worlds=16)
+    env = DummyEnv(num_envs=16)
     runner = make_runner(tmp_path, env=env, save_every=1)
     step = env.step
 
@@ -236,7 +236,9 @@ def test_nan_from_the_simulation_stops_before_the_update(tmp_path, where):
             getattr(env, where).assign(values)
 
     env.step = poisoned
-    with pytest.raises(TrainingDivergedError, match=rf"{where}s.*not finite in 1 worlds \(first: \[3\]\)"):
+    with pytest.raises(
+        TrainingDivergedError, match=rf"{where}s.*not finite in 1 environments \(first: \[3\]\)"
+    ):
         runner.learn(5)
     assert all(torch.isfinite(w).all() for w in _weights(runner).values())
     assert find_checkpoint(tmp_path, "latest").name == "model_0000001.pt"
@@ -302,7 +304,7 @@ def test_a_checkpoint_without_worlds_goes_on_with_new_episodes(tmp_path):
     save_checkpoint(tmp_path / "slim.pt", without_worlds(load_checkpoint(path)))
     assert (tmp_path / "slim.pt").stat().st_size < path.stat().st_size
 
-    env = DummyEnv(num_worlds=16, seed=5)
+    env = DummyEnv(num_envs=16, seed=5)
     resumed = make_runner(tmp_path, env=env, seed=5)
     resumed.load(str(tmp_path / "slim.pt"))
     assert resumed.new_episodes == "it holds no worlds"
@@ -325,7 +327,7 @@ def test_the_floor_of_the_std_falls_as_stillness_tightens(tmp_path):
     from train_dummy import SMALL_POLICY
 
     policy = replace(SMALL_POLICY, std_range=(0.2, 1.0), quiet_std=0.05)
-    env = DummyEnv(num_worlds=16)
+    env = DummyEnv(num_envs=16)
     runner = make_runner(tmp_path, env=env, policy=policy)
     observation = torch.randn(50, env.num_observations)
     seen = []
@@ -338,7 +340,7 @@ def test_the_floor_of_the_std_falls_as_stillness_tightens(tmp_path):
     for std, floor in zip(seen, (0.2, 0.1, 0.05), strict=True):
         assert torch.allclose(std, torch.full_like(std, floor), rtol=1e-4)
 
-    again = make_runner(tmp_path, env=DummyEnv(num_worlds=16), policy=policy)
+    again = make_runner(tmp_path, env=DummyEnv(num_envs=16), policy=policy)
     again.env.env.stage = Stage(1.0, 0.5)
     again.learn(1)
     assert float(again.alg.actor.distribution.log_floor) == pytest.approx(np.log(0.1))
@@ -357,7 +359,7 @@ def test_a_quiet_std_above_the_floor_or_of_another_distribution_is_refused(tmp_p
 
 
 def test_the_best_is_the_tightest_before_the_most_successful(tmp_path):
-    env = DummyEnv(num_worlds=16)
+    env = DummyEnv(num_envs=16)
     runner = make_runner(tmp_path, env=env, save_every=1)
     runner._window = GoalWindow(1)
     scores = []
@@ -375,7 +377,7 @@ class SeeingEnv(DummyEnv):
     num_observations = DummyEnv.num_observations + 3
 
     def _observe(self) -> None:
-        marker = np.full((self.num_worlds, 1), float(self.steps), dtype=np.float32) * 1e-3
+        marker = np.full((self.num_envs, 1), float(self.steps), dtype=np.float32) * 1e-3
         more = np.hstack([self._target * self._target, 100.0 + self._target[:, :1]])
         self.observation.assign(np.hstack([self._target, np.abs(self._target), marker, more]))
 
@@ -401,7 +403,7 @@ def test_networks_that_see_more_act_as_before_and_learn_on(tmp_path, how, normal
     policy = replace(SMALL_POLICY, normalise_observations=normalise)
     blind = make_runner(tmp_path / "blind", policy=policy)
     blind.learn(3)
-    seeing = make_runner(tmp_path / "seeing", env=SeeingEnv(num_worlds=16, seed=4), policy=policy, seed=4)
+    seeing = make_runner(tmp_path / "seeing", env=SeeingEnv(num_envs=16, seed=4), policy=policy, seed=4)
     getattr(seeing, how)(str(find_checkpoint(tmp_path / "blind", "latest")))
     assert seeing.new_inputs == 3 and seeing.new_episodes
 
@@ -444,7 +446,7 @@ def test_networks_keep_their_layers(tmp_path):
 
 
 def test_networks_cannot_see_less(tmp_path):
-    make_runner(tmp_path, env=SeeingEnv(num_worlds=16)).learn(1)
+    make_runner(tmp_path, env=SeeingEnv(num_envs=16)).learn(1)
     blind = make_runner(tmp_path / "blind")
     with pytest.raises(ValueError, match="read 8 values and this run observes 5"):
         blind.load(str(find_checkpoint(tmp_path, "latest")))
@@ -456,7 +458,7 @@ def test_a_new_run_can_begin_from_anothers_checkpoint(tmp_path):
     first.learn(3)
     checkpoint = find_checkpoint(tmp_path / "first", "latest")
     assert load_checkpoint(checkpoint)["best"] is not None
-    second = make_runner(tmp_path / "second", env=DummyEnv(num_worlds=16, seed=7), seed=7)
+    second = make_runner(tmp_path / "second", env=DummyEnv(num_envs=16, seed=7), seed=7)
     second.begin_from(str(checkpoint))
     assert second.new_inputs == 0 and second.new_episodes == "it is of another run"
     one, two = _weights(first), _weights(second)
@@ -485,10 +487,10 @@ def test_a_new_run_has_its_own_learning_rates_and_a_resumed_one_those_it_had(tmp
 
 
 def test_a_run_goes_on_with_another_number_of_worlds_to_the_same_steps(tmp_path):
-    make_runner(tmp_path).learn(3)  # 16 worlds x 8 steps = 128 an iteration
-    resumed = make_runner(tmp_path, env=DummyEnv(num_worlds=8), max_steps=600)
+    make_runner(tmp_path).learn(3)  # 16 environments x 8 steps = 128 an iteration
+    resumed = make_runner(tmp_path, env=DummyEnv(num_envs=8), max_steps=600)
     resumed.load(str(find_checkpoint(tmp_path, "latest")))
-    assert resumed.new_episodes == "it is of 16 worlds a process, this run has 8"
+    assert resumed.new_episodes == "it is of 16 environments a process, this run has 8"
     assert resumed.total_iterations == 3 + 4  # 600 - 384 steps, 64 an iteration
     resumed.learn()
     assert _rows(tmp_path)[-1]["env_steps"] == 384 + 4 * 64

@@ -28,7 +28,7 @@ class DummyCfg:
 class DummyEnv:
     """Reward is minus the squared distance of the action to a target that the observation shows.
 
-    A target within ``reach`` of the action counts as success and is replaced; worlds "fall" with a
+    A target within ``reach`` of the action counts as success and is replaced; environments "fall" with a
     small probability and time out after ``max_episode_steps``.
     """
 
@@ -40,10 +40,10 @@ class DummyEnv:
     reach = 0.2
     fall_probability = 0.02
 
-    def __init__(self, num_worlds: int = 4, max_episode_steps: int = 10, seed: int = 0, device: str = "cpu"):
+    def __init__(self, num_envs: int = 4, max_episode_steps: int = 10, seed: int = 0, device: str = "cpu"):
         self.cfg = DummyCfg(seed=seed)
-        self.num_worlds, self.max_episode_steps, self.device = num_worlds, max_episode_steps, device
-        n = num_worlds
+        self.num_envs, self.max_episode_steps, self.device = num_envs, max_episode_steps, device
+        n = num_envs
         self.action = wp.zeros((n, self.num_actions), dtype=float, device=device)
         self.observation = wp.zeros((n, self.num_observations), dtype=float, device=device)
         self.privileged = wp.zeros((n, self.num_privileged), dtype=float, device=device)
@@ -69,7 +69,7 @@ class DummyEnv:
         return self._generator.uniform(-0.8, 0.8, (count, self.num_actions)).astype(np.float32)
 
     def _observe(self) -> None:
-        marker = np.full((self.num_worlds, 1), float(self.steps), dtype=np.float32) * 1e-3
+        marker = np.full((self.num_envs, 1), float(self.steps), dtype=np.float32) * 1e-3
         self.observation.assign(np.hstack([self._target, np.abs(self._target), marker]))
 
     def step(self, action: wp.array) -> None:
@@ -78,7 +78,7 @@ class DummyEnv:
         distance = np.square(a - self._target).sum(axis=1)
         success = np.sqrt(distance) < self.reach
         count = self.step_count.numpy() + 1
-        fell = self._generator.uniform(size=self.num_worlds) < self.fall_probability
+        fell = self._generator.uniform(size=self.num_envs) < self.fall_probability
         timed_out = count >= self.max_episode_steps
         bonus = success.astype(np.float32)
         self.reward.assign(-distance + bonus)
@@ -115,7 +115,7 @@ class DummyEnv:
     def reset(self) -> None:
         """New episodes everywhere."""
         self.step_count.zero_()
-        self._target = self._draw(self.num_worlds)
+        self._target = self._draw(self.num_envs)
         self._observe()
 
     def state_dict(self) -> dict[str, Any]:
@@ -151,7 +151,7 @@ def simulating_the_dummy(monkeypatch) -> None:
 
     class Env(DummyEnv):
         def __init__(self, cfg, device):
-            super().__init__(num_worlds=cfg.num_worlds, seed=cfg.seed)
+            super().__init__(num_envs=cfg.num_envs, seed=cfg.seed)
             self.objects = list(cfg.objects)
 
         def state_dict(self):
@@ -159,7 +159,7 @@ def simulating_the_dummy(monkeypatch) -> None:
 
         def load_state_dict(self, state):
             if state["objects"] != self.objects:
-                raise ValueError("the worlds of the saved environment hold other objects")
+                raise ValueError("the environments of the saved environment hold other objects")
             super().load_state_dict(state)
 
     monkeypatch.setattr("vd.envs.reorient.ReorientEnv", Env)
@@ -192,8 +192,8 @@ def make_runner(
 ) -> TeacherRunner:
     """A runner on the dummy, deterministic from ``seed``."""
     torch.manual_seed(seed)
-    env = env or DummyEnv(num_worlds=16, seed=seed, device=device)
-    settings = RunCfg(run_dir=run_dir, device=device, **{"save_every": 3, "tensorboard": False, **run})
+    env = env or DummyEnv(num_envs=16, seed=seed, device=device)
+    settings = RunCfg(out=run_dir, device=device, **{"save_every": 3, "tensorboard": False, **run})
     task = {"hand": "dummy", "tolerance": PAPER.success.rotation_rad}
     return TeacherRunner(
         ReorientVecEnv(env), ppo, policy, settings, task=task, device=device, deadline=deadline

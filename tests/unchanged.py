@@ -87,7 +87,7 @@ def evaluated(part: str, items: dict[str, tuple[str, ...]], work: Path, objects:
     for name, words in items.items():
         out = work / name.replace(" ", "-")
         flags = ["--objects", objects, "--episodes", EPISODES[part], "--seed", 1, "--device", "cpu"]
-        call("-m", "vd.evaluate.cli", *words, *flags, "--output", out, log=out.with_suffix(".log"))
+        call("-m", "vd.evaluate.cli", *words, *flags, "--out", out, log=out.with_suffix(".log"))
         for row in json.loads((out / "eval.json").read_text())["rows"]:
             label = [row[key] for key in ("policy", "stopped_by", "ours") if row[key]]
             label += [f"{bound:g}" for bound in row["rule"].values()]
@@ -139,7 +139,7 @@ def step_tasks(objects: Path, out: Path) -> None:
     files = tuple(str(path) for path in sorted(objects.glob("*.usd"))[:2])
     found: dict[str, Any] = {}
     for name, task in sorted(tasks().items()):
-        env = ReorientEnv(replace(task, num_worlds=WORLDS, objects=files, seed=5, episode_s=1.0), "cpu")
+        env = ReorientEnv(replace(task, num_envs=WORLDS, objects=files, seed=5, episode_s=1.0), "cpu")
         rng, found[name] = np.random.default_rng(7), []
         for _ in range(STEPS):
             action = rng.uniform(-1.0, 1.0, (WORLDS, env.num_actions)).astype(np.float32)
@@ -177,7 +177,7 @@ def training(work: Path, objects: Path) -> dict[str, Any]:
     from vd.policy import load_policy
     from vd.train.metrics import read_progress
 
-    run, command = work / "run", ("-m", "vd.train.cli", "teacher", "--smoke", "--run-dir", work / "run")
+    run, command = work / "run", ("-m", "vd.train.cli", "teacher", "--smoke", "--out", work / "run")
     call(*command, "--max-steps", 384, log=work / "first.log")
     call(*command, "--resume", "--max-steps", 768, log=work / "second.log")
     weights = load_policy(run / "policy.pt", "cpu").weights
@@ -189,7 +189,9 @@ def faults(work: Path, objects: Path, only: str = "") -> dict[str, Any]:
     """How every fault of the twin ends, or one, without the figures that its words tell."""
     file = work / "faults.json"
     # Status 1 is of a fault that ended otherwise than it has to: its row says so.
-    call("-m", "vd.deploy.faults", "--json", file, "--only", only, log=work / "faults.log", status=(0, 1))
+    call(
+        "-m", "vd.deploy.twin.faults", "--json", file, "--only", only, log=work / "faults.log", status=(0, 1)
+    )
     rows = json.loads(file.read_text())
     return {row["fault"]: row | {"happened": re.sub(r"[\d.]+", "#", row["happened"])} for row in rows}
 

@@ -31,16 +31,16 @@ class AverageCfg:
     policies: Annotated[tuple[str, ...], tyro.conf.Positional]
     """Checkpoints of vd-train teacher, policies, runs' folders (their best), or installed policies; two at
     least."""
-    output: Path = Path("policy.pt")
+    out: Path = Path("policy.pt")
     """File to write."""
 
 
 def average_command(arguments: list[str], _started: float) -> int:
     """``vd-train average``; the exit status."""
     cfg = tyro.cli(AverageCfg, args=arguments, prog="vd-train average")
-    check_file(cfg.output)
-    average_policies(cfg.policies, cfg.output)
-    print(f"{cfg.output}: the mean of {len(cfg.policies)} policies; next, judge it: vd-eval {cfg.output}")
+    check_file(cfg.out)
+    average_policies(cfg.policies, cfg.out)
+    print(f"{cfg.out}: the mean of {len(cfg.policies)} policies; next, judge it: vd-eval {cfg.out}")
     return 0
 
 

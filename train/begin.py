@@ -91,7 +91,7 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
             f"--init: {path} was written by another version ({error}); add --preset and the settings that it "
             "was trained with"
         ) from error
-    run = replace(base.run, run_dir=Path("runs") / f"from-{Path(name).stem}")
+    run = replace(base.run, out=Path("runs") / f"from-{Path(name).stem}")
     return replace(
         base,
         run=run,

@@ -22,7 +22,7 @@ _NEEDED = {"actor": ("policy", "task", "iter", "env_steps"), "student": ("spec",
 """What belongs to the weights of a teacher or a student. Other projects' files have an actor too."""
 _NAME = re.compile(r"model_(\d+)\.pt")
 _ARRAY = "__numpy__"
-# Key in the environment's state under which that of its worlds lies.
+# Key in the environment's state under which that of its environments lies.
 _WORLDS = "arrays"
 
 
@@ -56,7 +56,7 @@ def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") ->
     files = [*([best] if best.is_file() else []), *list_checkpoints(run_dir)]
     if which is None and files:
         raise FileExistsError(
-            f"{run_dir} holds a run; add --resume to go on with it, or choose another --run-dir"
+            f"{run_dir} holds a run; add --resume to go on with it, or choose another --out"
         )
     if which is None or (which == AUTO and not files):
         return None
@@ -80,7 +80,7 @@ def _newest_sound(files: list[Path], network: str) -> Path:
             return path
         reasons.append(reason)
     raise ValueError(
-        f"--resume: no checkpoint is sound ({', '.join(reasons)}); start anew with another --run-dir"
+        f"--resume: no checkpoint is sound ({', '.join(reasons)}); start anew with another --out"
     )
 
 
@@ -166,7 +166,7 @@ def without_worlds(state: dict[str, Any]) -> dict[str, Any]:
 
 
 def saved_worlds(rank: dict[str, Any]) -> int:
-    """Worlds in one process's part of a checkpoint (an item of ``ranks``); 0 if it was left out."""
+    """Environments in one process's part of a checkpoint (an item of ``ranks``); 0 if it was left out."""
     arrays = rank["env"].get(_WORLDS)
     return 0 if arrays is None else len(arrays["step_count"])
 

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 USAGE = """usage: vd-train COMMAND [flags]
 
 commands:
-  teacher    train the teacher with PPO           vd-train teacher --preset gpu --run-dir runs/first
+  teacher    train the teacher with PPO           vd-train teacher --preset gpu --out runs/first
   student    imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
   tracker    let it act by a camera, learn nothing vd-train tracker dclaw3-table --objects SET
-  average    mean weights of several teachers     vd-train average runs/a runs/b --output policy.pt
+  average    mean weights of several teachers     vd-train average runs/a runs/b --out policy.pt
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
@@ -41,12 +41,13 @@ commands:
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset multi-gpu
 Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
-               -m vd.train.cli teacher --preset multi-gpu --run-dir SHARED/FOLDER
-Restart by itself after a failure: torchrun --max-restarts 3 ... teacher --run-dir FOLDER --resume auto
+               -m vd.train.cli teacher --preset multi-gpu --out SHARED/FOLDER
+Restart by itself after a failure: torchrun --max-restarts 3 ... teacher --out FOLDER --resume auto
                (several nodes: set TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1, or old addresses outlive a restart)
 
-A run goes on with any number of GPUs and worlds (--resume); on another machine it needs its config.json and a
-checkpoint, progress.jsonl for the curve so far: vd-train teacher --run-dir FOLDER --resume small.pt
+A run goes on with any number of GPUs and environments (--resume); on another machine it needs its
+config.json and a checkpoint, progress.jsonl for the curve so far: vd-train teacher --out FOLDER --resume
+small.pt
 
 vd-train COMMAND --help lists the flags of a command."""
 
@@ -72,8 +73,8 @@ class ExportCfg:
     """File to write. A name that ends in .onnx gets the network from observation to mean action, checked
     against onnxruntime where that is installed."""
     resumable: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Write a checkpoint for --resume instead, all but the state of the worlds: a run that moves to another
-    machine or number of GPUs starts its episodes anew anyway."""
+    """Write a checkpoint for --resume instead, all but the state of the environments: a run that moves to
+    another machine or number of GPUs starts its episodes anew anyway."""
 
 
 @dataclass
@@ -97,7 +98,7 @@ class CurvesCfg:
 
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional]
     """Folders of runs, or progress.jsonl files."""
-    output: Path | None = None
+    out: Path | None = None
     """PNG to write; curves.png beside the first run's progress by default."""
 
 
@@ -162,10 +163,10 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     """
     from vd.train.checkpoint import damaged_after, find_checkpoint, load_checkpoint, set_aside
 
-    check_folder(cfg.run.run_dir)
+    check_folder(cfg.run.out)
     rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
     cfg = replace(cfg, run=replace(cfg.run, device=device))
-    checkpoint = find_checkpoint(cfg.run.run_dir, cfg.resume)
+    checkpoint = find_checkpoint(cfg.run.out, cfg.resume)
     init = find_start(cfg.init) if checkpoint is None and cfg.init is not None else None
     if init is not None:
         load_checkpoint(init, flag="--init")  # a damaged one is refused before anything is built
@@ -193,7 +194,7 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     simulation = ReorientEnv(
         replace(cfg.env, seed=cfg.env.seed + rank, sim=physics, observation=seen), device
     )
-    simulation.dump_dir = cfg.run.run_dir
+    simulation.dump_dir = cfg.run.out
     env = ReorientVecEnv(simulation, second_view=cfg.second_view)
     deadline = cfg.run.deadline(started)
     runner = TeacherRunner(
@@ -207,8 +208,8 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
         # After all that can refuse: settings that a run cannot have must not take the place of its own.
         saved = to_dict(replace(cfg, resume=None))
         saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
-        write_json(cfg.run.run_dir / CONFIG_NAME, saved)
-        runner.damaged = damaged_after(cfg.run.run_dir, checkpoint)
+        write_json(cfg.run.out / CONFIG_NAME, saved)
+        runner.damaged = damaged_after(cfg.run.out, checkpoint)
         set_aside(runner.damaged)
     return runner
 
@@ -222,19 +223,21 @@ def print_damaged(damaged: dict[Path, str]) -> None:
 def _teacher(arguments: list[str], started: float) -> int:
     main_process = os.environ.get("RANK", "0") == "0"
     cfg = parse_teacher(arguments, say=print if main_process else None)
-    if not cfg.smoke or cfg.run.run_dir != SMOKE_RUN:
+    if not cfg.smoke or cfg.run.out != SMOKE_RUN:
         return _train_teacher(cfg, main_process, started)
     with TemporaryDirectory(prefix="vd-smoke-") as folder:  # nobody needs what is in it, twice least of all
-        return _train_teacher(replace(cfg, run=replace(cfg.run, run_dir=Path(folder))), main_process, started)
+        return _train_teacher(replace(cfg, run=replace(cfg.run, out=Path(folder))), main_process, started)
 
 
 def _train_teacher(cfg: TeacherCfg, main_process: bool, started: float) -> int:
     from vd.train.ending import finished
     from vd.train.progress import waiting
 
-    with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):
+    with waiting(
+        "building the environments (the first start compiles the kernels: a minute or two)", main_process
+    ):
         runner = build_teacher(cfg, started=started)
-    folder = cfg.run.run_dir
+    folder = cfg.run.out
     if main_process:
         print_damaged(runner.damaged)
     if runner.current_learning_iteration and main_process:
@@ -243,7 +246,7 @@ def _train_teacher(cfg: TeacherCfg, main_process: bool, started: float) -> int:
     runner.shutdown()
     if not whole:
         if main_process and not cfg.smoke:
-            print(f"saved in {folder}; go on with: vd-train teacher --run-dir {folder} --resume")
+            print(f"saved in {folder}; go on with: vd-train teacher --out {folder} --resume")
         return interrupt.INTERRUPTED
     from vd.train.runner import POLICY_NAME  # loads torch, which the first message should not wait for
 
@@ -264,7 +267,9 @@ def _print_begin(cfg: TeacherCfg, runner: "TeacherRunner") -> None:
     how = f"begins from {cfg.init}" if runner.begun else "resumed"
     print(f"{how} after iteration {runner.current_learning_iteration} of {runner.total_iterations}")
     if runner.new_episodes and not runner.begun:
-        print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
+        print(
+            f"episodes start anew, since the checkpoint does not fit the environments: {runner.new_episodes}"
+        )
     if runner.new_inputs:
         print(f"{runner.new_inputs} observed values are new to the networks and start without effect")
     if runner.critic_warmup:
@@ -342,7 +347,7 @@ def _curves(arguments: list[str], _started: float) -> int:
     from vd.train.student.curves import plot_student_curves
 
     files = [run / PROGRESS_FILE if run.is_dir() else run for run in cfg.runs]
-    output = cfg.output or files[0].with_name("curves.png")
+    output = cfg.out or files[0].with_name("curves.png")
     check_file(output)
     first = next(iter(read_runs(files).values()))[0]
     plot = plot_student_curves if any(key.startswith("student/") for key in first) else plot_curves

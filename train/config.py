@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from vd.config import Renamed
 from vd.paper import PAPER
 
 ACTIVATION = "elu"
@@ -23,7 +24,7 @@ class PpoCfg:
     rollout_steps: int = PAPER.teacher.rollout_steps
     """Control steps of every world between two updates."""
     minibatch_size: int = PAPER.teacher.minibatch_size
-    """Samples of an optimiser step on one GPU (at most worlds x rollout steps)."""
+    """Samples of an optimiser step on one GPU (at most environments x rollout steps)."""
     epochs: int = PAPER.teacher.epochs
     """Passes over a rollout."""
     actor_learning_rate: float = PAPER.teacher.actor_learning_rate
@@ -88,13 +89,17 @@ class PolicyCfg:
 class RunCfg:
     """Where, how long and how reproducibly."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"keep_last": 3, "stagger": True}
-    run_dir: Path = Path("runs/teacher")
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "run_dir": Renamed("out"),
+        "keep_last": 3,
+        "stagger": True,
+    }
+    out: Path = Path("runs/teacher")
     """Folder for configuration, checkpoints, curves and TensorBoard files."""
     device: str = "auto"
     """cpu, cuda:0, ... or auto: the first GPU, else the CPU (under torchrun: each process its own GPU)."""
     max_steps: int = 10_000_000_000
-    """End after this many control steps, all worlds and GPUs together, resumed ones counted."""
+    """End after this many control steps, all environments and GPUs together, resumed ones counted."""
     max_minutes: float | None = None
     """End after this much time since the start of this command, with a checkpoint."""
     coarse_physics: bool = False
@@ -131,7 +136,7 @@ class RunCfg:
 
 
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:
-    """Minibatches in a rollout of ``num_envs`` worlds, of at most ``minibatch_size`` samples each."""
+    """Minibatches in a rollout of ``num_envs`` environments, of at most ``minibatch_size`` samples each."""
     return max(1, math.ceil(num_envs * ppo.rollout_steps / ppo.minibatch_size))
 
 
@@ -196,7 +201,7 @@ def rsl_rl_config(
     Args:
         ppo: Algorithm settings.
         policy: Network settings.
-        num_envs: Worlds.
+        num_envs: Environments.
         groups: Groups of observations; the actor reads the first, the critic all.
     """
     from vd.train.distribution import BoundedStdGaussian, FreeStdGaussian  # imports torch

@@ -209,7 +209,7 @@ def turn_unseen(demo: Demo) -> dict[str, Any]:
         demo.objects = import_meshes(demo, cfg.meshes)
     options = (CAMERA_POLICY, "--objects", demo.objects[0], "--seed", str(cfg.seed))
     demo.command(
-        ["vd-eval", *options, "--episodes", str(EPISODES), "--output", demo.folder()],
+        ["vd-eval", *options, "--episodes", str(EPISODES), "--out", demo.folder()],
         ["vd-play", *options, "--cells", "4", "--seconds", str(FILM_S), "--video", film],
     )
     from vd.evaluate.comparison import Comparison
@@ -300,13 +300,13 @@ def train_small(demo: Demo) -> dict[str, Any]:
     seed = ("--seed", str(demo.cfg.seed))
     demo.command(
         [
-            *("vd-train", "teacher", "--preset", "cpu-demo", "--run-dir", run, *seed),
+            *("vd-train", "teacher", "--preset", "cpu-demo", "--out", run, *seed),
             *("--max-minutes", f"{minutes:.2f}"),
         ]
     )
     curves = run / "curves.png"
     demo.command(
-        ["vd-train", "curves", run, "--output", curves],
+        ["vd-train", "curves", run, "--out", curves],
         ["vd-play", run, "--cells", "4", "--seconds", str(FILM_S), *seed, "--video", film],
     )
     from vd.train.metrics import PROGRESS_FILE, read_progress

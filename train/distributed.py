@@ -19,7 +19,7 @@ from vd.files import OutputError
 from vd.train import watchdog
 
 START_TIMEOUT = timedelta(minutes=20)
-"""Longest wait for the slowest process to build its worlds; with a cold kernel cache alone over 3 minutes."""
+"""Longest wait for the slowest process to build its environments; compiling kernels takes 3 minutes."""
 COLLECTIVE_TIMEOUT = timedelta(minutes=2)
 """Longest wait in a collective: an iteration takes about a second and a checkpoint a few. NCCL's default of
 10 minutes is that much of every GPU lost when one process hangs."""
@@ -58,7 +58,7 @@ def join_processes(device: str) -> Processes:
             f"--device is {device}, but this is process {local_rank} of its machine; leave --device out, "
             "then each process takes its own GPU"
         )
-    # Worlds are built by now, on some machines minutes later than on others. All wait here, so that the
+    # Environments are built by now, on some machines minutes later than on others. All wait here, so that the
     # short limit below is one of collectives alone.
     store, rank, world_size = next(iter(rendezvous("env://", timeout=START_TIMEOUT)))
     if os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":

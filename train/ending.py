@@ -80,7 +80,7 @@ def finished(learn: Callable[[], None], close: Callable[[], None], *, distribute
 
     Args:
         learn: Trains; raises :class:`Interrupted` once a run that was asked to stop has saved.
-        close: Releases the worlds, however the training ends.
+        close: Releases the environments, however the training ends.
         distributed: Whether a failure must end the other processes as well.
 
     Returns:

@@ -27,7 +27,7 @@ TEACHER_HELP = """Train the teacher: PPO on the simulator's state.
 
 Flags start from --preset, or with --resume from the run's config.json. Without either the machine decides:
 gpu, under torchrun multi-gpu, and cpu-demo where there is no GPU. Short forms: --hand, --hand-layer,
---objects, --num-worlds and --seed stand for --env.hand and so on. Ctrl-C saves. --help-all lists the flags of
+--objects, --num-envs and --seed stand for --env.hand and so on. Ctrl-C saves. --help-all lists the flags of
 physics, reward, success and of the ranges of Table S3 too."""
 
 _RARE = {
@@ -41,7 +41,7 @@ _RARE = {
 OF_HELP_ALL = frozenset(f"{group}.{name}" for group, names in _RARE.items() for name in names.split())
 """Settings that few runs change: ``--help`` leaves them out, ``--help-all`` does not, and all are flags."""
 
-SHORT_FORMS = ("hand", "hand-layer", "objects", "num-worlds", "seed")
+SHORT_FORMS = ("hand", "hand-layer", "objects", "num-envs", "seed")
 """Fields of the environment that are common enough to be flags without the ``--env.`` prefix."""
 
 
@@ -159,7 +159,7 @@ def _without(kind: type, hidden: Collection[str], where: str = "") -> type:
 
 def _has_config(arguments: list[str]) -> bool:
     """Whether the run's folder is named and has a configuration."""
-    folder = value_of(arguments, "--run-dir")
+    folder = value_of(arguments, "--out")
     return folder is not None and (Path(folder) / CONFIG_NAME).is_file()
 
 
@@ -174,16 +174,16 @@ def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:
         FileNotFoundError: There is no such run.
         ValueError: Its configuration is of another version.
     """
-    run_dir = Path(value_of(arguments, "--run-dir") or start.run.run_dir)
+    run_dir = Path(value_of(arguments, "--out") or start.run.out)
     path = run_dir / CONFIG_NAME
     if not path.is_file():
         if value_of(arguments, "--resume") == "auto":
             return None
-        raise FileNotFoundError(f"--resume: no {path}; give the --run-dir of the run to go on with")
+        raise FileNotFoundError(f"--resume: no {path}; give the --out of the run to go on with")
     try:
         cfg = from_dict(type(start), json.loads(path.read_text()))
     except ValueError as error:
         raise ValueError(
             f"{path}: {error}; it was written by another version, start anew or edit it"
         ) from error
-    return replace(cfg, run=replace(cfg.run, run_dir=run_dir))
+    return replace(cfg, run=replace(cfg.run, out=run_dir))

@@ -54,7 +54,7 @@ class TeacherPPO(PPO):
     Args:
         actor: Policy.
         critic: Value function.
-        storage: Rollout of T steps in N worlds.
+        storage: Rollout of T steps in N environments.
         critic_learning_rate: The critic's rate; ``learning_rate`` is the actor's.
         bound_coef: Weight of the squared excess of mean actions beyond :data:`ACTION_BOUND`.
         cuda_graph: Whether to record the passes of a minibatch; with several GPUs, which exchange gradients

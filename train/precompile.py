@@ -3,7 +3,8 @@
 A training launches some 85 modules of kernels, which NVRTC compiles one after the other at the first start:
 about three minutes for which the GPU stands idle. Warp brings NVRTC along, and it needs no GPU. So a few
 steps of the training are taken on the CPU, and each module is compiled for the GPU too when it is first
-launched. What follows the number of worlds, or is launched on a GPU alone, is not met: two small modules.
+launched. What follows the number of environments, or is launched on a GPU alone, is not met: two small
+modules.
 """
 
 import tempfile
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 DEFAULT_BLOCK = 256
 """Threads of a block where a launch on a GPU asks for no number of its own: Warp's."""
 STEPS = 2
-"""Control steps to take: the first resets worlds, the second goes on (ours)."""
+"""Control steps to take: the first resets environments, the second goes on (ours)."""
 
 
 @dataclass
@@ -126,22 +127,22 @@ def precompile(
         raise ValueError(
             f"--arch is {cfg.arch}; Warp here compiles for {', '.join(map(str, known)) or 'none'}"
         )
-    worlds = len(load_set(teacher.env.objects))  # one of each: kinds of shapes decide which kernels there are
+    envs = len(load_set(teacher.env.objects))  # one of each: kinds of shapes decide which kernels there are
     with tempfile.TemporaryDirectory() as folder, compiling(cfg.output, cfg.arch, ptx=cfg.ptx) as names:
         small = replace(
             teacher,
             resume=None,
             init=None,  # networks have no kernels of Warp's
             init_stage=None,
-            run=replace(teacher.run, run_dir=Path(folder), device="cpu", tensorboard=False),
-            ppo=replace(teacher.ppo, minibatch_size=worlds * teacher.ppo.rollout_steps, cuda_graph=False),
-            env=replace(teacher.env, num_worlds=worlds),
+            run=replace(teacher.run, out=Path(folder), device="cpu", tensorboard=False),
+            ppo=replace(teacher.ppo, minibatch_size=envs * teacher.ppo.rollout_steps, cuda_graph=False),
+            env=replace(teacher.env, num_envs=envs),
         )
         runner = build_teacher(small)
         simulation = runner.env.env.sim
         sort_pairs(simulation.solver.mjw_model, simulation.solver.mjw_data)  # as on a GPU
         for _ in range(STEPS):
-            runner.env.step(torch.zeros(worlds, runner.env.num_actions))
+            runner.env.step(torch.zeros(envs, runner.env.num_actions))
         runner.env.end_iteration()
         runner.env.close()
     return names

@@ -36,7 +36,7 @@ class TeacherCfg:
     """Settings to start from; every other flag overrides one of them. By default what learns on this
     machine."""
     resume: str | None = None
-    """Go on from a checkpoint of --run-dir: latest (a bare --resume), best, a file, or auto: the latest, and
+    """Go on from a checkpoint of --out: latest (a bare --resume), best, a file, or auto: the latest, and
     a new run where there is none."""
     init: str | None = None
     """Begin a new run with networks, curriculum and counters of another: the name of an installed policy
@@ -52,7 +52,7 @@ class TeacherCfg:
     goals in views (--env.observation.view goal or mirrored)."""
     smoke: bool = False
     """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute. It learns nothing,
-    and keeps nothing unless --run-dir is given."""
+    and keeps nothing unless --out is given."""
     run: Annotated[RunCfg, tyro.conf.arg(name="")] = field(default_factory=RunCfg)
     ppo: PpoCfg = field(default_factory=PpoCfg)
     policy: PolicyCfg = field(default_factory=PolicyCfg)
@@ -63,9 +63,9 @@ def paper() -> TeacherCfg:
     """Table S1 as it stands, and the released code where the paper is silent."""
     return TeacherCfg(
         preset="paper",
-        run=RunCfg(run_dir=Path("runs/paper")),
+        run=RunCfg(out=Path("runs/paper")),
         env=ReorientCfg(
-            num_worlds=PAPER.teacher.num_worlds,
+            num_envs=PAPER.teacher.num_envs,
             objects=TRAINING_SET,
             observation=ObservationCfg(canonical=True),
         ),
@@ -109,7 +109,7 @@ def gpu() -> TeacherCfg:
     return TeacherCfg(
         preset="gpu",
         # Half as fast again, and as good in the physics of the tests.
-        run=RunCfg(run_dir=Path("runs/gpu"), coarse_physics=True),
+        run=RunCfg(out=Path("runs/gpu"), coarse_physics=True),
         ppo=replace(
             SHORT_ROLLOUTS,
             actor_learning_rate=2e-4,  # where the schedule starts; paper: 3e-4, fixed
@@ -129,9 +129,9 @@ def gpu() -> TeacherCfg:
             normalise_observations=True,
         ),
         env=ReorientCfg(
-            num_worlds=16384,
+            num_envs=16384,
             objects=TRAINING_SET,
-            episode_s=5.0,  # stuck worlds waste samples; paper: 10 s
+            episode_s=5.0,  # stuck environments waste samples; paper: 10 s
             # About one in 40 million was seen, always of a slim object, and ended the run.
             failures_per_million=1.0,
             # A third of the goals is left to learn; paper: neither shape nor views.
@@ -165,7 +165,7 @@ def cube() -> TeacherCfg:
     """The first thing to learn on one GPU: near goals of a cube on the table, nothing randomised."""
     return TeacherCfg(
         preset="cube",
-        run=RunCfg(run_dir=Path("runs/cube")),
+        run=RunCfg(out=Path("runs/cube")),
         ppo=replace(SHORT_ROLLOUTS, minibatch_size=8192),
         # As measured: a std that is the same in all states.
         policy=PolicyCfg(
@@ -173,7 +173,7 @@ def cube() -> TeacherCfg:
         ),
         env=ReorientCfg(
             objects=("cube",),
-            num_worlds=8192,
+            num_envs=8192,
             failures_per_million=1.0,
             observation=ObservationCfg(canonical=True),
             reward=TOWARDS_GOAL,
@@ -186,16 +186,16 @@ def cube() -> TeacherCfg:
 
 
 def multi_gpu() -> TeacherCfg:
-    """The gpu preset on every GPU of a torchrun: worlds and minibatches are per GPU."""
+    """The gpu preset on every GPU of a torchrun: environments and minibatches are per GPU."""
     cfg = gpu()
-    return replace(cfg, preset="multi-gpu", run=replace(cfg.run, run_dir=Path("runs/multi-gpu")))
+    return replace(cfg, preset="multi-gpu", run=replace(cfg.run, out=Path("runs/multi-gpu")))
 
 
 def cpu_demo() -> TeacherCfg:
     """Minutes on two cores, on an easier task: from rest, goals about the vertical, no stillness test."""
     return TeacherCfg(
         preset="cpu-demo",
-        run=RunCfg(run_dir=Path("runs/cpu-demo"), device="cpu", max_steps=200_000, save_every=10),
+        run=RunCfg(out=Path("runs/cpu-demo"), device="cpu", max_steps=200_000, save_every=10),
         # Many optimiser steps per sample: samples are what a CPU is short of.
         ppo=PpoCfg(
             rollout_steps=8,
@@ -217,7 +217,7 @@ def cpu_demo() -> TeacherCfg:
             normalise_observations=True,
         ),
         env=ReorientCfg(
-            num_worlds=256,
+            num_envs=256,
             hand="dclaw3",  # its own mirror image, so that all goals are turns one way round
             observation=ObservationCfg(view="mirrored", canonical=True),
             reward=RewardCfg(
@@ -270,12 +270,12 @@ def smoke() -> TeacherCfg:
         smoke=True,
         run=replace(
             cfg.run,
-            run_dir=SMOKE_RUN,
+            out=SMOKE_RUN,
             max_steps=2048,
             max_minutes=1.0,
             save_every=1,
             tensorboard=False,
         ),
         ppo=replace(cfg.ppo, minibatch_size=128, epochs=2),
-        env=replace(cfg.env, num_worlds=16, start=replace(cfg.env.start, poses=1)),  # finding them takes long
+        env=replace(cfg.env, num_envs=16, start=replace(cfg.env.start, poses=1)),  # finding them takes long
     )

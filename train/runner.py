@@ -47,8 +47,8 @@ LOWER_RATES = "lower --ppo.actor-learning-rate, --ppo.critic-learning-rate or --
 class TeacherRunner(OnPolicyRunner):
     """rsl-rl's on-policy runner with a loop that can be stopped, resumed and watched.
 
-    Under ``torchrun`` every process simulates its own worlds; rsl-rl averages the gradients, and the first
-    process logs and saves, with the random and environment state of all.
+    Under ``torchrun`` every process simulates its own environments; rsl-rl averages the gradients, and the
+    first process logs and saves, with the random and environment state of all.
 
     Args:
         env: Vectorised environment.
@@ -61,8 +61,8 @@ class TeacherRunner(OnPolicyRunner):
 
     Attributes:
         current_learning_iteration: Iterations completed, over all resumed runs.
-        env_steps: Control steps completed, over all worlds and processes.
-        new_episodes: Why the checkpoint that was loaded could not restore the worlds; empty if it did.
+        env_steps: Control steps completed, over all environments and processes.
+        new_episodes: Why the checkpoint that was loaded could not restore the environments; empty if it did.
         new_inputs: Observed values that the networks of that checkpoint did not read.
         critic_warmup: Iterations left in which the critic learns alone (``PpoCfg.critic_warmup_iterations``).
         imitation: What the actor does meanwhile, if anything (``PpoCfg.imitation_iterations``).
@@ -95,7 +95,7 @@ class TeacherRunner(OnPolicyRunner):
         self._steps_per_iteration = ppo.rollout_steps * env.num_envs * self.gpu_world_size
         self._elapsed_s = 0.0
         self._means = StepMeans()
-        # Two episodes, so that a window never misses the time-outs of worlds that run in step.
+        # Two episodes, so that a window never misses the time-outs of environments that run in step.
         self._window_length = math.ceil(2 * env.max_episode_length / ppo.rollout_steps)
         self._window = self._new_window()
         self._score = (0.0, 0.0, -math.inf)
@@ -138,7 +138,7 @@ class TeacherRunner(OnPolicyRunner):
         Args:
             num_learning_iterations: Iterations to do now; up to ``run.max_steps`` if ``None``.
             init_at_random_ep_len: Stagger the first episodes, so that time-outs do not come all at once; yes
-                if ``None``, and never where a checkpoint restored the worlds.
+                if ``None``, and never where a checkpoint restored the environments.
 
         Raises:
             Interrupted: Ctrl-C or SIGTERM, after saving.
@@ -151,9 +151,7 @@ class TeacherRunner(OnPolicyRunner):
             self.alg.broadcast_parameters()
         self.alg.train_mode()
         log = (
-            ProgressFile(self.run.run_dir, tensorboard=self.run.tensorboard, done=first)
-            if self.is_main
-            else None
+            ProgressFile(self.run.out, tensorboard=self.run.tensorboard, done=first) if self.is_main else None
         )
         progress = ProgressLine(total, done=first, enabled=self.is_main)
         try:
@@ -166,7 +164,7 @@ class TeacherRunner(OnPolicyRunner):
             raise Interrupted
 
     def _stagger(self, wanted: bool) -> None:
-        """Start worlds that are new at random times of their first episode."""
+        """Start environments that are new at random times of their first episode."""
         if wanted and self._stagger_due:
             steps = self.env.episode_length_buf
             self.env.episode_length_buf = torch.randint_like(steps, high=int(self.env.max_episode_length))
@@ -270,11 +268,12 @@ class TeacherRunner(OnPolicyRunner):
     def load(
         self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
     ) -> dict:
-        """Go on from a checkpoint: networks, optimiser, iteration, curriculum, worlds and random states.
+        """Go on from a checkpoint: networks, optimiser, iteration, curriculum, random states.
 
-        With the processes and worlds of the checkpoint the run goes on exactly. With others, or from a
-        checkpoint without worlds, all but worlds and random states is restored, and episodes start anew.
-        So they do where the run observes more than the checkpoint's networks read, which are widened.
+        With the processes and environments of the checkpoint the run goes on exactly. With others, or from a
+        checkpoint without environments, all but environments and random states is restored, and episodes
+        start anew. So they do where the run observes more than the checkpoint's networks read, which are
+        widened.
 
         Args:
             path: The checkpoint.
@@ -293,8 +292,8 @@ class TeacherRunner(OnPolicyRunner):
     def begin_from(self, path: str, stage: tuple[float, float] | None = None) -> None:
         """Begin with networks, optimiser, curriculum and counters of another run's checkpoint or policy.
 
-        Worlds, random states, learning rates and the choice of the best checkpoint are this run's own, and so
-        are a critic and an optimiser that the file lacks; then the critic learns alone first.
+        Environments, random states, learning rates and the choice of the best checkpoint are this run's own,
+        and so are a critic and an optimiser that the file lacks; then the critic learns alone first.
 
         Args:
             path: Checkpoint or exported policy.
@@ -348,16 +347,18 @@ class TeacherRunner(OnPolicyRunner):
         return widen(state, self.alg.actor, self.alg.critic, num_observations=self.num_observations)
 
     def _load_worlds(self, ranks: list[dict[str, Any]]) -> None:
-        """Restore worlds and random state, or else the curriculum alone. All processes decide alike."""
-        worlds = {saved_worlds(rank) for rank in ranks}
-        if worlds == {0}:
+        """Restore environments and random state, or else the curriculum alone. All processes decide alike."""
+        envs = {saved_worlds(rank) for rank in ranks}
+        if envs == {0}:
             self.new_episodes = "it holds no worlds"
         elif self.new_inputs:
             self.new_episodes = f"this run observes {self.new_inputs} values more"
         elif len(ranks) != self.gpu_world_size:
             self.new_episodes = f"it is of {len(ranks)} processes, this run has {self.gpu_world_size}"
-        elif worlds != {self.env.num_envs}:
-            self.new_episodes = f"it is of {max(worlds)} worlds a process, this run has {self.env.num_envs}"
+        elif envs != {self.env.num_envs}:
+            self.new_episodes = (
+                f"it is of {max(envs)} environments a process, this run has {self.env.num_envs}"
+            )
         else:
             self.new_episodes = ""
         self._stagger_due = bool(self.new_episodes)
@@ -408,10 +409,10 @@ class TeacherRunner(OnPolicyRunner):
 
         The best is chosen by the curriculum's stage, then success per goal over the last two
         episodes, then mean reward, in that order: while nothing succeeds the reward decides. Until two
-        episodes are over the latest takes its place: worlds whose goal is near succeed first, so that early
-        rates are too high and no later one would beat them.
+        episodes are over the latest takes its place: environments whose goal is near succeed first, so that
+        early rates are too high and no later one would beat them.
         """
-        path = checkpoint_path(self.run.run_dir, self.current_learning_iteration)
+        path = checkpoint_path(self.run.out, self.current_learning_iteration)
         better = self.current_learning_iteration > 0 and (self._best is None or self._score > self._best)
         if better and self._window.full:
             self._best = self._score
@@ -421,9 +422,9 @@ class TeacherRunner(OnPolicyRunner):
         save_checkpoint(path, state)
         if better:
             save_checkpoint(path.with_name(BEST_NAME), state)
-        if better or not (self.run.run_dir / POLICY_NAME).exists():
-            save_checkpoint(self.run.run_dir / POLICY_NAME, policy_export(state))
-        prune_checkpoints(self.run.run_dir, self.current_learning_iteration, self.run.keep_every)
+        if better or not (self.run.out / POLICY_NAME).exists():
+            save_checkpoint(self.run.out / POLICY_NAME, policy_export(state))
+        prune_checkpoints(self.run.out, self.current_learning_iteration, self.run.keep_every)
 
     def _check_rollout(self, latest: TensorDict) -> None:
         """Stop before an update on values that are not finite. One wait for the device an iteration."""
@@ -445,7 +446,7 @@ class TeacherRunner(OnPolicyRunner):
             return
         # What was not finite first has made the rest so.
         name, where = min(bad, key=lambda pair: int(pair[1].any(dim=1).nonzero()[0]))
-        worlds = where.any(dim=0)
+        envs = where.any(dim=0)
         if name in ("observations", "rewards"):
             self.env.check()  # says more, if the simulation is the cause
             remedy = "the simulation gave them: raise --env.sim.physics-hz or lower --env.action.scale-rad-s"
@@ -453,7 +454,7 @@ class TeacherRunner(OnPolicyRunner):
             remedy = f"the networks gave them: {LOWER_RATES}"
         raise TrainingDivergedError(
             f"iteration {self.current_learning_iteration + 1}: {name} not finite in "
-            f"{int(worlds.sum())} worlds (first: {worlds.nonzero().flatten()[:8].tolist()}); "
+            f"{int(envs.sum())} environments (first: {envs.nonzero().flatten()[:8].tolist()}); "
             f"{remedy}. {self._last_good()}"
         )
 
@@ -471,7 +472,7 @@ class TeacherRunner(OnPolicyRunner):
             )
 
     def _last_good(self) -> str:
-        folder = self.run.run_dir / CHECKPOINT_FOLDER
+        folder = self.run.out / CHECKPOINT_FOLDER
         return f"The last checkpoint in {folder} is from before; go on from it with --resume"
 
     def _configure_multi_gpu(self) -> None:

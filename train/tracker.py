@@ -32,7 +32,7 @@ class TrackerCfg:
     """The teacher: a policy.pt, a run's folder, or the name of an installed one."""
     objects: tuple[str, ...]
     """Object sets to choose the stopping rules on, not those of the training."""
-    output: Path = Path("tracking.pt")
+    out: Path = Path("tracking.pt")
     """File to write."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the optical frame (x right, y down, z forward) in the hand's base frame: position [m] and
@@ -53,8 +53,8 @@ class TrackerCfg:
     """Its camera errs as a D415 does."""
     second_view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Select symmetry views where a goal is not reached in 3 s: the rule of a policy that is to fly so."""
-    num_worlds: int | None = None
-    """Worlds simulated at once; as of vd-eval by default."""
+    num_envs: int | None = None
+    """Environments simulated at once; as of vd-eval by default."""
     seed: int = 1000
     """Of starts, goals and sensor errors."""
     device: str = "auto"
@@ -66,7 +66,7 @@ class TrackerCfg:
 def tracker_command(arguments: Sequence[str], _started: float) -> int:
     """``vd-train tracker``; the exit status."""
     cfg = tyro.cli(TrackerCfg, args=arguments, prog="vd-train tracker")
-    check_file(cfg.output)
+    check_file(cfg.out)
 
     from vd.evaluate.agents import check_names
 
@@ -78,17 +78,17 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
 
     with waiting("running the episodes", not cfg.json):
         policy, found, precise = make_tracker(cfg)
-    save_checkpoint(cfg.output, tracking_export(policy))
+    save_checkpoint(cfg.out, tracking_export(policy))
     if cfg.json:
         print(json.dumps(to_dict(found) | {"precise": precise and to_dict(precise)}, indent=1))
         return 0
     for result in (found, precise):
         if result is None:
-            print(f"{cfg.output}: no rule stops any within {PAPER.success.precise_rad:g} rad: none for it")
+            print(f"{cfg.out}: no rule stops any within {PAPER.success.precise_rad:g} rad: none for it")
             continue
         rule = result.rule
         print(
-            f"{cfg.output}: stop below {rule.distance_rad:.3f} rad and an action norm of "
+            f"{cfg.out}: stop below {rule.distance_rad:.3f} rad and an action norm of "
             f"{rule.action_norm:.3f}. Of {result.episodes} episodes {result.success:.1%} stop within "
             f"{result.tolerance_rad:g} rad, {result.wrong:.1%} outside; {result.reachable:.1%} came that near"
         )
@@ -161,7 +161,7 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
     count = len(load_set(list(cfg.objects)))
     each = math.ceil(cfg.episodes / count)
     limit = None if device == "cpu" else STUDENT_WORLDS_GPU
-    worlds = cfg.num_worlds or worlds_for(count, each, device, limit=limit)
+    envs = cfg.num_envs or worlds_for(count, each, device, limit=limit)
     evaluation = EvalCfg(
         policies=(cfg.teacher,),
         objects=cfg.objects,
@@ -176,7 +176,7 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
         seed=cfg.seed,
         device=device,
     )
-    env = ReorientEnv(task_of(evaluation, policy, cfg.objects, worlds), device)
+    env = ReorientEnv(task_of(evaluation, policy, cfg.objects, envs), device)
     env.objects = with_symmetries(env.objects, device)
     actor, _, _, rules = actor_of(evaluation, cfg.teacher, policy, env, device)
     trace = run_episodes(evaluation, env, actor, cfg.teacher, rules, math.inf)

@@ -20,7 +20,7 @@ PRIVILEGED_GROUP = "privileged"
 
 
 class ReorientVecEnv(VecEnv):
-    """N worlds of a :class:`vd.envs.reorient.ReorientEnv` behind rsl-rl's interface.
+    """N environments of a :class:`vd.envs.reorient.ReorientEnv` behind rsl-rl's interface.
 
     Rewards and flags are torch views of the environment's Warp arrays, without a copy. Observations
     are copied once, on the device: rsl-rl stores the observation of a step only *after* the next step has
@@ -42,7 +42,7 @@ class ReorientVecEnv(VecEnv):
             learned from in the others too.
 
     Attributes:
-        num_envs: Worlds N.
+        num_envs: Environments N.
         num_actions: Actions D.
         num_present: Values of the present state and shape, the last of those that the critic alone reads.
         max_episode_length: Control steps of an episode.
@@ -57,7 +57,7 @@ class ReorientVecEnv(VecEnv):
             self._others = ViewSelection(view_maps(env), env.cfg.sim.control_hz)
             self._goal_steps = wp.to_torch(env.goal_steps)
             self._world, self._view = wp.to_torch(env.world_observation), wp.to_torch(env.views.view)
-        self.num_envs = env.num_worlds
+        self.num_envs = env.num_envs
         self.num_actions = env.num_actions
         self.num_present = env.num_present
         self.max_episode_length = env.max_episode_steps
@@ -112,9 +112,9 @@ class ReorientVecEnv(VecEnv):
         Returns:
             Observation for the next action; reward [N] (view); done [N] (int64); and extras with
             ``time_outs`` [N] (float) and ``log``: scalars on the device, the same keys from the first step.
-            ``reward/*`` and ``task/rotation_error`` [rad] are means over worlds, ``task/reached``,
-            ``task/dropped``, ``task/timed_out`` the share of worlds whose goal ended that way in this step,
-            ``task/within_tolerance`` the share within the paper's success tolerance, moving or not.
+            ``reward/*`` and ``task/rotation_error`` [rad] are means over environments, ``task/reached``,
+            ``task/dropped``, ``task/timed_out`` the share of environments whose goal ended that way in this
+            step, ``task/within_tolerance`` the share within the paper's success tolerance, moving or not.
         """
         self._action.copy_(actions)
         self.env.step(self.env.action)
@@ -144,7 +144,7 @@ class ReorientVecEnv(VecEnv):
         )
 
     def _look_again(self, others: ViewSelection) -> None:
-        """Draw a view for the worlds that are due, and observe in it; nothing waits on the host."""
+        """Draw a view for the environments that are due, and observe in it; nothing waits on the host."""
         views = others.of(self._world)
         drawn = torch.randint(len(views), views.shape[1:], device=views.device)
         chosen = views.gather(0, drawn[None])[0].to(self._view.dtype)
@@ -161,7 +161,7 @@ class ReorientVecEnv(VecEnv):
 
         Returns:
             ``task/difficulty`` and ``task/tightness``: the stage of the curriculum, 1 and 1 is the configured
-            task; ``task/failed_steps``: those of worlds here that were put back since the begin
+            task; ``task/failed_steps``: those of environments here that were put back since the begin
             (``ReorientCfg.failures_per_million``).
 
         Raises:
@@ -192,7 +192,7 @@ class ReorientVecEnv(VecEnv):
         self.env.load_state_dict(state)
 
     def start_anew(self, state: dict[str, Any]) -> None:
-        """Begin new episodes in all worlds.
+        """Begin new episodes in all environments.
 
         Args:
             state: What :meth:`state_dict` gave, of which the stage of the curriculum is taken.

@@ -9,16 +9,16 @@ import warp as wp
 
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.kernels.kinematics import Joints, forward_kinematics_kernel
-from vd.kernels.link_points import CloudModel, link_points_kernel
+from vd.kernels.sensor.kinematics import Joints, forward_kinematics_kernel
+from vd.kernels.sensor.link_points import CloudModel, link_points_kernel
 from vd.paper import PAPER
 
 
 class SceneClouds:
-    """Complete synthetic clouds of N worlds in the hand's base frame.
+    """Complete synthetic clouds of N environments in the hand's base frame.
 
     Columns of a cloud are the goal's K samples, the hand's H, and the object's K; samples come from the
-    USD of hand and objects. Rows are poses of any worlds: of all at one time, or recorded ones.
+    USD of hand and objects. Rows are poses of any environments: of all at one time, or recorded ones.
 
     Attributes:
         goal: Columns of the goal.
@@ -85,7 +85,7 @@ class SceneClouds:
         goal_quat: wp.array,
         *,
         with_object: bool = True,
-        worlds: wp.array | None = None,
+        envs: wp.array | None = None,
     ) -> None:
         """Write clouds, in one launch that a CUDA graph can hold.
 
@@ -94,13 +94,13 @@ class SceneClouds:
             body_q: Body poses in the world frame, shape [R, B].
             goal_quat: Wanted orientations in the world frame, shape [R].
             with_object: Write the object too; without it its columns are left to a camera's points.
-            worlds: World of each row, shape [R]; row i is of world i by default.
+            envs: World of each row, shape [R]; row i is of world i by default.
         """
         columns = self.item.stop if with_object else self.item.start
         wp.launch(
             link_points_kernel,
             dim=(body_q.shape[0], columns),
-            inputs=[self._model, self._all_worlds if worlds is None else worlds, body_q, goal_quat],
+            inputs=[self._model, self._all_worlds if envs is None else envs, body_q, goal_quat],
             outputs=[points],
             device=self.device,
         )

@@ -19,6 +19,13 @@ class Dropped:
     value: Any
 
 
+@dataclasses.dataclass(frozen=True)
+class Renamed:
+    """In ``RETIRED``: a field that has another name now."""
+
+    name: str
+
+
 def to_dict(value: Any) -> Any:
     """Turn nested dataclasses into dictionaries of numbers, strings, lists and ``None``.
 
@@ -50,6 +57,7 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
 
     A class that lost a field says so in ``RETIRED``: by name the value that means what is now always so, of a
     group that went the values of those fields that say so. Others are refused, but for :class:`Dropped`.
+    A field that has another name is :class:`Renamed`.
 
     Raises:
         ValueError: A field that ``cls`` does not have, one that is needed and absent, or a value of the wrong
@@ -73,7 +81,9 @@ def from_dict(cls: type[T], values: Mapping[str, Any], *, where: str = "") -> T:
 
 
 def _without_retired(values: Mapping[str, Any], retired: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """``values`` without fields that are no more."""
+    """``values`` without fields that are no more, and with today's names."""
+    new = {old: to.name for old, to in retired.items() if isinstance(to, Renamed)}
+    values = {new.get(name, name): value for name, value in values.items()}
     for name in retired.keys() & values.keys():
         value, wanted = values[name], retired[name]
         if isinstance(wanted, Mapping) and wanted and isinstance(value, Mapping):

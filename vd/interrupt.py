@@ -17,8 +17,20 @@ from typing import Any, ParamSpec
 INTERRUPTED = 128 + signal.SIGINT
 """Exit status after Ctrl-C."""
 
+USAGE_ERROR = 2
+"""Exit status after a flag that does not exist."""
+
 PARENT_S = 0.5
 """Between two looks at the parent [s]."""
+
+RENAMED = {
+    "--output": "--out",
+    "--run-dir": "--out",
+    "--goal-s": "--episode-s",
+    "--air": "--in-air",
+    "--num-worlds": "--num-envs",
+}
+"""Flags of earlier versions, and what they are called in all commands."""
 
 P = ParamSpec("P")
 
@@ -47,6 +59,10 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
         @functools.wraps(main)
         def run(*args: P.args, **kwargs: P.kwargs) -> Any:
             given = args[0] if args and isinstance(args[0], Sequence) else sys.argv[1:]
+            renamed = _renamed(given)
+            if renamed:
+                print(f"{name}: {renamed}", file=sys.stderr)
+                return USAGE_ERROR
             if given and not {"-h", "--help"} & set(given):
                 print(f"{name}: starting", file=sys.stderr, flush=True)  # what it imports takes seconds
             with _terminated():
@@ -63,6 +79,12 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
         return run
 
     return wrap
+
+
+def _renamed(arguments: Sequence[str]) -> str:
+    """What flags of earlier versions are called now; empty without such flags."""
+    flags = [str(argument).partition("=")[0].replace("_", "-") for argument in arguments]
+    return ", ".join(f"{flag} is {RENAMED[flag]} now" for flag in flags if flag in RENAMED)
 
 
 def _status(status: Any) -> Any:

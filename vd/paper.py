@@ -134,7 +134,7 @@ class NominalMaterials:
 class TeacherConstants:
     """PPO of the teacher (Table S1)."""
 
-    num_worlds: int = source(32000, "P", "Table S1; the code uses 8000")
+    num_envs: int = source(32000, "P", "Table S1; the code uses 8000")
     rollout_steps: int = source(8, "P", "Table S1")
     minibatch_size: int = source(64000, "P", "Table S1: 4 minibatches of 32000 x 8")
     epochs: int = source(12, "P", "Table S1")
@@ -193,10 +193,12 @@ class DaggerConstants:
     """Training of the student by imitation (Methods, student; numbers from the code)."""
 
     rollout_steps: int = source(80, "C", "control steps of every world between two updates")
-    synthetic_worlds: int = source(400, "C", "stage 1: complete synthetic clouds")
-    synthetic_minibatch: int = source(40, "C", "stage 1: worlds of an optimiser step, whole sequences each")
-    rendered_worlds: int = source(260, "C", "stage 2: rendered clouds")
-    rendered_minibatch: int = source(20, "C", "stage 2: worlds of an optimiser step")
+    synthetic_envs: int = source(400, "C", "stage 1: complete synthetic clouds")
+    synthetic_minibatch: int = source(
+        40, "C", "stage 1: environments of an optimiser step, whole sequences each"
+    )
+    rendered_envs: int = source(260, "C", "stage 2: rendered clouds")
+    rendered_minibatch: int = source(20, "C", "stage 2: environments of an optimiser step")
     epochs: int = source(4, "C", "passes over a rollout")
     learning_rate: float = source(3e-4, "C", "AdamW with amsgrad, constant")
     grad_norm: float = source(5.0, "C", "gradient norm is clipped to this")

@@ -279,7 +279,7 @@ def _light(camera: Camera) -> wp.vec3:
 
 
 class _View:
-    """One camera over several worlds, with its buffers."""
+    """One camera over several environments, with its buffers."""
 
     def __init__(
         self,
@@ -288,7 +288,7 @@ class _View:
         width: int,
         height: int,
         samples: int,
-        worlds: Sequence[int],
+        envs: Sequence[int],
         background: int,
         device: str,
     ):
@@ -296,13 +296,13 @@ class _View:
         self._rays = SensorCamera.compute_camera_rays_pinhole(
             width, height, camera_fov=camera.fov, sample_count=samples, device=device
         )
-        self._transforms = wp.array([camera.transform] * len(worlds), dtype=wp.transformf, device=device)
-        self._worlds = wp.array(list(worlds), dtype=wp.int32, device=device)
-        self._image = sensor.allocate_image_color(len(worlds), width, height)
+        self._transforms = wp.array([camera.transform] * len(envs), dtype=wp.transformf, device=device)
+        self._worlds = wp.array(list(envs), dtype=wp.int32, device=device)
+        self._image = sensor.allocate_image_color(len(envs), width, height)
         self._clear = SensorCamera.ClearData(clear_color=background)
 
     def draw(self, state: newton.State, config: SensorCamera.RenderConfig) -> np.ndarray:
-        """RGB bytes of every world, shape [worlds, height, width, 3]."""
+        """RGB bytes of every world, shape [environments, height, width, 3]."""
         self._sensor.update(
             state,
             self._transforms,

@@ -13,7 +13,7 @@ from torch import nn
 from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import ObservationCfg, View
 from vd.envs.view_tables import ViewTables, view_tables
-from vd.kernels.observations import JOINTS_PER_FINGER, teacher_observation_slices
+from vd.kernels.task.observations import JOINTS_PER_FINGER, teacher_observation_slices
 
 TERMS = 4
 """Most values that a value of a view is made of, those of a quaternion."""

@@ -62,7 +62,7 @@ def inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, level: f
     """Whether the winding number of a mesh [V, 3], [T, 3] exceeds ``level`` at points [n, 3], bool [n]."""
     import warp as wp
 
-    from vd.kernels.winding import inside_kernel
+    from vd.kernels.sensor.winding import inside_kernel
 
     low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from warp.geometry import IsoSurfaceMarchingCubes
 
 from vd.assets_usd.objects.geometry import spread
-from vd.kernels.winding import winding_kernel
+from vd.kernels.sensor.winding import winding_kernel
 
 NEIGHBOURS = 24
 """Samples that make a piece of the surface: a plane is laid through them, which takes noise out."""

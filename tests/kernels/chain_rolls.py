@@ -1,14 +1,14 @@
-"""Small chains and their rollouts, for the tests of :mod:`vd.kernels.chains`."""
+"""Small chains and their rollouts, for the tests of :mod:`vd.kernels.servo.chains`."""
 
 import numpy as np
 import warp as wp
 from kernel_oracle import device_array, unwritten
 
 from vd.gap.rollout import links_of
-from vd.kernels import actuators as servo
-from vd.kernels.chain_bodies import Links
-from vd.kernels.chains import Samples, rollout_kernel
-from vd.kernels.effects import neutral_row
+from vd.kernels.servo import actuators as servo
+from vd.kernels.servo.chain_bodies import Links
+from vd.kernels.servo.chains import Samples, rollout_kernel
+from vd.kernels.servo.effects import neutral_row
 
 DT = 1 / 480
 FINE = 10

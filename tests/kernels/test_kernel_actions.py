@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from kernel_oracle import ALPHA, EXAMPLES, device_array, floats, settings_array, streams, unwritten
 from scipy import stats
 
-from vd.kernels.actions import (
+from vd.kernels.task.actions import (
     ActionParams,
     apply_action_kernel,
     joint_effort_kernel,

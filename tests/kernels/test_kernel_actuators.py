@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, unwritten
 
-from vd.kernels import actuators as servo
-from vd.kernels.effects import BASELINE, EFFECTS, neutral_row
+from vd.kernels.servo import actuators as servo
+from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
 
 DT = 1 / 480
 SWITCHES = {

@@ -14,9 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES
 
-from vd.kernels import actuators as servo
-from vd.kernels.chains import DIVERGED
-from vd.kernels.effects import EFFECTS, neutral_row
+from vd.kernels.servo import actuators as servo
+from vd.kernels.servo.chains import DIVERGED
+from vd.kernels.servo.effects import EFFECTS, neutral_row
 
 
 @EXAMPLES

@@ -20,9 +20,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, unwritten
 
-from vd.kernels import actuators as servo
-from vd.kernels.chain_bodies import Links, chain_dynamics
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo import actuators as servo
+from vd.kernels.servo.chain_bodies import Links, chain_dynamics
+from vd.kernels.servo.effects import EFFECTS
 
 # --- Bodies ---
 

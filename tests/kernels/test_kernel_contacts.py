@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, floats, unwritten
 
-from vd.kernels.contacts import restitution_kernel
+from vd.kernels.task.contacts import restitution_kernel
 
 OTHER, TABLE, OBJECT, HAND = 0, 1, 2, 3
 LOWEST = 0.05

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from kernel_oracle import EXAMPLES, device_array
 
-from vd.kernels.coordinate_maps import (
+from vd.kernels.sparse.coordinate_maps import (
     beside,
     coarsen,
     hash_table,
@@ -16,7 +16,7 @@ from vd.kernels.coordinate_maps import (
     strided_table,
     window_table,
 )
-from vd.kernels.voxels import coordinates, voxelise
+from vd.kernels.sparse.voxels import coordinates, voxelise
 
 OFFSETS = list(itertools.product((-1, 0, 1), repeat=3))
 """Of a 3x3x3 kernel, in the order of its weights."""

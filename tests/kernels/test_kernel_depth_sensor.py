@@ -18,7 +18,7 @@ from kernel_oracle import (
 from scipy import stats
 from scipy.spatial.transform import Rotation, Slerp
 
-from vd.kernels.depth_sensor import DepthSensorParams, delay_poses_kernel, measure_depth_kernel
+from vd.kernels.sensor.depth_sensor import DepthSensorParams, delay_poses_kernel, measure_depth_kernel
 from vd.sensors.cfg import D415
 
 FB = D415.focal_px * D415.baseline_m

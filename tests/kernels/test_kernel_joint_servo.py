@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, floats, streams, unwritten
 
-from vd.kernels import actuators as servo
-from vd.kernels.effects import neutral_row
-from vd.kernels.joint_servo import (
+from vd.kernels.servo import actuators as servo
+from vd.kernels.servo.effects import neutral_row
+from vd.kernels.servo.joint_servo import (
     finish_joint_kernel,
     joint_inertia_kernel,
     measure_joint_kernel,

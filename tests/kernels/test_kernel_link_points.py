@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, floats, pose_matrix, quaternions, transforms, unwritten
 
-from vd.kernels.link_points import CloudModel, link_points_kernel
+from vd.kernels.sensor.link_points import CloudModel, link_points_kernel
 
 BASE, OBJECT = 0, 1
 GOAL_POSITION = np.array([0.1, -0.2, -0.08])

@@ -20,7 +20,7 @@ from kernel_oracle import (
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from vd.kernels.observations import (
+from vd.kernels.task.observations import (
     ObservationParams,
     fingertip_kernel,
     teacher_observation_kernel,

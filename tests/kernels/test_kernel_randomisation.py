@@ -6,8 +6,9 @@ from hypothesis import strategies as st
 from kernel_oracle import ALPHA, EXAMPLES, device_array, settings_array, streams, unwritten
 from scipy import stats
 
-from vd.kernels.actuators import COMMAND_DELAY, PARAMETER_COLUMNS, READ_DELAY
-from vd.kernels.randomisation import (
+from vd.kernels.rng import next_stream
+from vd.kernels.servo.actuators import COMMAND_DELAY, PARAMETER_COLUMNS, READ_DELAY
+from vd.kernels.task.randomisation import (
     ForceParams,
     RandomisationParams,
     disturbance_force_kernel,
@@ -16,7 +17,6 @@ from vd.kernels.randomisation import (
     draw_restitution_kernel,
     draw_servo_kernel,
 )
-from vd.kernels.rng import next_stream
 from vd.paper import PAPER
 
 DR = PAPER.randomisation

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, pose_matrix, unwritten
 from scipy.spatial.transform import Rotation
 
-from vd.kernels.registration import (
+from vd.kernels.sensor.registration import (
     DAMPING,
     LARGEST_TURN,
     LEVER_M,
@@ -19,7 +19,7 @@ from vd.kernels.registration import (
     start_poses_kernel,
     take_better_kernel,
 )
-from vd.kernels.shape_grids import Shapes, off_mesh_kernel, shape_distance_kernel
+from vd.kernels.sensor.shape_grids import Shapes, off_mesh_kernel, shape_distance_kernel
 
 GRID, SAMPLES, SEEN = 5, 9, 7
 FAR, CELL, MARGIN = 0.02, 8.0, 0.004

@@ -23,7 +23,7 @@ from kernel_oracle import (
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from vd.kernels.resets import GoalParams, StartParams, episode_kernel, give_goal_kernel, reset_kernel
+from vd.kernels.task.resets import GoalParams, StartParams, episode_kernel, give_goal_kernel, reset_kernel
 from vd.paper import PAPER
 
 START = np.array(PAPER.scene.object_start_m)

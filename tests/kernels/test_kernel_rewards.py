@@ -14,14 +14,14 @@ from kernel_oracle import (
     unwritten,
 )
 
-from vd.kernels.rewards import (
+from vd.kernels.task.rewards import (
     FINGERTIP_MEAN,
     FINGERTIP_SQUARED_SUM,
     REWARD_TERMS,
     RewardParams,
     reward_kernel,
 )
-from vd.kernels.success import SuccessParams, success_kernel
+from vd.kernels.task.success import SuccessParams, success_kernel
 from vd.paper import PAPER
 
 REWARD = {

@@ -16,7 +16,7 @@ from kernel_oracle import (
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from vd.kernels.shapes import (
+from vd.kernels.task.shapes import (
     EXTENT_CENTRE_M,
     ORIENTATIONS,
     SHAPE_UNIT_M,

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, SENTINEL, device_array, floats, quaternions, unwritten
 from scipy.spatial.transform import Rotation
 
-from vd.kernels.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
+from vd.kernels.task.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
 
 
 @st.composite

@@ -7,7 +7,7 @@ from hypothesis.extra import numpy as hnp
 from kernel_oracle import ALPHA, EXAMPLES, device_array, streams, unwritten
 from scipy import stats
 
-from vd.kernels.voxels import (
+from vd.kernels.sparse.voxels import (
     CloudNoise,
     cloud_offsets,
     coordinates,

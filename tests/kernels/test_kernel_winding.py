@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, unwritten
 
 from vd.assets_usd.objects.geometry import winding_numbers
-from vd.kernels.winding import inside_kernel, winding_kernel
+from vd.kernels.sensor.winding import inside_kernel, winding_kernel
 
 SHAPE = (5, 4, 3)
 

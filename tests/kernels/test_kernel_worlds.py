@@ -7,9 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, SENTINEL, device_array, unwritten
 
-from vd.kernels.contacts import pair_force_kernel
-from vd.kernels.guard import collect_overflow_kernel, guard_kernel, put_back_kernel, void_step_kernel
-from vd.kernels.worlds import (
+from vd.kernels.task.contacts import pair_force_kernel
+from vd.kernels.task.environments import (
     copy_columns_kernel,
     count_goals_kernel,
     place_table_kernel,
@@ -20,6 +19,7 @@ from vd.kernels.worlds import (
     write_gains_kernel,
     write_object_force_kernel,
 )
+from vd.kernels.task.guard import collect_overflow_kernel, guard_kernel, put_back_kernel, void_step_kernel
 
 FRICTION = 0.8
 

@@ -1,4 +1,4 @@
-"""From a configuration to a runner: teacher, worlds, network, and where a student begins."""
+"""From a configuration to a runner: teacher, environments, network, and where a student begins."""
 
 import os
 from dataclasses import replace
@@ -39,7 +39,7 @@ def default_init(stage: int, run_dir: Path) -> Path | None:
 
 
 def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
-    """The worlds of the student: those of the teacher, which sees their state without noise."""
+    """The environments of the student: those of the teacher, which sees their state without noise."""
     from vd.evaluate.agents import task_for, trained_task
 
     trained, chosen = trained_task(policy), cfg.task
@@ -47,7 +47,7 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
         policy,
         hand=None,
         objects=chosen.objects or trained.objects,
-        num_worlds=chosen.num_worlds,
+        num_envs=chosen.num_envs,
         seed=chosen.seed,
         stop_tolerance_rad=PAPER.success.rotation_rad,
         max_goal_angle_rad=chosen.max_goal_angle_rad,
@@ -66,7 +66,7 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
 
 
 def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "StudentRunner":
-    """Build worlds, student and learner as ``cfg`` says, save the configuration, and resume if asked.
+    """Build environments, student and learner as ``cfg`` says, save the configuration, and resume if asked.
 
     Args:
         cfg: Configuration.
@@ -81,7 +81,7 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     from vd.train.checkpoint import find_checkpoint
 
     validate(cfg)
-    rank, folder = int(os.environ.get("RANK", "0")), cfg.run.run_dir
+    rank, folder = int(os.environ.get("RANK", "0")), cfg.run.out
     check_folder(folder)
     cfg = replace(cfg, run=replace(cfg.run, device=resolve_device(cfg.run.device)))
     checkpoint = find_checkpoint(folder, cfg.resume, "student")
@@ -157,7 +157,7 @@ def _take_folder(cfg: StudentTrainCfg, runner: "StudentRunner", checkpoint: Path
     """Save the configuration in the run's folder, and set aside what is damaged after the checkpoint."""
     from vd.train.checkpoint import damaged_after, set_aside
 
-    folder = cfg.run.run_dir
+    folder = cfg.run.out
     saved = to_dict(replace(cfg, resume=None))
     saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
     write_json(folder / CONFIG_NAME, saved)
@@ -176,7 +176,7 @@ def check_start(cfg: StudentTrainCfg) -> None:
         if cfg.stage == RENDERED and not cfg.from_scratch:
             raise ValueError(
                 "stage 2 begins from a student of stage 1: give it as --init, or as student.pt in "
-                f"{cfg.run.run_dir.with_name(f'stage{SYNTHETIC}')}; --from-scratch begins without one"
+                f"{cfg.run.out.with_name(f'stage{SYNTHETIC}')}; --from-scratch begins without one"
             )
         return
     from vd.vision.saved import read_student, saved_spec
@@ -205,7 +205,7 @@ def state_head(cfg: StudentTrainCfg, teacher: "TrainedPolicy") -> "StateCfg":
 def head_of(teacher: "TrainedPolicy") -> "StateCfg":
     """The head that estimates what a teacher observes, in the views that it was trained in."""
     from vd.evaluate.agents import trained_task
-    from vd.kernels.observations import JOINTS_PER_FINGER
+    from vd.kernels.task.observations import JOINTS_PER_FINGER
     from vd.vision.state import state_cfg
 
     observation = trained_task(teacher).observation
@@ -293,10 +293,10 @@ def _dagger(
     simulation = ReorientEnv(task, cfg.run.device)
     if simulation.num_observations != teacher.num_observations:
         raise ValueError(
-            f"the teacher observes {teacher.num_observations} values, its worlds give "
+            f"the teacher observes {teacher.num_observations} values, its environments give "
             f"{simulation.num_observations}; take a policy of this version"
         )
-    simulation.dump_dir = cfg.run.run_dir
+    simulation.dump_dir = cfg.run.out
     env = ReorientVecEnv(simulation)
     if fresh and not cfg.dagger.reset:
         steps = env.episode_length_buf
@@ -308,7 +308,7 @@ def _dagger(
         depth=cfg.depth,
         camera=cfg.camera,
         noise=cfg.noise,
-        batch=cfg.dagger.minibatch_worlds * cfg.dagger.rollout_steps,
+        batch=cfg.dagger.minibatch_envs * cfg.dagger.rollout_steps,
         seed=task.seed,
     )
     labels: Any = WorldOrder(teacher, simulation.views)

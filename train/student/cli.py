@@ -16,10 +16,10 @@ HELP = """Train the student: imitate the teacher from point clouds.
 
 Stage 0 pre-trains the encoder on random scenes, stage 1 imitates on complete synthetic clouds, stage 2 on
 those of a depth camera. Flags start from --preset and --stage, or with --resume from the run's config.json;
-the network from --init. Short forms: --objects, --num-worlds and --seed stand for --task.objects and so on.
+the network from --init. Short forms: --objects, --num-envs and --seed stand for --task.objects and so on.
 Ctrl-C saves."""
 
-SHORT_FORMS = ("objects", "num-worlds", "seed")
+SHORT_FORMS = ("objects", "num-envs", "seed")
 """Fields of the task that are flags without the ``--task.`` prefix too."""
 
 
@@ -59,22 +59,24 @@ def student_command(arguments: list[str], started: float) -> int:
     from vd.train.progress import waiting
 
     main_process = os.environ.get("RANK", "0") == "0"
-    with waiting("building the worlds (the first start compiles the kernels: a minute or two)", main_process):
+    with waiting(
+        "building the environments (the first start compiles the kernels: a minute or two)", main_process
+    ):
         runner = build_student(cfg, started=started)
-    folder = cfg.run.run_dir
+    folder = cfg.run.out
     if main_process:
         print_damaged(runner.damaged)
     if main_process and runner.iteration:
         print(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
         if runner.new_episodes:
-            print(f"episodes start anew, since the checkpoint does not fit the worlds: {runner.new_episodes}")
+            print(f"episodes start anew, the checkpoint does not fit the environments: {runner.new_episodes}")
     elif main_process and cfg.init is not None:
         print(f"begins with the weights of {cfg.init}")
     whole = finished(runner.learn, runner.learner.close, distributed=runner.is_distributed)
     runner.shutdown()
     if not whole:
         if main_process:
-            print(f"saved in {folder}; go on with: vd-train student --run-dir {folder} --resume")
+            print(f"saved in {folder}; go on with: vd-train student --out {folder} --resume")
         return interrupt.INTERRUPTED
     if main_process:
         print(f"done: {folder}/student.pt is the student, vd-train curves {folder} draws the curves")
@@ -88,10 +90,10 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
     """
     from vd.train.flags import value_of
 
-    given, run_dir = value_of(arguments, "--init"), value_of(arguments, "--run-dir")
+    given, run_dir = value_of(arguments, "--init"), value_of(arguments, "--out")
     if given is None and "--from-scratch" in arguments:
         return base
-    path = Path(given) if given else default_init(base.stage, Path(run_dir) if run_dir else base.run.run_dir)
+    path = Path(given) if given else default_init(base.stage, Path(run_dir) if run_dir else base.run.out)
     if path is None:
         return base
     from vd.vision.saved import read_student, saved_spec

@@ -3,10 +3,11 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from vd.config import Renamed
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
 from vd.train.config import RunCfg
@@ -18,7 +19,7 @@ PresetName = Literal["gpu", "paper", "cpu-demo", "cpu-overfit"]
 PRETRAINING, SYNTHETIC, RENDERED = 0, 1, 2
 """Stages: random scenes without simulation; complete clouds; clouds of a depth camera."""
 STUDENT_NAME = "student.pt"
-"""The student of a run, in its folder: what later stages start from, without optimiser and worlds."""
+"""The student of a run, in its folder: what later stages start from, without optimiser and environments."""
 RUNS = Path("runs/student")
 """Parent of the default folders stage0, stage1 and stage2."""
 
@@ -29,8 +30,12 @@ class DaggerCfg:
 
     rollout_steps: int = PAPER.dagger.rollout_steps
     """Control steps of every world between two updates; gradients flow through all of them."""
-    minibatch_worlds: int = PAPER.dagger.synthetic_minibatch
-    """Worlds of an optimiser step on one GPU, whole sequences each."""
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "minibatch_worlds": Renamed("minibatch_envs"),
+        "validation_worlds": Renamed("validation_envs"),
+    }
+    minibatch_envs: int = PAPER.dagger.synthetic_minibatch
+    """Environments of an optimiser step on one GPU, whole sequences each."""
     epochs: int = PAPER.dagger.epochs
     """Passes over a rollout."""
     learning_rate: float = PAPER.dagger.learning_rate
@@ -63,8 +68,8 @@ class DaggerCfg:
     clip_labels: bool = False
     """Clip the teacher's mean to [-1, 1], where the environment clips actions; the released code does not."""
     teacher_share: float = PAPER.dagger.teacher_share
-    """Share of worlds in which the teacher acts, drawn for every rollout, in the first iteration (beta of
-    DAgger)."""
+    """Share of environments in which the teacher acts, drawn for every rollout, in the first iteration (beta
+    of DAgger)."""
     teacher_share_last: float = 0.0
     """What that share comes to. With a rest of it the states near the goal stay among those learned from,
     which a student that is not good yet does not reach."""
@@ -74,12 +79,12 @@ class DaggerCfg:
     """Rollouts to learn from, the latest and those before it; the released code keeps the latest alone.
     Passes stay as long: they take sequences at random from all that are kept."""
     reset: bool = True
-    """Begin new episodes in all worlds with every rollout (released code): no step later than rollout_steps
-    is ever seen. Otherwise episodes go on, and each rollout starts with the memory of the one before."""
+    """Begin new episodes in all environments with every rollout (released code): no step later than
+    rollout_steps is ever seen. Otherwise episodes go on, and rollouts start with the memory of the last."""
     same_scene: bool = False
     """Begin every rollout in the same states, with the same disturbances: can they be learned by heart?"""
-    validation_worlds: int = 0
-    """Worlds that nothing is learned from: their first episode is the fixed set of ``validation/*``."""
+    validation_envs: int = 0
+    """Environments that nothing is learned from: their first episode is the fixed set of ``validation/*``."""
     precision: Literal["fp32", "bf16"] = "fp32"
     """Of the encoder's products; memory, heads, losses and weights stay in fp32."""
 
@@ -123,12 +128,13 @@ class PretrainCfg:
 
 @dataclass
 class StudentTaskCfg:
-    """The worlds; physics, actions and hand are those of the teacher's training."""
+    """The environments; physics, actions and hand are those of the teacher's training."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"num_worlds": Renamed("num_envs")}
     objects: tuple[str, ...] = ()
     """Object sets: names or folders of object USDs; the teacher's by default."""
-    num_worlds: int = PAPER.dagger.synthetic_worlds
-    """Worlds simulated side by side."""
+    num_envs: int = PAPER.dagger.synthetic_envs
+    """Environments simulated side by side."""
     seed: int = 0
     """Seed of every random draw."""
     randomise: bool | None = None
@@ -153,12 +159,12 @@ class StudentTrainCfg:
     """Policy to imitate, also the source of hand and task: a policy.pt, a run's folder, or the name of an
     installed one."""
     init: Path | None = None
-    """Student to begin from: student.pt or a checkpoint. Stage 2 takes ../stage1/student.pt of --run-dir by
+    """Student to begin from: student.pt or a checkpoint. Stage 2 takes ../stage1/student.pt of --out by
     default."""
     from_scratch: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Let stage 2 begin with a policy of random weights: several times slower than stage 1 first."""
     resume: str | None = None
-    """Go on from a checkpoint of --run-dir: latest (a bare --resume), a file, or auto: the latest, and a new
+    """Go on from a checkpoint of --out: latest (a bare --resume), a file, or auto: the latest, and a new
     run where there is none."""
     camera: tuple[float, float, float, float, float, float, float] | None = None
     """Pose of the optical frame (x right, y down, z forward) in the hand's base frame, for stage 2: position
@@ -179,17 +185,17 @@ def paper(stage: Stage) -> StudentTrainCfg:
     return StudentTrainCfg(
         preset="paper",
         stage=stage,
-        run=RunCfg(run_dir=RUNS / f"stage{stage}", save_every=20, max_steps=100_000_000),
+        run=RunCfg(out=RUNS / f"stage{stage}", save_every=20, max_steps=100_000_000),
         dagger=DaggerCfg(
-            minibatch_worlds=constants.rendered_minibatch if rendered else constants.synthetic_minibatch
+            minibatch_envs=constants.rendered_minibatch if rendered else constants.synthetic_minibatch
         ),
-        task=StudentTaskCfg(num_worlds=constants.rendered_worlds if rendered else constants.synthetic_worlds),
+        task=StudentTaskCfg(num_envs=constants.rendered_envs if rendered else constants.synthetic_envs),
         network=PAPER_NETWORK,
     )
 
 
 GPU_WORLDS = 2048
-"""Worlds of a GPU: five times those of the released code are simulated in hardly more time."""
+"""Environments of a GPU: five times those of the released code are simulated in hardly more time."""
 SHORT_ROLLOUTS = DaggerCfg(
     epochs=2,
     learning_rate=1e-3,
@@ -225,13 +231,13 @@ def gpu(stage: Stage) -> StudentTrainCfg:
         dagger=replace(
             dagger,
             rollout_steps=20,
-            minibatch_worlds=80,
+            minibatch_envs=80,
             decay_after_steps=2000,
             keep_rollouts=10,
-            validation_worlds=40,
+            validation_envs=40,
             precision="bf16",
         ),
-        task=replace(start.task, num_worlds=GPU_WORLDS),
+        task=replace(start.task, num_envs=GPU_WORLDS),
         pretrain=PretrainCfg(
             batch=1024,
             learning_rate=1e-3,
@@ -253,20 +259,20 @@ def cpu_demo(stage: Stage) -> StudentTrainCfg:
         stage=stage,
         teacher="dclaw4-cube",
         run=RunCfg(
-            run_dir=RUNS / f"cpu-stage{stage}", device="cpu", save_every=5, max_minutes=7.0, max_steps=16_000
+            out=RUNS / f"cpu-stage{stage}", device="cpu", save_every=5, max_minutes=7.0, max_steps=16_000
         ),
         dagger=replace(
             SHORT_ROLLOUTS,
             rollout_steps=20,
-            minibatch_worlds=4,
+            minibatch_envs=4,
             epochs=4,
             keep_rollouts=50,
-            validation_worlds=2,
+            validation_envs=2,
         ),
         pretrain=PretrainCfg(
             batch=64, steps=10, learning_rate=1e-3, amsgrad=False, distance="6d", near_share=0.5
         ),
-        task=StudentTaskCfg(num_worlds=16),
+        task=StudentTaskCfg(num_envs=16),
         network=SMALL_NETWORK,
         depth=DepthCameraCfg(points=2000),
     )
@@ -281,18 +287,18 @@ def cpu_overfit(stage: Stage) -> StudentTrainCfg:
     return replace(
         start,
         preset="cpu-overfit",
-        run=replace(start.run, run_dir=RUNS / f"cpu-overfit-stage{stage}", max_minutes=2.0, max_steps=800),
+        run=replace(start.run, out=RUNS / f"cpu-overfit-stage{stage}", max_minutes=2.0, max_steps=800),
         dagger=replace(
             start.dagger,
-            minibatch_worlds=1,
+            minibatch_envs=1,
             epochs=8,
             keep_rollouts=1,
             teacher_share_last=1.0,
-            validation_worlds=0,
+            validation_envs=0,
             reset=True,
             same_scene=True,
         ),
-        task=replace(start.task, num_worlds=1),
+        task=replace(start.task, num_envs=1),
     )
 
 
@@ -323,7 +329,7 @@ def validate(cfg: StudentTrainCfg) -> None:
     dagger, pretrain, run = cfg.dagger, cfg.pretrain, cfg.run
     positive = {
         "--dagger.rollout-steps": dagger.rollout_steps,
-        "--dagger.minibatch-worlds": dagger.minibatch_worlds,
+        "--dagger.minibatch-envs": dagger.minibatch_envs,
         "--dagger.epochs": dagger.epochs,
         "--dagger.keep-rollouts": dagger.keep_rollouts,
         "--dagger.learning-rate": dagger.learning_rate,
@@ -332,7 +338,7 @@ def validate(cfg: StudentTrainCfg) -> None:
         "--pretrain.steps": pretrain.steps,
         "--pretrain.learning-rate": pretrain.learning_rate,
         "--pretrain.grad-norm": pretrain.grad_norm,
-        "--num-worlds": cfg.task.num_worlds,
+        "--num-envs": cfg.task.num_envs,
         "--max-steps": run.max_steps,
         "--save-every": run.save_every,
         "--max-minutes": 1.0 if run.max_minutes is None else run.max_minutes,
@@ -349,7 +355,7 @@ def validate(cfg: StudentTrainCfg) -> None:
         "--dagger.teacher-share-iterations": dagger.teacher_share_iterations,
         "--dagger.warmup-steps": dagger.warmup_steps,
         "--dagger.decay-after-steps": dagger.decay_after_steps,
-        "--dagger.validation-worlds": dagger.validation_worlds,
+        "--dagger.validation-envs": dagger.validation_envs,
         "--pretrain.decay-after-steps": pretrain.decay_after_steps,
         "--pretrain.category-weight": pretrain.category_weight,
         "--pretrain.distance-weight": pretrain.distance_weight,

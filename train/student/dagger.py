@@ -1,6 +1,6 @@
 """Imitation of the teacher on what the student does: rollouts, labels, and updates through whole sequences.
 
-T steps, N worlds, D actions, G the student's memory.
+T steps, N environments, D actions, G the student's memory.
 """
 
 import math
@@ -55,9 +55,9 @@ class View(Protocol):
         ...
 
     def sites(
-        self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None, *, augment: bool
+        self, frame: Mapping[str, torch.Tensor], envs: torch.Tensor | None = None, *, augment: bool
     ) -> tuple[Sites, ...]:
-        """Voxels of frames [R, ...] of the given worlds [R]."""
+        """Voxels of frames [R, ...] of the given environments [R]."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
@@ -72,16 +72,18 @@ class View(Protocol):
 class Dagger:
     """Trains a student by the labels of a teacher that sees the noise-free state (Ross et al. 2011).
 
-    One iteration: the student acts T steps in N worlds and the teacher labels every state; then some passes
-    over the worlds, whole sequences in each minibatch, gradients through all T steps except across ends of
-    episodes. As in the released code only the latest rollout is learned from, unless more are to be kept. In
-    rollouts batch norms use their running statistics, as they do where the student is deployed.
+    One iteration: the student acts T steps in N environments and the teacher labels every state; then some
+    passes over the environments, whole sequences in each minibatch, gradients through all T steps except
+    across ends of episodes. As in the released code only the latest rollout is learned from, unless more are
+    to be kept. In rollouts batch norms use their running statistics, as they do where the student is
+    deployed.
 
-    The last worlds may be held out: nothing is learned from them, and their sequences of the first episode
-    are the fixed set on which each iteration measures the error, whatever states the student comes to.
+    The last environments may be held out: nothing is learned from them, and their sequences of the first
+    episode are the fixed set on which each iteration measures the error, whatever states the student comes
+    to.
 
     Args:
-        env: The worlds.
+        env: The environments.
         view: What the student sees of them.
         student: The network.
         teacher: Labels observations of ``env``, once [N, D] or in each view that the student may take
@@ -132,11 +134,11 @@ class Dagger:
         self._steps_done = 0
         self._figures: dict[str, torch.Tensor] = {}
         self._episode_rollouts = math.ceil(env.max_episode_length / cfg.rollout_steps)
-        self._learned_worlds = env.num_envs - cfg.validation_worlds
+        self._learned_worlds = env.num_envs - cfg.validation_envs
         if self._learned_worlds < 1:
             raise ValueError(
-                f"--dagger.validation-worlds {cfg.validation_worlds} leaves none of {env.num_envs} worlds to "
-                "learn from; give fewer, or more --num-worlds"
+                f"--dagger.validation-envs {cfg.validation_envs} leaves none of {env.num_envs} environments "
+                "to learn from; give fewer, or more --num-envs"
             )
 
     def iterate(self, stopping: Callable[[], bool]) -> dict[str, float | None] | None:
@@ -158,7 +160,7 @@ class Dagger:
         means = self._means.read(self._world_size) | self._read(self._figures)
         collected = time.perf_counter()
         self._kept.append(rollout)
-        if self.cfg.validation_worlds and len(self._held_out) < self._episode_rollouts:
+        if self.cfg.validation_envs and len(self._held_out) < self._episode_rollouts:
             held_out = torch.arange(self._learned_worlds, self.env.num_envs, device=self.device)
             self._held_out.append(taken([rollout], held_out))
         state = self.student.state
@@ -179,7 +181,7 @@ class Dagger:
         }
 
     def teacher_share(self) -> float:
-        """Share of worlds in which the teacher acts in this iteration."""
+        """Share of environments in which the teacher acts in this iteration."""
         first, last, iterations = (
             self.cfg.teacher_share,
             self.cfg.teacher_share_last,
@@ -191,19 +193,19 @@ class Dagger:
 
     def collect(self, stopping: Callable[[], bool] = lambda: False) -> Rollout | None:
         """Let the student act, and the teacher label; ``None`` if ``stopping`` said so on the way."""
-        cfg, worlds = self.cfg, self.env.num_envs
+        cfg, envs = self.cfg, self.env.num_envs
         self.student.eval()
         if cfg.reset:
             self._begin_episodes()
-            self._hidden = self.student.initial_hidden(worlds)
+            self._hidden = self.student.initial_hidden(envs)
         first = self._hidden
         # Whole rollouts of a world: mixed from step to step it would be what neither of the two does.
-        taught = torch.rand((worlds, 1), device=self.device) < self.teacher_share()
+        taught = torch.rand((envs, 1), device=self.device) < self.teacher_share()
         frames: dict[str, torch.Tensor] = {}
         labels: list[torch.Tensor] = []
         wanted: list[torch.Tensor] = []
         means: list[torch.Tensor] = []
-        done = torch.zeros((cfg.rollout_steps, worlds), dtype=torch.bool, device=self.device)
+        done = torch.zeros((cfg.rollout_steps, envs), dtype=torch.bool, device=self.device)
         with torch.no_grad():
             observation = self.env.get_observations()
             for step in range(cfg.rollout_steps):
@@ -238,7 +240,7 @@ class Dagger:
                     # Goals that the end of the rollout cuts off would be in no count otherwise.
                     log["task/timed_out"] = log["task/timed_out"] + (~done[step]).float().mean()
                 self._means.add(log | {"policy/std": std.mean()})
-        rollout = Rollout(frames, torch.stack(labels), done, first, torch.arange(worlds, device=self.device))
+        rollout = Rollout(frames, torch.stack(labels), done, first, torch.arange(envs, device=self.device))
         own = ~taught[:, 0] if not bool(taught.all()) else taught[:, 0]
         self._figures = imitation_figures("student", torch.stack(means)[:, own], torch.stack(wanted)[:, own])
         self._check_rollout(rollout)
@@ -249,7 +251,7 @@ class Dagger:
 
         The memory runs on through the whole episode, as the student's own does.
         """
-        if not self.cfg.validation_worlds:
+        if not self.cfg.validation_envs:
             return {}
         names = ["action_error", "zero_error", "unexplained", "distance_error"]
         if self.pose is not None:
@@ -257,7 +259,7 @@ class Dagger:
         if len(self._held_out) < self._episode_rollouts:
             return {f"validation/{name}": None for name in names}
         self.student.eval()
-        hidden = self.student.initial_hidden(self.cfg.validation_worlds)
+        hidden = self.student.initial_hidden(self.cfg.validation_envs)
         means, wanted, errors, turns = [], [], [], []
         with torch.no_grad():
             for part in self._held_out:
@@ -293,15 +295,15 @@ class Dagger:
         return losses
 
     def minibatches(self, rollouts: int) -> Iterator[torch.Tensor]:
-        """Sequences of each optimiser step: as many a pass as there are worlds, none twice, in a new order.
+        """Sequences of each optimiser step: each environment once a pass, in a new order.
 
-        Sequence n of rollout k is number k N + n; those of worlds that are held out never come. Of the latest
-        rollout alone that is every other world once. The last minibatch of a pass may be smaller.
+        Sequence n of rollout k is number k N + n; those of environments that are held out never come. Of the
+        latest rollout alone that is every other world once. The last minibatch of a pass may be smaller.
         """
-        learned, worlds = self._learned_worlds, self.env.num_envs
+        learned, envs = self._learned_worlds, self.env.num_envs
         for _ in range(self.cfg.epochs):
             order = torch.randperm(rollouts * learned, device=self.device)[:learned]
-            yield from (order // learned * worlds + order % learned).split(self.cfg.minibatch_worlds)
+            yield from (order // learned * envs + order % learned).split(self.cfg.minibatch_envs)
 
     def losses(self, rollout: Rollout) -> dict[str, torch.Tensor]:
         """Losses of sequences by name, with new noise on their clouds; their weights are in ``weights``."""
@@ -345,7 +347,7 @@ class Dagger:
         self.iteration = iteration
 
     def local_state(self) -> dict[str, Any]:
-        """What belongs to this process: its worlds, random states, the student's memory, kept rollouts."""
+        """What belongs to this process: environments, random states, the student's memory, kept rollouts."""
         # The next iteration drops the oldest: one that stands alone, or the first of a full store.
         kept = list(self._kept)[-(self.cfg.keep_rollouts - 1) :] if self.cfg.keep_rollouts > 1 else []
         if sum(rollout_bytes(rollout) for rollout in kept) > CHECKPOINT_ROLLOUT_BYTES:
@@ -370,12 +372,12 @@ class Dagger:
         self._held_out = [Rollout(**moved(rollout, self.device)) for rollout in state["held_out"]]
 
     def fits(self, ranks: list[dict[str, Any]]) -> str:
-        """Why the worlds of a checkpoint cannot be restored; empty if they can."""
+        """Why the environments of a checkpoint cannot be restored; empty if they can."""
         if len(ranks) != self._world_size:
             return f"it is of {len(ranks)} processes, this run has {self._world_size}"
-        worlds = {len(rank["local"]["hidden"]) for rank in ranks}
-        if worlds != {self.env.num_envs}:
-            return f"it is of {max(worlds)} worlds a process, this run has {self.env.num_envs}"
+        envs = {len(rank["local"]["hidden"]) for rank in ranks}
+        if envs != {self.env.num_envs}:
+            return f"it is of {max(envs)} environments a process, this run has {self.env.num_envs}"
         return ""
 
     def close(self) -> None:
@@ -417,7 +419,7 @@ class Dagger:
         """
         steps, count = rollout.done.shape
         flat = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
-        sites = self.view.sites(flat, rollout.worlds.repeat(steps), augment=augment)
+        sites = self.view.sites(flat, rollout.envs.repeat(steps), augment=augment)
         embedding, matches = self._look(sites)
         embedding = embedding.view(steps, count, -1)
         output = self.student(embedding, self.student.senses(rollout.frames), hidden, rollout.done)
@@ -427,9 +429,9 @@ class Dagger:
         """Let the estimate of the teacher's observation begin with the best one in least squares."""
         self.student.train()  # as in the updates that follow
         seen, observed = [], []
-        worlds = torch.arange(self._learned_worlds, device=self.device)
+        envs = torch.arange(self._learned_worlds, device=self.device)
         with torch.no_grad():
-            for some in worlds.split(self.cfg.minibatch_worlds)[:FIT_BATCHES]:
+            for some in envs.split(self.cfg.minibatch_envs)[:FIT_BATCHES]:
                 part = taken([rollout], some)
                 output, _, _ = self._run(part, part.hidden, augment=True)
                 seen.append(output.seen.flatten(0, 1))

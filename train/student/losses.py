@@ -1,4 +1,4 @@
-"""Losses of the student, and figures of its errors. T steps, N worlds, D actions, H distance heads."""
+"""Losses of the student, and figures of its errors. T steps, N environments, D actions, H distance heads."""
 
 import math
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ POSE_VALUES = 9
 def imitation_loss(
     output: StudentOutput, label: torch.Tensor, kind: str, *, bounded: bool = False
 ) -> torch.Tensor:
-    """How far the student's actions are from the teacher's, the mean over steps and worlds.
+    """How far the student's actions are from the teacher's, the mean over steps and environments.
 
     Args:
         output: What the student says, leading shape [T, N].
@@ -66,7 +66,7 @@ def distance_loss(predicted: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
 
 
 def unexplained(predicted: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
-    """Share of the variance of ``true`` [T, N, D] over steps and worlds that is left: 1 for a constant."""
+    """Share left of the variance of ``true`` [T, N, D] over steps and environments: 1 for a constant."""
     rest = (true - true.mean(dim=(0, 1))).square().mean()
     return (predicted - true).square().mean() / rest.clamp(min=torch.finfo(rest.dtype).tiny)
 

@@ -103,17 +103,17 @@ class RandomScenes:
                     f"a camera sees {len(self._seen)} scenes of a batch, but there are {len(world_object)} "
                     "objects in their sizes; raise --pretrain.batch or --pretrain.rendered-share"
                 )
-            worlds = self._seen.cpu().numpy()
+            envs = self._seen.cpu().numpy()
             self._camera = DepthCamera(
                 hand_surfaces(
                     hand,
                     objects,
-                    world_object=world_object[worlds],
-                    world_scale=world_scale[worlds],
+                    world_object=world_object[envs],
+                    world_scale=world_scale[envs],
                     **placed,
                 ),
                 hand.camera,
-                self._body_q[: len(worlds)],
+                self._body_q[: len(envs)],
                 cfg=depth,
                 camera_body=0,
                 seed=seed,
@@ -137,8 +137,8 @@ class RandomScenes:
         """
         count, device = self._batch, self._device
         share = torch.rand((count, len(self._lower)), device=device)
-        worlds = torch.randint(self._objects * self._scales, (count,), device=device)
-        worlds[: len(self._seen)] = self._seen
+        envs = torch.randint(self._objects * self._scales, (count,), device=device)
+        envs[: len(self._seen)] = self._seen
         orientation = random_rotations(count, device)
         goal = random_rotations(count, device)
         near = torch.rand((count, 1), device=device) < self._near_share
@@ -151,7 +151,7 @@ class RandomScenes:
             self._points,
             self._body_q,
             wp.from_torch(goal.contiguous(), dtype=wp.quat),
-            worlds=wp.from_torch(worlds.int()),
+            envs=wp.from_torch(envs.int()),
         )
         if self._camera is not None:
             self._camera.capture()
@@ -170,7 +170,7 @@ class RandomScenes:
             complete=self._camera is None,
         )
         targets = {
-            "category": worlds // self._scales,
+            "category": envs // self._scales,
             "distance": rotation_distance(orientation, goal),
             "rotation": two_columns(relative_rotation(orientation, goal)),
             "joints": 2.0 * share - 1.0,

@@ -1,6 +1,6 @@
 """Rollouts that imitation learns from: sequences of what was seen, with labels.
 
-T steps, N worlds, D actions, G the student's memory.
+T steps, N environments, D actions, G the student's memory.
 """
 
 from collections.abc import Sequence
@@ -25,16 +25,16 @@ class Rollout:
     """Where the goal or the episode ended with the step [T, N], bool."""
     hidden: torch.Tensor
     """The student's memory before the first step [N, G]."""
-    worlds: torch.Tensor
+    envs: torch.Tensor
     """World of each sequence [N]."""
 
 
 def taken(rollouts: Sequence[Rollout], sequences: torch.Tensor) -> Rollout:
-    """Some sequences of rollouts of N worlds each, as one: number k N + n is sequence n of rollout k."""
-    worlds = len(rollouts[0].worlds)
+    """Some sequences of rollouts of N environments each, as one: k N + n is sequence n of rollout k."""
+    envs = len(rollouts[0].envs)
     parts = []
     for index, rollout in enumerate(rollouts):
-        own = sequences[sequences // worlds == index] - index * worlds if len(rollouts) > 1 else sequences
+        own = sequences[sequences // envs == index] - index * envs if len(rollouts) > 1 else sequences
         if len(own):
             parts.append((rollout, own))
     return Rollout(
@@ -42,7 +42,7 @@ def taken(rollouts: Sequence[Rollout], sequences: torch.Tensor) -> Rollout:
         torch.cat([r.label[:, own] for r, own in parts], dim=1),
         torch.cat([r.done[:, own] for r, own in parts], dim=1),
         torch.cat([r.hidden[own] for r, own in parts]),
-        torch.cat([r.worlds[own] for r, own in parts]),
+        torch.cat([r.envs[own] for r, own in parts]),
     )
 
 

@@ -69,9 +69,10 @@ class Learner(Protocol):
 class StudentRunner:
     """Runs a learner until steps, time or the user end it; resumes exactly where it stopped.
 
-    Under ``torchrun`` every process has its own worlds; gradients are averaged, and the first process logs
-    and saves, with the random and world state of all. The latest student is the one that is kept: imitation
-    learns from ever new rollouts and does not overfit one, and its success rate is too noisy to choose by.
+    Under ``torchrun`` every process has its own environments; gradients are averaged, and the first process
+    logs and saves, with the random and world state of all. The latest student is the one that is kept:
+    imitation learns from ever new rollouts and does not overfit one, and its success rate is too noisy to
+    choose by.
 
     Args:
         learner: What to run.
@@ -85,8 +86,8 @@ class StudentRunner:
 
     Attributes:
         iteration: Iterations completed, over all resumed runs.
-        env_steps: Control steps (clouds in stage 0) completed, over all worlds and processes.
-        new_episodes: Why the checkpoint could not restore the worlds; empty if it did.
+        env_steps: Control steps (clouds in stage 0) completed, over all environments and processes.
+        new_episodes: Why the checkpoint could not restore the environments; empty if it did.
         damaged: Newer checkpoints than the one that was loaded, and what is wrong with them.
     """
 
@@ -150,7 +151,7 @@ class StudentRunner:
         with contextlib.ExitStack() as stack:
             log: ProgressFile | None = None
             if self.is_main:
-                log = ProgressFile(self.run.run_dir, tensorboard=self.run.tensorboard, done=first)
+                log = ProgressFile(self.run.out, tensorboard=self.run.tensorboard, done=first)
                 stack.callback(log.close)
             stack.enter_context(self._end.signals(progress.note))
             stack.enter_context(progress)
@@ -173,13 +174,13 @@ class StudentRunner:
         state = self._state()
         if not self.is_main:
             return
-        folder = self.run.run_dir
+        folder = self.run.out
         save_checkpoint(checkpoint_path(folder, self.iteration), state)
         save_checkpoint(folder / STUDENT_NAME, student_export(state))
         prune_checkpoints(folder, self.iteration, self.run.keep_every)
 
     def load(self, path: Path) -> None:
-        """Go on from a checkpoint: exactly, with its processes and worlds; else with new episodes.
+        """Go on from a checkpoint: exactly, with its processes and environments; else with new episodes.
 
         Args:
             path: The checkpoint.
@@ -213,7 +214,7 @@ class StudentRunner:
             # With several processes all must do the same collectives, so they stop between iterations.
             figures = self.learner.iterate(lambda: bool(self._end.signal) and not self.is_distributed)
         except TrainingDivergedError as error:
-            folder = self.run.run_dir / CHECKPOINT_FOLDER
+            folder = self.run.out / CHECKPOINT_FOLDER
             raise TrainingDivergedError(
                 f"iteration {self.iteration + 1}: {error}. The last checkpoint in {folder} is from before; "
                 "go on from it with --resume"

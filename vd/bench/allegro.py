@@ -75,18 +75,18 @@ class AllegroRate:
     """What the example did."""
 
     physics_steps_s: float
-    """Physics steps per second over all worlds."""
+    """Physics steps per second over all environments."""
     dt_s: float
     """Length of its physics step [s]."""
     hand: str
     """Which hand it had: :data:`FROM_NEWTON`, a file's name or :data:`OF_BOXES`."""
 
 
-def allegro_rate(worlds: int, device: str, *, file: Path | None = None, fetch: bool = False) -> AllegroRate:
-    """Physics steps per second of the example over all worlds.
+def allegro_rate(envs: int, device: str, *, file: Path | None = None, fetch: bool = False) -> AllegroRate:
+    """Physics steps per second of the example over all environments.
 
     Args:
-        worlds: World count.
+        envs: World count.
         device: Warp device.
         file: URDF of an Allegro hand, in its maker's frame, in place of the boxes.
         fetch: Let Newton download the example's asset, which is then the hand.
@@ -102,18 +102,18 @@ def allegro_rate(worlds: int, device: str, *, file: Path | None = None, fetch: b
         with wp.ScopedDevice(device):
             if file is not None:
                 with _in_place_of_the_asset(lambda builder: _add_file(builder, file)):
-                    return _measure(worlds, device, file.name)
+                    return _measure(envs, device, file.name)
             if fetch:
                 with redirect_stdout(sys.stderr):  # standard output is for the rows
-                    return _measure(worlds, device, FROM_NEWTON)
+                    return _measure(envs, device, FROM_NEWTON)
             with _in_place_of_the_asset(add_hand_of_boxes):
-                return _measure(worlds, device, OF_BOXES)
+                return _measure(envs, device, OF_BOXES)
     except Exception as error:
         raise RuntimeError(f"Newton's Allegro example cannot run here: {error}") from error
 
 
-def _measure(worlds: int, device: str, hand: str) -> AllegroRate:
-    example = make_example(worlds)
+def _measure(envs: int, device: str, hand: str) -> AllegroRate:
+    example = make_example(envs)
     for _ in range(FRAMES):
         example.step()
     wp.synchronize_device(device)
@@ -122,14 +122,14 @@ def _measure(worlds: int, device: str, hand: str) -> AllegroRate:
         example.step()
     wp.synchronize_device(device)
     elapsed = time.perf_counter() - start
-    return AllegroRate(worlds * FRAMES * example.sim_substeps / elapsed, example.sim_dt, hand)
+    return AllegroRate(envs * FRAMES * example.sim_substeps / elapsed, example.sim_dt, hand)
 
 
-def make_example(worlds: int) -> Any:
+def make_example(envs: int) -> Any:
     """The example, with a viewer that shows nothing."""
     from newton.examples.robot.example_robot_allegro_hand import Example
 
-    arguments = Example.create_parser().parse_args(["--viewer", "null", "--world-count", str(worlds)])
+    arguments = Example.create_parser().parse_args(["--viewer", "null", "--world-count", str(envs)])
     viewer: Any = newton.viewer.ViewerNull(num_frames=FRAMES)
     return Example(viewer, arguments)
 

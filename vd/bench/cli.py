@@ -21,10 +21,10 @@ from vd.warp_quiet import quiet_warp
 class SimCommand:
     """Control steps per second, memory and start-up of the simulation under a policy's actions."""
 
-    worlds: tuple[int, ...] = (4096, 8192, 16384)
+    envs: tuple[int, ...] = (4096, 8192, 16384)
     """World counts to measure."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
-    """Object sets, mixed over the worlds."""
+    """Object sets, mixed over the environments."""
     hand: str = "dclaw4"
     """Hand."""
     device: str = "auto"
@@ -61,11 +61,11 @@ class SimCommand:
         device = resolve_device(self.device)
         teacher = None if self.policy is None else load_policy(find_policy(self.policy), device)
         rows: list[dict[str, Any]] = []
-        for worlds, jacobian in itertools.product(self.worlds, self.jacobian):
+        for envs, jacobian in itertools.product(self.envs, self.jacobian):
             if teacher is None:
-                cfg = task(self.objects, worlds, self.hand, self.randomise)
+                cfg = task(self.objects, envs, self.hand, self.randomise)
             else:
-                cfg = teacher_task(teacher, self.objects, worlds)
+                cfg = teacher_task(teacher, self.objects, envs)
             cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, jacobian=jacobian))
             row = measure(cfg, device, teacher=teacher)
             record: dict[str, Any] = dataclasses.asdict(row)
@@ -73,7 +73,7 @@ class SimCommand:
             substeps = cfg.sim.substeps
             if self.allegro:
                 try:
-                    beside = allegro_rate(worlds, device, file=self.allegro_file, fetch=self.fetch_allegro)
+                    beside = allegro_rate(envs, device, file=self.allegro_file, fetch=self.fetch_allegro)
                     record["allegro_hand"] = beside.hand
                     record["allegro_physics_steps_s"] = beside.physics_steps_s
                     record["allegro_dt_s"] = beside.dt_s
@@ -143,10 +143,10 @@ class PhysicsCommand:
 class DepthCommand:
     """Depth images and clouds per second, beside Newton's camera at the same size in the same run."""
 
-    worlds: tuple[int, ...] = (256, 1024, 4096)
+    envs: tuple[int, ...] = (256, 1024, 4096)
     """World counts to measure; 1 for the figure at deployment on a CPU."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
-    """Object sets, mixed over the worlds."""
+    """Object sets, mixed over the environments."""
     hand: str = "dclaw4"
     """Hand."""
     device: str = "auto"
@@ -168,8 +168,8 @@ class DepthCommand:
         device = resolve_device(self.device)
         objects = load_set(list(self.objects))
         rows: list[dict[str, Any]] = []
-        for worlds in self.worlds:
-            row = dataclasses.asdict(measure(objects, worlds, device, hand=self.hand, seed=self.seed))
+        for envs in self.envs:
+            row = dataclasses.asdict(measure(objects, envs, device, hand=self.hand, seed=self.seed))
             rows.append(row)
             print(json.dumps(row), flush=True)
             if self.json:  # after each row: a later one may not fit the device
@@ -195,7 +195,7 @@ class StudentCommand:
     """Encoder in bfloat16 for the latency: for processors that multiply in it."""
     calls: int = 300
     """Control steps to time; 0 leaves the latency out."""
-    worlds: tuple[int, ...] = (10, 40)
+    envs: tuple[int, ...] = (10, 40)
     """Sequences of a minibatch, 80 steps each."""
     seed: int = 0
     """Of poses and weights."""
@@ -248,10 +248,10 @@ class StudentCommand:
             )
         training = device != "cpu" or self.device == "cpu"
         for name in presets if training else ():
-            for worlds in self.worlds:
+            for envs in self.envs:
                 for half in (True, False):
                     row = measure_training(
-                        objects, name, device, hand=self.hand, worlds=worlds, half=half, seed=self.seed
+                        objects, name, device, hand=self.hand, envs=envs, half=half, seed=self.seed
                     )
                     add("training", row)
         return 0

@@ -1,8 +1,8 @@
 """``vd-bench depth``: depth images and clouds per second, beside Newton's camera on the same scene.
 
-Hands of 16 links in random poses around the reset, a different object in each block of worlds near the table.
-Rates count images, each from new poses: Newton's include the refit of its hierarchies, which moving bodies
-need, ours the placing of meshes. Images of both are compared, so that a wrong one cannot look fast.
+Hands of 16 links in random poses around the reset, a different object in each block of environments near the
+table. Rates count images, each from new poses: Newton's include the refit of its hierarchies, which moving
+bodies need, ours the placing of meshes. Images of both are compared, so that a wrong one cannot look fast.
 """
 
 from dataclasses import dataclass, field
@@ -41,10 +41,10 @@ NEWTON_FROM_OPTICAL = Rotation.from_euler("x", 180, degrees=True)
 
 @dataclass(frozen=True)
 class DepthRow:
-    """Images per second of one number of worlds."""
+    """Images per second of one number of environments."""
 
-    worlds: int
-    """Worlds side by side, one camera each."""
+    envs: int
+    """Environments side by side, one camera each."""
     width: int
     """Pixels."""
     height: int
@@ -67,7 +67,7 @@ class DepthRow:
     """Device time of each kernel for one image in every world [ms], both methods with clouds and the sensor's
     errors; empty on the CPU."""
     points: float = 0.0
-    """Points of a cloud, mean over worlds."""
+    """Points of a cloud, mean over environments."""
     different: float = 0.0
     """Share of pixels that differ by more than 1 mm between Newton's image and ours (silhouettes)."""
     methods_different: float = 0.0
@@ -75,21 +75,21 @@ class DepthRow:
 
 
 def bench_scene(
-    objects: list[ObjectModel], worlds: int, hand: str, device: str, seed: int
+    objects: list[ObjectModel], envs: int, hand: str, device: str, seed: int
 ) -> tuple[Scene, Any]:
     """A scene with visual shapes, and a Newton state with random poses.
 
     Args:
-        objects: Objects to spread over the worlds; the first ones if there are fewer worlds.
-        worlds: Number of worlds.
+        objects: Objects to spread over the environments; the first ones if there are fewer environments.
+        envs: Number of environments.
         hand: Name of a hand.
         device: Warp device.
         seed: Of the poses.
     """
     scene = build_scene(
         hand=load_hand(hand),
-        objects=objects[:worlds],
-        num_worlds=worlds,
+        objects=objects[:envs],
+        num_envs=envs,
         cfg=SimCfg(),
         device=device,
         visuals=True,
@@ -101,7 +101,7 @@ def bench_scene(
 
 def pose(scene: Scene, state: Any, generator: np.random.Generator) -> None:
     """Give every world of a state random joints and a random pose of its object."""
-    n, d = scene.num_worlds, scene.hand.num_joints
+    n, d = scene.num_envs, scene.hand.num_joints
     reset = np.tile(PAPER.scene.reset_joint_rad, scene.hand.num_fingers)
     joints = reset + JOINT_SPREAD_RAD * generator.standard_normal((n, d))
     position = OBJECT_SPREAD_M * generator.standard_normal((n, 3)) + [0.0, 0.0, OBJECT_HEIGHT_M]
@@ -118,7 +118,7 @@ class NewtonCamera:
         """Prepare rays and image.
 
         Args:
-            scene: Worlds, built with visual shapes.
+            scene: Environments, built with visual shapes.
             camera_q: Optical frames in the world frame, shape [N, 7].
             order: Name of a ``SensorCamera.RenderOrder``.
         """
@@ -155,20 +155,20 @@ def newton_rays(camera: CameraModel, device: str) -> wp.array:
     )
 
 
-def rate(worlds: int, function: Any, device: str) -> float:
+def rate(envs: int, function: Any, device: str) -> float:
     """Images per second of a function that takes one in every world; waits for the device."""
     function()
     once = seconds_per_call(function, 1, device)
     calls = max(1, min(100, round(LEAST_TIME_S / once)))
-    return worlds / seconds_per_call(function, calls, device)
+    return envs / seconds_per_call(function, calls, device)
 
 
 def measure(
-    objects: list[ObjectModel], worlds: int, device: str, *, hand: str = "dclaw4", seed: int = 0
+    objects: list[ObjectModel], envs: int, device: str, *, hand: str = "dclaw4", seed: int = 0
 ) -> DepthRow:
-    """Measure one number of worlds."""
-    scene, state = bench_scene(objects, worlds, hand, device, seed)
-    body_q = state.body_q.reshape((worlds, -1))
+    """Measure one number of environments."""
+    scene, state = bench_scene(objects, envs, hand, device, seed)
+    body_q = state.body_q.reshape((envs, -1))
     camera = scene.hand.camera
 
     images: dict[Method, float] = {}
@@ -178,7 +178,7 @@ def measure(
     for method in methods:
         ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method, points=0))
         ours.capture()
-        images[method] = rate(worlds, captured(ours.capture, device), device)
+        images[method] = rate(envs, captured(ours.capture, device), device)
         depths[method], camera_q = ours.depth.numpy().copy(), ours.camera_q.numpy()
     best = max(images, key=lambda method: images[method])
 
@@ -189,13 +189,13 @@ def measure(
         ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method, block=block))
         ours.capture()
         clouds[method if block == 1 else f"{method}/{block}"] = rate(
-            worlds, captured(ours.capture, device), device
+            envs, captured(ours.capture, device), device
         )
         if block == 1:
             points = float(ours.count.numpy().mean())
     ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=best, sensor=DepthSensorCfg.realistic()))
     ours.capture()
-    with_sensor = rate(worlds, captured(ours.capture, device), device)
+    with_sensor = rate(envs, captured(ours.capture, device), device)
     kernels = {**_kernel_times(scene, body_q, "rays"), **_kernel_times(scene, body_q, "raster")}
     del ours
 
@@ -209,18 +209,18 @@ def measure(
             theirs.refit(state)
             theirs.render(state)
 
-        newton_rates[order] = rate(worlds, frame, device)
+        newton_rates[order] = rate(envs, frame, device)
         refit_s = 1.0 / rate(1, lambda theirs=theirs: theirs.refit(state), device)
         reference = theirs.depth.numpy().copy()
     order = max(newton_rates, key=lambda name: newton_rates[name])
     fastest = newton_rates[order]
     return DepthRow(
-        worlds=worlds,
+        envs=envs,
         width=camera.width,
         height=camera.height,
         newton=fastest,
         newton_order=order,
-        newton_refit_share=refit_s * fastest / worlds,
+        newton_refit_share=refit_s * fastest / envs,
         images=images,
         clouds=clouds,
         with_sensor=with_sensor,

@@ -212,14 +212,14 @@ def _prepare(device: str, models: set[str]) -> None:
     """Fill the caches of kernels and hands before many processes want the same at once."""
     import warp as wp
 
-    import vd.kernels.chains
+    import vd.kernels.servo.chains
     from vd.assets_usd.hands import load_hand
 
     for model in models - set(BARE_MODELS):
         load_hand(model)
 
     quiet_warp()
-    wp.load_module(vd.kernels.chains, device=device)
+    wp.load_module(vd.kernels.servo.chains, device=device)
 
 
 def read_result(path: Path) -> dict[str, Any] | None:

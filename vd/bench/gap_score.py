@@ -12,7 +12,7 @@ from vd.gap.hidden_plant import CABLE, COGGING, WARMING
 from vd.gap.hide import Hiding
 from vd.gap.recording import BARE_MODELS
 from vd.gap.sizes import sized_effect
-from vd.kernels.effects import EFFECTS, TOGETHER, equivalent
+from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 
 KINDS = ("single", "none", "pair", "outside")
 MASS_SPREAD = 0.2

@@ -51,12 +51,12 @@ class SimRow:
 
     scene: str
     """What was simulated."""
-    worlds: int
-    """Worlds side by side."""
+    envs: int
+    """Environments side by side."""
     jacobian: str
     """How the solver keeps the constraints' Jacobian: dense or sparse."""
     physics_only: float
-    """Control steps/s of the physics alone, over all worlds."""
+    """Control steps/s of the physics alone, over all environments."""
     whole_step: float
     """Control steps/s of the environment's step."""
     with_policy: float
@@ -71,7 +71,7 @@ class SimRow:
     start_s: float
     """From an empty process state to the first finished step, kernels included [s]."""
     contacts_mean: float
-    """Contacts per world, mean over worlds at the end."""
+    """Contacts per world, mean over environments at the end."""
     rows_max: int
     """Most constraint rows in any world at the end."""
     kernels: tuple[KernelRow, ...]
@@ -230,10 +230,10 @@ def measure(
     data = solver.mjw_data
     contacts, rows = float(data.nacon.numpy()[0]), int(np.max(data.nefc.numpy()))
     kernels = kernel_rows(env) if on_gpu else ()
-    n = cfg.num_worlds
+    n = cfg.num_envs
     return SimRow(
         scene=label,
-        worlds=n,
+        envs=n,
         jacobian=cfg.sim.jacobian,
         physics_only=n / physics_s,
         whole_step=n / step_s,
@@ -259,7 +259,7 @@ def free_memory(device: str) -> int:
     return int(wp.get_device(device).free_memory)
 
 
-def teacher_task(policy: "TrainedPolicy", objects: tuple[str, ...], worlds: int) -> ReorientCfg:
+def teacher_task(policy: "TrainedPolicy", objects: tuple[str, ...], envs: int) -> ReorientCfg:
     """The task a teacher was trained in, on these objects.
 
     Raises:
@@ -267,10 +267,10 @@ def teacher_task(policy: "TrainedPolicy", objects: tuple[str, ...], worlds: int)
     """
     from vd.evaluate.agents import trained_task
 
-    return dataclasses.replace(trained_task(policy), objects=objects, num_worlds=worlds)
+    return dataclasses.replace(trained_task(policy), objects=objects, num_envs=envs)
 
 
-def task(objects: tuple[str, ...], worlds: int, hand: str, randomise: bool) -> ReorientCfg:
+def task(objects: tuple[str, ...], envs: int, hand: str, randomise: bool) -> ReorientCfg:
     """The benchmark's task: the paper's, with table support so that contacts are many."""
-    cfg = ReorientCfg(hand=hand, objects=objects, num_worlds=worlds, reward=RewardCfg(table_contact=0.0))
+    cfg = ReorientCfg(hand=hand, objects=objects, num_envs=envs, reward=RewardCfg(table_contact=0.0))
     return dataclasses.replace(cfg, randomisation=dataclasses.replace(cfg.randomisation, enabled=randomise))

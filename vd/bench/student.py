@@ -68,7 +68,7 @@ class LatencyRow:
 
 @dataclass(frozen=True)
 class TrainingRow:
-    """One minibatch of sequences, and one step of as many worlds."""
+    """One minibatch of sequences, and one step of as many environments."""
 
     network: str
     """Preset."""
@@ -83,7 +83,7 @@ class TrainingRow:
     parts_ms: dict[str, float]
     """Its parts."""
     act_clouds_per_s: float
-    """The same number of worlds acting one step: points, voxels, maps, forward."""
+    """The same number of environments acting one step: points, voxels, maps, forward."""
     memory_gb: float
     """Most memory that torch held at once [GB]; 0 on the CPU, not measured."""
 
@@ -322,32 +322,32 @@ def measure_training(
     device: str,
     *,
     hand: str = "dclaw4",
-    worlds: int = 40,
+    envs: int = 40,
     steps: int = SEQUENCE_STEPS,
     half: bool = True,
     calls: int = 5,
     seed: int = 0,
 ) -> TrainingRow:
-    """Measure one minibatch of ``worlds`` sequences of ``steps`` steps.
+    """Measure one minibatch of ``envs`` sequences of ``steps`` steps.
 
     Args:
         objects: Objects, mixed over the clouds.
         network: Preset.
         device: Warp device.
         hand: Hand.
-        worlds: Sequences.
+        envs: Sequences.
         steps: Steps of a sequence.
         half: Products in bfloat16.
         calls: Minibatches to time.
         seed: Of poses, weights and noise.
     """
     torch.manual_seed(seed)
-    clouds = worlds * steps
+    clouds = envs * steps
     scenes = Scenes(objects, hand, clouds, device, seed)
     place = torch.device(wp.device_to_torch(wp.get_device(device)))
     net = Student(PRESETS[network], load_hand(hand).num_joints).to(place)
     voxelise = Voxeliser(net.cfg.voxel_m, noise=NoiseCfg(), clouds=clouds, seed=seed, device=device)
-    senses = torch.zeros(steps, worlds, net.num_senses, device=place)
+    senses = torch.zeros(steps, envs, net.num_senses, device=place)
     on_gpu = place.type == "cuda"
     encoder = net.cfg.encoder
     ends = scenes.clouds.ends if "marks" in encoder.inputs else ()
@@ -367,7 +367,7 @@ def measure_training(
         net.train()
         sites, start = prepare(time.perf_counter(), augment=True)
         with torch.autocast(place.type, dtype=torch.bfloat16, enabled=half):
-            output = net(net.encode(sites).unflatten(0, (steps, worlds)), senses, net.initial_hidden(worlds))
+            output = net(net.encode(sites).unflatten(0, (steps, envs)), senses, net.initial_hidden(envs))
             loss = output.mean.square().mean() + output.log_std.mean() + output.distance.square().mean()
         start = watch.stop("forward", start)
         loss.backward()

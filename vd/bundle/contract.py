@@ -241,8 +241,8 @@ def derive_interface(
 
 
 def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
-    from vd.kernels.observations import teacher_observation_slices
-    from vd.kernels.shapes import shape_observation_size
+    from vd.kernels.task.observations import teacher_observation_slices
+    from vd.kernels.task.shapes import shape_observation_size
 
     seen = task.observation
     if seen.history:

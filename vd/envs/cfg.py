@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from math import pi
 from typing import Any, ClassVar, Literal
 
-from vd.config import Dropped
+from vd.config import Dropped, Renamed
 from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
@@ -60,7 +60,7 @@ class SuccessCfg:
     """When a goal counts as reached, and when the object counts as lost."""
 
     RETIRED: ClassVar[dict[str, Any]] = {"no_table_contact": False}
-    """Fields of older files (:func:`vd.config.from_dict`); table.lift_share 1 asks the same of all worlds."""
+    """Fields of older files (:func:`vd.config.from_dict`); table.lift_share 1 asks the same everywhere."""
     rotation_rad: float = PAPER.success.rotation_rad
     """Largest rotation error [rad]."""
     joint_speed_rad_s: float = PAPER.success.joint_speed_rad_s
@@ -100,7 +100,7 @@ class ObservationCfg:
     them. On in all presets; off where a policy's file does not say: those policies have learned the signs."""
     history: int = 0
     """Ours: past control steps that are remembered, each with joint positions, action, and the object's way
-    and rotation since (vd/kernels/history.py): from them a policy can tell how late and stiff its hand is."""
+    and rotation since (kernels/task/history.py): they tell how late and stiff the hand is."""
     dynamics: Literal["none", "critic"] = "none"
     """Ours, privileged: whether the critic is told what was drawn (gains, delay, friction and backlash of
     joints, frictions, mass, latency), and the present state and shape, without noise."""
@@ -139,15 +139,15 @@ class StartCfg:
 
 @dataclass(frozen=True)
 class TableCfg:
-    """Ours: worlds whose table is taken away, as in in-air tests, or does not help; none by default."""
+    """Ours: environments whose table is taken away, as in in-air tests, or does not help; none by default."""
 
     away_share: float = 0.0
-    """Share of the worlds whose episodes lose the table; the same worlds throughout."""
+    """Share of the environments whose episodes lose the table; the same environments throughout."""
     away_s: tuple[float, float] = (PAPER.scene.air_table_s, PAPER.scene.air_table_s)
-    """Times in the episode at which it goes, uniform over these worlds [s]."""
+    """Times in the episode at which it goes, uniform over these environments [s]."""
     lift_share: float = 0.0
-    """Share of the worlds in which success asks that the object does not touch the table: those that lose
-    it first, then others."""
+    """Share of the environments in which success asks that the object does not touch the table: those that
+    lose it first, then others."""
 
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
@@ -183,8 +183,8 @@ class TighteningCfg:
     rotation_rad: float = PAPER.success.rotation_rad
     """Largest rotation error at tightness 0 [rad]; a smaller success.rotation_rad makes it finer."""
     object_weight: float = 1.0
-    """Share of its weight that the object has at tightness 0 in the worlds of table.lift_share: what is light
-    is easily held, and not lost before it is."""
+    """Share of its weight that the object has at tightness 0 in the environments of table.lift_share: what
+    is light is easily held, and not lost before it is."""
     raise_at: float = 0.5
     """Success rate of goals above which stillness tightens."""
     lower_at: float = 0.3
@@ -304,8 +304,8 @@ class RandomisationCfg:
     """How old the state is that the policy sees [s], drawn for each episode, to the nearest physics step.
     Rewards and success are of the true state."""
     nominal_share: float = 0.0
-    """Ours: share of the worlds, the same ones throughout, that keep nominal masses, joints and frictions and
-    get neither forces nor latency. Sizes and noise are drawn there too."""
+    """Ours: share of the environments, the same ones throughout, that keep nominal masses, joints and
+    frictions and get neither forces nor latency. Sizes and noise are drawn there too."""
     redraw_s: float = PAPER.randomisation.redraw_s
     """Gains and frictions are drawn anew at the first reset after this time [s]."""
 
@@ -342,9 +342,10 @@ class RandomisationCfg:
 
 @dataclass(frozen=True)
 class ReorientCfg:
-    """The in-hand reorientation task: hand, objects, worlds and all terms."""
+    """The in-hand reorientation task: hand, objects, environments and all terms."""
 
     RETIRED: ClassVar[dict[str, Any]] = {
+        "num_worlds": Renamed("num_envs"),
         "aim": {"enabled": Dropped(False)},
         "caught": {"go_on_share": 0.0},
         "nudge": {"enabled": False},
@@ -359,8 +360,8 @@ class ReorientCfg:
     """Layer over the hand with an identified servo model: identified.usda of vd-gap."""
     objects: tuple[str, ...] = ("cube",)
     """Object sets: names or folders of object USDs."""
-    num_worlds: int = 4096
-    """Worlds simulated side by side."""
+    num_envs: int = 4096
+    """Environments simulated side by side."""
     seed: int = 0
     """Seed of every random draw of the environment."""
     episode_s: float = PAPER.scene.episode_s
@@ -372,8 +373,8 @@ class ReorientCfg:
     table_friction: float = PAPER.materials.table_friction
     """Friction coefficient of the table where nothing is randomised; its contacts get the mean of the two."""
     failures_per_million: float = 0.0
-    """Steps of worlds in a million that may leave the finite numbers or fly off: their episode ends like one
-    that times out. Ten more (of few steps a rate says little) stop the run, at 0 the first one does."""
+    """Steps of environments in a million that may leave the finite numbers or fly off: their episode ends
+    like one that times out. Ten more (few steps say little) stop the run, at 0 the first one does."""
     sim: SimCfg = field(default_factory=SimCfg)
     action: ActionCfg = field(default_factory=ActionCfg)
     observation: ObservationCfg = field(default_factory=ObservationCfg)
@@ -401,8 +402,8 @@ class ReorientCfg:
             raise ValueError(f"start.at_rest needs start.poses >= 1 (now {self.start.poses})")
         if self.failures_per_million < 0.0:
             raise ValueError(f"failures_per_million = {self.failures_per_million}; it is 0 or positive")
-        if self.num_worlds < 1:
-            raise ValueError(f"num_worlds = {self.num_worlds}; at least 1 world is needed")
+        if self.num_envs < 1:
+            raise ValueError(f"num_envs = {self.num_envs}; at least 1 world is needed")
         if self.max_episode_steps < 1:
             raise ValueError(f"episode_s = {self.episode_s} is shorter than one control step")
         if self.fingertip not in ("rigid", "soft"):

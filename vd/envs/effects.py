@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from vd.kernels.effects import EFFECTS, Parameter
+from vd.kernels.servo.effects import EFFECTS, Parameter
 
 PARAMETERS: dict[str, Parameter] = {
     f"{name}.{p.name}": p for name, effect in EFFECTS.items() for p in effect.parameters

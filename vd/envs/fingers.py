@@ -3,15 +3,15 @@
 import warp as wp
 
 from vd.assets_usd.hand_model import HandModel
-from vd.kernels.actions import joint_effort_kernel
-from vd.kernels.observations import fingertip_kernel
-from vd.kernels.worlds import copy_columns_kernel
+from vd.kernels.task.actions import joint_effort_kernel
+from vd.kernels.task.environments import copy_columns_kernel
+from vd.kernels.task.observations import fingertip_kernel
 from vd.sim.scene import Scene
 from vd.sim.simulator import Simulator
 
 
 class Fingers:
-    """Fingertips and torques of N worlds, F fingers with D joints in all.
+    """Fingertips and torques of N environments, F fingers with D joints in all.
 
     Args:
         hand: The hand.
@@ -30,8 +30,8 @@ class Fingers:
         self.tip_body = wp.array(scene.link_body[hand.tip_link], dtype=wp.int32, device=device)
         self.tip_offset = wp.array(hand.tip_frame, dtype=wp.transform, device=device)
         self._effort_limit = wp.array(hand.effort, dtype=float, device=device)
-        self.tip_pos = wp.zeros((scene.num_worlds, hand.num_fingers), dtype=wp.vec3, device=device)
-        self.effort = wp.zeros((scene.num_worlds, hand.num_joints), dtype=float, device=device)
+        self.tip_pos = wp.zeros((scene.num_envs, hand.num_fingers), dtype=wp.vec3, device=device)
+        self.effort = wp.zeros((scene.num_envs, hand.num_joints), dtype=float, device=device)
 
     def measure(self, kp: wp.array, kd: wp.array) -> None:
         """Refresh positions and torques from the present state. Device work only.

@@ -6,7 +6,12 @@ from typing import Any
 import warp as wp
 
 from vd.envs.task_state import TaskState
-from vd.kernels.latency import begin_latency_kernel, recall_state_kernel, record_state_kernel, ring_columns
+from vd.kernels.task.latency import (
+    begin_latency_kernel,
+    recall_state_kernel,
+    record_state_kernel,
+    ring_columns,
+)
 
 
 class SeenState:
@@ -23,7 +28,7 @@ class SeenState:
 
     def __init__(self, state: TaskState):
         self._state = state
-        sim, n, device = state.sim, state.num_worlds, state.device
+        sim, n, device = state.sim, state.num_envs, state.device
         random = state.cfg.randomisation
         self.is_late = random.enabled and random.observation_latency_s[1] > 0.0
         self.latency = wp.zeros(n, dtype=float, device=device)
@@ -49,7 +54,7 @@ class SeenState:
         )
 
     def begin(self, mask: wp.array, nominal: wp.array | None) -> None:
-        """Draw the latency of the worlds of ``mask`` [N], whose past is their present state.
+        """Draw the latency of the environments of ``mask`` [N], whose past is their present state.
 
         Args:
             mask: 1 where an episode begins, shape [N].
@@ -60,18 +65,18 @@ class SeenState:
         state, sim = self._state, self._state.sim
         measured = self._measured(sim.joint_q, sim.joint_qd)
         now = [*measured, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
-        for worlds, span in ((mask, state.cfg.randomisation.observation_latency_s), (nominal, (0.0, 0.0))):
-            if worlds is None:
+        for envs, span in ((mask, state.cfg.randomisation.observation_latency_s), (nominal, (0.0, 0.0))):
+            if envs is None:
                 continue
             wp.launch(
                 begin_latency_kernel,
-                dim=state.num_worlds,
+                dim=state.num_envs,
                 inputs=[
                     wp.vec2(*span),
                     state.num_actions,
                     self._slots,
                     state.fingers.tip_body,
-                    worlds,
+                    envs,
                     *now,
                     state.rng,
                 ],
@@ -112,7 +117,7 @@ class SeenState:
         state = self._state
         wp.launch(
             kernel,
-            dim=state.num_worlds,
+            dim=state.num_envs,
             inputs=[state.num_actions, *inputs],
             outputs=outputs,
             device=state.device,

@@ -1,4 +1,4 @@
-"""Sizes of the objects that the worlds hold."""
+"""Sizes of the objects that the environments hold."""
 
 import numpy as np
 

@@ -11,14 +11,14 @@ from vd.envs.randomise import Randomiser
 from vd.envs.shapes import ShapeObserver
 from vd.envs.symmetry import Views
 from vd.envs.task_state import TaskState
-from vd.kernels.dynamics import dynamics_kernel
-from vd.kernels.history import forget_kernel, history_kernel, remember_kernel
-from vd.kernels.observations import teacher_observation_kernel, teacher_observation_slices
+from vd.kernels.task.dynamics import dynamics_kernel
+from vd.kernels.task.history import forget_kernel, history_kernel, remember_kernel
+from vd.kernels.task.observations import teacher_observation_kernel, teacher_observation_slices
 from vd.paper import PAPER
 
 
 class Observer:
-    """Writes the observations of N worlds.
+    """Writes the observations of N environments.
 
     Attributes:
         parts: Columns of what is observed.
@@ -33,7 +33,7 @@ class Observer:
     def __init__(self, state: TaskState, drawn: Randomiser, *, shapes: bool):
         """Allocate for what ``drawn`` has drawn; ``shapes`` also where they are not observed."""
         self._state, self._drawn = state, drawn
-        cfg, n, device = state.cfg.observation, state.num_worlds, state.device
+        cfg, n, device = state.cfg.observation, state.num_envs, state.device
         self.parts = observation_parts(cfg, state.num_fingers)
         self.num_observations = actor_size(self.parts)
         self.seen = SeenState(state)
@@ -73,7 +73,7 @@ class Observer:
         return values[:, :count], values[:, count:]
 
     def begin(self, mask: wp.array) -> None:
-        """Begin the episodes of the worlds of ``mask`` [N], after their state was reset."""
+        """Begin the episodes of the environments of ``mask`` [N], after their state was reset."""
         self.seen.begin(mask, self._drawn.nominal_of(mask))
         if self._frames:
             self._launch(forget_kernel, [mask], [self._count])
@@ -141,7 +141,7 @@ class Observer:
         if self._frames:
             wp.launch(
                 history_kernel,
-                dim=(self._state.num_worlds, self._frames),
+                dim=(self._state.num_envs, self._frames),
                 inputs=[
                     *self._remembered,
                     self._frames,
@@ -186,6 +186,4 @@ class Observer:
         return view | self.seen.stateful() | (past if self._frames else {})
 
     def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(
-            kernel, dim=self._state.num_worlds, inputs=inputs, outputs=outputs, device=self._state.device
-        )
+        wp.launch(kernel, dim=self._state.num_envs, inputs=inputs, outputs=outputs, device=self._state.device)

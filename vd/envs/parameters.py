@@ -7,12 +7,12 @@ import warp as wp
 
 from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, blend
-from vd.kernels.actions import ActionParams
-from vd.kernels.observations import ObservationParams
-from vd.kernels.randomisation import ForceParams, RandomisationParams
-from vd.kernels.resets import GoalParams, StartParams
-from vd.kernels.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, RewardParams
-from vd.kernels.success import SuccessParams
+from vd.kernels.task.actions import ActionParams
+from vd.kernels.task.observations import ObservationParams
+from vd.kernels.task.randomisation import ForceParams, RandomisationParams
+from vd.kernels.task.resets import GoalParams, StartParams
+from vd.kernels.task.rewards import FINGERTIP_MEAN, FINGERTIP_SQUARED_SUM, RewardParams
+from vd.kernels.task.success import SuccessParams
 from vd.paper import PAPER
 
 STILLNESS_START = 12.0

@@ -1,10 +1,10 @@
 """Which columns of an observation hold what, and which of them the actor reads."""
 
 from vd.envs.cfg import ObservationCfg
-from vd.kernels.dynamics import dynamics_size
-from vd.kernels.history import frame_size
-from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
-from vd.kernels.shapes import shape_observation_size
+from vd.kernels.task.dynamics import dynamics_size
+from vd.kernels.task.history import frame_size
+from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
+from vd.kernels.task.shapes import shape_observation_size
 
 
 def observation_parts(cfg: ObservationCfg, fingers: int) -> dict[str, slice]:

@@ -9,21 +9,21 @@ import warp as wp
 
 from vd.envs.servo import gain_scales, servo_ranges
 from vd.envs.task_state import TaskState
-from vd.kernels.actuators import INERTIA, PAYLOAD_INERTIA
-from vd.kernels.observations import teacher_observation_size
-from vd.kernels.randomisation import (
-    disturbance_force_kernel,
-    draw_dynamics_kernel,
-    draw_masses_kernel,
-    draw_restitution_kernel,
-    draw_servo_kernel,
-)
-from vd.kernels.worlds import (
+from vd.kernels.servo.actuators import INERTIA, PAYLOAD_INERTIA
+from vd.kernels.task.environments import (
     both_masks_kernel,
     redraw_mask_kernel,
     write_friction_kernel,
     write_gains_kernel,
     write_object_force_kernel,
+)
+from vd.kernels.task.observations import teacher_observation_size
+from vd.kernels.task.randomisation import (
+    disturbance_force_kernel,
+    draw_dynamics_kernel,
+    draw_masses_kernel,
+    draw_restitution_kernel,
+    draw_servo_kernel,
 )
 from vd.paper import PAPER
 from vd.sim.scene import SHAPE_HAND, SHAPE_OBJECT, SHAPE_TABLE
@@ -36,7 +36,7 @@ _Ranges: TypeAlias = tuple[wp.array, wp.array, wp.array, wp.array]
 class Randomiser:
     """Masses once at start-up; gains, servos, frictions and constant errors at resets; forces every step.
 
-    With randomisation off the same arrays hold the nominal values, and so they do in the worlds of
+    With randomisation off the same arrays hold the nominal values, and so they do in the environments of
     ``nominal_share``.
     """
 
@@ -45,7 +45,7 @@ class Randomiser:
         self._state = state
         cfg = state.cfg
         self.enabled = cfg.randomisation.enabled
-        n, d = state.num_worlds, state.num_actions
+        n, d = state.num_envs, state.num_actions
         device = state.device
 
         def zeros(*shape: int, dtype: Any = float) -> wp.array:
@@ -55,7 +55,7 @@ class Randomiser:
         """Joint stiffness [N m/rad] and damping [N m s/rad], shape [N, D]."""
         self.hand_friction, self.object_friction, self.table_friction = zeros(n), zeros(n), zeros(n)
         self.object_mass = self._pushed_mass = zeros(n)
-        """Object mass [kg], shape [N]; forces are in proportion to it, but for the nominal worlds."""
+        """Object mass [kg], shape [N]; forces are in proportion to it, but for the nominal environments."""
         self.action_offset = zeros(n, d)
         # Not of the shape's values, which no sensor measures.
         self.observation_offset = zeros(n, teacher_observation_size(state.num_fingers))
@@ -96,12 +96,12 @@ class Randomiser:
         return params, *(wp.array(scale, dtype=wp.vec2, device=self._state.device) for scale in scales)
 
     def nominal_of(self, mask: wp.array) -> wp.array | None:
-        """Those of the worlds of ``mask`` [N] that stay nominal; None where all are drawn."""
+        """Those of the environments of ``mask`` [N] that stay nominal; None where all are drawn."""
         if self._nominal is None:
             return None
         wp.launch(
             both_masks_kernel,
-            dim=self._state.num_worlds,
+            dim=self._state.num_envs,
             inputs=[mask, self._nominal_world],
             outputs=[self._among_nominal],
             device=self._state.device,
@@ -111,7 +111,7 @@ class Randomiser:
     def _draw_masses(self) -> None:
         """Draw link and object masses; inertias scale with them."""
         state = self._state
-        n, model = state.num_worlds, state.sim.model
+        n, model = state.num_envs, state.sim.model
         link_scale = wp.ones((n, len(state.scene.link_body)), dtype=float, device=state.device)
         everywhere = wp.ones(n, dtype=wp.int32, device=state.device)
         draws = [
@@ -147,12 +147,12 @@ class Randomiser:
         state.sim.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def redraw(self, reset: wp.array) -> None:
-        """Draw anew for the worlds of ``reset`` whose dynamics are old enough."""
+        """Draw anew for the environments of ``reset`` whose dynamics are old enough."""
         if not self.enabled:
             return
         wp.launch(
             redraw_mask_kernel,
-            dim=self._state.num_worlds,
+            dim=self._state.num_envs,
             inputs=[reset, self._interval, self._age],
             outputs=[self._due],
             device=self._state.device,
@@ -160,7 +160,7 @@ class Randomiser:
         self.draw(self._due)
 
     def draw(self, mask: wp.array) -> None:
-        """Draw gains, servos, frictions, restitution and constant errors for the worlds of ``mask`` [N]."""
+        """Draw gains, servos, frictions, restitution and constant errors where ``mask`` [N] is set."""
         state = self._state
         self._draw(mask, self._drawn)
         if self._nominal is not None:
@@ -169,7 +169,7 @@ class Randomiser:
             drawn = state.sim.restitution
             wp.launch(
                 draw_restitution_kernel,
-                dim=state.num_worlds,
+                dim=state.num_envs,
                 inputs=[wp.vec2(*state.cfg.randomisation.restitution), mask, state.rng],
                 outputs=[drawn.hand, drawn.object, drawn.table],
                 device=state.device,
@@ -181,7 +181,7 @@ class Randomiser:
         params, kp_scale, kd_scale, servo = ranges
         wp.launch(
             draw_dynamics_kernel,
-            dim=state.num_worlds,
+            dim=state.num_envs,
             inputs=[
                 self._nominal_kp,
                 self._nominal_kd,
@@ -205,7 +205,7 @@ class Randomiser:
         if state.sim.servo is not None:
             wp.launch(
                 draw_servo_kernel,
-                dim=state.num_worlds,
+                dim=state.num_envs,
                 inputs=[servo, mask, self.kp, self.kd, state.rng],
                 outputs=[state.sim.servo.parameters],
                 device=state.device,
@@ -217,7 +217,7 @@ class Randomiser:
         if self.enabled:
             wp.launch(
                 disturbance_force_kernel,
-                dim=state.num_worlds,
+                dim=state.num_envs,
                 inputs=[self._pushed_mass, state.parameters.force, self.force, state.rng],
                 device=state.device,
             )
@@ -232,7 +232,7 @@ class Randomiser:
         state = self._state
         wp.launch(
             write_object_force_kernel,
-            dim=state.num_worlds,
+            dim=state.num_envs,
             inputs=[
                 self.object_mass,
                 state.must_lift,
@@ -277,7 +277,7 @@ class Randomiser:
             flags |= newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES
             wp.launch(
                 write_gains_kernel,
-                dim=(state.num_worlds, state.num_actions),
+                dim=(state.num_envs, state.num_actions),
                 inputs=[self.kp, self.kd],
                 outputs=[self._model_kp, self._model_kd],
                 device=state.device,

@@ -1,4 +1,4 @@
-"""The in-hand reorientation environment: one call is one 12 Hz control step of N worlds.
+"""The in-hand reorientation environment: one call is one 12 Hz control step of N environments.
 
 World frame: z up, table top at z = 0. SI units, radians, quaternions xyzw. Everything but the
 physics is Warp kernels; a step copies nothing to the host, and it is one captured graph, on CPU and CUDA.
@@ -19,28 +19,28 @@ from vd.envs.starts import SETTLE_S, rest_poses
 from vd.envs.state import load_arrays, motion_arrays, save_failed_step, save_state, saved_stage
 from vd.envs.table import table_array
 from vd.envs.task_state import build_task
-from vd.kernels.actions import apply_action_kernel
-from vd.kernels.guard import void_step_kernel
-from vd.kernels.resets import episode_kernel, give_goal_kernel, reset_kernel
-from vd.kernels.rewards import REWARD_TERMS, reward_kernel
-from vd.kernels.success import success_kernel
-from vd.kernels.worlds import count_goals_kernel, record_step_kernel, world_mask_kernel
+from vd.kernels.task.actions import apply_action_kernel
+from vd.kernels.task.environments import count_goals_kernel, record_step_kernel, world_mask_kernel
+from vd.kernels.task.guard import void_step_kernel
+from vd.kernels.task.resets import episode_kernel, give_goal_kernel, reset_kernel
+from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
+from vd.kernels.task.success import success_kernel
 from vd.paper import PAPER
 from vd.sim.simulator import SimulationError
 
 FAILURES_AT_FIRST = 10.0
-"""Steps of worlds that may fail beside those that ``failures_per_million`` allows (ours): one object in an
-unlucky start fails in the first step, again whenever the run is started anew, and is no rate."""
+"""Steps of environments that may fail beside those that ``failures_per_million`` allows (ours): one object
+in an unlucky start fails in the first step, again whenever the run is started anew, and is no rate."""
 
 
 class ReorientEnv:
-    """N worlds, each with a hand (F fingers, D = 3F joints), a table and an object to reorient.
+    """N environments, each with a hand (F fingers, D = 3F joints), a table and an object to reorient.
 
     All arrays are Warp arrays on ``device``; ``wp.to_torch`` views them without copying.
     """
 
     def __init__(self, cfg: ReorientCfg, device: str | None = None):
-        """Build the worlds and reset them.
+        """Build the environments and reset them.
 
         Args:
             cfg: The task.
@@ -59,7 +59,7 @@ class ReorientEnv:
         self.measured_q, self.measured_qd = state.measured_q, state.measured_qd
         self.smoothed, self.goal_quat, self.must_lift = state.smoothed, state.goal_quat, state.must_lift
 
-        self.num_worlds = cfg.num_worlds
+        self.num_envs = cfg.num_envs
         self.num_fingers = self.hand.num_fingers
         self.num_actions = self.hand.num_joints
         self.sees_shape = cfg.observation.shape != "none"
@@ -96,7 +96,7 @@ class ReorientEnv:
         self._hold_graph: Any = None
         self._kernels_loaded = False
         self.steps = 0
-        """Control steps of all worlds since the begin of the run, with those of a checkpoint."""
+        """Control steps of all environments since the begin of the run, with those of a checkpoint."""
         self._own_steps = 0
         if cfg.start.at_rest:
             self._rest_poses = self._find_rest_poses()
@@ -104,7 +104,7 @@ class ReorientEnv:
 
     def _allocate(self) -> None:
         """Arrays of what a step decides, and of its counts."""
-        n, d, f = self.num_worlds, self.num_actions, self.num_fingers
+        n, d, f = self.num_envs, self.num_actions, self.num_fingers
 
         def zeros(*shape: int, dtype: Any = float) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=self.device)
@@ -136,7 +136,7 @@ class ReorientEnv:
         self.object_pose_end = zeros(n, dtype=wp.transform)
         """Object pose at the end of the step, before resets, shape [N]."""
         self.goal_counts = zeros(3)
-        """Goals ended, goals reached and objects lost since cleared, over all worlds, shape [3]."""
+        """Goals ended, goals reached and objects lost since cleared, over all environments, shape [3]."""
         self.clearance = zeros(n)
         """Height of the object's lowest point above the table [m], shape [N]; 0 unless it is rewarded."""
         self.previous_error = zeros(n)
@@ -163,7 +163,7 @@ class ReorientEnv:
     # Stepping
 
     def reset(self, object_quat: np.ndarray | None = None, goal_quat: np.ndarray | None = None) -> None:
-        """Reset all worlds.
+        """Reset all environments.
 
         Args:
             object_quat: Start orientations of the objects, xyzw, shape [N, 4]; random by default.
@@ -172,9 +172,9 @@ class ReorientEnv:
         for given, buffer in ((object_quat, self._given_start), (goal_quat, self._given_goal)):
             if given is not None:
                 given = np.asarray(given, dtype=np.float32)
-                if given.shape != (self.num_worlds, 4):
+                if given.shape != (self.num_envs, 4):
                     raise ValueError(
-                        f"reset() takes orientations of shape ({self.num_worlds}, 4), not {given.shape}"
+                        f"reset() takes orientations of shape ({self.num_envs}, 4), not {given.shape}"
                     )
                 buffer.assign(given)
         self._reset.fill_(1)
@@ -193,7 +193,7 @@ class ReorientEnv:
         self._given_goal.assign(np.asarray(goal_quat, dtype=np.float32))
         wp.launch(
             give_goal_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[self._given_goal, self.sim.joint_q, self.num_actions + 3],
             outputs=[self.goal_quat, self.goal_steps],
             device=self.device,
@@ -203,7 +203,7 @@ class ReorientEnv:
             self.views.choose(self._new_goal, self._new_goal)
 
     def step(self, action: Any) -> None:
-        """Simulate one control step; worlds that end are reset, and the observation is fresh.
+        """Simulate one control step; environments that end are reset, and the observation is fresh.
 
         Args:
             action: Actions in [-1, 1], shape [N, D]: a Warp array or anything ``wp.copy`` takes.
@@ -247,7 +247,7 @@ class ReorientEnv:
             action = self.views.world_action(action)
         wp.launch(
             apply_action_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[
                 self.state.lower,
                 self.state.upper,
@@ -280,7 +280,7 @@ class ReorientEnv:
         self._end_episodes()
         wp.launch(
             record_step_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[sim.joint_q, self.num_actions],
             outputs=[self.object_pose_end],
             device=self.device,
@@ -291,7 +291,7 @@ class ReorientEnv:
 
     def _judge(self) -> None:
         """Success and reward of the step, before resets."""
-        n, p, sim = self.num_worlds, self.parameters, self.sim
+        n, p, sim = self.num_envs, self.parameters, self.sim
         wp.launch(
             success_kernel,
             dim=n,
@@ -339,7 +339,7 @@ class ReorientEnv:
         """Which episodes end and which goals are new, and counts of goals."""
         wp.launch(
             episode_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[
                 self.success,
                 self.fell,
@@ -354,18 +354,18 @@ class ReorientEnv:
         )
         wp.launch(
             count_goals_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[self.success, self.fell, self.done],
             outputs=[self.goal_counts],
             device=self.device,
         )
 
     def _reset_worlds(self, *, use_start: bool = False, use_goal: bool = False) -> None:
-        """Reset the worlds of ``_reset``, give a goal to those of ``_new_goal`` too."""
+        """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too."""
         sim, p = self.sim, self.parameters
         wp.launch(
             reset_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[
                 self._reset_q,
                 p.start,
@@ -396,7 +396,7 @@ class ReorientEnv:
         # The solver warm-starts from the last accelerations, which mean nothing after a reset.
         wp.launch(
             world_mask_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[self._reset],
             outputs=[self._world_mask],
             device=self.device,
@@ -416,7 +416,7 @@ class ReorientEnv:
     def has_table(self) -> np.ndarray:
         """Whether each world's table was there in its last step, by the task, bool, shape [N] (host copy)."""
         last = self._table_steps
-        return np.ones(self.num_worlds, bool) if last is None else self.step_count.numpy() <= last.numpy()
+        return np.ones(self.num_envs, bool) if last is None else self.step_count.numpy() <= last.numpy()
 
     def object_pose(self) -> np.ndarray:
         """Present object poses, position [m] and quaternion xyzw, shape [N, 7] (host copy)."""
@@ -428,7 +428,7 @@ class ReorientEnv:
         The first control step that failed is saved in ``dump_dir`` for ``vd-bench replay``.
         """
         rate = self.cfg.failures_per_million
-        expected = rate * 1e-6 * self._own_steps * self.num_worlds
+        expected = rate * 1e-6 * self._own_steps * self.num_envs
         tolerated = FAILURES_AT_FIRST + expected if rate > 0.0 else 0.0
         try:
             self.sim.check(tolerated)
@@ -439,7 +439,7 @@ class ReorientEnv:
             raise SimulationError(f"{error} (dump: {path})") from error
 
     def failed_steps(self) -> int:
-        """Steps of worlds that failed and were put back (:attr:`ReorientCfg.failures_per_million`)."""
+        """Steps of environments that failed and were put back (:attr:`ReorientCfg.failures_per_million`)."""
         return int(self.sim.failures.numpy().sum())
 
     # Curriculum and checkpoints

@@ -1,11 +1,11 @@
-"""Which servo models the worlds draw: a hand layer's values and intervals, Table S3, chosen effects."""
+"""Which servo models the environments draw: a hand layer's values and intervals, Table S3, chosen effects."""
 
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
 from vd.envs.cfg import RandomisationCfg
 from vd.envs.effects import PARAMETERS
-from vd.kernels import actuators
+from vd.kernels.servo import actuators
 from vd.sim.actuators import has_effects
 
 
@@ -44,7 +44,7 @@ def needs_servo(ranges: np.ndarray) -> bool:
     """Whether any joint in any world has more than a plain drive.
 
     Stiffness and damping are randomised in the plain model too; a speed limit or an armature that differs
-    between worlds takes the servo.
+    between environments takes the servo.
     """
     drives = ranges[:, [actuators.VELOCITY_LIMIT, actuators.INERTIA]]
     return has_effects(np.moveaxis(ranges, 2, 0)) or bool(np.any(drives[..., 0] != drives[..., 1]))

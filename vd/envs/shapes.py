@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 
 from vd.envs.task_state import TaskState
-from vd.kernels.observations import teacher_observation_size
-from vd.kernels.shapes import (
+from vd.kernels.task.observations import teacher_observation_size
+from vd.kernels.task.shapes import (
     ORIENTATIONS,
     clearance_kernel,
     extent_directions,
@@ -20,7 +20,7 @@ from vd.paper import PAPER
 
 
 class ShapeObserver:
-    """Writes the columns of ``vd.kernels.shapes`` behind the state, and how high the objects are.
+    """Writes the columns of ``vd.kernels.task.shapes`` behind the state, and how high the objects are.
 
     Args:
         state: The task.
@@ -44,7 +44,7 @@ class ShapeObserver:
         state = self._state
         wp.launch(
             clearance_kernel,
-            dim=state.num_worlds,
+            dim=state.num_envs,
             inputs=[
                 self._points,
                 self._object,
@@ -63,7 +63,7 @@ class ShapeObserver:
         _, _, joint_q, _, body_q, _ = seen
         wp.launch(
             surface_kernel,
-            dim=(state.num_worlds, state.num_fingers),
+            dim=(state.num_envs, state.num_fingers),
             inputs=[
                 self._points,
                 self._object,
@@ -80,7 +80,7 @@ class ShapeObserver:
         )
         wp.launch(
             extent_kernel,
-            dim=(state.num_worlds, ORIENTATIONS, len(self._directions)),
+            dim=(state.num_envs, ORIENTATIONS, len(self._directions)),
             inputs=[
                 self._points,
                 self._object,

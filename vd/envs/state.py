@@ -53,7 +53,8 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         state: What was saved.
 
     Raises:
-        ValueError: If it belongs to another number of worlds, other objects, another hand or servo model.
+        ValueError: If it belongs to another number of environments, other objects, another hand or servo
+        model.
     """
     # Checkpoints from before goals had an age: no goal is older than its episode.
     arrays = {"goal_steps": state["arrays"]["step_count"]} | state["arrays"]
@@ -61,7 +62,7 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         raise ValueError(
             "the saved environment has other servos, views, memory, latency or contacts; resume with "
             "hand_layer, observation, randomisation.effects, randomisation.restitution and "
-            "randomisation.observation_latency_s of the checkpoint, or from one without worlds "
+            "randomisation.observation_latency_s of the checkpoint, or from one without environments "
             "(vd-train export --resumable)"
         )
     for name, array in here.items():
@@ -70,12 +71,12 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
             raise ValueError(
                 f"the saved environment has {name} of shape {saved.shape}, "
                 f"this one {array.numpy().shape}; "
-                "resume with the num_worlds and hand of the checkpoint"
+                "resume with the num_envs and hand of the checkpoint"
             )
     if state.get("objects", _objects(task)) != _objects(task):
         raise ValueError(
-            "the worlds of the saved environment hold other objects; resume with objects of the checkpoint, "
-            "or from one without worlds (vd-train export --resumable)"
+            "the saved environments hold other objects; resume with objects of the checkpoint, "
+            "or from one without environments (vd-train export --resumable)"
         )
     for name, array in here.items():
         array.assign(arrays[name])
@@ -99,7 +100,7 @@ def save_failed_step(sim: Simulator, cfg: ReorientCfg, folder: Path) -> Path | N
 
 
 def _objects(task: TaskState) -> list[tuple[str, int]]:
-    """Worlds of each object, in the order of the worlds."""
+    """Environments of each object, in the order of the environments."""
     counts = np.bincount(task.scene.world_object, minlength=len(task.objects))
     return [(item.name, int(count)) for item, count in zip(task.objects, counts, strict=True)]
 

@@ -1,4 +1,4 @@
-"""The views of :mod:`vd.kernels.symmetry` in the worlds of a task: their launches."""
+"""The views of :mod:`vd.kernels.task.symmetry` in the environments of a task: their launches."""
 
 from typing import Any
 
@@ -6,7 +6,7 @@ import warp as wp
 
 from vd.envs.task_state import TaskState
 from vd.envs.view_tables import view_tables
-from vd.kernels.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
+from vd.kernels.task.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
 
 
 class Views:
@@ -29,7 +29,7 @@ class Views:
             ValueError: The hand has no such views, see :func:`vd.envs.view_tables.view_tables`.
         """
         self._state, self._out = state, out
-        device, worlds = state.device, state.num_worlds
+        device, envs = state.device, state.num_envs
         seen = state.cfg.observation
         tables = self.tables = view_tables(state.hand, seen, seen.view)
         chosen_from = seen.views(state.num_fingers)
@@ -39,16 +39,16 @@ class Views:
         self._offset = wp.array(tables.offset, dtype=float, device=device)
         self._sign = wp.array(tables.sign, dtype=float, device=device)
         self._sector = wp.array(tables.sector[:chosen_from], dtype=wp.vec3, device=device)
-        self._action = wp.zeros((worlds, state.num_actions), dtype=float, device=device)
-        self.view = wp.zeros(worlds, dtype=wp.int32, device=device)
+        self._action = wp.zeros((envs, state.num_actions), dtype=float, device=device)
+        self.view = wp.zeros(envs, dtype=wp.int32, device=device)
         self.observation = wp.zeros_like(out)
 
     def choose(self, reset: wp.array, new_goal: wp.array) -> None:
-        """Choose anew for worlds in which either mask, shape [N], is set."""
+        """Choose anew for environments in which either mask, shape [N], is set."""
         state = self._state
         wp.launch(
             choose_view_kernel,
-            dim=state.num_worlds,
+            dim=state.num_envs,
             inputs=[self._sector, state.num_actions, reset, new_goal, state.sim.joint_q, state.goal_quat],
             outputs=[self.view],
             device=state.device,

@@ -1,4 +1,4 @@
-"""Tables that are taken away during an episode, and worlds in which they must not be touched."""
+"""Tables that are taken away during an episode, and environments in which they must not be touched."""
 
 import numpy as np
 import warp as wp
@@ -12,9 +12,10 @@ ALWAYS = 2**31 - 1
 def table_steps(cfg: ReorientCfg) -> np.ndarray:
     """Control steps for which each world's table stays, int32, shape [N].
 
-    Which worlds lose it, and when, is drawn once from the seed: an episode says nothing of it to the policy.
+    Which environments lose it, and when, is drawn once from the seed: an episode says nothing of it to the
+    policy.
     """
-    table, n = cfg.table, cfg.num_worlds
+    table, n = cfg.table, cfg.num_envs
     draw = np.random.default_rng(cfg.seed)
     away = draw.permutation(n) < round(table.away_share * n)
     steps = np.maximum(1, np.round(draw.uniform(*table.away_s, size=n) * cfg.sim.control_hz))
@@ -24,9 +25,10 @@ def table_steps(cfg: ReorientCfg) -> np.ndarray:
 def must_lift(cfg: ReorientCfg) -> np.ndarray:
     """1 where success asks that the object does not touch the table, int32, shape [N].
 
-    Worlds are chosen in the order of :func:`table_steps`: of two shares the smaller is a part of the larger.
+    Environments are chosen in the order of :func:`table_steps`: of two shares the smaller is a part of the
+    larger.
     """
-    n, share = cfg.num_worlds, cfg.table.lift_share
+    n, share = cfg.num_envs, cfg.table.lift_share
     return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
 
 

@@ -22,7 +22,7 @@ from vd.sim.simulator import Simulator
 
 @dataclass(frozen=True)
 class TaskState:
-    """N worlds with a hand of F fingers and D joints, and an object. Arrays are on ``device``."""
+    """N environments with a hand of F fingers and D joints, and an object. Arrays are on ``device``."""
 
     cfg: ReorientCfg
     device: str
@@ -52,9 +52,9 @@ class TaskState:
     """Random stream of each world, shape [N]."""
 
     @property
-    def num_worlds(self) -> int:
+    def num_envs(self) -> int:
         """N."""
-        return self.cfg.num_worlds
+        return self.cfg.num_envs
 
     @property
     def num_fingers(self) -> int:
@@ -77,7 +77,7 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
     scene = build_scene(
         hand=hand,
         objects=objects,
-        num_worlds=cfg.num_worlds,
+        num_envs=cfg.num_envs,
         cfg=cfg.sim,
         device=device,
         scales=object_scales(cfg.randomisation),
@@ -91,7 +91,7 @@ def build_task(cfg: ReorientCfg, device: str) -> TaskState:
         servo_seed=cfg.seed,
         restitution=cfg.randomisation.bounces,
     )
-    n = cfg.num_worlds
+    n = cfg.num_envs
     goal = wp.zeros(n, dtype=wp.quat, device=device)
     rng = wp.zeros(n, dtype=wp.uint32, device=device)
     wp.launch(init_rng_kernel, dim=n, inputs=[cfg.seed], outputs=[rng], device=device)

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, compose
 from vd.envs.cfg import ObservationCfg, View
 from vd.envs.parts import observation_parts
-from vd.kernels.dynamics import JOINT_CHANNELS, SCALARS
-from vd.kernels.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER, teacher_observation_slices
-from vd.kernels.shapes import extent_directions, shape_observation_slices
+from vd.kernels.task.dynamics import JOINT_CHANNELS, SCALARS
+from vd.kernels.task.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER, teacher_observation_slices
+from vd.kernels.task.shapes import extent_directions, shape_observation_slices
 
 TERMS = 4
 """Most values that a turned value is made of: those of a quaternion."""

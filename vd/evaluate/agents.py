@@ -261,7 +261,7 @@ def task_for(
     *,
     hand: str | None,
     objects: tuple[str, ...],
-    num_worlds: int,
+    num_envs: int,
     seed: int,
     stop_tolerance_rad: float,
     max_goal_angle_rad: float | None,
@@ -282,7 +282,7 @@ def task_for(
         policy: A trained policy, or None.
         hand: Hand name; None takes the policy's.
         objects: Object sets.
-        num_worlds: N.
+        num_envs: N.
         seed: Of the environment.
         stop_tolerance_rad: Orientation tolerance of success [rad].
         max_goal_angle_rad: Largest angle from an object to a goal the environment draws [rad]; None: as
@@ -315,7 +315,7 @@ def task_for(
         hand=hand or base.hand,
         hand_layer=base.hand_layer if hand_layer is None else None if hand_layer == NO_LAYER else hand_layer,
         objects=objects,
-        num_worlds=num_worlds,
+        num_envs=num_envs,
         seed=seed,
         episode_s=episode_s,
         success_ends_episode=success_ends_episode,

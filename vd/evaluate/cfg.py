@@ -16,7 +16,7 @@ from vd.paper import PAPER
 if TYPE_CHECKING:
     from vd.envs.cfg import RandomisationCfg
 
-# Worlds simulated at once by default: enough to keep the device busy, few enough to fit anywhere.
+# Environments simulated at once by default: enough to keep the device busy, few enough to fit anywhere.
 WORLDS_CPU, WORLDS_GPU = 64, 8192
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0
@@ -83,7 +83,7 @@ class EvalCfg:
     """Goals are within this angle [rad] of the start; pi is all of SO(3)."""
     at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start at rest on the table; the default is as trained, and a drop for --agent zero and random. The
-    environment draws such starts and their goals; they depend on --num-worlds too."""
+    environment draws such starts and their goals; they depend on --num-envs too."""
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
     stop_tolerance: float = PAPER.success.rotation_rad
@@ -114,12 +114,12 @@ class EvalCfg:
     observation-late and command-late, 83 ms and nothing else."""
     resample: Literal["auto", "object", "episode"] = "auto"
     """What intervals speak about: objects (from 8 of them) or episodes within objects."""
-    num_worlds: int | None = None
-    """Worlds simulated at once; by default as many as episodes, up to 64 on a CPU and 8192 on a GPU (1024
+    num_envs: int | None = None
+    """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a GPU (1024
     with camera policies)."""
     device: str = "auto"
     """auto, cpu or cuda:N."""
-    output: Path = Path("runs/eval")
+    out: Path = Path("runs/eval")
     """Folder for eval.json and eval.html."""
     json: bool = False
     """Print protocol and summaries as JSON instead of the table."""
@@ -183,10 +183,8 @@ class EvalCfg:
             raise ValueError(f"--table-friction is {self.table_friction}; it must not be negative")
         self._validate_suite()
         start_at_rest(self.at_rest, self.no_at_rest)
-        if self.num_worlds is not None and self.num_worlds < 1:
-            raise ValueError(
-                f"--num-worlds is {self.num_worlds}; at least one world for each object is needed"
-            )
+        if self.num_envs is not None and self.num_envs < 1:
+            raise ValueError(f"--num-envs is {self.num_envs}; at least one world for each object is needed")
 
     def _validate_suite(self) -> None:
         if self.jobs < 1:

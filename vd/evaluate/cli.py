@@ -21,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cfg.validate()
         names = cfg.agent_names
         check_names(names, chain(*parse_groups(cfg.object_sets).values()), cfg.hand)
-        check_folder(cfg.output)
+        check_folder(cfg.out)
         if cfg.second_view:
             check_second_view(names)
         return _evaluate(cfg) if cfg.suite is None else _run_suite(cfg)
@@ -43,7 +43,7 @@ def _evaluate(cfg: EvalCfg) -> int:
     if cfg.json:
         print(json.dumps(comparison.summary(), indent=1))
     else:
-        print(f"{terminal_text(comparison)}\n{cfg.output / 'eval.json'}\n{cfg.output / 'eval.html'}")
+        print(f"{terminal_text(comparison)}\n{cfg.out / 'eval.json'}\n{cfg.out / 'eval.html'}")
     return 0
 
 
@@ -57,7 +57,7 @@ def _run_suite(cfg: EvalCfg) -> int:
     else:
         print(f"{terminal_table(result)}\n")
         if result.found:
-            print(f"{cfg.output / RESULT_FILE}\n{cfg.output / PAGE_FILE}")
+            print(f"{cfg.out / RESULT_FILE}\n{cfg.out / PAGE_FILE}")
     if result.late:
         print(f"vd-eval: {out_of_time(result)}", file=sys.stderr)
     for (condition, policy), why in result.failed.items():

@@ -29,12 +29,12 @@ if TYPE_CHECKING:
     from vd.stopping import StoppingRule
 
 STUDENT_WORLDS_GPU = 1024
-"""Worlds simulated at once by default where a student looks at them: depth images and clouds take memory."""
+"""Environments at once by default where a student looks at them: depth images and clouds take memory."""
 _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
 
 
 def compare(cfg: EvalCfg, stop_at: float = math.inf) -> "Comparison":
-    """Run an evaluation and write its JSON and page into ``cfg.output``.
+    """Run an evaluation and write its JSON and page into ``cfg.out``.
 
     Args:
         cfg: Settings of the command line.
@@ -64,15 +64,15 @@ def compare(cfg: EvalCfg, stop_at: float = math.inf) -> "Comparison":
     members = {name: [item.name for item in load_set(list(sets))] for name, sets in groups.items()}
     count = len(load_set(list(everything)))
     limit = STUDENT_WORLDS_GPU if device != "cpu" and any(map(sees_clouds, cfg.agent_names)) else None
-    worlds = cfg.num_worlds or worlds_for(count, cfg.episodes, device, limit=limit)
+    envs = cfg.num_envs or worlds_for(count, cfg.episodes, device, limit=limit)
     rows, predictions = [], []
     env: Any = None
     task, start = None, None
     for name, policy in policies.items():
-        wanted = task_of(cfg, policy, everything, worlds)
+        wanted = task_of(cfg, policy, everything, envs)
         check_bundle(name, wanted)
         if task != wanted:
-            print("building the worlds (the first start compiles kernels: minutes)", file=sys.stderr)
+            print("building the environments (the first start compiles kernels: minutes)", file=sys.stderr)
             if env is not None:
                 env.close()
             env = ReorientEnv(wanted, device)
@@ -99,12 +99,12 @@ def compare(cfg: EvalCfg, stop_at: float = math.inf) -> "Comparison":
             predictions += [] if prediction is None else [prediction]
     env.close()
     comparison = Comparison(tuple(rows), tuple(predictions), software=_software(device))
-    comparison.write(cfg.output / "eval.json")
-    write_comparison(comparison, cfg.output / "eval.html", pictures=pictures(env.objects))
+    comparison.write(cfg.out / "eval.json")
+    write_comparison(comparison, cfg.out / "eval.html", pictures=pictures(env.objects))
     return comparison
 
 
-def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], worlds: int) -> "ReorientCfg":
+def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) -> "ReorientCfg":
     """The task of one policy, in which no state ends an episode but a fall."""
     from vd.evaluate.trace import NEVER_RAD
 
@@ -112,7 +112,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], worlds: int
         policy,
         hand=cfg.hand,
         objects=sets,
-        num_worlds=worlds,
+        num_envs=envs,
         seed=cfg.seed,
         stop_tolerance_rad=NEVER_RAD,
         max_goal_angle_rad=cfg.max_goal_angle,
@@ -128,7 +128,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], worlds: int
         task = replace(task, table_friction=cfg.table_friction)
     if cfg.randomised:
         return task
-    # Noise that is switched off anyway, and would keep a teacher and its student from sharing the worlds.
+    # Noise that is switched off anyway, and would keep a teacher and its student from sharing environments.
     exact = replace(
         task.randomisation,
         observation_noise_mean=0.0,
@@ -239,7 +239,7 @@ def run_episodes(
             for item in env.objects
         ]
         starts, goals = (np.stack([pair[i] for pair in drawn]) for i in range(2))
-    rounds = math.ceil(cfg.episodes / (env.num_worlds // len(env.objects)))
+    rounds = math.ceil(cfg.episodes / (env.num_envs // len(env.objects)))
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
     title = Path(name).name or name
     ways = ways_to_stop(rules, cfg.stop_tolerance, predicts=hasattr(actor, "predicted"))
@@ -265,7 +265,7 @@ def run_episodes(
 
 
 def worlds_for(num_objects: int, episodes: int, device: str, *, limit: int | None = None) -> int:
-    """Worlds to simulate at once: the same number for every object, at most one for each episode."""
+    """Environments to simulate at once: the same number for every object, at most one for each episode."""
     limit = limit or (WORLDS_CPU if device == "cpu" else WORLDS_GPU)
     return num_objects * max(1, min(episodes, limit // num_objects))
 

@@ -1,4 +1,4 @@
-"""Starts and goals of an evaluation, and the rounds in which an environment of many worlds runs them."""
+"""Starts and goals of an evaluation, and the rounds in which many environments run them."""
 
 import zlib
 
@@ -15,8 +15,8 @@ def draw_starts_and_goals(
     """Draw the initial and goal orientations of one object.
 
     They depend on the object's name, the seed and the number of the episode alone: not on the other
-    objects, the number of worlds or the device. Starts are uniform on SO(3); goals are uniform on the part
-    of SO(3) within ``max_goal_angle`` of the start.
+    objects, the number of environments or the device. Starts are uniform on SO(3); goals are uniform on the
+    part of SO(3) within ``max_goal_angle`` of the start.
 
     Args:
         name: Object name.
@@ -56,7 +56,9 @@ def episode_rounds(world_object: np.ndarray, objects: int, episodes: int) -> lis
     """For every round the episode number of each world, -1 for none: a list of [N] arrays."""
     missing = sorted(set(range(objects)) - set(world_object.tolist()))
     if missing:
-        raise ValueError(f"no world simulates object {missing[0]}; raise the number of worlds to {objects}")
+        raise ValueError(
+            f"no world simulates object {missing[0]}; raise the number of environments to {objects}"
+        )
     # The position of each world among those of its object.
     order = np.array([np.count_nonzero(world_object[:w] == k) for w, k in enumerate(world_object)])
     share = np.bincount(world_object, minlength=objects)

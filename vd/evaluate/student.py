@@ -11,7 +11,7 @@ from vd.config import from_dict
 from vd.evaluate.goals import Goals
 from vd.evaluate.scanned import known_objects
 from vd.evaluate.senses import EnvironmentSenses
-from vd.kernels.observations import teacher_observation_slices
+from vd.kernels.task.observations import teacher_observation_slices
 from vd.quaternions import canonical, relative_rotation, rotation_distance
 from vd.sensors.cfg import DepthCameraCfg
 from vd.tracking.symmetry import nearest_goal, symmetries_of_worlds
@@ -100,10 +100,10 @@ class StudentView:
         return changed
 
     def sites(
-        self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None, *, augment: bool
+        self, frame: Mapping[str, torch.Tensor], envs: torch.Tensor | None = None, *, augment: bool
     ) -> tuple[Sites, ...]:
         """Voxels of frames (:meth:`vd.vision.sight.Sight.sites`)."""
-        return self.sight.sites(frame, worlds, augment=augment)
+        return self.sight.sites(frame, envs, augment=augment)
 
     def state_dict(self) -> dict[str, Any]:
         """Random states and what the camera remembers, as NumPy arrays."""
@@ -179,15 +179,15 @@ class StudentActor:
             goals=known_objects(env.objects, goals, seed=seed, device=env.device),
             seed=seed,
         )
-        self._hidden = self._student.initial_hidden(env.num_worlds)
+        self._hidden = self._student.initial_hidden(env.num_envs)
         self._steps = wp.to_torch(env.step_count)
-        self.predicted = self._hidden.new_zeros(env.num_worlds)
-        self.active = torch.ones(env.num_worlds, dtype=torch.bool, device=self._hidden.device)
+        self.predicted = self._hidden.new_zeros(env.num_envs)
+        self.active = torch.ones(env.num_envs, dtype=torch.bool, device=self._hidden.device)
 
     def act(self, _observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] for what is seen now; the teacher's observation is not looked at.
 
-        The memory of worlds that have just been reset starts empty.
+        The memory of environments that have just been reset starts empty.
         """
         frame = self._view.frame()
         self._hidden.masked_fill_((self._steps == 0)[:, None], 0.0)

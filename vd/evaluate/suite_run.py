@@ -50,11 +50,11 @@ PAGE_EVERY_S = 30.0
 LOG_FILE = "log.txt"
 """Progress of an evaluation that ran beside others."""
 # Settings that say where and how an evaluation runs, not what it measures.
-_NOT_MEASURED = ("output", "device", "json", "num_worlds", "jobs")
+_NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs")
 
 
 def run_suite(cfg: EvalCfg, *, say: Callable[[str], object] | None = None) -> SuiteResult:
-    """Run what is not there yet, and write the page and its figures into ``cfg.output``.
+    """Run what is not there yet, and write the page and its figures into ``cfg.out``.
 
     Args:
         cfg: Settings of the command line.
@@ -76,7 +76,7 @@ def run_suite(cfg: EvalCfg, *, say: Callable[[str], object] | None = None) -> Su
     try:
         waiting = []
         for task in tasks:
-            there = _read(task.cfg.output, task.wanted)
+            there = _read(task.cfg.out, task.wanted)
             if there is None:
                 waiting.append(task)
             else:
@@ -89,9 +89,9 @@ def run_suite(cfg: EvalCfg, *, say: Callable[[str], object] | None = None) -> Su
                 if time.monotonic() <= stop_at:
                     progress.say(task.text)
                 _keep(task, _measure(task, stop_at), result, progress)
-                progress.show(result, cfg.output)
+                progress.show(result, cfg.out)
     finally:
-        _write(result, cfg.output)
+        _write(result, cfg.out)
     return result
 
 
@@ -107,7 +107,7 @@ def _tasks(cfg: EvalCfg, result: SuiteResult) -> list["_Task"]:
             if not condition.concerns(student=name in result.students, views=views[name]):
                 continue
             one = settings(cfg, condition, name, objects)
-            one = replace(one, output=cfg.output / condition.name / short[name].replace("/", "-"))
+            one = replace(one, out=cfg.out / condition.name / short[name].replace("/", "-"))
             text = f"{condition.title}: {short[name]} ({objects.text})"
             tasks.append(_Task(condition.name, name, one, prints[name], text))
     return tasks
@@ -171,8 +171,8 @@ def _measure(task: _Task, stop_at: float = math.inf) -> str:
 
 def _measure_apart(task: _Task, stop_at: float = math.inf) -> str:
     """The same in a process of its own, whose progress goes to a file: several would mix."""
-    make_folder(task.cfg.output)
-    with (task.cfg.output / LOG_FILE).open("w") as log, redirect_stdout(log), redirect_stderr(log):
+    make_folder(task.cfg.out)
+    with (task.cfg.out / LOG_FILE).open("w") as log, redirect_stdout(log), redirect_stderr(log):
         try:
             return _measure(task, stop_at)
         except OSError as error:
@@ -188,8 +188,8 @@ def _keep(task: _Task, failure: str, result: SuiteResult, progress: _Progress) -
         result.failed[task.condition, task.policy] = failure
         progress.line(f"  failed: {failure}")
         return
-    result.found[task.condition, task.policy] = Comparison.read(task.cfg.output / "eval.json")
-    write_json(task.cfg.output / SETTINGS_FILE, task.wanted)
+    result.found[task.condition, task.policy] = Comparison.read(task.cfg.out / "eval.json")
+    write_json(task.cfg.out / SETTINGS_FILE, task.wanted)
 
 
 def _run_together(
@@ -210,7 +210,7 @@ def _run_together(
     def finished(task: _Task, failure: str | None, died: str) -> None:
         progress.say(task.text)
         _keep(task, died if failure is None else failure, result, progress)
-        progress.show(result, cfg.output)
+        progress.show(result, cfg.out)
 
     run_tasks(
         partial(_measure_apart, stop_at=stop_at),

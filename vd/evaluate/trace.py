@@ -154,8 +154,9 @@ def record(
     """Run a policy and write down what happens.
 
     Errors are up to the symmetry that ``env.objects`` declare. All rounds are drawn before the first step,
-    since how often worlds reset depends on the policy and moves the random streams: so starts, goals and
-    noise depend on the environment's configuration (seed and number of worlds included), not on the policy.
+    since how often environments reset depends on the policy and moves the random streams: so starts, goals
+    and noise depend on the environment's configuration (seed and number of environments included), not on the
+    policy.
 
     Args:
         env: An environment that no state ends (``success.rotation_rad`` of NEVER_RAD), as it was built.
@@ -203,26 +204,26 @@ def record(
 
 
 class _Stops:
-    """The states in which a rule stops the worlds of a round; those of the others are of its beginning."""
+    """The states in which a rule stops the environments of a round; of others those of its beginning."""
 
     def __init__(self, env: Any, hold: Hold) -> None:
         self._env, self._hold = env, hold
-        self._state = {name: _rows(array, env.num_worlds).clone() for name, array in env.motion().items()}
-        self._after = np.full(env.num_worlds, -1)
+        self._state = {name: _rows(array, env.num_envs).clone() for name, array in env.motion().items()}
+        self._after = np.full(env.num_envs, -1)
 
-    def look(self, step: int, trace: Trace, worlds: np.ndarray, place: tuple[np.ndarray, np.ndarray]) -> None:
-        """Keep the states of worlds, those of ``place``, that the rule stops after ``step`` steps."""
+    def look(self, step: int, trace: Trace, envs: np.ndarray, place: tuple[np.ndarray, np.ndarray]) -> None:
+        """Keep the states of environments, those of ``place``, that the rule stops after ``step`` steps."""
         rule, by = self._hold.rule, self._hold.by
         distance = {"predicted": trace.predicted, "exact": trace.exact, "error": trace.error}.get(by)
         assert distance is not None  # what success criteria stop is not held
         near = distance[(*place, step)] < rule.distance_rad
-        stops = near & (trace.action_norm[(*place, step)] < rule.action_norm) & (self._after[worlds] < 0)
+        stops = near & (trace.action_norm[(*place, step)] < rule.action_norm) & (self._after[envs] < 0)
         if step == 0 or not stops.any():
             return
-        self._after[worlds[stops]] = step
+        self._after[envs[stops]] = step
         for name, array in self._env.motion().items():
-            live, kept = _rows(array, self._env.num_worlds), self._state[name]
-            rows = torch.from_numpy(worlds[stops]).to(kept.device)
+            live, kept = _rows(array, self._env.num_envs), self._state[name]
+            rows = torch.from_numpy(envs[stops]).to(kept.device)
             kept[rows] = live[rows]
 
     def hold(
@@ -234,20 +235,20 @@ class _Stops:
     ) -> None:
         """Go on from the stops with the last targets, and write down what came of them."""
         env = self._env
-        worlds = np.flatnonzero(self._after >= 0)
-        if not len(worlds):
+        envs = np.flatnonzero(self._after >= 0)
+        if not len(envs):
             return
         for name, array in env.motion().items():
-            _rows(array, env.num_worlds).copy_(self._state[name])
-        place = np.asarray(env.world_object)[worlds], numbers[worlds]
-        lost = np.zeros(len(worlds), dtype=bool)
+            _rows(array, env.num_envs).copy_(self._state[name])
+        place = np.asarray(env.world_object)[envs], numbers[envs]
+        lost = np.zeros(len(envs), dtype=bool)
         for step in range(round(HOLD_S * env.cfg.sim.control_hz)):
             if table_steps is not None:
                 env.sim.place_tables(*_int_arrays(env, self._after + step, table_steps))
             env.hold()
-            away = env.object_pose()[worlds, :3] - np.array(PAPER.scene.goal_position_m)
+            away = env.object_pose()[envs, :3] - np.array(PAPER.scene.goal_position_m)
             lost |= ~(np.linalg.norm(away, axis=-1) < env.cfg.success.fall_m)  # not a number is lost too
-        quat, goal = unit_quats(env.object_pose()[worlds, 3:7]), goals[place]
+        quat, goal = unit_quats(env.object_pose()[envs, 3:7]), goals[place]
         exact = rotation_angle(quat, goal)
         error = np.array(
             [symmetric_error(q, g, symmetry[k]) for q, g, k in zip(quat, goal, place[0], strict=True)]
@@ -256,15 +257,15 @@ class _Stops:
         self._hold.error[place] = np.where(lost, np.pi, error)
 
 
-def _rows(array: wp.array, worlds: int) -> torch.Tensor:
-    """An array of all worlds with a row for each, sharing its memory."""
-    rows = wp.to_torch(array).view(worlds, -1)
+def _rows(array: wp.array, envs: int) -> torch.Tensor:
+    """An array of all environments with a row for each, sharing its memory."""
+    rows = wp.to_torch(array).view(envs, -1)
     return rows.view(torch.int32) if rows.dtype == torch.uint32 else rows  # torch cannot index the other
 
 
 def _int_arrays(env: Any, *values: Any) -> list[wp.array]:
     """One number, or one of each world, as device arrays [N]."""
-    rows = (np.broadcast_to(np.asarray(value, dtype=np.int32), env.num_worlds) for value in values)
+    rows = (np.broadcast_to(np.asarray(value, dtype=np.int32), env.num_envs) for value in values)
     return [wp.array(row, dtype=wp.int32, device=env.device) for row in rows]
 
 
@@ -279,34 +280,34 @@ def _record_round(
     stops: Sequence[_Stops],
 ) -> None:
     """One episode in every world that has one; ``numbers`` [N]: its place among its object's, -1 for none."""
-    worlds = np.flatnonzero(numbers >= 0)
-    place = np.asarray(env.world_object)[worlds], numbers[worlds]
-    goal = unit_quats(env.goal_quat.numpy())[worlds]
-    quat = unit_quats(env.object_pose()[:, 3:7])[worlds]
+    envs = np.flatnonzero(numbers >= 0)
+    place = np.asarray(env.world_object)[envs], numbers[envs]
+    goal = unit_quats(env.goal_quat.numpy())[envs]
+    quat = unit_quats(env.object_pose()[:, 3:7])[envs]
     trace.start_quat[place], trace.goal_quat[place] = quat, goal
     _write_errors(trace, symmetry, place, 0, quat, goal)
-    alive = np.ones(len(worlds), dtype=bool)
+    alive = np.ones(len(envs), dtype=bool)
     smoothed = wp.to_torch(env.smoothed)
     for step in range(env.max_episode_steps):
         if step == table_steps:
             env.sim.place_table(present=False)
         living = place[0][alive], place[1][alive]
-        trace.action_norm[(*living, step)] = smoothed.norm(dim=-1).cpu().numpy()[worlds][alive]
+        trace.action_norm[(*living, step)] = smoothed.norm(dim=-1).cpu().numpy()[envs][alive]
         if trace.predicted is not None:
-            policy.active = _mask(worlds[alive], env.num_worlds, smoothed.device)
+            policy.active = _mask(envs[alive], env.num_envs, smoothed.device)
         action = policy.act(wp.to_torch(env.observation))
         if trace.predicted is not None:
-            trace.predicted[(*living, step)] = policy.predicted.cpu().numpy()[worlds][alive]
+            trace.predicted[(*living, step)] = policy.predicted.cpu().numpy()[envs][alive]
         for one in stops:
-            one.look(step, trace, worlds[alive], living)
+            one.look(step, trace, envs[alive], living)
         env.step(wp.from_torch(action.detach().contiguous().float(), dtype=wp.float32))
-        quat = unit_quats(env.object_pose_end.numpy()[:, 3:7])[worlds]
+        quat = unit_quats(env.object_pose_end.numpy()[:, 3:7])[envs]
         _write_errors(trace, symmetry, living, step + 1, quat[alive], goal[alive])
         assert trace.still is not None
-        trace.still[(*living, step + 1)] = env.still.numpy()[worlds][alive] != 0
-        ended = (env.done.numpy()[worlds] != 0) & alive
+        trace.still[(*living, step + 1)] = env.still.numpy()[envs][alive] != 0
+        ended = (env.done.numpy()[envs] != 0) & alive
         last = place[0][ended], place[1][ended]
-        trace.fell[last] = env.fell.numpy()[worlds][ended] != 0
+        trace.fell[last] = env.fell.numpy()[envs][ended] != 0
         trace.steps[last] = step + 1
         alive &= ~ended
         on_step()
@@ -314,10 +315,10 @@ def _record_round(
             return
 
 
-def _mask(worlds: np.ndarray, count: int, device: torch.device) -> torch.Tensor:
-    """True at some worlds [N]."""
+def _mask(envs: np.ndarray, count: int, device: torch.device) -> torch.Tensor:
+    """True at some environments [N]."""
     mask = torch.zeros(count, dtype=torch.bool, device=device)
-    mask[torch.from_numpy(worlds).to(device)] = True
+    mask[torch.from_numpy(envs).to(device)] = True
     return mask
 
 

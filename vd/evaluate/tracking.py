@@ -59,8 +59,8 @@ class TrackingActor:
             device=env.device,
         )
         place = wp.device_to_torch(env.device)
-        self.predicted = torch.zeros(env.num_worlds, device=place)
-        self.active = torch.ones(env.num_worlds, dtype=torch.bool, device=place)
+        self.predicted = torch.zeros(env.num_envs, device=place)
+        self.active = torch.ones(env.num_envs, dtype=torch.bool, device=place)
 
     def act(self, _observation: torch.Tensor) -> torch.Tensor:
         """Mean actions [N, D] for what is sensed now; the teacher's observation is not looked at."""

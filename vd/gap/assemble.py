@@ -32,7 +32,7 @@ from vd.gap.result import (
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import interval, resamples, rmse
 from vd.gap.team import Bench, JointSpec
-from vd.kernels.effects import EFFECTS, TOGETHER, equivalent
+from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 
 CLOSE = 0.1
 """Values of one effect on two joints within this share of each other are one value."""

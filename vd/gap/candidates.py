@@ -10,7 +10,7 @@ from vd.gap.coordinates import Scales, beside, best_two, sizes, smaller, torque_
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import AT_FLOOR, EXPLAINED, RANDOM, SHARP
 from vd.gap.telemetry import BEHIND_SENSOR
-from vd.kernels.effects import EFFECTS, equivalent
+from vd.kernels.servo.effects import EFFECTS, equivalent
 
 SHORT_LIST = 10
 """Candidates of a round that are fitted, after the linear screening of all."""

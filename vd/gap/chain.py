@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import HandModel
 from vd.gap.recording import Recording
-from vd.kernels import actuators as servo
-from vd.kernels.effects import BASELINE, EFFECTS, neutral_row
+from vd.kernels.servo import actuators as servo
+from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
 
 GRAVITY_M_S2 = 9.81
 """Acceleration of gravity, the simulator's."""

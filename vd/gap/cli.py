@@ -340,7 +340,7 @@ def _print_report(analysis: "Analysis", as_json: bool) -> int:
 
 def _effects(text: str) -> tuple[str, ...]:
     """Names of effects, separated by commas."""
-    from vd.kernels.effects import EFFECTS
+    from vd.kernels.servo.effects import EFFECTS
 
     names = tuple(filter(None, (name.strip() for name in text.split(","))))
     if unknown := [name for name in names if name not in EFFECTS]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from vd.gap.recording import Recording
 from vd.gap.result import GRAVITY, Closing, NamedEffect, Predictions, Report, effect_values
-from vd.kernels.effects import BASELINE, EFFECTS
+from vd.kernels.servo.effects import BASELINE, EFFECTS
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-import vd.kernels.actuators as servo
-from vd.kernels.effects import BASELINE, EFFECTS, Parameter
+import vd.kernels.servo.actuators as servo
+from vd.kernels.servo.effects import BASELINE, EFFECTS, Parameter
 
 GRAVITY = EFFECTS["gravity_load"].parameters[0]
 BASELINE_PARAMETERS: dict[str, Parameter] = {p.name: p for p in (*BASELINE, GRAVITY)}

@@ -11,7 +11,7 @@ from vd.gap.judge import RANDOM
 from vd.gap.result import Verdict
 from vd.gap.statistics import covariance, half_width
 from vd.gap.veil import Veil
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 NAMED = 0.9
 """Share of the resamples that must choose an effect for it to be named."""

@@ -14,7 +14,7 @@ from vd.gap.one_joint import REFITS, Explained, Joint, rest
 from vd.gap.statistics import resamples
 from vd.gap.team import Team, parallel
 from vd.gap.verdict import Verdicts, cancelled, explains
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 
 def masses_alone(team: Team, joints: Sequence[Joint]) -> dict[int, Masses]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.chain import others_in
 from vd.gap.coordinates import BASELINE_PARAMETERS, Coordinate, Scales, coordinate, keys, sizes
 from vd.gap.descent import FIRST_DAMPING, LOG_TRUST, Descent, LeastSquares
@@ -18,7 +18,7 @@ from vd.gap.holding import Holding
 from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
 from vd.gap.veil import Veil
-from vd.kernels.chains import MAX_JOINTS
+from vd.kernels.servo.chains import MAX_JOINTS
 
 RIDGE = 0.01
 """Pull towards the start, as information in units of the noise floor: holds directions that the data

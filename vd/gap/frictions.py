@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.candidates import FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIONS, CandidateFits
 from vd.gap.coordinates import sizes
 from vd.gap.joint_fit import ONE_SIDED, JointFit
@@ -92,7 +92,7 @@ class Frictions(CandidateFits, Verdicts):
     def as_an_offset(self, present: JointFit) -> JointFit:
         """The model with an offset in the place of friction with a direction beside Stribeck friction.
 
-        They are the same (:data:`vd.kernels.effects.BESIDE`), and the offset is simpler.
+        They are the same (:data:`vd.kernels.servo.effects.BESIDE`), and the offset is simpler.
         """
         dry, offset = "stribeck_friction", "encoder_bias"
         usable = {*self.candidates} - {*present.effects, *self.vetoes}

@@ -5,7 +5,7 @@ finger in closed form), another integrator (leapfrog, linearly implicit), anothe
 friction (stick and slip as a complementarity), float64, and a step several times finer. All
 trajectories, of several plants too, advance together, one array operation for all.
 
-Effects: those of :data:`vd.kernels.effects.EFFECTS`, and :data:`OUTSIDE` the table. SI units, radians.
+Effects: those of :data:`vd.kernels.servo.effects.EFFECTS`, and :data:`OUTSIDE` the table. SI units, radians.
 """
 
 from collections.abc import Mapping, Sequence

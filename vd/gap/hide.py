@@ -17,7 +17,7 @@ from vd.gap.excitations import Excitation, JointRange, excitation_set
 from vd.gap.hidden_finger import FingerBody
 from vd.gap.hidden_plant import OUTSIDE, Plant, Run, simulate, simulate_with_duty
 from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording, Trajectory, write_recording
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 ENCODER_COUNT = 2.0 * math.pi / 4096
 """Twelve bits a turn, as of Dynamixel X and Feetech STS servos [rad]."""

@@ -17,8 +17,8 @@ from vd.assets_usd.hand_model import HandModel
 from vd.gap.close import counterparts
 from vd.gap.newton import DEFAULT_DT, JOINTS_PER_FINGER, HandReplay
 from vd.gap.recording import Recording
-from vd.kernels.actuators import KD, KP, VELOCITY_LIMIT
-from vd.kernels.effects import BASELINE
+from vd.kernels.servo.actuators import KD, KP, VELOCITY_LIMIT
+from vd.kernels.servo.effects import BASELINE
 
 SEARCHED = (KP, KD, VELOCITY_LIMIT)
 """What the paper identifies, by column of a parameter row."""

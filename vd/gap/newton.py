@@ -20,9 +20,9 @@ from vd.assets_usd.hand_model import HandModel
 from vd.gap.chain import DOWN_IN_BASE, GRAVITY_M_S2
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import STREAM_BITS
-from vd.kernels.actuators import BACKLASH_WIDTH, ENCODER_BIAS
-from vd.kernels.chains import Samples
-from vd.kernels.joint_replay import (
+from vd.kernels.servo.actuators import BACKLASH_WIDTH, ENCODER_BIAS
+from vd.kernels.servo.chains import Samples
+from vd.kernels.servo.joint_replay import (
     Tracks,
     replay_command_kernel,
     rest_play_kernel,

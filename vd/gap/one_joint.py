@@ -22,7 +22,7 @@ from vd.gap.statistics import resamples
 from vd.gap.team import JointSpec, Team
 from vd.gap.telemetry import vetoes
 from vd.gap.warming import middles
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 POLISH_ITERATIONS = 5
 """Steps of a fit that has to follow small changes of the other joints."""

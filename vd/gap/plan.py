@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.files import write_json, write_text
 from vd.gap.chain import Chain, chains
 from vd.gap.excitations import MENU, Excitation, JointRange
@@ -27,7 +27,7 @@ from vd.gap.recording import BARE_MODELS, Recording, Trajectory
 from vd.gap.result import Report, parameter_columns, parameter_of
 from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.words import joints_text, listing, plain
-from vd.kernels.effects import BASELINE, EFFECTS
+from vd.kernels.servo.effects import BASELINE, EFFECTS
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel

@@ -29,7 +29,7 @@ from vd.gap.words import (
     verdict_sentence,
     where_text,
 )
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 from vd.page import write_html
 
 REPORT_JSON, REPORT_HTML = "report.json", "report.html"

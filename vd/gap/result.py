@@ -17,7 +17,7 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import atomic_path, write_json
-from vd.kernels.effects import BASELINE, EFFECTS, TOGETHER, Parameter, equivalent
+from vd.kernels.servo.effects import BASELINE, EFFECTS, TOGETHER, Parameter, equivalent
 
 FORMAT = "vd-gap-report/1"
 LAYER = "identified.usda"
@@ -59,7 +59,7 @@ class NamedEffect:
     """An accepted effect on joints that share its parameters."""
 
     name: str
-    """Name in :data:`vd.kernels.effects.EFFECTS`."""
+    """Name in :data:`vd.kernels.servo.effects.EFFECTS`."""
     joints: tuple[str, ...]
     confidence: float
     """Share of bootstrap repetitions, choice included, that name it."""
@@ -393,7 +393,7 @@ def parameter_of(key: str, effect: str = "") -> Parameter:
 
 
 def parameter_columns(report: Report, joint: str) -> dict[int, float]:
-    """Columns of the joint's parameter row (:mod:`vd.kernels.actuators`) that the report identified."""
+    """Columns of the joint's parameter row (:mod:`vd.kernels.servo.actuators`) that the report identified."""
     known = {p.name: p.column for p in (*BASELINE, GRAVITY)}
     columns = {known[name]: value for name, value in report.identified.parameters.get(joint, {}).items()}
     for effect in (*report.effects, *report.provisional):

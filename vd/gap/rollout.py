@@ -1,6 +1,6 @@
 """Predict a recording: whole trajectories of one chain of joints, many parameter sets at once.
 
-Chains: :mod:`vd.gap.chain`. Physics: :mod:`vd.kernels.chains`.
+Chains: :mod:`vd.gap.chain`. Physics: :mod:`vd.kernels.servo.chains`.
 """
 
 import copy
@@ -17,8 +17,8 @@ import warp as wp
 from vd.gap.chain import Chain, load_of
 from vd.gap.crowd import Crowd
 from vd.gap.recording import Recording
-from vd.kernels import actuators as servo
-from vd.kernels.chains import MAX_JOINTS, Links, Samples, rollout_kernel
+from vd.kernels.servo import actuators as servo
+from vd.kernels.servo.chains import MAX_JOINTS, Links, Samples, rollout_kernel
 
 STEP_S = 1.0 / 480.0
 """Time step [s]: four of the simulator's, a fifth of a servo's fastest time constant (inertia / kd)."""

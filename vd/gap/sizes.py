@@ -15,7 +15,7 @@ from vd.gap.excitations import excitation_set
 from vd.gap.hidden_plant import OUTSIDE, Plant, Run, simulate
 from vd.gap.hide import Hiding, effect_parameters, machine, noise_floor
 from vd.gap.sizes_table import SCALES
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 GAPS = (1.5, 3.0, 6.0, 12.0)
 """Root-mean-square residual of the refitted base model, in noise floors."""

@@ -7,7 +7,7 @@ its controller's output: where it follows the plain error at the recorded gain, 
 
 import numpy as np
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain
 from vd.gap.recording import Recording, Trajectory
 from vd.gap.team import JointSpec
@@ -67,7 +67,7 @@ def vetoes(recording: Recording, chain: Chain, spec: JointSpec, rows: np.ndarray
 def late_side(recording: Recording, chain: Chain, spec: JointSpec) -> str:
     """Which of command and reading is late, if the recorded duty cycle says so.
 
-    Positions alone cannot tell (:data:`vd.kernels.effects.EQUIVALENT`). The duty cycle follows the late
+    Positions alone cannot tell (:data:`vd.kernels.servo.effects.EQUIVALENT`). The duty cycle follows the late
     command less the position there is, or the command there is less the position that is reported later.
 
     Returns:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-import vd.kernels.actuators as servo
+import vd.kernels.servo.actuators as servo
 from vd.gap.explanation import NAMED, Accepted, Explanation, Trial, estimates, intervals
 from vd.gap.joint_fit import ONE_SIDED, JointFit
 from vd.gap.judge import (
@@ -21,7 +21,7 @@ from vd.gap.judge import (
     Judge,
 )
 from vd.gap.warming import warming
-from vd.kernels.effects import BESIDE
+from vd.kernels.servo.effects import BESIDE
 
 UNEXPLAINED = 1.5
 """A baseline beyond this factor of the noise floor has a gap, whether or not an effect explains it."""

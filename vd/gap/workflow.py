@@ -34,7 +34,7 @@ from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S
 from vd.gap.statistics import noise_floor
 from vd.gap.team import Bench, JointSpec, Team, parallel
-from vd.kernels.effects import EFFECTS
+from vd.kernels.servo.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"
 VERSION = 10

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from vd.play.session import Session
 
 VIDEO_SECONDS = 10.0
-# A CPU simulates this many worlds about in real time.
+# A CPU simulates this many environments about in real time.
 FAST_WORLDS_CPU = 16
 
 
@@ -52,7 +52,7 @@ class PlayCfg:
     seconds: float = VIDEO_SECONDS
     """Length of the video [s]."""
     cells: int = 1
-    """Worlds side by side in the video, of different objects as far as there are."""
+    """Environments side by side in the video, of different objects as far as there are."""
     samples: int = 1
     """Rays a pixel in the video; 4 smooths edges."""
     port: int = 8080
@@ -175,13 +175,13 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
-    env, trained, device = _open(cfg, num_worlds=cfg.cells)
+    env, trained, device = _open(cfg, num_envs=cfg.cells)
     policy = trained or built_in(cfg.agent_name, env.num_actions, seed=cfg.seed, device=device)
-    worlds = spread(env.world_object, cfg.cells)
+    envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
     renderer = Renderer(
         env.hand,
-        [env.objects[env.world_object[world]] for world in worlds],
+        [env.objects[env.world_object[world]] for world in envs],
         width=width,
         height=height,
         goal_size=round(GOAL_SHARE * height),
@@ -190,7 +190,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     )
     rate = env.cfg.sim.control_hz
     steps = max(1, round(cfg.seconds * rate))
-    frames: Iterable[Any] = record(env, policy, renderer, worlds, steps)
+    frames: Iterable[Any] = record(env, policy, renderer, envs, steps)
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
     frames = tqdm(frames, total=steps, unit="frame", desc="vd-play", mininterval=refresh)
     count = write_frames(path, frames, rate)
@@ -223,13 +223,13 @@ def open_session(cfg: PlayCfg) -> "Session":
     """The environment and agents behind the viewer."""
     from vd.play.session import Session, agent_choices
 
-    env, trained, device = _open(cfg, num_worlds=1)
+    env, trained, device = _open(cfg, num_envs=1)
     agents = agent_choices(cfg.agent_name, trained, env.num_actions, seed=cfg.seed, device=device)
     return Session(env, agents, cfg.agent_name, seed=cfg.seed)
 
 
 def spread(world_object: Sequence[int], cells: int) -> list[int]:
-    """Worlds to show: of different objects first, then more of the same."""
+    """Environments to show: of different objects first, then more of the same."""
     seen: dict[int, int] = {}
     rank = []
     for world, index in enumerate(world_object):
@@ -238,7 +238,7 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
     return sorted(world for _, world in islice(sorted(rank), cells))
 
 
-def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
+def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
     """Environment with at least one world for each object, trained agent if one is named, device."""
     quiet_warp()
     from vd.assets_usd.objects.sets import load_set
@@ -257,7 +257,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
     device = resolve_device(cfg.device)
     count = len(load_set(list(cfg.objects)))
     if device == "cpu" and count > FAST_WORLDS_CPU:
-        print(f"vd-play: {count} objects are {count} worlds, slow on a CPU; name fewer with --objects")
+        print(f"vd-play: {count} objects are {count} environments, slow on a CPU; name fewer with --objects")
     if cfg.second_view:
         check_second_view([cfg.agent_name])
     trained = open_policy(cfg.agent_name, device)
@@ -265,7 +265,7 @@ def _open(cfg: PlayCfg, *, num_worlds: int) -> tuple[Any, Any, str]:
         trained,
         hand=cfg.hand,
         objects=cfg.objects,
-        num_worlds=max(num_worlds, count),
+        num_envs=max(num_envs, count),
         seed=cfg.seed,
         stop_tolerance_rad=cfg.stop_tolerance,
         max_goal_angle_rad=cfg.max_goal_angle,

@@ -60,13 +60,13 @@ class Session:
         self.snapshot: Snapshot = self._watcher.read(stepped=False)[0]
 
     def step(self) -> Snapshot:
-        """One control step of all worlds."""
+        """One control step of all environments."""
         act(self.env, self._made[self.agent])
         self.snapshot = self._watcher.read()[0]
         return self.snapshot
 
     def reset(self) -> Snapshot:
-        """Start all worlds anew, with new goals; counts go on."""
+        """Start all environments anew, with new goals; counts go on."""
         self.env.reset()
         self.snapshot = self._watcher.read(stepped=False)[0]
         return self.snapshot

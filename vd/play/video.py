@@ -68,21 +68,21 @@ class Snapshot:
 
 
 class Watcher:
-    """Reads chosen worlds of an environment after every step, and counts goals and drops.
+    """Reads chosen environments of an environment after every step, and counts goals and drops.
 
     Args:
         env: The environment.
-        worlds: Indices of the worlds to watch, length C.
+        envs: Indices of the environments to watch, length C.
     """
 
-    def __init__(self, env: Any, worlds: Sequence[int]):
-        self.env, self.worlds = env, list(worlds)
+    def __init__(self, env: Any, envs: Sequence[int]):
+        self.env, self.envs = env, list(envs)
         self.steps = 0
-        self.goals = np.zeros(len(self.worlds), dtype=int)
-        self.drops = np.zeros(len(self.worlds), dtype=int)
+        self.goals = np.zeros(len(self.envs), dtype=int)
+        self.drops = np.zeros(len(self.envs), dtype=int)
 
     def read(self, *, stepped: bool = True) -> list[Snapshot]:
-        """The present state of the watched worlds.
+        """The present state of the watched environments.
 
         Args:
             stepped: Whether a step was made since the last call; False after a reset.
@@ -90,15 +90,15 @@ class Watcher:
         Returns:
             C snapshots.
         """
-        env, worlds = self.env, self.worlds
-        success = (env.success.numpy()[worlds] != 0) & stepped
-        fell = (env.fell.numpy()[worlds] != 0) & stepped
+        env, envs = self.env, self.envs
+        success = (env.success.numpy()[envs] != 0) & stepped
+        fell = (env.fell.numpy()[envs] != 0) & stepped
         self.goals += success
         self.drops += fell
         self.steps += stepped
-        q, goal = env.sim.joint_q.numpy()[worlds], env.goal_quat.numpy()[worlds]
-        error, terms = env.rotation_error.numpy()[worlds], env.reward_terms.numpy()[worlds]
-        table = env.has_table()[worlds]
+        q, goal = env.sim.joint_q.numpy()[envs], env.goal_quat.numpy()[envs]
+        error, terms = env.rotation_error.numpy()[envs], env.reward_terms.numpy()[envs]
+        table = env.has_table()[envs]
         if not stepped:  # what the environment holds is of the step before the reset
             error, terms = rotation_angle(q[:, -4:].astype(float), goal.astype(float)), np.zeros_like(terms)
         return [
@@ -115,27 +115,27 @@ class Watcher:
                 terms=terms[i].copy(),
                 table=bool(table[i]),
             )
-            for i, world in enumerate(worlds)
+            for i, world in enumerate(envs)
         ]
 
 
 def record(
-    env: Any, policy: Any, renderer: Renderer, worlds: Sequence[int], steps: int
+    env: Any, policy: Any, renderer: Renderer, envs: Sequence[int], steps: int
 ) -> Iterator[np.ndarray]:
     """Reset, run a policy, and draw one frame after every control step.
 
     Args:
         env: The environment.
         policy: With ``act(observation)``, torch in and out.
-        renderer: With one cell for each of ``worlds``.
-        worlds: Which worlds are drawn, length C.
+        renderer: With one cell for each of ``envs``.
+        envs: Which environments are drawn, length C.
         steps: Control steps.
 
     Yields:
         Frames, RGB bytes [height, width, 3].
     """
-    watcher = Watcher(env, worlds)
-    composer = Composer(env.reward_term_names, len(worlds))
+    watcher = Watcher(env, envs)
+    composer = Composer(env.reward_term_names, len(envs))
     env.reset()
     for _ in range(steps):
         act(env, policy)

@@ -12,18 +12,23 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CameraModel
-from vd.kernels.depth_cloud import next_frame_kernel
-from vd.kernels.depth_sensor import (
+from vd.kernels.rng import init_rng_kernel
+from vd.kernels.sensor.depth_cloud import next_frame_kernel
+from vd.kernels.sensor.depth_sensor import (
     DepthSensorParams,
     delay_poses_kernel,
     forget_poses_kernel,
     measure_depth_kernel,
     next_count_kernel,
 )
-from vd.kernels.depth_views import NO_HIT, finish_depth_kernel, place_camera_kernel, place_meshes_kernel
-from vd.kernels.rasterise import rasterise_kernel
-from vd.kernels.raycast import RAY_BLOCK, cull_tiles_kernel, order_shapes_kernel, raycast_kernel
-from vd.kernels.rng import init_rng_kernel
+from vd.kernels.sensor.depth_views import (
+    NO_HIT,
+    finish_depth_kernel,
+    place_camera_kernel,
+    place_meshes_kernel,
+)
+from vd.kernels.sensor.rasterise import rasterise_kernel
+from vd.kernels.sensor.raycast import RAY_BLOCK, cull_tiles_kernel, order_shapes_kernel, raycast_kernel
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_cloud import DepthCloud, make_views
@@ -71,7 +76,7 @@ class DepthCamera:
         cfg.validate()
         self.camera, self.surfaces, self.body_q = camera, surfaces, body_q
         self.device = device = str(body_q.device)
-        self.num_worlds = n = surfaces.num_worlds
+        self.num_envs = n = surfaces.num_envs
         self._camera_body = camera_body
         self.height, self.width = camera.height, camera.width
         self._cloud = cloud = DepthCloud(
@@ -175,7 +180,7 @@ class DepthCamera:
         if self._history is None:
             return
         if mask is None:
-            mask = wp.ones(self.num_worlds, dtype=wp.int32, device=self.device)
+            mask = wp.ones(self.num_envs, dtype=wp.int32, device=self.device)
         self._launch(forget_poses_kernel, self.body_q.shape, [mask, self.body_q], [self._history])
 
     def stateful(self) -> dict[str, wp.array]:
@@ -187,7 +192,7 @@ class DepthCamera:
 
     def capture(self) -> None:
         """Take an image in every world and make its cloud. Launches only; nothing reaches the host."""
-        n, surfaces = self.num_worlds, self.surfaces
+        n, surfaces = self.num_envs, self.surfaces
         body_q = self._late_poses()
         self._launch(place_camera_kernel, n, [self._camera_body, self.extrinsics, body_q], [self.camera_q])
         self._launch(
@@ -264,7 +269,7 @@ class DepthCamera:
         return self._late_q
 
     def _cast(self) -> None:
-        n, surfaces = self.num_worlds, self.surfaces
+        n, surfaces = self.num_envs, self.surfaces
         cloud, lanes = self._cloud, self._lanes
         tiles = cloud.tile_rows * cloud.tile_columns
         self._launch(order_shapes_kernel, self._nearest.shape, [self._nearest], [self._order])
@@ -303,7 +308,7 @@ class DepthCamera:
         self.true_depth.fill_(NO_HIT)
         self._launch(
             rasterise_kernel,
-            (self.num_worlds, len(surfaces.slot_shape)),
+            (self.num_envs, len(surfaces.slot_shape)),
             [
                 self.views,
                 surfaces.points,

@@ -7,15 +7,15 @@ import numpy as np
 import warp as wp
 
 from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, compose
-from vd.kernels.depth_cloud import (
+from vd.kernels.rng import init_rng_kernel
+from vd.kernels.sensor.depth_cloud import (
     choose_points_kernel,
     count_points_kernel,
     crop_cells_kernel,
     next_frame_kernel,
 )
-from vd.kernels.depth_views import View
-from vd.kernels.raycast import TILE_COLUMNS, TILE_ROWS
-from vd.kernels.rng import init_rng_kernel
+from vd.kernels.sensor.depth_views import View
+from vd.kernels.sensor.raycast import TILE_COLUMNS, TILE_ROWS
 from vd.paper import PAPER
 
 
@@ -41,7 +41,7 @@ class DepthCloud:
         self,
         height: int,
         width: int,
-        num_worlds: int,
+        num_envs: int,
         *,
         points: int = PAPER.camera.points,
         crop_m: tuple[float, float] = PAPER.camera.crop_m,
@@ -53,7 +53,7 @@ class DepthCloud:
         Args:
             height: Rows of the image.
             width: Columns of the image.
-            num_worlds: N.
+            num_envs: N.
             points: K, points of a cloud at most.
             crop_m: Least and largest height of a point in the world frame [m].
             block: Pixels on a side of a cell.
@@ -68,17 +68,17 @@ class DepthCloud:
         def empty(*shape: int, dtype: type = int) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        self.points = empty(num_worlds, points, dtype=wp.vec3)
+        self.points = empty(num_envs, points, dtype=wp.vec3)
         """Points in the frame of the camera's body (the base) [m], NaN beyond ``count``, shape [N, K]."""
-        self.count = empty(num_worlds)
+        self.count = empty(num_envs)
         """Points of each cloud, shape [N]."""
-        self.available = empty(num_worlds)
+        self.available = empty(num_envs)
         """Pixels within the crop, of which the points were chosen, shape [N]."""
-        self._tile_cells = empty(num_worlds, tiles, dtype=wp.uint32)
-        self._tile_first = empty(num_worlds, tiles)
+        self._tile_cells = empty(num_envs, tiles, dtype=wp.uint32)
+        self._tile_first = empty(num_envs, tiles)
         self._row_count, self._row_first = (
-            empty(num_worlds, self.tile_rows),
-            empty(num_worlds, self.tile_rows),
+            empty(num_envs, self.tile_rows),
+            empty(num_envs, self.tile_rows),
         )
 
     def make(

@@ -9,7 +9,7 @@ import warp as wp
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hand_visuals import read_surfaces
 from vd.assets_usd.objects.model import ObjectModel
-from vd.kernels.raycast import MAX_SHAPES
+from vd.kernels.sensor.raycast import MAX_SHAPES
 from vd.sim.scene import Scene
 
 
@@ -49,7 +49,7 @@ class SurfaceSet:
         Raises:
             ValueError: More shapes than a tile's word has bits, or a mesh without triangles.
         """
-        self.num_worlds, self.num_shapes = shape_mesh.shape
+        self.num_envs, self.num_shapes = shape_mesh.shape
         if self.num_shapes > MAX_SHAPES:
             raise ValueError(
                 f"{self.num_shapes} shapes a world; the depth camera takes {MAX_SHAPES} at most: join some"

@@ -1,7 +1,7 @@
 """The identified servo of every hand joint, in every world of a simulation.
 
 The solver's own drive knows kp, kd and an effort limit. :class:`JointServo` puts the missing effects of
-:data:`vd.kernels.effects.EFFECTS` around it; without one it is not built and nothing is launched.
+:data:`vd.kernels.servo.effects.EFFECTS` around it; without one it is not built and nothing is launched.
 """
 
 import math
@@ -12,9 +12,16 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from vd.kernels.actuators import COMMAND_DELAY, JITTER_SIGMA, PARAMETER_COLUMNS, READ_DELAY, STATE_COLUMNS
-from vd.kernels.effects import EFFECTS, neutral_row
-from vd.kernels.joint_servo import (
+from vd.kernels.rng import init_rng_kernel
+from vd.kernels.servo.actuators import (
+    COMMAND_DELAY,
+    JITTER_SIGMA,
+    PARAMETER_COLUMNS,
+    READ_DELAY,
+    STATE_COLUMNS,
+)
+from vd.kernels.servo.effects import EFFECTS, neutral_row
+from vd.kernels.servo.joint_servo import (
     MAX_JITTER_SIGMAS,
     drive_joint_kernel,
     finish_joint_kernel,
@@ -24,7 +31,6 @@ from vd.kernels.joint_servo import (
     reset_joint_kernel,
     send_command_kernel,
 )
-from vd.kernels.rng import init_rng_kernel
 
 PARAMETERS = {p.column: (effect.name, p) for effect in EFFECTS.values() for p in effect.parameters}
 """Effect and parameter of every column of a row but the baseline's."""
@@ -71,7 +77,7 @@ class JointServo:
         Raises:
             ValueError: Rows of the wrong shape or with values that cannot be simulated.
         """
-        self.num_worlds = n = joint_q.shape[0]
+        self.num_envs = n = joint_q.shape[0]
         self.num_joints = d = np.shape(rows)[-2] if np.ndim(rows) >= 2 else 0
         self.dt = physics_dt
         self._solver, self._control, self._joint_q = solver, control, joint_q
@@ -140,7 +146,7 @@ class JointServo:
         Raises:
             ValueError: Names the joint and the parameter that cannot be simulated.
         """
-        n, d = self.num_worlds, self.num_joints
+        n, d = self.num_envs, self.num_joints
         rows = np.asarray(rows, dtype=np.float32)
         if rows.shape not in ((d, PARAMETER_COLUMNS), (n, d, PARAMETER_COLUMNS)) or d == 0:
             raise ValueError(
@@ -194,7 +200,7 @@ class JointServo:
         """Send a command [rad], shape [N, *], once per control step."""
         wp.launch(
             send_command_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[self.parameters, self.dt, command, self.state, self._rng, *self._transit],
             device=self.device,
         )
@@ -257,5 +263,5 @@ class JointServo:
         }
 
     def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        dim = (self.num_worlds, self.num_joints)
+        dim = (self.num_envs, self.num_joints)
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

@@ -80,7 +80,7 @@ def replay(path: Path, *, device: str = "cpu") -> Iterator[str]:
     hand = load_hand(record["hand"], record["fingertip"], record.get("hand_layer"))
     # One physics step a call: the control rate is raised to half the physics rate, an even multiple.
     cfg = dataclasses.replace(sim, control_hz=sim.physics_hz / 2.0)
-    scene = build_scene(hand=hand, objects=[item], num_worlds=1, cfg=cfg, device=device)
+    scene = build_scene(hand=hand, objects=[item], num_envs=1, cfg=cfg, device=device)
     # Servos start at rest: what they remembered is not in a dump.
     simulator = Simulator(scene, cfg, servo_rows=hand.servo if has_effects(hand.servo) else None)
     simulator.joint_q.assign(arrays["joint_q"][None])

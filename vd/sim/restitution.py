@@ -19,7 +19,7 @@ Coulomb's distance with coefficients of 1, and for 0.97 times with 0.6, as witho
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from vd.kernels.contacts import restitution_kernel
+from vd.kernels.task.contacts import restitution_kernel
 from vd.sim.scene import SHAPE_HAND, SHAPE_TABLE
 
 BOUNCE_THRESHOLD = 0.2

@@ -62,7 +62,7 @@ class Scene:
     """SHAPE_* of every shape, shape [S]."""
 
     @property
-    def num_worlds(self) -> int:
+    def num_envs(self) -> int:
         """N."""
         return len(self.world_object)
 
@@ -72,12 +72,12 @@ def hand_mount() -> wp.transform:
     return wp.transform(*BASE_IN_WORLD)
 
 
-def assign_objects(num_worlds: int, num_objects: int) -> np.ndarray:
-    """Spread objects evenly over worlds in contiguous blocks, shape [num_worlds], non-decreasing.
+def assign_objects(num_envs: int, num_objects: int) -> np.ndarray:
+    """Spread objects evenly over worlds in contiguous blocks, shape [num_envs], non-decreasing.
 
     Blocks because Newton copies a run of equal worlds in one pass.
     """
-    return (np.arange(num_worlds) * num_objects) // num_worlds
+    return (np.arange(num_envs) * num_objects) // num_envs
 
 
 def new_builder() -> newton.ModelBuilder:
@@ -232,18 +232,18 @@ def build_scene(
     *,
     hand: HandModel,
     objects: Sequence[ObjectModel],
-    num_worlds: int,
+    num_envs: int,
     cfg: SimCfg,
     device: str,
     scales: Sequence[float] = (1.0,),
     visuals: bool = False,
 ) -> Scene:
-    """Build and finalize ``num_worlds`` worlds.
+    """Build and finalize ``num_envs`` worlds.
 
     Args:
         hand: The hand, read from USD (path and fingertip kind are taken from it).
         objects: Objects, spread over the worlds.
-        num_worlds: N.
+        num_envs: N.
         cfg: Physics settings.
         device: Warp device.
         scales: Size factors, spread evenly over the worlds of each object.
@@ -255,14 +255,14 @@ def build_scene(
     cfg.validate()
     if not objects:
         raise ValueError("no objects to simulate; name a set with --objects (vd-assets makes them)")
-    if num_worlds < len(objects):
+    if num_envs < len(objects):
         raise ValueError(
-            f"num_worlds = {num_worlds} is fewer than the {len(objects)} objects; "
-            "raise num_worlds or name fewer objects"
+            f"num_envs = {num_envs} is fewer than the {len(objects)} objects; "
+            "raise num_envs or name fewer objects"
         )
     hand_builder = build_hand(hand, cfg, visuals=visuals)
-    world_object = assign_objects(num_worlds, len(objects))
-    world_scale = np.ones(num_worlds)
+    world_object = assign_objects(num_envs, len(objects))
+    world_scale = np.ones(num_envs)
     scene = new_builder()
     for index, item in enumerate(objects):
         count = int(np.count_nonzero(world_object == index))

@@ -9,10 +9,10 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from vd.kernels.actions import limit_joint_velocity_kernel
-from vd.kernels.contacts import pair_force_kernel
-from vd.kernels.guard import collect_overflow_kernel, guard_kernel, put_back_kernel
-from vd.kernels.worlds import place_table_kernel
+from vd.kernels.task.actions import limit_joint_velocity_kernel
+from vd.kernels.task.contacts import pair_force_kernel
+from vd.kernels.task.environments import place_table_kernel
+from vd.kernels.task.guard import collect_overflow_kernel, guard_kernel, put_back_kernel
 from vd.paper import PAPER
 from vd.sim.actuators import JointServo
 from vd.sim.cfg import SimCfg
@@ -121,7 +121,7 @@ class Simulator:
             scene: The worlds.
             cfg: Physics settings.
             servo_rows: Parameters of every joint's servo, shape [D, P] or [N, D, P]
-                (:mod:`vd.kernels.actuators`); the solver's plain drives by default.
+                (:mod:`vd.kernels.servo.actuators`); the solver's plain drives by default.
             servo_seed: Seed of the random delays and losses of commands.
             restitution: Whether contacts can bounce; see :attr:`restitution`.
         """
@@ -129,7 +129,7 @@ class Simulator:
         self.scene, self.cfg = scene, cfg
         self.model = scene.model
         self.device = self.model.device
-        self.num_worlds = n = scene.num_worlds
+        self.num_envs = n = scene.num_envs
         self.solver = make_solver(self.model, cfg)
         self.state, self._next = self.model.state(), self.model.state()
         self.control = self.model.control()
@@ -208,7 +208,7 @@ class Simulator:
         self._table_contact()
         wp.launch(
             guard_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[self.joint_q, self.joint_qd, self._start_q, self._start_qd, self.target, MAX_SPEED],
             outputs=[self.failures, self._dump_q, self._dump_qd, self._dump_target, self.failed],
             device=self.device,
@@ -218,7 +218,7 @@ class Simulator:
         """Put worlds of which this step failed back to its begin, as :func:`put_back_kernel` says."""
         wp.launch(
             put_back_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[self.failed, self._start_q, last_step],
             outputs=[self.joint_q, self.joint_qd, step_count],
             device=self.device,
@@ -257,14 +257,14 @@ class Simulator:
         else:
             wp.launch(
                 limit_joint_velocity_kernel,
-                dim=(self.num_worlds, len(self.velocity_limit)),
+                dim=(self.num_envs, len(self.velocity_limit)),
                 inputs=[self.velocity_limit, self.cfg.physics_dt, previous_q],
                 outputs=[q, qd],
                 device=self.device,
             )
         wp.launch(
             collect_overflow_kernel,
-            dim=self.num_worlds,
+            dim=self.num_envs,
             inputs=[self._observables.overflow, self._overflow_mask],
             outputs=[self.overflow],
             device=self.device,
@@ -294,7 +294,7 @@ class Simulator:
 
     def place_table(self, *, present: bool) -> None:
         """Put the table where it belongs, or out of reach of everything, in all worlds."""
-        n = self.num_worlds
+        n = self.num_envs
         counts = wp.zeros(n, dtype=wp.int32, device=self.device)
         self.place_tables(counts, wp.full(n, int(present), dtype=wp.int32, device=self.device))
 
@@ -339,7 +339,7 @@ class Simulator:
                 if np.any(overflow & bit)
             ]
             raise SimulationError(
-                f"{len(worlds)} of {self.num_worlds} worlds lost contacts (first: world {worlds[0]}; "
+                f"{len(worlds)} of {self.num_envs} worlds lost contacts (first: world {worlds[0]}; "
                 f"objects: {', '.join(sorted(names)[:5])}): {'; '.join(lines)}"
             )
         failures = self.failures.numpy()
@@ -347,7 +347,7 @@ class Simulator:
             worlds = np.flatnonzero(failures)
             name = self.scene.objects[self.scene.world_object[worlds[0]]].name
             raise SimulationError(
-                f"{len(worlds)} of {self.num_worlds} worlds left the finite numbers or exceeded "
+                f"{len(worlds)} of {self.num_envs} worlds left the finite numbers or exceeded "
                 f"{MAX_SPEED:g} m/s or rad/s (first: world {worlds[0]}, object {name}). "
                 "Replay the saved dump with "
                 "`vd-bench replay DUMP`; then raise sim.physics_hz or sim.contact_time_constant_s"

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, compose, invert
-from vd.kernels.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER
+from vd.kernels.task.observations import FINGERTIP_VALUES, JOINTS_PER_FINGER
 from vd.quaternions import product, rotated
 
 
@@ -48,7 +48,7 @@ class Fingertips:
             velocity: Joint velocities [rad/s], shape [N, D].
 
         Returns:
-            Columns as of :func:`vd.kernels.observations.teacher_observation_slices`, shape [N, 13 G].
+            Columns as of :func:`vd.kernels.task.observations.teacher_observation_slices`, shape [N, 13 G].
         """
         shape = (len(position), *self._axis.shape[:2], 1)
         half, rate = 0.5 * position.reshape(shape), velocity.reshape(shape)

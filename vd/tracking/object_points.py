@@ -4,8 +4,8 @@ import torch
 import warp as wp
 
 from vd.clouds import spread
-from vd.kernels.coordinate_maps import beside
-from vd.kernels.voxels import coordinates, voxelise_marked
+from vd.kernels.sparse.coordinate_maps import beside
+from vd.kernels.sparse.voxels import coordinates, voxelise_marked
 
 
 def object_points(

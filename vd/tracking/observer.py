@@ -16,8 +16,8 @@ import warp as wp
 from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.clouds import HandKinematics, SceneClouds
-from vd.kernels.observations import teacher_observation_size, teacher_observation_slices
-from vd.kernels.shapes import (
+from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
+from vd.kernels.task.shapes import (
     ORIENTATIONS,
     extent_directions,
     extent_kernel,
@@ -85,11 +85,11 @@ class Observer:
         def array(values: Any, dtype: Any) -> wp.array:
             return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
 
-        worlds: dict[str, Any] = {"world_object": world_object, "world_scale": world_scale, "device": device}
+        envs: dict[str, Any] = {"world_object": world_object, "world_scale": world_scale, "device": device}
         self._kinematics = HandKinematics(hand, link_body=links, base=BASE_IN_WORLD, device=device)
-        self._hand_cloud = SceneClouds(hand, (), link_body=links, object_body=-1, **worlds)
+        self._hand_cloud = SceneClouds(hand, (), link_body=links, object_body=-1, **envs)
         self._hand_end = array([self._hand_cloud.ends[1]], wp.int32)
-        self._registration = Registration(objects, camera=camera, **worlds)
+        self._registration = Registration(objects, camera=camera, **envs)
         self._before = self._registration.pose[:, 0].clone()
         self._symmetry = symmetries_of_worlds(objects, world_object, device)
         self._fingertips = Fingertips(hand, place)
@@ -170,16 +170,16 @@ class Observer:
         return found
 
     def _shape(self, found: Found, goal_quat: torch.Tensor) -> torch.Tensor:
-        """The shape's values, as the environment computes those of true poses (:mod:`vd.kernels.shapes`)."""
-        fingers, worlds = self._hand.num_fingers, len(found.orientation)
-        values = torch.empty((worlds, shape_observation_size(fingers)), device=self._base.device)
+        """The shape's values, as the environment computes those of true poses."""
+        fingers, envs = self._hand.num_fingers, len(found.orientation)
+        values = torch.empty((envs, shape_observation_size(fingers)), device=self._base.device)
         slices = shape_observation_slices(fingers)
         pose = wp.from_torch(torch.cat([found.position, found.orientation], dim=1))
         goal, out = wp.from_torch(goal_quat.contiguous(), dtype=wp.quat), wp.from_torch(values)
         surface = [*self._shapes, *self._tips, 0, slices["surface"].start, pose, self._links]
-        self._launch(surface_kernel, (worlds, fingers), surface, out)
+        self._launch(surface_kernel, (envs, fingers), surface, out)
         extent = [*self._shapes, self._directions, 0, slices["extent"].start, pose, goal]
-        self._launch(extent_kernel, (worlds, ORIENTATIONS, len(self._directions)), extent, out)
+        self._launch(extent_kernel, (envs, ORIENTATIONS, len(self._directions)), extent, out)
         return values
 
     def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list[Any], output: wp.array) -> None:

@@ -4,7 +4,7 @@ What a network has to learn of each shape anew is computed: many rotations are t
 best are improved, and a few that fit well are kept and followed, so that a turn of the object tells apart
 what one look does not. A few other rotations are tried in each step, in case none of those kept is right.
 
-N worlds, P seen points at most, K kept poses. Base frame; metres, quaternions xyzw.
+N environments, P seen points at most, K kept poses. Base frame; metres, quaternions xyzw.
 """
 
 import math
@@ -17,7 +17,7 @@ import warp as wp
 
 from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.objects.model import ObjectModel
-from vd.kernels.registration import (
+from vd.kernels.sensor.registration import (
     Eye,
     fit_poses_kernel,
     keep_poses_kernel,
@@ -26,7 +26,7 @@ from vd.kernels.registration import (
     start_poses_kernel,
     take_better_kernel,
 )
-from vd.kernels.shape_grids import Shapes, off_mesh_kernel, shape_distance_kernel
+from vd.kernels.sensor.shape_grids import Shapes, off_mesh_kernel, shape_distance_kernel
 
 POINTS = 256
 """Points seen of the object that are looked at, at most."""
@@ -117,7 +117,7 @@ class Registration:
             device: Warp device.
             grid: Grid points along a side of a shape's distances.
         """
-        self.device, worlds = device, len(world_object)
+        self.device, envs = device, len(world_object)
         place = torch.device(wp.device_to_torch(device))
 
         def array(values: Any, dtype: Any) -> wp.array:
@@ -154,16 +154,16 @@ class Registration:
             self._eye.cell, self._eye.margin = CELL_PX, MARGIN_M
             cells = (math.ceil(camera.height / CELL_PX), math.ceil(camera.width / CELL_PX))
         self._placing = [shapes, self._eye, int(self._rendered), EVERY_SAMPLE]
-        self._nearness = wp.zeros((worlds, *cells), dtype=float, device=device)
+        self._nearness = wp.zeros((envs, *cells), dtype=float, device=device)
         self._rotations = array(even_rotations(ROTATIONS), wp.quat)
-        self.pose = torch.zeros((worlds, KEPT, 7), device=place)
+        self.pose = torch.zeros((envs, KEPT, 7), device=place)
         self.pose[..., 6] = 1.0
-        self.misfit = torch.zeros((worlds, KEPT), device=place)
-        self.looks = torch.zeros(worlds, dtype=torch.int32, device=place)
+        self.misfit = torch.zeros((envs, KEPT), device=place)
+        self.looks = torch.zeros(envs, dtype=torch.int32, device=place)
         self._kept = [wp.from_torch(self.pose, dtype=wp.transform), wp.from_torch(self.misfit)]
-        self._worlds = torch.arange(worlds, dtype=torch.int32, device=place)
+        self._worlds = torch.arange(envs, dtype=torch.int32, device=place)
         # What a later look fits: poses kept before, the same where points are now, and others.
-        self._found = wp.empty((worlds, 2 * KEPT + OTHERS), dtype=wp.transform, device=device)
+        self._found = wp.empty((envs, 2 * KEPT + OTHERS), dtype=wp.transform, device=device)
         self._cost = wp.zeros(self._found.shape, dtype=float, device=device)
 
     def look(
@@ -219,69 +219,69 @@ class Registration:
         return wp.to_torch(poses), wp.to_torch(cost)
 
     def _tried(
-        self, worlds: wp.array, steps: int, every: int, inputs: list[wp.array]
+        self, envs: wp.array, steps: int, every: int, inputs: list[wp.array]
     ) -> tuple[wp.array, wp.array]:
         """Poses in all rotations [M, H], improved, and their misfits."""
-        first = wp.zeros(len(worlds), dtype=int, device=self.device)
-        poses = wp.empty((len(worlds), ROTATIONS), dtype=wp.transform, device=self.device)
+        first = wp.zeros(len(envs), dtype=int, device=self.device)
+        poses = wp.empty((len(envs), ROTATIONS), dtype=wp.transform, device=self.device)
         cost = wp.zeros(poses.shape, dtype=float, device=self.device)
-        self._start(poses, worlds, first, inputs)
-        self._fit(poses, cost, worlds, steps, every, inputs)
+        self._start(poses, envs, first, inputs)
+        self._fit(poses, cost, envs, steps, every, inputs)
         return poses, cost
 
-    def _find(self, worlds: wp.array, inputs: list[wp.array]) -> None:
-        """Find the objects of some worlds, of which nothing is known."""
-        tried, cost = self._tried(worlds, FIRST_STEPS, FIRST_EVERY, inputs)
+    def _find(self, envs: wp.array, inputs: list[wp.array]) -> None:
+        """Find the objects of some environments, of which nothing is known."""
+        tried, cost = self._tried(envs, FIRST_STEPS, FIRST_EVERY, inputs)
         best = wp.to_torch(cost).topk(CHOSEN, dim=1, largest=False).indices
         poses = wp.to_torch(tried)
         chosen = wp.from_torch(
             poses.gather(1, best[..., None].expand(-1, -1, poses.shape[-1])), dtype=wp.transform
         )
         cost = wp.zeros(chosen.shape, dtype=float, device=self.device)
-        self._fit(chosen, cost, worlds, CHOSEN_STEPS, 1, inputs)
-        self._keep(0, worlds, chosen, cost)
+        self._fit(chosen, cost, envs, CHOSEN_STEPS, 1, inputs)
+        self._keep(0, envs, chosen, cost)
 
-    def _follow(self, worlds: wp.array, inputs: list[wp.array]) -> None:
+    def _follow(self, envs: wp.array, inputs: list[wp.array]) -> None:
         """Go on from the kept poses, and try a few others; a row for each world, -1 where it is left out."""
         known, again, others = slice(KEPT), slice(KEPT, 2 * KEPT), slice(2 * KEPT, None)
         self._cost.zero_()
         wp.copy(self._found[:, known], self._kept[0])
-        self._fit(self._found[:, known], self._cost[:, known], worlds, STEPS, 1, inputs)
+        self._fit(self._found[:, known], self._cost[:, known], envs, STEPS, 1, inputs)
         # What falls is 4 cm farther at the next look, and steps look FAR_M far.
         self._launch(
             replace_poses_kernel,
-            (len(worlds), KEPT),
-            [*self._placing, worlds, WORSE, *self._kept, self._cost[:, known], *inputs],
+            (len(envs), KEPT),
+            [*self._placing, envs, WORSE, *self._kept, self._cost[:, known], *inputs],
             [self._found[:, again], self._cost[:, again]],
         )
-        self._fit(self._found[:, again], self._cost[:, again], worlds, STEPS, 1, inputs)
+        self._fit(self._found[:, again], self._cost[:, again], envs, STEPS, 1, inputs)
         first = wp.from_torch((self.looks * STRIDE) % ROTATIONS)
-        self._start(self._found[:, others], worlds, first, inputs)
-        self._fit(self._found[:, others], self._cost[:, others], worlds, STEPS, 1, inputs)
-        self._launch(take_better_kernel, (len(worlds), KEPT), [worlds, KEPT], [self._found, self._cost])
-        self._keep(KEPT, worlds, self._found, self._cost)
+        self._start(self._found[:, others], envs, first, inputs)
+        self._fit(self._found[:, others], self._cost[:, others], envs, STEPS, 1, inputs)
+        self._launch(take_better_kernel, (len(envs), KEPT), [envs, KEPT], [self._found, self._cost])
+        self._keep(KEPT, envs, self._found, self._cost)
 
-    def _start(self, pose: wp.array, worlds: wp.array, first: wp.array, inputs: list[wp.array]) -> None:
+    def _start(self, pose: wp.array, envs: wp.array, first: wp.array, inputs: list[wp.array]) -> None:
         """Write poses [M, C] in so many rotations, from the given ones on."""
-        given = [*self._placing, worlds, first, self._rotations]
+        given = [*self._placing, envs, first, self._rotations]
         self._launch(start_poses_kernel, pose.shape, [*given, *inputs], [pose])
 
     def _fit(
-        self, pose: wp.array, cost: wp.array, worlds: wp.array, steps: int, every: int, inputs: list[wp.array]
+        self, pose: wp.array, cost: wp.array, envs: wp.array, steps: int, every: int, inputs: list[wp.array]
     ) -> None:
         """Improve poses [M, C], and write their misfits."""
         sizes = [FAR_M, steps, every, EVERY_SAMPLE]
         self._launch(
             fit_poses_kernel,
             pose.shape,
-            [self._shapes, self._eye, *sizes, worlds, *inputs, self._nearness],
+            [self._shapes, self._eye, *sizes, envs, *inputs, self._nearness],
             [pose, cost],
         )
 
-    def _keep(self, known: int, worlds: wp.array, found: wp.array, cost: wp.array) -> None:
+    def _keep(self, known: int, envs: wp.array, found: wp.array, cost: wp.array) -> None:
         """Keep the best of poses [M, C], the first of which were kept before."""
-        inputs = [APART_RAD, STAY, SHARE, known, worlds, found]
-        self._launch(keep_poses_kernel, len(worlds), inputs, [cost, *self._kept])
+        inputs = [APART_RAD, STAY, SHARE, known, envs, found]
+        self._launch(keep_poses_kernel, len(envs), inputs, [cost, *self._kept])
 
     def _launch(self, kernel: wp.Kernel, dim: Any, inputs: list, outputs: list) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)

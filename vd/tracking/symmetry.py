@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects.geometry import random_surface_points
 from vd.assets_usd.objects.model import ObjectModel
-from vd.kernels.shape_grids import off_mesh_kernel
+from vd.kernels.sensor.shape_grids import off_mesh_kernel
 from vd.quaternions import product, rotation_distance
 from vd.tracking.registration import POINTS, Registration
 

@@ -18,7 +18,7 @@ EVERY_S = 1.0
 
 
 class ViewSelection:
-    """Which worlds look at their goals again, and in which views they go on: those that a critic prefers.
+    """Which environments look at their goals again, and in which views they go on, by a critic.
 
     Args:
         maps: The views of the hand, all that may be selected.
@@ -30,7 +30,7 @@ class ViewSelection:
         self._after, self._every = round(AFTER_S * control_hz), round(EVERY_S * control_hz)
 
     def due(self, goal_steps: torch.Tensor) -> torch.Tensor:
-        """Worlds that look again if they are far [N], so many control steps after their goal was new [N]."""
+        """Environments to look again if far [N], so many control steps after their goal was new [N]."""
         late = goal_steps - self._after
         return (late >= 0) & (late % self._every == 0)
 

@@ -3,8 +3,8 @@
 Written in Triton, which comes with torch's builds for CUDA; without it :mod:`vd.vision.sparse` gathers
 first. Every output is written by one program, in a fixed order of sums, so results repeat.
 
-Tables are those of :mod:`vd.kernels.coordinate_maps`; j = k INNER + c counts the rows of the weights as one
-matrix [K INNER, OUTER]. Sums are of single precision, products of the inputs' precision.
+Tables are those of :mod:`vd.kernels.sparse.coordinate_maps`; j = k INNER + c counts the rows of the weights
+as one matrix [K INNER, OUTER]. Sums are of single precision, products of the inputs' precision.
 """
 
 import torch

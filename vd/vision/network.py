@@ -1,6 +1,6 @@
 """The student's network: sparse encoder, memory, policy and distance heads.
 
-T steps, N worlds, B = T N or N clouds, D actions, E the embedding, G the memory, H distance heads.
+T steps, N environments, B = T N or N clouds, D actions, E the embedding, G the memory, H distance heads.
 """
 
 import math
@@ -209,9 +209,9 @@ class Student(nn.Module):
         ]
         return torch.cat(parts, dim=-1)
 
-    def initial_hidden(self, worlds: int) -> torch.Tensor:
+    def initial_hidden(self, envs: int) -> torch.Tensor:
         """The memory at the start of an episode: zeros [N, G]."""
-        return self.mean.weight.new_zeros((worlds, self.cfg.memory))
+        return self.mean.weight.new_zeros((envs, self.cfg.memory))
 
     def encode(self, scene: Sites, goal: Sites | None = None) -> torch.Tensor:
         """Embeddings [B, E] of clouds; arguments as of :meth:`look`."""
@@ -304,15 +304,15 @@ class Student(nn.Module):
     def _remember(
         self, inputs: torch.Tensor, hidden: torch.Tensor, done: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The GRU over [T, N, E], its memory cleared where worlds ended."""
+        """The GRU over [T, N, E], its memory cleared where environments ended."""
         if done is None:
             outputs, state = self.memory(inputs, hidden[None])
             return outputs, state[0]
         # A world's steps are cut into runs at its ends, and all runs go through the GRU side by side.
         ended = done.bool()
-        steps, worlds = ended.shape
+        steps, envs = ended.shape
         begins = torch.cat([torch.ones_like(ended[:1]), ended[:-1]])
-        run = begins.T.flatten().cumsum(0).view(worlds, steps).T - 1
+        run = begins.T.flatten().cumsum(0).view(envs, steps).T - 1
         step = torch.arange(steps, device=inputs.device)[:, None]
         since = step - torch.where(begins, step, 0).cummax(dim=0).values
         runs = int(run[-1, -1]) + 1  # waits for the device
@@ -320,5 +320,5 @@ class Student(nn.Module):
         beside = inputs.new_zeros((steps * runs, inputs.shape[-1])).index_copy(0, place, inputs.flatten(0, 1))
         first = hidden.new_zeros((runs, hidden.shape[-1])).index_copy(0, run[0], hidden)
         outputs, _ = self.memory(beside.view(steps, runs, -1), first[None])
-        remembered = outputs.flatten(0, 1).index_select(0, place).view(steps, worlds, -1)
+        remembered = outputs.flatten(0, 1).index_select(0, place).view(steps, envs, -1)
         return remembered, remembered[-1].masked_fill(ended[-1, :, None], 0.0)

@@ -154,12 +154,12 @@ class Sight:
         }
         return frame if self._complete else frame | {"points": senses.points.clone()}
 
-    def points(self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None) -> torch.Tensor:
+    def points(self, frame: Mapping[str, torch.Tensor], envs: torch.Tensor | None = None) -> torch.Tensor:
         """Clouds of frames: goal, hand, and the object or what the camera sees [R, P, 3]; base frame [m].
 
         Args:
             frame: The frames.
-            worlds: Hand of each row [R]; row i is of hand i by default.
+            envs: Hand of each row [R]; row i is of hand i by default.
         """
         rows, columns = frame["body_q"].shape[0], self._clouds.item
         seen = columns.stop - columns.start if self._complete else frame["points"].shape[1]
@@ -169,26 +169,26 @@ class Sight:
             wp.from_torch(frame["body_q"].contiguous(), dtype=wp.transform),
             wp.from_torch(frame["goal_quat"].contiguous(), dtype=wp.quat),
             with_object=self._complete,
-            worlds=None if worlds is None else wp.from_torch(worlds.int()),
+            envs=None if envs is None else wp.from_torch(envs.int()),
         )
         if not self._complete:
             points[:, columns.start :] = frame["points"]
         return points
 
     def sites(
-        self, frame: Mapping[str, torch.Tensor], worlds: torch.Tensor | None = None, *, augment: bool = False
+        self, frame: Mapping[str, torch.Tensor], envs: torch.Tensor | None = None, *, augment: bool = False
     ) -> tuple[Sites, ...]:
         """Voxels of frames; arguments as of :meth:`points`.
 
         Args:
             frame: The frames.
-            worlds: Hand of each row.
+            envs: Hand of each row.
             augment: Add noise, as in training.
 
         Returns:
             Arguments of :meth:`vd.vision.network.Student.encode`.
         """
-        points = self.points(frame, worlds)
+        points = self.points(frame, envs)
         return voxels(
             points,
             self._clouds.ends,

@@ -7,7 +7,7 @@ import torch
 import warp as wp
 
 from vd.clouds import spread
-from vd.kernels.coordinate_maps import (
+from vd.kernels.sparse.coordinate_maps import (
     HashTable,
     beside,
     coarsen,
@@ -17,7 +17,7 @@ from vd.kernels.coordinate_maps import (
     strided_table,
     window_table,
 )
-from vd.kernels.voxels import cloud_offsets, coordinates
+from vd.kernels.sparse.voxels import cloud_offsets, coordinates
 
 GOAL, HAND = 0, 1
 """Columns of the marks of voxels."""
@@ -31,7 +31,7 @@ class Sites:
     device, to learn the sizes of all.
 
     Attributes:
-        keys: Sorted keys of the cells (:mod:`vd.kernels.voxels`), shape [M].
+        keys: Sorted keys of the cells (:mod:`vd.kernels.sparse.voxels`), shape [M].
         clouds: B.
         level: l.
         complete: Whether all that bears no mark is of the object; a camera sees the hand too.

@@ -21,7 +21,7 @@ import torch
 from torch import nn
 from torch.autograd.function import once_differentiable
 
-from vd.kernels.coordinate_maps import KERNEL
+from vd.kernels.sparse.coordinate_maps import KERNEL
 from vd.vision.sites import Sites
 
 GATHER_LIMIT = {"cpu": 2**20, "cuda": 2**27}
@@ -167,7 +167,8 @@ class SparseConv3d(nn.Module):
     at the cells of the next level that hold any, input = 2 output + offset, offsets in {-1, 0, 1}^3.
 
     Attributes:
-        weight: Shape [27, in_channels, out_channels]; offset k as in :mod:`vd.kernels.coordinate_maps`.
+        weight: Shape [27, in_channels, out_channels]; offset k as in
+        :mod:`vd.kernels.sparse.coordinate_maps`.
     """
 
     def __init__(self, in_channels: int, out_channels: int, *, stride: int = 1):

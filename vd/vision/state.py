@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from vd.kernels.observations import JOINTS_PER_FINGER, teacher_observation_slices
+from vd.kernels.task.observations import JOINTS_PER_FINGER, teacher_observation_slices
 from vd.policy import MeanAction, PolicySpec, perceptron
 from vd.quaternions import canonical
 from vd.views import ViewMaps
@@ -142,7 +142,7 @@ class StateHead(nn.Module):
     def fit(self, features: torch.Tensor, observation: torch.Tensor) -> None:
         """Begin with the estimate that is best in least squares: gradients would take long to what is exact.
 
-        How much it is held back (ridge) is decided by the last states, which are to be of other worlds.
+        How much it is held back (ridge) is decided by the last states, which are to be of other environments.
 
         Args:
             features: Features of some states [R, width].

@@ -4,7 +4,7 @@ import torch
 import warp as wp
 
 from vd.kernels.rng import init_rng_kernel
-from vd.kernels.voxels import CloudNoise, draw_noise, voxelise, voxelise_marked
+from vd.kernels.sparse.voxels import CloudNoise, draw_noise, voxelise, voxelise_marked
 from vd.paper import PAPER
 from vd.vision.cfg import NoiseCfg
 from vd.vision.sites import Sites

@@ -1,0 +1,1 @@
+"""The depth camera of a hand, and where it stands."""

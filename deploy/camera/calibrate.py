@@ -1,0 +1,401 @@
+"""Find where the camera is: move fingers with markers on their tips before it, and solve for its place.
+
+Print markers (--print-markers), stick marker k flat to the last link of finger k so that it faces the camera
+at the start pose, and run. Views are kept in a folder and can be solved again without the hand (--views).
+The result is a layer over the hand's USD, for vd-deploy --camera-layer.
+"""
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+import numpy as np
+import tyro
+from scipy.spatial.transform import Rotation
+
+from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, Intrinsics, compose, invert
+from vd.config import from_dict
+from vd.deploy.camera.calibration_poses import plan
+from vd.deploy.camera.camera import GrayFrame, StaleCamera
+from vd.deploy.camera.hand_eye import HandEye, Views, solve
+from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, MarkerFinder, save_marker
+from vd.deploy.camera.realsense import RealSenseCfg, RealSenseInfrared, find_device
+from vd.deploy.hardware.check import ready
+from vd.deploy.hardware.connect import Connection, HandOptions, connect, read_hand_and_joints
+from vd.deploy.hardware.motion import move, reset_pose
+from vd.deploy.safety.limits import SafetyCfg
+from vd.deploy.safety.safety import SafeHand
+from vd.deploy.twin.calibration_twin import CalibrationTwin
+from vd.files import atomic_path, make_folder, write_json
+from vd.paper import PAPER
+
+FORMAT = "vd-calibration-views/1"
+VIEWS_FILE = "views.json"
+SIDE_M = 0.020
+"""Side of a marker [m]: with its white border 27 mm, as wide as the last link of a D'Claw."""
+SPEED_RAD_S = 0.5
+"""Of the slow movements between views."""
+IMAGE_S = 0.15
+"""Longest wait for an image at rest [s]; below the watchdog's patience."""
+TRIES = 5
+"""Images that are waited for at each pose."""
+SAME_RAD = 0.05
+"""Joints of a finger that differ by less show its marker once more, not anew."""
+OBJECT_IN_WORLD_M = (0.0, 0.0, 0.1)
+"""Where objects are held: the place for which errors are said."""
+LARGEST_ERROR_M = PAPER.cloud.voxel_m
+"""Uncertainty at the object above which the result is called ill-conditioned [m]: a voxel of the student."""
+
+
+@dataclass(frozen=True)
+class CalibrateCfg(HandOptions):
+    """Find where the camera is, from markers on the fingertips."""
+
+    out: Path = Path("camera.usda")
+    """Layer to write."""
+    views: Path | None = None
+    """Solve these views again, without a hand: a folder that an earlier run kept."""
+    keep: Path | None = None
+    """Folder for the views; beside --out by default."""
+    fingers: tuple[int, ...] = ()
+    """Fingers that carry a marker, from 0; all by default. Marker k is on finger k."""
+    count: int = 30
+    """Views to take."""
+    side_m: float = SIDE_M
+    """Side of the markers' black square [m]; measure the print."""
+    print_markers: Path | None = None
+    """Write the markers as pictures into this folder, and do nothing else."""
+    camera: RealSenseCfg = field(default_factory=lambda: RealSenseCfg(width=1280, height=720))
+    """The camera."""
+    speed: float = SPEED_RAD_S
+    """Of the joint with the farthest way [rad/s]."""
+    safety: SafetyCfg = field(default_factory=SafetyCfg)
+    """Limits of the movements."""
+    seed: int = 0
+    """Of the poses that are chosen."""
+    yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Do not ask before it moves."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print JSON."""
+
+
+class ImageSource(Protocol):
+    """Where pictures come from."""
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of the pictures."""
+
+    def read(self, timeout_s: float) -> GrayFrame:
+        """The newest picture; raises :class:`StaleCamera` if none comes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One picture and the joints at it."""
+
+    joint_q: np.ndarray
+    """Angles [rad] [D]."""
+    image: np.ndarray
+    """Brightness, uint8 [H, W]."""
+
+
+@dataclass(frozen=True)
+class _View:
+    """An entry of the file of the views."""
+
+    image: str
+    joint_q: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _ViewsFile:
+    """The file of the views."""
+
+    format: str
+    hand: str
+    side_m: float
+    lens: Intrinsics
+    views: tuple[_View, ...]
+
+
+def calibrate(cfg: CalibrateCfg) -> int:
+    """Take views, solve, write the layer; 1 if the result is too uncertain."""
+    if not cfg.side_m > 0.0 or not cfg.speed > 0.0 or cfg.count < 1:
+        raise ValueError("--side-m, --speed and --count have to be positive")
+    hand, _ = read_hand_and_joints(cfg)
+    fingers = cfg.fingers or tuple(range(hand.num_fingers))
+    if not all(0 <= f < hand.num_fingers for f in fingers) or len(set(fingers)) != len(fingers):
+        raise ValueError(f"--fingers {fingers}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")
+    if cfg.print_markers is not None:
+        return _print_markers(cfg.print_markers, fingers, cfg.side_m)
+    truth = None
+    if cfg.views is not None:
+        lens, side_m, shots = read_views(cfg.views, hand)
+    else:
+        lens, shots, truth = take(cfg, fingers)
+        side_m = cfg.side_m
+        save_views(cfg.keep or cfg.out.with_suffix(".views"), hand, lens, side_m, shots)
+    views = find_markers(hand, lens, side_m, shots, fingers)
+    if not cfg.json:
+        print(f"{len(views)} views of markers in {len(shots)} pictures")
+    found = solve(views)
+    record = report(hand, found, views, pictures=len(shots))
+    if truth is not None:
+        record["twin_off_at_object_m"] = float(np.linalg.norm(misplaced(found.camera, truth)))
+    write_layer(cfg.out, hand, found, record)
+    if cfg.json:
+        print(json.dumps(record, indent=1))
+    else:
+        print("\n".join(lines(record)))
+        print(f"written to {cfg.out}; vd-deploy --camera-layer {cfg.out}")
+    return 1 if record["warnings"] else 0
+
+
+def _print_markers(folder: Path, fingers: tuple[int, ...], side_m: float) -> int:
+    for finger in fingers:
+        save_marker(folder / f"marker-{finger}.png", finger, side_m)
+    border = 1e3 * side_m * MARGIN_CELLS / CELLS
+    print(
+        f"{len(fingers)} markers in {folder}: print them at true size (600 dots per inch), keep their white"
+    )
+    print(f"border of {border:.1f} mm, check that the black square is {1e3 * side_m:.1f} mm wide")
+    return 0
+
+
+def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[Shot], np.ndarray | None]:
+    """Move the fingers before the camera and take pictures at rest.
+
+    Returns:
+        Lens, pictures, and where the camera is in truth [7], which only a twin knows.
+
+    Raises:
+        StoppedError: A limit was passed; the hand is safe.
+        CameraError: The camera does not serve.
+    """
+    with ExitStack() as stack:
+        connection = stack.enter_context(connect(cfg))
+        camera = stack.enter_context(_pictures(cfg, connection, fingers))
+        hand = connection.hand
+        poses = plan(hand, camera.intrinsics, fingers, cfg.count, side_m=cfg.side_m, seed=cfg.seed)
+        question = f"The hand will move to {len(poses)} poses at {cfg.speed:g} rad/s."
+        ready(connection, question, yes=cfg.yes, quiet=cfg.json)
+        safe = stack.enter_context(SafeHand(connection.bus, connection.joints, hand, cfg.safety))
+        safe.arm()
+        shots = []
+        for number, pose in enumerate(poses):
+            move(safe, pose, cfg.speed)
+            shot = _shoot(safe, camera)
+            if shot is not None:
+                shots.append(shot)
+            print(f"\r{number + 1} of {len(poses)} poses", end="", file=sys.stderr, flush=True)
+        print(file=sys.stderr)
+        move(safe, reset_pose(hand.num_fingers), cfg.speed)
+        truth = camera.camera if isinstance(camera, CalibrationTwin) else None
+        return camera.intrinsics, shots, truth
+
+
+def _shoot(safe: SafeHand, camera: ImageSource) -> Shot | None:
+    """A picture taken between two readings of the resting joints."""
+    begin = safe.read()
+    for _ in range(TRIES):
+        try:
+            frame = camera.read(IMAGE_S)
+        except StaleCamera:
+            safe.read()
+            safe.beat()
+            continue
+        end = safe.read()
+        safe.beat()
+        if frame.time_s >= begin.time_s:
+            return Shot(0.5 * (begin.position + end.position), frame.image)
+    return None
+
+
+@contextmanager
+def _pictures(cfg: CalibrateCfg, connection: Connection, fingers: tuple[int, ...]) -> Iterator[ImageSource]:
+    """The infrared images of the camera, or those of its twin."""
+    camera: RealSenseInfrared | CalibrationTwin
+    if cfg.twin:
+
+        def joints() -> np.ndarray:
+            return connection.joints.to_joint(connection.bus.read_state().position)
+
+        camera = CalibrationTwin(
+            connection.hand, joints, fingers, cfg.camera, side_m=cfg.side_m, seed=cfg.seed
+        )
+    else:
+        camera = RealSenseInfrared(find_device(cfg.camera.serial), cfg.camera)
+    try:
+        yield camera
+    finally:
+        camera.close()
+
+
+def find_markers(
+    hand: HandModel, lens: Intrinsics, side_m: float, shots: list[Shot], fingers: tuple[int, ...]
+) -> Views:
+    """The markers in the pictures, as views to solve; of a finger that waits only the first."""
+    finder = MarkerFinder(lens, side_m)
+    tip, finger, corners, candidates = [], [], [], []
+    seen: dict[int, list[np.ndarray]] = {number: [] for number in fingers}
+    for shot in shots:
+        poses = hand.tip_poses(shot.joint_q)
+        for number, square in finder.find(shot.image).items():
+            own = shot.joint_q[3 * number : 3 * number + 3]
+            if number in seen and all(np.abs(own - other).max() > SAME_RAD for other in seen[number]):
+                seen[number].append(own)
+                tip.append(poses[number])
+                finger.append(number)
+                corners.append(square)
+                candidates.append(finder.poses(square))
+    return Views(
+        np.array(tip).reshape(-1, 7),
+        np.array(finger, dtype=int),
+        np.array(corners).reshape(-1, 4, 2),
+        tuple(candidates),
+        lens,
+        side_m,
+    )
+
+
+def save_views(folder: Path, hand: HandModel, lens: Intrinsics, side_m: float, shots: list[Shot]) -> None:
+    """Keep the pictures and the joints."""
+    from PIL import Image
+
+    make_folder(folder)
+    rows = []
+    for number, shot in enumerate(shots):
+        name = f"view-{number:03d}.png"
+        with atomic_path(folder / name) as temporary:
+            Image.fromarray(shot.image).save(temporary)
+        rows.append({"image": name, "joint_q": [float(q) for q in shot.joint_q]})
+    record = {"format": FORMAT, "hand": hand.name, "side_m": side_m, "lens": asdict(lens), "views": rows}
+    write_json(folder / VIEWS_FILE, record)
+
+
+def read_views(folder: Path, hand: HandModel) -> tuple[Intrinsics, float, list[Shot]]:
+    """Lens, side of the markers [m] and pictures of a folder.
+
+    Raises:
+        ValueError: The folder holds no views, or none of this hand; names the file.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    file = Path(folder) / VIEWS_FILE
+    try:
+        record = from_dict(_ViewsFile, json.loads(file.read_text()), where="the file")
+        if record.format != FORMAT:
+            raise ValueError(f"its format is {record.format!r}, not {FORMAT!r}")
+        if record.hand != hand.name:
+            raise ValueError(f"it is of {record.hand}, not of {hand.name}; give --hand {record.hand}")
+        lens, shots = record.lens, []
+        for row in record.views:
+            with Image.open(Path(folder) / row.image) as picture:
+                image = np.array(picture.convert("L"))
+            if image.shape != (lens.height, lens.width) or len(row.joint_q) != hand.num_joints:
+                raise ValueError(f"{row.image} has another size than the lens, or other joints than the hand")
+            shots.append(Shot(np.array(row.joint_q), image))
+        return lens, record.side_m, shots
+    except (OSError, TypeError, ValueError, UnidentifiedImageError) as error:
+        raise ValueError(f"{file} holds no views to solve ({error}); take them again") from error
+
+
+def object_place() -> np.ndarray:
+    """Where objects are held, in the hand's base [3] [m]."""
+    place = np.array([*OBJECT_IN_WORLD_M, 0.0, 0.0, 0.0, 1.0])
+    return compose(invert(np.array(BASE_IN_WORLD)), place)[:3]
+
+
+def misplaced(camera: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """By how much what is where objects are seems moved to a camera [7] that is at another place [3] [m]."""
+    point = object_place()
+    seen = compose(invert(truth), np.array([*point, 0.0, 0.0, 0.0, 1.0]))
+    return compose(camera, seen)[:3] - point
+
+
+def report(hand: HandModel, found: HandEye, views: Views, *, pictures: int) -> dict[str, Any]:
+    """What was found and how well, for people and scripts (SI units, radians)."""
+    point = object_place()
+    used = views.chosen(found.inliers)
+    error, condition = found.point_error(point), found.condition(point)
+    warnings = []
+    if error > LARGEST_ERROR_M:
+        warnings.append(
+            f"ill-conditioned: where objects are, the cloud may be off by {1e3 * error:.1f} mm, more than a "
+            f"voxel ({1e3 * LARGEST_ERROR_M:.0f} mm). The fingers turn too little for these pictures: take "
+            "more views (--count), put markers on more fingers, larger ones, or move the camera nearer"
+        )
+    return {
+        "hand": hand.name,
+        "position_m": [float(v) for v in found.camera[:3]],
+        "quaternion_xyzw": [float(v) for v in found.camera[3:]],
+        "position_half_width_m": [float(v) for v in found.half_width[:3]],
+        "turn_half_width_rad": [float(v) for v in found.half_width[3:]],
+        "error_at_object_m": error,
+        "condition": condition,
+        "residual_px": found.rms_px,
+        "pictures": pictures,
+        "views": len(views),
+        "used": len(found.inliers),
+        "fingers": [int(f) for f in np.unique(used.finger)],
+        "turned_rad": [float(v) for v in turned(used)],
+        "dual_quaternions": {
+            "position_m": [float(v) for v in found.linear[:3]],
+            "quaternion_xyzw": [float(v) for v in found.linear[3:]],
+        },
+        "moved_m": float(np.linalg.norm(found.camera[:3] - hand.camera.position)),
+        "warnings": warnings,
+    }
+
+
+def turned(views: Views) -> np.ndarray:
+    """How far the fingertips turned about the three directions about which they turned most [rad] [3]."""
+    spread = np.zeros((3, 3))
+    for finger in np.unique(views.finger):
+        turns = Rotation.from_quat(views.tip[views.finger == finger, 3:])
+        steps = (turns * turns.mean().inv()).as_rotvec()
+        spread += steps.T @ steps
+    return np.sqrt(np.linalg.eigvalsh(spread / len(views))[::-1].clip(0.0))
+
+
+def write_layer(path: Path, hand: HandModel, found: HandEye, record: dict[str, Any]) -> None:
+    """Write the layer, with what is known of its errors."""
+    from vd.assets_usd.camera_layer import write_camera_layer
+
+    notes = {
+        "tool": "vd-deploy calibrate",
+        "position_half_width_m": json.dumps(record["position_half_width_m"]),
+        "turn_half_width_rad": json.dumps(record["turn_half_width_rad"]),
+        "error_at_object_m": f"{record['error_at_object_m']:.6f}",
+        "residual_px": f"{record['residual_px']:.3f}",
+        "views": str(record["used"]),
+    }
+    write_camera_layer(path, hand, found.camera, notes)
+
+
+def lines(record: dict[str, Any]) -> list[str]:
+    """The report as text."""
+    rows = [
+        f"{record['used']} of {record['views']} views agree, {record['residual_px']:.2f} pixels apart",
+        "camera in the hand's base, 95 % intervals:",
+    ]
+    for axis, value, half in zip("xyz", record["position_m"], record["position_half_width_m"], strict=True):
+        rows.append(f"  {axis}       {1e3 * value:8.1f} mm  +- {1e3 * half:.1f}")
+    for axis, half in zip(("right", "down", "ahead"), record["turn_half_width_rad"], strict=True):
+        rows.append(f"  turn about its {axis:<6} +- {np.degrees(half):.2f} deg")
+    first = np.linalg.norm(np.subtract(record["dual_quaternions"]["position_m"], record["position_m"]))
+    turns = ", ".join(f"{np.degrees(t):.0f}" for t in record["turned_rad"])
+    rows += [
+        f"at the object: off by at most {1e3 * record['error_at_object_m']:.1f} mm (95 %)",
+        f"fingertips turned by {turns} deg (r.m.s., three directions); condition {record['condition']:.0f}",
+        f"dual quaternions alone: {1e3 * first:.1f} mm from this; "
+        f"the hand's file: {1e3 * record['moved_m']:.1f} mm",
+    ]
+    if "twin_off_at_object_m" in record:
+        rows.append(f"the twin knows: off by {1e3 * record['twin_off_at_object_m']:.1f} mm at the object")
+    return rows + [f"WARNING: {warning}" for warning in record["warnings"]]

@@ -1,0 +1,1 @@
+"""The motors of a hand: their bus, registers, preflight and slow movements."""

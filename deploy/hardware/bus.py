@@ -1,0 +1,484 @@
+"""The motors of a hand through dynamixel-sdk: goals out, states in, gains and limits written and read back.
+
+Angles in radians with zero in the middle of a motor's range, velocities in rad/s, currents in A. Which states
+are accepted, :mod:`vd.deploy.hardware.answers` says. Everything goes through one lock.
+"""
+
+import contextlib
+import termios
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vd.deploy.clock import MONOTONIC, Clock
+from vd.deploy.finding import BAUD_RATE, command
+from vd.deploy.hardware.answers import (
+    CLOCK_TOLERANCE_S,
+    OTHER_BYTES,
+    STATE_ADDRESS,
+    STATE_BYTES,
+    Answer,
+    BusError,
+    GarbledError,
+    HandState,
+    LateError,
+    SilentError,
+    StateCheck,
+    read_answer,
+)
+from vd.deploy.hardware.control_table import (
+    MODELS,
+    SIZE,
+    WATCHDOG_UNIT_S,
+    describe_hardware_error,
+    model_name,
+    table,
+    to_counts,
+)
+from vd.deploy.hardware.packets import MAX_ID
+from vd.deploy.hardware.port import WAIT_S, KeptPacket, open_port, sdk
+from vd.deploy.hardware.registers import MotorSettings, different
+
+STARVED_S = 0.02
+"""A read of the port that returns so much too late may have missed an answer: motors answer within 5 ms, and
+the SDK, once it runs again, finds that its 34 ms are over."""
+BUSY = "this computer is busy; end other programs, or give this one real-time priority (ulimit -r 1)"
+TORQUE_BYTES = 1
+LATE_S = 0.02
+"""Pause after a question that was asked in vain or again; what arrives meanwhile is dropped."""
+
+
+def check_wiring() -> str:
+    """What to try where a motor is silent."""
+    return "check its cable, power, baud rate and ID, which may be that of another motor"
+
+
+class MotorBus:
+    """Motors of one model on one serial port.
+
+    Args:
+        port: Device, such as /dev/ttyUSB0, or an open port of the SDK's kind.
+        ids: Motors in the order of the arrays.
+        model: Name of their model.
+        baud_rate: To open the device with.
+        retries: How often to ask again where no sound answer came.
+        clock: Time.
+        remedy: What to try where a motor is silent though this program listened, in words.
+
+    Raises:
+        BusError: The port cannot be opened, or another program has it.
+        ValueError: IDs or model that cannot be.
+    """
+
+    def __init__(
+        self,
+        port: Any,
+        ids: Sequence[int],
+        model: str,
+        *,
+        baud_rate: int = BAUD_RATE,
+        retries: int = 1,
+        clock: Clock = MONOTONIC,
+        remedy: Callable[[], str] = check_wiring,
+    ):
+        """Open the port."""
+        if model not in MODELS:
+            raise ValueError(f"no motor {model!r}; choose of {', '.join(MODELS)}")
+        if not ids or len(set(ids)) != len(ids) or not all(0 <= id <= MAX_ID for id in ids):
+            raise ValueError(f"ids are {list(ids)}; give each motor's own, within 0 and {MAX_ID}")
+        self.ids, self.model, self.retries, self.clock = tuple(ids), MODELS[model], retries, clock
+        self._remedy = remedy
+        self._items = table(self.model)
+        self._sdk = sdk()
+        self._lock = threading.RLock()
+        self._packets = self._sdk.PacketHandler(2.0)
+        self._states = StateCheck(self.ids, self.model)
+        self._goals, self._length = b"", STATE_BYTES
+        self._settings: dict[int, MotorSettings] = {}
+        self.rejected = 0
+        """States that were not accepted."""
+        self._port = open_port(port, baud_rate) if isinstance(port, str) else port
+        self._late_s = self._listened_s = 0.0
+        self._hear, self._port.readPort = self._port.readPort, self._listen
+
+    def __enter__(self) -> "MotorBus":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def port(self) -> str:
+        """Name of the port."""
+        return str(self._port.getPortName())
+
+    def command(self, words: str) -> str:
+        """A command of vd-deploy for these motors, as a person can enter it."""
+        return command(words, self.port, self._port.getBaudRate())
+
+    def _garbled(self, result: int) -> bool:
+        """Whether what answered the last exchange is no sound packet, though this program listened."""
+        return bool(result == self._sdk.COMM_RX_CORRUPT) and self._late_s <= STARVED_S
+
+    def _twice(self, id: int) -> str:
+        """What garbled answers mean."""
+        return (
+            f"its answers are garbled: two motors have the ID {id} (unplug one, then "
+            f"{self.command(f'set-id {id} NEW')} for the other), or a cable is bad"
+        )
+
+    def close(self) -> None:
+        """Close the port. Torque stays as it is."""
+        with self._lock:
+            if self._port.is_open:
+                self._port.closePort()
+
+    def _listen(self, length: int) -> bytes:
+        """Read the port, and keep by how much this program was later at it than it has to be."""
+        data: bytes = self._hear(length)
+        now = self.clock.now()
+        self._late_s = max(self._late_s, now - self._listened_s - WAIT_S)
+        self._listened_s = now
+        return data
+
+    @contextlib.contextmanager
+    def _line(self) -> Iterator[None]:
+        """The bus for one exchange. What the serial port raises becomes a BusError."""
+        with self._lock:
+            self._late_s, self._listened_s = 0.0, self.clock.now()
+            try:
+                yield
+            except (OSError, termios.error, TypeError) as error:  # a closed port raises TypeError
+                raise BusError(f"{self.port} is lost: {error}; is its adapter still there?") from error
+            finally:
+                self._port.is_using = False  # else no packet could follow an exchange that was interrupted
+
+    def _ask(self, ask: Callable[..., tuple[Any, int, int]], *arguments: Any) -> tuple[Any, int, int]:
+        """One exchange with one motor, again if no sound answer came: answer, result and error byte."""
+        first = self.clock.now()
+        for attempt in range(self.retries + 1):
+            last = self.clock.now()
+            with self._line():
+                answer, result, error = ask(self._port, *arguments)
+            sound = result == self._sdk.COMM_SUCCESS
+            if not sound or attempt:
+                # An answer that comes now is none to the next question. A sound one may have been to the
+                # first try, and that to the last is as late.
+                self.clock.sleep(LATE_S + (last - first if sound else 0.0))
+            if sound:
+                break
+        return answer, result, error
+
+    def ping(self, id: int) -> int | None:
+        """Model number of a motor, or None if it does not answer.
+
+        Raises:
+            GarbledError: Something answers, but not soundly.
+        """
+        number, result, _ = self._ask(self._packets.ping, id)
+        if self._garbled(result):
+            raise GarbledError(self._twice(id))
+        return int(number) if result == self._sdk.COMM_SUCCESS else None
+
+    def ping_all(self) -> dict[int, tuple[int, int]]:
+        """Model number and firmware version of every motor that answers a ping to all, by ID."""
+        with self._line():
+            found, _ = self._packets.broadcastPing(self._port)
+        return {int(id): (int(number), int(firmware)) for id, (number, firmware) in found.items()}
+
+    def missing(self) -> dict[int, str]:
+        """What is wrong with the motors that do not answer, or are of another model, by ID."""
+        wrong = {}
+        for id in self.ids:
+            try:
+                number = self.ping(id)
+            except GarbledError as error:
+                wrong[id] = str(error)
+                continue
+            if number is None:
+                wrong[id] = str(self._silence("does not answer"))
+            elif number != self.model.number:
+                wrong[id] = f"is {model_name(number)}, not {self.model.name}"
+        return wrong
+
+    def read(self, id: int, name: str) -> int:
+        """Value of one item of the control table.
+
+        Raises:
+            BusError: No sound answer.
+        """
+        item = self._items[name]
+        return item.from_bytes(self._read(id, name, item.address, item.size))
+
+    def read_table(self, id: int) -> dict[str, int]:
+        """The whole control table of a motor, with one packet: values by item.
+
+        Raises:
+            BusError: No sound answer; GarbledError where answers came that were none.
+        """
+        data = self._read(id, "the control table", 0, SIZE)
+        return {
+            name: item.from_bytes(data[item.address : item.address + item.size])
+            for name, item in self._items.items()
+        }
+
+    def _read(self, id: int, what: str, address: int, size: int) -> bytes:
+        """Bytes of the control table of a motor."""
+
+        def receive(_: Any, motor: int, address: int, size: int) -> tuple[bytes, int, int]:
+            result = self._packets.readTx(self._port, motor, address, size)
+            if result != self._sdk.COMM_SUCCESS:
+                return b"", result, 0
+            frame, result = self._packets.rxPacket(self._port, False)
+            answer = read_answer(bytes(frame)) if result == self._sdk.COMM_SUCCESS else None
+            # The SDK's own reading takes any answer, such as one to a write that came late.
+            if answer is None or answer.id != motor or (not answer.refused and len(answer.data) != size):
+                return b"", result if result != self._sdk.COMM_SUCCESS else self._sdk.COMM_RX_CORRUPT, 0
+            return answer.data, result, answer.error
+
+        data, result, error = self._ask(receive, id, address, size)
+        self._check(id, f"read {what}", result, error)
+        return bytes(data)
+
+    def write(self, id: int, name: str, value: int) -> None:
+        """Write one item of the control table.
+
+        Raises:
+            BusError: No sound answer, or the motor refused.
+        """
+        item = self._items[name]
+        data = list(item.to_bytes(value))
+
+        def send(*arguments: Any) -> tuple[None, int, int]:
+            return None, *self._packets.writeTxRx(*arguments)
+
+        _, result, error = self._ask(send, id, item.address, item.size, data)
+        self._check(id, f"write {value} to {name}", result, error)
+
+    def configure(self, settings: Mapping[int, MotorSettings]) -> None:
+        """Torque off, write what differs of the registers that are ours to set, and read all of it back.
+
+        Raises:
+            BusError: A motor did not answer, refused, or kept another value; names each.
+        """
+        wrong = []
+        for id in self.ids:
+            self.write(id, "torque_enable", 0)
+            for _ in range(2):  # another operating mode changes the gains
+                for one, (_, wanted) in different(self.read_table(id), self.model, settings[id]).items():
+                    self.write(id, one.name, wanted)
+            for one, (found, wanted) in different(self.read_table(id), self.model, settings[id]).items():
+                wrong.append(f"motor {id}: {one.name} is {found}, not {wanted}")
+        if wrong:
+            raise BusError("; ".join(wrong))
+        with self._lock:
+            self._settings = dict(settings)
+            self._states.fastest[:] = [settings[id].velocity_limit_rad_s for id in self.ids]
+            self._states.forget()
+
+    def torque(self, on: bool, ids: Iterable[int] | None = None) -> dict[int, str]:
+        """Switch torque on or off. Goes on to the other motors if one does not answer.
+
+        Returns:
+            What failed, by ID: with torque off, those motors may still be on.
+        """
+        failed = {}
+        for id in self.ids if ids is None else ids:
+            try:
+                self.write(id, "torque_enable", int(on))
+            except BusError as error:
+                failed[id] = str(error)
+        return failed
+
+    def release(self) -> None:
+        """Switch the torque of all motors off with one packet, which none of them answers.
+
+        Raises:
+            BusError: The packet could not be sent.
+        """
+        self._write_all("torque_enable", [0] * len(self.ids))
+
+    def watch(self, seconds: float) -> None:
+        """Have the motors stop where they are once the line was silent for so long; 0 switches that off.
+
+        A motor that has stopped so refuses goals until this is called again.
+
+        Raises:
+            BusError: No sound answer, or a motor refused.
+        """
+        for id in self.ids:
+            self.write(id, "bus_watchdog", 0)
+            if seconds > 0.0:
+                self.write(id, "bus_watchdog", max(1, round(seconds / WATCHDOG_UNIT_S)))
+
+    def freeze(self) -> None:
+        """Have the motors stop by themselves where they are, without an answer, within two units of silence.
+
+        The shortest bus watchdog, in one packet: what a line that brings no states still can do.
+
+        Raises:
+            BusError: The packet could not be sent.
+        """
+        self._write_all("bus_watchdog", [1] * len(self.ids))
+        self.clock.sleep(2.0 * WATCHDOG_UNIT_S)
+
+    def reboot(self, id: int) -> None:
+        """Restart a motor: clears its hardware error. Torque is off afterwards; configure it before use."""
+        with self._line():
+            result, error = self._packets.reboot(self._port, id)
+            self._states.forget()
+        self._check(id, "reboot", result, error)
+
+    def hardware_errors(self) -> dict[int, str]:
+        """Hardware errors of the motors that have one, in words, by ID."""
+        found = {id: self.read(id, "hardware_error_status") for id in self.ids}
+        return {id: describe_hardware_error(bits) for id, bits in found.items() if bits}
+
+    def write_goals(self, goals: np.ndarray, *, with_state: bool = False) -> None:
+        """Send all goals in one packet.
+
+        Args:
+            goals: Angles [rad], shape [D]; clipped to the limits that were configured.
+            with_state: Send them in one piece with the question of the next :meth:`read_state`, so that both
+                arrive at the same moment; others that are sent before take their place.
+
+        Raises:
+            ValueError: A goal that is no number; nothing is sent.
+            BusError: The packet could not be sent.
+        """
+        goals = np.asarray(goals, dtype=float)
+        if goals.shape != (len(self.ids),) or not np.isfinite(goals).all():
+            raise ValueError(f"goals have to be {len(self.ids)} finite angles, not {goals}")
+        counts = []
+        for id, goal in zip(self.ids, goals, strict=True):
+            if id in self._settings:
+                goal = np.clip(goal, self._settings[id].lower_rad, self._settings[id].upper_rad)
+            counts.append(to_counts(float(goal)))
+        self._write_all("goal_position", counts, later=with_state)
+
+    def _write_all(self, name: str, values: Sequence[int], *, later: bool = False) -> None:
+        """Write one item of every motor in one packet, now or with the question for their state."""
+        item = self._items[name]
+        rows = [
+            byte for id, value in zip(self.ids, values, strict=True) for byte in (id, *item.to_bytes(value))
+        ]
+        with self._line():
+            port = KeptPacket() if later else self._port
+            result = self._packets.syncWriteTxOnly(port, item.address, item.size, rows, len(rows))
+            self._goals = port.packet if later else b""
+        if result != self._sdk.COMM_SUCCESS:
+            raise BusError(f"{name} was not sent: {self._words(result)}")
+
+    def read_state(self, *, retries: int | None = None) -> HandState:
+        """Read all motors at once.
+
+        Args:
+            retries: How often to ask again; the bus' own by default.
+
+        Raises:
+            BusError: No whole, fresh and possible state came, also not when asked again; names the motor.
+        """
+        retries = self.retries if retries is None else retries
+        for attempt in range(retries + 1):
+            try:
+                return self._read_state()
+            except BusError:
+                self.rejected += 1
+                self._length = STATE_BYTES + OTHER_BYTES - self._length
+                if attempt == retries:
+                    raise
+        raise AssertionError("retries are not negative")
+
+    def _read_state(self) -> HandState:
+        with self._line():
+            asked = self.clock.now()
+            goals, self._goals = self._goals, b""
+            heard, answers = self._ask_all(STATE_ADDRESS, self._length, before=goals)
+            took = self.clock.now() - asked
+            if took > CLOCK_TOLERANCE_S:
+                # This process did not run: whose time is not known is nothing to compare later ones with.
+                raise LateError(f"the state took {took:.3f} s: {BUSY}")
+            # Motors measure when they have heard it, or not before they answer. A later time than theirs
+            # would look like a delay of the goals, which has a name; an earlier one does not.
+            return self._states.accept(heard, answers)
+
+    def read_torque(self) -> np.ndarray:
+        """Whether each motor has its torque on, shape [D] bool.
+
+        Raises:
+            BusError: A motor did not answer, also not when asked again.
+        """
+        item = self._items["torque_enable"]
+        for attempt in range(self.retries + 1):
+            try:
+                with self._line():
+                    _, answers = self._ask_all(item.address, item.size)
+                break
+            except BusError:
+                if attempt == self.retries:
+                    raise
+        return np.array([bool(item.from_bytes(answer.data)) for answer in answers])
+
+    def _ask_all(self, address: int, length: int, before: bytes = b"") -> tuple[float, list[Answer]]:
+        """Ask all motors for the same bytes with one packet: when they heard it [s], and what each answers.
+
+        Args:
+            address: First byte.
+            length: How many.
+            before: Packets to send in one piece with it.
+        """
+        ids, question = list(self.ids), KeptPacket()
+        self._packets.syncReadTx(question, address, length, ids, len(ids), fast_option=False)
+        packets = before + question.packet
+        self._port.clearPort()
+        if self._port.writePort(packets) != len(packets):
+            raise BusError("the motors were not asked: the port did not take the packet")
+        self._port.setPacketTimeout(question.answer_bytes)
+        # One time for all: the SDK counts no time for the answers' bytes.
+        heard = self._listened_s = self.clock.now()
+        answers = [self._answer(id, length) for id in ids]
+        for answer in answers:
+            if answer.refused:
+                raise BusError(f"motor {answer.id}: {answer.refused}")
+            if len(answer.data) != length:
+                raise BusError(f"motor {answer.id}: {len(answer.data)} bytes came, not {length}")
+        return heard, answers
+
+    def _answer(self, id: int, length: int) -> Answer:
+        """This motor's next answer."""
+        while True:
+            frame, result = self._packets.rxPacket(self._port, False)
+            if result != self._sdk.COMM_SUCCESS:
+                raise self._failure(f"motor {id}", result)
+            answer = read_answer(bytes(frame))
+            if answer is None:
+                raise BusError(f"motor {id}: what answered is no status packet")
+            late = len(answer.data) in {STATE_BYTES, OTHER_BYTES, TORQUE_BYTES} - {length}
+            if answer.id == id and not late:
+                return answer  # others come late from an exchange before; the time limit is one for all
+
+    def _words(self, result: int) -> str:
+        """What went wrong in an exchange, in the SDK's words."""
+        return str(self._packets.getTxRxResult(result)).removeprefix("[TxRxResult] ").rstrip("!.")
+
+    def _silence(self, what: str) -> BusError:
+        """Nobody was heard in the last exchange: by this program's own fault, or the motor's."""
+        if self._late_s > STARVED_S:
+            return LateError(f"{what}: this program was {self._late_s:.3f} s late to listen: {BUSY}")
+        return SilentError(f"{what}: {self._remedy()}")
+
+    def _failure(self, what: str, result: int) -> BusError:
+        """What went wrong in the last exchange."""
+        if result == self._sdk.COMM_RX_TIMEOUT or self._late_s > STARVED_S:
+            return self._silence(f"{what} does not answer")
+        return BusError(f"{what}: {self._words(result)}")
+
+    def _check(self, id: int, what: str, result: int, error: int) -> None:
+        if self._garbled(result):
+            raise GarbledError(f"motor {id}: {what}: {self._words(result)}: {self._twice(id)}")
+        if result != self._sdk.COMM_SUCCESS:
+            raise self._failure(f"{what}: motor {id}", result)
+        if refused := Answer(id, error, b"").refused:
+            raise BusError(f"motor {id}: {what}: {refused}")

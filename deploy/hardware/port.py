@@ -1,0 +1,152 @@
+"""The serial port of the motors, for one program at a time: two on one line undo what the other does."""
+
+import errno
+import fcntl
+import grp
+import os
+import re
+import termios
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from vd.deploy.finding import BAUD_RATE
+from vd.deploy.hardware.answers import BusError
+
+WAIT_S = 0.002
+"""How long a read of the port sleeps at most until its bytes are there. The SDK's own does not sleep but asks
+again and again, which takes a core, and keeps whatever shares it from answering."""
+PSEUDO_TERMINALS = "/dev/pts/"
+"""A twin holds its own end of these open, so exclusive use by one program is for the lock alone."""
+LONGEST_COMMAND = 80
+
+
+class KeptPacket:
+    """In place of a port: keeps the packet that the SDK makes."""
+
+    def __init__(self) -> None:
+        self.is_using, self.packet, self.answer_bytes = False, b"", 0
+
+    def clearPort(self) -> None:  # noqa: N802 (the SDK's name)
+        """Nothing has come."""
+
+    def writePort(self, packet: Sequence[int]) -> int:  # noqa: N802
+        """Keep it."""
+        self.packet = bytes(packet)
+        return len(packet)
+
+    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
+        """Keep how long the answer is."""
+        self.answer_bytes = packet_length
+
+
+def sdk() -> ModuleType:
+    """The motors' SDK.
+
+    Raises:
+        BusError: It is not installed.
+    """
+    try:
+        import dynamixel_sdk
+    except ImportError as error:
+        raise BusError("motors need dynamixel-sdk: pip install -e '.[hardware]'") from error
+    return dynamixel_sdk
+
+
+def open_port(path: str, baud_rate: int = BAUD_RATE) -> Any:
+    """A serial port as the SDK takes it, locked for this process until it is closed or the process ends.
+
+    Args:
+        path: Device, such as /dev/ttyUSB0.
+        baud_rate: Of the port; the motors' own has to be the same.
+
+    Raises:
+        BusError: It cannot be opened, another program has it, or there is no SDK.
+    """
+    handler = sdk().PortHandler(path)
+    try:
+        _ask_for(path)
+        opened = handler.setBaudRate(baud_rate)
+        if opened:
+            fcntl.flock(handler.ser.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not pseudo(path):
+                fcntl.ioctl(handler.ser.fileno(), termios.TIOCEXCL)
+    except OSError as error:  # the SDK lets errors of the serial port through
+        if handler.is_open:
+            handler.closePort()
+        raise BusError(f"cannot open {path}: {_why(path, error)}") from error
+    if not opened:
+        raise BusError(f"{path}: no baud rate {baud_rate}")
+    handler.ser.timeout = WAIT_S
+    return handler
+
+
+def _ask_for(path: str) -> None:
+    """Whether the port is free, before the SDK opens it: that drops what has come for whoever has it.
+
+    Raises:
+        OSError: It is not, or cannot be opened.
+    """
+    probe = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        fcntl.flock(probe, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    finally:
+        os.close(probe)
+    if not pseudo(path) and any(pid != os.getpid() for pid, _ in _holders(path)):
+        raise OSError(errno.EBUSY, "another program has it open")
+
+
+def pseudo(path: str) -> bool:
+    """Whether a port is a pseudo-terminal, as a twin's is: it has no baud rate, so motors answer at each."""
+    return os.path.realpath(path).startswith(PSEUDO_TERMINALS)
+
+
+def _why(path: str, error: OSError) -> str:
+    """Why a port cannot be opened, with the remedy."""
+    if error.errno in (errno.EBUSY, errno.EWOULDBLOCK):
+        held = list(_holders(path))
+        # On a pseudo-terminal the twin has its own end open: the one with the lock is meant.
+        named = [pid for pid, locked in held if locked] or [pid for pid, _ in held if pid != os.getpid()]
+        who = ", ".join(f"process {pid} ({_command(pid)})" for pid in named) or "another user's program"
+        return f"it is in use by {who}; one program at a time may drive the motors: end that one first"
+    if error.errno == errno.EACCES:
+        group = _group(path)
+        return (
+            f"permission denied: it belongs to the group {group}; "
+            f"`sudo usermod -aG {group} $USER`, then log out and in again"
+        )
+    if error.errno == errno.ENOENT:
+        there = sorted(str(one) for kind in ("ttyUSB*", "ttyACM*") for one in Path("/dev").glob(kind))
+        return f"there is no such device; is the adapter plugged in? There are: {', '.join(there) or 'none'}"
+    return f"{error}; is it the motors' adapter?"
+
+
+def _holders(path: str) -> Iterator[tuple[int, bool]]:
+    """Processes that have a device open, as far as we may know, and whether each has it locked."""
+    device = os.path.realpath(path)
+    for link in Path("/proc").glob("[0-9]*/fd/*"):
+        try:
+            if str(link.readlink()) == device:
+                lock = (link.parents[1] / "fdinfo" / link.name).read_text()
+                yield int(link.parts[2]), bool(re.search(r"^lock:.*FLOCK", lock, re.MULTILINE))
+        except OSError:  # it has just ended, or is another user's
+            continue
+
+
+def _command(pid: int) -> str:
+    """How a process was called."""
+    try:
+        words = Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ")
+    except OSError:
+        words = ""
+    words = " ".join(words.split())
+    return words if len(words) <= LONGEST_COMMAND else f"{words[:LONGEST_COMMAND]} ..."
+
+
+def _group(path: str) -> str:
+    """Group of a device: dialout on Debian and Ubuntu, uucp elsewhere."""
+    try:
+        return grp.getgrgid(Path(path).stat().st_gid).gr_name
+    except (KeyError, OSError):
+        return "dialout"

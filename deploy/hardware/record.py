@@ -1,0 +1,389 @@
+"""Record motions for vd-gap: the paper's steps and sines, or a plan of vd-gap's, finger by finger."""
+
+import csv
+import itertools
+import json
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import tyro
+
+from vd.deploy.clock import Pacer
+from vd.deploy.hardware.answers import HandState
+from vd.deploy.hardware.check import ready
+from vd.deploy.hardware.connect import Connection, HandOptions, connect
+from vd.deploy.hardware.control_table import RAD_PER_COUNT
+from vd.deploy.hardware.motion import move
+from vd.deploy.hardware.motor_time import measured_at
+from vd.deploy.hardware.registers import D_GAIN, P_GAIN
+from vd.deploy.safety.limits import SafetyCfg
+from vd.deploy.safety.safety import SafeHand
+from vd.deploy.timely import Priority, real_time, undisturbed
+from vd.files import check_folder
+
+if TYPE_CHECKING:
+    from vd.assets_usd.hand_model import HandModel
+    from vd.gap.excitations import Excitation
+    from vd.gap.recording import Recording, Trajectory
+
+RATE_HZ = 100.0
+"""Rate that is tried, that of the excitations; the bus may be slower."""
+ROUNDING_S = 1e-6
+"""Of times on the grid of samples."""
+SPEED_RAD_S = 1.0
+"""Of the way to where a motion starts."""
+JOINTS_PER_FINGER = 3
+ASIDE = 0.8
+"""Where the other fingers swing to meanwhile, outward, as a share of half their range: on the three-finger
+hand a straight finger that bends through its range would press on its neighbour."""
+WIDE = SafetyCfg(step_rad=4.0)
+"""Steps go through most of a joint's range at once, which a policy must not."""
+TWIN_ARGS = "--physics-hz 3840"
+"""Steps of the twin so short that its integrator is as exact as vd-gap's: at 960 Hz it is off by 0.3 mrad
+(median of a moving hand; up to 0.9), two thirds of what the encoders round."""
+RATE_SHARE = 0.95
+"""Share of the rate that is wanted below which a recording says that it missed it."""
+AGAIN_S = 0.01
+"""A state that was asked for so long after its goal was sent was asked for again."""
+STATE_CHANNELS = ("velocity", "current", "pwm", "voltage", "temperature")
+
+
+class RecordError(ValueError):
+    """A recording that cannot be made or gone on with; names the file and the remedy."""
+
+
+@dataclass(frozen=True)
+class RecordCfg(HandOptions):
+    """Record motions for vd-gap. Started again with the same options, it goes on where it stopped.
+
+    One joint moves at a time, the others hold; nothing may be in the way, and no object in the hand.
+    """
+
+    out: Path = Path("recording")
+    """Folder of the recording."""
+    fingers: tuple[int, ...] = ()
+    """Fingers to move, from 0; all by default."""
+    excitations: tuple[str, ...] = ("steps_and_sines",)
+    """Sets of motions, as vd-gap names them."""
+    plan: Path | None = None
+    """Plan of vd-gap (next_experiment.json) in place of --excitations; its motions are added to --out."""
+    rate_hz: float = RATE_HZ
+    """Samples a second, as far as the bus allows."""
+    safety: SafetyCfg = field(default_factory=lambda: WIDE)
+    """Limits."""
+    realtime: Priority = "auto"
+    """Run before all ordinary programs, the twin too: where that is permitted (root, ulimit -r), always, or
+    never."""
+    yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Do not ask before it moves."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print what was recorded as JSON."""
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """One motion to record: an excitation of the whole hand."""
+
+    file: str
+    """Its CSV file, by which it is known to be recorded."""
+    excitation: "Excitation"
+
+    @property
+    def payload(self) -> tuple[float, str]:
+        """Mass that has to hang at a fingertip [kg], and at whose; of nobody without one."""
+        mass = float(self.excitation.conditions.get("payload_kg", 0.0))
+        return mass, self.excitation.joints[0].partition("_")[0] if mass > 0.0 else ""
+
+
+def motions_of(hand: "HandModel", fingers: Sequence[int], sets: Sequence[str]) -> list[Motion]:
+    """The motions of excitation sets, finger by finger.
+
+    Raises:
+        ValueError: A set or a finger is unknown.
+    """
+    from vd.gap.excitations import JointRange, excitation_set
+
+    reach = JointRange(hand.joint_names, hand.lower, hand.upper, p_gain=float(P_GAIN))
+    every = excitation_set(reach, sets)
+    joints = joints_of(hand, fingers)
+    ordered = sorted(
+        (motion for motion in every if motion.joints[0] in joints),
+        key=lambda motion: hand.joint_names.index(motion.joints[0]) // JOINTS_PER_FINGER,
+    )
+    return [
+        _motion(f"{index:03d}_{motion.joints[0]}_{motion.name}.csv", motion, hand)
+        for index, motion in enumerate(ordered)
+    ]
+
+
+def _motion(file: str, excitation: "Excitation", hand: "HandModel") -> Motion:
+    """An excitation with the fingers aside that it does not move, and the usual gain if it names none."""
+    command = excitation.command.copy()
+    moved = {name.partition("_")[0] for name in excitation.joints}
+    for swing in range(0, len(hand.joint_names), JOINTS_PER_FINGER):
+        if hand.joint_names[swing].partition("_")[0] not in moved:
+            low, high = hand.lower[swing], hand.upper[swing]
+            command[:, swing] = 0.5 * (low + high) + ASIDE * 0.5 * (high - low)
+    conditions = {"p_gain": float(P_GAIN), **excitation.conditions}
+    return Motion(file, replace(excitation, command=command, conditions=conditions))
+
+
+def read_plan(path: Path, hand: "HandModel") -> list[Motion]:
+    """The motions of a plan that ``vd-gap plan`` wrote; joints that it does not name are straight.
+
+    Args:
+        path: ``next_experiment.json``, or the folder with it.
+        hand: The hand.
+
+    Raises:
+        RecordError: It is no such plan, or one of another hand.
+    """
+    from vd.gap.excitations import Excitation
+
+    file = path / "next_experiment.json" if path.is_dir() else path
+    try:
+        plan: dict[str, Any] = json.loads(file.read_text())
+        entries, joints = plan["trajectories"], plan["joints"]
+        columns = [hand.joint_names.index(name) for name in joints]
+    except (OSError, json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise RecordError(f"{file} is no plan for {hand.name}: {error}; vd-gap plan writes one") from error
+    motions = []
+    for entry in entries:
+        with (file.parent / entry["file"]).open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+        time_s = np.array([float(row["t"]) for row in rows])
+        command = np.tile(0.5 * (hand.lower + hand.upper), (len(rows), 1))
+        enabled = np.ones(command.shape, dtype=bool)
+        for name, column in zip(joints, columns, strict=True):
+            command[:, column] = [float(row[f"command.{name}"]) for row in rows]
+            enabled[:, column] = [row.get(f"enabled.{name}", "1") == "1" for row in rows]
+        excitation = Excitation(
+            entry["excitation"], tuple(entry["joints"]), time_s, command, entry["conditions"], enabled
+        )
+        motions.append(_motion("plan_" + Path(entry["file"]).name, excitation, hand))
+    return motions
+
+
+def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
+    """Joints of some fingers, all without any.
+
+    Raises:
+        ValueError: The hand lacks a finger.
+    """
+    wrong = [finger for finger in fingers if not 0 <= finger < hand.num_fingers]
+    if wrong:
+        raise ValueError(f"--fingers {wrong[0]}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")
+    chosen = sorted(set(fingers)) or range(hand.num_fingers)
+    return tuple(name for f in chosen for name in hand.joint_names[3 * f : 3 * f + JOINTS_PER_FINGER])
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One sample."""
+
+    state: HandState
+    """What was measured."""
+    goal: np.ndarray
+    """Angles of the joints that were sent with the question for it [rad] [D]."""
+    sent_s: float
+    """When [s]."""
+    on: np.ndarray
+    """Whether each joint's torque is on [D]."""
+
+
+class Recorder:
+    """Plays motions on an armed hand and keeps what it answers.
+
+    Args:
+        connection: The hand.
+        joints: Names of the recorded joints.
+        rate_hz: Samples a second that are tried.
+    """
+
+    def __init__(self, connection: Connection, joints: Sequence[str], rate_hz: float):
+        self._connection, self._rate = connection, rate_hz
+        names = connection.joints.names
+        self._columns = [names.index(name) for name in joints]
+
+    def play(self, safe: SafeHand, motion: Motion) -> "Trajectory":
+        """Go to where the motion starts, play it, and give what was measured.
+
+        A sample is a goal and the state at the moment at which it arrived.
+
+        Raises:
+            StoppedError: The hand was stopped.
+            BusError: A gain could not be written.
+        """
+        excitation = motion.excitation
+        move(safe, excitation.command[0], SPEED_RAD_S)
+        gain = int(float(excitation.conditions["p_gain"]))
+        self._set_gain(gain)
+        rows: list[Row] = []
+        pacer, last = Pacer(self._rate, self._connection.bus.clock), -np.inf
+        pacer.wait()
+        begin = pacer.due_s
+        on = np.ones(len(self._connection.joints.ids), dtype=bool)
+        while (now := pacer.due_s - begin) < excitation.duration:
+            at = int(np.searchsorted(excitation.time, now + ROUNDING_S, side="right")) - 1
+            if not np.array_equal(on, excitation.enabled[at]):
+                on = excitation.enabled[at]
+                safe.switch(on)
+            goal = safe.command(excitation.command[at], with_state=True)
+            sent_s = self._connection.bus.clock.now()
+            state = safe.read()
+            if state.time_s > last:  # else the last one again
+                rows.append(Row(state, goal, sent_s, on))
+                last = state.time_s
+            safe.beat()
+            pacer.wait()
+        if not on.all():
+            safe.switch(np.ones_like(on))
+        self._set_gain(P_GAIN)
+        return self._trajectory(motion, rows)
+
+    def _set_gain(self, gain: int) -> None:
+        bus = self._connection.bus
+        for column in self._columns:
+            id = self._connection.joints.ids[column]
+            if bus.read(id, "position_p_gain") != gain:
+                bus.write(id, "position_p_gain", gain)
+
+    def _trajectory(self, motion: Motion, rows: Sequence["Row"]) -> "Trajectory":
+        from vd.gap.recording import Trajectory
+
+        states = [row.state for row in rows]
+
+        def column(values: Sequence[np.ndarray]) -> np.ndarray:
+            return np.array(values)[:, self._columns]
+
+        asked_s, sent_s = np.array([state.time_s for state in states]), np.array([row.sent_s for row in rows])
+        measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
+        # A goal arrives with the question for its state, unless that was asked again.
+        sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
+        measured: dict[str, Any] = {
+            name: column([getattr(state, name) for state in states]) for name in STATE_CHANNELS
+        }
+        excitation = motion.excitation
+        return Trajectory(
+            file=motion.file,
+            excitation=excitation.name,
+            joints=excitation.joints,
+            conditions=excitation.conditions,
+            time=measured_s - measured_s[0],
+            command_time=sent_s - measured_s[0],
+            command=column([row.goal for row in rows]),
+            position=column([state.position for state in states]),
+            enabled=column([row.on for row in rows]),
+            # A motor that does not tell its duty cycle says zero.
+            **{name: values for name, values in measured.items() if name != "pwm" or values.any()},
+        )
+
+
+def record(cfg: RecordCfg) -> int:
+    """Record what is not recorded yet."""
+    from vd.gap.recording import write_recording
+
+    if not cfg.rate_hz > 0.0:
+        raise ValueError(f"--rate-hz is {cfg.rate_hz}; it has to be above 0")
+    check_folder(cfg.out)
+    twin_args = f"{TWIN_ARGS} --realtime {cfg.realtime} {cfg.twin_args}"
+    with (
+        connect(replace(cfg, twin_args=twin_args)) as connection,
+        undisturbed(),
+        real_time(cfg.realtime),
+    ):
+        hand = connection.hand
+        joints = joints_of(hand, cfg.fingers)
+        motions = (
+            motions_of(hand, cfg.fingers, cfg.excitations) if cfg.plan is None else read_plan(cfg.plan, hand)
+        )
+        recording = _begun(cfg, connection, joints)
+        done = {trajectory.file for trajectory in recording.trajectories}
+        left = [motion for motion in motions if motion.file not in done]
+        print(f"{len(motions)} motions, {len(motions) - len(left)} of them recorded", file=sys.stderr)
+        written: list[Future[Path]] = []
+        # Beside the loop: a hand that holds has to be told so all the time.
+        with ThreadPoolExecutor(1) as writer:
+
+            def keep(trajectory: "Trajectory") -> None:
+                nonlocal recording
+                recording = replace(recording, trajectories=(*recording.trajectories, trajectory))
+                only = (trajectory.file,)
+                written.append(writer.submit(write_recording, recording, cfg.out, only=only))
+
+            left.sort(key=lambda motion: motion.payload)
+            for payload, group in itertools.groupby(left, key=lambda motion: motion.payload):
+                _session(cfg, connection, joints, list(group), payload, keep)
+        for one in written:
+            one.result()
+    if cfg.json:
+        files = [trajectory.file for trajectory in recording.trajectories]
+        print(json.dumps({"recording": str(cfg.out), "trajectories": files}, indent=1))
+    else:
+        print(f"{cfg.out}: {len(recording.trajectories)} motions; vd-gap run {cfg.out} --out gap")
+    return 0
+
+
+def _session(
+    cfg: RecordCfg,
+    connection: Connection,
+    joints: tuple[str, ...],
+    motions: Sequence[Motion],
+    payload: tuple[float, str],
+    keep: Callable[["Trajectory"], None],
+) -> None:
+    """Motions with one payload [kg] at one finger, between preflight and torque off."""
+    payload_kg, finger = payload
+    seconds = sum(motion.excitation.duration for motion in motions)
+    question = f"The hand will move for about {seconds:.0f} s, one joint at a time and quickly."
+    if payload_kg > 0.0:
+        if cfg.yes or cfg.twin:
+            raise RecordError(f"{motions[0].file}: somebody has to hang {payload_kg:g} kg at the fingertip")
+        question = f"Hang {payload_kg:g} kg at the fingertip of {finger}. {question}"
+    ready(connection, question, yes=cfg.yes, quiet=cfg.json)
+    recorder = Recorder(connection, joints, cfg.rate_hz)
+    with SafeHand(connection.bus, connection.joints, connection.hand, cfg.safety) as safe:
+        safe.arm()
+        for number, motion in enumerate(motions, 1):
+            trajectory = recorder.play(safe, motion)
+            rate = (len(trajectory.time) - 1) / trajectory.time[-1]
+            what = f"{number}/{len(motions)} {Path(motion.file).stem}"
+            missed = _missed(rate, cfg.rate_hz)
+            print(
+                f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz{missed}", file=sys.stderr, flush=True
+            )
+            keep(trajectory)
+
+
+def _missed(rate_hz: float, wanted_hz: float) -> str:
+    """What to say of a rate below the one that is wanted [Hz]; empty for one that is kept."""
+    if rate_hz >= RATE_SHARE * wanted_hz:
+        return ""
+    return (
+        f", not {wanted_hz:g}: a sample takes {1e3 / rate_hz:.1f} ms; look at the adapter's latency timer, "
+        f"the baud rate, end other programs, or ask for --rate-hz {rate_hz:.0f}"
+    )
+
+
+def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":
+    """The recording in the folder, or an empty one."""
+    from vd.assets_usd.hand_spec import HANDS
+    from vd.gap.recording import Recording, read_recording
+
+    hand = connection.hand
+    if (cfg.out / "recording.json").exists():
+        found = read_recording(cfg.out)
+        if found.joints != joints or found.model != hand.name:
+            raise RecordError(
+                f"{cfg.out} is of {found.model}, {', '.join(found.joints)}; choose another --out"
+            )
+        return found
+    if hand.name not in HANDS:
+        raise RecordError(f"a recording names its hand, and {hand.name} is none of {', '.join(HANDS)}")
+    servo = {"model": connection.bus.model.name, "p_gain": P_GAIN, "d_gain": D_GAIN}
+    return Recording(cfg.out, hand.name, joints, servo, RAD_PER_COUNT, ())

@@ -1,0 +1,123 @@
+"""The registers of a motor that matter: what is wanted of each, whether we set it or refuse, and why.
+
+One table for the preflight, which compares, and for :meth:`vd.deploy.hardware.bus.MotorBus.configure`, which
+writes. What is wanted is the hand's own value, and else the factory's. The other registers tell, or act in
+other operating modes alone: velocity gains, goal current, goal velocity.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from vd.deploy.hardware.control_table import EEPROM_END, RAD_S_PER_COUNT, Model, table, to_counts
+
+P_GAIN, D_GAIN = 200, 10
+"""Position gains of the paper's motors, in their units."""
+WIZARD = "set it to {wanted} with ROBOTIS' DYNAMIXEL Wizard 2.0"
+
+
+@dataclass(frozen=True)
+class Register:
+    """One register that has to be right before a hand moves."""
+
+    name: str
+    """Item of the control table."""
+    why: str
+    """What another value does."""
+    remedy: str = ""
+    """What a person has to do where it is not ours to set; empty where we set it."""
+    bits: bool = False
+    """Whether its bits are protections, of which more may be on than are wanted."""
+
+    def right(self, found: int, wanted: int) -> bool:
+        """Whether a value will do."""
+        return found & wanted == wanted if self.bits else found == wanted
+
+
+REGISTERS = (
+    Register(
+        "drive_mode", "angles, profiles or the torque follow other rules", f"{WIZARD}, and calibrate again"
+    ),
+    Register("homing_offset", "angles begin elsewhere", f"{WIZARD}, and calibrate again"),
+    Register("status_return_level", "writes or reads stay unanswered", "{reboot}"),
+    # In the order to write them: the mode resets gains and profiles, a watchdog that acted locks the goals.
+    Register("operating_mode", "goals are no positions"),
+    Register("bus_watchdog", "goals are refused, or it stops too early"),
+    Register("secondary_id", "it obeys what is sent to another motor, too"),
+    Register("return_delay_time", "its answers come late"),
+    Register("startup_configuration", "it switches itself on, or restores other settings, at a start"),
+    Register("temperature_limit", "it shuts down too hot, or too early"),
+    Register("max_voltage_limit", "it takes another supply for right"),
+    Register("min_voltage_limit", "it takes another supply for right"),
+    Register("shutdown", "it does not protect itself", bits=True),
+    Register("pwm_limit", "its torque and speed are cut"),
+    Register("current_limit", "its limit is not the joint's"),
+    Register("velocity_limit", "its limit is not the joint's"),
+    Register("min_position_limit", "its limit is not the joint's"),
+    Register("max_position_limit", "its limit is not the joint's"),
+    Register("position_p_gain", "it is not as stiff as in training"),
+    Register("position_i_gain", "it overshoots, and pushes ever harder"),
+    Register("position_d_gain", "it is not damped as in training"),
+    Register("feedforward_1st_gain", "it is pushed beyond its goals"),
+    Register("feedforward_2nd_gain", "it is pushed beyond its goals"),
+    Register("goal_pwm", "its torque and speed are cut"),
+    Register("profile_acceleration", "it comes slowly to its goals"),
+    Register("profile_velocity", "it comes slowly to its goals"),
+)
+"""The table."""
+
+
+@dataclass(frozen=True)
+class MotorSettings:
+    """What is written to a motor at start, and read back."""
+
+    current_limit_a: float
+    """Largest current [A]."""
+    velocity_limit_rad_s: float
+    """Largest speed [rad/s]."""
+    lower_rad: float
+    """Least angle [rad]."""
+    upper_rad: float
+    """Largest angle [rad]."""
+    p_gain: int = P_GAIN
+    d_gain: int = D_GAIN
+    return_delay_us: int = 0
+    """Wait before an answer [us]; 500 from the factory."""
+
+    def values(self, model: Model) -> dict[str, int]:
+        """Values of the control table that are the joint's own, by item."""
+        return {
+            "return_delay_time": self.return_delay_us // 2,
+            "current_limit": int(self.current_limit_a / model.current_unit_a),
+            "velocity_limit": int(self.velocity_limit_rad_s / RAD_S_PER_COUNT),
+            "min_position_limit": to_counts(self.lower_rad),
+            "max_position_limit": to_counts(self.upper_rad),
+            "position_p_gain": self.p_gain,
+            "position_d_gain": self.d_gain,
+        }
+
+
+def different(
+    found: Mapping[str, int], model: Model, settings: MotorSettings, *, ours: bool = True
+) -> dict[Register, tuple[int, int]]:
+    """Registers that are not as they should be: the value of each, and the wanted one.
+
+    Args:
+        found: Control table of a motor.
+        model: Its model.
+        settings: What its joint wants; the factory's values otherwise.
+        ours: Those that we set, else those that only a person can.
+    """
+    items, own = table(model), settings.values(model)
+    wanted = {
+        one: own.get(one.name, items[one.name].initial) for one in REGISTERS if ours != bool(one.remedy)
+    }
+    return {
+        one: (found[one.name], value)
+        for one, value in wanted.items()
+        if not one.right(found[one.name], value)
+    }
+
+
+def kept(model: Model, register: Register) -> bool:
+    """Whether a register is kept without power (EEPROM)."""
+    return table(model)[register.name].address < EEPROM_END

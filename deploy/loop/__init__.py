@@ -1,0 +1,1 @@
+"""The control loop: from senses to goals at 12 Hz, its log, and its score."""

@@ -1,0 +1,168 @@
+"""Writing the log of a run on a hand: rows and events are appended whole, by a thread.
+
+A write can wait for the disk as long as other programs keep that busy, and the hand must not.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd.assets_usd.hand_data import HandModel
+from vd.assets_usd.hand_spec import HANDS
+from vd.deploy.clock import MONOTONIC, Clock
+from vd.deploy.hardware.control_table import RAD_PER_COUNT
+from vd.files import make_folder, write_json, writing
+from vd.gap.recording import COMMAND_TIME
+from vd.gap.recording import FORMAT as RECORDING_FORMAT
+from vd.hand_log import (
+    EVENTS_FILE,
+    IMAGES,
+    JOINT_CHANNELS,
+    LOG_FORMAT,
+    RECORDING_FILE,
+    RUN_FILE,
+    STEP_COLUMNS,
+    STEPS_FILE,
+    TRUTH_COLUMNS,
+)
+
+DIGITS = 6
+
+
+class LogWriter:
+    """A log being written.
+
+    Args:
+        folder: To make; it must not hold a log.
+        hand: The hand.
+        run: What runs: policy, object, goals (quaternions xyzw), and whatever is worth to know.
+        servo: What is known of the motors: model, gains.
+        truth: Whether the object's pose is known: a twin's.
+        clock: Time.
+
+    Raises:
+        FileExistsError: There is a log already.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        hand: HandModel,
+        run: Mapping[str, Any],
+        *,
+        servo: Mapping[str, Any],
+        truth: bool = False,
+        clock: Clock = MONOTONIC,
+    ):
+        if (folder / RUN_FILE).exists():
+            raise FileExistsError(f"{folder} holds a log; choose another folder")
+        make_folder(folder)
+        self.folder, self._joints = folder, hand.joint_names
+        self._clock, self.started_s = clock, clock.now()
+        self._run = {
+            "format": LOG_FORMAT,
+            "hand": hand.name,
+            "joints": list(hand.joint_names),
+            "unix_s": time.time(),
+            **run,
+        }
+        recording = {
+            "format": RECORDING_FORMAT,
+            "model": hand.name if hand.name in HANDS else "servo",
+            "joints": list(hand.joint_names),
+            "servo": dict(servo),
+            "encoder_resolution_rad": RAD_PER_COUNT,
+            "trajectories": [{"file": STEPS_FILE, "excitation": "policy", "joints": list(hand.joint_names)}],
+        }
+        self._columns = [
+            "t",
+            COMMAND_TIME,
+            *(f"{channel}.{joint}" for channel in JOINT_CHANNELS for joint in hand.joint_names),
+            *STEP_COLUMNS,
+            *(TRUTH_COLUMNS if truth else ()),
+        ]
+        flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
+        self._steps = os.open(folder / STEPS_FILE, flags, 0o644)
+        self._events = os.open(folder / EVENTS_FILE, flags, 0o644)
+        self._writer = ThreadPoolExecutor(1, "log")
+        self._written: Future[Any] | None = None
+        self._append(self._steps, ",".join(self._columns))
+        write_json(folder / RECORDING_FILE, recording)
+        write_json(folder / RUN_FILE, self._run)
+
+    def since(self, time_s: float) -> float:
+        """Seconds from the start of the log to a time of the monotonic clock."""
+        return time_s - self.started_s
+
+    def step(
+        self,
+        time_s: float,
+        sent_s: float,
+        joints: Mapping[str, np.ndarray],
+        values: Sequence[float],
+        truth: Sequence[float] = (),
+    ) -> None:
+        """Append a control step.
+
+        Args:
+            time_s: When the state was read, by the monotonic clock [s].
+            sent_s: When the goals were sent, by the same clock [s].
+            joints: Each of JOINT_CHANNELS [D].
+            values: In the order of STEP_COLUMNS.
+            truth: In the order of TRUTH_COLUMNS, if they are logged.
+        """
+        row = [
+            self.since(time_s),
+            self.since(sent_s),
+            *(v for channel in JOINT_CHANNELS for v in joints[channel]),
+            *values,
+            *truth,
+        ]
+        self._append(self._steps, ",".join(f"{value:.{DIGITS}f}" for value in row))
+
+    def image(self, step: int, depth_m: np.ndarray) -> None:
+        """Keep the depth image of a step [m] [H, W]."""
+        self._later(_save, self.folder / IMAGES / f"{step:06d}.npy", depth_m.copy())
+
+    def event(self, event: str, **values: Any) -> None:
+        """Append an event of this moment."""
+        line = {"t": round(self.since(self._clock.now()), DIGITS), "event": event, **values}
+        self._append(self._events, json.dumps(line))
+
+    def finish(self, reason: str, **summary: Any) -> None:
+        """Say how it ended, and close the files.
+
+        Raises:
+            OSError: Something could not be written.
+        """
+        self.event("end", reason=reason)
+        self._writer.shutdown()
+        os.close(self._steps)
+        os.close(self._events)
+        write_json(self.folder / RUN_FILE, {**self._run, "end": {"reason": reason, **summary}})
+        self._check()
+
+    def _append(self, file: int, line: str) -> None:
+        self._later(os.write, file, line.encode() + b"\n")  # one call: whole, or not at all
+
+    def _later(self, write: Callable[..., Any], *arguments: Any) -> None:
+        self._check()
+        self._written = self._writer.submit(write, *arguments)
+
+    def _check(self) -> None:
+        """Raise what went wrong in writing: a run without its log is not worth going on with."""
+        if self._written is not None and self._written.done():
+            with writing(self.folder):
+                self._written.result()
+
+
+def _save(file: Path, values: np.ndarray) -> None:
+    """Write an array, in a folder that is made for the first one."""
+    file.parent.mkdir(exist_ok=True)
+    np.save(file, values)

@@ -1,0 +1,1 @@
+"""Limits and a watchdog that hold whatever decides on goals."""

@@ -1,0 +1,110 @@
+"""Limits of a hand that hold whatever decides on its goals: which goals are sent, and which states end it.
+
+Angles [rad] and speeds [rad/s] are the joints'.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from vd.assets_usd.hand_data import HandModel
+from vd.deploy.hardware.answers import HandState
+from vd.deploy.hardware.control_table import Model
+from vd.paper import PAPER
+
+PERIOD_S = 1.0 / PAPER.scene.control_hz
+
+
+@dataclass(frozen=True)
+class SafetyCfg:
+    """Limits that hold whatever the policy asks for."""
+
+    margin_rad: float = 0.0
+    """Distance that goals keep from the ends of the joints' ranges [rad]."""
+    step_rad: float = 0.35
+    """Farthest goal from where a joint is [rad]: the policy asks for 3.5 rad/s / 12 Hz = 0.29 at most. It
+    limits the torque as well, to stiffness times this."""
+    velocity_share: float = 1.5
+    """Speed over the joints' own limit at which the hand is stopped; it turns faster only when something
+    else moves it."""
+    current_share: float = 0.8
+    """Current over the one for the joints' largest torque at which the hand is stopped, if it lasts; motors
+    shut down by themselves near 1."""
+    current_s: float = 0.5
+    """How long [s] a current may be above that."""
+    temperature_c: float = 70.0
+    """Temperature [deg C] of a motor at which the hand is stopped; motors shut down at 80."""
+    lost_s: float = 3.0 * PERIOD_S
+    """Time [s] without a sound state after which the bus is lost; shorter gaps repeat the last state."""
+    misses: int = 3
+    """Deadlines missed in a row at which the hand is stopped; also this many periods without a beat."""
+    stale_s: float = 3.0 * PERIOD_S
+    """Age [s] of the newest image at which the hand is stopped, once there was one."""
+    watchdog_s: float = 0.3
+    """Silence [s] after which the motors stop by themselves; 0 for never. Above three control periods."""
+    then: Literal["off", "hold"] = "off"
+    """After the hold: torque off, or leave the hand holding."""
+    hold_s: float = 1.0
+    """How long [s] the hand holds before its torque goes off: time to support what it carries."""
+
+    def __post_init__(self) -> None:
+        """Refuse numbers that would switch a limit off by accident."""
+        positive = ("step_rad", "velocity_share", "current_share", "current_s", "temperature_c", "lost_s")
+        for name in (*positive, "misses", "stale_s"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"safety.{name} is {getattr(self, name)}; it has to be above 0")
+        for name in ("margin_rad", "watchdog_s", "hold_s"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"safety.{name} is {getattr(self, name)}; it must not be negative")
+
+
+class Limits:
+    """Limits of one hand.
+
+    Args:
+        hand: The hand; its ranges, speeds and torques are taken.
+        motor: Model of its motors.
+        names: What its joints are called when a limit is passed [D].
+        cfg: Where the limits are.
+
+    Attributes:
+        lower: Least goals [rad] [D].
+        upper: Largest goals [rad] [D].
+
+    Raises:
+        ValueError: The margin leaves a joint no range.
+    """
+
+    def __init__(self, hand: HandModel, motor: Model, names: Sequence[str], cfg: SafetyCfg):
+        self._names, self._cfg = tuple(names), cfg
+        self.lower, self.upper = hand.lower + cfg.margin_rad, hand.upper - cfg.margin_rad
+        if (self.lower >= self.upper).any():
+            raise ValueError(f"safety.margin_rad is {cfg.margin_rad}; some joint's range is no wider")
+        strongest = motor.current_limit * motor.current_unit_a
+        torque_current = np.minimum(hand.effort / motor.torque_nm_per_a, strongest)
+        self._current = cfg.current_share * torque_current
+        self._velocity = cfg.velocity_share * hand.velocity_limit
+        self._strained_since = np.full(len(self._names), np.inf)
+
+    def goal(self, target: np.ndarray, here: np.ndarray) -> np.ndarray:
+        """The goal nearest to the target, in range and not too far from where the joints are, all [D]."""
+        near = np.clip(target, here - self._cfg.step_rad, here + self._cfg.step_rad)
+        return np.clip(near, self.lower, self.upper)
+
+    def passed(self, state: HandState) -> str:
+        """Which limit the newest state of the joints is beyond, in words; empty for none."""
+        fast = np.abs(state.velocity) > self._velocity
+        hot = state.temperature > self._cfg.temperature_c
+        strained = np.abs(state.current) > self._current
+        self._strained_since = np.where(strained, np.minimum(self._strained_since, state.time_s), np.inf)
+        long = state.time_s - self._strained_since > self._cfg.current_s
+        for axis, name in enumerate(self._names):
+            if fast[axis]:
+                return f"{name}: {state.velocity[axis]:.1f} rad/s, over {self._velocity[axis]:.1f}"
+            if hot[axis]:
+                return f"{name}: {state.temperature[axis]:.0f} deg C, over {self._cfg.temperature_c:g}"
+            if long[axis]:
+                return f"{name}: {state.current[axis]:.2f} A for {self._cfg.current_s:g} s; is it blocked?"
+        return ""

@@ -1,0 +1,431 @@
+"""Limits and a watchdog between whatever decides on goals and the motors; they hold whatever it decides.
+
+    with SafeHand(bus, joints, hand, cfg) as safe:     # preflight has passed, the person has confirmed
+        safe.arm()                                     # torque on where the hand is; watchdogs run from here
+        while not done:
+            state = safe.read()                        # joints' frame [rad]; checked
+            goal = safe.command(target)                # limited, sent; what was sent
+            safe.image_at(time_s)                      # of the newest image, where there is a camera
+            safe.beat(missed=late)                     # once per control step, after its work
+
+Whatever ends the block, the hand is brought to a hold where it is, and then, as configured, its torque is
+switched off. A limit that is passed, a lost bus, a stale image, missed deadlines, Ctrl-C or the end of the
+terminal raise :class:`StoppedError` with the reason at the next call; a thread has stopped the hand by then,
+also if no call ever comes. Where the driver itself dies, the motors' bus watchdog stops them.
+
+Angles and speeds are the joints', rad and rad/s; times of the monotonic clock.
+"""
+
+import contextlib
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import numpy as np
+
+from vd.assets_usd.hand_data import HandModel
+from vd.deploy.camera.camera import AHEAD_S
+from vd.deploy.finding import NAMED
+from vd.deploy.hardware.answers import BusError, HandState, LateError, SilentError
+from vd.deploy.hardware.bus import MotorBus
+from vd.deploy.hardware.joints import Joints
+from vd.deploy.safety.limits import PERIOD_S, Limits, SafetyCfg
+
+WATCH_S = 0.01
+"""How often the watchdog looks."""
+TORQUE_S = PERIOD_S / 3.0
+"""Age of what is known of the motors' torque from which it is asked for again, in a packet of its own, since
+its register lies far from the state's: with each reading of a control loop, each third of a recording."""
+TORQUE_GONE = "another program on the line switched it off, or it restarted"
+UNHEARD = ": motors do not answer, or this computer is busy"
+"""Said where the loop stands on the line."""
+OFF_S = 1.0
+"""How long switching off is tried on a bus that does not answer soundly."""
+FINISHED = "finished"
+"""Reason of the stop at the end of what was to be done."""
+SIGNALS = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "asked to end", signal.SIGHUP: "the terminal is gone"}
+"""Signals that stop the hand; a second one ends at once."""
+
+
+class StoppedError(RuntimeError):
+    """The hand was stopped; the message says why.
+
+    Args:
+        reason: Why.
+        number: Signal that asked for it; 0 for another reason.
+
+    Attributes:
+        signal: The same.
+    """
+
+    def __init__(self, reason: str, number: int = 0):
+        super().__init__(reason)
+        self.signal = number
+
+
+@dataclass(frozen=True)
+class StopReport:
+    """How a stop went."""
+
+    reason: str
+    """Why."""
+    detected_s: float
+    """When that was noticed [s]."""
+    held_s: float | None = None
+    """When the hand was told to hold where it is [s]; None if that could not be sent."""
+    unreleased: dict[int, str] = field(default_factory=dict)
+    """Motors of which it is not known that their torque is off, by ID."""
+    signal: int = 0
+    """Number of the signal that asked for it; 0 for another reason."""
+
+
+def unheard(error: BusError) -> str:
+    """Why no state came: by this computer's fault, or the bus'."""
+    return f"heard no motor: {error}" if isinstance(error, LateError) else f"lost the bus: {error}"
+
+
+class SafeHand:
+    """A hand whose goals are limited and that stops by itself.
+
+    Args:
+        bus: Its motors, configured.
+        joints: Which motor turns which joint.
+        hand: The hand; its limits are taken.
+        cfg: Limits.
+        say: Tells the person.
+    """
+
+    def __init__(
+        self,
+        bus: MotorBus,
+        joints: Joints,
+        hand: HandModel,
+        cfg: SafetyCfg | None = None,
+        say: Callable[[str], None] = lambda text: print(text, file=sys.stderr, flush=True),
+    ):
+        """Nothing is sent before :meth:`arm`."""
+        self.bus, self.joints, self.hand, self.cfg, self._say = bus, joints, hand, cfg or SafetyCfg(), say
+        self._names = [f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)]
+        self.limits = Limits(hand, bus.model, self._names, self.cfg)
+        self.limited = 0
+        """Goals that were limited."""
+        self.missed = 0
+        """Deadlines missed, in all."""
+        self.repeated = 0
+        """Readings without a sound answer, for which the last state stood in."""
+        self.report: StopReport | None = None
+        """How the stop went, once there was one."""
+        self._state: HandState | None = None
+        self._misses = self._signal = 0
+        self._beat_s = self._image_s = np.inf
+        self._torque_s = -np.inf
+        self._armed = False
+        self._on = np.ones(len(joints.ids), dtype=bool)
+        self._loop = threading.get_ident()
+        self._stopping = threading.RLock()
+        self._unwatch: Callable[[], None] = lambda: None
+        self._handlers: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> "SafeHand":
+        if threading.current_thread() is threading.main_thread():
+            self._handlers = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
+        self._unwatch = self.bus.clock.every(WATCH_S, self._watch)
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> None:
+        try:
+            if self._armed:
+                self._hold(FINISHED if error is None else f"{kind.__name__ if kind else ''}: {error}")
+                self._off()
+        finally:
+            self._unwatch()
+            for number, handler in self._handlers.items():
+                signal.signal(number, handler)
+
+    def arm(self) -> HandState:
+        """Switch the torque on where the hand is, and start the watchdogs.
+
+        Raises:
+            StoppedError: A motor does not switch on.
+        """
+        with self._stopping:
+            try:
+                self._state = state = self._read()
+                self._armed = True  # from here on whatever happens ends with torque off
+                self.bus.watch(self.cfg.watchdog_s)
+                self.bus.write_goals(self.joints.to_motor(state.position))
+                failed = self.bus.torque(True)
+            except BusError as error:
+                raise self._stop(f"could not switch on: {error}", lost=True) from error
+            if failed:
+                raise self._stop(f"could not switch on: {next(iter(failed.values()))}")
+            self._beat_s = self.bus.clock.now()
+            return state
+
+    def read(self) -> HandState:
+        """Read the joints; for a short gap in the bus the last state once more, with its own time.
+
+        Raises:
+            StoppedError: The bus is lost, a limit was passed, a motor reports an error, or another stop.
+        """
+        self._check()
+        try:
+            state = self._read()
+        except BusError as error:
+            last = self._state
+            if last is None or self.bus.clock.now() - last.time_s > self.cfg.lost_s:
+                raise self._stop(unheard(error), lost=True) from error
+            self.repeated += 1
+            self._check()
+            return last
+        self._state = state
+        self._check()
+        return state
+
+    def command(self, target: np.ndarray, *, with_state: bool = False) -> np.ndarray:
+        """Send goals within the limits.
+
+        Args:
+            target: Wanted angles of the joints [rad], shape [D].
+            with_state: Send them with the question of the next :meth:`read`.
+
+        Returns:
+            The goals that were sent [rad], shape [D].
+
+        Raises:
+            StoppedError: The hand is stopped, the target is no number, or the bus is lost.
+        """
+        self._check()
+        target = np.asarray(target, dtype=float)
+        if self._state is None or not self._armed:
+            raise RuntimeError("arm() has to come before command()")
+        if target.shape != self.limits.lower.shape or not np.isfinite(target).all():
+            raise self._stop(f"the target is not {len(self.joints.ids)} finite angles: {target}")
+        goal = self.limits.goal(target, self._state.position)
+        self.limited += int((goal != target).any())
+        with self._stopping:  # never after the hold
+            self._check()
+            try:
+                self.bus.write_goals(self.joints.to_motor(goal), with_state=with_state)
+            except BusError as error:
+                raise self._stop(unheard(error), lost=True) from error
+        return goal
+
+    def switch(self, on: np.ndarray) -> None:
+        """Switch the torque of joints on or off; one that is switched on stays where it is.
+
+        Args:
+            on: Shape [D] bool.
+
+        Raises:
+            StoppedError: A motor does not switch.
+        """
+        self.command(self.read().position)
+        for axis in np.flatnonzero(on != self._on):
+            failed = self.bus.torque(bool(on[axis]), [self.joints.ids[axis]])
+            if failed:
+                raise self._stop(next(iter(failed.values())))
+        self._on = np.array(on, dtype=bool)
+
+    def beat(self, *, missed: bool = False) -> None:
+        """A control step has ended: its goal is sent.
+
+        Args:
+            missed: Whether it ended after its deadline.
+
+        Raises:
+            StoppedError: Too many in a row.
+        """
+        self._check()
+        self._beat_s = self.bus.clock.now()
+        self.missed += missed
+        self._misses = self._misses + 1 if missed else 0
+        if self._misses >= self.cfg.misses:
+            raise self._stop(f"{self._misses} deadlines missed in a row")
+
+    def image_at(self, time_s: float) -> None:
+        """The newest image is of this time [s], by the monotonic clock.
+
+        Raises:
+            StoppedError: It is from the future, so its age is not known.
+        """
+        ahead = time_s - self.bus.clock.now()
+        if ahead > AHEAD_S:
+            raise self._stop(
+                f"the newest image is {ahead:.2f} s from the future: its clock is not the monotonic one"
+            )
+        self._image_s = time_s
+
+    def stop(self, reason: str) -> None:
+        """Stop for a reason of the caller's.
+
+        Raises:
+            StoppedError: Always.
+        """
+        raise self._stop(reason)
+
+    def _read(self) -> HandState:
+        try:
+            raw = self.bus.read_state()
+        except (LateError, SilentError):
+            raise  # they would not be heard either
+        except BusError:
+            self._check_torque()  # a motor that restarted answers, but no state of it is accepted
+            raise
+        state = self.joints.state(raw)
+        if raw.alert.any():
+            raise self._stop(self._errors(raw.alert, "a hardware error"))
+        self._check_torque()
+        if passed := self.limits.passed(state):
+            raise self._stop(passed)
+        return state
+
+    def _check_torque(self) -> None:
+        """Stop where a motor that was switched on is so no more; every TORQUE_S once the hand is armed."""
+        now = self.bus.clock.now()
+        if not self._armed or now - self._torque_s < TORQUE_S:
+            return
+        gone = self._on & ~self.bus.read_torque()
+        self._torque_s = now
+        if gone.any():
+            raise self._stop(f"torque went off: {self._errors(gone, TORQUE_GONE)}")
+
+    def _errors(self, which: np.ndarray, otherwise: str) -> str:
+        """What some motors [D] bool report as their errors, and what is said of one that reports none."""
+        try:
+            errors = self.bus.hardware_errors()
+        except BusError:
+            errors = {}
+        axes = np.flatnonzero(which)
+        words = [self._names[a] + ": " + errors.get(self.bus.ids[a], otherwise) for a in axes[:NAMED]]
+        return "; ".join(words) + (f"; and {len(axes) - NAMED} more" if len(axes) > NAMED else "")
+
+    def _check(self) -> None:
+        if self.report is not None:
+            raise self._error()
+        due = self._due()
+        if due:
+            raise self._stop(due)
+
+    def _due(self) -> str:
+        """Why the hand has to stop now, whatever its motors say; empty if it has not."""
+        now = self.bus.clock.now()
+        silent, age = now - self._beat_s, now - self._image_s
+        if self._signal:
+            return SIGNALS[signal.Signals(self._signal)]
+        if silent > self.cfg.misses * PERIOD_S:
+            return f"the loop stands: no step ended for {silent:.2f} s{self._place()}"
+        if age > self.cfg.stale_s:
+            return f"the newest image is {age:.2f} s old"
+        return ""
+
+    def _place(self) -> str:
+        """What of ours the loop is in at present; empty where it is the loop itself that asks."""
+        if threading.get_ident() == self._loop:
+            return ""
+        own = Path(__file__).parent
+        stack = traceback.extract_stack(sys._current_frames().get(self._loop))
+        at = next((call for call in reversed(stack) if Path(call.filename).parent == own), None)
+        if at is None:
+            return ""
+        why = UNHEARD if at.filename == sys.modules[MotorBus.__module__].__file__ else ""
+        return f", in {at.name} ({Path(at.filename).name}, line {at.lineno}){why}"
+
+    def _stop(self, reason: str, *, lost: bool = False) -> StoppedError:
+        """Hold, and give what to raise.
+
+        Args:
+            reason: Why.
+            lost: Whether the bus is not to be relied on.
+        """
+        self._hold(reason, lost=lost)
+        return self._error()
+
+    def _error(self) -> StoppedError:
+        """What to raise once the hand is stopped."""
+        assert self.report is not None
+        return StoppedError(self.report.reason, self.report.signal)
+
+    def _hold(self, reason: str, *, lost: bool = False) -> None:
+        """Have every joint stay where it is, once; what fails is told, not raised."""
+        detected = self.bus.clock.now()
+        with self._stopping:
+            if self.report is not None:
+                return
+            self.report = StopReport(reason, detected, signal=self._signal)
+            if not self._armed:
+                return
+            try:
+                if not lost:
+                    self._hold_at(self.joints.state(self.bus.read_state(retries=0)).position)
+            except BusError:
+                lost = True
+            if lost:  # nobody tells where the joints are, but the motors know
+                self._tell(self.bus.freeze)
+
+    def _hold_at(self, where: np.ndarray) -> None:
+        """Send angles of the joints [rad] as goals, whatever else is going on."""
+        goals = self.joints.to_motor(np.clip(where, self.limits.lower, self.limits.upper))
+        self._tell(lambda: self.bus.write_goals(goals))
+
+    def _tell(self, send: Callable[[], None]) -> None:
+        """Tell the motors to hold, and note when."""
+        assert self.report is not None
+        try:
+            send()
+        except BusError as error:
+            self._say(f"could not be told to hold: {error}")
+        else:
+            self.report = replace(self.report, held_s=self.report.held_s or self.bus.clock.now())
+
+    def _off(self) -> None:
+        """Settle where the hand came to rest, then torque off as configured."""
+        assert self.report is not None
+        with contextlib.suppress(BusError):
+            self._hold_at(self.joints.state(self.bus.read_state()).position)
+        why = "" if self.report.reason == FINISHED else f"stopped: {self.report.reason}; "
+        if self.cfg.then == "hold":
+            self._say(f"{why}the hand holds, its torque is on")
+            return
+        end = self.bus.clock.now() + self.cfg.hold_s
+        self._signal = 0
+        while self.bus.clock.now() < end and not self._signal:  # a signal: at once
+            self.bus.clock.sleep(WATCH_S)
+        left = self._release()
+        self.report = replace(self.report, unreleased=left)
+        self._say(f"{why}torque off")
+        for id, why in left.items():
+            self._say(f"motor {id} may still be on, cut its power: {why}")
+
+    def _release(self) -> dict[int, str]:
+        """Switch all motors off; those of which that is not known, with the reason."""
+        end = self.bus.clock.now() + OFF_S
+        left: dict[int, str] = dict.fromkeys(self.bus.ids, "")
+        while True:
+            try:
+                self.bus.release()  # one packet for all; each is asked afterwards
+            except BusError as error:
+                return dict.fromkeys(left, str(error))
+            left = self.bus.torque(False, left)
+            if not left:
+                with contextlib.suppress(BusError):
+                    self.bus.watch(0.0)  # what it guarded is off; other programs would find it in their way
+            if not left or self.bus.clock.now() > end:
+                return left
+
+    def _on_signal(self, number: int, _: FrameType | None) -> None:
+        """Note a signal; the watchdog acts on it. A second one is not caught any more."""
+        self._signal = number
+        if self.report is not None:
+            signal.signal(number, signal.default_int_handler)
+
+    def _watch(self) -> None:
+        """Stop the hand when the loop does not."""
+        if self._armed and self.report is None and (due := self._due()):
+            self._hold(due)

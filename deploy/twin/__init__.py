@@ -1,0 +1,1 @@
+"""A hand without the hand: simulated motors and camera that speak the real protocols."""

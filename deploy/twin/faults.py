@@ -1,0 +1,476 @@
+"""What happens when something goes wrong: each fault injected into a moving hand's twin, and how it ended.
+
+``python -m vd.deploy.twin.faults`` prints a row for every fault. The twin runs in this process,
+behind its pseudo-terminal, so that what its motors really did is known: who had torque, and who pushed.
+"""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from vd.assets_usd.hand_model import HandModel
+from vd.assets_usd.hands import load_hand
+from vd.deploy.hardware.bus import MotorBus
+from vd.deploy.hardware.check import preflight, write_settings
+from vd.deploy.hardware.connect import MOTOR, Connection
+from vd.deploy.hardware.control_table import MODELS, HardwareError
+from vd.deploy.hardware.joints import Joints, uncalibrated
+from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
+from vd.deploy.safety.safety import FINISHED, SafeHand, StoppedError
+from vd.deploy.twin.line import Faults
+from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.newton_hand import NewtonHand
+from vd.deploy.twin.plant import Drive, FirstOrderPlant, Plant
+from vd.deploy.twin.twin import Twin
+from vd.files import write_json
+from vd.warp_quiet import quiet_warp
+
+PUSH_RAD = 0.29
+"""Distance of the goals from the joints: what the policy asks for at most."""
+TURN_S = 0.5
+"""Time after which the loop pushes another way."""
+BEFORE_S, AFTER_S = 1.0, 3.0
+"""Time that the hand moves before the fault, and longest time after it."""
+SAFE_RAD = 0.15
+"""A motor this near to its goal carries its finger and pushes no more: gravity bends joints by 0.1 rad."""
+REST_S = 0.6
+"""Time after the end in which even a motor that hears nothing has to have stopped by itself."""
+
+
+SETUP_RETRIES = 20
+"""On a busy machine a twin may not run for longer than the SDK waits; before the start that is no matter."""
+
+
+class Witness:
+    """A plant that remembers what its motors did.
+
+    Args:
+        plant: The plant.
+        motors: The motors on it.
+    """
+
+    def __init__(self, plant: Plant, motors: Sequence[Motor]):
+        self.plant, self._motors = plant, motors
+        self.own: dict[int, float] = {}
+        """When a motor stopped by its own watchdog [s], by its place."""
+        self.times: list[float] = []
+        """When it went on [s], by the monotonic clock."""
+        self.pushes: list[np.ndarray] = []
+        """How far each motor was from its goal then [rad], zero without torque, shape [D]."""
+
+    def advance(self, seconds: float, drives: Sequence[Drive]) -> None:
+        """Go on, and note it."""
+        self.plant.advance(seconds, drives)
+        where = self.plant.read()[0]
+        goals = np.array([np.nan if drive.goal_rad is None else drive.goal_rad for drive in drives])
+        self.times.append(time.monotonic())
+        self.pushes.append(np.nan_to_num(np.abs(goals - where)))
+        for axis, motor in enumerate(self._motors):
+            if motor.get("bus_watchdog") == -1:
+                self.own.setdefault(axis, self.times[-1])
+
+    def read(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """What the plant reads."""
+        return self.plant.read()
+
+    def left(self) -> list[int]:
+        """Places of the motors that have torque."""
+        return [axis for axis, motor in enumerate(self._motors) if motor.get("torque_enable")]
+
+    def pushing(self) -> list[int]:
+        """Places of the motors that push."""
+        return [int(axis) for axis in np.flatnonzero(self.pushes[-1] > SAFE_RAD)]
+
+    def safe_after(self, since: float) -> float:
+        """Time from ``since`` until no motor that has been told pushed any more, for good [s].
+
+        One that has torque now was not told; infinite if another still pushes.
+        """
+        told = np.setdiff1d(np.arange(len(self._motors)), self.left())
+        pushes = np.array(self.pushes)[:, told]
+        times = np.array(self.times[: len(pushes)])  # the twin goes on meanwhile
+        pushing = (pushes > SAFE_RAD).any(axis=1)
+        last = np.flatnonzero(pushing & (times >= since))
+        if not len(last):
+            return 0.0
+        return float(times[last[-1] + 1] - since) if last[-1] + 1 < len(times) else float("inf")
+
+
+@dataclass
+class Scene:
+    """A twin with a hand that moves, and what is to go wrong."""
+
+    twin: Twin
+    bus: MotorBus
+    injected_s: float = float("inf")
+    """When the fault came [s]."""
+    camera: bool = False
+    """Whether there is a camera whose newest image is always new."""
+    pause_s: float = 0.0
+    """Time that the loop wastes in each step."""
+    error: Exception | None = None
+    """What the loop raises."""
+
+    def motor(self, id: int) -> Motor:
+        """A motor of the twin, by its ID."""
+        return next(motor for motor in self.twin.motors if motor.id == id)
+
+
+def _faults(scene: Scene, **values: object) -> None:
+    for name, value in values.items():
+        setattr(scene.twin.faults, name, value)
+
+
+@dataclass(frozen=True)
+class Fault:
+    """Something that goes wrong while the hand moves."""
+
+    name: str
+    inject: Callable[[Scene], None]
+    prepare: Callable[[Scene], None] = lambda scene: None
+    """What is so from the start."""
+    stops: bool = True
+    """Whether the hand has to stop; else it has to go on."""
+    cfg: SafetyCfg = field(default_factory=SafetyCfg)
+    reach_rad: float = PUSH_RAD
+    """Distance of the goals from the joints once it came."""
+    blockable: bool = False
+    """On axes without mass that can be blocked, in place of the hand."""
+
+
+def _set(**values: object) -> Callable[[Scene], None]:
+    """A fault that sets attributes of the scene."""
+
+    def inject(scene: Scene) -> None:
+        for name, value in values.items():
+            setattr(scene, name, value)
+
+    return inject
+
+
+def _block(scene: Scene) -> None:
+    plant = scene.twin.plant
+    assert isinstance(plant, Witness) and isinstance(plant.plant, FirstOrderPlant)
+    plant.plant.blocked[2] = True
+
+
+def _overload(scene: Scene) -> None:
+    scene.motor(22).put("hardware_error_status", HardwareError.OVERLOAD)
+
+
+WIDE = SafetyCfg(step_rad=4.0)
+"""Limits that let goals far away through."""
+MOVING = (
+    Fault("1 % of packets lost", lambda s: _faults(s, lose=0.01), stops=False),
+    Fault("1 % of packets corrupted", lambda s: _faults(s, corrupt=0.01), stops=False),
+    Fault("1 % of packets cut off", lambda s: _faults(s, truncate=0.01), stops=False),
+    Fault("1 % of packets 0.1 s late", lambda s: _faults(s, late=0.01), stops=False),
+    Fault("every packet lost", lambda s: _faults(s, lose=1.0)),
+    Fault("every packet corrupted", lambda s: _faults(s, corrupt=1.0)),
+    Fault("every packet 0.1 s late", lambda s: _faults(s, late=1.0)),
+    Fault("cable of one motor loose", lambda s: s.twin.faults.cut_off.add(11)),
+    Fault("cable of all motors loose", lambda s: s.twin.faults.cut_off.update(m.id for m in s.twin.motors)),
+    Fault("adapter unplugged", lambda s: s.bus.close()),
+    Fault("a motor warms by 50 deg C/s", lambda s: setattr(s.motor(21), "heat_c_per_s", 50.0)),
+    Fault("a motor shuts down, too hot", lambda s: setattr(s.motor(21), "heat_c_per_s", 5000.0)),
+    Fault("a joint is blocked", _block, stops=False, blockable=True),
+    Fault("a joint is blocked, goals far away", _block, cfg=WIDE, reach_rad=2.0, blockable=True),
+    Fault("a motor shuts down, overload", _overload),
+    Fault("a motor restarts", lambda s: s.motor(32).reboot()),
+    Fault("a motor takes another ID", lambda s: s.motor(11).put("id", 13)),
+    Fault("the camera stops", _set(camera=False), prepare=_set(camera=True)),
+    Fault("every step takes 0.15 s", _set(pause_s=0.15)),
+    Fault("the loop stands", _set(pause_s=2.0)),
+    Fault("an exception in the loop", _set(error=ArithmeticError("no such number"))),
+    Fault("Ctrl-C", lambda s: os.kill(os.getpid(), signal.SIGINT)),
+    Fault("the terminal closes", lambda s: os.kill(os.getpid(), signal.SIGHUP)),
+)
+"""Faults of a moving hand."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a fault ended."""
+
+    fault: str
+    happened: str
+    detected_s: float | None = None
+    """From the fault to its detection [s]; None if it was not to stop the hand."""
+    safe_s: float | None = None
+    """From its detection until the hand was told to hold, and no motor that heard it pushed any more [s]."""
+    own_s: float | None = None
+    """From the fault until the last motor that could not be told had stopped by its own watchdog [s]."""
+    energised: tuple[int, ...] = ()
+    """Motors with torque at the end."""
+    pushing: tuple[int, ...] = ()
+    """Of these, the ones that push."""
+    right: bool = True
+    """Whether it went as it has to."""
+
+
+@contextlib.contextmanager
+def scene_of(hand: HandModel, joints: Joints, *, blockable: bool = False) -> Iterator[tuple[Scene, Witness]]:
+    """A twin that serves, and a configured bus to it."""
+    plant: Plant = FirstOrderPlant(len(joints.ids)) if blockable else NewtonHand(hand, joints)
+    motors = [Motor(MODELS[MOTOR], id) for id in joints.ids]
+    witness = Witness(plant, motors)
+    with Twin(motors, witness, Faults(seed=1)) as twin, MotorBus(twin.path, joints.ids, MOTOR) as bus:
+        bus.retries = SETUP_RETRIES
+        bus.configure(joints.settings(hand, MOTOR))
+        bus.retries = 1
+        yield Scene(twin, bus), witness
+
+
+def try_fault(fault: Fault, hand: HandModel, joints: Joints) -> Outcome:
+    """Move the hand's twin, inject a fault, and see how it ends."""
+    with scene_of(hand, joints, blockable=fault.blockable) as (scene, witness):
+        fault.prepare(scene)
+        with contextlib.suppress(StoppedError, ArithmeticError):
+            with SafeHand(scene.bus, joints, hand, fault.cfg, lambda text: None) as safe:
+                safe.arm()
+                _move(scene, safe, fault)
+        time.sleep(REST_S)
+        report = safe.report
+        assert report is not None
+        if not fault.stops:
+            right = report.reason == FINISHED
+            happened = f"went on; {safe.repeated} readings repeated" if right else report.reason
+            return _outcome(fault.name, happened, witness, joints, right=right)
+        told_s = PERIOD_S if report.held_s is None else report.held_s - report.detected_s
+        safe_s = max(told_s, witness.safe_after(report.detected_s))
+        left = f"; {len(report.unreleased)} motors may still be on" if report.unreleased else ""
+        return _outcome(
+            fault.name,
+            report.reason + left,
+            witness,
+            joints,
+            right=report.reason != FINISHED and report.detected_s >= scene.injected_s and safe_s <= PERIOD_S,
+            since_s=scene.injected_s,
+            detected_s=report.detected_s - scene.injected_s,
+            safe_s=None if report.held_s is None else safe_s,
+        )
+
+
+def _outcome(
+    name: str,
+    happened: str,
+    witness: Witness,
+    joints: Joints,
+    *,
+    right: bool,
+    since_s: float = 0.0,
+    detected_s: float | None = None,
+    safe_s: float | None = None,
+) -> Outcome:
+    """How it ended: a motor with torque at the end is right only where it has stopped by itself."""
+    left, pushing = witness.left(), witness.pushing()
+    own_s = max((witness.own.get(axis, float("inf")) - since_s for axis in left), default=None)
+    return Outcome(
+        fault=name,
+        happened=happened,
+        detected_s=detected_s,
+        safe_s=safe_s,
+        own_s=own_s,
+        energised=tuple(joints.ids[axis] for axis in left),
+        pushing=tuple(joints.ids[axis] for axis in pushing),
+        right=right and not pushing and (own_s is None or own_s < float("inf")),
+    )
+
+
+def _move(scene: Scene, safe: SafeHand, fault: Fault) -> None:
+    """A loop at the control rate that pushes every joint about, and in which the fault comes."""
+    rng = np.random.default_rng(0)
+    begin = time.monotonic()
+    due = begin
+    way = np.zeros(len(safe.limits.lower))
+    for step in range(round((BEFORE_S + AFTER_S) / PERIOD_S)):
+        if step == round(BEFORE_S / PERIOD_S):
+            scene.injected_s = time.monotonic()
+            fault.inject(scene)
+        if scene.error is not None:
+            raise scene.error
+        if step % round(TURN_S / PERIOD_S) == 0:
+            way = rng.choice([-1.0, 1.0], len(way))
+        if fault.blockable and step >= round(BEFORE_S / PERIOD_S):
+            way = np.sign(safe.limits.lower + safe.limits.upper - 2.0 * safe.read().position)
+        reach = PUSH_RAD if scene.injected_s == float("inf") else fault.reach_rad
+        safe.command(safe.read().position + reach * way)
+        if scene.camera:
+            safe.image_at(time.monotonic())
+        time.sleep(scene.pause_s)
+        due += PERIOD_S
+        late = time.monotonic() > due
+        safe.beat(missed=late)
+        due = max(due, time.monotonic())  # not to hurry after it
+        time.sleep(due - time.monotonic() if due > time.monotonic() else 0.0)
+
+
+def _put(item: str, value: int, *motors: int) -> Callable[[Twin], None]:
+    """An item of some motors, or all, that is not as it should be."""
+
+    def spoil(twin: Twin) -> None:
+        for motor in twin.motors:
+            if not motors or motor.id in motors:
+                motor.put(item, value)
+
+    return spoil
+
+
+def _stubborn(twin: Twin) -> None:
+    """A motor that does not keep a limit."""
+    motor = twin.motors[4]
+    motor.put("max_position_limit", 4000)
+    accept = motor._accept
+    motor._accept = lambda name, value: accept(name, 4000 if name == "max_position_limit" else value)  # type: ignore[method-assign]
+
+
+def _at(axis: int, angle: float) -> Callable[[Twin], None]:
+    """A motor at an angle [rad]."""
+
+    def spoil(twin: Twin) -> None:
+        plant = twin.plant
+        assert isinstance(plant, Witness) and isinstance(plant.plant, FirstOrderPlant)
+        plant.plant.position[axis] = angle
+
+    return spoil
+
+
+def _twice(twin: Twin) -> None:
+    """Two motors with one ID, at different angles as any two are."""
+    _put("id", 11, 12)(twin)
+    _at(2, 0.4)(twin)
+
+
+BEFORE: dict[str, Callable[[Twin], None]] = {
+    "a motor has a wrong ID": _put("id", 13, 11),
+    "two motors have the same ID": _twice,
+    "a motor does not keep its limit": _stubborn,
+    "a motor's direction was reversed": _put("drive_mode", 1, 20),
+    "a motor has an overload": _put("hardware_error_status", HardwareError.OVERLOAD, 22),
+    "a motor is hot": lambda twin: setattr(twin.motors[0], "temperature", 66.0),
+    "the supply is low": _put("present_input_voltage", 190),
+    "a joint is out of its range": _at(5, 2.6),
+    "a joint was turned round": _at(5, 2.0 * np.pi),
+    "a cable is loose": lambda twin: twin.faults.cut_off.add(32),
+}
+"""What the preflight has to find."""
+
+
+def try_preflight(name: str, hand: HandModel, joints: Joints) -> Outcome:
+    """Spoil something before the start; nothing may move."""
+    with scene_of(hand, joints, blockable=True) as (scene, witness):
+        scene.bus.release()
+        BEFORE[name](scene.twin)
+        time.sleep(0.1)
+        connection = Connection(hand, joints, scene.bus)
+        wrong = [finding for finding in preflight(connection) if not finding.ok]
+        if not wrong and not (written := write_settings(connection)).ok:
+            wrong = [written]
+        happened = f"nothing moves: {wrong[0].what}: {wrong[0].found}" if wrong else "was not found"
+        return _outcome(name, happened, witness, joints, right=bool(wrong) and not witness.left())
+
+
+def try_process(name: str, number: signal.Signals, hand: HandModel, joints: Joints) -> Outcome:
+    """Send a signal to `vd-deploy home` while it moves the twin."""
+    with scene_of(hand, joints) as (scene, witness):
+        scene.bus.close()  # one program at a time has the port
+        command = [sys.executable, "-m", "vd.deploy.cli", "home", "--port", scene.twin.path, "--yes"]
+        command += ["--hand", hand.name, "--speed", "0.2"]
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        end = time.monotonic() + START_S
+        while not all(motor.get("torque_enable") for motor in scene.twin.motors):
+            if process.poll() is not None or time.monotonic() > end:
+                break
+            time.sleep(0.01)
+        time.sleep(0.5)
+        sent = time.monotonic()
+        process.send_signal(number)
+        _, words = process.communicate()
+        time.sleep(REST_S)
+        said = [line for line in words.splitlines() if line.startswith("stopped")]
+        if number == signal.SIGKILL:
+            happened, right = "the motors stop by themselves and hold", True
+        else:
+            happened, right = (said or ["said nothing"])[-1], bool(said) and not witness.left()
+        safe_s = witness.safe_after(sent)
+        return _outcome(name, happened, witness, joints, right=right, since_s=sent, safe_s=safe_s)
+
+
+START_S = 60.0
+"""Longest start of a command."""
+PROCESS = {
+    "vd-deploy gets Ctrl-C": signal.SIGINT,
+    "vd-deploy is asked to end": signal.SIGTERM,
+    "vd-deploy is killed": signal.SIGKILL,
+}
+"""Signals to a command that moves the hand."""
+
+
+def table(outcomes: Sequence[Outcome]) -> str:
+    """The table as Markdown."""
+    lines = [
+        "| fault | what happened | found after | safe after that | others by themselves | on, pushing |",
+        "|---|---|---|---|---|---|",
+    ]
+
+    def ms(seconds: float | None) -> str:
+        return "-" if seconds is None else f"{1e3 * seconds:.0f} ms"
+
+    for one in outcomes:
+        mark = "" if one.right else " **(wrong)**"
+        times = " | ".join(map(ms, (one.detected_s, one.safe_s, one.own_s)))
+        left = f"{len(one.energised)}, {len(one.pushing)}"
+        lines.append(f"| {one.fault} | {one.happened}{mark} | {times} | {left} |")
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class FaultsCommand:
+    """Inject every fault into the twin of a hand, and print what happened."""
+
+    hand: str = "dclaw3"
+    """dclaw3 or dclaw4."""
+    only: str = ""
+    """Only faults whose name holds this."""
+    json: Path | None = None
+    """Write the outcomes to this file."""
+
+    def run(self) -> int:
+        """Try all; 1 if one did not end as it has to."""
+        quiet_warp()
+        hand = load_hand(self.hand)
+        joints = uncalibrated(hand)
+        trials: list[tuple[str, Callable[[], Outcome]]] = [
+            *((f.name, lambda f=f: try_fault(f, hand, joints)) for f in MOVING),
+            *((name, lambda n=name: try_preflight(n, hand, joints)) for name in BEFORE),
+            *((name, lambda n=name: try_process(n, PROCESS[n], hand, joints)) for name in PROCESS),
+        ]
+        outcomes = []
+        for name, trial in trials:
+            if self.only in name:
+                outcomes.append(trial())
+                how = "ok   " if outcomes[-1].right else "WRONG"
+                print(f"{how}  {name}: {outcomes[-1].happened}", file=sys.stderr, flush=True)
+        print(table(outcomes))
+        if self.json is not None:
+            write_json(self.json, [asdict(outcome) for outcome in outcomes])
+        return 0 if all(outcome.right for outcome in outcomes) else 1
+
+
+def main() -> int:
+    """Entry point of ``python -m vd.deploy.twin.faults``."""
+    import tyro
+
+    return tyro.cli(FaultsCommand, prog="python -m vd.deploy.twin.faults", description=__doc__).run()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,274 @@
+"""A line of simulated motors: bytes of a program in, bytes of the motors out, and what they move goes on.
+
+Where the bytes come from and how time goes on is for others: :mod:`vd.deploy.twin.twin` puts a
+pseudo-terminal and the computer's clock around it. Faults can be injected.
+"""
+
+import functools
+import itertools
+import operator
+import random
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from vd.deploy.clock import MONOTONIC, Clock
+from vd.deploy.hardware.packets import BROADCAST, Failure, Instruction, Packet, PacketReader, encode, status
+from vd.deploy.twin.motor import Motor
+from vd.deploy.twin.plant import FirstOrderPlant, Plant
+
+RETURN_DELAY_UNIT_S = 2e-6
+SILENCE_S = 0.01
+"""A packet that has begun and not gone on for this long was cut off."""
+
+
+@dataclass
+class Faults:
+    """What goes wrong on the bus. Shares are of status packets, drawn from ``seed``."""
+
+    lose: float = 0.0
+    """Share that never arrives."""
+    corrupt: float = 0.0
+    """Share with one byte changed."""
+    truncate: float = 0.0
+    """Share that is cut off."""
+    late: float = 0.0
+    """Share that is held back for ``late_s``."""
+    late_s: float = 0.1
+    cut_off: set[int] = field(default_factory=set)
+    """Motors that neither hear nor answer: a loose cable."""
+    seed: int = 0
+
+
+class MotorLine:
+    """Motors on a line.
+
+    Args:
+        motors: Motors in the order of the plant's axes.
+        plant: What they move; axes without mass by default.
+        faults: What goes wrong; may be changed while it runs.
+        clock: Time.
+        put: Takes the bytes that arrive at the program's end.
+    """
+
+    def __init__(
+        self,
+        motors: Sequence[Motor],
+        plant: Plant | None = None,
+        faults: Faults | None = None,
+        *,
+        clock: Clock = MONOTONIC,
+        put: Callable[[bytes], None],
+    ):
+        """Power on."""
+        self.motors = list(motors)
+        self.plant = plant or FirstOrderPlant(len(self.motors))
+        self.faults = faults or Faults()
+        self.put = put
+        self._clock, self._then = clock, clock.now()
+        self._random = random.Random(self.faults.seed)
+        self._reader = PacketReader()
+        self._held: list[tuple[float, bytes]] = []
+        self._heard_at = 0.0
+        self._sense(0.0)
+
+    @property
+    def due_s(self) -> float:
+        """When the next late packet arrives [s]; infinite without one."""
+        return min((at for at, _ in self._held), default=float("inf"))
+
+    def go_on(self, heard: bytes = b"", *, at: float | None = None) -> None:
+        """Go on to the present, or the moment ``at`` [s], in which bytes arrive at the motors, or none."""
+        now = max(self._clock.now() if at is None else at, self._then)
+        seconds, self._then = now - self._then, now
+        if seconds > 0.0:
+            self.plant.advance(seconds, [motor.drive(seconds) for motor in self.motors])
+            self._sense(seconds)
+        packets: list[Packet] = []
+        if heard:
+            self._heard_at, packets = now, self._reader.feed(heard)
+        elif self._reader.waiting and now - self._heard_at > SILENCE_S:
+            packets = self._reader.give_up()
+        for packet in packets:
+            self._handle(packet)
+        for at, data in [held for held in self._held if held[0] <= self._clock.now()]:
+            self._held.remove((at, data))
+            self.put(data)
+
+    def _handle(self, packet: Packet) -> None:
+        """Carry out one instruction and send what the motors answer."""
+        named = list(ORDER[packet.instruction](packet.parameters)) if packet.instruction in ORDER else []
+        # Motors that a packet names answer in its order; each waits for the one before.
+        answers: dict[int, list[tuple[Motor, list[bytes]]]] = {}
+        for motor in sorted(self.motors, key=lambda m: named.index(m.id) if m.id in named else len(named)):
+            if motor.id not in self.faults.cut_off:
+                frames = [encode(answer) for answer in self._answers(motor, packet)]
+                answers.setdefault(motor.id, []).append((motor, frames))
+        for same in answers.values():
+            for at_once in itertools.zip_longest(*(frames for _, frames in same), fillvalue=b""):
+                self._send(same[0][0], collide(at_once))
+
+    def _answers(self, motor: Motor, packet: Packet) -> list[Packet]:
+        """What one motor makes of a packet on the bus."""
+        level = motor.get("status_return_level")
+        shared = SHARED.get(packet.instruction)
+        if packet.id == BROADCAST and shared is not None:
+            motor.heard()
+            answers = shared(motor, packet.parameters)
+            return answers if level else []
+        if packet.instruction == Instruction.STATUS:
+            return []
+        if packet.id == motor.secondary_id:
+            motor.heard()
+            if packet.instruction == Instruction.WRITE:
+                motor.write(_word(packet.parameters), packet.parameters[2:], secondary=True)
+            return []
+        if packet.id not in (motor.id, BROADCAST):
+            return []
+        motor.heard()
+        single = SINGLE.get(packet.instruction)
+        if single is None:
+            failure, data = int(Failure.INSTRUCTION), b""
+        else:
+            failure, data = single(motor, packet.parameters)
+        quiet = level == 0 or (level == 1 and packet.instruction != Instruction.READ)
+        if packet.instruction != Instruction.PING and (quiet or packet.id == BROADCAST):
+            return []
+        return [status(motor.id, failure | motor.alert, data)]
+
+    def _send(self, motor: Motor, frame: bytes) -> None:
+        self._clock.sleep(motor.get("return_delay_time") * RETURN_DELAY_UNIT_S)
+        data, draw, faults = bytearray(frame), self._random.random, self.faults
+        if draw() < faults.lose:
+            return
+        if draw() < faults.corrupt:
+            data[self._random.randrange(len(data))] ^= self._random.randrange(1, 256)
+        if draw() < faults.truncate:
+            del data[self._random.randrange(1, len(data)) :]
+        if draw() < faults.late:
+            self._held.append((self._clock.now() + faults.late_s, bytes(data)))
+            return
+        self.put(bytes(data))
+
+    def _sense(self, seconds: float) -> None:
+        state = zip(*self.plant.read(), strict=True)
+        for motor, (position, velocity, torque) in zip(self.motors, state, strict=True):
+            motor.sense(seconds, float(position), float(velocity), float(torque))
+
+
+def collide(frames: Sequence[bytes]) -> bytes:
+    """What is on the line when motors of one ID answer at once: a zero of any of them pulls it down.
+
+    Equal answers, such as those to a ping, are not told from one.
+    """
+    return bytes(
+        functools.reduce(operator.and_, column) for column in itertools.zip_longest(*frames, fillvalue=0xFF)
+    )
+
+
+Result = tuple[int, bytes]
+
+
+def _word(data: bytes, at: int = 0) -> int:
+    return int.from_bytes(data[at : at + 2], "little")
+
+
+def _ping(motor: Motor, parameters: bytes) -> Result:
+    if parameters:
+        return Failure.LENGTH, b""
+    return Failure.NONE, motor.read(0, 2)[1] + motor.read(6, 1)[1]
+
+
+def _read(motor: Motor, parameters: bytes) -> Result:
+    return (
+        motor.read(_word(parameters), _word(parameters, 2)) if len(parameters) == 4 else (Failure.LENGTH, b"")
+    )
+
+
+def _write(motor: Motor, parameters: bytes) -> Result:
+    return motor.write(_word(parameters), parameters[2:]), b""
+
+
+def _register(motor: Motor, parameters: bytes) -> Result:
+    if len(parameters) < 3:
+        return Failure.LENGTH, b""
+    motor.registered = _word(parameters), parameters[2:]
+    motor.put("registered_instruction", 1)
+    return Failure.NONE, b""
+
+
+def _action(motor: Motor, parameters: bytes) -> Result:
+    if motor.registered is None:
+        return Failure.RESULT, b""
+    failure = motor.write(*motor.registered)
+    motor.registered = None
+    motor.put("registered_instruction", 0)
+    return failure, b""
+
+
+def _reboot(motor: Motor, parameters: bytes) -> Result:
+    motor.reboot()
+    return Failure.NONE, b""
+
+
+def _sync_read(motor: Motor, parameters: bytes) -> list[Packet]:
+    if len(parameters) < 5 or motor.id not in parameters[4:]:
+        return []
+    failure, data = motor.read(_word(parameters), _word(parameters, 2))
+    return [status(motor.id, failure | motor.alert, data)]
+
+
+def _sync_write(motor: Motor, parameters: bytes) -> list[Packet]:
+    address, length = _word(parameters), _word(parameters, 2)
+    rows = parameters[4:]
+    if length and len(rows) % (length + 1) == 0:
+        for start in range(0, len(rows), length + 1):
+            if rows[start] in (motor.id, motor.secondary_id):
+                row = rows[start + 1 : start + 1 + length]
+                motor.write(address, row, secondary=rows[start] != motor.id)
+    return []
+
+
+def _bulk_read(motor: Motor, parameters: bytes) -> list[Packet]:
+    if len(parameters) % 5:
+        return []
+    answers = []
+    for start in range(0, len(parameters), 5):
+        if parameters[start] == motor.id:
+            failure, data = motor.read(_word(parameters, start + 1), _word(parameters, start + 3))
+            answers.append(status(motor.id, failure | motor.alert, data))
+    return answers
+
+
+def _bulk_write(motor: Motor, parameters: bytes) -> list[Packet]:
+    while len(parameters) >= 5:
+        length = _word(parameters, 3)
+        data = parameters[5 : 5 + length]
+        if parameters[0] == motor.id and len(data) == length:
+            motor.write(_word(parameters, 1), data)
+        parameters = parameters[5 + length :]
+    return []
+
+
+SINGLE: dict[int, Callable[[Motor, bytes], Result]] = {
+    Instruction.PING: _ping,
+    Instruction.READ: _read,
+    Instruction.WRITE: _write,
+    Instruction.REG_WRITE: _register,
+    Instruction.ACTION: _action,
+    Instruction.REBOOT: _reboot,
+}
+"""Instructions to one motor, or broadcast."""
+SHARED: dict[int, Callable[[Motor, bytes], list[Packet]]] = {
+    Instruction.SYNC_READ: _sync_read,
+    Instruction.SYNC_WRITE: _sync_write,
+    Instruction.BULK_READ: _bulk_read,
+    Instruction.BULK_WRITE: _bulk_write,
+}
+"""Instructions to many motors, which name them in their parameters."""
+
+
+ORDER: dict[int, Callable[[bytes], bytes]] = {
+    Instruction.SYNC_READ: lambda parameters: parameters[4:],
+    Instruction.BULK_READ: lambda parameters: parameters[::5],
+}
+"""Where the instructions that several motors answer name them."""

@@ -1,0 +1,289 @@
+"""One motor of the twin: its control table, what can be written when, how it drives and protects itself."""
+
+import math
+from dataclasses import dataclass, field
+
+from vd.deploy.hardware.control_table import (
+    COUNTS_PER_TURN,
+    EEPROM_END,
+    FULL_PWM,
+    LAST_SECONDARY_ID,
+    POSITION_MODE,
+    RAD_PER_COUNT,
+    RAD_S2_PER_COUNT,
+    RAD_S_PER_COUNT,
+    SIZE,
+    TICK_MODULUS,
+    WATCHDOG_UNIT_S,
+    HardwareError,
+    Model,
+    table,
+    to_angle,
+    to_counts,
+)
+from vd.deploy.hardware.packets import ALERT, Failure
+from vd.deploy.twin.plant import Drive
+
+OVERLOAD_SHARE, OVERLOAD_S = 0.9, 1.0
+"""A motor that gives this share of its largest torque for this long has an overload; the real rule is not
+published."""
+AMBIENT_C, HEATING_C_PER_S, COOLING_S = 30.0, 0.5, 120.0
+"""Case temperature: rise at full torque, and time constant of cooling."""
+TICK_S = 1e-3
+"""What its clock counts."""
+PHASE_S = 0.618e-3
+"""Between the clocks of two motors whose IDs follow each other: none start at the same moment."""
+CONTROL_S = 1e-3
+"""Period of its position controller, in which the I gain sums the error; not published, and chosen."""
+P_UNIT, I_UNIT, FEEDFORWARD_UNIT = 128.0, 65536.0, 4.0
+"""What the gains are divided by (e-manual): a count of error, or of the trajectory's speed or acceleration,
+gives so many counts of PWM."""
+MODE_ITEMS = (
+    "position_p_gain",
+    "position_i_gain",
+    "position_d_gain",
+    "feedforward_1st_gain",
+    "feedforward_2nd_gain",
+    "profile_velocity",
+    "profile_acceleration",
+    "goal_pwm",
+)
+"""What another operating mode brings back to its initial value."""
+GOALS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
+
+
+def _clip(value: float, largest: float) -> float:
+    return max(-largest, min(largest, value))
+
+
+@dataclass
+class Motor:
+    """A motor on the bus."""
+
+    model: Model
+    id: int
+    memory: bytearray = field(init=False)
+    heat_c_per_s: float = 0.0
+    """Injected heating, whatever the torque [deg C/s]."""
+
+    def __post_init__(self) -> None:
+        """Power on with factory settings."""
+        self.items = table(self.model)
+        self._at = {item.address: (name, item) for name, item in self.items.items()}
+        self.memory = bytearray(SIZE)
+        own = self.id
+        for name, item in self.items.items():
+            self.put(name, item.initial)
+        self.put("id", own)
+        self.temperature, self._where = AMBIENT_C, 0.0
+        self._power_on()
+
+    def _power_on(self) -> None:
+        for name, item in self.items.items():
+            if item.address >= EEPROM_END and item.writable:
+                self.put(name, item.initial)
+        self.put("hardware_error_status", 0)
+        self._clock = self.id * PHASE_S % TICK_S
+        self._strained = self._silence = 0.0
+        self._turns = 0
+        self._follow(self._where)
+        self._count_one_turn()
+        self.registered: tuple[int, bytes] | None = None
+
+    def reboot(self) -> None:
+        """Start anew: torque off, errors cleared, RAM at its initial values; what is kept in EEPROM stays."""
+        self._power_on()
+
+    def get(self, name: str) -> int:
+        """Value of an item."""
+        item = self.items[name]
+        return item.from_bytes(bytes(self.memory[item.address : item.address + item.size]))
+
+    def put(self, name: str, value: int) -> None:
+        """Set an item, as the motor itself does, without any rule."""
+        item = self.items[name]
+        self.memory[item.address : item.address + item.size] = item.to_bytes(value)
+        if name == "id":
+            self.id = value
+
+    @property
+    def alert(self) -> int:
+        """The alert bit of status packets."""
+        return ALERT if self.get("hardware_error_status") else 0
+
+    @property
+    def shut_down(self) -> bool:
+        """Whether an error has taken the torque away; only a reboot gives it back."""
+        return bool(self.get("hardware_error_status") & self.get("shutdown"))
+
+    @property
+    def secondary_id(self) -> int | None:
+        """A further ID to which it listens without an answer, if it has one."""
+        id = self.get("secondary_id")
+        return id if id <= LAST_SECONDARY_ID and id != self.id else None
+
+    def _follow(self, angle: float) -> None:
+        """Begin a trajectory at rest at an angle of the axis [rad]."""
+        self._path, self._speed, self._acceleration, self._summed = angle, 0.0, 0.0, 0.0
+
+    def _count_one_turn(self) -> None:
+        """Count angles anew within one turn, as when switched on: turned by hand it has counted on."""
+        self._turns = to_counts(self._where) // COUNTS_PER_TURN
+        self.put("present_position", to_counts(self._where) % COUNTS_PER_TURN)
+
+    def read(self, address: int, length: int) -> tuple[Failure, bytes]:
+        """Bytes of the control table."""
+        if length < 1 or address + length > SIZE:
+            return Failure.LENGTH, b""
+        return Failure.NONE, bytes(self.memory[address : address + length])
+
+    def write(self, address: int, data: bytes, *, secondary: bool = False) -> Failure:
+        """Write whole items; all or, with an error, none; as ``secondary`` ID nothing that is kept."""
+        changes: list[tuple[str, int]] = []
+        if not data:
+            return Failure.LENGTH
+        while data:
+            if address not in self._at:
+                return Failure.ACCESS
+            name, item = self._at[address]
+            if len(data) < item.size:
+                return Failure.LENGTH
+            value = item.from_bytes(data[: item.size])
+            failure = self._refusal(name, value)
+            if secondary and address < EEPROM_END:
+                failure = Failure.ACCESS
+            if failure:
+                return failure
+            changes.append((name, value))
+            address, data = address + item.size, data[item.size :]
+        for name, value in changes:
+            self._accept(name, value)
+        return Failure.NONE
+
+    def _refusal(self, name: str, value: int) -> Failure:
+        item = self.items[name]
+        torque = self.get("torque_enable")
+        if not item.writable or (item.address < EEPROM_END and torque):
+            return Failure.ACCESS
+        if (item.low is not None and value < item.low) or (item.high is not None and value > item.high):
+            return Failure.RANGE
+        if name == "torque_enable" and value and self.shut_down:
+            return Failure.ACCESS
+        if name in GOALS and self.get("bus_watchdog") == -1:
+            return Failure.ACCESS
+        if name == "goal_position":
+            low, high = self.get("min_position_limit"), self.get("max_position_limit")
+            return Failure.NONE if low <= value <= high else Failure.LIMIT
+        limits = {"goal_pwm": "pwm_limit", "goal_current": "current_limit", "goal_velocity": "velocity_limit"}
+        if name in limits and abs(value) > self.get(limits[name]):
+            return Failure.LIMIT
+        return Failure.NONE
+
+    def _accept(self, name: str, value: int) -> None:
+        if name == "torque_enable" and value and not self.get("torque_enable"):
+            self._count_one_turn()
+            self.put("goal_position", self.get("present_position"))  # a motor does not jump when switched on
+        if name == "operating_mode" and value != self.get(name):
+            for item in MODE_ITEMS:
+                self.put(item, self.items[item].initial)
+            if value == POSITION_MODE:
+                self._count_one_turn()
+        self.put(name, value)
+
+    def heard(self) -> None:
+        """An instruction came for this motor."""
+        self._silence = 0.0
+
+    def drive(self, seconds: float) -> Drive:
+        """What the motor does with its axis in the next seconds."""
+        power = min(abs(self.get("goal_pwm")), self.get("pwm_limit")) / FULL_PWM
+        limit = min(self.get("current_limit"), self.model.current_limit) * self.model.current_unit_a
+        goal: float | None = None
+        if self.get("torque_enable"):
+            turns = 2.0 * math.pi * self._turns
+            self._plan(to_angle(self.get("goal_position")) + turns, seconds)
+            goal = self._path + self._push(seconds, power)
+        else:
+            self._follow(self._where)
+        return Drive(
+            goal_rad=goal,
+            p_gain=float(self.get("position_p_gain")),
+            velocity_limit=self.get("velocity_limit") * RAD_S_PER_COUNT,
+            torque_limit=limit * self.model.torque_nm_per_a,
+            power=power,
+        )
+
+    def _plan(self, goal: float, seconds: float) -> None:
+        """Go on with the trajectory to a goal [rad]: a step, or a profile of speed and acceleration."""
+        fastest = self.get("profile_velocity") * RAD_S_PER_COUNT
+        if fastest == 0.0:  # no profile, whatever its acceleration (e-manual)
+            self._path, self._speed, self._acceleration = goal, 0.0, 0.0
+            return
+        hardest = self.get("profile_acceleration") * RAD_S2_PER_COUNT or math.inf
+        left, before = goal - self._path, self._speed
+        wanted = math.copysign(min(fastest, math.sqrt(2.0 * hardest * abs(left))), left)
+        change = hardest * seconds
+        self._speed += _clip(wanted - self._speed, change)
+        step = self._speed * seconds
+        if abs(step) >= abs(left) and step * left >= 0.0:
+            step, self._speed = left, 0.0
+        self._path += step
+        self._acceleration = (self._speed - before) / seconds
+
+    def _push(self, seconds: float, power: float) -> float:
+        """What I gain and feed-forward add to the error of position [rad], no more than the full PWM."""
+        p_gain = self.get("position_p_gain") / P_UNIT
+        if p_gain == 0.0:
+            return 0.0
+        i_gain = self.get("position_i_gain") / I_UNIT
+        largest = power * FULL_PWM / p_gain * RAD_PER_COUNT
+        self._summed += i_gain / p_gain * (self._path - self._where) * seconds / CONTROL_S
+        self._summed = _clip(self._summed, largest)  # else it would wind up
+        speed = self.get("feedforward_1st_gain") * self._speed / RAD_S_PER_COUNT
+        acceleration = self.get("feedforward_2nd_gain") * self._acceleration / RAD_S2_PER_COUNT
+        forward = (speed + acceleration) / FEEDFORWARD_UNIT / p_gain * RAD_PER_COUNT
+        return _clip(self._summed + forward, largest)
+
+    def sense(self, seconds: float, position: float, velocity: float, torque: float) -> None:
+        """Take in the state of the axis after ``seconds`` more, and protect the motor.
+
+        Args:
+            seconds: Time since the last call.
+            position: Angle [rad].
+            velocity: Speed [rad/s].
+            torque: Torque of the motor [N m].
+        """
+        self._clock += seconds
+        self.put("realtime_tick", int(self._clock / TICK_S) % TICK_MODULUS)
+        self._where = position
+        counts = to_counts(position) - self._turns * COUNTS_PER_TURN
+        speed = round(velocity / RAD_S_PER_COUNT)
+        self.put("present_position", counts)
+        self.put("present_velocity", speed)
+        self.put("present_current", round(torque / self.model.torque_nm_per_a / self.model.current_unit_a))
+        self.put("moving", int(abs(speed) > self.get("moving_threshold")))
+        self._protect(seconds, torque)
+        self._watch(seconds)
+
+    def _protect(self, seconds: float, torque: float) -> None:
+        full = self.model.current_limit * self.model.current_unit_a * self.model.torque_nm_per_a
+        load = abs(torque) / full
+        warming = HEATING_C_PER_S * load**2 - (self.temperature - AMBIENT_C) / COOLING_S + self.heat_c_per_s
+        self.temperature += seconds * warming
+        self.put("present_temperature", min(255, round(self.temperature)))
+        self._strained = self._strained + seconds if load >= OVERLOAD_SHARE else 0.0
+        bits = self.get("hardware_error_status")
+        if self.temperature > self.get("temperature_limit"):
+            bits |= HardwareError.OVERHEATING
+        if self._strained >= OVERLOAD_S:
+            bits |= HardwareError.OVERLOAD
+        self.put("hardware_error_status", bits)
+        if self.shut_down:
+            self.put("torque_enable", 0)
+
+    def _watch(self, seconds: float) -> None:
+        self._silence += seconds
+        limit = self.get("bus_watchdog")
+        if limit > 0 and self._silence > limit * WATCHDOG_UNIT_S:
+            self.put("bus_watchdog", -1)
+            self.put("goal_position", self.get("present_position"))

@@ -1,0 +1,209 @@
+"""From a depth image to a point cloud: crop by height, choose a fixed number of points, carry to the base.
+
+Its points are those of the cells: the image's own pixels, or one of each block.
+Launch order: ``crop_cells_kernel``, ``count_points_kernel``, ``choose_points_kernel``.
+"""
+
+import warp as wp
+
+from vd.kernels.rng import next_stream
+from vd.kernels.sensor.depth_views import View, cell_pixel, pixel_direction
+from vd.kernels.sensor.raycast import TILE_CELLS, TILE_COLUMNS, TILE_ROWS
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.func
+def last_not_above(value: int, world: int, start: int, end: int, sums: wp.array2d[int]) -> int:
+    """Last of ``sums[world, start:end]``, which does not fall, that is not above ``value``."""
+    low = start
+    high = end
+    while high - low > 1:
+        middle = (low + high) // 2
+        if sums[world, middle] <= value:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+@wp.kernel
+def crop_cells_kernel(
+    # Model:
+    views: wp.array[View],
+    lowest: float,
+    highest: float,
+    height: int,
+    width: int,
+    block: int,
+    tile_columns: int,
+    # In:
+    camera_q_in: wp.array[wp.transform],
+    rng_in: wp.array[wp.uint32],
+    depth_in: wp.array3d[float],
+    # Out:
+    tile_cells_out: wp.array2d[wp.uint32],
+    tile_first_out: wp.array2d[int],
+    row_count_out: wp.array2d[int],
+):
+    """Mark the cells whose point lies within the crop. Launch: [N, T / tile_columns], the rows of tiles.
+
+    Args:
+        views: Camera of each world, shape [N].
+        lowest: Least height of a point in the world frame [m].
+        highest: Largest height [m].
+        height: Rows of the image.
+        width: Columns of the image.
+        block: Pixels on a side of a cell.
+        tile_columns: Tiles in a row of tiles.
+        camera_q_in: Optical frames in the world frame, shape [N].
+        rng_in: Random state of each world, shape [N]; that of the ray casting, not advanced.
+        depth_in: Depth [m], 0 for none, shape [N, R, C].
+        tile_cells_out: Bit k is set if the tile's cell k is within the crop, shape [N, T].
+        tile_first_out: Points before each tile in its row of tiles, shape [N, T].
+        row_count_out: Points of each row of tiles, shape [N, T / tile_columns].
+    """
+    world, tile_row = wp.tid()
+    view = views[world]
+    camera_q = camera_q_in[world]
+    # Height of a point: the third row of the camera's rotation by the point, above the eye.
+    up = wp.quat_rotate_inv(wp.transform_get_rotation(camera_q), wp.vec3(0.0, 0.0, 1.0))
+    eye_height = wp.transform_get_translation(camera_q)[2]
+    rows = depth_in.shape[1]
+    columns = depth_in.shape[2]
+    seed = rng_in[world]
+    count = wp.int32(0)
+    for tile_column in range(tile_columns):
+        tile = tile_row * tile_columns + tile_column
+        tile_first_out[world, tile] = count
+        word = wp.uint32(0)
+        for cell in range(TILE_CELLS):
+            row = tile_row * TILE_ROWS + cell // TILE_COLUMNS
+            column = tile_column * TILE_COLUMNS + cell % TILE_COLUMNS
+            if row < rows and column < columns:
+                depth = depth_in[world, row, column]
+                if depth > 0.0:
+                    pixel_row, pixel_column = cell_pixel(seed, row, column, columns, block, height, width)
+                    above = wp.dot(up, pixel_direction(view, pixel_column, pixel_row)) * depth + eye_height
+                    if above >= lowest and above <= highest:
+                        word = word | (wp.uint32(1) << wp.uint32(cell))
+                        count += 1
+        tile_cells_out[world, tile] = word
+    row_count_out[world, tile_row] = count
+
+
+@wp.kernel
+def count_points_kernel(
+    # Model:
+    capacity: int,
+    # In:
+    row_count_in: wp.array2d[int],
+    # Out:
+    row_first_out: wp.array2d[int],
+    available_out: wp.array[int],
+    count_out: wp.array[int],
+):
+    """Number the points of each world. Launch: [N].
+
+    Args:
+        capacity: Points of a cloud at most, K.
+        row_count_in: Points of each row of tiles, shape [N, Y].
+        row_first_out: Points before each row of tiles, shape [N, Y].
+        available_out: Points within the crop, shape [N].
+        count_out: Points of the cloud, shape [N].
+    """
+    world = wp.tid()
+    total = wp.int32(0)
+    for tile_row in range(row_count_in.shape[1]):
+        row_first_out[world, tile_row] = total
+        total += row_count_in[world, tile_row]
+    available_out[world] = total
+    count_out[world] = wp.min(total, capacity)
+
+
+@wp.kernel
+def choose_points_kernel(
+    # Model:
+    views: wp.array[View],
+    height: int,
+    width: int,
+    block: int,
+    tile_columns: int,
+    # In:
+    extrinsics_in: wp.array[wp.transform],
+    rng_in: wp.array[wp.uint32],
+    depth_in: wp.array3d[float],
+    tile_cells_in: wp.array2d[wp.uint32],
+    tile_first_in: wp.array2d[int],
+    row_first_in: wp.array2d[int],
+    available_in: wp.array[int],
+    # Out:
+    points_out: wp.array2d[wp.vec3],
+):
+    """Choose points at random, evenly over the image and each at most once. Launch: [N, K].
+
+    With V points and room for K < V, thread k takes a random one of those from k V / K to (k + 1) V / K. With
+    V <= K all are taken, in order, and the rows beyond are NaN.
+
+    Args:
+        views: Camera of each world, shape [N].
+        height: Rows of the image.
+        width: Columns of the image.
+        block: Pixels on a side of a cell.
+        tile_columns: Tiles in a row of tiles.
+        extrinsics_in: Optical frame in the frame of the camera's body (the hand's base), shape [N].
+        rng_in: Random state of each world, shape [N]; that of the ray casting, not advanced.
+        depth_in: Depth [m], 0 for none, shape [N, R, C].
+        tile_cells_in: Cells within the crop, a bit each, shape [N, T].
+        tile_first_in: Points before each tile in its row of tiles, shape [N, T].
+        row_first_in: Points before each row of tiles, shape [N, Y].
+        available_in: Points within the crop, shape [N].
+        points_out: Points in the frame of the camera's body [m], shape [N, K].
+    """
+    world, k = wp.tid()
+    capacity = points_out.shape[1]
+    available = available_in[world]
+    if k >= available:
+        points_out[world, k] = wp.vec3(wp.nan, wp.nan, wp.nan)
+        return
+    rows = depth_in.shape[1]
+    columns = depth_in.shape[2]
+    wanted = k
+    if available > capacity:
+        # 64 bits: k times the pixels of a large image does not fit 32.
+        start = int(wp.int64(k) * wp.int64(available) // wp.int64(capacity))
+        end = int(wp.int64(k + 1) * wp.int64(available) // wp.int64(capacity))
+        # Streams of the cells come first.
+        rng = wp.rand_init(int(rng_in[world]), rows * columns + k)
+        wanted = wp.randi(rng, start, end)
+
+    tile_row = last_not_above(wanted, world, 0, row_first_in.shape[1], row_first_in)
+    wanted -= row_first_in[world, tile_row]
+    first = tile_row * tile_columns
+    tile = last_not_above(wanted, world, first, first + tile_columns, tile_first_in)
+    wanted -= tile_first_in[world, tile]
+    word = tile_cells_in[world, tile]
+    chosen = wp.int32(0)
+    for cell in range(TILE_CELLS):
+        if (word & (wp.uint32(1) << wp.uint32(cell))) != wp.uint32(0):
+            if wanted == 0:
+                chosen = cell
+            wanted -= 1
+
+    row = tile_row * TILE_ROWS + chosen // TILE_COLUMNS
+    column = (tile % tile_columns) * TILE_COLUMNS + chosen % TILE_COLUMNS
+    pixel_row, pixel_column = cell_pixel(rng_in[world], row, column, columns, block, height, width)
+    seen = pixel_direction(views[world], pixel_column, pixel_row) * depth_in[world, row, column]
+    points_out[world, k] = wp.transform_point(extrinsics_in[world], seen)
+
+
+@wp.kernel
+def next_frame_kernel(
+    # In/Out:
+    rng: wp.array[wp.uint32],
+):
+    """Advance the random state of each world, shape [N], past this frame's draws. Launch: [N]."""
+    world = wp.tid()
+    state = rng[world]
+    wp.randu(state)  # else the next frame's state would be that of one of this frame's cells
+    rng[world] = next_stream(state, world)

@@ -1,0 +1,135 @@
+"""Depth by rasterisation: one thread a triangle, which looks at the pixels it can cover.
+
+The same image as :mod:`vd.kernels.sensor.raycast`, by turning the loops around: a mesh of the size of these
+covers few pixels with each triangle. A pixel is covered if the ray through its centre meets the triangle,
+tested without dividing by depth, so that triangles beside and behind the camera need no clipping.
+
+Launch order: ``place_camera_kernel``, ``place_meshes_kernel``, then ``depth.fill_(NO_HIT)``,
+``rasterise_kernel``, and ``finish_depth_kernel`` (:mod:`vd.kernels.sensor.depth_views`).
+"""
+
+import warp as wp
+
+from vd.kernels.sensor.depth_views import View
+
+wp.set_module_options({"enable_backward": False})
+
+MARGIN = wp.constant(1.0e-3)
+"""Pixels by which a triangle's bounds are widened: above the rounding of a projection."""
+
+
+@wp.func
+def edge_normal(a: wp.vec3, b: wp.vec3, index_a: int, index_b: int) -> wp.vec3:
+    """Normal of the plane through the camera and an edge; exactly opposite for the edge turned around.
+
+    The two triangles at an edge must agree on which side a ray passes, or rays slip between them; the
+    rounding of a cross product depends on the order of its factors, so the indices choose the order.
+    """
+    if index_a < index_b:
+        first, second, sign = a, b, 1.0
+    else:
+        first, second, sign = b, a, -1.0
+    return wp.cross(first, second) * sign
+
+
+@wp.kernel
+def rasterise_kernel(
+    # Model:
+    views: wp.array[View],
+    points: wp.array[wp.vec3],
+    triangles: wp.array[wp.vec3i],
+    mesh_first: wp.array[int],
+    slot_shape: wp.array[int],
+    slot_index: wp.array[int],
+    shape_mesh: wp.array2d[int],
+    shape_scale: wp.array2d[float],
+    # In:
+    rotation_in: wp.array2d[wp.mat33],
+    position_in: wp.array2d[wp.vec3],
+    window_in: wp.array2d[wp.vec4],
+    # Out:
+    depth_bits: wp.array3d[wp.int32],
+):
+    """Lower the depth of every pixel that a triangle covers. Launch: [N, K].
+
+    Args:
+        views: Camera of each world, shape [N].
+        points: Vertices of all meshes in their frames [m], shape [V].
+        triangles: Vertices of all triangles, mesh after mesh, shape [F].
+        mesh_first: First triangle of each mesh, and the end of the last, shape [M + 1].
+        slot_shape: Shape of each thread, shape [K].
+        slot_index: Number of each thread's triangle within the shape's mesh; there may be fewer, shape [K].
+        shape_mesh: Mesh of each shape, shape [N, S].
+        shape_scale: Size factor of each shape, shape [N, S].
+        rotation_in: Rotation from mesh to optical frame, shape [N, S].
+        position_in: Origin of the mesh frame in the optical frame [m], shape [N, S].
+        window_in: Pixels that each shape's bounds cover, shape [N, S].
+        depth_bits: Depth [m] as the bits of a float, whose order as integers is that of positive floats, for
+            which devices have an atomic minimum; shape [N, H, W].
+    """
+    world, slot = wp.tid()
+    shape = slot_shape[slot]
+    mesh = shape_mesh[world, shape]
+    triangle = mesh_first[mesh] + slot_index[slot]
+    window = window_in[world, shape]
+    if triangle >= mesh_first[mesh + 1] or window[0] > window[2]:
+        return
+    view = views[world]
+    rotation = rotation_in[world, shape] * shape_scale[world, shape]
+    position = position_in[world, shape]
+    corner = triangles[triangle]
+    a = rotation * points[corner[0]] + position
+    b = rotation * points[corner[1]] + position
+    c = rotation * points[corner[2]] + position
+    if wp.max(a[2], wp.max(b[2], c[2])) <= 0.0:
+        return
+
+    height = depth_bits.shape[1]
+    width = depth_bits.shape[2]
+    left = wp.int32(0)
+    top = wp.int32(0)
+    right = width
+    bottom = height
+    if wp.min(a[2], wp.min(b[2], c[2])) >= view.near:
+        pa = wp.vec2(a[0] / a[2], a[1] / a[2])
+        pb = wp.vec2(b[0] / b[2], b[1] / b[2])
+        pc = wp.vec2(c[0] / c[2], c[1] / c[2])
+        least = wp.min(pa, wp.min(pb, pc))
+        largest = wp.max(pa, wp.max(pb, pc))
+        # Pixel k is seen along k + 0.5. Clamped before the cast: a far column need not fit an integer.
+        last_column, last_row = float(width) - 1.0, float(height) - 1.0
+        left = int(wp.ceil(wp.clamp(view.cx + view.fx * least[0] - MARGIN - 0.5, 0.0, last_column + 1.0)))
+        top = int(wp.ceil(wp.clamp(view.cy + view.fy * least[1] - MARGIN - 0.5, 0.0, last_row + 1.0)))
+        right = int(wp.floor(wp.clamp(view.cx + view.fx * largest[0] + MARGIN - 0.5, -1.0, last_column))) + 1
+        bottom = int(wp.floor(wp.clamp(view.cy + view.fy * largest[1] + MARGIN - 0.5, -1.0, last_row))) + 1
+    if left >= right or top >= bottom:
+        return
+
+    # A ray d meets the plane of abc at u a + v b + w c with u : v : w = d.(b x c) : d.(c x a) : d.(a x b),
+    # and the triangle where none of the three has the other sign. The depth comes from the plane's normal, a
+    # product of short vectors and hence exact where these products of long ones are not.
+    na = edge_normal(b, c, corner[1], corner[2])
+    nb = edge_normal(c, a, corner[2], corner[0])
+    nc = edge_normal(a, b, corner[0], corner[1])
+    normal = wp.cross(b - a, c - a)
+    offset = wp.dot(a, normal)
+    if offset < 0.0:
+        na, nb, nc, normal, offset = -na, -nb, -nc, -normal, -offset
+    nearest = wp.min(a[2], wp.min(b[2], c[2]))
+    farthest = wp.max(a[2], wp.max(b[2], c[2]))
+    across = 1.0 / view.fx
+    for row in range(top, bottom):
+        # Along a row the direction is (x, y, 1) with x alone changing.
+        y = (float(row) + 0.5 - view.cy) / view.fy
+        ka = na[1] * y + na[2]
+        kb = nb[1] * y + nb[2]
+        kc = nc[1] * y + nc[2]
+        kn = normal[1] * y + normal[2]
+        for column in range(left, right):
+            x = (float(column) + 0.5 - view.cx) * across
+            if na[0] * x + ka >= 0.0 and nb[0] * x + kb >= 0.0 and nc[0] * x + kc >= 0.0:
+                slope = normal[0] * x + kn
+                if slope > 0.0:
+                    bits = wp.cast(wp.clamp(offset / slope, nearest, farthest), wp.int32)
+                    if bits < depth_bits[world, row, column]:
+                        wp.atomic_min(depth_bits, world, row, column, bits)

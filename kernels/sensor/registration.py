@@ -1,0 +1,435 @@
+"""Where a known shape is, from points seen of it: poses are fitted, many at once, and the best kept.
+
+A shape is a grid of distances to its surface, so that a point costs one look-up whatever the shape is. Each
+pose is improved by steps of Gauss and Newton on the distances of the seen points, of which far ones count
+less. How badly it fits is the mean square of two lengths, both cut off at ``far``: how far the seen points
+are from the shape, and how far the shape stands out before what a camera saw.
+
+Frames: *base* is that of the points and poses, *object* that of the samples. Metres, quaternions xyzw.
+N worlds, P seen points at most, O shapes of S samples, grids of E^3 distances; M rows, each of one world,
+with C poses each.
+"""
+
+import warp as wp
+
+from vd.kernels.sensor.shape_grids import Shapes, surface_distance
+
+wp.set_module_options({"enable_backward": False})
+
+LEVER_M = wp.constant(0.03)
+"""Turns weigh against shifts as at this distance from the centre, about the size of an object."""
+DAMPING = wp.constant(0.01)
+"""Curvature added to each direction, of one: what the points do not fix stays where it is."""
+LARGEST_TURN = wp.constant(0.5)
+"""Largest turn of one step [rad]."""
+SETTLED_M = wp.constant(5.0e-5)
+"""A step that shifts a pose by less than this [m] (ours, far below what is seen) ..."""
+SETTLED_RAD = wp.constant(1.0e-3)
+"""... and turns it by less than this [rad] is the last one (ours)."""
+SMALL = wp.constant(1.0e-7)
+"""Lengths and angles below this have no direction."""
+NEVER = wp.constant(1.0e9)
+"""Misfit of a pose that is not to be taken."""
+
+
+@wp.struct
+class Eye:
+    """A camera and what it can tell.
+
+    focal: Focal lengths [pixel].
+    centre: Principal point, from the top left corner of the image [pixel].
+    pose: Optical frame in the base frame.
+    cell: Side of a cell of the image [pixel].
+    margin: What is nearer than all that was seen in its cell by less than this may be there [m].
+    """
+
+    focal: wp.vec2
+    centre: wp.vec2
+    pose: wp.transform
+    cell: float
+    margin: float
+
+
+@wp.func
+def cell_of(eye: Eye, seen: wp.vec3):
+    """Row and column of the cell that shows a point of the optical frame."""
+    column = wp.floor((eye.focal[0] * seen[0] / seen[2] + eye.centre[0]) / eye.cell)
+    row = wp.floor((eye.focal[1] * seen[1] / seen[2] + eye.centre[1]) / eye.cell)
+    return int(row), int(column)
+
+
+@wp.kernel
+def nearness_kernel(
+    # Model:
+    eye: Eye,
+    # In:
+    points_in: wp.array2d[wp.vec3],
+    # In/Out:
+    nearness: wp.array3d[float],
+):
+    """How near the nearest is that was seen in each cell of the image. Launch: [N, K].
+
+    Args:
+        eye: The camera.
+        points_in: What it saw, base frame [m], NaN for none, shape [N, K].
+        nearness: One over depth [1/m], shape [N, Y, X]; to be zero before, and zero where nothing was seen.
+    """
+    world, k = wp.tid()
+    place = wp.transform_point(wp.transform_inverse(eye.pose), points_in[world, k])
+    if place[2] > 0.0:  # not so of NaN
+        row, column = cell_of(eye, place)
+        if row >= 0 and row < nearness.shape[1] and column >= 0 and column < nearness.shape[2]:
+            wp.atomic_max(nearness, world, row, column, 1.0 / place[2])
+
+
+@wp.func
+def standing_out(eye: Eye, place: wp.vec3, world: int, nearness: wp.array3d[float], far: float) -> float:
+    """How far a point of the base frame lies before all that was seen in its cell [m], at most ``far``.
+
+    Where nothing was seen, not even the hand, there is nothing for a long way. Beyond the image all may be.
+    """
+    seen = wp.transform_point(wp.transform_inverse(eye.pose), place)
+    row, column = cell_of(eye, seen)
+    if row < 0 or row >= nearness.shape[1] or column < 0 or column >= nearness.shape[2]:
+        return 0.0
+    near = nearness[world, row, column]
+    if near == 0.0:
+        return far
+    return wp.clamp(1.0 / near - eye.margin - seen[2], 0.0, far)
+
+
+@wp.func
+def placed(
+    shapes: Shapes,
+    eye: Eye,
+    rendered: int,
+    every: int,
+    world: int,
+    turn: wp.quat,
+    seen: wp.array2d[wp.vec3],
+    count: wp.array[int],
+) -> wp.transform:
+    """The shape in a given rotation, what would be seen of it where points are.
+
+    The mean of the samples that lie nearer to the camera than their mean, of all without a camera, comes to
+    the mean of the seen points.
+    """
+    shape = shapes.world_shape[world]
+    middle = wp.vec3()
+    for i in range(count[world]):
+        middle += seen[world, i]
+    middle = middle / wp.max(float(count[world]), 1.0)
+    whole = wp.vec3()
+    for i in range(0, shapes.samples.shape[1], every):
+        whole += shapes.samples[shape, i]
+    samples = (shapes.samples.shape[1] + every - 1) // every
+    whole = whole / float(samples)
+    part = whole
+    if rendered != 0:
+        ray = wp.quat_rotate_inv(turn, middle - wp.transform_get_translation(eye.pose))
+        total = wp.vec3()
+        near = wp.float32(0.0)
+        for i in range(0, shapes.samples.shape[1], every):
+            sample = shapes.samples[shape, i]
+            if wp.dot(sample - whole, ray) <= 0.0:
+                total += sample
+                near += 1.0
+        part = total / wp.max(near, 1.0)
+    return wp.transform(middle - wp.quat_rotate(turn, shapes.world_scale[world] * part), turn)
+
+
+@wp.kernel
+def start_poses_kernel(
+    # Model:
+    shapes: Shapes,
+    eye: Eye,
+    rendered: int,
+    every: int,
+    # In:
+    world_in: wp.array[int],
+    first_in: wp.array[int],
+    rotation_in: wp.array[wp.quat],
+    seen_in: wp.array2d[wp.vec3],
+    count_in: wp.array[int],
+    # Out:
+    pose_out: wp.array2d[wp.transform],
+):
+    """Place the shape in given rotations, as :func:`placed` does. Launch: [M, C].
+
+    Args:
+        shapes: The shapes.
+        eye: The camera.
+        rendered: 1 where a camera saw the points, 0 where they are of all sides.
+        every: Look at every so many-th sample.
+        world_in: World of each row, shape [M]; a row of -1 is left out.
+        first_in: Which rotation is the first of each row, counted on and around, shape [M].
+        rotation_in: Rotations, shape [H].
+        seen_in: Points seen of the object, base frame [m], shape [N, P].
+        count_in: How many there are, shape [N].
+        pose_out: Object frame in the base frame, shape [M, C].
+    """
+    row, c = wp.tid()
+    world = world_in[row]
+    if world < 0:
+        return
+    turn = rotation_in[(first_in[row] + c) % rotation_in.shape[0]]
+    pose_out[row, c] = placed(shapes, eye, rendered, every, world, turn, seen_in, count_in)
+
+
+@wp.kernel
+def replace_poses_kernel(
+    # Model:
+    shapes: Shapes,
+    eye: Eye,
+    rendered: int,
+    every: int,
+    # In:
+    world_in: wp.array[int],
+    worse: float,
+    pose_in: wp.array2d[wp.transform],
+    misfit_in: wp.array2d[float],
+    cost_in: wp.array2d[float],
+    seen_in: wp.array2d[wp.vec3],
+    count_in: wp.array[int],
+    # Out:
+    pose_out: wp.array2d[wp.transform],
+    cost_out: wp.array2d[float],
+):
+    """Put poses where points are now, turned as they were: what falls is soon too far. Launch: [M, C].
+
+    Only those that do not fit any more as they did.
+
+    Args:
+        shapes: The shapes.
+        eye: The camera.
+        rendered: 1 where a camera saw the points, 0 where they are of all sides.
+        every: Look at every so many-th sample.
+        world_in: World of each row, shape [M]; a row of -1 is left out.
+        worse: A pose fits as it did if its misfit is no more than so many times that before.
+        pose_in: Poses before, object frame in the base frame, shape [N, C].
+        misfit_in: Their misfits, averaged over time [m^2], shape [N, C].
+        cost_in: Misfits of what became of them now [m^2], shape [M, C].
+        seen_in: Points seen of the object, base frame [m], shape [N, P].
+        count_in: How many there are, shape [N].
+        pose_out: Poses, shape [M, C].
+        cost_out: NEVER where a pose fits as it did and none is written, else 0, shape [M, C].
+    """
+    row, c = wp.tid()
+    world = world_in[row]
+    if world < 0:
+        return
+    cost_out[row, c] = 0.0
+    if cost_in[row, c] <= worse * misfit_in[world, c]:
+        cost_out[row, c] = NEVER
+        return
+    turn = wp.transform_get_rotation(pose_in[world, c])
+    pose_out[row, c] = placed(shapes, eye, rendered, every, world, turn, seen_in, count_in)
+
+
+@wp.func
+def improved(
+    shapes: Shapes,
+    world: int,
+    pose: wp.transform,
+    far: float,
+    every: int,
+    seen: wp.array2d[wp.vec3],
+    count: wp.array[int],
+) -> wp.transform:
+    """A pose after one step of Gauss and Newton on the distances of the seen points from the shape."""
+    shape = shapes.world_shape[world]
+    scale = shapes.world_scale[world]
+    place = wp.transform_get_translation(pose)
+    turn = wp.transform_get_rotation(pose)
+    # Curvature of shifts, of turns, and between them; slopes of both.
+    shifts = wp.mat33()
+    turns = wp.mat33()
+    mixed = wp.mat33()
+    shift_slope = wp.vec3()
+    turn_slope = wp.vec3()
+    used = wp.float32(0.0)
+    for i in range(0, count[world], every):
+        arm = seen[world, i] - place
+        distance, gradient = surface_distance(shapes, shape, wp.quat_rotate_inv(turn, arm) / scale)
+        distance = scale * distance
+        normal = wp.quat_rotate(turn, gradient)
+        moment = wp.cross(arm, normal) / LEVER_M
+        weight = far * far / (far * far + distance * distance)
+        shifts += weight * wp.outer(normal, normal)
+        turns += weight * wp.outer(moment, moment)
+        mixed += weight * wp.outer(normal, moment)
+        shift_slope += weight * distance * normal
+        turn_slope += weight * distance * moment
+        used += 1.0
+    if used == 0.0:
+        return pose
+    damping = DAMPING * used * wp.identity(n=3, dtype=float)
+    solved = wp.inverse(shifts + damping)
+    # The shift that is best for each turn put in (Schur's complement).
+    left = turns + damping - wp.transpose(mixed) * solved * mixed
+    angle_axis = wp.inverse(left) * (turn_slope - wp.transpose(mixed) * solved * shift_slope)
+    shift = solved * (shift_slope - mixed * angle_axis)
+    angle_axis = angle_axis / LEVER_M
+    angle = wp.length(angle_axis)
+    if angle > SMALL:
+        step = wp.quat_from_axis_angle(angle_axis / angle, wp.min(angle, LARGEST_TURN))
+        turn = wp.normalize(step * turn)
+    return wp.transform(place + shift, turn)
+
+
+@wp.kernel
+def fit_poses_kernel(
+    # Model:
+    shapes: Shapes,
+    eye: Eye,
+    far: float,
+    steps: int,
+    every: int,
+    every_sample: int,
+    # In:
+    world_in: wp.array[int],
+    seen_in: wp.array2d[wp.vec3],
+    count_in: wp.array[int],
+    nearness_in: wp.array3d[float],
+    # In/Out:
+    pose: wp.array2d[wp.transform],
+    misfit: wp.array2d[float],
+):
+    """Improve poses until they stay, and say how badly they fit. Launch: [M, C].
+
+    Args:
+        shapes: The shapes.
+        eye: The camera.
+        far: Length at which distances are cut off [m]; from about there on points count less.
+        steps: Steps of each pose at most.
+        every: Look at every so many-th seen point.
+        every_sample: Look at every so many-th sample for what stands out.
+        world_in: World of each row, shape [M]; a row of -1 is left out.
+        seen_in: Points seen of the object, base frame [m], shape [N, P].
+        count_in: How many there are, shape [N].
+        nearness_in: From ``nearness_kernel``, shape [N, Y, X]; [N, 0, 0] without a camera.
+        pose: Object frame in the base frame, shape [M, C].
+        misfit: Mean squares of both lengths, together [m^2], shape [M, C]; NEVER where nothing is to be done.
+    """
+    row, c = wp.tid()
+    world = world_in[row]
+    if world < 0 or misfit[row, c] >= NEVER:
+        return
+    best = pose[row, c]
+    for _ in range(steps):
+        before = best
+        best = improved(shapes, world, before, far, every, seen_in, count_in)
+        shift = wp.transform_get_translation(best) - wp.transform_get_translation(before)
+        turn = wp.transform_get_rotation(best) - wp.transform_get_rotation(before)  # half the angle, if small
+        if wp.length(shift) < SETTLED_M and 2.0 * wp.length(turn) < SETTLED_RAD:
+            break
+    pose[row, c] = best
+
+    shape = shapes.world_shape[world]
+    scale = shapes.world_scale[world]
+    to_object = wp.transform_inverse(best)
+    off = wp.float32(0.0)
+    points = wp.float32(0.0)
+    for i in range(0, count_in[world], every):
+        place = wp.transform_point(to_object, seen_in[world, i]) / scale
+        distance, _gradient = surface_distance(shapes, shape, place)
+        distance = wp.min(wp.abs(scale * distance), far)
+        off += distance * distance
+        points += 1.0
+    out = wp.float32(0.0)
+    samples = wp.float32(0.0)
+    if nearness_in.shape[1] > 0:
+        for i in range(0, shapes.samples.shape[1], every_sample):
+            place = wp.transform_point(best, scale * shapes.samples[shape, i])
+            length = standing_out(eye, place, world, nearness_in, far)
+            out += length * length
+            samples += 1.0
+    misfit[row, c] = off / wp.max(points, 1.0) + out / wp.max(samples, 1.0)
+
+
+@wp.kernel
+def take_better_kernel(
+    # In:
+    world_in: wp.array[int],
+    known: int,
+    # In/Out:
+    pose: wp.array2d[wp.transform],
+    cost: wp.array2d[float],
+):
+    """Of each two attempts at the same pose take the better one. Launch: [M, K].
+
+    Args:
+        world_in: World of each row, shape [M]; a row of -1 is left out.
+        known: K.
+        pose: Poses, shape [M, >= 2 K]: attempt k + K is another one at what k is.
+        cost: Their misfits [m^2], likewise; NEVER of the second ones afterwards.
+    """
+    row, k = wp.tid()
+    if world_in[row] < 0:
+        return
+    again = known + k
+    if cost[row, again] < cost[row, k]:
+        pose[row, k] = pose[row, again]
+        cost[row, k] = cost[row, again]
+    cost[row, again] = NEVER
+
+
+@wp.kernel
+def keep_poses_kernel(
+    # Model:
+    apart: float,
+    stay: float,
+    share: float,
+    known: int,
+    # In:
+    world_in: wp.array[int],
+    found_in: wp.array2d[wp.transform],
+    # In/Out:
+    cost: wp.array2d[float],
+    pose: wp.array2d[wp.transform],
+    misfit: wp.array2d[float],
+):
+    """Keep the best poses of each world that are not nearly the same. Launch: [M].
+
+    The first of the found poses may be those kept before, improved: their misfits are averaged over time.
+    The very first stays so unless another is better by a good deal: of a shape that looks the same from
+    several sides any is as good, but not another one in each step. The kept poses are in the order of their
+    misfits.
+
+    Args:
+        apart: Least angle between two kept poses [rad].
+        stay: Factor on the misfit of the first pose when it is compared.
+        share: Share of the latest misfit in the average over time.
+        known: How many of the found poses were kept before, 0 or K.
+        world_in: World of each row, shape [M]; a row of -1 is left out.
+        found_in: Found poses, shape [M, C].
+        cost: Their misfits now, shape [M, C]; of no meaning after.
+        pose: Kept poses, shape [N, K].
+        misfit: Their misfits, averaged over time; NEVER where none is left, shape [N, K].
+    """
+    row = wp.tid()
+    world = world_in[row]
+    if world < 0:
+        return
+    for c in range(known):
+        if misfit[world, c] >= NEVER:
+            cost[row, c] = NEVER
+        else:
+            cost[row, c] = misfit[world, c] + share * (cost[row, c] - misfit[world, c])
+    for k in range(pose.shape[1]):
+        best = wp.int32(0)
+        least = 2.0 * NEVER
+        for c in range(found_in.shape[1]):
+            weighed = cost[row, c]
+            if c == 0 and known > 0:
+                weighed = stay * weighed
+            if weighed < least:
+                best = c
+                least = weighed
+        misfit[world, k] = wp.min(cost[row, best], NEVER)
+        pose[world, k] = found_in[row, best]
+        turn = wp.transform_get_rotation(found_in[row, best])
+        for c in range(found_in.shape[1]):
+            cosine = wp.abs(wp.dot(turn, wp.transform_get_rotation(found_in[row, c])))
+            if c == best or 2.0 * wp.acos(wp.min(cosine, 1.0)) < apart:
+                cost[row, c] = NEVER

@@ -1,0 +1,422 @@
+"""Rollouts of one chain of one to three revolute joints, one thread per trajectory and parameter set.
+
+The joints carry the servos of :mod:`vd.kernels.servo.actuators`. Without bodies a joint is its own inertia
+(a bare servo, a pendulum); with bodies the chain is a finger: mass matrix and bias forces in 3-D
+(:mod:`vd.kernels.servo.chain_bodies`).
+
+Each step ``dt`` is a leapfrog step: positions at whole steps, velocities half-way between, so the
+error of smooth motion falls with dt^2. What makes a servo stiff is implicit: damping by
+Crank-Nicolson as far as that does not ring, stiffness by average acceleration. Dry friction is an
+impulse bounded by the friction torque, found by projected Gauss-Seidel sweeps: a joint that friction
+can hold stands still exactly.
+
+A command takes the share of a step that remains when it arrives, so the motion is a smooth function
+of its delay. SI units, radians; times are whole steps and a fraction, exact over any duration.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from vd.kernels.servo.actuators import (
+    COMMAND_DELAY,
+    COUPLING_0,
+    ENCODER_BIAS,
+    INERTIA,
+    JITTER_DROP,
+    JITTER_SIGMA,
+    KP,
+    LOAD_FRICTION,
+    PARAMETER_COLUMNS,
+    PAYLOAD_INERTIA,
+    READ_DELAY,
+    STATE_TIME,
+    VELOCITY_LIMIT,
+    drive_joint,
+    rest_play,
+    shape_command,
+    start_servo,
+)
+from vd.kernels.servo.chain_bodies import MAX_JOINTS, Links, chain_dynamics
+
+SMALLEST_INERTIA = 1.0e-8
+"""Least inertia on the diagonal [kg m^2], so that a search that asks for none divides by something."""
+FRICTION_SWEEPS = 3
+"""Gauss-Seidel sweeps a step, started from the impulses of the step before."""
+CENTRED = 0.5
+"""Leapfrog: the torque of a step acts from half a step before its position to half a step after."""
+DIVERGED = 100.0
+"""Distance from the start [rad] at which a rollout stops to mean anything and is held."""
+
+
+COMPILER = "-march=native" if wp.config.cpu_compiler_flags is None else wp.config.cpu_compiler_flags
+wp.set_module_options(
+    {
+        "enable_backward": False,
+        # Everything that a step reads is in registers or on the stack: no write makes it be read again.
+        "max_unroll": PARAMETER_COLUMNS,
+        # Vectors of three fill no register of a CPU: packing them costs more than it saves.
+        "optimization_level": 3,
+        "cpu_compiler_flags": f"{COMPILER} -fno-slp-vectorize",
+    }
+)
+Rows = wp.types.matrix(shape=(MAX_JOINTS, PARAMETER_COLUMNS), dtype=float)
+
+
+@wp.struct
+class Samples:
+    """Recorded trajectories, one after the other; S rows (time stamps) in all.
+
+    step: Time stamp in whole steps [S]. A trajectory need not begin at 0: a piece of a longer one.
+    fraction: And the rest, in [0, 1] [S].
+    sent_step: When the command was sent, in whole steps [S].
+    sent_fraction: And the rest, in [0, 1] [S].
+    command: Commanded positions [S, n] [rad].
+    power: Factor on the controller's gains, 0 with the torque off [S, n].
+    """
+
+    step: wp.array[int]
+    fraction: wp.array[float]
+    sent_step: wp.array[int]
+    sent_fraction: wp.array[float]
+    command: wp.array2d[float]
+    power: wp.array2d[float]
+
+
+@wp.func
+def implicitness(ratio: float) -> float:
+    """Weight of the new velocity in the damping torque of a step, for dt damping / inertia = ``ratio``.
+
+    One half is exact to second order; above a ratio of 2 more is needed for the velocity not to ring.
+    """
+    return wp.max(0.5, 1.0 - 1.0 / wp.max(ratio, 1.0))
+
+
+@wp.func
+def split_steps(step: int, fraction: float, shift: float):
+    """The time ``step + fraction + shift`` as whole steps and a fraction in [0, 1)."""
+    rest = fraction + shift
+    whole = wp.floor(rest)
+    return step + int(whole), rest - whole
+
+
+@wp.func
+def arrival(
+    samples: Samples,
+    write: int,
+    stream: int,
+    parameters: Any,
+    row: int,
+    dt: float,
+):
+    """When a command acts, and whether it does: ``(step, fraction, kept)``.
+
+    The random numbers belong to the write, whatever the parameters. Joints share them: the commands of
+    a hand go out together.
+    """
+    delay = parameters[row, COMMAND_DELAY]
+    sigma = parameters[row, JITTER_SIGMA]
+    drop = parameters[row, JITTER_DROP]
+    kept = 1
+    if sigma > 0.0 or drop > 0.0:
+        rng = wp.rand_init(stream, write)
+        if wp.randf(rng) < drop:
+            kept = 0
+        delay += sigma * wp.abs(wp.randn(rng))
+    step, fraction = split_steps(samples.sent_step[write], samples.sent_fraction[write], CENTRED + delay / dt)
+    return step, fraction, kept
+
+
+@wp.func
+def friction_impulses(wanted: wp.vec3, inverse: wp.mat33, bound: wp.vec3, before: wp.vec3, count: int):
+    """Velocities under dry friction.
+
+    Args:
+        wanted: Velocities without friction [rad/s].
+        inverse: Inverse of the effective mass matrix [1/(kg m^2)].
+        bound: Largest friction impulses [N m s].
+        before: Impulses of the step before, to start from [N m s].
+        count: Joints.
+
+    Returns:
+        ``(speed, impulse)``; joints whose impulse is within its bound stand still exactly.
+    """
+    impulse = wp.vec3(0.0)
+    for i in range(MAX_JOINTS):
+        if i < count:
+            impulse[i] = wp.clamp(before[i], -bound[i], bound[i])
+    speed = wanted + inverse * impulse
+    moved = wp.bool(True)
+    for _sweep in range(FRICTION_SWEEPS):
+        if moved:  # what a sweep leaves as it is the next would too
+            moved = wp.bool(False)
+            for i in range(MAX_JOINTS):
+                if i < count:
+                    new = wp.clamp(impulse[i] - speed[i] / inverse[i, i], -bound[i], bound[i])
+                    change = new - impulse[i]
+                    moved = moved or change != 0.0
+                    impulse[i] = new
+                    for j in range(MAX_JOINTS):
+                        if j < count:
+                            speed[j] += inverse[j, i] * change
+    for i in range(MAX_JOINTS):
+        if i < count and wp.abs(impulse[i]) < bound[i]:
+            speed[i] = 0.0
+    return speed, impulse
+
+
+@wp.func
+def slip(speed: float, change: float):
+    """A speed [rad/s] less what dry friction takes of it, ``change`` at most."""
+    return speed - wp.sign(speed) * wp.min(change, wp.abs(speed))
+
+
+@wp.func
+def load_bounds(bound: wp.vec3, kick: float, motor: wp.vec3, loaded: wp.vec3, gained: wp.vec3):
+    """Friction impulses at the middle of a step, for those that follow the motor's torque.
+
+    Args:
+        bound: Largest friction impulses with the torques at the step's beginning [N m s].
+        kick: Duration of the step [s].
+        motor: Load friction that these bounds hold [N m].
+        loaded: How it falls with speed [N m s/rad].
+        gained: Change of speed over the step [rad/s].
+    """
+    result = bound
+    for j in range(MAX_JOINTS):
+        middle = wp.abs(motor[j] - 0.5 * loaded[j] * gained[j])
+        result[j] = wp.max(bound[j] + kick * (middle - motor[j]), 0.0)
+    return result
+
+
+@wp.kernel
+def rollout_kernel(
+    # In:
+    samples: Samples,
+    first_sample: wp.array[int],
+    sample_count: wp.array[int],
+    first_output: wp.array[int],
+    stream: wp.array[int],
+    start: wp.array2d[float],
+    wanted: wp.array[int],
+    slot: wp.array[int],
+    lower: wp.array[float],
+    upper: wp.array[float],
+    effort: wp.array[float],
+    bodies: int,
+    links: Links,
+    parameters: wp.array2d[float],
+    dt: float,
+    # Out:
+    state: wp.array3d[float],
+    predicted: wp.array2d[float],
+):
+    """Simulate trajectories with parameter sets. Launch: [R].
+
+    Args:
+        samples: What was recorded.
+        first_sample: Row of ``samples`` where each rollout's trajectory begins, shape [R].
+        sample_count: Rows of each trajectory, shape [R].
+        first_output: Row of ``predicted`` where each rollout begins, shape [R].
+        stream: Number of each trajectory's random stream, shape [R].
+        start: Measured positions at the start, where the joints are at rest, shape [R, n] [rad].
+        wanted: Joint whose positions are kept, in column 0; -1 for all, each in its own, shape [R].
+        slot: Place of each joint in the finger, which is its column of the coupling, shape [n].
+        lower: Lower stops, shape [n] [rad].
+        upper: Upper stops, shape [n] [rad].
+        effort: Largest torques of the drives, shape [n] [N m].
+        bodies: 1 if the links have mass, 0 if each joint is its own inertia.
+        links: The links, if they have mass.
+        parameters: Parameter rows by rollout and joint, shape [R n, PARAMETER_COLUMNS].
+        dt: Time step [s].
+        state: Working memory, shape [R, n, STATE_COLUMNS].
+        predicted: Positions as the servo would have reported them, shape [S', n] or [S', 1] [rad].
+    """
+    run = wp.tid()
+    count = slot.shape[0]
+    base_row = run * count
+    begin = first_sample[run]
+    end = begin + sample_count[run]
+    to_output = first_output[run] - begin
+    only = wanted[run]
+    memory = state[run]
+    rows = Rows(0.0)
+    coupling = wp.mat33(0.0)
+    for j in range(MAX_JOINTS):
+        if j < count:
+            for column in range(PARAMETER_COLUMNS):
+                rows[j, column] = parameters[base_row + j, column]
+            for i in range(MAX_JOINTS):
+                if i < count:
+                    coupling[j, i] = parameters[base_row + j, COUPLING_0 + slot[i]]
+
+    q = wp.vec3(0.0)
+    q_start = wp.vec3(0.0)
+    speed = wp.vec3(0.0)
+    impulse = wp.vec3(0.0)
+    # Per joint: the command in force, the write that comes next and when, the next sample and when.
+    held = wp.vec3(0.0)
+    held_power = wp.vec3(0.0)
+    write = wp.vec3i(begin)
+    due_step = wp.vec3i(0)
+    due_fraction = wp.vec3(0.0)
+    due_kept = wp.vec3i(1)
+    read = wp.vec3i(begin)
+    read_step = wp.vec3i(0)
+    read_fraction = wp.vec3(0.0)
+    dry = wp.int32(0)  # typed: it changes in a loop
+    for j in range(MAX_JOINTS):
+        if j < count:
+            q[j] = start[run, j] - rows[j, ENCODER_BIAS]
+            q_start[j] = q[j]
+            held[j] = samples.command[begin, j]
+            held_power[j] = samples.power[begin, j]
+            start_servo(held[j], q[j], j, memory)
+            memory[j, STATE_TIME] = dt * float(samples.step[begin])
+            step, fraction, kept = arrival(samples, begin, stream[run], rows, j, dt)
+            due_step[j] = step
+            due_fraction[j] = fraction
+            due_kept[j] = kept
+            step, fraction = split_steps(
+                samples.step[begin], samples.fraction[begin], -rows[j, READ_DELAY] / dt
+            )
+            read_step[j] = step
+            read_fraction[j] = fraction
+    weight = wp.vec3(0.0)
+    if bodies != 0:
+        _resting, weight = chain_dynamics(q, wp.vec3(0.0), links)
+    for j in range(MAX_JOINTS):
+        if j < count:
+            # What coupled joints add to the reference is a load in the units of the drive.
+            load = -weight[j]
+            for i in range(MAX_JOINTS):
+                if i < count and i != j:
+                    load += held_power[j] * rows[j, KP] * coupling[j, i] * q[i]
+            rest_play(held[j], q[j], load, held_power[j], rows, j, memory)
+
+    for k in range(samples.step[begin], samples.step[end - 1] + 1):
+        # From rest at the first position to the velocity half a step later.
+        kick = dt
+        if k == samples.step[begin]:
+            kick = CENTRED * dt
+        torque = wp.vec3(0.0)
+        damping = wp.vec3(0.0)
+        bound = wp.vec3(0.0)
+        diagonal = wp.vec3(1.0)
+        stiffness = wp.vec3(0.0)
+        motor = wp.vec3(0.0)
+        loaded = wp.vec3(0.0)
+        for j in range(MAX_JOINTS):
+            if j < count:
+                # Commands that arrive within the step divide it; the reference is the mean over it.
+                reference = wp.float32(0.0)
+                power = held_power[j]
+                done = wp.float32(0.0)
+                while due_step[j] <= k:
+                    if due_kept[j] == 1:
+                        part = wp.float32(0.0)
+                        if due_step[j] == k:
+                            part = due_fraction[j] - done
+                        if part > 0.0:
+                            reference += part * shape_command(held[j], part * dt, rows, j, memory)
+                            done += part
+                        power += (1.0 - done) * (samples.power[write[j], j] - held_power[j])
+                        held[j] = samples.command[write[j], j]
+                        held_power[j] = samples.power[write[j], j]
+                    write[j] = write[j] + 1
+                    if write[j] < end:
+                        step, fraction, kept = arrival(samples, write[j], stream[run], rows, j, dt)
+                        # In order: no command overtakes the one before.
+                        if step < due_step[j] or (step == due_step[j] and fraction < due_fraction[j]):
+                            step = due_step[j]
+                            fraction = due_fraction[j]
+                        due_step[j] = step
+                        due_fraction[j] = fraction
+                        due_kept[j] = kept
+                    else:
+                        due_step[j] = 2147483647
+                coupled = wp.float32(0.0)
+                if count > 1:
+                    for i in range(MAX_JOINTS):
+                        if i < count:
+                            coupled += coupling[j, i] * q[i]
+                before = wp.float32(0.0)
+                if done > 0.0:
+                    before = reference / done + coupled
+                part = 1.0 - done
+                reference += part * shape_command(held[j], part * dt, rows, j, memory) + coupled
+                drive = drive_joint(
+                    reference, before, done, q[j], speed[j], power, dt, effort[j], rows, j, memory
+                )
+                torque[j] = (
+                    drive.stiffness * (drive.reference - q[j]) - drive.damping * speed[j] + drive.torque
+                )
+                damping[j] = drive.damping
+                stiffness[j] = drive.stiffness
+                bound[j] = kick * drive.friction
+                motor[j] = rows[j, LOAD_FRICTION] * drive.motor
+                loaded[j] = rows[j, LOAD_FRICTION] * drive.motor_damping
+                if drive.friction > 0.0:
+                    dry = 1
+                diagonal[j] = rows[j, INERTIA] + rows[j, PAYLOAD_INERTIA]
+
+        mass = wp.mat33(0.0)
+        if bodies == 1:
+            mass, bias = chain_dynamics(q, speed, links)
+            torque -= bias
+        for j in range(MAX_JOINTS):
+            inertia = wp.max(diagonal[j] + mass[j, j], SMALLEST_INERTIA)
+            mass[j, j] = (
+                inertia
+                + kick * damping[j] * implicitness(kick * damping[j] / inertia)
+                + 0.25 * dt * dt * stiffness[j]
+            )
+        new_speed = wp.vec3(0.0)
+        if count == 1:
+            free = speed[0] + kick * torque[0] / mass[0, 0]
+            new_speed[0] = slip(free, bound[0] / mass[0, 0])
+            if loaded[0] != 0.0:
+                bound = load_bounds(bound, kick, motor, loaded, new_speed - speed)
+                new_speed[0] = slip(free, bound[0] / mass[0, 0])
+        else:
+            inverse = wp.inverse(mass)
+            free_speed = speed + inverse * (kick * torque)
+            new_speed = free_speed
+            if dry == 1:
+                new_speed, impulse = friction_impulses(free_speed, inverse, bound, impulse, count)
+                if loaded[0] != 0.0 or loaded[1] != 0.0 or loaded[2] != 0.0:
+                    bound = load_bounds(bound, kick, motor, loaded, new_speed - speed)
+                    new_speed, impulse = friction_impulses(free_speed, inverse, bound, impulse, count)
+        for j in range(MAX_JOINTS):
+            if j < count:
+                limit = rows[j, VELOCITY_LIMIT]
+                v = wp.clamp(new_speed[j], -limit, limit)
+                last = q[j]
+                after = last + dt * v
+                if after < lower[j] or after > upper[j]:
+                    # A start beyond a stop, as an encoder's bias makes it, is no reason to jump.
+                    after = wp.clamp(after, wp.min(lower[j], last), wp.max(upper[j], last))
+                    v = 0.0
+                if not (wp.abs(after - q_start[j]) < DIVERGED):
+                    after = q_start[j] + DIVERGED
+                    v = 0.0
+                q[j] = after
+                speed[j] = v
+                while read_step[j] <= k and read[j] < end:
+                    share = 0.0
+                    if read_step[j] == k:
+                        share = read_fraction[j]
+                    position = last + share * (after - last) + rows[j, ENCODER_BIAS]
+                    if only < 0:
+                        predicted[to_output + read[j], j] = position
+                    elif only == j:
+                        predicted[to_output + read[j], 0] = position
+                    read[j] = read[j] + 1
+                    if read[j] < end:
+                        step, fraction = split_steps(
+                            samples.step[read[j]],
+                            samples.fraction[read[j]],
+                            -rows[j, READ_DELAY] / dt,
+                        )
+                        read_step[j] = step
+                        read_fraction[j] = fraction

@@ -1,0 +1,226 @@
+"""Replay recorded commands in the simulator, and sample its positions where the recording has them.
+
+Order in a physics step: :func:`replay_command_kernel`, the servo and the solver's step, then
+:func:`sample_position_kernel` and :func:`tick_kernel`. Every finger of every world follows its own
+trajectory: a track. W worlds, F fingers of three joints, D = 3F; S samples of all trajectories one
+after the other, J recorded joints. Times, delays and lost commands are those of
+:mod:`vd.kernels.servo.chains`.
+"""
+
+import warp as wp
+
+from vd.kernels.servo.actuators import COUPLING_0, ENCODER_BIAS, KP, READ_DELAY, rest_play, shape_command
+from vd.kernels.servo.chains import Samples, arrival, split_steps
+from vd.kernels.servo.joint_servo import JOINTS_PER_FINGER
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Tracks:
+    """What each finger of each world follows.
+
+    column: Recorded column of every hand joint, or -1 [D].
+    first: First sample of the track [W, F].
+    last: Sample after the last [W, F].
+    stream: Random stream of the track's trajectory [W, F].
+    """
+
+    column: wp.array[int]
+    first: wp.array2d[int]
+    last: wp.array2d[int]
+    stream: wp.array2d[int]
+
+
+@wp.kernel
+def rest_play_kernel(
+    # Model:
+    parameters: wp.array2d[float],
+    # In:
+    held_in: wp.array2d[float],
+    power_in: wp.array2d[float],
+    load_in: wp.array2d[float],
+    joint_q_in: wp.array2d[float],
+    # Out:
+    state_out: wp.array2d[float],
+):
+    """Start the play of every servo where the joint rests. Launch: [W, D].
+
+    Args:
+        parameters: Parameter rows, shape [W D, PARAMETER_COLUMNS].
+        held_in: Commands in force [rad], shape [W, D].
+        power_in: Their power factors, shape [W, D].
+        load_in: Torques of gravity on the joints, shape [W, D] [N m].
+        joint_q_in: Joint positions [rad], shape [W, *].
+        state_out: State rows, shape [W D, STATE_COLUMNS].
+    """
+    world, joint = wp.tid()
+    row = world * held_in.shape[1] + joint
+    power = power_in[world, joint]
+    first = joint - joint % JOINTS_PER_FINGER
+    coupled = wp.float32(0.0)
+    for slot in range(JOINTS_PER_FINGER):
+        if first + slot != joint:
+            coupled += parameters[row, COUPLING_0 + slot] * joint_q_in[world, first + slot]
+    load = load_in[world, joint] + power * parameters[row, KP] * coupled
+    rest_play(held_in[world, joint], joint_q_in[world, joint], load, power, parameters, row, state_out)
+
+
+@wp.kernel
+def replay_command_kernel(
+    # Model:
+    parameters: wp.array2d[float],
+    samples: Samples,
+    tracks: Tracks,
+    # In:
+    dt: float,
+    step_in: wp.array[wp.int32],
+    # In/Out:
+    write: wp.array2d[wp.int32],
+    due_step: wp.array2d[wp.int32],
+    due_fraction: wp.array2d[float],
+    held: wp.array2d[float],
+    held_power: wp.array2d[float],
+    state: wp.array2d[float],
+    # Out:
+    reference_out: wp.array2d[float],
+    power_out: wp.array2d[float],
+):
+    """The mean reference of each servo over the coming physics step. Launch: [W, D].
+
+    As in :func:`vd.kernels.servo.joint_servo.receive_command_kernel`, commands that arrive divide the step.
+
+    Args:
+        parameters: Parameter rows, shape [W D, PARAMETER_COLUMNS].
+        samples: The recording; columns are the recorded joints.
+        tracks: What each finger follows.
+        dt: Physics time step [s].
+        step_in: Number of the physics step, shape [1].
+        write: The next command, shape [W, D].
+        due_step: Whole steps at which the one before arrived, shape [W, D].
+        due_fraction: And the rest, shape [W, D].
+        held: The command that arrived last [rad], shape [W, D].
+        held_power: Its power factor, shape [W, D].
+        state: State rows, shape [W D, STATE_COLUMNS].
+        reference_out: Mean references [rad], shape [W, D].
+        power_out: Mean power factors, shape [W, D].
+    """
+    world, joint = wp.tid()
+    column = tracks.column[joint]
+    finger = joint // JOINTS_PER_FINGER
+    row = world * write.shape[1] + joint
+    now = step_in[0]
+    upcoming = write[world, joint]
+    last = tracks.last[world, finger]
+    if column < 0:
+        last = upcoming  # nothing recorded: the first command holds
+    value = held[world, joint]
+    value_power = held_power[world, joint]
+    power = value_power
+    reference = wp.float32(0.0)
+    done = wp.float32(0.0)
+    waiting = wp.bool(True)
+    while waiting and upcoming < last:
+        step, fraction, kept = arrival(samples, upcoming, tracks.stream[world, finger], parameters, row, dt)
+        late_step = due_step[world, joint]
+        late_fraction = due_fraction[world, joint]
+        if step < late_step or (step == late_step and fraction < late_fraction):
+            step = late_step
+            fraction = late_fraction
+        if step <= now:
+            if kept == 1:
+                if step == now and fraction > done:
+                    part = fraction - done
+                    reference += part * shape_command(value, part * dt, parameters, row, state)
+                    done += part
+                power += (1.0 - done) * (samples.power[upcoming, column] - value_power)
+                value = samples.command[upcoming, column]
+                value_power = samples.power[upcoming, column]
+            due_step[world, joint] = step
+            due_fraction[world, joint] = fraction
+            upcoming += 1
+        else:
+            waiting = wp.bool(False)
+    write[world, joint] = upcoming
+    held[world, joint] = value
+    held_power[world, joint] = value_power
+    rest = 1.0 - done
+    reference += rest * shape_command(value, rest * dt, parameters, row, state)
+    reference_out[world, joint] = reference
+    power_out[world, joint] = power
+
+
+@wp.kernel
+def sample_position_kernel(
+    # Model:
+    parameters: wp.array2d[float],
+    samples: Samples,
+    tracks: Tracks,
+    # In:
+    position_in: wp.array2d[float],
+    dt: float,
+    step_in: wp.array[wp.int32],
+    joint_q_prev_in: wp.array2d[float],
+    joint_q_in: wp.array2d[float],
+    # In/Out:
+    read: wp.array2d[wp.int32],
+    squared_error: wp.array2d[float],
+    # Out:
+    position_out: wp.array3d[float],
+):
+    """Positions as the recording would have them: linear in time, old by the read delay, biased.
+
+    Launch: [W, D].
+
+    Args:
+        parameters: Parameter rows, shape [W D, PARAMETER_COLUMNS].
+        samples: The recording; columns are the recorded joints.
+        tracks: What each finger follows.
+        position_in: Recorded positions [rad], shape [S, J].
+        dt: Physics time step [s].
+        step_in: Number of the physics step, shape [1].
+        joint_q_prev_in: Joint positions at the start of the step [rad], shape [W, *].
+        joint_q_in: Joint positions at its end [rad], shape [W, *].
+        read: The next sample to take, shape [W, D].
+        squared_error: Sum of squared differences to the recording [rad^2], shape [W, D].
+        position_out: Predicted positions [rad], by sample of the track, shape [W, T, D]; T = 0: not kept.
+    """
+    world, joint = wp.tid()
+    column = tracks.column[joint]
+    if column < 0:
+        return
+    finger = joint // JOINTS_PER_FINGER
+    row = world * read.shape[1] + joint
+    now = step_in[0]
+    before = joint_q_prev_in[world, joint]
+    change = joint_q_in[world, joint] - before
+    upcoming = read[world, joint]
+    last = tracks.last[world, finger]
+    error = squared_error[world, joint]
+    waiting = wp.bool(True)
+    while waiting and upcoming < last:
+        shift = -parameters[row, READ_DELAY] / dt
+        step, fraction = split_steps(samples.step[upcoming], samples.fraction[upcoming], shift)
+        if step <= now:
+            if step < now:  # before the start of the recording
+                fraction = 0.0
+            position = before + fraction * change + parameters[row, ENCODER_BIAS]
+            difference = position - position_in[upcoming, column]
+            error += difference * difference
+            index = upcoming - tracks.first[world, finger]
+            if index < position_out.shape[1]:
+                position_out[world, index, joint] = position
+            upcoming += 1
+        else:
+            waiting = wp.bool(False)
+    read[world, joint] = upcoming
+    squared_error[world, joint] = error
+
+
+@wp.kernel
+def tick_kernel(
+    # In/Out:
+    step: wp.array[wp.int32],
+):
+    """Count a physics step, shape [1]; on the device, so that a CUDA graph can be replayed."""
+    step[0] = step[0] + 1

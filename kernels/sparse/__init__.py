@@ -1,0 +1,1 @@
+"""Kernels of sparse convolutions: voxels and coordinate maps."""

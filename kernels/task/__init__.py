@@ -1,0 +1,1 @@
+"""Kernels of the task: actions, randomisation, success, rewards, resets, observations."""

@@ -1,0 +1,160 @@
+"""Reward terms of equations 1-5, 7 and 8.
+
+World frame (z up, table top at z = 0), SI units, radians, quaternions xyzw.
+"""
+
+import warp as wp
+
+from vd.kernels.columns import read_vec3
+
+wp.set_module_options({"enable_backward": False})
+
+REWARD_TERMS = (
+    "success",
+    "rotation",
+    "fingertip",
+    "energy",
+    "fall",
+    "table_contact",
+    "fingertip_height",
+    "progress",
+    "lift",
+)
+"""Columns of the reward terms."""
+
+FINGERTIP_SQUARED_SUM = 0
+"""``RewardParams.fingertip_form``: sum over fingers of squared distances (paper, eq. 3)."""
+FINGERTIP_MEAN = 1
+"""``RewardParams.fingertip_form``: mean over fingers of distances (released code)."""
+
+
+@wp.struct
+class RewardParams:
+    """Coefficients of the reward; an array of length 1 in device memory.
+
+    success: c1, on reaching the goal (eq. 1).
+    rotation: c2, on 1 / (error + rotation_epsilon) (eq. 2) [rad].
+    rotation_epsilon: epsilon_theta [rad].
+    fingertip: c3, on the distance of fingertips to the object (eq. 3) [1/m^2, or 1/m].
+    fingertip_form: FINGERTIP_SQUARED_SUM or FINGERTIP_MEAN.
+    energy: c4, on the mechanical power of the joints (eq. 4) [1/W].
+    energy_clip: Largest power counted [W]; none if <= 0.
+    fall: c5, on losing the object (eq. 5).
+    table_contact: c6, on touching the table (eq. 7).
+    table_contact_force: Force on the table above which the object touches it [N].
+    fingertip_height: c7, on each fingertip above height_limit (eq. 8).
+    height_limit: World z above which a fingertip is too high [m].
+    progress: Coefficient on the decrease of the rotation error since the last step [1/rad]; not in the paper.
+    lift: Coefficient on the object's clearance over ``lift_height``, at most 1; not in the paper.
+    lift_height: Clearance of the object's lowest point from which more is worth nothing [m].
+    scale: Factor on the sum of all terms.
+    """
+
+    success: float
+    rotation: float
+    rotation_epsilon: float
+    fingertip: float
+    fingertip_form: int
+    energy: float
+    energy_clip: float
+    fall: float
+    table_contact: float
+    table_contact_force: float
+    fingertip_height: float
+    height_limit: float
+    progress: float
+    lift: float
+    lift_height: float
+    scale: float
+
+
+@wp.kernel
+def reward_kernel(
+    # Model:
+    params: wp.array[RewardParams],
+    # In:
+    joint_q_in: wp.array2d[float],
+    joint_qd_in: wp.array2d[float],
+    tip_pos_in: wp.array2d[wp.vec3],
+    effort_in: wp.array2d[float],
+    table_force_in: wp.array[float],
+    clearance_in: wp.array[float],
+    rotation_error_in: wp.array[float],
+    success_in: wp.array[int],
+    fell_in: wp.array[int],
+    # In/Out:
+    previous_error: wp.array[float],
+    # Out:
+    reward_out: wp.array[float],
+    terms_out: wp.array2d[float],
+):
+    """Reward of the state after a control step. Launch: [N], after the success kernel.
+
+    reward = scale * (c1 [success] + c2 / (error + epsilon) + c3 sum_i norm(tip_i - object)^2
+    + c4 sum_j abs(qd_j tau_j) + c5 [fell] + c6 [table force > limit]
+    + c7 sum_i [tip_i.z > height_limit] + progress (previous_error - error)
+    + lift clamp(clearance / lift_height, 0, 1)).
+    ``previous_error`` becomes the present error; the reset kernel starts it anew with each goal.
+
+    Args:
+        params: Coefficients, shape [1].
+        joint_q_in: Hand joints [rad], object position [m] and quaternion, shape [N, D + 7].
+        joint_qd_in: Hand joints [rad/s], object linear [m/s] and angular [rad/s] velocity, shape [N, D + 6].
+        tip_pos_in: Fingertip positions, world frame [m], shape [N, G].
+        effort_in: Joint torques [N m], shape [N, D].
+        table_force_in: Magnitude of the object's force on the table [N], shape [N].
+        clearance_in: Height of the object's lowest point above the table's top [m], shape [N].
+        rotation_error_in: Angle between object and goal [rad], shape [N].
+        success_in: 1 where the goal is reached, shape [N].
+        fell_in: 1 where the object is lost, shape [N].
+        previous_error: Rotation error of the last step [rad], shape [N].
+        reward_out: Reward, shape [N].
+        terms_out: Terms with their coefficients, without scale, columns REWARD_TERMS, shape [N, 9].
+    """
+    world = wp.tid()
+    weights = params[0]
+    joints = effort_in.shape[1]
+    fingers = tip_pos_in.shape[1]
+
+    position = read_vec3(world, joints, joint_q_in)
+    power = wp.float32(0.0)
+    for joint in range(joints):
+        power += wp.abs(joint_qd_in[world, joint] * effort_in[world, joint])
+    if weights.energy_clip > 0.0:
+        power = wp.min(power, weights.energy_clip)
+
+    reach = wp.float32(0.0)
+    high_tips = wp.float32(0.0)
+    for finger in range(fingers):
+        tip = tip_pos_in[world, finger]
+        if weights.fingertip_form == wp.static(FINGERTIP_MEAN):
+            reach += wp.length(tip - position) / float(fingers)
+        else:
+            reach += wp.length_sq(tip - position)
+        if tip[2] > weights.height_limit:
+            high_tips += 1.0
+
+    error = rotation_error_in[world]
+    success_term = wp.where(success_in[world] != 0, weights.success, 0.0)
+    rotation_term = weights.rotation / (error + weights.rotation_epsilon)
+    fingertip_term = weights.fingertip * reach
+    energy_term = weights.energy * power
+    fall_term = wp.where(fell_in[world] != 0, weights.fall, 0.0)
+    table_term = wp.where(table_force_in[world] > weights.table_contact_force, weights.table_contact, 0.0)
+    height_term = weights.fingertip_height * high_tips
+    progress_term = weights.progress * (previous_error[world] - error)
+    lift_term = weights.lift * wp.clamp(clearance_in[world] / weights.lift_height, 0.0, 1.0)
+
+    terms_out[world, 0] = success_term
+    terms_out[world, 1] = rotation_term
+    terms_out[world, 2] = fingertip_term
+    terms_out[world, 3] = energy_term
+    terms_out[world, 4] = fall_term
+    terms_out[world, 5] = table_term
+    terms_out[world, 6] = height_term
+    terms_out[world, 7] = progress_term
+    terms_out[world, 8] = lift_term
+    total = success_term + rotation_term + fingertip_term + energy_term
+    total += fall_term + table_term + height_term + progress_term + lift_term
+    reward_out[world] = weights.scale * total
+    previous_error[world] = error
