@@ -19,7 +19,7 @@ from vd.bench.gap_score import (
     missed_pairs,
     score,
 )
-from vd.gap.hidden_plant import OUTSIDE
+from vd.bench.hidden_plant import OUTSIDE
 from vd.kernels.servo.effects import EFFECTS
 
 TRUTH = {

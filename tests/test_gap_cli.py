@@ -13,10 +13,10 @@ import pytest
 
 from vd.assets_usd.bare_layer import read_bare_layer
 from vd.assets_usd.hand_data import HandError
+from vd.bench.hide import hide
 from vd.gap import cli, steps
 from vd.gap.chain import chains
 from vd.gap.close import counterparts, simulate_again, write_identified
-from vd.gap.hide import hide
 from vd.gap.plan import _fitted, discard_plan, plan, write_plan
 from vd.gap.recording import read_recording
 from vd.gap.result import (

@@ -8,10 +8,10 @@ import pytest
 from gap_recordings import recorded
 
 import vd.kernels.servo.actuators as servo
+from vd.bench.hidden_plant import CABLE, COGGING, OUTSIDE
+from vd.bench.hide import Hidden, Hiding, simulate_hidden
 from vd.gap.answers import FOLDER
 from vd.gap.fit import JointProblem
-from vd.gap.hidden_plant import CABLE, COGGING, OUTSIDE
-from vd.gap.hide import Hidden, Hiding, simulate_hidden
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
 from vd.gap.words import verdict_sentence

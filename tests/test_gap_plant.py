@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vd.gap.hidden_finger import FingerBody
-from vd.gap.hidden_plant import OUTSIDE, STEP_S, Plant, Run, simulate
-from vd.gap.hide import COUPLING, Hiding, machine
-from vd.gap.sizes import effect_at
+from vd.bench.gap_sizes import effect_at
+from vd.bench.hidden_finger import FingerBody
+from vd.bench.hidden_plant import OUTSIDE, STEP_S, Plant, Run, simulate
+from vd.bench.hide import COUPLING, Hiding, machine
 from vd.kernels.servo.effects import EFFECTS
 
 KP, KD, INERTIA = 2.0, 0.1, 4.0e-3

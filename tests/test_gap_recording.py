@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vd.bench.hide import Hiding, simulate_hidden
 from vd.gap.cautions import cautions
-from vd.gap.hide import Hiding, simulate_hidden
 from vd.gap.recording import Recording, RecordingError, Trajectory, read_recording, write_recording
 from vd.gap.recording_checks import check_motion
 

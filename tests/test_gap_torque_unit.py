@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vd.bench.hide import Hiding, simulate_hidden
 from vd.gap.chain import chains
-from vd.gap.hide import Hiding, simulate_hidden
 from vd.gap.result import (
     Candidate,
     Estimate,

@@ -1,6 +1,6 @@
 """The battery of the gap workflow: does it name what is hidden, and nothing else?
 
-Every case is a recording from :mod:`vd.gap.hide`, analysed by :mod:`vd.gap.workflow` from the recording
+Every case is a recording from :mod:`vd.bench.hide`, analysed by :mod:`vd.gap.workflow` from the recording
 alone, and compared with the truth: every effect of the table at four sizes, all pairs at one, nothing
 hidden, and effects outside the table. Results are one JSON file per case, so that a run can be
 interrupted, resumed and split over machines.
@@ -23,11 +23,11 @@ import numpy as np
 from vd.bench.gap_beside import beside
 from vd.bench.gap_rows import merged
 from vd.bench.gap_score import KINDS, Case, said, score
+from vd.bench.gap_sizes import GAPS, showing
+from vd.bench.hidden_plant import OUTSIDE
+from vd.bench.hide import simulate_hidden, write_hidden
 from vd.files import make_folder, write_json
-from vd.gap.hidden_plant import OUTSIDE
-from vd.gap.hide import simulate_hidden, write_hidden
 from vd.gap.recording import BARE_MODELS
-from vd.gap.sizes import GAPS, showing
 from vd.versions import source_commit
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
