@@ -1,4 +1,4 @@
-"""What decides: gains on unseen motions, sets of equals, bounds, structure, and other joints, on made-up fits."""
+"""What decides, on made-up fits: gains on unseen motions, ties, bounds, structure, and other joints."""
 
 from dataclasses import replace
 

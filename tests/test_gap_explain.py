@@ -1,4 +1,4 @@
-"""What is missing is named, told from what it looks like, or left open: whole analyses of small recordings."""
+"""Whole analyses of small recordings: what is missing is named, or left open."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +10,8 @@ from gap_recordings import recorded
 import vd.kernels.servo.actuators as servo
 from vd.bench.hidden_plant import CABLE, COGGING, OUTSIDE
 from vd.bench.hide import Hidden, Hiding, simulate_hidden
-from vd.gap.answers import FOLDER
 from vd.gap.fit import JointProblem
+from vd.gap.fit_cache import FOLDER
 from vd.gap.recording import Recording
 from vd.gap.result import Predictions, Report
 from vd.gap.words import verdict_sentence

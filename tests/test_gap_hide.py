@@ -22,8 +22,8 @@ from vd.bench.hide import (
 from vd.gap.chain import chains
 from vd.gap.excitations import MENU, JointRange, excitation_set
 from vd.gap.recording import read_recording
-from vd.gap.team import JointSpec
 from vd.gap.telemetry import late_side, vetoes
+from vd.gap.worker_pool import JointSpec
 from vd.kernels.servo.effects import EFFECTS
 
 

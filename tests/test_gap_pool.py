@@ -1,4 +1,4 @@
-"""Fits one after the other, in processes, in threads that simulate together, and from what was kept of them."""
+"""Fits one by one, in processes, in threads that simulate together, and from what was kept of them."""
 
 import multiprocessing
 import os
@@ -16,69 +16,69 @@ import pytest
 from gap_recordings import TRUE, made_up, recorded
 
 import vd.kernels.servo.actuators as servo
-from vd.gap.answers import Answers, digest_of
 from vd.gap.assemble import curves
 from vd.gap.chain import chains
-from vd.gap.crowd import Crowd
 from vd.gap.design import design
+from vd.gap.fit_cache import FitCache, digest_of
+from vd.gap.launch_batch import LaunchBatch
 from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.statistics import noise_floor
-from vd.gap.team import Bench, Call, JointSpec, Team, parallel
+from vd.gap.worker_pool import Call, JointSpec, Problems, WorkerPool, parallel
 from vd.gap.workflow import baseline_of
 
 EFFECTS = ("coulomb_friction", "backlash", "load_friction")
 
 
-def fits(team: Team, spec: JointSpec) -> list[Any]:
-    base = team.bench.chains[0].start_row.copy()
+def fits(pool: WorkerPool, spec: JointSpec) -> list[Any]:
+    base = pool.problems.chains[0].start_row.copy()
     for column, value in TRUE.items():
         base[0, column] = 1.1 * value
-    scales = team.run(spec, [("scales", {"row": base[0], "residual": 0.02})])[0]
+    scales = pool.run(spec, [("scales", {"row": base[0], "residual": 0.02})])[0]
     given = {"base": base, "starts": [{}], "scales": scales, "iterations": 3, "refits": 2}
     calls: list[Call] = [("fit", {**given, "effects": (effect,)}) for effect in EFFECTS]
-    return team.run(spec, calls)
+    return pool.run(spec, calls)
 
 
-def problem(extra: dict[int, float], crowd: Crowd | None = None) -> tuple[Bench, JointSpec]:
+def problem(extra: dict[int, float], batch: LaunchBatch | None = None) -> tuple[Problems, JointSpec]:
     """A made-up recording of a servo, and what makes the problem of its joint."""
     recording = recorded(extra)
     (chain,) = chains(recording)
     trajectories, folds = design(recording, chain, 0)
     spec = JointSpec(0, 0, trajectories, folds, noise_floor(recording, 0), baseline_of(chain))
-    return Bench(recording, [chain], STEP_S, "cpu", crowd), spec
+    return Problems(recording, [chain], STEP_S, "cpu", batch), spec
 
 
 def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
     extra = {servo.COULOMB_TORQUE: 0.06}
-    bench, spec = problem(extra)
-    with Team(bench, workers=1) as team:
-        alone, simulated = fits(team, spec), team.simulated
-        again = fits(team, spec)
-        assert team.simulated == simulated, "a call that was made before is not made again"
+    problems, spec = problem(extra)
+    with WorkerPool(problems, workers=1) as pool:
+        alone, simulated = fits(pool, spec), pool.simulated
+        again = fits(pool, spec)
+        assert pool.simulated == simulated, "a call that was made before is not made again"
         assert all(one is other for one, other in zip(alone, again, strict=True))
-    crowd = Crowd()
-    with Team(problem(extra, crowd)[0], workers=1) as team:
-        together = fits(team, spec)
+    batch = LaunchBatch()
+    with WorkerPool(problem(extra, batch)[0], workers=1) as pool:
+        together = fits(pool, spec)
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one.x, other.x)
         np.testing.assert_array_equal(one.held_out, other.held_out)
-    assert team.simulated == simulated, "every call counts its own"
+    assert pool.simulated == simulated, "every call counts its own"
     # Start and end, three steps of a Jacobian and two sets of trials; two of the refits, whose first
     # Jacobian is known; one prediction.
-    assert crowd.launches <= 2 + 3 * 3 + (2 * 3 - 1) + 1
+    assert batch.launches <= 2 + 3 * 3 + (2 * 3 - 1) + 1
 
 
 PARENT = """
 import time
 import multiprocessing
 from test_gap_pool import problem
-from vd.gap.team import Team
+from vd.gap.worker_pool import WorkerPool
 
 if __name__ == "__main__":
-    bench, spec = problem({})
-    with Team(bench, workers=2) as team:
-        row = bench.chains[0].start_row[0]
-        team.run(spec, [("scales", {"row": row, "residual": left}) for left in (0.01, 0.02)])
+    problems, spec = problem({})
+    with WorkerPool(problems, workers=2) as pool:
+        row = problems.chains[0].start_row[0]
+        pool.run(spec, [("scales", {"row": row, "residual": left}) for left in (0.01, 0.02)])
         print(*(child.pid for child in multiprocessing.active_children()), flush=True)
         time.sleep(60.0)
 """
@@ -117,26 +117,26 @@ def runs(pid: int) -> bool:
 
 
 def test_a_worker_that_is_killed_ends_the_run_with_what_to_change() -> None:
-    bench, spec = problem({})
+    problems, spec = problem({})
     others = multiprocessing.active_children()
-    with Team(bench, workers=2) as team:
-        fits(team, spec)
+    with WorkerPool(problems, workers=2) as pool:
+        fits(pool, spec)
         for process in multiprocessing.active_children():
             if process not in others:
                 process.kill()
         with pytest.raises(ChildProcessError, match=r"one of 2 processes was killed.*memory"):
-            team.run(spec, [("scales", {"row": bench.chains[0].start_row[0], "residual": 0.03})])
+            pool.run(spec, [("scales", {"row": problems.chains[0].start_row[0], "residual": 0.03})])
 
 
 def test_a_failure_reaches_all_who_wait() -> None:
     recording = recorded({})
     (chain,) = chains(recording)
-    crowd = Crowd()
-    rollouts = Rollouts(chain, recording, crowd=crowd)
-    crowd.join(1)
+    batch = LaunchBatch()
+    rollouts = Rollouts(chain, recording, batch=batch)
+    batch.join(1)
     with pytest.raises(IndexError):
         rollouts.predict(chain.start_row[None], [99])
-    crowd.leave()
+    batch.leave()
     np.testing.assert_array_equal(
         rollouts.predict(chain.start_row[None]), Rollouts(chain, recording).predict(chain.start_row[None])
     )
@@ -157,13 +157,13 @@ def test_whoever_stops_does_not_wait_for_the_other_joints() -> None:
 
 
 def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
-    bench, spec = problem({servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2})
-    recording, (chain,) = bench.recording, bench.chains
+    problems, spec = problem({servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2})
+    recording, (chain,) = problems.recording, problems.chains
     rows = chain.start_row.copy()
     for column, value in {**TRUE, servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2}.items():
         rows[0, column] = value
     exact = Rollouts(chain, recording, dt=STEP_S / 32).predict(rows[None])[0]
-    drawn = curves(recording, bench, [("j", spec, rows)])
+    drawn = curves(recording, problems, [("j", spec, rows)])
     searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
     assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)
 
@@ -182,14 +182,14 @@ def test_equal_calls_have_one_digest_and_others_another() -> None:
 
 
 def test_fits_that_are_kept_are_of_one_recording_and_those_that_are_damaged_none(tmp_path: Path) -> None:
-    Answers(tmp_path / "a", "one").add("q", [made_up((), 1.0), 0.5])
-    again = Answers(tmp_path / "a", "one")
+    FitCache(tmp_path / "a", "one").add("q", [made_up((), 1.0), 0.5])
+    again = FitCache(tmp_path / "a", "one")
     assert "q" in again and again["q"][0].coordinates == made_up((), 1.0).coordinates
-    assert "q" not in Answers(tmp_path / "a", "another")
+    assert "q" not in FitCache(tmp_path / "a", "another")
     (file,) = (tmp_path / "a").iterdir()
     whole = file.read_bytes()
     for content in (whole[: len(whole) // 2], b"", pickle.dumps(print)):
         file.write_bytes(content)
-        assert "q" not in Answers(tmp_path / "a", "one"), "nor is anything run that a file asks for"
+        assert "q" not in FitCache(tmp_path / "a", "one"), "nor is anything run that a file asks for"
     again.forget()
     assert not (tmp_path / "a").exists()
