@@ -17,7 +17,7 @@ from vd.bench.hide import hide
 from vd.gap import cli, steps
 from vd.gap.chain import chains
 from vd.gap.close import counterparts, simulate_again, write_identified
-from vd.gap.plan import _fitted, discard_plan, plan, write_plan
+from vd.gap.plan import discard_plan, plan, write_plan
 from vd.gap.recording import read_recording
 from vd.gap.result import (
     Candidate,
@@ -346,17 +346,6 @@ def test_plan_counts_the_pairs_of_every_set_that_a_motion_tells_apart(recording)
     assert f"tells {told[0]} of 2 pairs" in result.sentence
 
 
-def test_plan_takes_an_effect_as_it_was_fitted_beside_the_others(recording):
-    report, _ = servo_report(recording)
-    early = report.evidence[1]
-    late = dataclasses.replace(early, round=7, parameters={"width_rad": 0.02}, given=("command_delay",))
-    report = dataclasses.replace(report, evidence=(*report.evidence, late))
-    assert _fitted(report, JOINT, "backlash", set()) == {"width_rad": 0.08}
-    assert _fitted(report, JOINT, "backlash", {"command_delay"}) == {"width_rad": 0.02}
-    assert _fitted(report, JOINT, "backlash", {"supply_sag"}) == {"width_rad": 0.02}
-    assert _fitted(report, JOINT, "supply_sag", set()) == {}
-
-
 def test_plan_for_motions_that_show_too_little(recording):
     report, _ = servo_report(recording, verdict="under_excited")
     slow = read_recording(recording).subset([3])
@@ -364,25 +353,6 @@ def test_plan_for_motions_that_show_too_little(recording):
     assert tuple(result.competing) == (JOINT,)
     assert "what these motions do not show" in result.sentence
     assert slow.trajectories[0].excitation not in {motion.name for motion in result.motions}
-
-
-def test_plan_says_when_nothing_would_help(recording):
-    """An effect and its twin: the same model twice."""
-    report, _ = servo_report(
-        recording, verdict="ambiguous", ambiguous=(("coulomb_friction", "stribeck_friction"),)
-    )
-    twins = {
-        "coulomb_friction": {"tau_c_nm": FRICTION},
-        "stribeck_friction": {"tau_s_nm": FRICTION, "tau_c_nm": FRICTION, "v_s_rad_s": 0.1},
-    }
-    rows = tuple(
-        dataclasses.replace(row, name=name, parameters=twins[name])
-        for row, name in zip(report.evidence, twins, strict=True)
-    )
-    result = plan(dataclasses.replace(report, evidence=rows), read_recording(recording), None)
-    assert (
-        "No motion of the menu would decide between coulomb friction and stribeck friction" in result.sentence
-    )
 
 
 def test_other_fingers_take_the_model_of_the_recorded_one():

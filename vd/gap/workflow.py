@@ -22,7 +22,6 @@ from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.chain import Chain, chains
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
 from vd.gap.design import design, pieces
-from vd.gap.explanation import Explanation
 from vd.gap.find import findings
 from vd.gap.fit_cache import FOLDER, FitCache
 from vd.gap.joint_fit import JointFit
@@ -179,7 +178,7 @@ def explain(
         joints = _resume(pool, _specs(recording, pool.problems.chains), known["joints"])
         explained = explain_joints(Explainer(pool, joints, chosen.effects, chosen.seed, progress))
         analysed = [
-            Analysed(j.name, j.spec, replace_baseline(e, j.fit), j.scales)
+            Analysed(j.name, j.spec, replace(e, baseline=j.fit), j.scales)
             for j, e in zip(joints, explained, strict=True)
         ]
         seconds = known["seconds"] + time.perf_counter() - begin
@@ -201,11 +200,6 @@ def explain(
     cache.forget()
     progress(f"explain: {report.verdict} after {seconds:.0f} s")
     return report
-
-
-def run(recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any) -> Report:
-    """Find and explain; see :func:`explain`."""
-    return explain(recording, hand, out, **options)
 
 
 def fingerprint(recording: Recording, hand: HandModel | None, options: Options) -> str:
@@ -341,8 +335,3 @@ def _resume(pool: WorkerPool, specs: Sequence[JointSpec], known: dict[str, Any])
         return Joint(name, spec, scales, pool.run(spec, [("fit", {**call, "refits": REFITS})])[0])
 
     return parallel(one, specs)
-
-
-def replace_baseline(explanation: Explanation, baseline: JointFit) -> Explanation:
-    """The explanation with the joint's baseline."""
-    return replace(explanation, baseline=baseline)
