@@ -120,18 +120,6 @@ def test_effects_that_are_one_together_are_right_as_that_one_if_the_report_says_
     )
 
 
-def test_an_effect_that_stands_for_another_beside_a_third_is_right_beside_that():
-    hidden = case("stribeck_friction", "asymmetric_friction", kind="pair")
-    groups = [("encoder_bias", "asymmetric_friction")]
-    told = score(hidden, report("stribeck_friction", "encoder_bias", sets=groups), TRUTH)
-    assert told["by_convention"] == ["asymmetric_friction"] and not told["false"]
-    assert value([told], "two hidden: both named").value == 1.0
-    silent = score(hidden, report("stribeck_friction", "encoder_bias"), TRUTH)
-    assert silent["false"] == ["encoder_bias"] and not silent["by_convention"]
-    alone = score(hidden, report("encoder_bias", sets=groups), TRUTH)
-    assert alone["false"] == ["encoder_bias"], "without the other it is another cause"
-
-
 def test_bad_requests_are_refused():
     for options, words in (
         ({"kinds": ("triple",)}, "triple"),

@@ -9,7 +9,7 @@ import re
 import numpy as np
 import pytest
 
-from vd.gap import figures, words
+from vd.gap import words
 from vd.gap.report import write_report
 from vd.gap.result import (
     Alternative,
@@ -78,51 +78,23 @@ def sample_report(curves, **changes):
     """A report of the curves with a named delay."""
     before, after = curves.baseline - curves.measured, curves.identified - curves.measured
     rows = {i: curves.trajectory == i for i in range(len(FILES))}
+    told = dict.fromkeys(JOINTS, ("no_gap", "the error is at the noise floor"))
+    told[JOINTS[1]] = ("effects", "a delay removes nearly all of it")
     gap = [
-        JointGap(
-            joint,
-            FLOOR,
-            rms(before[:, j]),
-            (0.9 * rms(before[:, j]), 1.1 * rms(before[:, j])),
-            rms(after[:, j]),
-            (0.9 * rms(after[:, j]), 1.1 * rms(after[:, j])),
-            "effects" if joint == JOINTS[1] else "no_gap",
-            "a delay removes nearly all of it" if joint == JOINTS[1] else "the error is at the noise floor",
-        )
+        JointGap(joint, FLOOR, rms(before[:, j]), (0.0, 1.0), rms(after[:, j]), (0.0, 1.0), *told[joint])
         for j, joint in enumerate(JOINTS)
     ]
-    evidence = [
-        Candidate((JOINTS[1],), 1, "command_delay", 2e-3, 0.93, (0.91, 0.95), "named", "largest gain"),
-        Candidate(
-            (JOINTS[1],),
-            1,
-            "command_filter",
-            9e-3,
-            0.6,
-            (0.5, 0.7),
-            "rejected",
-            "worse than the delay by 7 mrad",
-        ),
-        *(
-            Candidate(
-                (JOINTS[1],),
-                1,
-                name,
-                0.02,
-                0.01 * i - 0.05,
-                (0.01 * i - 0.2, 0.01 * i + 0.06),
-                "rejected",
-                "gain covers 0",
-            )
-            for i, name in enumerate(list(EFFECTS)[4:12])
-        ),
-        Candidate(
-            (JOINTS[1],), 1, "command_delay", 0.03, -0.1, (-0.3, 0.02), "rejected", "no gain", placebo=True
-        ),
-        Candidate(
-            (JOINTS[1],), 2, "coulomb_friction", 2e-3, 0.01, (-0.03, 0.05), "rejected", "gain under 5 %"
-        ),
+    tried = [
+        ("command_delay", 1, 0.93, "named", "largest gain"),
+        ("command_filter", 1, 0.6, "rejected", "worse than the delay by 7 mrad"),
+        ("backlash", 1, 0.01, "rejected", "gain covers 0"),
+        ("coulomb_friction", 2, 0.02, "rejected", "gain under 5 %"),
     ]
+    evidence = [
+        Candidate((JOINTS[1],), number, name, 9e-3, gain, (gain - 0.1, gain + 0.1), decision, reason)
+        for name, number, gain, decision, reason in tried
+    ]
+    evidence.append(dataclasses.replace(evidence[0], gain=-0.1, decision="rejected", placebo=True))
     delay = NamedEffect(
         "command_delay",
         (JOINTS[1],),
@@ -353,16 +325,6 @@ def test_torques_of_a_bare_servo_are_said_to_be_relative(report, tmp_path, told)
     source = dataclasses.replace(report.recording, model="servo", relative_torques=told)
     write_report(dataclasses.replace(report, recording=source), None, tmp_path)
     assert ("Torques are relative" in (tmp_path / "report.html").read_text()) == told
-
-
-def test_overlays_show_joints_with_a_gap_in_different_motions(report, curves):
-    chosen = figures.chosen_overlays(report, curves)
-    assert {joint for joint, _ in chosen} == {"f0_j2"}
-    assert len({index for _, index in chosen}) == len(chosen) == 3
-    nothing = dataclasses.replace(
-        report, effects=(), joints=tuple(dataclasses.replace(one, verdict="no_gap") for one in report.joints)
-    )
-    assert len(figures.chosen_overlays(nothing, curves)) == 1
 
 
 @pytest.mark.parametrize(

@@ -167,23 +167,6 @@ def test_play_begins_where_the_joint_rests():
     np.testing.assert_allclose(got[1:, -1] + droop[1:], 0.23, atol=1e-4)
 
 
-def test_a_finger_with_play_rests_where_its_weight_asks(hand):
-    """What a finger without play comes to rest at, one with play keeps."""
-    names = tuple(hand.joint_names[:3])
-    target = np.array([0.3, 0.5, -0.7])
-    command = np.tile(target, (200, 1))
-    (chain,) = chains(recording("dclaw3", names, trajectory("a", command, position=command)), hand)
-    data = recording("dclaw3", names, trajectory("a", command, position=command))
-    rest = Rollouts(chain, data).predict(chain.start_row[None])[0, -1]
-    assert np.abs(rest - target).max() > 2e-3
-    again = recording("dclaw3", names, trajectory("a", command, position=np.tile(rest, (200, 1))))
-    row = chain.start_row.copy()
-    row[:, servo.BACKLASH_WIDTH] = 0.05
-    np.testing.assert_allclose(
-        Rollouts(chain, again).predict(row[None])[0], np.tile(rest, (200, 1)), atol=1e-4
-    )
-
-
 def test_a_finger_droops_as_its_weight_asks(hand):
     """In rest the springs carry the weight: the gradient of the potential energy by the hand's kinematics."""
     names = ("f1_j3", "f1_j1", "f1_j2")  # columns in another order than the finger's
