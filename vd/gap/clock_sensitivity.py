@@ -65,8 +65,8 @@ def explain_weighted(search: Search, baseline: JointFit, weighting: SampleWeight
         weighting: What errors of the clock do.
     """
     search.report("errors of the clock grow: samples are weighted by how surely they are known")
-    seen = weighted(search, weighting)
-    return told(seen.explain(seen.run([seen.plain(baseline)])[0]), weighting)
+    inner = weighted(search, weighting)
+    return told(inner.explain(inner.run([inner.plain(baseline)])[0]), weighting)
 
 
 def told(found: Explanation, weighting: SampleWeighting) -> Explanation:

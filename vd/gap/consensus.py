@@ -59,8 +59,8 @@ def as_another(search: Search, baseline: JointFit, loose: str) -> Explanation | 
     starts = [{**baseline.values, **values}, {**search.nominal, **values}]
     fit = search.run([search.call(baseline, effects, starts, FULL_ITERATIONS)])[0]
     if weighting := clock_sensitivity(search, fit):
-        seen = weighted(search, weighting)
-        found = as_another(seen, seen.run([seen.plain(baseline)])[0], loose)
+        inner = weighted(search, weighting)
+        found = as_another(inner, inner.run([inner.plain(baseline)])[0], loose)
         return found and told(found, weighting)
     if search.too_coarse(fit):
         search = search.finer()

@@ -68,7 +68,7 @@ class Explanation:
     rivals: Mapping[str, Sequence[JointFit]] = field(default_factory=dict)
     """Fits with others in the place of each effect."""
     weighting: SampleWeighting | None = None
-    """What the samples were seen through; errors of the fits are in what it weighs them by."""
+    """How the samples were weighted; errors of the fits are in what it weighs them by."""
     warms: bool = False
     """Whether a friction of the final model changes over the recording, as none of the table does."""
 

@@ -15,7 +15,7 @@ from vd.gap.jitter_search import FIXED
 from vd.gap.joint_fit import JointFit
 from vd.gap.judge import JITTER
 from vd.gap.masses import widened
-from vd.gap.one_joint import REFITS, Explained, Explainer, Joint, beside, seen
+from vd.gap.one_joint import REFITS, Explained, Explainer, Joint, beside, weighting_of
 from vd.gap.worker_pool import WorkerPool, parallel
 
 
@@ -54,9 +54,9 @@ def _fitted(
     """A model of a joint with these effects, fitted to the end beside the joints as they are known."""
     call = {"base": beside(joint, known), "effects": effects, "starts": list(starts), "scales": joint.scales}
     call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
-    through = seen(next(found for other, found in known if other is joint))
-    whole = pool.run(joint.spec, [("fit", {**call, **through})])[0]
-    return pool.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales, **through})])[0]
+    weighting = weighting_of(next(found for other, found in known if other is joint))
+    whole = pool.run(joint.spec, [("fit", {**call, **weighting})])[0]
+    return pool.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales, **weighting})])[0]
 
 
 def _finished(
@@ -116,7 +116,7 @@ def _consistent(
         if not changed or not own.final.effects or JITTER in own.final.effects:
             return own
         rows[joint.spec.joint] = own.final.rows[joint.spec.joint]
-        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales, **seen(own)}
+        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales, **weighting_of(own)}
         fit = pool.run(joint.spec, [("refine", call)])[0]
         if own.final.extents:
             fit = widened(fit, joint.spec.floor, own.final.extents)

@@ -206,8 +206,8 @@ def beside(joint: Joint, explained: Explained) -> np.ndarray:
     return rows
 
 
-def seen(found: Explanation) -> dict[str, Any]:
-    """What the samples of an explained joint are to be seen through, as an argument of a call."""
+def weighting_of(found: Explanation) -> dict[str, Any]:
+    """How the samples of an explained joint are weighted, as an argument of a call."""
     return {} if found.weighting is None else {"weighting": found.weighting}
 
 
