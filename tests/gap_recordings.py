@@ -49,9 +49,9 @@ def blank(gains: tuple[float, ...] = (), model: str = "servo") -> Recording:
     return Recording(Path("made up"), model, ("j",), {}, ENCODER_COUNT, tuple(parts))
 
 
-def recorded(extra: dict[int, float], noise: float = 3e-4) -> Recording:
+def recorded(extra: dict[int, float], noise: float = 3e-4, model: str = "servo") -> Recording:
     """What the servo with ``extra`` columns would have answered."""
-    recording = blank()
+    recording = blank(model=model)
     (chain,) = chains(recording)
     rollouts = Rollouts(chain, recording)
     path = rollouts.predict(true_row(chain.start_row, extra)[None])[0].astype(float)
