@@ -243,8 +243,8 @@ def test_conditions_act():
 
 def test_the_time_step_does_not_show():
     names = [name for name in (*EFFECTS, *OUTSIDE) if name != COUPLING]  # which one joint cannot have
-    time = np.arange(150) * 1e-2
-    command = np.sin(2.0 * np.pi * time)[:, None]
+    time = np.arange(80) * 1e-2
+    command = np.sin(4.0 * np.pi * time)[:, None]
     runs = []
     for name in names:
         hiding = Hiding("pendulum", {name: effect_at(name, 1.0)}, base_spread=0.0)

@@ -162,14 +162,22 @@ def test_run_writes_everything_and_says_what_was_found(fitted, recording, tmp_pa
     assert report.closing.identified_rmse_rad < 0.5 * report.closing.baseline_rmse_rad
     assert report.command.startswith(f"vd-gap run {recording}")
     assert {path.name for path in out.iterdir()} >= {"identified.usda", "report.html", "gap.png"}
+    assert cli.main(["run", str(recording), "--out", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads((out / "report.json").read_text())
 
 
-def test_finished_steps_are_kept_until_something_changes(fitted, recording, tmp_path, capsys, monkeypatch):
-    def without_figures(report, curves, folder):
+@pytest.fixture
+def no_figures(monkeypatch):
+    """The report as JSON alone: its page has a test of its own."""
+
+    def write(report, curves, folder):
         report.write(folder / "report.json")
         (folder / "report.html").write_text("")
 
-    monkeypatch.setattr("vd.gap.report.write_report", without_figures)
+    monkeypatch.setattr("vd.gap.report.write_report", write)
+
+
+def test_finished_steps_are_kept_until_something_changes(fitted, no_figures, recording, tmp_path, capsys):
     out = str(tmp_path / "gap")
     arguments = ["run", str(recording), "--out", out]
     assert cli.main(arguments) == cli.main(arguments) == 0
@@ -184,7 +192,7 @@ def test_finished_steps_are_kept_until_something_changes(fitted, recording, tmp_
     assert (fitted["find"], fitted["explain"]) == (3, 4)
 
 
-def test_steps_go_on_from_what_the_one_before_wrote(fitted, recording, tmp_path, capsys):
+def test_steps_go_on_from_what_the_one_before_wrote(fitted, no_figures, recording, tmp_path, capsys):
     out = str(tmp_path / "gap")
     assert cli.main(["explain", str(recording), "--out", out]) == 1
     assert "run vd-gap find --out" in capsys.readouterr().err
@@ -193,12 +201,6 @@ def test_steps_go_on_from_what_the_one_before_wrote(fitted, recording, tmp_path,
         assert cli.main([step, "--out", out]) == 0, step
     assert fitted["find"] == 1
     assert "--seed 7" in Report.read(tmp_path / "gap" / "report.json").command
-
-
-def test_json_is_the_report(fitted, recording, tmp_path, capsys):
-    out = tmp_path / "gap"
-    assert cli.main(["run", str(recording), "--out", str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == json.loads((out / "report.json").read_text())
 
 
 def test_unusable_recordings_exit_with_2_and_a_message(tmp_path, capsys):

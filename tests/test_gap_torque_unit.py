@@ -70,7 +70,8 @@ def test_a_known_stiffness_makes_torques_absolute_and_nothing_else():
     assert told.identified.parameters["b"] == BASE
     assert told.evidence[0].parameters == {"relative": 0.25}
     assert told.recording.relative_torques, "joint b's are"
-    assert not in_known_unit(found, machine(kp_nm_rad={"a": 6.0, "b": 1.5})).recording.relative_torques
+    whole = replace(recording, servo={"kp_nm_rad": {"a": 6.0, "b": 1.5}})
+    assert not in_known_unit(found, whole).recording.relative_torques
     assert in_known_unit(told, recording) == told, "a second time changes nothing"
 
 
