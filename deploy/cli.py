@@ -23,52 +23,27 @@ class Entry(NamedTuple):
 
 RUN = Entry("vd.deploy.loop.run", "RunCfg", "run", "drive the hand with a policy")
 COMMANDS = {
-    "scan": Entry(
-        "vd.deploy.hardware.scan",
-        "ScanCfg",
-        "scan",
-        "which motors are on the line, and what is wrong with them",
-    ),
     "check": Entry(
-        "vd.deploy.hardware.check",
-        "CheckCfg",
-        "check",
-        "preflight: everything that must be right before it moves",
+        "vd.deploy.hardware.check", "CheckCfg", "check", "preflight: what must be right before it moves"
     ),
     "calibrate": Entry(
-        "vd.deploy.camera.calibrate",
-        "CalibrateCfg",
-        "calibrate",
-        "find where the camera is, by markers on fingertips",
+        "vd.deploy.camera.calibrate", "CalibrateCfg", "calibrate", "find the camera, by markers on fingertips"
     ),
     "reboot": Entry(
-        "vd.deploy.hardware.maintain",
-        "RebootCfg",
-        "reboot",
-        "restart a motor: clears its error, and its count of turns",
+        "vd.deploy.hardware.reboot", "RebootCfg", "reboot", "restart a motor: clears its error and its turns"
     ),
-    "set-id": Entry("vd.deploy.hardware.maintain", "SetIdCfg", "set_id", "give a motor another ID"),
-    "set-baud": Entry(
-        "vd.deploy.hardware.maintain", "SetBaudCfg", "set_baud", "give a motor another baud rate"
-    ),
-    "home": Entry(
-        "vd.deploy.hardware.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"
-    ),
+    "home": Entry("vd.deploy.hardware.home", "HomeCfg", "home", "move slowly to where an episode starts"),
     "record": Entry("vd.deploy.hardware.record", "RecordCfg", "record", "record motions for vd-gap"),
-    "shadow": Entry(
-        "vd.deploy.loop.shadow",
-        "ShadowCfg",
-        "shadow",
-        "compare what the policy saw with what the simulator shows",
-    ),
-    "score": Entry(
-        "vd.deploy.loop.score_command",
-        "ScoreCfg",
-        "score",
-        "the object's error at each stop, by motion capture",
-    ),
+    "score": Entry("vd.deploy.loop.score", "ScoreCfg", "score", "errors at the stops, by motion capture"),
 }
 """The commands by name."""
+GONE = {
+    "scan": "vd-deploy check names what is silent; ROBOTIS' DYNAMIXEL Wizard 2.0 tries other rates",
+    "set-id": "ROBOTIS' DYNAMIXEL Wizard 2.0 sets IDs",
+    "set-baud": "ROBOTIS' DYNAMIXEL Wizard 2.0 sets baud rates",
+    "shadow": "vd-play shows logs; tests hold that the loop sees what the simulator shows",
+}
+"""Commands that went, and what is there instead."""
 
 USAGE = """usage: vd-deploy [POLICY] [flags]   {run}
        vd-deploy COMMAND [flags]
@@ -91,10 +66,12 @@ def _no_policy(text: str) -> str:
     """Why it is no file, no folder and no installed policy; "" if it is one."""
     if Path(text).exists():
         return ""
-    from vd.evaluate.agents import find_policy
+    if text in GONE:
+        return f"there is no command {text} any more: {GONE[text]}"
+    from vd.evaluate.agents import check_names
 
     try:
-        find_policy(text)
+        check_names([text], [])
     except FileNotFoundError:
         return f"no command and no policy {text!r}; commands are {', '.join(COMMANDS)}"
     except ValueError as error:  # it has another name now

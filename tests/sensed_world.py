@@ -1,6 +1,6 @@
 """What a hand would sense if a simulated world were its own."""
 
-from vd.deploy.loop.observation import Sensed
+from vd.deploy.loop.policy_runner import Sensed
 from vd.envs.reorient import ReorientEnv
 
 

@@ -9,8 +9,8 @@ import warp as wp
 from sensed_world import state_of
 
 from vd.deploy.loop.action import ActionFilter
-from vd.deploy.loop.mirror import Mirror
-from vd.deploy.loop.observation import seen_points, senses_of
+from vd.deploy.loop.policy_runner import seen_points, senses_of
+from vd.deploy.loop.teacher_runner import Mirror
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_teacher, task_for, trained_task
@@ -161,8 +161,3 @@ def test_a_mirror_takes_either_quaternion_of_goal_and_object():
     np.testing.assert_array_equal(seen[0][0], env.observation.numpy())
     for other in seen[1:]:
         np.testing.assert_array_equal(other, seen[0])
-
-
-def test_a_mirror_wants_one_plain_world_and_the_truth():
-    with pytest.raises(ValueError, match="one world"):
-        Mirror(ReorientCfg(num_envs=2))

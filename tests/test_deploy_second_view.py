@@ -7,15 +7,12 @@ from sensed_world import state_of
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
-from vd.deploy.loop.flight import make_flight, mirror_task
-from vd.deploy.loop.mirror import Mirror
-from vd.deploy.loop.observation import Sensed
-from vd.deploy.loop.pilot import TeacherPilot, TrackingPilot
+from vd.deploy.loop.policy_runner import Sensed, TrackingRunner
+from vd.deploy.loop.teacher_runner import TeacherRunner
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate.agents import open_policy
 from vd.evaluate.second_view import SecondView
-from vd.tracking.policy import TrackingPolicy, TrackingSpec
 from vd.tracking.tracker import NEAREST
 from vd.tracking.views import AFTER_S, EVERY_S
 
@@ -29,15 +26,14 @@ def test_a_teacher_takes_the_views_on_a_twin_that_it_takes_in_the_simulator(hand
     policy = open_policy(f"{hand}-table", "cpu")
     last = max(name for name in policy._critic if name.startswith("mlp.") and name.endswith(".weight"))
     policy._critic[last] = -policy._critic[last]
-    task = mirror_task(policy, hand, "cuboid", second_view=True)
-    env = ReorientEnv(task, "cpu")
-    actor, pilot = SecondView(env, policy), TeacherPilot(policy, Mirror(task), second_view=True)
-    mirror, seen = pilot._sight.mirror.env, set()
+    runner = TeacherRunner(policy, hand, "cuboid", second_view=True)
+    env = ReorientEnv(runner.task, "cpu")
+    actor, mirror, seen = SecondView(env, policy), runner.mirror.env, set()
     for goal in range(2):
         env.reset()
-        pilot.new_goal()
+        runner.new_goal()
         for step in range(AFTER + EVERY + 2):
-            ours = pilot.decide(state_of(env)).action
+            ours = runner.decide(state_of(env)).action
             theirs = actor.act(wp.to_torch(env.observation)).contiguous()
             view = int(env.views.view.numpy()[0])
             assert int(mirror.views.view.numpy()[0]) == view
@@ -52,35 +48,23 @@ def test_a_teacher_takes_the_views_on_a_twin_that_it_takes_in_the_simulator(hand
 
 def test_a_tracker_looks_again_after_a_while_and_begins_anew_with_a_new_goal():
     policy, hand, (item,) = open_policy("dclaw3-tracking", "cpu"), load_hand("dclaw3"), load_set("cube")
-    plain, pilot = (TrackingPilot(policy, hand, item, second_view=second) for second in (False, True))
+    plain, runner = (TrackingRunner(policy, hand, item, second_view=second) for second in (False, True))
     zero = np.zeros(9)
     image = np.full((hand.camera.height, hand.camera.width), 0.6, dtype=np.float32)
     sensed = Sensed(zero, zero, zero, np.array([np.sin(1.0), 0.0, 0.0, np.cos(1.0)]), depth=image)
 
-    def flown(steps: int) -> tuple[list[bool], list[int]]:
-        """Whether both pilots act alike in each of so many steps, and the views that were taken."""
+    def played(steps: int) -> tuple[list[bool], list[int]]:
+        """Whether both act alike in each of so many steps, and the views that were taken."""
         alike, taken = [], []
         for _ in range(steps):
-            one, other = plain.decide(sensed).action, pilot.decide(sensed).action
+            one, other = plain.decide(sensed).action, runner.decide(sensed).action
             alike.append(np.allclose(one, other, atol=1e-5))
-            taken.append(int(pilot._tracker._selected[0]))
+            taken.append(int(runner._tracker._selected[0]))
         return alike, taken
 
     for begin in ("begin", "new_goal"):
-        for each in (plain, pilot):
+        for each in (plain, runner):
             getattr(each, begin)()
-        alike, taken = flown(AFTER + 1)
+        alike, taken = played(AFTER + 1)
         assert all(alike[:AFTER]) and set(taken[:AFTER]) == {NEAREST}
         assert taken[AFTER] != NEAREST
-
-
-def test_what_has_no_second_view_is_refused():
-    hand, (item,) = load_hand("dclaw4"), load_set("cube")
-    with pytest.raises(ValueError, match="still does nothing"):
-        make_flight("still", "dclaw4", "cube", hand, item, second_view=True)
-    with pytest.raises(ValueError, match=r"observation\.view world"):
-        make_flight("dclaw4-cube", "dclaw4", "cube", hand, item, second_view=True)
-    with pytest.raises(ValueError, match="does not see its goals in views"):
-        TrackingPilot(
-            TrackingPolicy(open_policy("dclaw4-cube", "cpu"), TrackingSpec()), hand, item, second_view=True
-        )

@@ -7,25 +7,23 @@ The result is a layer over the hand's USD, for vd-deploy --camera-layer.
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
-from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, Intrinsics, compose, invert
 from vd.config import from_dict
-from vd.deploy.camera.calibration_poses import plan
-from vd.deploy.camera.camera import GrayFrame, StaleCamera
+from vd.deploy.camera.calibration_poses import plan, seat
+from vd.deploy.camera.camera import Camera, StaleCamera
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
-from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, MarkerFinder, save_marker
-from vd.deploy.camera.realsense import RealSenseCfg, RealSenseInfrared, find_device
+from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
+from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.hardware.check import ready
-from vd.deploy.hardware.connect import Connection, HandOptions, connect, read_hand_and_joints
+from vd.deploy.hardware.connect import HandOptions, connect, read_hand_and_joints
 from vd.deploy.hardware.motion import move, reset_pose
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
@@ -58,9 +56,7 @@ class CalibrateCfg(HandOptions):
     out: Path = Path("camera.usda")
     """Layer to write."""
     views: Path | None = None
-    """Solve these views again, without a hand: a folder that an earlier run kept."""
-    keep: Path | None = None
-    """Folder for the views; beside --out by default."""
+    """Solve these views again, without a hand: the folder that an earlier run left beside its --out."""
     fingers: tuple[int, ...] = ()
     """Fingers that carry a marker, from 0; all by default. Marker k is on finger k."""
     count: int = 30
@@ -71,27 +67,12 @@ class CalibrateCfg(HandOptions):
     """Write the markers as pictures into this folder, and do nothing else."""
     camera: RealSenseCfg = field(default_factory=lambda: RealSenseCfg(width=1280, height=720))
     """The camera."""
-    speed: float = SPEED_RAD_S
-    """Of the joint with the farthest way [rad/s]."""
     safety: SafetyCfg = field(default_factory=SafetyCfg)
     """Limits of the movements."""
-    seed: int = 0
-    """Of the poses that are chosen."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves."""
     json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Print JSON."""
-
-
-class ImageSource(Protocol):
-    """Where pictures come from."""
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """Of the pictures."""
-
-    def read(self, timeout_s: float) -> GrayFrame:
-        """The newest picture; raises :class:`StaleCamera` if none comes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,8 +106,8 @@ class _ViewsFile:
 
 def calibrate(cfg: CalibrateCfg) -> int:
     """Take views, solve, write the layer; 1 if the result is too uncertain."""
-    if not cfg.side_m > 0.0 or not cfg.speed > 0.0 or cfg.count < 1:
-        raise ValueError("--side-m, --speed and --count have to be positive")
+    if not cfg.side_m > 0.0 or cfg.count < 1:
+        raise ValueError("--side-m and --count have to be positive")
     hand, _ = read_hand_and_joints(cfg)
     fingers = cfg.fingers or tuple(range(hand.num_fingers))
     if not all(0 <= f < hand.num_fingers for f in fingers) or len(set(fingers)) != len(fingers):
@@ -139,11 +120,12 @@ def calibrate(cfg: CalibrateCfg) -> int:
     else:
         lens, shots, truth = take(cfg, fingers)
         side_m = cfg.side_m
-        save_views(cfg.keep or cfg.out.with_suffix(".views"), hand, lens, side_m, shots)
-    views = find_markers(hand, lens, side_m, shots, fingers)
+        save_views(cfg.out.with_suffix(".views"), hand, lens, side_m, shots)
+    views = views_of(hand, lens, side_m, shots, fingers)
     if not cfg.json:
         print(f"{len(views)} views of markers in {len(shots)} pictures")
-    found = solve(views)
+    thought = np.concatenate([hand.camera.position, hand.camera.quaternion])
+    found = solve(views, thought, {finger: seat(hand, finger, thought) for finger in fingers})
     record = report(hand, found, views, pictures=len(shots))
     if truth is not None:
         record["twin_off_at_object_m"] = float(np.linalg.norm(misplaced(found.camera, truth)))
@@ -179,27 +161,36 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[
     """
     with ExitStack() as stack:
         connection = stack.enter_context(connect(cfg))
-        camera = stack.enter_context(_pictures(cfg, connection, fingers))
-        hand = connection.hand
-        poses = plan(hand, camera.intrinsics, fingers, cfg.count, side_m=cfg.side_m, seed=cfg.seed)
-        question = f"The hand will move to {len(poses)} poses at {cfg.speed:g} rad/s."
+        hand, bus, joints = connection.hand, connection.bus, connection.joints
+        camera: RealSense | CalibrationTwin
+        if cfg.twin:
+            camera = CalibrationTwin(
+                hand,
+                lambda: joints.to_joint(bus.read_state().position),
+                fingers,
+                (cfg.camera.width, cfg.camera.height),
+                side_m=cfg.side_m,
+            )
+        else:
+            camera = RealSense(find_device(cfg.camera.serial), cfg.camera, infrared=True)
+        stack.callback(camera.close)
+        poses = plan(hand, camera.intrinsics, fingers, cfg.count, side_m=cfg.side_m)
+        question = f"The hand will move to {len(poses)} poses at {SPEED_RAD_S:g} rad/s."
         ready(connection, question, yes=cfg.yes, quiet=cfg.json)
-        safe = stack.enter_context(SafeHand(connection.bus, connection.joints, hand, cfg.safety))
+        safe = stack.enter_context(SafeHand(bus, joints, hand, cfg.safety))
         safe.arm()
         shots = []
         for number, pose in enumerate(poses):
-            move(safe, pose, cfg.speed)
-            shot = _shoot(safe, camera)
-            if shot is not None:
+            move(safe, pose, SPEED_RAD_S)
+            if (shot := _shoot(safe, camera)) is not None:
                 shots.append(shot)
             print(f"\r{number + 1} of {len(poses)} poses", end="", file=sys.stderr, flush=True)
         print(file=sys.stderr)
-        move(safe, reset_pose(hand.num_fingers), cfg.speed)
-        truth = camera.camera if isinstance(camera, CalibrationTwin) else None
-        return camera.intrinsics, shots, truth
+        move(safe, reset_pose(hand.num_fingers), SPEED_RAD_S)
+        return camera.intrinsics, shots, camera.camera if isinstance(camera, CalibrationTwin) else None
 
 
-def _shoot(safe: SafeHand, camera: ImageSource) -> Shot | None:
+def _shoot(safe: SafeHand, camera: Camera) -> Shot | None:
     """A picture taken between two readings of the resting joints."""
     begin = safe.read()
     for _ in range(TRIES):
@@ -216,51 +207,23 @@ def _shoot(safe: SafeHand, camera: ImageSource) -> Shot | None:
     return None
 
 
-@contextmanager
-def _pictures(cfg: CalibrateCfg, connection: Connection, fingers: tuple[int, ...]) -> Iterator[ImageSource]:
-    """The infrared images of the camera, or those of its twin."""
-    camera: RealSenseInfrared | CalibrationTwin
-    if cfg.twin:
-
-        def joints() -> np.ndarray:
-            return connection.joints.to_joint(connection.bus.read_state().position)
-
-        camera = CalibrationTwin(
-            connection.hand, joints, fingers, cfg.camera, side_m=cfg.side_m, seed=cfg.seed
-        )
-    else:
-        camera = RealSenseInfrared(find_device(cfg.camera.serial), cfg.camera)
-    try:
-        yield camera
-    finally:
-        camera.close()
-
-
-def find_markers(
+def views_of(
     hand: HandModel, lens: Intrinsics, side_m: float, shots: list[Shot], fingers: tuple[int, ...]
 ) -> Views:
     """The markers in the pictures, as views to solve; of a finger that waits only the first."""
-    finder = MarkerFinder(lens, side_m)
-    tip, finger, corners, candidates = [], [], [], []
+    tip, finger, corners = [], [], []
     seen: dict[int, list[np.ndarray]] = {number: [] for number in fingers}
     for shot in shots:
         poses = hand.tip_poses(shot.joint_q)
-        for number, square in finder.find(shot.image).items():
+        for number, square in find_markers(shot.image).items():
             own = shot.joint_q[3 * number : 3 * number + 3]
             if number in seen and all(np.abs(own - other).max() > SAME_RAD for other in seen[number]):
                 seen[number].append(own)
                 tip.append(poses[number])
                 finger.append(number)
                 corners.append(square)
-                candidates.append(finder.poses(square))
-    return Views(
-        np.array(tip).reshape(-1, 7),
-        np.array(finger, dtype=int),
-        np.array(corners).reshape(-1, 4, 2),
-        tuple(candidates),
-        lens,
-        side_m,
-    )
+    rows = np.array(tip).reshape(-1, 7), np.array(finger, dtype=int), np.array(corners).reshape(-1, 4, 2)
+    return Views(*rows, lens, side_m)
 
 
 def save_views(folder: Path, hand: HandModel, lens: Intrinsics, side_m: float, shots: list[Shot]) -> None:
@@ -284,7 +247,7 @@ def read_views(folder: Path, hand: HandModel) -> tuple[Intrinsics, float, list[S
     Raises:
         ValueError: The folder holds no views, or none of this hand; names the file.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     file = Path(folder) / VIEWS_FILE
     try:
@@ -301,7 +264,7 @@ def read_views(folder: Path, hand: HandModel) -> tuple[Intrinsics, float, list[S
                 raise ValueError(f"{row.image} has another size than the lens, or other joints than the hand")
             shots.append(Shot(np.array(row.joint_q), image))
         return lens, record.side_m, shots
-    except (OSError, TypeError, ValueError, UnidentifiedImageError) as error:
+    except (OSError, TypeError, ValueError) as error:  # of JSON, fields and pictures too
         raise ValueError(f"{file} holds no views to solve ({error}); take them again") from error
 
 
@@ -320,9 +283,7 @@ def misplaced(camera: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 def report(hand: HandModel, found: HandEye, views: Views, *, pictures: int) -> dict[str, Any]:
     """What was found and how well, for people and scripts (SI units, radians)."""
-    point = object_place()
-    used = views.chosen(found.inliers)
-    error, condition = found.point_error(point), found.condition(point)
+    error = found.point_error(object_place())
     warnings = []
     if error > LARGEST_ERROR_M:
         warnings.append(
@@ -332,35 +293,19 @@ def report(hand: HandModel, found: HandEye, views: Views, *, pictures: int) -> d
         )
     return {
         "hand": hand.name,
-        "position_m": [float(v) for v in found.camera[:3]],
-        "quaternion_xyzw": [float(v) for v in found.camera[3:]],
-        "position_half_width_m": [float(v) for v in found.half_width[:3]],
-        "turn_half_width_rad": [float(v) for v in found.half_width[3:]],
+        "position_m": found.camera[:3].tolist(),
+        "quaternion_xyzw": found.camera[3:].tolist(),
+        "position_half_width_m": found.half_width[:3].tolist(),
+        "turn_half_width_rad": found.half_width[3:].tolist(),
         "error_at_object_m": error,
-        "condition": condition,
         "residual_px": found.rms_px,
         "pictures": pictures,
         "views": len(views),
         "used": len(found.inliers),
-        "fingers": [int(f) for f in np.unique(used.finger)],
-        "turned_rad": [float(v) for v in turned(used)],
-        "dual_quaternions": {
-            "position_m": [float(v) for v in found.linear[:3]],
-            "quaternion_xyzw": [float(v) for v in found.linear[3:]],
-        },
+        "fingers": np.unique(views.finger[found.inliers]).tolist(),
         "moved_m": float(np.linalg.norm(found.camera[:3] - hand.camera.position)),
         "warnings": warnings,
     }
-
-
-def turned(views: Views) -> np.ndarray:
-    """How far the fingertips turned about the three directions about which they turned most [rad] [3]."""
-    spread = np.zeros((3, 3))
-    for finger in np.unique(views.finger):
-        turns = Rotation.from_quat(views.tip[views.finger == finger, 3:])
-        steps = (turns * turns.mean().inv()).as_rotvec()
-        spread += steps.T @ steps
-    return np.sqrt(np.linalg.eigvalsh(spread / len(views))[::-1].clip(0.0))
 
 
 def write_layer(path: Path, hand: HandModel, found: HandEye, record: dict[str, Any]) -> None:
@@ -388,14 +333,8 @@ def lines(record: dict[str, Any]) -> list[str]:
         rows.append(f"  {axis}       {1e3 * value:8.1f} mm  +- {1e3 * half:.1f}")
     for axis, half in zip(("right", "down", "ahead"), record["turn_half_width_rad"], strict=True):
         rows.append(f"  turn about its {axis:<6} +- {np.degrees(half):.2f} deg")
-    first = np.linalg.norm(np.subtract(record["dual_quaternions"]["position_m"], record["position_m"]))
-    turns = ", ".join(f"{np.degrees(t):.0f}" for t in record["turned_rad"])
-    rows += [
-        f"at the object: off by at most {1e3 * record['error_at_object_m']:.1f} mm (95 %)",
-        f"fingertips turned by {turns} deg (r.m.s., three directions); condition {record['condition']:.0f}",
-        f"dual quaternions alone: {1e3 * first:.1f} mm from this; "
-        f"the hand's file: {1e3 * record['moved_m']:.1f} mm",
-    ]
+    rows.append(f"at the object: off by at most {1e3 * record['error_at_object_m']:.1f} mm (95 %)")
+    rows.append(f"{1e3 * record['moved_m']:.1f} mm from where the hand's file has it")
     if "twin_off_at_object_m" in record:
         rows.append(f"the twin knows: off by {1e3 * record['twin_off_at_object_m']:.1f} mm at the object")
     return rows + [f"WARNING: {warning}" for warning in record["warnings"]]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, Intrinsics, compose, invert
 from vd.deploy.camera.camera import CameraError
-from vd.deploy.camera.hand_eye import project, square
+from vd.deploy.camera.hand_eye import marker_corners
 from vd.deploy.hardware.motion import reset_pose
 
 DRAWS = 400
@@ -116,14 +116,12 @@ def _visible(
     poses[:, axes] = generator.uniform(low, high, (DRAWS, 3))
     marker = seat(hand, finger, camera)
     seen = compose(invert(camera), compose(hand.tip_poses(poses)[:, finger], marker))
-    turn = Rotation.from_quat(seen[:, 3:])
+    normal = Rotation.from_quat(seen[:, 3:]).apply([0.0, 0.0, 1.0])
     sight = seen[:, :3] / np.linalg.norm(seen[:, :3], axis=1, keepdims=True)
-    facing = -np.sum(turn.apply([0.0, 0.0, 1.0]) * sight, axis=1) > np.cos(SLANT_RAD)
-    corners = np.einsum("nij,kj->nki", turn.as_matrix(), square(side_m)) + seen[:, None, :3]
-    pixels = project(corners, lens)
-    inside = ((pixels > BORDER_PX) & (pixels < np.array([lens.width, lens.height]) - BORDER_PX)).all(
-        axis=(1, 2)
-    )
+    facing = -np.sum(normal * sight, axis=1) > np.cos(SLANT_RAD)
+    pixels = marker_corners(seen, lens, side_m)
+    border = np.array([lens.width, lens.height]) - BORDER_PX
+    inside = ((pixels > BORDER_PX) & (pixels < border)).all(axis=(1, 2))
     still = cKDTree(_points(hand, waiting, without=finger))
     good = [
         row
@@ -196,8 +194,7 @@ def _design(
     def corners(step: np.ndarray) -> np.ndarray:
         eye, on = _moved(camera, step[:6]), _moved(marker, step[6:])
         pose = compose(invert(eye), compose(tips, on))
-        turn = Rotation.from_quat(pose[:, 3:]).as_matrix()
-        return project(np.einsum("nij,kj->nki", turn, square(side_m)) + pose[:, None, :3], lens)
+        return marker_corners(pose, lens, side_m)
 
     steps = STEP * np.eye(12)
     columns = [(corners(step) - corners(-step)) / (2 * STEP) for step in steps]

@@ -12,18 +12,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
+from scipy.stats import theilslopes
 
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.check import ready
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
-from vd.deploy.hardware.control_table import RAD_PER_COUNT
+from vd.deploy.hardware.control_table import RAD_PER_COUNT, TICK_MODULUS
 from vd.deploy.hardware.motion import move
-from vd.deploy.hardware.motor_time import measured_at
 from vd.deploy.hardware.registers import D_GAIN, P_GAIN
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
-from vd.deploy.timely import Priority, real_time, undisturbed
+from vd.deploy.timely import real_time, undisturbed
 from vd.files import check_folder
 
 if TYPE_CHECKING:
@@ -43,13 +43,15 @@ ASIDE = 0.8
 hand a straight finger that bends through its range would press on its neighbour."""
 WIDE = SafetyCfg(step_rad=4.0)
 """Steps go through most of a joint's range at once, which a policy must not."""
-TWIN_ARGS = "--physics-hz 3840"
+TWIN_ARGS = ("--physics-hz", "3840")
 """Steps of the twin so short that its integrator is as exact as vd-gap's: at 960 Hz it is off by 0.3 mrad
 (median of a moving hand; up to 0.9), two thirds of what the encoders round."""
 RATE_SHARE = 0.95
 """Share of the rate that is wanted below which a recording says that it missed it."""
 AGAIN_S = 0.01
 """A state that was asked for so long after its goal was sent was asked for again."""
+CLOCK_SAMPLES = 200
+"""By which two clocks are compared."""
 STATE_CHANNELS = ("velocity", "current", "pwm", "voltage", "temperature")
 
 
@@ -76,13 +78,10 @@ class RecordCfg(HandOptions):
     """Samples a second, as far as the bus allows."""
     safety: SafetyCfg = field(default_factory=lambda: WIDE)
     """Limits."""
-    realtime: Priority = "auto"
-    """Run before all ordinary programs, the twin too: where that is permitted (root, ulimit -r), always, or
-    never."""
+    realtime: bool = True
+    """Run before all ordinary programs, the twin too, where that is permitted (root, ulimit -r)."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print what was recorded as JSON."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +179,29 @@ def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
         raise ValueError(f"--fingers {wrong[0]}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")
     chosen = sorted(set(fingers)) or range(hand.num_fingers)
     return tuple(name for f in chosen for name in hand.joint_names[3 * f : 3 * f + JOINTS_PER_FINGER])
+
+
+def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+    """Times of states on this computer's clock, by those of the motors.
+
+    Between a program and its motors lie an adapter, a driver and a scheduler, which pass a packet on
+    milliseconds later on a busy machine. The motors have a clock of their own in their state.
+
+    Args:
+        asked_s: When each was asked for [T] [s].
+        ticks: What the motors' clocks said [T, D] [ms], which start again at their modulus: whole
+            milliseconds, each from a moment of its own, so that the mean of nine is as good as 0.1 ms.
+
+    Returns:
+        When each was measured [T] [s]: as long after it was asked for as most of them were.
+    """
+    gone = np.diff(ticks, axis=0) % TICK_MODULUS
+    own = np.concatenate([[0.0], 1e-3 * gone.mean(axis=1).cumsum()])
+    # The rates of two clocks differ; a share of the packets that comes late must not count. All pairs of some
+    # samples: those of all take longer than a hand may wait for its loop.
+    some = np.unique(np.linspace(0, len(own) - 1, CLOCK_SAMPLES).astype(int))
+    rate, begin, *_ = theilslopes((asked_s - own)[some], own[some])
+    return np.asarray(own * (1.0 + rate) + begin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,9 +313,8 @@ def record(cfg: RecordCfg) -> int:
     if not cfg.rate_hz > 0.0:
         raise ValueError(f"--rate-hz is {cfg.rate_hz}; it has to be above 0")
     check_folder(cfg.out)
-    twin_args = f"{TWIN_ARGS} --realtime {cfg.realtime} {cfg.twin_args}"
     with (
-        connect(replace(cfg, twin_args=twin_args)) as connection,
+        connect(cfg, [*TWIN_ARGS, *["--realtime"] * cfg.realtime]) as connection,
         undisturbed(),
         real_time(cfg.realtime),
     ):
@@ -321,11 +342,7 @@ def record(cfg: RecordCfg) -> int:
                 _session(cfg, connection, joints, list(group), payload, keep)
         for one in written:
             one.result()
-    if cfg.json:
-        files = [trajectory.file for trajectory in recording.trajectories]
-        print(json.dumps({"recording": str(cfg.out), "trajectories": files}, indent=1))
-    else:
-        print(f"{cfg.out}: {len(recording.trajectories)} motions; vd-gap run {cfg.out} --out gap")
+    print(f"{cfg.out}: {len(recording.trajectories)} motions; vd-gap run {cfg.out} --out gap")
     return 0
 
 
@@ -345,7 +362,7 @@ def _session(
         if cfg.yes or cfg.twin:
             raise RecordError(f"{motions[0].file}: somebody has to hang {payload_kg:g} kg at the fingertip")
         question = f"Hang {payload_kg:g} kg at the fingertip of {finger}. {question}"
-    ready(connection, question, yes=cfg.yes, quiet=cfg.json)
+    ready(connection, question, yes=cfg.yes)
     recorder = Recorder(connection, joints, cfg.rate_hz)
     with SafeHand(connection.bus, connection.joints, connection.hand, cfg.safety) as safe:
         safe.arm()

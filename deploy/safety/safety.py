@@ -20,17 +20,14 @@ import contextlib
 import signal
 import sys
 import threading
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.deploy.camera.camera import AHEAD_S
 from vd.deploy.finding import NAMED
 from vd.deploy.hardware.answers import BusError, HandState, LateError, SilentError
 from vd.deploy.hardware.bus import MotorBus
@@ -43,8 +40,8 @@ TORQUE_S = PERIOD_S / 3.0
 """Age of what is known of the motors' torque from which it is asked for again, in a packet of its own, since
 its register lies far from the state's: with each reading of a control loop, each third of a recording."""
 TORQUE_GONE = "another program on the line switched it off, or it restarted"
-UNHEARD = ": motors do not answer, or this computer is busy"
-"""Said where the loop stands on the line."""
+AHEAD_S = 0.02
+"""An image cannot be newer than the moment it came [s]; what the SDK makes of its clock is off by some ms."""
 OFF_S = 1.0
 """How long switching off is tried on a bus that does not answer soundly."""
 FINISHED = "finished"
@@ -113,10 +110,6 @@ class SafeHand:
         self.bus, self.joints, self.hand, self.cfg, self._say = bus, joints, hand, cfg or SafetyCfg(), say
         self._names = [f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)]
         self.limits = Limits(hand, bus.model, self._names, self.cfg)
-        self.limited = 0
-        """Goals that were limited."""
-        self.missed = 0
-        """Deadlines missed, in all."""
         self.repeated = 0
         """Readings without a sound answer, for which the last state stood in."""
         self.report: StopReport | None = None
@@ -127,7 +120,6 @@ class SafeHand:
         self._torque_s = -np.inf
         self._armed = False
         self._on = np.ones(len(joints.ids), dtype=bool)
-        self._loop = threading.get_ident()
         self._stopping = threading.RLock()
         self._unwatch: Callable[[], None] = lambda: None
         self._handlers: dict[signal.Signals, Any] = {}
@@ -208,7 +200,6 @@ class SafeHand:
         if target.shape != self.limits.lower.shape or not np.isfinite(target).all():
             raise self._stop(f"the target is not {len(self.joints.ids)} finite angles: {target}")
         goal = self.limits.goal(target, self._state.position)
-        self.limited += int((goal != target).any())
         with self._stopping:  # never after the hold
             self._check()
             try:
@@ -244,7 +235,6 @@ class SafeHand:
         """
         self._check()
         self._beat_s = self.bus.clock.now()
-        self.missed += missed
         self._misses = self._misses + 1 if missed else 0
         if self._misses >= self.cfg.misses:
             raise self._stop(f"{self._misses} deadlines missed in a row")
@@ -258,7 +248,8 @@ class SafeHand:
         ahead = time_s - self.bus.clock.now()
         if ahead > AHEAD_S:
             raise self._stop(
-                f"the newest image is {ahead:.2f} s from the future: its clock is not the monotonic one"
+                f"the newest image is {ahead:.2f} s from the future: wait until the computer's clock is set "
+                "(NTP), then plug the camera in again"
             )
         self._image_s = time_s
 
@@ -320,22 +311,10 @@ class SafeHand:
         if self._signal:
             return SIGNALS[signal.Signals(self._signal)]
         if silent > self.cfg.misses * PERIOD_S:
-            return f"the loop stands: no step ended for {silent:.2f} s{self._place()}"
+            return f"the loop stands: no step ended for {silent:.2f} s"
         if age > self.cfg.stale_s:
             return f"the newest image is {age:.2f} s old"
         return ""
-
-    def _place(self) -> str:
-        """What of ours the loop is in at present; empty where it is the loop itself that asks."""
-        if threading.get_ident() == self._loop:
-            return ""
-        own = Path(__file__).parent
-        stack = traceback.extract_stack(sys._current_frames().get(self._loop))
-        at = next((call for call in reversed(stack) if Path(call.filename).parent == own), None)
-        if at is None:
-            return ""
-        why = UNHEARD if at.filename == sys.modules[MotorBus.__module__].__file__ else ""
-        return f", in {at.name} ({Path(at.filename).name}, line {at.lineno}){why}"
 
     def _stop(self, reason: str, *, lost: bool = False) -> StoppedError:
         """Hold, and give what to raise.

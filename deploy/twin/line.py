@@ -1,7 +1,6 @@
 """A line of simulated motors: bytes of a program in, bytes of the motors out, and what they move goes on.
 
-Where the bytes come from and how time goes on is for others: :mod:`vd.deploy.twin.twin` puts a
-pseudo-terminal and the computer's clock around it. Faults can be injected.
+:mod:`vd.deploy.twin.twin` puts a pseudo-terminal and the computer's clock around it. Faults can be injected.
 """
 
 import functools
@@ -81,7 +80,7 @@ class MotorLine:
         now = max(self._clock.now() if at is None else at, self._then)
         seconds, self._then = now - self._then, now
         if seconds > 0.0:
-            self.plant.advance(seconds, [motor.drive(seconds) for motor in self.motors])
+            self.plant.advance(seconds, [motor.drive() for motor in self.motors])
             self._sense(seconds)
         packets: list[Packet] = []
         if heard:
@@ -96,7 +95,7 @@ class MotorLine:
 
     def _handle(self, packet: Packet) -> None:
         """Carry out one instruction and send what the motors answer."""
-        named = list(ORDER[packet.instruction](packet.parameters)) if packet.instruction in ORDER else []
+        named = list(packet.parameters[4:]) if packet.instruction == Instruction.SYNC_READ else []
         # Motors that a packet names answer in its order; each waits for the one before.
         answers: dict[int, list[tuple[Motor, list[bytes]]]] = {}
         for motor in sorted(self.motors, key=lambda m: named.index(m.id) if m.id in named else len(named)):
@@ -116,11 +115,6 @@ class MotorLine:
             answers = shared(motor, packet.parameters)
             return answers if level else []
         if packet.instruction == Instruction.STATUS:
-            return []
-        if packet.id == motor.secondary_id:
-            motor.heard()
-            if packet.instruction == Instruction.WRITE:
-                motor.write(_word(packet.parameters), packet.parameters[2:], secondary=True)
             return []
         if packet.id not in (motor.id, BROADCAST):
             return []
@@ -188,23 +182,6 @@ def _write(motor: Motor, parameters: bytes) -> Result:
     return motor.write(_word(parameters), parameters[2:]), b""
 
 
-def _register(motor: Motor, parameters: bytes) -> Result:
-    if len(parameters) < 3:
-        return Failure.LENGTH, b""
-    motor.registered = _word(parameters), parameters[2:]
-    motor.put("registered_instruction", 1)
-    return Failure.NONE, b""
-
-
-def _action(motor: Motor, parameters: bytes) -> Result:
-    if motor.registered is None:
-        return Failure.RESULT, b""
-    failure = motor.write(*motor.registered)
-    motor.registered = None
-    motor.put("registered_instruction", 0)
-    return failure, b""
-
-
 def _reboot(motor: Motor, parameters: bytes) -> Result:
     motor.reboot()
     return Failure.NONE, b""
@@ -222,30 +199,8 @@ def _sync_write(motor: Motor, parameters: bytes) -> list[Packet]:
     rows = parameters[4:]
     if length and len(rows) % (length + 1) == 0:
         for start in range(0, len(rows), length + 1):
-            if rows[start] in (motor.id, motor.secondary_id):
-                row = rows[start + 1 : start + 1 + length]
-                motor.write(address, row, secondary=rows[start] != motor.id)
-    return []
-
-
-def _bulk_read(motor: Motor, parameters: bytes) -> list[Packet]:
-    if len(parameters) % 5:
-        return []
-    answers = []
-    for start in range(0, len(parameters), 5):
-        if parameters[start] == motor.id:
-            failure, data = motor.read(_word(parameters, start + 1), _word(parameters, start + 3))
-            answers.append(status(motor.id, failure | motor.alert, data))
-    return answers
-
-
-def _bulk_write(motor: Motor, parameters: bytes) -> list[Packet]:
-    while len(parameters) >= 5:
-        length = _word(parameters, 3)
-        data = parameters[5 : 5 + length]
-        if parameters[0] == motor.id and len(data) == length:
-            motor.write(_word(parameters, 1), data)
-        parameters = parameters[5 + length :]
+            if rows[start] == motor.id:
+                motor.write(address, rows[start + 1 : start + 1 + length])
     return []
 
 
@@ -253,22 +208,11 @@ SINGLE: dict[int, Callable[[Motor, bytes], Result]] = {
     Instruction.PING: _ping,
     Instruction.READ: _read,
     Instruction.WRITE: _write,
-    Instruction.REG_WRITE: _register,
-    Instruction.ACTION: _action,
     Instruction.REBOOT: _reboot,
 }
 """Instructions to one motor, or broadcast."""
 SHARED: dict[int, Callable[[Motor, bytes], list[Packet]]] = {
     Instruction.SYNC_READ: _sync_read,
     Instruction.SYNC_WRITE: _sync_write,
-    Instruction.BULK_READ: _bulk_read,
-    Instruction.BULK_WRITE: _bulk_write,
 }
 """Instructions to many motors, which name them in their parameters."""
-
-
-ORDER: dict[int, Callable[[bytes], bytes]] = {
-    Instruction.SYNC_READ: lambda parameters: parameters[4:],
-    Instruction.BULK_READ: lambda parameters: parameters[::5],
-}
-"""Where the instructions that several motors answer name them."""

@@ -1,28 +1,30 @@
-"""A simulated world that takes the state of a hand: what the simulator would observe in it."""
+"""A teacher on a twin: it reads the true state, which no real hand tells, as its environment shows it."""
 
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 
 from vd.assets_usd.hand_data import canonical_quat
-from vd.deploy.loop.observation import Sensed
+from vd.deploy.loop.policy_runner import Decision, PolicyRunner, Sensed
 from vd.envs.cfg import ReorientCfg
 from vd.envs.reorient import ReorientEnv
+from vd.evaluate.agents import task_for
+from vd.evaluate.second_view import SecondView
 from vd.evaluate.statistics import rotation_angle
+from vd.paper import PAPER
+from vd.policy import TrainedPolicy
+from vd.stopping import StoppingRule
 
 
 class Mirror:
-    """One world of the environment of a training, put into states from elsewhere; it is never stepped.
+    """An environment of a training, put into states from elsewhere; it is never stepped.
 
     Args:
-        task: The environment: one world of one object, not randomised.
+        task: The environment: one of one object, not randomised.
     """
 
     def __init__(self, task: ReorientCfg):
-        if task.num_envs != 1 or task.randomisation.enabled:
-            raise ValueError("a mirror is one world that is not randomised")
         self.env = ReorientEnv(task, "cpu")
         self._goal: np.ndarray | None = None
         self._turn: np.ndarray | None = None
@@ -33,9 +35,6 @@ class Mirror:
 
     def take(self, sensed: Sensed) -> None:
         """Take a state, one in every control step: they are counted for the time of the goal.
-
-        Args:
-            sensed: The state, with that of the object.
 
         Raises:
             ValueError: The object's state is not known.
@@ -67,26 +66,59 @@ class Mirror:
         env.observe()
 
 
-class TeacherSight:
-    """What a teacher sees of a twin: the true state, as the environment of its training shows it.
+class TeacherRunner(PolicyRunner):
+    """A teacher on a twin.
 
     Args:
         policy: The teacher.
-        mirror: A world of its training.
+        hand_name: Name of the hand or its USD.
+        item_name: Name of the object's set or its USD.
+        tolerance_rad: How near to the goal it is to stop [rad].
+        second_view: Select symmetry views by its critic.
+
+    Raises:
+        ValueError: It is to select views, and has no critic, or sees its goals in none.
     """
 
-    def __init__(self, policy: Any, mirror: Mirror):
-        self._policy, self.mirror = policy, mirror
+    kind = "teacher"
+    needs_truth = True
 
-    def act(self, sensed: Sensed) -> np.ndarray:
-        """Mean action, in the joints' order [D]."""
+    def __init__(
+        self,
+        policy: TrainedPolicy,
+        hand_name: str,
+        item_name: str,
+        tolerance_rad: float = PAPER.success.rotation_rad,
+        *,
+        second_view: bool = False,
+    ):
+        task = task_for(
+            policy,
+            hand=hand_name,
+            objects=(item_name,),
+            num_envs=1,
+            seed=0,
+            stop_tolerance_rad=PAPER.success.rotation_rad,
+            max_goal_angle_rad=None,
+            episode_s=PAPER.scene.episode_s,
+            randomised=False,
+            success_ends_episode=False,
+            at_rest=False,
+            second_view=second_view,
+        )
+        super().__init__(task, StoppingRule(tolerance_rad))
+        self.mirror = Mirror(task)
+        self._actor: Any = SecondView(self.mirror.env, policy) if second_view else policy
+
+    def new_goal(self) -> None:
+        """The time of the goal is counted anew, for a teacher that sees it."""
+        self.mirror.begin()
+
+    def decide(self, sensed: Sensed) -> Decision:
+        """Mean action, in the joints' order, and true distance."""
         self.mirror.take(sensed)
         env = self.mirror.env
-        action = self._policy.act(wp.to_torch(env.observation)).contiguous().float()
+        action = self._actor.act(wp.to_torch(env.observation)).contiguous().float()
         if env.views is not None:
             action = wp.to_torch(env.views.world_action(wp.from_torch(action)))
-        return _row(action)
-
-
-def _row(action: torch.Tensor) -> np.ndarray:
-    return action[0].numpy().copy()
+        return Decision(action[0].numpy().copy(), float(env.rotation_error.numpy()[0]))
