@@ -149,7 +149,8 @@ def test_a_blocked_motor_shuts_down_and_says_why_until_rebooted(bus, twin):
     assert bus.hardware_errors() == {11: "overload"}
     assert bus.read(11, "torque_enable") == 0 and state.current[1] == 0.0
     assert "access" in bus.torque(True, [11])[11]
-    bus.reboot(11)
+    twin.motors[1].reboot()
+    bus.configure(dict.fromkeys(IDS, full))
     assert bus.hardware_errors() == {}
 
 

@@ -31,6 +31,15 @@ def turned(hand) -> Joints:
     return Joints(plain.names, plain.ids, rng.choice([-1.0, 1.0], 9), rng.uniform(-0.5, 0.5, 9))
 
 
+def save(joints: Joints, path, hand: str) -> dict:
+    """Write a calibration file."""
+    rows = zip(joints.names, joints.ids, joints.sign, joints.offset, strict=True)
+    motors = [{"joint": n, "id": i, "sign": int(s), "offset_rad": float(o)} for n, i, s, o in rows]
+    record = {"format": "vd-motors/1", "hand": hand, "motors": motors}
+    path.write_text(json.dumps(record))
+    return record
+
+
 def drives(joints: Joints, goal: np.ndarray | None) -> list[Drive]:
     angles = [None] * len(joints.ids) if goal is None else list(joints.to_motor(goal))
     return [Drive(angle, 200.0, 6.0, 2.6) for angle in angles]
@@ -68,7 +77,7 @@ def test_limits_are_the_hands_in_the_motors_frame(hand, turned):
 
 def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_path):
     path = tmp_path / "motors.json"
-    turned.save(path, hand.name)
+    save(turned, path, hand.name)
     again = read_joints(path, hand)
     assert again.ids == turned.ids
     np.testing.assert_array_equal(again.offset, turned.offset)
@@ -95,8 +104,7 @@ def test_a_calibration_is_read_back_and_a_wrong_one_refused(hand, turned, tmp_pa
 )
 def test_what_is_no_calibration_is_refused_with_file_and_field(hand, turned, tmp_path, change, reason):
     path = tmp_path / "motors.json"
-    turned.save(path, hand.name)
-    record = json.loads(path.read_text())
+    record = save(turned, path, hand.name)
     record["motors"][1] |= change
     record["motors"][1] = {name: value for name, value in record["motors"][1].items() if value is not None}
     path.write_text(json.dumps(record))

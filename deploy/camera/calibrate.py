@@ -10,7 +10,7 @@ import sys
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -18,7 +18,7 @@ import tyro
 from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, Intrinsics, compose, invert
 from vd.config import from_dict
 from vd.deploy.camera.calibration_poses import plan, seat
-from vd.deploy.camera.camera import Camera, StaleCamera
+from vd.deploy.camera.camera import Camera, CameraError, StaleCamera
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
@@ -27,7 +27,6 @@ from vd.deploy.hardware.connect import HandOptions, connect, read_hand_and_joint
 from vd.deploy.hardware.motion import move, reset_pose
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
-from vd.deploy.twin.calibration_twin import CalibrationTwin
 from vd.files import atomic_path, make_folder, write_json
 from vd.paper import PAPER
 
@@ -71,8 +70,6 @@ class CalibrateCfg(HandOptions):
     """Limits of the movements."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print JSON."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,28 +111,27 @@ def calibrate(cfg: CalibrateCfg) -> int:
         raise ValueError(f"--fingers {fingers}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")
     if cfg.print_markers is not None:
         return _print_markers(cfg.print_markers, fingers, cfg.side_m)
-    truth = None
     if cfg.views is not None:
         lens, side_m, shots = read_views(cfg.views, hand)
     else:
-        lens, shots, truth = take(cfg, fingers)
-        side_m = cfg.side_m
+        (lens, shots), side_m = take(cfg, fingers), cfg.side_m
         save_views(cfg.out.with_suffix(".views"), hand, lens, side_m, shots)
     views = views_of(hand, lens, side_m, shots, fingers)
-    if not cfg.json:
-        print(f"{len(views)} views of markers in {len(shots)} pictures")
+    print(f"{len(views)} views of markers in {len(shots)} pictures")
     thought = np.concatenate([hand.camera.position, hand.camera.quaternion])
     found = solve(views, thought, {finger: seat(hand, finger, thought) for finger in fingers})
-    record = report(hand, found, views, pictures=len(shots))
-    if truth is not None:
-        record["twin_off_at_object_m"] = float(np.linalg.norm(misplaced(found.camera, truth)))
-    write_layer(cfg.out, hand, found, record)
-    if cfg.json:
-        print(json.dumps(record, indent=1))
-    else:
-        print("\n".join(lines(record)))
-        print(f"written to {cfg.out}; vd-deploy --camera-layer {cfg.out}")
-    return 1 if record["warnings"] else 0
+    error_m = found.point_error(object_place())
+    write_layer(cfg.out, hand, found, error_m)
+    print("\n".join(report(hand, found, views, error_m)))
+    print(f"written to {cfg.out}; vd-deploy --camera-layer {cfg.out}")
+    if error_m <= LARGEST_ERROR_M:
+        return 0
+    print(
+        f"WARNING: ill-conditioned: where objects are, the cloud may be off by {1e3 * error_m:.1f} mm, more "
+        f"than a voxel ({1e3 * LARGEST_ERROR_M:.0f} mm). The fingers turn too little for these pictures: "
+        "take more views (--count), put markers on more fingers, larger ones, or move the camera nearer"
+    )
+    return 1
 
 
 def _print_markers(folder: Path, fingers: tuple[int, ...], side_m: float) -> int:
@@ -149,35 +145,24 @@ def _print_markers(folder: Path, fingers: tuple[int, ...], side_m: float) -> int
     return 0
 
 
-def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[Shot], np.ndarray | None]:
-    """Move the fingers before the camera and take pictures at rest.
-
-    Returns:
-        Lens, pictures, and where the camera is in truth [7], which only a twin knows.
+def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[Shot]]:
+    """Move the fingers before the camera and take pictures at rest: lens and pictures.
 
     Raises:
         StoppedError: A limit was passed; the hand is safe.
         CameraError: The camera does not serve.
     """
+    if cfg.twin:
+        raise CameraError("a twin has no camera that sees markers; give --port, or --views of an earlier run")
     with ExitStack() as stack:
-        connection = stack.enter_context(connect(cfg))
-        hand, bus, joints = connection.hand, connection.bus, connection.joints
-        camera: RealSense | CalibrationTwin
-        if cfg.twin:
-            camera = CalibrationTwin(
-                hand,
-                lambda: joints.to_joint(bus.read_state().position),
-                fingers,
-                (cfg.camera.width, cfg.camera.height),
-                side_m=cfg.side_m,
-            )
-        else:
-            camera = RealSense(find_device(cfg.camera.serial), cfg.camera, infrared=True)
+        camera = RealSense(find_device(cfg.camera.serial), cfg.camera, infrared=True)
         stack.callback(camera.close)
+        connection = stack.enter_context(connect(cfg))
+        hand = connection.hand
         poses = plan(hand, camera.intrinsics, fingers, cfg.count, side_m=cfg.side_m)
         question = f"The hand will move to {len(poses)} poses at {SPEED_RAD_S:g} rad/s."
-        ready(connection, question, yes=cfg.yes, quiet=cfg.json)
-        safe = stack.enter_context(SafeHand(bus, joints, hand, cfg.safety))
+        ready(connection, question, yes=cfg.yes)
+        safe = stack.enter_context(SafeHand(connection.bus, connection.joints, hand, cfg.safety))
         safe.arm()
         shots = []
         for number, pose in enumerate(poses):
@@ -187,7 +172,7 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[
             print(f"\r{number + 1} of {len(poses)} poses", end="", file=sys.stderr, flush=True)
         print(file=sys.stderr)
         move(safe, reset_pose(hand.num_fingers), SPEED_RAD_S)
-        return camera.intrinsics, shots, camera.camera if isinstance(camera, CalibrationTwin) else None
+        return camera.intrinsics, shots
 
 
 def _shoot(safe: SafeHand, camera: Camera) -> Shot | None:
@@ -274,67 +259,32 @@ def object_place() -> np.ndarray:
     return compose(invert(np.array(BASE_IN_WORLD)), place)[:3]
 
 
-def misplaced(camera: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """By how much what is where objects are seems moved to a camera [7] that is at another place [3] [m]."""
-    point = object_place()
-    seen = compose(invert(truth), np.array([*point, 0.0, 0.0, 0.0, 1.0]))
-    return compose(camera, seen)[:3] - point
-
-
-def report(hand: HandModel, found: HandEye, views: Views, *, pictures: int) -> dict[str, Any]:
-    """What was found and how well, for people and scripts (SI units, radians)."""
-    error = found.point_error(object_place())
-    warnings = []
-    if error > LARGEST_ERROR_M:
-        warnings.append(
-            f"ill-conditioned: where objects are, the cloud may be off by {1e3 * error:.1f} mm, more than a "
-            f"voxel ({1e3 * LARGEST_ERROR_M:.0f} mm). The fingers turn too little for these pictures: take "
-            "more views (--count), put markers on more fingers, larger ones, or move the camera nearer"
-        )
-    return {
-        "hand": hand.name,
-        "position_m": found.camera[:3].tolist(),
-        "quaternion_xyzw": found.camera[3:].tolist(),
-        "position_half_width_m": found.half_width[:3].tolist(),
-        "turn_half_width_rad": found.half_width[3:].tolist(),
-        "error_at_object_m": error,
-        "residual_px": found.rms_px,
-        "pictures": pictures,
-        "views": len(views),
-        "used": len(found.inliers),
-        "fingers": np.unique(views.finger[found.inliers]).tolist(),
-        "moved_m": float(np.linalg.norm(found.camera[:3] - hand.camera.position)),
-        "warnings": warnings,
-    }
-
-
-def write_layer(path: Path, hand: HandModel, found: HandEye, record: dict[str, Any]) -> None:
-    """Write the layer, with what is known of its errors."""
+def write_layer(path: Path, hand: HandModel, found: HandEye, error_m: float) -> None:
+    """Write the layer, with what is known of its errors (SI units, radians)."""
     from vd.assets_usd.camera_layer import write_camera_layer
 
     notes = {
         "tool": "vd-deploy calibrate",
-        "position_half_width_m": json.dumps(record["position_half_width_m"]),
-        "turn_half_width_rad": json.dumps(record["turn_half_width_rad"]),
-        "error_at_object_m": f"{record['error_at_object_m']:.6f}",
-        "residual_px": f"{record['residual_px']:.3f}",
-        "views": str(record["used"]),
+        "position_half_width_m": json.dumps(found.half_width[:3].tolist()),
+        "turn_half_width_rad": json.dumps(found.half_width[3:].tolist()),
+        "error_at_object_m": f"{error_m:.6f}",
+        "residual_px": f"{found.rms_px:.3f}",
+        "views": str(len(found.inliers)),
     }
     write_camera_layer(path, hand, found.camera, notes)
 
 
-def lines(record: dict[str, Any]) -> list[str]:
-    """The report as text."""
+def report(hand: HandModel, found: HandEye, views: Views, error_m: float) -> list[str]:
+    """What was found and how well, as text."""
     rows = [
-        f"{record['used']} of {record['views']} views agree, {record['residual_px']:.2f} pixels apart",
+        f"{len(found.inliers)} of {len(views)} views agree, {found.rms_px:.2f} pixels apart",
         "camera in the hand's base, 95 % intervals:",
     ]
-    for axis, value, half in zip("xyz", record["position_m"], record["position_half_width_m"], strict=True):
+    for axis, value, half in zip("xyz", found.camera[:3], found.half_width[:3], strict=True):
         rows.append(f"  {axis}       {1e3 * value:8.1f} mm  +- {1e3 * half:.1f}")
-    for axis, half in zip(("right", "down", "ahead"), record["turn_half_width_rad"], strict=True):
+    for axis, half in zip(("right", "down", "ahead"), found.half_width[3:], strict=True):
         rows.append(f"  turn about its {axis:<6} +- {np.degrees(half):.2f} deg")
-    rows.append(f"at the object: off by at most {1e3 * record['error_at_object_m']:.1f} mm (95 %)")
-    rows.append(f"{1e3 * record['moved_m']:.1f} mm from where the hand's file has it")
-    if "twin_off_at_object_m" in record:
-        rows.append(f"the twin knows: off by {1e3 * record['twin_off_at_object_m']:.1f} mm at the object")
-    return rows + [f"WARNING: {warning}" for warning in record["warnings"]]
+    moved_m = np.linalg.norm(found.camera[:3] - hand.camera.position)
+    rows.append(f"at the object: off by at most {1e3 * error_m:.1f} mm (95 %)")
+    rows.append(f"{1e3 * moved_m:.1f} mm from where the hand's file has it")
+    return rows

@@ -1,8 +1,7 @@
-"""ArUco markers: printed, found in images, and drawn into images as a camera would see them.
+"""ArUco markers: printed, and found in images.
 
-A marker's own frame has x right and y up on the print, z out of it, its origin in the middle. Pixels are
-those of :class:`vd.assets_usd.hand_data.Intrinsics`: the first one's centre is at (0.5, 0.5), not at 0 as
-OpenCV has it.
+Pixels are those of :class:`vd.assets_usd.hand_data.Intrinsics`: the first one's centre is at (0.5, 0.5), not
+at 0 as OpenCV has it.
 """
 
 from pathlib import Path
@@ -11,9 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.assets_usd.hand_data import Intrinsics
 from vd.deploy.camera.camera import CameraError
-from vd.deploy.camera.hand_eye import marker_corners
 from vd.files import atomic_path
 
 DICTIONARY = "DICT_4X4_50"
@@ -25,10 +22,6 @@ MARGIN_CELLS = 1
 PRINT_DPI = 600
 CELL_PX = 32
 """Side of a cell in the picture of a marker."""
-SUPERSAMPLING = 4
-"""Rays a side of a pixel, of drawn images."""
-WHITE = 230
-"""Brightness of a drawn marker's white, of 255."""
 
 
 def opencv() -> ModuleType:
@@ -79,46 +72,12 @@ def save_marker(path: Path, number: int, side_m: float) -> None:
 
     inches = side_m * (CELLS + 2 * MARGIN_CELLS) / CELLS / 0.0254
     size = round(inches * PRINT_DPI)
-    image = Image.fromarray(_picture(number)).resize((size, size), Image.Resampling.NEAREST)
+    image = Image.fromarray(picture_of(number)).resize((size, size), Image.Resampling.NEAREST)
     with atomic_path(path) as temporary:
         image.save(temporary, dpi=(PRINT_DPI, PRINT_DPI))
 
 
-def draw(image: np.ndarray, number: int, pose: np.ndarray, lens: Intrinsics, side_m: float) -> np.ndarray:
-    """An image with a marker in it, each pixel the mean of rays through it.
-
-    Args:
-        image: Brightness of what is behind, uint8 [H, W].
-        number: Number of the marker.
-        pose: Pose of the marker in the camera [7].
-        lens: Of the camera.
-        side_m: Side of its black square [m].
-    """
-    cv = opencv()
-    rim = marker_corners(pose[None], lens, side_m * (CELLS + 2 * MARGIN_CELLS) / CELLS)[0]
-    first, second = rim[1] - rim[0], rim[3] - rim[0]
-    if not np.isfinite(rim).all() or first[0] * second[1] <= first[1] * second[0]:  # behind, or its back
-        return image
-    low = np.clip(np.floor(rim.min(axis=0)).astype(int), 0, (lens.width, lens.height))
-    high = np.clip(np.ceil(rim.max(axis=0)).astype(int), 0, (lens.width, lens.height))
-    width, height = (int(side) for side in (high - low))
-    if width < 1 or height < 1:
-        return image
-    n, picture = SUPERSAMPLING, np.minimum(_picture(number), WHITE)
-    side = len(picture)
-    source = np.array([[0, 0], [side, 0], [side, side], [0, side]], dtype=np.float32) - 0.5
-    warp = cv.getPerspectiveTransform(source, (n * (rim - low) - 0.5).astype(np.float32))
-    size = (n * width, n * height)
-    ink = cv.warpPerspective(picture, warp, size, flags=cv.INTER_NEAREST)
-    inside = cv.warpPerspective(np.ones_like(picture), warp, size, flags=cv.INTER_NEAREST) > 0
-    behind = image[low[1] : high[1], low[0] : high[0]].repeat(n, axis=0).repeat(n, axis=1)
-    seen = np.where(inside, ink, behind).reshape(height, n, width, n).mean(axis=(1, 3))
-    result = image.copy()
-    result[low[1] : high[1], low[0] : high[0]] = np.rint(seen).astype(np.uint8)
-    return result
-
-
-def _picture(number: int) -> np.ndarray:
+def picture_of(number: int) -> np.ndarray:
     """A marker with its white border, brightness uint8 [S, S]."""
     cv = opencv()
     marker = cv.aruco.generateImageMarker(_dictionary(cv), number, CELLS)

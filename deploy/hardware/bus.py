@@ -111,12 +111,6 @@ class MotorBus:
         """Name of the port."""
         return str(self._port.getPortName())
 
-    def command(self, words: str) -> str:
-        """A command of vd-deploy for these motors, as a person can enter it."""
-        rate = self._port.getBaudRate()
-        flag = "" if rate == BAUD_RATE else f" --baud-rate {rate}"
-        return f"`vd-deploy {words} --port {self.port}{flag}`"
-
     def _garbled(self, result: int) -> bool:
         """Whether what answered the last exchange is no sound packet, though this program listened."""
         return bool(result == self._sdk.COMM_RX_CORRUPT) and self._late_s <= STARVED_S
@@ -322,13 +316,6 @@ class MotorBus:
         """
         self._write_all("bus_watchdog", [1] * len(self.ids))
         self.clock.sleep(2.0 * WATCHDOG_UNIT_S)
-
-    def reboot(self, id: int) -> None:
-        """Restart a motor: clears its hardware error. Torque is off afterwards; configure it before use."""
-        with self._line():
-            result, error = self._packets.reboot(self._port, id)
-            self._states.forget()
-        self._check(id, "reboot", result, error)
 
     def hardware_errors(self) -> dict[int, str]:
         """Hardware errors of the motors that have one, in words, by ID."""

@@ -18,7 +18,7 @@ from vd.deploy.hardware.answers import BusError, GarbledError, LateError
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
 from vd.deploy.hardware.joints import CalibrationError
 from vd.deploy.hardware.motion import move
-from vd.deploy.hardware.registers import Register, different, kept
+from vd.deploy.hardware.registers import RESTART, Register, different, kept
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import SafeHand
 from vd.deploy.twin.child import TwinCamera
@@ -88,11 +88,7 @@ def preflight(connection: Connection) -> Iterator[Finding]:
         yield finding("motors answer", wrong, f"all {len(bus.ids)}")
         if wrong:
             return
-        mend = "once it is mended {} clears it"
-        errors = [
-            f"motor {id}: {why}; {mend.format(bus.command(f'reboot {id}'))}"
-            for id, why in bus.hardware_errors().items()
-        ]
+        errors = [f"motor {id}: {why}; mend it, then {RESTART}" for id, why in bus.hardware_errors().items()]
         yield finding("no hardware error", errors, "none")
         yield from register_findings(connection, tables)
         yield Finding("torque", True, _holding(bus) or "off")
@@ -127,8 +123,7 @@ def _read_tables(bus: "MotorBus", ids: Sequence[int]) -> tuple[dict[int, dict[st
         except (GarbledError, LateError) as error:
             wrong.append(str(error))
         except BusError:
-            mend = bus.command(f"reboot {id}")
-            wrong.append(f"motor {id} answers pings, but no reads: its status_return_level is 0; {mend}")
+            wrong.append(f"motor {id} answers pings, but no reads: its status_return_level is 0; {RESTART}")
     return tables, wrong
 
 
@@ -148,8 +143,7 @@ def register_findings(connection: Connection, tables: Tables) -> Iterator[Findin
     for one, motors in rows.items():
         if one.remedy:
             values = [
-                f"motor {id}: {value}; {one.remedy.format(reboot=bus.command(f'reboot {id}'), wanted=wanted)}"
-                for id, value, wanted in motors
+                f"motor {id}: {value}; {one.remedy.format(wanted=wanted)}" for id, value, wanted in motors
             ]
             yield Finding(one.name, False, f"{one.why}: {listed(values)}")
             continue
@@ -211,8 +205,9 @@ def _state(connection: Connection) -> Iterator[Finding]:
     outside = []
     for axis in np.flatnonzero(out > OUTSIDE_RAD):
         # Turned by hand without torque a motor counts on; one that starts counts within one turn.
-        mend = f"it was turned round; {bus.command(f'reboot {bus.ids[axis]}')}"
-        mend = mend if turns[axis] else "move it by hand, or mend its calibration"
+        mend = (
+            f"it was turned round: {RESTART}" if turns[axis] else "move it by hand, or mend its calibration"
+        )
         where = f"{q[axis]:.2f} rad, out of {hand.lower[axis]:.2f} to {hand.upper[axis]:.2f}"
         outside.append(f"{joints.names[axis]}: {where}: {mend}")
     yield finding("pose within limits", outside, "every joint")

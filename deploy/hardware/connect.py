@@ -97,7 +97,11 @@ def connect(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[
     with contextlib.ExitStack() as stack:
         twin, port = None, options.port
         if port is None:
-            print("starting the twin ...", file=sys.stderr, flush=True)
+            print(
+                "starting the twin (the first start compiles its kernels for minutes) ...",
+                file=sys.stderr,
+                flush=True,
+            )
             arguments = ["--hand", options.hand, "--model", options.motor]
             if options.hand_layer is not None:
                 arguments += ["--hand-layer", str(options.hand_layer)]

@@ -144,9 +144,7 @@ def _by_joint(file: _File, hand: HandModel) -> list[_Motor]:
         raise ValueError(f"motors.id are {ids}; give each motor its own, within 0 and {MAX_ID}")
     for motor in file.motors:
         if motor.sign not in (-1.0, 1.0):
-            raise ValueError(
-                f"motors.sign of {motor.joint} is {motor.sign:g}; it is 1, or -1 for the other way"
-            )
+            raise ValueError(f"motors.sign of {motor.joint} is {motor.sign:g}; it is 1, or -1")
         if not np.isfinite(motor.offset_rad):
             raise ValueError(f"motors.offset_rad of {motor.joint} is {motor.offset_rad}; give an angle [rad]")
     return [file.motors[named.index(name)] for name in hand.joint_names]

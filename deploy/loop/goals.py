@@ -223,8 +223,8 @@ def _unit(path: Path, longest: float) -> float:
     fitting = [UNITS_M[name] for name in GUESSED_UNITS if low <= longest * UNITS_M[name] <= high]
     if not fitting:
         raise GoalError(
-            f"{path}: its longest side is {longest:.4g} units, which in {' or '.join(GUESSED_UNITS)} is not within "
-            f"{100 * low:.0f} to {100 * high:.0f} cm; cut away what is not the object, or scale the file to "
-            "metres"
+            f"{path}: its longest side is {longest:.4g} units, which in {' or '.join(GUESSED_UNITS)} is not "
+            f"within {100 * low:.0f} to {100 * high:.0f} cm; cut away what is not the object, or "
+            "scale the file to metres"
         )
     return fitting[0]

@@ -3,8 +3,9 @@
 One step is :meth:`ControlLoop.step`: wait, sense, decide, filter, send, log.
 """
 
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -22,8 +23,8 @@ from vd.paper import PAPER
 
 CAMERA_SHARE = 0.5
 """Share of a control period for which an image is waited for."""
-STATUS_STEPS = 3
-"""Control steps between two refreshes of the status line: four a second."""
+STATUS_STEPS = 60
+"""Control steps between two status lines: five seconds."""
 NO_SYMMETRY = np.array([[0.0, 0.0, 0.0, 1.0]])
 
 
@@ -71,7 +72,6 @@ class ControlLoop:
         camera: Depth camera; None: the policy needs none.
         truth: A twin; None on a real hand.
         symmetry: Rotations that map the object to itself [K, 4], for the true error.
-        status: Shows the status line.
 
     Attributes:
         times: Of every step so far.
@@ -89,11 +89,9 @@ class ControlLoop:
         camera: Camera | None = None,
         truth: Truth | None = None,
         symmetry: np.ndarray = NO_SYMMETRY,
-        status: Callable[[str], None] = lambda line: None,
     ):
         self._safe, self._runner, self._actions, self._pacer, self._log = safe, runner, actions, pacer, log
-        self._cfg, self._camera, self._truth, self._status = cfg, camera, truth, status
-        self._symmetry = symmetry
+        self._cfg, self._camera, self._truth, self._symmetry = cfg, camera, truth, symmetry
         self._target = safe.read().position
         self.times: list[StepTimes] = []
 
@@ -205,7 +203,7 @@ class ControlLoop:
         acting: bool,
         times: StepTimes,
     ) -> None:
-        """Log the step, keep its times, and refresh the status line."""
+        """Log the step, keep its times, and now and then say how it goes."""
         truth: list[float] = []
         if sensed.object_pose is not None:
             pose = sensed.object_pose.astype(float)
@@ -224,11 +222,13 @@ class ControlLoop:
         self._log.step(state.time_s, self._pacer.due_s + times.sent_s, joints, values, truth)
         self.times.append(times)
         if len(self.times) % STATUS_STEPS == 0:
-            self._status(
+            print(
                 f"goal {number + 1}{'' if acting else ', holding'} | distance {distance:.2f} rad"
                 + (f", true {truth[-1]:.2f}" if truth else "")
                 + f" | loop {1e3 * times.sent_s:.0f} ms | missed {self._pacer.missed}"
-                f" | {state.temperature.max():.0f} deg C | {np.abs(state.current).max():.2f} A"
+                f" | {state.temperature.max():.0f} deg C | {np.abs(state.current).max():.2f} A",
+                file=sys.stderr,
+                flush=True,
             )
 
 

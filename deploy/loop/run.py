@@ -7,7 +7,6 @@ it can be a teacher too; that one reads the simulated object's true pose, which 
 import contextlib
 import select
 import sys
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -47,8 +46,6 @@ SETTLE_S = 1.5
 """Time that an object of a twin has to come to rest between the fingers [s]."""
 LATEST = 0.25
 """Share of a control period by which a step may begin late: to find the object takes much of one."""
-STATUS_S = 5.0
-"""Seconds between status lines where there is no terminal to rewrite one on."""
 WARM_UP = 3
 """Decisions before the hand is switched on: kernels are loaded, allocators have grown."""
 FIRST_IMAGE_S = 5.0
@@ -223,7 +220,6 @@ def _pursue(
         )
         pacer = Pacer(hz, latest=LATEST)
         reason, outcomes = "aborted", list[str]()
-        status = StatusLine()
         loop: ControlLoop | None = None
         try:
             with SafeHand(connection.bus, connection.joints, hand, cfg.safety) as safe:
@@ -240,7 +236,6 @@ def _pursue(
                     camera=camera,
                     truth=twin,
                     symmetry=item.symmetry,
-                    status=status.show,
                 )
                 outcomes = loop.run(goals)
                 reason = "lost" if "lost" in outcomes else "all goals pursued"
@@ -248,7 +243,6 @@ def _pursue(
             reason = f"{type(error).__name__}: {error}"
             raise
         finally:
-            status.end()
             steps = 0 if loop is None else len(loop.times)
             times = summary(loop.times) if loop else {}
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
@@ -335,26 +329,6 @@ def place(safe: SafeHand, pose: np.ndarray, twin: "TwinChild | None", *, yes: bo
         clock.sleep(MOVE_S)
     if asked:
         sys.stdin.readline()
-
-
-class StatusLine:
-    """One line that is rewritten on a terminal, and now and then a new one elsewhere."""
-
-    def __init__(self) -> None:
-        self._live, self._next = sys.stderr.isatty(), 0.0
-
-    def show(self, line: str) -> None:
-        """Show a line."""
-        if self._live:
-            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
-        elif time.monotonic() >= self._next:
-            self._next = time.monotonic() + STATUS_S
-            print(line, file=sys.stderr, flush=True)
-
-    def end(self) -> None:
-        """Leave the line."""
-        if self._live:
-            print(file=sys.stderr)
 
 
 def report(folder: Path, steps: int, missed: int, times: dict[str, Any]) -> None:

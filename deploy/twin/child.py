@@ -20,9 +20,6 @@ from vd.deploy.camera.camera import Frame, StaleCamera
 
 START_S = 1200.0
 """Longest start: on a machine that has not compiled the simulator's kernels, and has other work."""
-USUAL_S = 30.0
-"""Longest start on one that has; then it is said what takes so long."""
-SLOW = "... it compiles the simulator's kernels, once for this machine: that takes minutes"
 END_S = 5.0
 """Time that a twin has to end."""
 ANSWER_S = 5.0
@@ -124,20 +121,15 @@ class TwinChild:
             TwinError: It ended before, or takes too long.
         """
         assert self._process.stdout is not None
-        waited, begin = 0.0, time.monotonic()
-        while waited < START_S:
-            left = (USUAL_S if waited < USUAL_S else START_S) - waited
-            if select.select([self._process.stdout], [], [], left)[0]:
-                line = self._process.stdout.readline().decode()
-                if line.startswith("/"):
-                    return line.strip()
-                if not line:
-                    self._words.seek(0)
-                    words = self._words.read().strip().splitlines()
-                    raise TwinError(f"the twin did not start: {words[-1] if words else 'no answer'}")
-            before, waited = waited, time.monotonic() - begin
-            if before < USUAL_S <= waited:
-                print(SLOW, file=sys.stderr, flush=True)
+        end = time.monotonic() + START_S
+        while select.select([self._process.stdout], [], [], max(0.0, end - time.monotonic()))[0]:
+            line = self._process.stdout.readline().decode()
+            if line.startswith("/"):
+                return line.strip()
+            if not line:
+                self._words.seek(0)
+                words = self._words.read().strip().splitlines()
+                raise TwinError(f"the twin did not start: {words[-1] if words else 'no answer'}")
         raise TwinError(
             f"the twin did not start within {START_S:g} s; what it has compiled is kept, so try again, "
             "or with fewer other programs"

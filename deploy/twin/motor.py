@@ -63,9 +63,10 @@ class Motor:
             self.put(name, item.initial)
         self.put("id", own)
         self.temperature, self._where = AMBIENT_C, 0.0
-        self._power_on()
+        self.reboot()
 
-    def _power_on(self) -> None:
+    def reboot(self) -> None:
+        """Start anew: torque off, errors cleared, RAM at its initial values; what is kept in EEPROM stays."""
         for name, item in self.items.items():
             if item.address >= EEPROM_END and item.writable:
                 self.put(name, item.initial)
@@ -74,10 +75,6 @@ class Motor:
         self._strained = self._silence = 0.0
         self._turns = 0
         self._count_one_turn()
-
-    def reboot(self) -> None:
-        """Start anew: torque off, errors cleared, RAM at its initial values; what is kept in EEPROM stays."""
-        self._power_on()
 
     def get(self, name: str) -> int:
         """Value of an item."""
