@@ -113,7 +113,7 @@ def test_the_grid_stays_where_it_was_whatever_is_late():
 
 def test_it_acts_until_the_policy_has_arrived_then_holds_and_goes_on(parts):
     hand, runner, actions, pacer, log = parts
-    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=10.0, hold_s=0.5), truth=Truth())
+    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=10.0, hold_s=0.5), twin=Truth())
     assert loop.run([GOAL, GOAL]) == ["stopped", "stopped"]
     log.finish("done")
     read = read_log(log.folder)
@@ -152,7 +152,7 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
     truth = None if turned is None else Truth(quat=tuple(quat))
     if truth is None:
         log = LogWriter(log.folder / "real", load_hand("dclaw3"), log._run, servo={}, clock=hand.clock)
-    ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=limit_s, hold_s=0.2), truth=truth).run(
+    ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=limit_s, hold_s=0.2), twin=truth).run(
         [GOAL]
     )
     log.finish("done")
@@ -165,11 +165,11 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
 def test_a_goal_that_is_not_reached_ends_by_its_time_and_a_lost_object_the_run(parts):
     hand, runner, actions, pacer, log = parts
     runner.start = 9.0
-    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), truth=Truth())
+    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), twin=Truth())
     assert loop.run([GOAL]) == ["time limit"]
     assert runner.decided == 12
     away = Truth((0.3, 0.0, 0.03))
-    lost = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), truth=away)
+    lost = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), twin=away)
     assert lost.run([GOAL, GOAL]) == ["lost"]
 
 

@@ -1,7 +1,7 @@
-"""Poses of a hand in which a camera sees the markers on its fingertips, chosen to tell most of the camera.
+"""Poses of a hand in which a camera sees the markers on its fingertips, chosen to tell much of the camera.
 
 One finger moves, the others are spread out of its way. Of random poses that are free and in view, those are
-taken one by one that lessen the uncertainty of the camera most (a greedy D-optimal design).
+taken whose fingertips are turned most from each other.
 """
 
 import numpy as np
@@ -35,8 +35,6 @@ SEAT_M = 0.012
 """Distance of a marker from the middle of its link."""
 PATH_STEPS = 6
 """Poses between two views that have to be free as well."""
-STEP = 1e-6
-"""Of differences [m], [rad]."""
 
 
 def seat(hand: HandModel, finger: int, camera: np.ndarray) -> np.ndarray:
@@ -87,7 +85,8 @@ def plan(
                 f"only {len(options)} of {DRAWS} poses of finger {finger} show its marker to the camera at "
                 f"{np.round(camera[:3], 2)} m of the base; choose other --fingers, or mend the hand's camera"
             )
-        chosen = _design(hand, lens, finger, camera, options, side_m, share)
+        turns = Rotation.from_quat(hand.tip_poses(options)[:, finger, 3:])
+        chosen = options[_apart(turns, share)]
         # From the waiting pose, always on to the nearest one, along free ways only.
         here = waiting
         while len(chosen):
@@ -179,39 +178,10 @@ def _way_free(hand: HandModel, finger: int, waiting: np.ndarray, here: np.ndarra
     return all(_free(hand, finger, here + share * (there - here), still) for share in shares)
 
 
-def _design(
-    hand: HandModel,
-    lens: Intrinsics,
-    finger: int,
-    camera: np.ndarray,
-    options: np.ndarray,
-    side_m: float,
-    count: int,
-) -> np.ndarray:
-    """The poses of ``options`` [n, D] that together tell most of camera and marker, [count, D]."""
-    tips, marker = hand.tip_poses(options)[:, finger], seat(hand, finger, camera)
-
-    def corners(step: np.ndarray) -> np.ndarray:
-        eye, on = _moved(camera, step[:6]), _moved(marker, step[6:])
-        pose = compose(invert(eye), compose(tips, on))
-        return marker_corners(pose, lens, side_m)
-
-    steps = STEP * np.eye(12)
-    columns = [(corners(step) - corners(-step)) / (2 * STEP) for step in steps]
-    jacobian = np.stack([c.reshape(len(options), 8) for c in columns], axis=2)
-    jacobian /= np.sqrt((jacobian**2).mean(axis=(0, 1)))
-    information = 1e-6 * np.eye(12)
-    left, chosen = list(range(len(options))), []
-    for _ in range(count):
-        trial = information + np.einsum("nki,nkj->nij", jacobian[left], jacobian[left])
-        best = left[int(np.argmax(np.linalg.slogdet(trial)[1]))]
-        information = information + jacobian[best].T @ jacobian[best]
-        chosen.append(best)
-        left.remove(best)
-    return options[chosen]
-
-
-def _moved(pose: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """A pose [7], moved by [3] m and turned about its own axes by [3] rad."""
-    turn = Rotation.from_quat(pose[3:]) * Rotation.from_rotvec(step[3:])
-    return np.concatenate([pose[:3] + step[:3], turn.as_quat()])
+def _apart(turns: Rotation, count: int) -> list[int]:
+    """So many of some orientations, each as far from those before as there is any."""
+    chosen, nearest = [0], np.full(len(turns), np.inf)
+    while len(chosen) < count:
+        nearest = np.minimum(nearest, (turns[chosen[-1]].inv() * turns).magnitude())
+        chosen.append(int(np.argmax(nearest)))
+    return chosen

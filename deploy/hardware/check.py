@@ -142,10 +142,10 @@ def register_findings(connection: Connection, tables: Tables) -> Iterator[Findin
                 rows.setdefault(one, []).append((id, *values))
     for one, motors in rows.items():
         if one.remedy:
-            values = [
+            mend = [
                 f"motor {id}: {value}; {one.remedy.format(wanted=wanted)}" for id, value, wanted in motors
             ]
-            yield Finding(one.name, False, f"{one.why}: {listed(values)}")
+            yield Finding(one.name, False, f"{one.why}: {listed(mend)}")
             continue
         alike: dict[tuple[int, int], list[str]] = {}
         for id, value, wanted in motors:
@@ -258,18 +258,15 @@ def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
 
 def ready(
     connection: Connection, question: str, *, yes: bool, quiet: bool = False, more: Iterable[Finding] = ()
-) -> list[Finding]:
+) -> None:
     """Preflight, and ``more`` of it, have the person confirm, and only then write the settings.
 
     Raises:
         RuntimeError: Something is wrong, the person did not say yes, or a motor does not keep a setting.
     """
-    findings = show(itertools.chain(preflight(connection), more), quiet=quiet)
-    _stop_at_wrong(findings)
+    _stop_at_wrong(show(itertools.chain(preflight(connection), more), quiet=quiet))
     confirm(question, yes=yes)
-    findings += show([write_settings(connection)], quiet=quiet)
-    _stop_at_wrong(findings)
-    return findings
+    _stop_at_wrong(show([write_settings(connection)], quiet=quiet))
 
 
 def _stop_at_wrong(findings: Iterable[Finding]) -> None:

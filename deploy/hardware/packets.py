@@ -35,7 +35,6 @@ class Failure(IntEnum):
     """Error numbers of a status packet (its lower seven bits)."""
 
     NONE = 0
-    RESULT = 1
     INSTRUCTION = 2
     CRC = 3
     RANGE = 4

@@ -238,8 +238,10 @@ def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float)
         sent_s = bus.clock.now()
         state = safe.read()
         if not states or state.time_s > states[-1].time_s:  # else the last one again
-            for kept, value in ((states, state), (goals, goal), (sent, sent_s), (enabled, on)):
-                kept.append(value)
+            states.append(state)
+            goals.append(goal)
+            sent.append(sent_s)
+            enabled.append(on)
         safe.beat()
         pacer.wait()
     if not on.all():
@@ -272,7 +274,7 @@ def _trajectory(
     measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
     # A goal arrives with the question for its state, unless that was asked again.
     sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
-    measured = {name: of(name) for name in STATE_CHANNELS}
+    measured: dict[str, Any] = {name: of(name) for name in STATE_CHANNELS}
     return Trajectory(
         file=motion.file,
         excitation=motion.excitation.name,

@@ -7,7 +7,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.policy_runner import PolicyRunner, Sensed
 from vd.deploy.safety.safety import SafeHand
+from vd.deploy.twin.child import TwinChild
 from vd.evaluate.statistics import symmetric_error
 from vd.paper import PAPER
 
@@ -26,13 +26,6 @@ CAMERA_SHARE = 0.5
 STATUS_STEPS = 60
 """Control steps between two status lines: five seconds."""
 NO_SYMMETRY = np.array([[0.0, 0.0, 0.0, 1.0]])
-
-
-class Truth(Protocol):
-    """Somebody who knows the object: a twin."""
-
-    def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """Pose [7] and velocity [6] of the object."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +63,7 @@ class ControlLoop:
         log: Takes every step.
         cfg: Times.
         camera: Depth camera; None: the policy needs none.
-        truth: A twin; None on a real hand.
+        twin: Knows the object's true state; None on a real hand.
         symmetry: Rotations that map the object to itself [K, 4], for the true error.
 
     Attributes:
@@ -87,11 +80,11 @@ class ControlLoop:
         cfg: LoopCfg,
         *,
         camera: Camera | None = None,
-        truth: Truth | None = None,
+        twin: TwinChild | None = None,
         symmetry: np.ndarray = NO_SYMMETRY,
     ):
         self._safe, self._runner, self._actions, self._pacer, self._log = safe, runner, actions, pacer, log
-        self._cfg, self._camera, self._truth, self._symmetry = cfg, camera, truth, symmetry
+        self._cfg, self._camera, self._twin, self._symmetry = cfg, camera, twin, symmetry
         self._target = safe.read().position
         self.times: list[StepTimes] = []
 
@@ -174,8 +167,8 @@ class ControlLoop:
             frame = self._camera.read(CAMERA_SHARE * self._pacer.period_s)
             self._safe.image_at(frame.time_s)
             depth = frame.image
-        if self._truth is not None:
-            pose, velocity = self._truth.state()
+        if self._twin is not None:
+            pose, velocity = self._twin.state()
         state = self._safe.read()
         smoothed = self._actions.smoothed
         return Sensed(state.position, state.velocity, smoothed, goal, depth, pose, velocity), state

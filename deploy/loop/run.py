@@ -234,7 +234,7 @@ def _pursue(
                     log,
                     LoopCfg(cfg.episode_s, cfg.hold_s),
                     camera=camera,
-                    truth=twin,
+                    twin=twin,
                     symmetry=item.symmetry,
                 )
                 outcomes = loop.run(goals)

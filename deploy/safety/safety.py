@@ -253,14 +253,6 @@ class SafeHand:
             )
         self._image_s = time_s
 
-    def stop(self, reason: str) -> None:
-        """Stop for a reason of the caller's.
-
-        Raises:
-            StoppedError: Always.
-        """
-        raise self._stop(reason)
-
     def _read(self) -> HandState:
         try:
             raw = self.bus.read_state()

@@ -9,14 +9,13 @@ import contextlib
 import os
 import pty
 import select
-import socket
-import struct
 import sys
 import termios
 import threading
 import tty
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -38,8 +37,6 @@ if TYPE_CHECKING:
 
 IDLE_S = 0.005
 """Longest wait for bytes: the plant goes on in steps of this size at most."""
-STAMP = struct.Struct("d")
-"""Time before bytes that arrived."""
 LONGEST = 4096
 """Bytes that are taken at once."""
 
@@ -66,7 +63,7 @@ class Twin(MotorLine):
         self._side = side
         self._end = threading.Event()
         self._thread: threading.Thread | None = None
-        self._mouth, self._ear = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._ear, self._mouth = Pipe(duplex=False)
         self._near, self._far = pty.openpty()
         tty.setraw(self._far)
         os.set_blocking(self._near, False)
@@ -111,8 +108,8 @@ class Twin(MotorLine):
         wait_s = max(0.0, min(IDLE_S, self.due_s - self._clock.now()))
         ready, _, _ = select.select(waited, [], [], wait_s)
         if self._ear in ready:
-            heard = self._ear.recv(STAMP.size + LONGEST)
-            self.go_on(heard[STAMP.size :], at=STAMP.unpack_from(heard)[0])
+            at, heard = self._ear.recv()
+            self.go_on(heard, at=at)
         else:
             self.go_on()
         if self._side is not None and self._side.pipe in ready and not self._side.serve():
@@ -124,7 +121,7 @@ class Twin(MotorLine):
             if select.select([self._near], [], [], IDLE_S)[0]:
                 at = self._clock.now()
                 with contextlib.suppress(BlockingIOError, OSError):
-                    self._mouth.send(STAMP.pack(at) + os.read(self._near, LONGEST))
+                    self._mouth.send((at, os.read(self._near, LONGEST)))
 
     def _write(self, data: bytes) -> None:
         try:
