@@ -55,6 +55,9 @@ LATE_S = 0.02
 class MotorBus:
     """Motors of one model on one serial port.
 
+    Every exchange raises :class:`BusError` where a packet could not be sent, a motor refused, or no sound
+    answer came, also not when asked again.
+
     Args:
         port: Device, such as /dev/ttyUSB0, or an open port of the SDK's kind.
         ids: Motors in the order of the arrays.
@@ -197,11 +200,7 @@ class MotorBus:
         return wrong
 
     def read(self, id: int, name: str) -> int:
-        """Value of one item of the control table.
-
-        Raises:
-            BusError: No sound answer.
-        """
+        """Value of one item of the control table."""
         item = self._items[name]
         return item.from_bytes(self._read(id, name, item.address, item.size))
 
@@ -236,11 +235,7 @@ class MotorBus:
         return bytes(data)
 
     def write(self, id: int, name: str, value: int) -> None:
-        """Write one item of the control table.
-
-        Raises:
-            BusError: No sound answer, or the motor refused.
-        """
+        """Write one item of the control table."""
         item = self._items[name]
         data = list(item.to_bytes(value))
 
@@ -286,20 +281,13 @@ class MotorBus:
         return failed
 
     def release(self) -> None:
-        """Switch the torque of all motors off with one packet, which none of them answers.
-
-        Raises:
-            BusError: The packet could not be sent.
-        """
+        """Switch the torque of all motors off with one packet, which none of them answers."""
         self._write_all("torque_enable", [0] * len(self.ids))
 
     def watch(self, seconds: float) -> None:
         """Have the motors stop where they are once the line was silent for so long; 0 switches that off.
 
         A motor that has stopped so refuses goals until this is called again.
-
-        Raises:
-            BusError: No sound answer, or a motor refused.
         """
         for id in self.ids:
             self.write(id, "bus_watchdog", 0)
@@ -310,9 +298,6 @@ class MotorBus:
         """Have the motors stop by themselves where they are, without an answer, within two units of silence.
 
         The shortest bus watchdog, in one packet: what a line that brings no states still can do.
-
-        Raises:
-            BusError: The packet could not be sent.
         """
         self._write_all("bus_watchdog", [1] * len(self.ids))
         self.clock.sleep(2.0 * WATCHDOG_UNIT_S)
@@ -391,11 +376,7 @@ class MotorBus:
             return self._states.accept(heard, answers)
 
     def read_torque(self) -> np.ndarray:
-        """Whether each motor has its torque on, shape [D] bool.
-
-        Raises:
-            BusError: A motor did not answer, also not when asked again.
-        """
+        """Whether each motor has its torque on, shape [D] bool."""
         item = self._items["torque_enable"]
         for attempt in range(self.retries + 1):
             try:

@@ -2,7 +2,6 @@
 
 import errno
 import fcntl
-import grp
 import os
 import termios
 from collections.abc import Sequence
@@ -104,7 +103,7 @@ def _why(path: str, error: OSError) -> str:
     if error.errno in (errno.EBUSY, errno.EWOULDBLOCK):
         return f"it is in use; one program at a time may drive the motors: `fuser -v {path}` names it, end it"
     if error.errno == errno.EACCES:
-        group = _group(path)
+        group = Path(path).group()  # dialout on Debian and Ubuntu, uucp elsewhere
         return (
             f"permission denied: it belongs to the group {group}; "
             f"`sudo usermod -aG {group} $USER`, then log out and in again"
@@ -113,11 +112,3 @@ def _why(path: str, error: OSError) -> str:
         there = sorted(str(one) for kind in ("ttyUSB*", "ttyACM*") for one in Path("/dev").glob(kind))
         return f"there is no such device; is the adapter plugged in? There are: {', '.join(there) or 'none'}"
     return f"{error}; is it the motors' adapter?"
-
-
-def _group(path: str) -> str:
-    """Group of a device: dialout on Debian and Ubuntu, uucp elsewhere."""
-    try:
-        return grp.getgrgid(Path(path).stat().st_gid).gr_name
-    except (KeyError, OSError):
-        return "dialout"

@@ -97,12 +97,7 @@ class PolicyRunner:
 class StudentRunner(PolicyRunner):
     """A student: sees by a depth camera, remembers, and predicts its distance.
 
-    Args:
-        student: The student.
-        hand: The hand.
-        item: The object.
-        tolerance_rad: How near to the goal it is to stop [rad].
-        seed: Of the choice of camera points.
+    Arguments are those of :func:`vd.deploy.loop.load_runner.load_runner`.
 
     Raises:
         ValueError: It is none of stage 2, and so does not see by a camera.
@@ -159,13 +154,7 @@ class StudentRunner(PolicyRunner):
 class TrackingRunner(PolicyRunner):
     """A tracking policy: finds the object in the camera's images, and lets its teacher act.
 
-    Args:
-        policy: The policy.
-        hand: The hand.
-        item: The object.
-        tolerance_rad: How near to the goal it is to stop [rad].
-        second_view: Select symmetry views by its teacher's critic.
-        seed: Of the choice of camera points.
+    Arguments are those of :func:`vd.deploy.loop.load_runner.load_runner`.
 
     Raises:
         ValueError: It is for another hand, or has no views to select.

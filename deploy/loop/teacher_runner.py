@@ -69,12 +69,7 @@ class Mirror:
 class TeacherRunner(PolicyRunner):
     """A teacher on a twin.
 
-    Args:
-        policy: The teacher.
-        hand_name: Name of the hand or its USD.
-        item_name: Name of the object's set or its USD.
-        tolerance_rad: How near to the goal it is to stop [rad].
-        second_view: Select symmetry views by its critic.
+    Arguments are those of :func:`vd.deploy.loop.load_runner.load_runner`.
 
     Raises:
         ValueError: It is to select views, and has no critic, or sees its goals in none.

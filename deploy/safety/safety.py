@@ -90,6 +90,8 @@ def unheard(error: BusError) -> str:
 class SafeHand:
     """A hand whose goals are limited and that stops by itself.
 
+    Once it is stopped, each method raises :class:`StoppedError` with the reason.
+
     Args:
         bus: Its motors, configured.
         joints: Which motor turns which joint.
@@ -141,11 +143,7 @@ class SafeHand:
                 signal.signal(number, handler)
 
     def arm(self) -> HandState:
-        """Switch the torque on where the hand is, and start the watchdogs.
-
-        Raises:
-            StoppedError: A motor does not switch on.
-        """
+        """Switch the torque on where the hand is, and start the watchdogs."""
         with self._stopping:
             try:
                 self._state = state = self._read()
@@ -161,11 +159,7 @@ class SafeHand:
             return state
 
     def read(self) -> HandState:
-        """Read the joints; for a short gap in the bus the last state once more, with its own time.
-
-        Raises:
-            StoppedError: The bus is lost, a limit was passed, a motor reports an error, or another stop.
-        """
+        """Read the joints; for a short gap in the bus the last state once more, with its own time."""
         self._check()
         try:
             state = self._read()
@@ -189,9 +183,6 @@ class SafeHand:
 
         Returns:
             The goals that were sent [rad], shape [D].
-
-        Raises:
-            StoppedError: The hand is stopped, the target is no number, or the bus is lost.
         """
         self._check()
         target = np.asarray(target, dtype=float)
@@ -213,9 +204,6 @@ class SafeHand:
 
         Args:
             on: Shape [D] bool.
-
-        Raises:
-            StoppedError: A motor does not switch.
         """
         self.command(self.read().position)
         for axis in np.flatnonzero(on != self._on):
@@ -229,9 +217,6 @@ class SafeHand:
 
         Args:
             missed: Whether it ended after its deadline.
-
-        Raises:
-            StoppedError: Too many in a row.
         """
         self._check()
         self._beat_s = self.bus.clock.now()
