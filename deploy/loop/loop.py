@@ -162,16 +162,15 @@ class ControlLoop:
             StoppedError: The hand was stopped.
             StaleCamera: There is no new image.
         """
-        depth, pose, velocity = None, None, None
+        depth = None
         if self._camera is not None:
             frame = self._camera.read(CAMERA_SHARE * self._pacer.period_s)
             self._safe.image_at(frame.time_s)
             depth = frame.image
-        if self._twin is not None:
-            pose, velocity = self._twin.state()
+        pose = None if self._twin is None else self._twin.object_pose()
         state = self._safe.read()
         smoothed = self._actions.smoothed
-        return Sensed(state.position, state.velocity, smoothed, goal, depth, pose, velocity), state
+        return Sensed(state.position, state.velocity, smoothed, goal, depth, pose), state
 
     def _ended(self, distance: float, sensed: Sensed, *, first: bool) -> str:
         """``stopped``, ``lost``, or nothing."""

@@ -1,7 +1,8 @@
 """Policies in the control loop: from what is sensed to an action and the distance to the goal."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict
 from vd.envs.cfg import ReorientCfg
-from vd.evaluate.agents import trained_task
+from vd.evaluate.agents import check_bundle, is_saved_student, is_tracking_policy, open_policy, trained_task
 from vd.evaluate.student import RENDERED
 from vd.paper import PAPER
 from vd.senses import Senses
@@ -42,9 +43,7 @@ class Sensed:
     depth: np.ndarray | None = None
     """Depth image [m], 0 for none [H, W]."""
     object_pose: np.ndarray | None = None
-    """True pose of the object [7]: a twin's only."""
-    object_velocity: np.ndarray | None = None
-    """Its true linear [m/s] and angular [rad/s] velocity [6]: a twin's only."""
+    """True pose of the object [7], which a twin tells and no policy is told."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +53,7 @@ class Decision:
     action: np.ndarray
     """Mean action [D]."""
     distance: float
-    """Distance to the goal by which it is stopped [rad]: a prediction, or the truth; NaN: not known."""
+    """Distance to the goal by which it is stopped [rad], as it is predicted; NaN: not known."""
 
 
 class PolicyRunner:
@@ -65,15 +64,13 @@ class PolicyRunner:
         rule: When it has arrived.
 
     Attributes:
-        kind: teacher, student, tracking or zero.
+        kind: student, tracking or zero.
         camera: Where its depth camera has to be; None: it has none.
-        needs_truth: Whether it needs the object's true pose, which only a twin knows.
-        calibrated: Whether its rule to stop comes from episodes; a teacher's needs none.
+        calibrated: Whether its rule to stop comes from episodes.
     """
 
     kind = ZERO
     camera: CameraModel | None = None
-    needs_truth = False
     calibrated = True
 
     def __init__(self, task: ReorientCfg, rule: StoppingRule):
@@ -97,7 +94,7 @@ class PolicyRunner:
 class StudentRunner(PolicyRunner):
     """A student: sees by a depth camera, remembers, and predicts its distance.
 
-    Arguments are those of :func:`vd.deploy.loop.load_runner.load_runner`.
+    Arguments are those of :func:`load_runner`.
 
     Raises:
         ValueError: It is none of stage 2, and so does not see by a camera.
@@ -154,7 +151,7 @@ class StudentRunner(PolicyRunner):
 class TrackingRunner(PolicyRunner):
     """A tracking policy: finds the object in the camera's images, and lets its teacher act.
 
-    Arguments are those of :func:`vd.deploy.loop.load_runner.load_runner`.
+    Arguments are those of :func:`load_runner`.
 
     Raises:
         ValueError: It is for another hand, or has no views to select.
@@ -199,6 +196,54 @@ class TrackingRunner(PolicyRunner):
         decided = self._tracker.step(senses)
         self._fresh, self._goal_steps = False, self._goal_steps + 1
         return Decision(decided.action[0].numpy().copy(), float(decided.angle[0]))
+
+
+def load_runner(
+    name: str,
+    hand_name: str,
+    hand: HandModel,
+    item: ObjectModel,
+    *,
+    tolerance_rad: float = PAPER.success.rotation_rad,
+    second_view: bool = False,
+    seed: int = 0,
+) -> PolicyRunner:
+    """Load a policy for the loop.
+
+    Args:
+        name: Bundle, file of a policy, installed policy, or ``zero``.
+        hand_name: Name of the hand or its USD.
+        hand: The hand.
+        item: The object.
+        tolerance_rad: How near to the goal it is to stop [rad].
+        second_view: Select symmetry views by the critic (:mod:`vd.evaluate.second_view`).
+        seed: Of the choice of camera points.
+
+    Raises:
+        ValueError: It is for another hand, does not see by a camera, or has no second view.
+    """
+    policy: Any = None if name == ZERO else open_policy(name, "cpu")
+    student = is_saved_student(policy)
+    if second_view and (policy is None or student):
+        raise ValueError(f"--second-view: {name} has no views to select; give a tracking policy")
+    if policy is None:
+        if name != ZERO:
+            raise ValueError(f"{name} is not for a hand; give a bundle, a policy's file, or {ZERO}")
+        return PolicyRunner(ReorientCfg(hand=hand_name), StoppingRule())
+    moves = policy.spec.num_actions if student else policy.num_actions
+    if moves != hand.num_joints:
+        raise ValueError(f"{name} moves {moves} joints, the hand {hand.name} has {hand.num_joints}")
+    check_bundle(name, replace(trained_task(policy), hand=hand_name))
+    if student:
+        return StudentRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
+    if is_tracking_policy(policy):
+        return TrackingRunner(
+            policy, hand, item, tolerance_rad=tolerance_rad, second_view=second_view, seed=seed
+        )
+    raise ValueError(
+        f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train tracker makes "
+        "a tracking policy of it"
+    )
 
 
 def seen_points(cloud: CameraCloud, depth: np.ndarray | None) -> torch.Tensor:

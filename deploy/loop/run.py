@@ -1,7 +1,6 @@
 """Drive a hand with a policy: pursue goals one after the other, in one process at 12 Hz, and log every step.
 
-On a real hand the policy sees joints and a depth camera: a tracking policy, or a student. On a twin
-it can be a teacher too; that one reads the simulated object's true pose, which no real hand tells.
+The policy sees joints and a depth camera: a tracking policy, or a student.
 """
 
 import contextlib
@@ -57,8 +56,8 @@ class RunCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """Bundle, file or name of a policy that sees by camera, or with --twin also of a teacher; with --twin
-    the installed teacher of the hand by default. "zero" does nothing."""
+    """Bundle, file or name of a policy that sees by camera; with --twin the installed tracking policy of the
+    hand by default. "zero" does nothing."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj, .glb)."""
     goal: tuple[str, ...] = ()
@@ -127,18 +126,17 @@ def run(cfg: RunCfg) -> int:
 
     from vd.deploy.hardware.connect import read_hand_and_joints
     from vd.deploy.loop.goals import make_goals, one_object
-    from vd.deploy.loop.load_runner import load_runner
+    from vd.deploy.loop.policy_runner import load_runner
 
     quiet_warp()
     torch.set_num_threads(1)  # of several, some would wait for one that has no core
     goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
     hand, _ = read_hand_and_joints(cfg)
-    item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-table"
+    item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
     tolerance = cfg.tolerance_rad
     runner = load_runner(
         name,
         cfg.hand,
-        cfg.object,
         hand,
         item,
         tolerance_rad=tolerance,
@@ -150,10 +148,6 @@ def run(cfg: RunCfg) -> int:
             f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that distance; "
             "vd-train tracker finds a better one",
             file=sys.stderr,
-        )
-    if runner.needs_truth and not cfg.twin:
-        raise ValueError(
-            f"{name} needs the object's true pose, which no real hand tells; give one that sees by a camera"
         )
     folder = cfg.log or LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
     fault: StoppedError | None = None
@@ -206,7 +200,7 @@ def _pursue(
             camera = open_camera(cfg, runner, hand, twin)
             stack.callback(camera.close)
             seen = camera_findings(camera, runner.camera, fps=cfg.camera.fps if twin is None else hz)
-        warm_up(runner, pose, goals[0], camera, twin)
+        warm_up(runner, pose, goals[0], camera)
         stack.enter_context(undisturbed())
         stack.enter_context(real_time(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals."
@@ -276,7 +270,6 @@ def warm_up(
     pose: np.ndarray,
     goal: np.ndarray,
     camera: Camera | None,
-    twin: "TwinChild | None",
 ) -> None:
     """Let the policy decide a few times on what is seen now; the run begins without that.
 
@@ -286,9 +279,8 @@ def warm_up(
 
     still = np.zeros_like(pose)
     depth = None if camera is None else camera.read(FIRST_IMAGE_S).image
-    truth = (None, None) if twin is None else twin.state()
     for _ in range(WARM_UP):
-        runner.decide(Sensed(pose, still, still, goal, depth, *truth))
+        runner.decide(Sensed(pose, still, still, goal, depth))
 
 
 def _description(

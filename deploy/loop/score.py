@@ -6,14 +6,15 @@ error, and count as failures in the shares.
 """
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
+from vd.config import to_dict
 from vd.deploy.loop.goals import one_object
 from vd.deploy.loop.mocap import Mocap, MocapError, read_mocap
 from vd.evaluate.result import TOLERANCES_RAD
@@ -74,10 +75,10 @@ class Trial:
 class Score:
     """A scored run."""
 
-    log: HandLog
+    log: Path
     """The run."""
-    mocap: Mocap
-    """Its motion capture: times since the start of the log, the object in the hand's world frame."""
+    mocap: Path
+    """Its motion capture."""
     offset_s: float
     """Time of the export at the log's beginning [s]."""
     trials: tuple[Trial, ...]
@@ -97,20 +98,6 @@ class Score:
         """Trials that were not discarded."""
         return sum(not trial.discarded for trial in self.trials)
 
-    def record(self) -> dict[str, Any]:
-        """For scripts: SI units, radians."""
-        return {
-            "log": str(self.log.path),
-            "mocap": str(self.mocap.path),
-            "offset_s": self.offset_s,
-            "trials": [asdict(trial) | {"discarded": trial.discarded} for trial in self.trials],
-            "scored": self.scored,
-            "discarded": len(self.trials) - self.scored,
-            "stopped": len(self.errors),
-            "median_rad": None if self.median is None else asdict(self.median),
-            "within": [{"tolerance_rad": t, **asdict(interval)} for t, interval in self.within],
-        }
-
 
 def score(cfg: ScoreCfg) -> int:
     """Print the table; 1 if no trial could be scored."""
@@ -118,7 +105,7 @@ def score(cfg: ScoreCfg) -> int:
     symmetry = one_object(log.run["object"]["set"]).symmetry
     mocap = in_world(read_mocap(cfg.mocap, cfg.body), up=cfg.up, world=cfg.world, marker=cfg.marker)
     result = score_run(log, mocap, symmetry, offset_s=cfg.offset_s)
-    print(json.dumps(result.record(), indent=1) if cfg.json else "\n".join(lines(result)))
+    print(json.dumps(to_dict(result), indent=1) if cfg.json else "\n".join(lines(result)))
     return 0 if result.scored else 1
 
 
@@ -177,8 +164,8 @@ def score_run(log: HandLog, mocap: Mocap, symmetry: np.ndarray, *, offset_s: flo
         outcomes = np.stack([errors <= tolerance for tolerance in TOLERANCES_RAD])[:, None, :]
         rates = rate_intervals(outcomes, "episode")
     return Score(
-        log,
-        mocap,
+        log.path,
+        mocap.path,
         offset_s,
         tuple(trials),
         median_interval(found[None], "episode") if len(found) else None,

@@ -1,6 +1,6 @@
 """A twin as a process of its own, which ends with the one that started it.
 
-Beside its motors it tells what no real hand does: the object's true state and depth images of it.
+Beside its motors it tells what no real hand does: the object's true pose and depth images of it.
 """
 
 import multiprocessing
@@ -76,14 +76,13 @@ class TwinChild:
         self._process.stdout.close()
         self._words.close()
 
-    def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """The object's true position [m] and quaternion xyzw [7], its linear and angular velocity [6].
+    def object_pose(self) -> np.ndarray:
+        """The object's true position [m] and quaternion xyzw [7].
 
         Raises:
             TwinError: No answer.
         """
-        pose, velocity = self._ask("state")
-        return pose, velocity
+        return np.asarray(self._ask("pose"))
 
     def place_object(self) -> None:
         """Put the object where an episode starts; it falls from there.

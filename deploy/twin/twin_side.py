@@ -1,4 +1,4 @@
-"""What the twin tells beside its motors: the object's true state and depth images; and who places the object.
+"""What the twin tells beside its motors: the object's true pose and depth images; and who places the object.
 
 Nothing on a real hand answers to this: it stands for eyes and a helping hand.
 """
@@ -59,8 +59,8 @@ class TwinSide:
     def _answer(self, request: str) -> Any:
         assert self._hand is not None, "a hand with an object"
         match request:
-            case "state":
-                return self._hand.joint_q[-7:], self._hand.joint_qd[-6:]
+            case "pose":
+                return self._hand.joint_q[-7:]
             case "depth":
                 self._camera.capture()
                 return self._camera.depth.numpy()[0].copy(), time.monotonic()
