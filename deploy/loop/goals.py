@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -44,8 +42,6 @@ NEIGHBOURS = 24
 """Samples by whose distance one is told that floats about by itself."""
 FAR = 6.0
 """Distance to the neighbours, of the usual, from which a sample floats about by itself."""
-LEAST_PIECE = 0.05
-"""Share of all samples below which a separate piece is taken for dirt."""
 THINNEST = 1e-3
 """Thickness below which points are of one side only, as a share of the longest side."""
 LARGER = 1.5
@@ -190,7 +186,8 @@ def _surface(path: Path, generator: np.random.Generator) -> Surface:
         points = vertices[generator.permutation(len(vertices))[:CANDIDATES]]
     if len(points) < LEAST_POINTS:
         raise MeshError(f"{len(points)} points; {LEAST_POINTS} at least make a shape")
-    points = _without_dirt(points)
+    away = cKDTree(points).query(points, NEIGHBOURS)[0][:, -1]
+    points = points[away < FAR * np.median(away)]
     if _thickness(points) < THINNEST * np.ptp(points, axis=0).max():
         raise MeshError("flat: the scan shows one side only")
     try:
@@ -203,18 +200,6 @@ def _thickness(points: np.ndarray) -> float:
     """Least extent of points along their principal axes."""
     axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
     return float(np.ptp(points @ axes.T, axis=0).min())
-
-
-def _without_dirt(points: np.ndarray) -> np.ndarray:
-    """The samples without those that float about, by themselves or in small pieces."""
-    near = cKDTree(points).query(points, NEIGHBOURS)[0][:, -1]
-    points = points[near < FAR * np.median(near)]
-    pairs = cKDTree(points).query_pairs(2.0 * float(np.median(near)), output_type="ndarray")
-    ones = np.ones(len(pairs), dtype=bool)
-    graph = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
-    piece = connected_components(graph, directed=False)[1]
-    size = np.bincount(piece)
-    return points[size[piece] >= LEAST_PIECE * len(points)]
 
 
 def _unit(path: Path, longest: float) -> float:

@@ -241,8 +241,8 @@ def load_runner(
             policy, hand, item, tolerance_rad=tolerance_rad, second_view=second_view, seed=seed
         )
     raise ValueError(
-        f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train tracker makes "
-        "a tracking policy of it"
+        f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train tracker "
+        "makes a tracking policy of it"
     )
 
 
