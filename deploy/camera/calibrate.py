@@ -1,8 +1,9 @@
-"""Find where the camera is: move fingers with markers on their tips before it, and solve for its place.
+"""Find where the camera is: a person bends fingers with markers on their tips before it.
 
 Print markers (--print-markers), stick marker k flat to the last link of finger k so that it faces the camera
-at the start pose, and run. Views are kept in a folder and can be solved again without the hand (--views).
-The result is a layer over the hand's USD, for vd-deploy --camera-layer.
+at the start pose, and run. The torque goes off. A picture is taken whenever the fingers rest and show
+something new. Views are kept in a folder and can be solved again without the hand (--views). The result is a
+layer over the hand's USD, for vd-deploy --camera-layer.
 """
 
 import json
@@ -14,19 +15,18 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, Intrinsics, compose, invert
 from vd.config import from_dict
-from vd.deploy.camera.calibration_poses import plan, seat
-from vd.deploy.camera.camera import Camera, CameraError, StaleCamera
+from vd.deploy.camera.camera import CameraError
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
-from vd.deploy.hardware.check import ready
+from vd.deploy.hardware.answers import BusError
+from vd.deploy.hardware.check import confirm
 from vd.deploy.hardware.connect import HandOptions, connect, read_hand_and_joints
-from vd.deploy.hardware.motion import move, reset_pose
-from vd.deploy.safety.limits import SafetyCfg
-from vd.deploy.safety.safety import SafeHand
+from vd.deploy.hardware.motion import reset_pose
 from vd.files import atomic_path, make_folder, write_json
 from vd.paper import PAPER
 
@@ -34,12 +34,12 @@ FORMAT = "vd-calibration-views/1"
 VIEWS_FILE = "views.json"
 SIDE_M = 0.020
 """Side of a marker [m]: with its white border 27 mm, as wide as the last link of a D'Claw."""
-SPEED_RAD_S = 0.5
-"""Of the slow movements between views."""
-IMAGE_S = 0.15
-"""Longest wait for an image at rest [s]; below the watchdog's patience."""
-TRIES = 5
-"""Images that are waited for at each pose."""
+IMAGE_S = 1.0
+"""Longest wait for an image [s]."""
+STILL_RAD = 0.005
+"""Joints that move by less while an image is taken rest."""
+SEAT_M = 0.012
+"""Distance of a marker from the middle of its link."""
 SAME_RAD = 0.05
 """Joints of a finger that differ by less show its marker once more, not anew."""
 OBJECT_IN_WORLD_M = (0.0, 0.0, 0.1)
@@ -66,10 +66,8 @@ class CalibrateCfg(HandOptions):
     """Write the markers as pictures into this folder, and do nothing else."""
     camera: RealSenseCfg = field(default_factory=lambda: RealSenseCfg(width=1280, height=720))
     """The camera."""
-    safety: SafetyCfg = field(default_factory=SafetyCfg)
-    """Limits of the movements."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Do not ask before it moves."""
+    """Do not ask before the torque goes off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,10 +144,10 @@ def _print_markers(folder: Path, fingers: tuple[int, ...], side_m: float) -> int
 
 
 def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[Shot]]:
-    """Move the fingers before the camera and take pictures at rest: lens and pictures.
+    """Take pictures of fingers that a person moves: lens and pictures.
 
     Raises:
-        StoppedError: A limit was passed; the hand is safe.
+        BusError: A motor does not answer.
         CameraError: The camera does not serve.
     """
     if cfg.twin:
@@ -158,38 +156,38 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[
         camera = RealSense(find_device(cfg.camera.serial), cfg.camera, infrared=True)
         stack.callback(camera.close)
         connection = stack.enter_context(connect(cfg))
-        hand = connection.hand
-        poses = plan(hand, camera.intrinsics, fingers, cfg.count, side_m=cfg.side_m)
-        question = f"The hand will move to {len(poses)} poses at {SPEED_RAD_S:g} rad/s."
-        ready(connection, question, yes=cfg.yes)
-        safe = stack.enter_context(SafeHand(connection.bus, connection.joints, hand, cfg.safety))
-        safe.arm()
-        shots = []
-        for number, pose in enumerate(poses):
-            move(safe, pose, SPEED_RAD_S)
-            if (shot := _shoot(safe, camera)) is not None:
-                shots.append(shot)
-            print(f"\r{number + 1} of {len(poses)} poses", end="", file=sys.stderr, flush=True)
+        hand, bus, joints = connection.hand, connection.bus, connection.joints
+        confirm("The torque goes off, and the hand lets go.", yes=cfg.yes)
+        if failed := bus.torque(False):
+            raise BusError(next(iter(failed.values())))
+        print("Bend one finger after the other, its marker to the camera; turn it all ways, hold it still.")
+        shots: list[Shot] = []
+        found = 0
+        while found < cfg.count:
+            before = joints.to_joint(bus.read_state().position)
+            image = camera.read(IMAGE_S).image
+            after = joints.to_joint(bus.read_state().position)
+            if np.abs(after - before).max() > STILL_RAD:
+                continue
+            more = [*shots, Shot(0.5 * (before + after), image)]
+            now = len(views_of(hand, camera.intrinsics, cfg.side_m, more, fingers))
+            if now > found:
+                shots, found = more, now
+                print(f"\r{found} of {cfg.count} views", end="", file=sys.stderr, flush=True)
         print(file=sys.stderr)
-        move(safe, reset_pose(hand.num_fingers), SPEED_RAD_S)
         return camera.intrinsics, shots
 
 
-def _shoot(safe: SafeHand, camera: Camera) -> Shot | None:
-    """A picture taken between two readings of the resting joints."""
-    begin = safe.read()
-    for _ in range(TRIES):
-        try:
-            frame = camera.read(IMAGE_S)
-        except StaleCamera:
-            safe.read()
-            safe.beat()
-            continue
-        end = safe.read()
-        safe.beat()
-        if frame.time_s >= begin.time_s:
-            return Shot(0.5 * (begin.position + end.position), frame.image)
-    return None
+def seat(hand: HandModel, finger: int, camera: np.ndarray) -> np.ndarray:
+    """Pose in the tip's frame [7] of a marker that faces a camera [7] when the hand is at its start."""
+    tip = hand.tip_poses(reset_pose(hand.num_fingers))[finger]
+    normal = camera[:3] - tip[:3]
+    normal /= np.linalg.norm(normal)
+    right = Rotation.from_quat(camera[3:]).apply([1.0, 0.0, 0.0])
+    right -= normal * (right @ normal)
+    right /= np.linalg.norm(right)
+    turn = Rotation.from_matrix(np.stack([right, np.cross(normal, right), normal], axis=1))
+    return compose(invert(tip), np.concatenate([tip[:3] + SEAT_M * normal, turn.as_quat()]))
 
 
 def views_of(
