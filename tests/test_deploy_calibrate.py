@@ -17,8 +17,8 @@ from vd.assets_usd.camera_layer import read_camera, write_camera_layer
 from vd.assets_usd.hand_data import HandError, Intrinsics, compose, invert
 from vd.assets_usd.hands import load_hand
 from vd.deploy.camera import calibrate as command
-from vd.deploy.camera.calibrate import CalibrateCfg, calibrate, object_place, seat
-from vd.deploy.camera.camera import Frame
+from vd.deploy.camera.calibrate import CalibrateCfg, calibrate, seat
+from vd.deploy.camera.camera import Frame, object_place
 from vd.deploy.camera.hand_eye import HandEyeError, Views, marker_corners, refine, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, picture_of
 from vd.deploy.hardware.joints import uncalibrated

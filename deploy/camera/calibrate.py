@@ -17,9 +17,9 @@ import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, Intrinsics, compose, invert
+from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert
 from vd.config import from_dict
-from vd.deploy.camera.camera import CameraError
+from vd.deploy.camera.camera import CameraError, object_place
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
 from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
 from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
@@ -42,8 +42,6 @@ SEAT_M = 0.012
 """Distance of a marker from the middle of its link."""
 SAME_RAD = 0.05
 """Joints of a finger that differ by less show its marker once more, not anew."""
-OBJECT_IN_WORLD_M = (0.0, 0.0, 0.1)
-"""Where objects are held: the place for which errors are said."""
 LARGEST_ERROR_M = PAPER.cloud.voxel_m
 """Uncertainty at the object above which the result is called ill-conditioned [m]: a voxel of the student."""
 
@@ -249,12 +247,6 @@ def read_views(folder: Path, hand: HandModel) -> tuple[Intrinsics, float, list[S
         return lens, record.side_m, shots
     except (OSError, TypeError, ValueError) as error:  # of JSON, fields and pictures too
         raise ValueError(f"{file} holds no views to solve ({error}); take them again") from error
-
-
-def object_place() -> np.ndarray:
-    """Where objects are held, in the hand's base [3] [m]."""
-    place = np.array([*OBJECT_IN_WORLD_M, 0.0, 0.0, 0.0, 1.0])
-    return compose(invert(np.array(BASE_IN_WORLD)), place)[:3]
 
 
 def write_layer(path: Path, hand: HandModel, found: HandEye, error_m: float) -> None:

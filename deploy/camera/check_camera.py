@@ -4,14 +4,11 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CameraModel
-from vd.deploy.camera.camera import Camera, CameraError
+from vd.deploy.camera.camera import Camera, CameraError, object_place
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.finding import Finding, finding
-from vd.paper import PAPER
-from vd.sim.scene import hand_mount
 
 FIRST_S = 5.0
 """Longest wait for the first image: a camera that starts tunes its exposure first."""
@@ -75,7 +72,7 @@ def _rate(times: np.ndarray, age: float, fps: float) -> Finding:
 def _lens(seen: CameraModel) -> Finding:
     wide = 2.0 * math.degrees(math.atan2(0.5 * seen.width, seen.fx))
     lens = f"{seen.width} x {seen.height}, f {seen.fx:.1f} {seen.fy:.1f} px, {wide:.0f} deg wide"
-    column, row, depth = seen.project(_object_place())
+    column, row, depth = seen.project(object_place())
     if depth > 0.0 and 0.0 <= column < seen.width and 0.0 <= row < seen.height:
         where = f"the object's place is at {column:.0f}, {row:.0f}, {depth:.2f} m away"
         return Finding("camera lens", True, f"{lens}; {where}")
@@ -86,7 +83,7 @@ def _lens(seen: CameraModel) -> Finding:
 def _depth(images: np.ndarray, seen: CameraModel) -> Finding:
     """Share of the pixels [N, H, W] with depth, in all and where the object is handled."""
     valid = (images >= seen.near) & (images <= seen.far)
-    column, row, depth = seen.project(_object_place())
+    column, row, depth = seen.project(object_place())
     half = AROUND_M * np.array([seen.fx, seen.fy]) / abs(depth)
     first = np.maximum(np.round(np.array([column, row]) - half), 0).astype(int)
     last = np.maximum(np.round(np.array([column, row]) + half), 0).astype(int)
@@ -97,9 +94,3 @@ def _depth(images: np.ndarray, seen: CameraModel) -> Finding:
         remedy = "clean the lens, keep it off by what its range asks for, switch the emitter on"
         return Finding("camera depth", False, f"{found}, not {100 * DEPTH_SHARE:.0f}: {remedy}")
     return Finding("camera depth", True, found)
-
-
-def _object_place() -> np.ndarray:
-    """Where the object is handled, in the base frame [m]."""
-    mount = np.array(hand_mount())
-    return Rotation.from_quat(mount[3:]).inv().apply(np.array(PAPER.scene.goal_position_m) - mount[:3])

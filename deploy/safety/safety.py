@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.deploy.finding import NAMED
+from vd.deploy.finding import listed
 from vd.deploy.hardware.answers import BusError, HandState, LateError, SilentError
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.joints import Joints
@@ -271,8 +271,7 @@ class SafeHand:
         except BusError:
             errors = {}
         axes = np.flatnonzero(which)
-        words = [self._names[a] + ": " + errors.get(self.bus.ids[a], otherwise) for a in axes[:NAMED]]
-        return "; ".join(words) + (f"; and {len(axes) - NAMED} more" if len(axes) > NAMED else "")
+        return listed([f"{self._names[a]}: {errors.get(self.bus.ids[a], otherwise)}" for a in axes])
 
     def _check(self) -> None:
         if self.report is not None:
