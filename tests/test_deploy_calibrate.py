@@ -237,7 +237,7 @@ def kept(hand, lens, poses, camera, tmp_path_factory):
         patch.setattr(command, "connect", lambda cfg: contextlib.nullcontext(bench))
         patch.setattr(command, "find_device", lambda serial: None)
         patch.setattr(command, "RealSense", lambda *_, **__: bench)
-        cfg = CalibrateCfg(hand="dclaw3", port="none", out=folder / "camera.usda", count=30, yes=True)
+        cfg = CalibrateCfg(hand="dclaw3", port="none", out=folder / "camera.usda", count=18, yes=True)
         assert calibrate(cfg) == 0
     return folder, bench.camera
 

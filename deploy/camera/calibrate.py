@@ -56,8 +56,8 @@ class CalibrateCfg(HandOptions):
     """Solve these views again, without a hand: the folder that an earlier run left beside its --out."""
     fingers: tuple[int, ...] = ()
     """Fingers that carry a marker, from 0; all by default. Marker k is on finger k."""
-    count: int = 30
-    """Views to take."""
+    count: int = 10
+    """Views to take of each finger."""
     side_m: float = SIDE_M
     """Side of the markers' black square [m]; measure the print."""
     print_markers: Path | None = None
@@ -160,18 +160,20 @@ def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[
             raise BusError(next(iter(failed.values())))
         print("Bend one finger after the other, its marker to the camera; turn it all ways, hold it still.")
         shots: list[Shot] = []
-        found = 0
-        while found < cfg.count:
+        seen = np.zeros(len(fingers), dtype=int)
+        while seen.min() < cfg.count:
             before = joints.to_joint(bus.read_state().position)
             image = camera.read(IMAGE_S).image
             after = joints.to_joint(bus.read_state().position)
             if np.abs(after - before).max() > STILL_RAD:
                 continue
             more = [*shots, Shot(0.5 * (before + after), image)]
-            now = len(views_of(hand, camera.intrinsics, cfg.side_m, more, fingers))
-            if now > found:
-                shots, found = more, now
-                print(f"\r{found} of {cfg.count} views", end="", file=sys.stderr, flush=True)
+            views = views_of(hand, camera.intrinsics, cfg.side_m, more, fingers)
+            now = np.array([np.count_nonzero(views.finger == finger) for finger in fingers])
+            if now.sum() > seen.sum():
+                shots, seen = more, now
+                said = ", ".join(map(str, seen))
+                print(f"\r{said} of {cfg.count} views of each finger", end="", file=sys.stderr, flush=True)
         print(file=sys.stderr)
         return camera.intrinsics, shots
 

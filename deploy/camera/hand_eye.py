@@ -21,6 +21,8 @@ from vd.assets_usd.hand_data import Intrinsics, compose, invert
 CONFIDENCE = 0.95
 LEAST_VIEWS = 6
 """Views below which nothing is solved: 12 unknowns with one marker, and some views to judge by."""
+LEAST_OF_FINGER = 4
+"""Views of one finger below which its marker only costs unknowns."""
 INLIER_PX = 6.0
 """Mean distance of a view's corners from where the others put them, from which it is an outlier [px]: joints
 off by a degree make less."""
@@ -112,9 +114,10 @@ def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -
     Raises:
         HandEyeError: Too few views agree, or the fingers turned about too few directions.
     """
-    if len(views) < LEAST_VIEWS:
-        raise HandEyeError(f"{len(views)} views of a marker; take at least {LEAST_VIEWS}, better 30")
-    turned = {}
+    rows = _enough(views.finger, np.arange(len(views)))
+    if len(rows) < LEAST_VIEWS:
+        raise HandEyeError(f"{len(rows)} views of a marker; take at least {LEAST_VIEWS}, better 30")
+    views, turned = views.chosen(rows), {}
     for finger in np.unique(views.finger):
         options = [_turned(markers[int(finger)], quarter) for quarter in range(4)]
         mine = views.chosen(np.flatnonzero(views.finger == finger))
@@ -122,7 +125,7 @@ def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -
     found = refine(views, camera, turned, robust=True)
     for _ in range(2):
         off = _off(views, found.camera, np.stack([found.markers[int(f)] for f in views.finger]))
-        rows = np.flatnonzero(off < INLIER_PX)
+        rows = _enough(views.finger, np.flatnonzero(off < INLIER_PX))
         if len(rows) < max(LEAST_VIEWS, len(views) / 2):
             raise HandEyeError(
                 f"only {len(rows)} of {len(views)} views agree with each other; check the marker's side, "
@@ -132,6 +135,11 @@ def solve(views: Views, camera: np.ndarray, markers: Mapping[int, np.ndarray]) -
         again = refine(views.chosen(rows), found.camera, found.markers)
         found = replace(again, markers=found.markers | again.markers, inliers=rows)
     return found
+
+
+def _enough(finger: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Those of some rows whose finger [N] has enough of them."""
+    return rows[np.bincount(finger[rows], minlength=1)[finger[rows]] >= LEAST_OF_FINGER]
 
 
 def refine(
