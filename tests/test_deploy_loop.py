@@ -269,7 +269,6 @@ def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(tmp_path, cap
         ("--hand dclaw4 --twin dclaw3-tracking", "moves 9 joints, the hand dclaw4 has 12"),
         ("--hand dclaw3 --port /dev/none", "name the policy"),
         ("--hand dclaw3 --twin zero --goal 1,2,3", "give a quaternion"),
-        ("zero --twin --second-view", "no views to select"),
     ],
 )
 def test_what_cannot_be_run_is_refused(flags, error, capsys):

@@ -154,7 +154,7 @@ class TrackingRunner(PolicyRunner):
     Arguments are those of :func:`load_runner`.
 
     Raises:
-        ValueError: It is for another hand, or has no views to select.
+        ValueError: It is for another hand.
     """
 
     kind = "tracking"
@@ -166,14 +166,13 @@ class TrackingRunner(PolicyRunner):
         item: ObjectModel,
         *,
         tolerance_rad: float = PAPER.success.rotation_rad,
-        second_view: bool = False,
         seed: int = 0,
     ):
         super().__init__(trained_task(policy), policy.spec.rule_for(tolerance_rad))
         self.calibrated, depth = policy.spec.calibrated_for(tolerance_rad), policy.spec.depth
         self._cloud = partial(CameraCloud, points=depth.points, crop_m=depth.crop_m, seed=seed)
-        self._tracker_of = partial(Tracker, policy, hand, [item], second_view=second_view)
-        self._fresh, self._goal_steps = True, 0
+        self._tracker_of = partial(Tracker, policy, hand, [item])
+        self._fresh = True
         self.look_by(hand.camera.at(policy.spec.camera))
 
     def look_by(self, camera: CameraModel) -> None:
@@ -182,19 +181,14 @@ class TrackingRunner(PolicyRunner):
 
     def begin(self) -> None:
         """The object is looked for anew, which takes several times as long as a step."""
-        self.new_goal()
         self._fresh = True
-
-    def new_goal(self) -> None:
-        """The object is followed on."""
-        self._goal_steps = 0
 
     def decide(self, sensed: Sensed) -> Decision:
         """Mean action, and the angle that was found."""
         points = seen_points(self._eye, sensed.depth)
-        senses = senses_of(sensed, points, fresh=self._fresh, goal_steps=self._goal_steps)
+        senses = senses_of(sensed, points, fresh=self._fresh)
         decided = self._tracker.step(senses)
-        self._fresh, self._goal_steps = False, self._goal_steps + 1
+        self._fresh = False
         return Decision(decided.action[0].numpy().copy(), float(decided.angle[0]))
 
 
@@ -205,7 +199,6 @@ def load_runner(
     item: ObjectModel,
     *,
     tolerance_rad: float = PAPER.success.rotation_rad,
-    second_view: bool = False,
     seed: int = 0,
 ) -> PolicyRunner:
     """Load a policy for the loop.
@@ -216,16 +209,13 @@ def load_runner(
         hand: The hand.
         item: The object.
         tolerance_rad: How near to the goal it is to stop [rad].
-        second_view: Select symmetry views by the critic (:mod:`vd.evaluate.second_view`).
         seed: Of the choice of camera points.
 
     Raises:
-        ValueError: It is for another hand, does not see by a camera, or has no second view.
+        ValueError: It is for another hand, or does not see by a camera.
     """
     policy: Any = None if name == ZERO else open_policy(name, "cpu")
     student = is_saved_student(policy)
-    if second_view and (policy is None or student):
-        raise ValueError(f"--second-view: {name} has no views to select; give a tracking policy")
     if policy is None:
         if name != ZERO:
             raise ValueError(f"{name} is not for a hand; give a bundle, a policy's file, or {ZERO}")
@@ -237,9 +227,7 @@ def load_runner(
     if student:
         return StudentRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     if is_tracking_policy(policy):
-        return TrackingRunner(
-            policy, hand, item, tolerance_rad=tolerance_rad, second_view=second_view, seed=seed
-        )
+        return TrackingRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
     raise ValueError(
         f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train tracker "
         "makes a tracking policy of it"
@@ -261,14 +249,13 @@ def seen_points(cloud: CameraCloud, depth: np.ndarray | None) -> torch.Tensor:
     return seen
 
 
-def senses_of(sensed: Sensed, points: torch.Tensor, *, fresh: bool = False, goal_steps: int = 1) -> Senses:
+def senses_of(sensed: Sensed, points: torch.Tensor, *, fresh: bool = False) -> Senses:
     """What a policy that sees by a camera is told of one hand.
 
     Args:
         sensed: What is known.
         points: What its camera sees [1, K, 3].
         fresh: Whether an episode begins.
-        goal_steps: Control steps since the goal was new.
     """
 
     def row(values: np.ndarray) -> torch.Tensor:
@@ -281,5 +268,4 @@ def senses_of(sensed: Sensed, points: torch.Tensor, *, fresh: bool = False, goal
         goal_quat=row(sensed.goal_quat),
         points=points,
         fresh=torch.tensor([fresh]),
-        goal_steps=torch.tensor([goal_steps], dtype=torch.int32),
     )

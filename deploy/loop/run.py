@@ -73,8 +73,6 @@ class RunCfg(HandOptions):
     """How long the hand holds still between goals [s]."""
     precise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Stop within 0.1 rad rather than 0.4, as the paper's precise variant does: fewer goals, nearer."""
-    second_view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Where a goal is not reached in 3 s, look at it in other views (vd-eval --help): more goals."""
     realistic: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Give the twin's depth images the errors of a real camera."""
     camera: RealSenseCfg = field(default_factory=RealSenseCfg)
@@ -140,7 +138,6 @@ def run(cfg: RunCfg) -> int:
         hand,
         item,
         tolerance_rad=tolerance,
-        second_view=cfg.second_view,
         seed=cfg.seed,
     )
     if not runner.calibrated:
@@ -296,7 +293,6 @@ def _description(
         "control_hz": runner.task.sim.control_hz,
         "stopping": vars(runner.rule),
         "tolerance_rad": cfg.tolerance_rad,
-        "second_view": cfg.second_view,
         "action": vars(runner.task.action),
     }
 

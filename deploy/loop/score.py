@@ -17,8 +17,7 @@ from scipy.spatial.transform import Rotation
 from vd.config import to_dict
 from vd.deploy.loop.goals import one_object
 from vd.deploy.loop.mocap import Mocap, MocapError, read_mocap
-from vd.evaluate.result import TOLERANCES_RAD
-from vd.evaluate.statistics import Interval, median_interval, rate_intervals, symmetric_error
+from vd.evaluate.statistics import TOLERANCES_RAD, Interval, median_interval, rate_intervals, symmetric_error
 from vd.hand_log import HandLog, read_log
 
 NEAR_S = 0.1
