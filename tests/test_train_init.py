@@ -10,7 +10,7 @@ from train_dummy import SMALL_POLICY, SMALL_PPO, DummyEnv, make_runner
 from vd.config import to_dict
 from vd.envs.cfg import CurriculumCfg, TighteningCfg
 from vd.evaluate.agents import SHIPPED_POLICIES, trained_task
-from vd.policy import load_policy, policy_export
+from vd.policy import MeanAction, load_policy, policy_export
 from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start, unlike
 from vd.train.checkpoint import BEST_NAME, find_checkpoint, load_checkpoint, save_checkpoint
 from vd.train.cli import main
