@@ -51,7 +51,6 @@ WRITERS = {
     "page.html": _text,
     "model.pt": _checkpoint,
     "cache.npz": _arrays,
-    "film.gif": _picture,
     "film.mp4": _picture,
     "cube.usda": _object,
 }
