@@ -221,13 +221,3 @@ def test_settings_that_cannot_be_used_are_refused_before_anything_is_written(
     assert main(arguments) == 1
     assert message in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-
-
-def test_what_an_earlier_demo_left_is_replaced(played, tmp_path):
-    for _ in range(2):
-        assert main(["--out", str(tmp_path), "--quick"]) == 0
-        (tmp_path / "camera" / "old.txt").touch()
-        assert (tmp_path / "camera" / "eval.json").is_file()
-    assert main(["--out", str(tmp_path), "--quick"]) == 0
-    assert not (tmp_path / "camera" / "old.txt").exists()
-    assert Result.read(tmp_path / "camera" / "eval.json").rows

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from student_dummy import TINY, make_student_runner
+from student_dummy import TINY, make_dagger
 
 from vd.train.student.build import begin_from
 from vd.vision.cfg import StudentCfg
@@ -19,8 +19,8 @@ def saved(tmp_path):
 
     def write(stage: int, network: StudentCfg = TINY, actions: int = ACTIONS):
         torch.manual_seed(7)
-        runner = make_student_runner(tmp_path / str(stage))
-        runner.learner.student = student = Student(network, actions)
+        runner = make_dagger(tmp_path / str(stage))
+        runner.student = student = Student(network, actions)
         runner.spec = replace(runner.spec, stage=stage, network=network, num_actions=actions)
         for value in student.state_dict().values():
             if value.is_floating_point():

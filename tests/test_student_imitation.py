@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from student_dummy import TINY, DummyTeacher, make_dagger, make_student_runner, weights
+from student_dummy import TINY, DummyTeacher, make_dagger, weights
 
 from vd.train.checkpoint import list_checkpoints
 from vd.train.cli import main
@@ -32,7 +32,7 @@ def test_the_losses_fall_on_one_rollout():
 
 
 def test_the_student_acts_more_and_more_like_the_teacher(tmp_path):
-    runner = make_student_runner(tmp_path, make_dagger(envs=16, epochs=4))
+    runner = make_dagger(tmp_path, envs=16, epochs=4)
     runner.learn(16)
     errors = [row["student/action_error"] for row in read_progress(tmp_path / "progress.jsonl")]
     assert np.mean(errors[-3:]) < 0.6 * np.mean(errors[:3])
@@ -122,7 +122,7 @@ def test_kept_rollouts_are_learned_from_too():
         torch.testing.assert_close(loss, 0.5 * (parts[0][name] + parts[1][name]))
     drawn = torch.cat([batch for _ in range(40) for batch in dagger.minibatches(2)])
     assert len(drawn) == 120 and set(drawn.tolist()) == set(range(6))
-    assert [len(dagger._kept) for _ in range(4) if dagger.iterate(lambda: False)] == [1, 2, 3, 3]
+    assert [len(dagger._kept) for _ in range(4) if dagger._iterate()] == [1, 2, 3, 3]
 
 
 def test_a_rollout_pairs_each_frame_with_its_label_and_end():
@@ -206,8 +206,8 @@ def test_poses_are_read_from_frames_and_learned(monkeypatch):
         last = dagger.update([rollout])
     assert last["loss/pose"] < 0.3 * first["loss/pose"]
     again = make_dagger(pose_weight=1.0, seed=3)
-    again.load_state_dict(dagger.state_dict(), 41)
-    for one, two in zip(*(d.network["pose"].parameters() for d in (again, dagger)), strict=True):
+    again._load_learner(dagger._learner())
+    for one, two in zip(*(d.heads["pose"].parameters() for d in (again, dagger)), strict=True):
         assert torch.equal(one, two)
 
 
@@ -233,15 +233,15 @@ def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
     for reset in (True, False):
         options = {"noise": NoiseCfg(), "reset": reset, "keep_rollouts": 1 if reset else 2}
         options |= {"warmup_steps": 6}
-        whole = make_student_runner(tmp_path / f"whole{reset}", make_dagger(**options))
+        whole = make_dagger(tmp_path / f"whole{reset}", **options)
         whole.learn(4)
-        make_student_runner(tmp_path / f"parts{reset}", make_dagger(**options)).learn(2)
+        make_dagger(tmp_path / f"parts{reset}", **options).learn(2)
         torch.manual_seed(99)  # whatever happened in between
-        again = make_student_runner(tmp_path / f"parts{reset}", make_dagger(**options, seed=5))
+        again = make_dagger(tmp_path / f"parts{reset}", **options, seed=5)
         again.load(list_checkpoints(tmp_path / f"parts{reset}")[-1])
         assert again.new_episodes == "" and again.iteration == 2
         again.learn(2)
-        np.testing.assert_array_equal(weights(again.learner.student), weights(whole.learner.student))
+        np.testing.assert_array_equal(weights(again.student), weights(whole.student))
         rows = [read_progress(tmp_path / f"{name}{reset}" / "progress.jsonl") for name in ("whole", "parts")]
         assert [row["iteration"] for row in rows[1]] == [1, 2, 3, 4]
         for first, second in zip(*rows, strict=True):
@@ -249,8 +249,8 @@ def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
 
 
 def test_other_worlds_start_anew(tmp_path):
-    make_student_runner(tmp_path).learn(2)
-    again = make_student_runner(tmp_path, make_dagger(envs=6))
+    make_dagger(tmp_path).learn(2)
+    again = make_dagger(tmp_path, envs=6)
     again.load(list_checkpoints(tmp_path)[-1])
     assert "8 environments" in again.new_episodes
     again.learn(1)
@@ -258,17 +258,17 @@ def test_other_worlds_start_anew(tmp_path):
 
 
 def test_a_student_is_exported_from_a_checkpoint(tmp_path, capsys):
-    runner = make_student_runner(tmp_path)
+    runner = make_dagger(tmp_path)
     runner.learn(1)
     (checkpoint,), out = list_checkpoints(tmp_path), tmp_path / "out.pt"
     assert main(["export", str(checkpoint), str(out)]) == 0
-    np.testing.assert_array_equal(weights(load_student(out).network), weights(runner.learner.student))
+    np.testing.assert_array_equal(weights(load_student(out).network), weights(runner.student))
     assert main(["export", "--resumable", str(checkpoint), str(out)]) == 1
     assert "--init" in capsys.readouterr().err
 
 
 def test_ctrl_c_saves_within_a_rollout(tmp_path):
-    dagger = make_dagger(rollout_steps=50)
+    dagger = make_dagger(tmp_path, rollout_steps=50, save_every=100)
     step, calls = dagger.env.step, []
 
     def interrupt(action):
@@ -279,18 +279,18 @@ def test_ctrl_c_saves_within_a_rollout(tmp_path):
 
     dagger.env.step = interrupt
     with pytest.raises(Interrupted):
-        make_student_runner(tmp_path, dagger, save_every=100).learn(5)
+        dagger.learn(5)
     assert len(calls) == 60  # at once, not at the end of the rollout
-    again = make_student_runner(tmp_path, make_dagger(rollout_steps=50))
+    again = make_dagger(tmp_path, rollout_steps=50)
     again.load(list_checkpoints(tmp_path)[-1])
     assert again.iteration == 1
 
 
 def test_values_that_are_not_finite_stop_the_run_with_a_remedy(tmp_path):
-    runner = make_student_runner(tmp_path)
+    runner = make_dagger(tmp_path)
     runner.learn(2)
     with torch.no_grad():
-        runner.learner.student.mean.weight[0, 0] = torch.nan
+        runner.student.mean.weight[0, 0] = torch.nan
     before = list_checkpoints(tmp_path)
     with pytest.raises(TrainingDivergedError, match=r"iteration 3: .*--dagger\.learning-rate.*--resume"):
         runner.learn(2)

@@ -1,6 +1,7 @@
 """Stage 0: random scenes and their targets, heads, learning, resuming."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +23,6 @@ from vd.train.student.pretrain import (
     RandomScenes,
 )
 from vd.train.student.rotations import angle_between, multiply, random_rotations, two_columns
-from vd.train.student.runner import StudentRunner
 from vd.vision.cfg import EncoderCfg, NoiseCfg, StudentCfg
 from vd.vision.network import Student
 from vd.vision.saved import StudentSpec
@@ -39,7 +39,7 @@ def assets():
     return load_hand("dclaw3"), load_set(["cube", "cuboid"])
 
 
-def make(assets, cfg=QUICK, *, seed=0, noise=None, scales=(1.0,)):
+def make(assets, cfg=QUICK, *, seed=0, noise=None, scales=(1.0,), out=Path("unused")):
     torch.manual_seed(seed)
     hand, objects = assets
     scenes = RandomScenes(
@@ -51,7 +51,17 @@ def make(assets, cfg=QUICK, *, seed=0, noise=None, scales=(1.0,)):
         batch=cfg.batch,
         device="cpu",
     )
-    return Pretrainer(scenes, Student(NETWORK, JOINTS), len(objects), cfg)
+    return Pretrainer(
+        scenes,
+        Student(NETWORK, JOINTS),
+        len(objects),
+        cfg,
+        RunCfg(out=out, device="cpu", save_every=1, tensorboard=False),
+        spec=StudentSpec(network=NETWORK, num_actions=JOINTS, stage=0),
+        task={},
+        depth=to_dict(NoiseCfg()),
+        device="cpu",
+    )
 
 
 def test_rotations_agree_with_scipys():
@@ -125,14 +135,7 @@ def test_the_encoder_learns_and_what_follows_it_does_not(assets):
 
 def test_pre_training_goes_on_as_if_it_had_not_stopped(assets, tmp_path):
     def runner(name, seed=0):
-        return StudentRunner(
-            make(assets, seed=seed, noise=NoiseCfg()),
-            RunCfg(out=tmp_path / name, device="cpu", save_every=1, tensorboard=False),
-            spec=StudentSpec(network=NETWORK, num_actions=JOINTS, stage=0),
-            task={},
-            depth=to_dict(NoiseCfg()),
-            device="cpu",
-        )
+        return make(assets, seed=seed, noise=NoiseCfg(), out=tmp_path / name)
 
     whole = runner("whole")
     whole.learn(2)
@@ -140,4 +143,4 @@ def test_pre_training_goes_on_as_if_it_had_not_stopped(assets, tmp_path):
     again = runner("parts", seed=7)
     again.load(list_checkpoints(tmp_path / "parts")[-1])
     again.learn(1)
-    np.testing.assert_array_equal(weights(again.learner.student), weights(whole.learner.student))
+    np.testing.assert_array_equal(weights(again.student), weights(whole.student))

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from student_dummy import TINY, make_student_runner
+from student_dummy import make_dagger
 
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
@@ -22,10 +22,8 @@ from vd.sensors.cfg import DepthCameraCfg
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main
 from vd.train.metrics import read_progress
-from vd.train.student.build import check_start, default_init
-from vd.train.student.cli import parse_student
 from vd.train.student.config import PRESETS
-from vd.vision.cfg import LEAN, NoiseCfg, StudentCfg
+from vd.vision.cfg import NoiseCfg, StudentCfg
 from vd.vision.saved import load_student
 
 NETWORK = StudentCfg(voxel_m=0.01)
@@ -152,41 +150,12 @@ def stage(tmp_path):
     """Writes a student of a stage, beside a folder for the next."""
 
     def write(number):
-        runner = make_student_runner(tmp_path / f"stage{number}")
+        runner = make_dagger(tmp_path / f"stage{number}")
         runner.spec = replace(runner.spec, stage=number, teacher="dclaw3-table")
         runner.save()
         return tmp_path / f"stage{number}" / "student.pt"
 
     return write
-
-
-def test_stage_2_does_not_begin_from_nothing_unless_told_to(tmp_path, stage, capsys):
-    folder = str(tmp_path / "stage2")
-    flags = ["student", "--stage", "2", "--out", folder, "--device", "cpu", "--teacher", "dclaw3-table"]
-    assert main(flags) == 1
-    error = capsys.readouterr().err
-    assert "--from-scratch" in error and str(tmp_path / "stage1") in error
-    assert not (tmp_path / "stage2").exists()
-    check_start(parse_student([*flags[1:], "--from-scratch"]))
-    # a pre-trained encoder is not yet a policy
-    encoder = stage(0)
-    with pytest.raises(ValueError, match="of stage 0"):
-        check_start(parse_student([*flags[1:], "--init", str(encoder)]))
-    cfg = parse_student([*flags[1:], "--init", str(encoder), "--from-scratch"])
-    check_start(cfg)
-    # of which the encoder is taken, and what follows it is this stage's own
-    assert cfg.network == replace(LEAN, encoder=TINY.encoder, voxel_m=TINY.voxel_m)
-
-
-def test_stage_2_begins_from_stage_1_beside_it_with_its_network(tmp_path, stage):
-    path = stage(1)
-    cfg = parse_student(["--stage", "2", "--out", str(tmp_path / "stage2")])
-    assert cfg.init == path == default_init(2, tmp_path / "stage2")
-    assert cfg.network == TINY and cfg.teacher == "dclaw3-table"
-    check_start(cfg)
-    other = ["--stage", "2", "--out", str(tmp_path / "stage2"), "--from-scratch"]
-    assert parse_student(other).init is None
-    assert default_init(1, tmp_path / "stage1") is None
 
 
 def test_presets_are_valid_and_the_papers_has_its_numbers():
@@ -225,8 +194,10 @@ def test_stages_on_the_command_line(tmp_path, capsys):
     assert main([*first, "--out", str(tmp_path / "stage1"), "--max-steps", "6"]) == 0
     (row,) = read_progress(tmp_path / "stage1" / "progress.jsonl")
     assert all(row[f"loss/{name}"] > 0.0 for name in ("imitation", "distance", "pose"))
-    second = ["student", *small, "--stage", "2", "--out", str(tmp_path / "stage2")]
-    assert main([*second, "--max-steps", "6"]) == 0
+    second = ["student", *small, "--stage", "2", "--out", str(tmp_path / "stage2"), "--max-steps", "6"]
+    assert main(second) == 1
+    assert "give it as --init" in capsys.readouterr().err and not (tmp_path / "stage2").exists()
+    assert main([*second, "--init", str(tmp_path / "stage1" / "student.pt")]) == 0
     assert "begins with the weights of" in capsys.readouterr().out
     resume = ["student", "--out", str(tmp_path / "stage2"), "--resume", "--max-steps", "12"]
     assert main(resume) == 0
@@ -247,16 +218,15 @@ import torch
 torch.set_num_threads(1)
 sys.path.insert(0, {tests!r})
 from types import SimpleNamespace
-from student_dummy import make_dagger, make_student_runner, weights
+from student_dummy import make_dagger, weights
 from train_dummy import DummyEnv
 import vd.train.student.dagger as dagger_module
 DummyEnv.scene = SimpleNamespace(object_body=1)
 dagger_module.poses = lambda frames: frames["target"].repeat(1, 1, 5)[..., :9]
 rank, folder = int(os.environ["RANK"]), Path({folder!r})
-dagger = make_dagger(seed=rank, world_size=2, pose_weight=1.0)  # other environments; other weights at first
-runner = make_student_runner(folder, dagger)
+runner = make_dagger(folder, seed=rank, pose_weight=1.0)  # other environments; other weights at first
 runner.learn(2)
-result = [weights(dagger.network).tolist(), float(dagger.collect().label.sum())]
+result = [weights(runner.networks).tolist(), float(runner.collect().label.sum())]
 (folder / f"rank{{rank}}.json").write_text(json.dumps(result))
 runner.shutdown()
 """

@@ -11,6 +11,7 @@ from vd.config import to_dict
 from vd.envs.cfg import CurriculumCfg, TighteningCfg
 from vd.evaluate.agents import SHIPPED_POLICIES, trained_task
 from vd.policy import MeanAction, load_policy, policy_export
+from vd.train import begin
 from vd.train.begin import CRITIC_WARMUP, MOMENTS_WARMUP, find_start, unlike
 from vd.train.checkpoint import BEST_NAME, find_checkpoint, load_checkpoint, save_checkpoint
 from vd.train.cli import main
@@ -33,8 +34,8 @@ def _export(folder: Path, *, critic: bool = True, learner: bool = True) -> Path:
     return path
 
 
-def _begun(folder: Path, policy: Path, *, warmup: int | None = None, **options):
-    ppo = replace(LEARNED, critic_warmup_iterations=warmup, **options)
+def _begun(folder: Path, policy: Path, **options):
+    ppo = replace(LEARNED, **options)
     runner = make_runner(folder, env=DummyEnv(num_envs=16, seed=7), seed=7, policy=NORMALISING, ppo=ppo)
     runner.begin_from(str(policy))
     return runner
@@ -74,9 +75,10 @@ def test_a_run_begun_from_a_policy_acts_as_it_and_says_how_long_the_critic_learn
 
 
 @pytest.mark.parametrize("schedule", ["fixed", "adaptive"])
-def test_only_the_critic_learns_while_it_warms_up(tmp_path, schedule):
+def test_only_the_critic_learns_while_it_warms_up(tmp_path, monkeypatch, schedule):
+    monkeypatch.setattr(begin, "CRITIC_WARMUP", 2)
     path = _export(tmp_path / "first", critic=False)
-    runner = _begun(tmp_path / "second", path, warmup=2, schedule=schedule)
+    runner = _begun(tmp_path / "second", path, schedule=schedule)
     actor, critic, rate = _state(runner.alg.actor), _state(runner.alg.critic), runner.alg.learning_rate
     runner.learn(2)
     assert _same(actor, _state(runner.alg.actor)) == list(actor)
@@ -94,27 +96,12 @@ def test_only_the_critic_learns_while_it_warms_up(tmp_path, schedule):
     ]
 
 
-def test_the_warmed_up_critic_explains_what_the_actor_gets(tmp_path):
-    # Sure actions: what the actor gets depends on what it sees, and hardly on chance.
-    sure = replace(NORMALISING, initial_std=0.05)
-    make_runner(tmp_path / "first", policy=sure).learn(1)
-    state = load_checkpoint(tmp_path / "first" / "policy.pt")
-    del state["critic_state_dict"]
-    save_checkpoint(tmp_path / "first" / "policy.pt", state)
-    ppo = replace(LEARNED, critic_warmup_iterations=20)
-    runner = make_runner(tmp_path / "second", env=DummyEnv(num_envs=64, seed=7), policy=sure, ppo=ppo)
-    runner.begin_from(str(tmp_path / "first" / "policy.pt"))
-    runner.learn(20)
-    explained = [r["loss/explained_variance"] for r in read_progress(tmp_path / "second" / "progress.jsonl")]
-    assert explained[0] < 0.2
-    assert min(explained[-3:]) > 0.5
-
-
-def test_a_run_that_stops_while_the_critic_warms_up_goes_on_with_it(tmp_path):
+def test_a_run_that_stops_while_the_critic_warms_up_goes_on_with_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(begin, "CRITIC_WARMUP", 4)
     path = _export(tmp_path / "first", critic=False)
-    whole = _begun(tmp_path / "whole", path, warmup=4)
+    whole = _begun(tmp_path / "whole", path)
     whole.learn(6)
-    part = _begun(tmp_path / "part", path, warmup=4)
+    part = _begun(tmp_path / "part", path)
     part.learn(2)
     checkpoint = find_checkpoint(tmp_path / "part", "latest")
     assert "critic_state_dict" not in load_checkpoint(tmp_path / "part" / "policy.pt"), (
@@ -234,7 +221,7 @@ def test_names_files_and_folders_are_found_and_students_refused(tmp_path, capsys
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("name", ["dclaw3-table", "dclaw4-table", "dclaw4-cube"])
+@pytest.mark.parametrize("name", ["dclaw3-table", "dclaw4-table"])
 def test_without_a_preset_task_and_networks_are_those_of_the_policy(name):
     cfg = parse_teacher(["--init", name, "--objects", "cube", "--num-envs", "8"])
     state = load_checkpoint(SHIPPED_POLICIES[name])

@@ -16,8 +16,6 @@ CRITIC_WARMUP = 50
 to 8 steps later, 4.5 in the mean, so an error of states that last shrinks by gamma^4.5 a time: to a tenth."""
 MOMENTS_WARMUP = 3
 """Iterations of it where only the optimiser is missing: about a hundred steps, for Adam's second moment."""
-FINE_KL, FINE_LEARNING_RATE = 0.03, 1e-4
-"""Divergence and first rate of a policy that has learned, for one that does not say how it was trained."""
 NETWORK = ("hidden", "distribution", "normalise_observations")
 """Settings of ``PolicyCfg`` that a network's shape decides."""
 _APPENDED = {"history": 0, "dynamics": "none"}
@@ -56,36 +54,27 @@ def find_start(name: str, flag: str = "--init") -> Path:
 def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     """Settings with which a run goes on as what it begins from was trained, where no preset is asked for.
 
-    Task and networks are those of the file. So is the learner, if the file says; else it is that of ``base``,
-    with the small steps of a policy that has learned.
-
     Args:
         name: What ``--init`` names.
-        base: Settings for what the file does not say.
+        base: Settings of the run, such as when to save.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: It is no teacher, or its settings are not of this version.
     """
     from vd.envs.cfg import ReorientCfg
-    from vd.policy import PolicySpec
     from vd.train.checkpoint import load_checkpoint
     from vd.train.config import PolicyCfg, PpoCfg
 
     path = find_start(name)
     state = load_checkpoint(path, flag="--init")
+    if "learner" not in state:
+        raise ValueError(f"--init: {path} does not say how it was trained; add --preset")
     try:
         env = from_dict(ReorientCfg, state["task"], where="task")
-        if "learner" in state:
-            learner = state["learner"]
-            ppo = from_dict(PpoCfg, learner["ppo"], where="learner.ppo")
-            policy = from_dict(PolicyCfg, learner["policy"], where="learner.policy")
-        else:
-            spec = from_dict(PolicySpec, state["policy"], where="policy")
-            ppo = replace(base.ppo, desired_kl=FINE_KL, actor_learning_rate=FINE_LEARNING_RATE)
-            policy = replace(base.policy, **{name: getattr(spec, name) for name in NETWORK})
-            if spec.distribution == "gaussian":  # it has learned its std; what bounds it had is unknown
-                policy = replace(policy, std_range=PolicyCfg().std_range, quiet_std=None)
+        learner = state["learner"]
+        ppo = from_dict(PpoCfg, learner["ppo"], where="learner.ppo")
+        policy = from_dict(PolicyCfg, learner["policy"], where="learner.policy")
     except ValueError as error:
         raise ValueError(
             f"--init: {path} was written by another version ({error}); add --preset and the settings that it "
@@ -95,21 +84,14 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     return replace(
         base,
         run=run,
-        ppo=replace(ppo, critic_warmup_iterations=None, imitation_iterations=0),
+        ppo=replace(ppo, imitation_iterations=0),
         policy=policy,
         env=env,
     )
 
 
-def warmup_iterations(state: Mapping[str, Any], wanted: int | None) -> int:
-    """Iterations in which the critic is to learn alone after a begin from ``state``.
-
-    Args:
-        state: Checkpoint or exported policy.
-        wanted: What ``--ppo.critic-warmup-iterations`` asks for; None: what the state needs.
-    """
-    if wanted is not None:
-        return wanted
+def warmup_iterations(state: Mapping[str, Any]) -> int:
+    """Iterations in which the critic has to learn alone after a begin from a checkpoint or policy."""
     if "critic_state_dict" not in state:
         return CRITIC_WARMUP
     if "optimizer_state_dict" not in state:

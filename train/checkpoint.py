@@ -1,8 +1,6 @@
-"""Checkpoints: whole or absent, readable without running code, with every random state."""
+"""Checkpoints: whole or absent, readable without running code, with the random state."""
 
 import os
-import random
-import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,7 +19,6 @@ AUTO = "auto"
 """``--resume auto`` goes on with a run where there is one, and starts it otherwise."""
 _NEEDED = {"actor": ("policy", "task", "iter", "env_steps"), "student": ("spec", "task", "iter", "env_steps")}
 """What belongs to the weights of a teacher or a student. Other projects' files have an actor too."""
-_NAME = re.compile(r"model_(\d+)\.pt")
 _ARRAY = "__numpy__"
 # Key in the environment's state under which that of its environments lies.
 _WORLDS = "arrays"
@@ -34,8 +31,7 @@ def checkpoint_path(run_dir: Path, iteration: int) -> Path:
 
 def list_checkpoints(run_dir: Path) -> list[Path]:
     """Periodic checkpoints of a run, oldest first (``best.pt`` is not among them)."""
-    files = [p for p in (run_dir / CHECKPOINT_FOLDER).glob("model_*.pt") if _NAME.fullmatch(p.name)]
-    return sorted(files, key=_iteration_of)
+    return sorted((run_dir / CHECKPOINT_FOLDER).glob(f"model_{'[0-9]' * 7}.pt"))
 
 
 def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") -> Path | None:
@@ -97,8 +93,9 @@ def prune_checkpoints(run_dir: Path, newest: int, every: int | None = None) -> N
         newest: Iteration of the newest; what a run that went on from an older one finds after it, stays.
         every: Keep those after every so many iterations, besides the newest; None: no others.
     """
-    for path in [path for path in list_checkpoints(run_dir) if _iteration_of(path) <= newest][:-KEEP_LAST]:
-        if every is None or _iteration_of(path) % every:
+    numbered = [(int(path.stem.removeprefix("model_")), path) for path in list_checkpoints(run_dir)]
+    for number, path in [pair for pair in numbered if pair[0] <= newest][:-KEEP_LAST]:
+        if every is None or number % every:
             path.unlink(missing_ok=True)
     for path in (run_dir / CHECKPOINT_FOLDER).glob(".*.pt"):
         path.unlink(missing_ok=True)
@@ -153,14 +150,8 @@ def saved_worlds(rank: dict[str, Any]) -> int:
 
 
 def random_state(device: str) -> dict[str, Any]:
-    """State of the random generators of Python, NumPy and torch (CPU, and ``device`` if it is a GPU)."""
-    version, internal, gauss = random.getstate()
-    name, keys, position, has_gauss, cached = np.random.get_state()  # noqa: NPY002  # others' code may use it
-    state: dict[str, Any] = {
-        "python": [version, list(internal), gauss],
-        "numpy": [str(name), np.asarray(keys), int(position), int(has_gauss), float(cached)],
-        "torch": torch.get_rng_state(),
-    }
+    """State of torch's random generators: of the CPU, and of ``device`` if it is a GPU."""
+    state = {"torch": torch.get_rng_state()}
     if device.startswith("cuda"):
         state["cuda"] = torch.cuda.get_rng_state(device)
     return state
@@ -168,17 +159,9 @@ def random_state(device: str) -> dict[str, Any]:
 
 def set_random_state(state: dict[str, Any], device: str) -> None:
     """Restore what :func:`random_state` gave. A GPU state is skipped where there is no GPU."""
-    version, internal, gauss = state["python"]
-    random.setstate((version, tuple(internal), gauss))
-    np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
     torch.set_rng_state(state["torch"].cpu())
     if device.startswith("cuda") and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)
-
-
-def _iteration_of(path: Path) -> int:
-    match = _NAME.fullmatch(path.name)
-    return int(match.group(1)) if match else -1
 
 
 def _plain(value: Any) -> Any:

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated
@@ -222,11 +223,11 @@ def _teacher(arguments: list[str], started: float) -> int:
 
 
 def _train_teacher(cfg: TeacherCfg, main_process: bool, started: float) -> int:
-    from vd.train.progress import BUILDING, waiting
+    from vd.train.progress import BUILDING
 
-    with waiting(BUILDING, main_process):
-        runner = build_teacher(cfg, started=started)
-    folder, say = cfg.run.out, print if main_process else (lambda _: None)
+    folder, say = cfg.run.out, partial(print, flush=True) if main_process else (lambda _: None)
+    say(BUILDING)
+    runner = build_teacher(cfg, started=started)
     for line in _beginning(cfg, runner) if runner.iteration else []:
         say(line)
     if not runner.run_to_end():

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from vd.config import Renamed
+from vd.config import Dropped, Renamed
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
@@ -24,7 +24,11 @@ ACTIVATION = "elu"
 class PpoCfg:
     """Proximal policy optimisation, with Adam as in the paper."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"optimizer": "adam"}
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "optimizer": "adam",
+        "critic_warmup_iterations": Dropped(None),
+        "imitation_learning_rate": 1e-3,
+    }
     rollout_steps: int = PAPER.teacher.rollout_steps
     """Control steps of every world between two updates."""
     minibatch_size: int = PAPER.teacher.minibatch_size
@@ -56,15 +60,9 @@ class PpoCfg:
     cuda_graph: bool = False
     """Record forward and backward pass of a minibatch once as a CUDA graph, and replay it: where launching
     some hundred kernels takes longer than running them, as on busy processors. On one GPU; else ignored."""
-    critic_warmup_iterations: int | None = None
-    """Iterations at the begin of a run in which the critic learns alone; the actor acts and stays as it is.
-    None: as many as what --init begins from needs, 50 without a critic, 3 without an optimiser, else 0."""
-
     imitation_iterations: int = 0
     """Iterations after --init in which the actor imitates, in what it does itself, the policy that it began
     from, which sees the present state and shape (--env.observation.dynamics); the critic learns alone."""
-    imitation_learning_rate: float = 1e-3
-    """The actor's rate at the begin of that; it falls to zero."""
 
 
 @dataclass
@@ -177,15 +175,7 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
     run.validate()
     require_positive(ppo, "--ppo.", "rollout_steps", "minibatch_size", "epochs", "clip", "grad_norm")
     require_positive(ppo, "--ppo.", "actor_learning_rate", "critic_learning_rate", "desired_kl")
-    require_positive(ppo, "--ppo.", "imitation_learning_rate")
-    require_positive(
-        ppo,
-        "--ppo.",
-        "critic_warmup_iterations",
-        "imitation_iterations",
-        "bound_coefficient",
-        or_zero=True,
-    )
+    require_positive(ppo, "--ppo.", "imitation_iterations", "bound_coefficient", or_zero=True)
     require_share(ppo, "--ppo.", "gamma", "gae_lambda")
     if not min(policy.hidden, default=0) > 0:
         raise ValueError(f"--policy.hidden is {policy.hidden}; widths have to be positive")

@@ -231,8 +231,8 @@ class Demo:
         run, film, curves = part.folder / "run", part.folder / "film.mp4", part.folder / "curves.png"
         minutes = max(self.cfg.minutes - self.minutes - AFTER_TRAINING_MIN, LEAST_TRAINING_MIN)
         seed = ("--seed", str(self.cfg.seed))
-        words = ["vd-train", "teacher", "--preset", "cpu-demo", "--out", run, *seed]
-        part.run([*words, "--max-minutes", f"{minutes:.2f}"])
+        words = ("vd-train", "teacher", "--preset", "cpu-demo", *seed, "--max-minutes", f"{minutes:.2f}")
+        part.run([*words, "--out", run])
         part.run(
             ["vd-train", "curves", run, "--out", curves],
             ["vd-play", run, "--cells", "4", "--seconds", str(FILM_S), *seed, "--video", film],
@@ -263,8 +263,8 @@ def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:
 
     chosen = sorted(find_meshes([meshes]), key=lambda path: (path.stat().st_size, path))[:MESHES]
     out = part.folder / "objects"
-    words = ["vd-assets", "import", *chosen, "--out", out, "--mcts-iterations", str(IMPORT_SEARCH)]
-    part.run(words, seconds=IMPORT_S)
+    options = ("--out", out, "--mcts-iterations", str(IMPORT_SEARCH))
+    part.run(["vd-assets", "import", *chosen, *options], seconds=IMPORT_S)
     found = object_files(out) if out.is_dir() else []
     if not found:
         names = ", ".join(path.name for path in chosen)

@@ -32,12 +32,10 @@ class Processes:
 
     Attributes:
         rank: Number among all processes; 0 logs and saves.
-        local_rank: Number among those of this machine, and of its GPU.
         world_size: Processes of the run.
     """
 
     rank: int = 0
-    local_rank: int = 0
     world_size: int = 1
 
 
@@ -76,7 +74,7 @@ def join_processes(device: str) -> Processes:
         world_size=world_size,
         timeout=COLLECTIVE_TIMEOUT,
     )
-    return Processes(rank, local_rank, world_size)
+    return Processes(rank, world_size)
 
 
 def watch_iteration() -> None:

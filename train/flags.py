@@ -48,9 +48,7 @@ SHORT_FORMS = {name: f"env.{name}" for name in ("hand", "hand-layer", "objects",
 """Flags that are short for others: fields of the environment that are common enough."""
 
 
-def parse_teacher(
-    arguments: Sequence[str], *, unnamed: str | None = None, say: Callable[[str], object] | None = None
-) -> TeacherCfg:
+def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | None = None) -> TeacherCfg:
     """The configuration that command-line flags ask for.
 
     The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins from, or the
@@ -58,7 +56,6 @@ def parse_teacher(
 
     Args:
         arguments: Flags.
-        unnamed: Preset where nothing says another; None: that of the machine.
         say: Is told which preset the machine decided.
 
     Raises:
@@ -72,7 +69,7 @@ def parse_teacher(
         start = smoke()
     elif preset is None and init is not None:
         start = settings_of(init, PRESETS["gpu"]())
-    elif preset is None and unnamed is None and not saved:
+    elif preset is None and not saved:
         # Wrong flags and names, and --help, do not wait for torch.
         _parsed(arguments, PRESETS["gpu"]())
         preset, reason = machine_preset(value_of(arguments, "--device"))
@@ -80,7 +77,7 @@ def parse_teacher(
         if say is not None:
             say(f"preset {preset}, since none is named: {reason}")
     else:  # the second pass refuses an unknown name
-        start = PRESETS.get(preset or unnamed or "gpu", PRESETS["gpu"])()
+        start = PRESETS.get(preset or "gpu", PRESETS["gpu"])()
     if init is None:
         start = for_hand(start, value_of(arguments, "--env.hand"))
     base = (saved_config(arguments, start) or start) if resume is not None else start

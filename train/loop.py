@@ -20,7 +20,7 @@ from vd.train.config import RunCfg
 from vd.train.distributed import ending_together, join_processes, watch_iteration
 from vd.train.ending import EndRequest, Interrupted, TrainingDivergedError
 from vd.train.metrics import ProgressFile
-from vd.train.progress import ProgressLine
+from vd.train.progress import ProgressLines
 
 
 class TrainingLoop:
@@ -81,7 +81,7 @@ class TrainingLoop:
         first = saved = self.iteration
         total = self.total_iterations if iterations is None else first + iterations
         self._begin()
-        progress = ProgressLine(total, done=first, enabled=self.is_main)
+        progress = ProgressLines(total, enabled=self.is_main)
         with contextlib.ExitStack() as stack:
             log: ProgressFile | None = None
             if self.is_main:

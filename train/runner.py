@@ -51,7 +51,7 @@ class TeacherRunner(TrainingLoop):
 
     Attributes:
         new_inputs: Observed values that the networks of the policy that it began from did not read.
-        critic_warmup: Iterations left in which the critic learns alone (``PpoCfg.critic_warmup_iterations``).
+        critic_warmup: Iterations left in which the critic learns alone.
         imitation: What the actor does meanwhile, if anything (``PpoCfg.imitation_iterations``).
         begun: Whether this run began from another one's networks, in this process.
         unlike: What observations and actions mean otherwise than to the policy that the run began from.
@@ -82,7 +82,7 @@ class TeacherRunner(TrainingLoop):
         self._better = False
         self._stagger_due = True
         self.new_inputs = 0
-        self.critic_warmup = ppo.critic_warmup_iterations or 0
+        self.critic_warmup = 0
         self.imitation: Imitation | None = None
         self.begun = False
         self.unlike: list[str] = []
@@ -131,8 +131,8 @@ class TeacherRunner(TrainingLoop):
         self.alg.set_learning_rates(self.ppo.actor_learning_rate, self.ppo.critic_learning_rate)
         self.begun = True
         self.imitation = begin_imitation(self.alg, self.ppo, self.env.num_present, found, path)
-        warmup = warmup_iterations(found, self.ppo.critic_warmup_iterations)
-        self.critic_warmup = warmup if self.imitation is None else self.ppo.imitation_iterations
+        imitating = self.imitation is not None
+        self.critic_warmup = self.ppo.imitation_iterations if imitating else warmup_iterations(found)
         self._best, self._window = None, self._new_window()
 
     def set_std_floor(self) -> None:

@@ -3,31 +3,21 @@
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vd.config import to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.files import check_folder
 from vd.paper import PAPER
 from vd.train.flags import write_config
-from vd.train.student.config import PRETRAINING, RENDERED, STUDENT_NAME, SYNTHETIC, StudentTrainCfg
+from vd.train.student.config import PRETRAINING, RENDERED, StudentTrainCfg
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
     from vd.train.student.dagger import Dagger
     from vd.train.student.pretrain import Pretrainer
-    from vd.train.student.runner import StudentRunner
     from vd.vision.network import Student
-
-
-def default_init(stage: int, run_dir: Path) -> Path | None:
-    """The student of stage 1 beside a folder of stage 2 (``.../stage1/student.pt``), if there is one."""
-    if stage != RENDERED:
-        return None
-    name = run_dir.name.replace(f"stage{RENDERED}", f"stage{SYNTHETIC}")
-    path = run_dir.with_name(name) / STUDENT_NAME
-    return path if name != run_dir.name and path.is_file() else None
 
 
 def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
@@ -57,7 +47,7 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
     return replace(task, randomisation=exact, observation=replace(task.observation, view="world"))
 
 
-def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "StudentRunner":
+def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Pretrainer | Dagger":
     """Build environments, student and learner as ``cfg`` says, save the configuration, and resume if asked.
 
     Args:
@@ -80,8 +70,8 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
         raise ValueError(
             "--teacher is missing; give the policy to imitate: a policy.pt, a run's folder, or a name"
         )
-    if checkpoint is None:
-        check_start(cfg)
+    if cfg.stage == RENDERED and cfg.init is None and checkpoint is None:
+        raise ValueError("--stage 2 begins from a student of an earlier stage; give it as --init")
 
     import torch
 
@@ -89,12 +79,11 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
     quiet_warp()
     from vd.evaluate.agents import find_policy, policy_name
     from vd.policy import load_policy
-    from vd.train.student.runner import StudentRunner
     from vd.vision.network import Student
     from vd.vision.saved import StudentSpec
     from vd.workers import one_thread_without_gpu
 
-    rank, world_size = int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+    rank = int(os.environ.get("RANK", "0"))
     teacher = load_policy(find_policy(cfg.teacher), device)
     task = student_task(teacher, cfg)
     one_thread_without_gpu(device)
@@ -108,59 +97,33 @@ def build_student(cfg: StudentTrainCfg, *, started: float | None = None) -> "Stu
             print(f"of {cfg.init} these do not fit, and begin anew: {', '.join(anew)}")
     torch.manual_seed(cfg.task.seed + rank)
     own_task = replace(task, seed=cfg.task.seed + rank)
+    kept: dict[str, Any] = {
+        "spec": StudentSpec(
+            network=cfg.network,
+            num_actions=teacher.num_actions,
+            stage=cfg.stage,
+            teacher=policy_name(str(cfg.teacher)),
+            camera=cfg.camera,
+        ),
+        "task": to_dict(task),
+        "depth": to_dict(cfg.depth),
+        "device": device,
+        "deadline": cfg.run.deadline(started),
+    }
+    runner: Pretrainer | Dagger
     if cfg.stage == PRETRAINING:
-        learner: Pretrainer | Dagger = _pretrainer(cfg, own_task, student, device, world_size)
+        runner = _pretrainer(cfg, own_task, student, kept)
     else:
-        learner = _dagger(cfg, own_task, student, teacher, device, world_size)
+        runner = _dagger(cfg, own_task, student, teacher, kept)
         if checkpoint is None and not cfg.dagger.reset:  # or all episodes would time out at once
-            steps = learner.env.episode_length_buf
-            learner.env.episode_length_buf = torch.randint_like(steps, learner.env.max_episode_length)
-    spec = StudentSpec(
-        network=cfg.network,
-        num_actions=teacher.num_actions,
-        stage=cfg.stage,
-        teacher=policy_name(str(cfg.teacher)),
-        camera=cfg.camera,
-    )
-    runner = StudentRunner(
-        learner,
-        cfg.run,
-        spec=spec,
-        task=to_dict(task),
-        depth=to_dict(cfg.depth),
-        device=device,
-        deadline=cfg.run.deadline(started),
-    )
+            steps = runner.env.episode_length_buf
+            runner.env.episode_length_buf = torch.randint_like(steps, runner.env.max_episode_length)
     if checkpoint is not None:
         runner.load(checkpoint)
     if rank == 0:
         # After all that can refuse: settings that a run cannot have must not take the place of its own.
         write_config(cfg)
     return runner
-
-
-def check_start(cfg: StudentTrainCfg) -> None:
-    """Refuse to begin stage 2 from random weights without being told to.
-
-    Raises:
-        FileNotFoundError: ``--init`` is no file.
-        ValueError: There is nothing to begin from, or only a pre-trained encoder.
-    """
-    if cfg.init is None:
-        if cfg.stage == RENDERED and not cfg.from_scratch:
-            raise ValueError(
-                "stage 2 begins from a student of stage 1: give it as --init, or as student.pt in "
-                f"{cfg.run.out.with_name(f'stage{SYNTHETIC}')}; --from-scratch begins without one"
-            )
-        return
-    from vd.vision.saved import read_student, saved_spec
-
-    stage = saved_spec(read_student(cfg.init), cfg.init).stage
-    if cfg.stage == RENDERED and stage == PRETRAINING and not cfg.from_scratch:
-        raise ValueError(
-            f"--init {cfg.init} is of stage 0: its encoder is trained, its policy is not. Give a student of "
-            "stage 1, or add --from-scratch"
-        )
 
 
 def begin_from(path: Path, student: "Student", device: str) -> list[str]:
@@ -195,7 +158,7 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
 
 
 def _pretrainer(
-    cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", device: str, world_size: int
+    cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", kept: dict[str, Any]
 ) -> "Pretrainer":
     from vd.assets_usd.hands import load_hand
     from vd.assets_usd.objects.sets import load_set
@@ -211,9 +174,9 @@ def _pretrainer(
         noise=cfg.noise,
         batch=cfg.pretrain.batch,
         seed=task.seed,
-        device=device,
+        device=kept["device"],
     )
-    return Pretrainer(scenes, student, len(objects), cfg.pretrain, world_size=world_size)
+    return Pretrainer(scenes, student, len(objects), cfg.pretrain, cfg.run, **kept)
 
 
 def _dagger(
@@ -221,8 +184,7 @@ def _dagger(
     task: ReorientCfg,
     student: "Student",
     teacher: "TrainedPolicy",
-    device: str,
-    world_size: int,
+    kept: dict[str, Any],
 ) -> "Dagger":
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.agents import trained_task
@@ -231,7 +193,7 @@ def _dagger(
     from vd.train.vec_env import ReorientVecEnv
     from vd.views import ViewMaps
 
-    simulation = ReorientEnv(task, device)
+    simulation = ReorientEnv(task, kept["device"])
     if simulation.num_observations != teacher.num_observations:
         raise ValueError(
             f"the teacher observes {teacher.num_observations} values, its environments give "
@@ -250,6 +212,6 @@ def _dagger(
     )
     seen, maps = trained_task(teacher).observation, None
     if seen.view != "world":
-        maps = ViewMaps(simulation.hand, seen, device)
+        maps = ViewMaps(simulation.hand, seen, kept["device"])
     labels = WorldTeacher(teacher, maps)
-    return Dagger(ReorientVecEnv(simulation), view, student, labels, cfg.dagger, world_size=world_size)
+    return Dagger(ReorientVecEnv(simulation), view, student, labels, cfg.dagger, cfg.run, **kept)

@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
@@ -10,7 +11,7 @@ import tyro
 
 from vd import interrupt
 from vd.train.flags import normalise, saved_config, value_of
-from vd.train.student.build import build_student, default_init
+from vd.train.student.build import build_student
 from vd.train.student.config import PRESETS, PRETRAINING, STUDENT_NAME, Stage, StudentTrainCfg
 
 HELP = """Train the student: imitate the teacher from point clouds.
@@ -53,11 +54,12 @@ def student_command(arguments: list[str], started: float) -> int:
     from vd.evaluate.agents import check_names
 
     check_names([] if cfg.teacher is None else [cfg.teacher], cfg.task.objects)
-    from vd.train.progress import BUILDING, waiting
+    from vd.train.progress import BUILDING
 
-    with waiting(BUILDING, os.environ.get("RANK", "0") == "0"):
-        runner = build_student(cfg, started=started)
-    folder, say = cfg.run.out, print if runner.is_main else (lambda _: None)
+    main_process = os.environ.get("RANK", "0") == "0"
+    folder, say = cfg.run.out, partial(print, flush=True) if main_process else (lambda _: None)
+    say(BUILDING)
+    runner = build_student(cfg, started=started)
     if runner.iteration:
         say(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
         if runner.new_episodes:
@@ -76,12 +78,10 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
 
     A pre-trained one has an encoder to give, whatever else it needed to be trained.
     """
-    given, run_dir = value_of(arguments, "--init"), value_of(arguments, "--out")
-    if given is None and "--from-scratch" in arguments:
+    given = value_of(arguments, "--init")
+    if given is None:
         return base
-    path = Path(given) if given else default_init(base.stage, Path(run_dir) if run_dir else base.run.out)
-    if path is None:
-        return base
+    path = Path(given)
     from vd.vision.saved import read_student, saved_spec
 
     spec = saved_spec(read_student(path), path)

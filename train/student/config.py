@@ -155,6 +155,7 @@ class StudentTaskCfg:
 class StudentTrainCfg:
     """Train the student."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"from_scratch": Dropped(False)}
     preset: PresetName = "gpu"
     """Settings to start from; every other flag overrides one of them."""
     stage: Stage = 1
@@ -164,10 +165,8 @@ class StudentTrainCfg:
     """Policy to imitate, also the source of hand and task: a policy.pt, a run's folder, or the name of an
     installed one."""
     init: Path | None = None
-    """Student to begin from: student.pt or a checkpoint. Stage 2 takes ../stage1/student.pt of --out by
-    default."""
-    from_scratch: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Let stage 2 begin with a policy of random weights: several times slower than stage 1 first."""
+    """Student to begin from: student.pt or a checkpoint. Stage 2 needs one: from random weights it takes
+    several times as long."""
     resume: str | None = None
     """Go on from a checkpoint of --out: latest (a bare --resume), a file, or auto: the latest, and a new
     run where there is none."""

@@ -6,26 +6,21 @@ T steps, N environments, D actions, G the student's memory.
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import nn
 
 from vd.policy import Policy
+from vd.train.config import RunCfg
 from vd.train.ending import TrainingDivergedError, check_update
 from vd.train.metrics import GoalWindow, StepMeans
 from vd.train.student.config import DaggerCfg
 from vd.train.student.losses import POSE_VALUES, imitation_figures, imitation_loss, poses
-from vd.train.student.optimise import (
-    autocast,
-    descend,
-    make_optimizer,
-    read_means,
-    scheduled,
-    share_statistics,
-)
+from vd.train.student.optimise import autocast, read_means, scheduled, share_statistics
 from vd.train.student.rollout import UNCLIPPED, Rollout, taken
+from vd.train.student.runner import StudentRunner
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
 from vd.views import ViewMaps
 from vd.vision.network import Student
@@ -58,7 +53,7 @@ class WorldTeacher:
         return self._maps.world_action(self._policy.act(self._maps.take(observation, view)), view)
 
 
-class Dagger:
+class Dagger(StudentRunner):
     """Trains a student by the labels of a teacher that sees the noise-free state (Ross et al. 2011).
 
     One iteration: the student acts T steps in N environments and the teacher labels every state; then some
@@ -72,7 +67,8 @@ class Dagger:
         student: The network.
         teacher: Labels observations of ``env``.
         cfg: Settings.
-        world_size: Processes of the run: gradients are averaged over them.
+        run: Run settings.
+        **kept: What :class:`StudentRunner` keeps with the student, and its device and deadline.
     """
 
     def __init__(
@@ -82,60 +78,40 @@ class Dagger:
         student: Student,
         teacher: Policy,
         cfg: DaggerCfg,
-        *,
-        world_size: int = 1,
+        run: RunCfg,
+        **kept: Any,
     ) -> None:
-        self.env, self.view, self.student, self.teacher, self.cfg = env, view, student, teacher, cfg
-        self.device = torch.device(env.device)
-        self.network = nn.ModuleDict({"student": student})
-        """All that is trained."""
-        if cfg.pose_weight > 0.0:  # predicts poses from embeddings, in training only
+        heads: dict[str, nn.Module] = {}
+        if cfg.pose_weight > 0.0:  # predicts poses from embeddings
             width, inside = student.cfg.encoder.embedding, student.cfg.distance_hidden
             layers = (nn.Linear(width, inside), nn.GELU(), nn.Linear(inside, POSE_VALUES))
-            self.network["pose"] = nn.Sequential(*layers).to(self.device)
-        self.weights = {
-            "imitation": 1.0,
-            "distance": cfg.distance_weight,
-            "pose": cfg.pose_weight,
-        }
+            heads["pose"] = nn.Sequential(*layers)
+        super().__init__(student, heads, run, amsgrad=cfg.amsgrad, **kept)
+        self.env, self.view, self.teacher, self.cfg = env, view, teacher, cfg
+        self.weights = {"imitation": 1.0, "distance": cfg.distance_weight, "pose": cfg.pose_weight}
         """Weights of the losses."""
-        self.optimizer = make_optimizer(self.network, amsgrad=cfg.amsgrad)
-        self.samples_per_iteration = cfg.rollout_steps * env.num_envs
-        self.iteration = 0
-        """Iterations completed; decides the teacher's share."""
-        self._world_size = world_size
         self._hidden = student.initial_hidden(env.num_envs)
         self._window = GoalWindow(math.ceil(2 * env.max_episode_length / cfg.rollout_steps))
         self._means = StepMeans()
         self._kept: deque[Rollout] = deque(maxlen=cfg.keep_rollouts)
-        self._steps_done = 0
         self._figures: dict[str, torch.Tensor] = {}
 
-    def iterate(self, stopping: Callable[[], bool]) -> dict[str, float | None] | None:
-        """One rollout and update.
+    def _samples(self) -> int:
+        return self.cfg.rollout_steps * self.env.num_envs
 
-        Args:
-            stopping: Asked before every step whether to give up.
-
-        Returns:
-            Figures of the iteration, or ``None`` if it was given up.
-
-        Raises:
-            TrainingDivergedError: Something is not finite any more.
-        """
+    def _iterate(self) -> dict[str, Any] | None:
         start = time.perf_counter()
-        rollout = self.collect(stopping)
+        rollout = self.collect()
         if rollout is None:
             return None
-        means = self._means.read(self._world_size) | read_means(self._figures, self._world_size)
+        size = self.processes.world_size
+        means = self._means.read(size) | read_means(self._figures, size)
         collected = time.perf_counter()
         self._kept.append(rollout)
         losses = self.update(list(self._kept))
-        learned = time.perf_counter()
-        self.iteration += 1
         return {
             "collect_s": round(collected - start, 4),
-            "learn_s": round(learned - collected, 4),
+            "learn_s": round(time.perf_counter() - collected, 4),
             **self._window.add(means),
             **means,
             **self.env.end_iteration(),
@@ -149,8 +125,8 @@ class Dagger:
             return first
         return first + (last - first) * min(1.0, self.iteration / self.cfg.teacher_share_iterations)
 
-    def collect(self, stopping: Callable[[], bool] = lambda: False) -> Rollout | None:
-        """Let the student act, and the teacher label; ``None`` if ``stopping`` said so on the way."""
+    def collect(self) -> Rollout | None:
+        """Let the student act, and the teacher label; ``None`` if it was cut short."""
         cfg, envs = self.cfg, self.env.num_envs
         self.student.eval()
         if cfg.reset:
@@ -166,7 +142,7 @@ class Dagger:
         with torch.no_grad():
             observation = self.env.get_observations()
             for step in range(cfg.rollout_steps):
-                if stopping():
+                if self._stopping():
                     self._means.clear()
                     return None
                 frame = self.view.frame()
@@ -200,10 +176,10 @@ class Dagger:
         self.student.train()
         batches = self.minibatches(len(rollouts))
         steps = [self._minibatch_step(taken(rollouts, sequences)) for sequences in batches]
-        share_statistics(self.student, self._world_size)
+        share_statistics(self.student, self.processes.world_size)
         means = torch.stack([torch.stack(tuple(step.values())) for step in steps]).mean(dim=0)
         losses = dict(zip(steps[0], means.tolist(), strict=True))
-        check_update(losses, self.network, LOWER_RATES)
+        check_update(losses, self.networks, LOWER_RATES)
         return losses
 
     def minibatches(self, rollouts: int) -> Iterator[torch.Tensor]:
@@ -232,31 +208,19 @@ class Dagger:
             ),
             "distance": error.square().mean(),
         }
-        if "pose" in self.network:
-            error = self.network["pose"](embedding) - poses(rollout.frames)
+        if "pose" in self.heads:
+            error = self.heads["pose"](embedding) - poses(rollout.frames)
             found["pose"] = error.square().mean()
         return found
 
-    def state_dict(self) -> dict[str, Any]:
-        """What all processes share besides the student: optimiser, head of the poses, window of rates."""
-        return {
-            "optimizer": self.optimizer.state_dict(),
-            "steps": self._steps_done,
-            "pose": self.network["pose"].state_dict() if "pose" in self.network else None,
-            "window": self._window.state_dict(),
-        }
+    def _learner(self) -> dict[str, Any]:
+        return super()._learner() | {"window": self._window.state_dict()}
 
-    def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
-        """Restore what :meth:`state_dict` gave."""
-        self.optimizer.load_state_dict(state["optimizer"])
-        self._steps_done = state["steps"]
-        if "pose" in self.network:
-            self.network["pose"].load_state_dict(state["pose"])
+    def _load_learner(self, state: dict[str, Any]) -> None:
+        super()._load_learner(state)
         self._window.load_state_dict(state["window"])
-        self.iteration = iteration
 
-    def local_state(self) -> dict[str, Any]:
-        """What belongs to this process: environments, random states, the student's memory, kept rollouts."""
+    def _own_state(self) -> dict[str, Any]:
         # The next iteration drops the oldest: one that stands alone, or the first of a full store.
         kept = list(self._kept)[-(self.cfg.keep_rollouts - 1) :] if self.cfg.keep_rollouts > 1 else []
         if sum(rollout.num_bytes for rollout in kept) > CHECKPOINT_ROLLOUT_BYTES:
@@ -268,23 +232,20 @@ class Dagger:
             "rollouts": [rollout.state_dict() for rollout in kept],
         }
 
-    def load_local_state(self, state: dict[str, Any]) -> None:
-        """Restore what :meth:`local_state` gave."""
+    def _load_own_state(self, state: dict[str, Any]) -> None:
         self.env.load_state_dict(state["env"])
         self.view.load_state_dict(state["view"])
         self._hidden = state["hidden"].to(self.device)
         self._kept.clear()
         self._kept.extend(Rollout.from_state(rollout, self.device) for rollout in state["rollouts"])
 
-    def misfit(self, locals_: list[dict[str, Any]]) -> str:
-        """Why the environments of a checkpoint, of all processes, cannot be restored; empty if they can."""
-        envs = {len(local["hidden"]) for local in locals_}
+    def _misfit(self, ranks: list[dict[str, Any]]) -> str:
+        envs = {len(rank["hidden"]) for rank in ranks}
         if envs == {self.env.num_envs}:
             return ""
         return f"it is of {max(envs)} environments a process, this run has {self.env.num_envs}"
 
-    def close(self) -> None:
-        """Release the simulation."""
+    def _close(self) -> None:
         self.env.close()
 
     def _record(self, frames: dict[str, torch.Tensor], frame: dict[str, torch.Tensor], step: int) -> None:
@@ -298,7 +259,7 @@ class Dagger:
 
     def _encode(self, sites: Sites) -> torch.Tensor:
         """Embeddings of clouds; what follows the encoder is small, and stays in single precision."""
-        with autocast(self.device, self.cfg.precision):
+        with autocast(torch.device(self.device), self.cfg.precision):
             return self.student.encode(sites).float()
 
     def _minibatch_step(self, rollout: Rollout) -> dict[str, torch.Tensor]:
@@ -309,14 +270,7 @@ class Dagger:
         rate = scheduled(
             cfg.learning_rate, self._steps_done, warmup=cfg.warmup_steps, decay_after=cfg.decay_after_steps
         )
-        norm = descend(
-            self.network,
-            self.optimizer,
-            total,
-            rate=rate,
-            grad_norm=cfg.grad_norm,
-            world_size=self._world_size,
-        )
+        norm = self._descend(total, rate=rate, grad_norm=cfg.grad_norm)
         return {f"loss/{name}": loss.detach() for name, loss in losses.items()} | {"loss/grad_norm": norm}
 
     def _check_rollout(self, rollout: Rollout) -> None:

@@ -6,11 +6,6 @@ import torch
 from torch import nn
 
 
-def make_optimizer(networks: nn.Module, *, amsgrad: bool = False) -> torch.optim.Optimizer:
-    """AdamW; its rate is set before each step."""
-    return torch.optim.AdamW(networks.parameters(), amsgrad=amsgrad)
-
-
 def scheduled(rate: float, step: int, *, warmup: int = 0, decay_after: int = 0) -> float:
     """Learning rate of an optimiser step, counted from 1.
 

@@ -4,7 +4,7 @@ R clouds a batch, D joints, O objects, E the embedding. World frame: z up; quate
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -18,17 +18,12 @@ from vd.clouds import HandKinematics, SceneClouds
 from vd.paper import PAPER
 from vd.quaternions import relative_rotation, rotation_distance
 from vd.sim.scene import hand_mount
+from vd.train.config import RunCfg
 from vd.train.ending import check_update
 from vd.train.student.config import PretrainCfg
-from vd.train.student.optimise import (
-    autocast,
-    descend,
-    make_optimizer,
-    read_means,
-    scheduled,
-    share_statistics,
-)
+from vd.train.student.optimise import autocast, read_means, scheduled, share_statistics
 from vd.train.student.rotations import angle_between, multiply, random_rotations, rotations_about, two_columns
+from vd.train.student.runner import StudentRunner
 from vd.vision.cfg import NoiseCfg, StudentCfg
 from vd.vision.network import Student
 from vd.vision.sites import Sites
@@ -141,57 +136,52 @@ class RandomScenes:
         self._voxelise.rng.assign(state["noise"])
 
 
-class Pretrainer:
+class Pretrainer(StudentRunner):
     """Trains the encoder of a student on random scenes: which object, how it is turned, the joints.
 
-    Each is read from the embedding by a head of the training alone.
+    Each is read from the embedding by a head of the training alone. What follows the encoder keeps its random
+    weights.
 
     Args:
         scenes: Where clouds and targets come from.
-        student: The network; what follows its encoder keeps its random weights.
+        student: The network.
         objects: Number of objects O.
         cfg: Settings.
-        world_size: Processes of the run.
+        run: Run settings.
+        **kept: What :class:`StudentRunner` keeps with the student, and its device and deadline.
     """
 
     def __init__(
-        self, scenes: RandomScenes, student: Student, objects: int, cfg: PretrainCfg, *, world_size: int = 1
+        self,
+        scenes: RandomScenes,
+        student: Student,
+        objects: int,
+        cfg: PretrainCfg,
+        run: RunCfg,
+        **kept: Any,
     ) -> None:
-        self.scenes, self.student, self.cfg = scenes, student, cfg
         width, sizes = student.cfg.encoder.embedding, {"category": objects, "rotation": 6}
-        heads = {
+        heads: dict[str, nn.Module] = {
             name: nn.Sequential(nn.Linear(width, HEAD_HIDDEN), nn.GELU(), nn.Linear(HEAD_HIDDEN, outputs))
             for name, outputs in (sizes | {"joints": student.num_actions}).items()
         }
-        self.heads = nn.ModuleDict(heads).to(next(student.parameters()).device)
-        self.network = nn.ModuleList([student, self.heads])
-        self.optimizer = make_optimizer(self.network)
-        self.samples_per_iteration = cfg.batch * cfg.steps
-        self._world_size = world_size
-        self._steps_done = 0
+        super().__init__(student, heads, run, **kept)
+        self.scenes, self.cfg = scenes, cfg
 
-    def iterate(self, stopping: Callable[[], bool]) -> dict[str, float | None] | None:
-        """Some optimiser steps, a new batch each.
+    def _samples(self) -> int:
+        return self.cfg.batch * self.cfg.steps
 
-        Args:
-            stopping: Asked before every step whether to give up.
-
-        Returns:
-            Means over the steps, or ``None`` if it was given up.
-
-        Raises:
-            TrainingDivergedError: Something is not finite any more.
-        """
+    def _iterate(self) -> dict[str, Any] | None:
         self.student.train()
         rows = []
         for _ in range(self.cfg.steps):
-            if stopping():
+            if self._stopping():
                 return None
             rows.append(self._step())
         means = {name: torch.stack([row[name] for row in rows]).mean() for name in rows[0]}
-        share_statistics(self.student, self._world_size)
-        figures = read_means(means, self._world_size)
-        check_update(figures, self.network, LOWER_RATES)
+        share_statistics(self.student, self.processes.world_size)
+        figures = read_means(means, self.processes.world_size)
+        check_update(figures, self.networks, LOWER_RATES)
         return dict(figures)
 
     def losses(
@@ -219,36 +209,19 @@ class Pretrainer:
             }
         return losses, figures
 
-    def state_dict(self) -> dict[str, Any]:
-        """Heads and optimiser."""
-        return {
-            "optimizer": self.optimizer.state_dict(),
-            "steps": self._steps_done,
-            "heads": self.heads.state_dict(),
-        }
-
-    def load_state_dict(self, state: dict[str, Any], iteration: int) -> None:
-        """Restore what :meth:`state_dict` gave."""
-        self.heads.load_state_dict(state["heads"])
-        self.optimizer.load_state_dict(state["optimizer"])
-        self._steps_done = state["steps"]
-
-    def local_state(self) -> dict[str, Any]:
-        """Random state of the augmentation."""
+    def _own_state(self) -> dict[str, Any]:
         return {"scenes": self.scenes.state_dict()}
 
-    def load_local_state(self, state: dict[str, Any]) -> None:
-        """Restore it."""
+    def _load_own_state(self, state: dict[str, Any]) -> None:
         self.scenes.load_state_dict(state["scenes"])
 
-    def misfit(self, locals_: list[dict[str, Any]]) -> str:
-        """Why the random states of a checkpoint cannot be restored; empty if they can."""
-        batches = {len(local["scenes"]["noise"]) for local in locals_}
+    def _misfit(self, ranks: list[dict[str, Any]]) -> str:
+        batches = {len(rank["scenes"]["noise"]) for rank in ranks}
         if batches == {self.cfg.batch}:
             return ""
         return f"it is of batches of {max(batches)} clouds, this run has {self.cfg.batch}"
 
-    def close(self) -> None:
+    def _close(self) -> None:
         """Nothing to release."""
 
     def _step(self) -> dict[str, torch.Tensor]:
@@ -256,13 +229,6 @@ class Pretrainer:
         self._steps_done += 1
         cfg, total = self.cfg, torch.stack(tuple(losses.values())).sum()
         rate = scheduled(cfg.learning_rate, self._steps_done, decay_after=cfg.decay_after_steps)
-        norm = descend(
-            self.network,
-            self.optimizer,
-            total,
-            rate=rate,
-            grad_norm=PAPER.dagger.grad_norm,
-            world_size=self._world_size,
-        )
+        norm = self._descend(total, rate=rate, grad_norm=PAPER.dagger.grad_norm)
         logged = {f"loss/{name}": loss.detach() for name, loss in losses.items()}
         return figures | logged | {"loss/grad_norm": norm}

@@ -1,29 +1,32 @@
-"""The training loop around a learner of the student: imitation or pre-training."""
+"""What imitation and pre-training share: the training loop of a student, its checkpoints and its file."""
 
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 
 from vd.config import to_dict
 from vd.train.checkpoint import load_checkpoint, save_checkpoint
 from vd.train.config import RunCfg
 from vd.train.loop import TrainingLoop
 from vd.train.student.config import STUDENT_NAME
-from vd.train.student.dagger import Dagger
-from vd.train.student.pretrain import Pretrainer
+from vd.train.student.optimise import descend
+from vd.vision.network import Student
 from vd.vision.saved import StudentSpec, student_export
 
 
 class StudentRunner(TrainingLoop):
-    """Runs a learner of the student.
+    """Trains a student.
 
     The latest student is the one that is kept: imitation learns from ever new rollouts and does not overfit
     one, and its success rate is too noisy to choose by.
 
     Args:
-        learner: What to run.
+        student: The network.
+        heads: Networks of the training alone.
         run: Run settings.
+        amsgrad: Never forget the largest gradients.
         spec: Description of the student, kept with it.
         task: The environment's configuration as a dictionary, kept with it.
         depth: The depth camera's configuration as a dictionary, kept with it.
@@ -33,9 +36,11 @@ class StudentRunner(TrainingLoop):
 
     def __init__(
         self,
-        learner: Dagger | Pretrainer,
+        student: Student,
+        heads: dict[str, nn.Module],
         run: RunCfg,
         *,
+        amsgrad: bool = False,
         spec: StudentSpec,
         task: dict[str, Any],
         depth: dict[str, Any],
@@ -43,7 +48,12 @@ class StudentRunner(TrainingLoop):
         deadline: float | None = None,
     ) -> None:
         super().__init__(run, device=device, deadline=deadline)
-        self.learner, self.spec, self.task, self.depth = learner, spec, task, depth
+        self.student, self.spec, self.task, self.depth = student, spec, task, depth
+        self.heads = nn.ModuleDict(heads).to(device)
+        self.networks = nn.ModuleList([student, self.heads])
+        """All that is trained."""
+        self.optimizer = torch.optim.AdamW(self.networks.parameters(), amsgrad=amsgrad)
+        self._steps_done = 0
 
     def load(self, path: Path) -> None:
         """Go on from a checkpoint: exactly, with its processes and environments; else with new episodes.
@@ -56,46 +66,47 @@ class StudentRunner(TrainingLoop):
         """
         state = load_checkpoint(path, self.device, network="student")
         try:
-            self.learner.student.load_state_dict(state["student_state_dict"])
-            self.learner.load_state_dict(state["learner"], state["iter"])
+            self.student.load_state_dict(state["student_state_dict"])
+            self._load_learner(state["learner"])
+            self._restore(state)
         except (RuntimeError, ValueError, KeyError) as error:
             raise ValueError(
                 f"{path} does not fit this run's network; resume with the configuration it was trained with "
                 f"(its run folder's config.json), or start anew ({error})"
             ) from error
-        self._restore(state)
 
-    def _samples(self) -> int:
-        return self.learner.samples_per_iteration
+    def _descend(self, loss: torch.Tensor, *, rate: float, grad_norm: float) -> torch.Tensor:
+        """One optimiser step; the gradient's norm."""
+        size = self.processes.world_size
+        return descend(self.networks, self.optimizer, loss, rate=rate, grad_norm=grad_norm, world_size=size)
 
     def _begin(self) -> None:
         if self.is_distributed:
-            for value in self.learner.network.state_dict().values():
+            for value in self.networks.state_dict().values():
                 torch.distributed.broadcast(value, 0)
 
-    def _iterate(self) -> dict[str, Any] | None:
-        return self.learner.iterate(self._stopping)
+    def _learner(self) -> dict[str, Any]:
+        """What a checkpoint has of the training besides the student."""
+        return {
+            "optimizer": self.optimizer.state_dict(),
+            "steps": self._steps_done,
+            "heads": self.heads.state_dict(),
+        }
+
+    def _load_learner(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`_learner` gave."""
+        self.optimizer.load_state_dict(state["optimizer"])
+        self._steps_done = state["steps"]
+        self.heads.load_state_dict(state["heads"])
 
     def _shared_state(self) -> dict[str, Any]:
         return {
-            "student_state_dict": self.learner.student.state_dict(),
-            "learner": self.learner.state_dict(),
+            "student_state_dict": self.student.state_dict(),
+            "learner": self._learner(),
             "spec": to_dict(self.spec),
             "task": self.task,
             "depth": self.depth,
         }
 
-    def _own_state(self) -> dict[str, Any]:
-        return {"local": self.learner.local_state()}
-
-    def _load_own_state(self, state: dict[str, Any]) -> None:
-        self.learner.load_local_state(state["local"])
-
-    def _misfit(self, ranks: list[dict[str, Any]]) -> str:
-        return self.learner.misfit([rank["local"] for rank in ranks])
-
     def _save_policy(self, path: Path, state: dict[str, Any]) -> None:
         save_checkpoint(self.run.out / STUDENT_NAME, student_export(state))
-
-    def _close(self) -> None:
-        self.learner.close()
