@@ -70,22 +70,14 @@ def test_an_unknown_policy_is_refused_with_the_names_there_are(capsys):
     assert "dclaw4-cube" in capsys.readouterr().err
 
 
-def test_the_start_is_as_trained_unless_asked_otherwise():
+def test_start_goals_and_layer_are_as_trained_unless_asked_otherwise():
     trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
     assert task_of(trained).start.at_rest and not task_of(None).start.at_rest
     assert not task_of(trained, at_rest=False).start.at_rest
     assert task_of(None, at_rest=True).start.at_rest
-
-
-def test_goals_are_as_trained_unless_an_angle_is_given():
-    trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
     assert task_of(trained).goal.max_angle_rad == pytest.approx(1.0)
     assert task_of(None).goal.max_angle_rad == pytest.approx(math.pi)
     assert task_of(trained, max_goal_angle_rad=0.5).goal.max_angle_rad == 0.5
-
-
-def test_the_layer_over_the_hand_is_as_trained_unless_asked_otherwise():
-    trained = load_policy(SHIPPED_POLICIES["dclaw4-cube"])
     assert task_of(trained).hand_layer is None
     trained.task["hand_layer"] = "bench/identified.usda"
     assert task_of(trained).hand_layer == "bench/identified.usda"

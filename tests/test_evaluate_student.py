@@ -13,7 +13,7 @@ from vd.config import to_dict
 from vd.envs.cfg import RandomisationCfg, ReorientCfg, SuccessCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import student as module
-from vd.evaluate.agents import SHIPPED_POLICIES, sees_clouds
+from vd.evaluate.agents import sees_clouds
 from vd.evaluate.cli import main
 from vd.evaluate.result import Result
 from vd.evaluate.scanned import MISSING, NOISE_M, known_objects, scan
@@ -105,19 +105,14 @@ def test_memory_lasts_until_the_reset(env):
     assert not torch.allclose(actor.act(wp.to_torch(env.observation)), first, atol=1e-5)
 
 
-def test_what_it_sees_is_as_its_stage_was_trained(env):
+def test_what_it_sees_is_as_its_stage_was_trained(env, tmp_path):
+    assert sees_clouds(save_student(tmp_path / "student.pt", 2))
+    assert not sees_clouds("dclaw3-table") and not sees_clouds("zero")
     assert [StudentActor(env, make_student(stage)).rendered for stage in (1, 2)] == [False, True]
     with pytest.raises(ValueError, match="stage 0 is an encoder"):
         StudentActor(env, make_student(0))
     with pytest.raises(ValueError, match="moves 12 joints, the hand dclaw3 has 9"):
         StudentActor(env, make_student(num_actions=12))
-
-
-def test_an_installed_student_is_known_as_one(tmp_path, monkeypatch):
-    path = tmp_path / "dclaw3-seen.pt"
-    save_student(path, 2)
-    monkeypatch.setitem(SHIPPED_POLICIES, "dclaw3-seen", path)
-    assert sees_clouds("dclaw3-seen") and not sees_clouds("dclaw3-table") and not sees_clouds("zero")
 
 
 def test_a_scan_is_noisy_and_misses_one_side():
@@ -135,10 +130,9 @@ def test_a_scan_is_noisy_and_misses_one_side():
     assert (ball @ side > 0.6 * 0.05).mean() == pytest.approx(MISSING, abs=0.03)
 
 
-@pytest.mark.parametrize("rendered", [False, True], ids=["complete", "rendered"])
-def test_only_the_goal_is_scanned(env, rendered):
+def test_only_the_goal_is_scanned(env):
     env.reset()
-    settings = dict(rendered=rendered, depth=DepthCameraCfg(points=300))
+    settings = dict(rendered=True, depth=DepthCameraCfg(points=300))
     scans = known_objects(env.objects, "scan", seed=0, device="cpu")
     exact, scanned = (StudentView(env, TINY, **settings, goals=goals) for goals in (None, scans))
     frame = exact.frame()

@@ -94,7 +94,7 @@ def test_a_prediction_stops_where_it_says_and_the_truth_is_scored():
     (by_truth,) = trace.episodes(StoppingRule(0.2, 2.0), "error")
     assert by_prediction.steps == 4 and by_prediction.error_rad == pytest.approx(0.45, abs=1e-5)
     assert by_truth.steps == 7 and by_truth.error_rad == pytest.approx(0.15, abs=1e-5)
-    with pytest.raises(ValueError, match="only a student predicts"):
+    with pytest.raises(ValueError, match="only camera policies predict"):
         traced().episodes(StoppingRule(), "predicted")
 
 
@@ -302,12 +302,12 @@ def test_what_predictions_are_worth():
     prediction, true = by_prediction.prediction, np.abs(0.85 - STEP_RAD * np.arange(12))
     assert prediction.states == 8 * 12 and by_truth.prediction is None
     assert prediction.mean_error_rad == pytest.approx(0.3, abs=1e-4)
-    near, far = prediction.bounds
-    assert (near.bound_rad, far.bound_rad) == (0.1, 0.4)
     said = true - 0.3 <= 0.4
-    assert far.seen == 1.0 and far.right == pytest.approx((true[said] <= 0.4).mean())
+    assert list(prediction.seen) == ["0.1", "0.4"]
+    assert prediction.seen["0.4"] == 1.0
+    assert prediction.right["0.4"] == pytest.approx((true[said] <= 0.4).mean())
     sure = compared(offset=0.0, rules=StoppingRule)
-    assert [bound.right for bound in sure[0].prediction.bounds] == [1.0, 1.0]
+    assert list(sure[0].prediction.right.values()) == [1.0, 1.0]
     assert sure[0].precise == sure[1].precise
 
 

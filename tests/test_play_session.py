@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.evaluate.statistics import rotation_angle
 from vd.play.cli import PlayCfg, spread
-from vd.play.session import Session, agent_choices
+from vd.play.session import Session
 from vd.play.video import STRIP_HEIGHT, Composer, Snapshot, Watcher, act
 from vd.render import Picture
 
@@ -31,20 +31,16 @@ class Turn:
         return action
 
 
-def make_session(**kwargs):
+def make_session(speed=1.0, **kwargs):
     env = FakeEnv([FakeObject("a"), FakeObject("b")], num_envs=4, max_episode_steps=1000, **kwargs)
-    return Session(env, {"turn": lambda: Turn(1.0), "still": lambda: Turn(0.0)}, "turn")
+    return Session(env, Turn(speed))
 
 
-def test_agent_chosen_acts_from_the_next_step():
+def test_the_policy_acts_in_every_step():
     session = make_session(tolerance=-1.0)
     before = session.snapshot.joint_q[-4:]
     moved = session.step().joint_q[-4:]
     assert rotation_angle(before, moved) == pytest.approx(1 / 12, abs=1e-3)
-    session.choose_agent("still")
-    assert rotation_angle(session.step().joint_q[-4:], moved) == pytest.approx(0.0, abs=1e-3)
-    with pytest.raises(ValueError, match="no agent 'x'; there are turn, still"):
-        session.choose_agent("x")
 
 
 def test_object_chosen_is_the_one_watched():
@@ -53,8 +49,6 @@ def test_object_chosen_is_the_one_watched():
     assert session.object_name == session.snapshot.name == "b"
     assert session.env.world_object[session.world] == 1
     np.testing.assert_allclose(session.snapshot.joint_q, session.env.sim.joint_q.numpy()[session.world])
-    with pytest.raises(ValueError, match="no object 'c'"):
-        session.choose_object("c")
 
 
 def test_new_goal_changes_the_goal_alone():
@@ -69,8 +63,7 @@ def test_new_goal_changes_the_goal_alone():
 
 
 def test_reset_shows_the_error_of_the_new_start_and_keeps_counts():
-    session = make_session(tolerance=4.0)  # every step succeeds once the object is slow
-    session.choose_agent("still")
+    session = make_session(speed=0.0, tolerance=4.0)  # every step succeeds
     session.step()
     assert session.snapshot.success and session.snapshot.goals == 1
     shot = session.reset()
@@ -90,14 +83,6 @@ def test_watcher_counts_goals_and_drops_of_its_worlds_alone():
     assert shots[0].time_s == pytest.approx(0.5)
 
 
-def test_choices_make_agents_that_fit_the_hand():
-    choices = agent_choices("zero", None, 12, seed=0, device="cpu")
-    assert list(choices) == ["zero", "random"]
-    assert choices["random"]().act(torch.zeros(5, 3)).shape == (5, 12)
-    choices = agent_choices("a.pt", "trained", 9, seed=0, device="cpu")
-    assert list(choices) == ["a.pt", "zero", "random"] and choices["a.pt"]() == "trained"
-
-
 def shot_of(**changes):
     quat = Rotation.identity().as_quat()
     values = dict(
@@ -110,7 +95,6 @@ def shot_of(**changes):
         fell=False,
         goals=0,
         drops=0,
-        terms=np.array([1.0, -2.0]),
     )
     return Snapshot(**{**values, **changes})
 

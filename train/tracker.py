@@ -174,7 +174,9 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
     )
     env = ReorientEnv(task_of(evaluation, policy, cfg.objects, envs), device)
     env.objects = with_symmetries(env.objects, device)
-    actor, _, _, rules = actor_of(evaluation, cfg.teacher, policy, env, device)
+    actor, _, _, rules = actor_of(
+        cfg.teacher, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
+    )
     trace = run_episodes(evaluation, env, actor, cfg.teacher, rules, math.inf)
     env.close()
     return trace

@@ -22,6 +22,7 @@ from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
+    from vd.evaluate.goals import Goals
     from vd.evaluate.result import Protocol, Result
     from vd.evaluate.trace import Trace
     from vd.stopping import StoppingRule
@@ -77,7 +78,9 @@ def compare(cfg: EvalCfg, condition: str = "", stop_at: float = math.inf) -> "Re
             env.objects = with_symmetries(env.objects, device)
             task, start = wanted, env.state_dict()
         env.load_state_dict(start)
-        actor, kind, sees, rules = actor_of(cfg, name, policy, env, device)
+        actor, kind, sees, rules = actor_of(
+            name, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
+        )
         trace = run_episodes(cfg, env, actor, name, rules, stop_at)
         index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
@@ -122,7 +125,7 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         task = replace(task, table_friction=cfg.table_friction)
     if cfg.randomised:
         return task
-    # Noise that is switched off anyway, and would keep a teacher and its student from sharing environments.
+    # Noise that is switched off anyway, and would keep a teacher and a tracker from sharing environments.
     exact = replace(
         task.randomisation,
         observation_noise_mean=0.0,
@@ -156,19 +159,36 @@ def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: st
     )
 
 
-def actor_of(cfg: EvalCfg, name: str, policy: Any | None, env: Any, device: str) -> tuple[Any, str, str, Any]:
-    """What acts, its kind, what it sees, and its rules to stop, by tolerance."""
+def actor_of(
+    name: str,
+    policy: Any | None,
+    env: Any,
+    *,
+    goals: "Goals" = "mesh",
+    sensor_errors: bool = False,
+    seed: int = 0,
+) -> tuple[Any, str, str, Any]:
+    """What acts in an environment, its kind, what it sees, and its rules to stop, by tolerance.
+
+    Args:
+        name: Of the policy.
+        policy: What :func:`open_policy` gave.
+        env: The environment.
+        goals: What a camera policy knows shapes and goals by.
+        sensor_errors: Its camera errs as a real one.
+        seed: Of everything random.
+    """
     from vd.policy import TrainedPolicy
     from vd.stopping import StoppingRule
 
     if policy is None:
-        return built_in(name, env.num_actions, seed=cfg.seed, device=device), name, "nothing", StoppingRule
+        return built_in(name, env.num_actions, seed=seed, device=env.device), name, "nothing", StoppingRule
     if isinstance(policy, TrainedPolicy):
         return policy, "teacher", "state", StoppingRule
     from vd.workers import one_thread_without_gpu
 
-    one_thread_without_gpu(device)
-    settings: dict[str, Any] = {"goals": cfg.goals, "sensor_errors": cfg.sensor_errors, "seed": cfg.seed}
+    one_thread_without_gpu(env.device)
+    settings: dict[str, Any] = {"goals": goals, "sensor_errors": sensor_errors, "seed": seed}
     if is_tracking_policy(policy):
         from vd.evaluate.tracking import TrackingActor
 

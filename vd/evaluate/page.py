@@ -136,14 +136,17 @@ def write_page(
 
 
 def terminal_text(result: Result) -> str:
-    """Tables, those by object too if there is one policy, warnings and what was asked, for a terminal."""
-    short = labels(result.policies)
+    """Tables, warnings and what was asked, for a terminal; of one policy without a suite by object too."""
+    if not result.rows:
+        return ""
+    short, suite = labels(result.policies), any(row.condition for row in result.rows)
     # Of the shares only success has its interval here: a line has to fit.
     rows = [
-        [c if i <= WORDS else c.split(" (")[0] for i, c in enumerate(_cells(r, short))] for r in result.rows
+        [cell if column <= WORDS else cell.split(" (")[0] for column, cell in enumerate(_cells(row, short))]
+        for row in result.rows
     ]
     parts = [aligned([_HEADER, *rows], words=WORDS)]
-    if len(result.policies) == 1:
+    if len(result.policies) == 1 and not suite:
         parts += [
             f"{_heading(row, short)}\n{aligned([_OBJECT_HEADER, *_object_cells(row)], words=1)}"
             for row in result.rows
@@ -151,7 +154,8 @@ def terminal_text(result: Result) -> str:
         ]
     parts += ["\n".join("  ".join(cells) for cells in _difference_cells(result, short))]
     parts += [f"warning {name}: {words}" for name, words in result.warnings.items()]
-    return "\n\n".join(part for part in (*parts, asked(result.rows[0].protocol)) if part)
+    parts += [] if suite else [asked(result.rows[0].protocol)]
+    return "\n\n".join(part for part in parts if part)
 
 
 def aligned(rows: Sequence[Sequence[str]], *, words: int) -> str:
@@ -231,14 +235,14 @@ def _bound_cells(result: Result, short: dict[str, str]) -> list[tuple[str, ...]]
             short[row.policy],
             row.group,
             row.condition or NOTHING,
-            f"{bound.bound_rad:g}",
-            share(bound.seen),
-            share(bound.right),
+            bound,
+            share(row.prediction.seen[bound]),
+            share(row.prediction.right[bound]),
             f"{row.prediction.mean_error_rad:.2f}",
         )
         for row in result.rows
         if row.prediction is not None and row.headline
-        for bound in row.prediction.bounds
+        for bound in row.prediction.seen
     ]
 
 

@@ -101,25 +101,17 @@ class Summary:
 
 
 @dataclass(frozen=True)
-class Bound:
-    """How well predictions tell which states are within a bound."""
-
-    bound_rad: float
-    seen: float | None
-    """Share of the states truly within the bound that are predicted within it; None without such states."""
-    right: float | None
-    """Share of the states predicted within the bound that truly are; None without such states."""
-
-
-@dataclass(frozen=True)
 class Prediction:
     """Predicted beside true distances of a camera policy, in all states of all episodes."""
 
     states: int
     mean_error_rad: float
     """Mean absolute difference."""
-    bounds: tuple[Bound, ...]
-    """At each of BOUNDS_RAD."""
+    seen: dict[str, float | None]
+    """By bound [rad] (as text): share of the states truly within it that are predicted within it; None
+    without such states."""
+    right: dict[str, float | None]
+    """By bound: share of the states predicted within it that truly are; None without such states."""
 
 
 @dataclass(frozen=True)
@@ -403,14 +395,10 @@ def _prediction(trace: Trace) -> Prediction:
     assert trace.predicted is not None
     there = np.isfinite(trace.predicted)
     true, predicted = trace.error[there], trace.predicted[there]
-    bounds = []
+    seen: dict[str, float | None] = {}
+    right: dict[str, float | None] = {}
     for bound in BOUNDS_RAD:
         near, said = true <= bound, predicted <= bound
-        bounds.append(
-            Bound(
-                bound_rad=bound,
-                seen=float(said[near].mean()) if near.any() else None,
-                right=float(near[said].mean()) if said.any() else None,
-            )
-        )
-    return Prediction(len(true), float(np.abs(predicted - true).mean()), tuple(bounds))
+        seen[str(bound)] = float(said[near].mean()) if near.any() else None
+        right[str(bound)] = float(near[said].mean()) if said.any() else None
+    return Prediction(len(true), float(np.abs(predicted - true).mean()), seen, right)

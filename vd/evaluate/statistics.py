@@ -30,9 +30,6 @@ MIN_CLUSTERS = 8
 # Draws for chance on a symmetric object, for which no closed form is used: 0.5 % at a rate of one half.
 CHANCE_DRAWS = 40_000
 
-CHANCE_MEAN_RAD = np.pi / 2 + 2 / np.pi
-"""Mean angle between two uniform rotations: 2.2074 rad."""
-
 
 @dataclass(frozen=True)
 class Interval:

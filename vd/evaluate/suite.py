@@ -167,8 +167,7 @@ def precise(row: Row) -> Interval:
 
 def seen_within(row: Row, bound_rad: float) -> float | None:
     """Share of the states truly within a bound that a camera policy predicts within it."""
-    bounds = () if row.prediction is None else row.prediction.bounds
-    return next((bound.seen for bound in bounds if bound.bound_rad == bound_rad), None)
+    return None if row.prediction is None else row.prediction.seen[str(bound_rad)]
 
 
 def lost_at_once(row: Row) -> Interval:

@@ -3,7 +3,10 @@
 ``vd-play LOG`` replays a run on a hand.
 """
 
+import contextlib
+import importlib
 import math
+import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -27,6 +30,15 @@ if TYPE_CHECKING:
     from vd.play.session import Session
 
 VIDEO_SECONDS = 10.0
+SLOWEST_MODULES = (
+    "newton._src.solvers.mujoco.kernels",
+    "mujoco_warp._src.smooth",
+    "newton._src.sim.articulation",
+    "newton._src.sensors.sensor_camera_render.camera_utils",
+    "newton._src.geometry.bvh",
+    "mujoco_warp._src.set_const",
+)
+"""Kernels that take longest to compile on a CPU, a third of a first start (found by Warp's own log)."""
 # A CPU simulates this many environments about in real time.
 FAST_WORLDS_CPU = 16
 
@@ -158,13 +170,11 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     """
     from tqdm import tqdm
 
-    from vd.evaluate.agents import built_in
     from vd.evaluate.cfg import LOG_EVERY_S
     from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
-    env, trained, device = _open(cfg, num_envs=cfg.cells)
-    policy = trained or built_in(cfg.agent_name, env.num_actions, seed=cfg.seed, device=device)
+    env, policy = _open(cfg, _policy(cfg), num_envs=cfg.cells)
     envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
     renderer = Renderer(
@@ -173,7 +183,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
         width=width,
         height=height,
         goal_size=round(GOAL_SHARE * height),
-        device=device,
+        device=env.device,
     )
     rate = env.cfg.sim.control_hz
     steps = max(1, round(cfg.seconds * rate))
@@ -186,9 +196,21 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     return count
 
 
+def compile_side_by_side() -> None:
+    """Compile what takes longest on a CPU with all cores, in place of one module after the other."""
+    import warp as wp
+
+    for name in SLOWEST_MODULES:
+        with contextlib.suppress(ImportError):  # they are not public, and may move
+            importlib.import_module(name)
+    modules = [wp.get_module(name) for name in SLOWEST_MODULES if name in sys.modules]
+    wp.force_load("cpu", modules, max_workers=os.cpu_count())
+
+
 def serve(cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C; the page is there, and says so, while the scene is being built."""
-    _serve(lambda: open_session(cfg), cfg)
+    trained = _policy(cfg)
+    _serve(lambda: open_session(cfg, trained), cfg)
 
 
 def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> None:
@@ -206,13 +228,11 @@ def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> No
         page.viewer.close()
 
 
-def open_session(cfg: PlayCfg) -> "Session":
-    """The environment and agents behind the viewer."""
-    from vd.play.session import Session, agent_choices
+def open_session(cfg: PlayCfg, trained: Any) -> "Session":
+    """The environment and policy behind the viewer."""
+    from vd.play.session import Session
 
-    env, trained, device = _open(cfg, num_envs=1)
-    agents = agent_choices(cfg.agent_name, trained, env.num_actions, seed=cfg.seed, device=device)
-    return Session(env, agents, cfg.agent_name, seed=cfg.seed)
+    return Session(*_open(cfg, trained, num_envs=1), seed=cfg.seed)
 
 
 def spread(world_object: Sequence[int], cells: int) -> list[int]:
@@ -225,15 +245,24 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
     return sorted(world for _, world in islice(sorted(rank), cells))
 
 
-def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
-    """Environment with at least one world for each object, trained agent if one is named, device."""
-    from vd.evaluate.agents import check_bundle, is_saved_student, is_tracking_policy, open_policy, task_for
+def _policy(cfg: PlayCfg) -> Any:
+    """What is trained; a file that cannot be used is told before anything slow."""
+    from vd.evaluate.agents import open_policy
+
+    return open_policy(cfg.agent_name, resolve_device(cfg.device))
+
+
+def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
+    """Environment with at least one world for each object, and what acts in it."""
+    from vd.evaluate.agents import check_bundle, task_for
 
     device = resolve_device(cfg.device)
-    trained = open_policy(cfg.agent_name, device)  # a file that cannot be used is told before anything slow
+    if device == "cpu":
+        compile_side_by_side()
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv
+    from vd.evaluate.compare import actor_of
 
     count = len(load_set(list(cfg.objects)))
     if device == "cpu" and count > FAST_WORLDS_CPU:
@@ -256,15 +285,7 @@ def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
         task = replace(task, table=TableCfg(away_share=1.0))
     check_bundle(cfg.agent_name, task)
     env = ReorientEnv(task, device)
-    if is_saved_student(trained):
-        from vd.evaluate.student import StudentActor
-
-        return env, StudentActor(env, trained, seed=cfg.seed), device
-    if is_tracking_policy(trained):
-        from vd.evaluate.tracking import TrackingActor
-
-        return env, TrackingActor(env, trained, seed=cfg.seed), device
-    return env, trained, device
+    return env, actor_of(cfg.agent_name, trained, env, seed=cfg.seed)[0]
 
 
 if __name__ == "__main__":

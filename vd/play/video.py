@@ -56,8 +56,6 @@ class Snapshot:
     """Goals reached since the recording began."""
     drops: int
     """Drops since the recording began."""
-    terms: np.ndarray
-    """Reward terms of the step, shape [T]."""
     table: bool = True
     """The table was there."""
 
@@ -92,10 +90,10 @@ class Watcher:
         self.drops += fell
         self.steps += stepped
         q, goal = env.sim.joint_q.numpy()[envs], env.goal_quat.numpy()[envs]
-        error, terms = env.rotation_error.numpy()[envs], env.reward_terms.numpy()[envs]
+        error = env.rotation_error.numpy()[envs]
         table = env.has_table()[envs]
         if not stepped:  # what the environment holds is of the step before the reset
-            error, terms = rotation_angle(q[:, -4:].astype(float), goal.astype(float)), np.zeros_like(terms)
+            error = rotation_angle(q[:, -4:].astype(float), goal.astype(float))
         return [
             Snapshot(
                 name=env.objects[env.world_object[world]].name,
@@ -107,7 +105,6 @@ class Watcher:
                 fell=bool(fell[i]),
                 goals=int(self.goals[i]),
                 drops=int(self.drops[i]),
-                terms=terms[i].copy(),
                 table=bool(table[i]),
             )
             for i, world in enumerate(envs)
@@ -119,7 +116,8 @@ def record(
 ) -> Iterator[np.ndarray]:
     """Reset, run a policy, and draw the start and every control step.
 
-    A frame is drawn while the next step is simulated. So the kernels of both are compiled at the same time.
+    On a CPU a frame is drawn while the next step is simulated. So the kernels of both are compiled at the
+    same time.
 
     Args:
         env: The environment.
@@ -146,6 +144,8 @@ def record(
     with ThreadPoolExecutor(max_workers=1) as pool:
         for _ in range(steps):
             frame = pool.submit(draw, snapshots)
+            if str(env.device) != "cpu":  # what others launch would become part of the step's graph
+                frame.result()
             act(env, policy)
             snapshots = watcher.read()
             yield frame.result()
