@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vd.assets_usd.hand_author import hand_usd
+from vd.assets_usd.hands import hand_usd
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hand_model import read_hand

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 import pytest
 
-from vd.assets_usd.bare_layer import read_bare_layer
+from vd.assets_usd.hand_layer import read_bare_layer
 from vd.assets_usd.hand_data import HandError
 from vd.gap import cli, steps
 from vd.gap.chain import chains

@@ -12,7 +12,7 @@ from vd.assets_usd.hand_author import author_hand, hand_usd
 from vd.assets_usd.hand_meshes import solid_mesh, surface_points
 from vd.assets_usd.hand_model import HandModel, open_stage, read_hand
 from vd.assets_usd.hand_schema import Box, Capsule, Cylinder, Pose, Solid, Sphere, Taper
-from vd.assets_usd.hand_spec import HANDS
+from vd.assets_usd.hands import HANDS
 
 HALF = 2**-0.5
 

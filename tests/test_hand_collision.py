@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from vd.assets_usd.hand_author import hand_usd
+from vd.assets_usd.hands import hand_usd
 from vd.assets_usd.hand_model import HandModel, read_hand
 
 GEOMS = {

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pxr import Usd, UsdPhysics
 
-from vd.assets_usd.hand_author import hand_usd
+from vd.assets_usd.hands import hand_usd
 from vd.assets_usd.hand_data import HandError, HandModel
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hand_model import open_stage, read_hand

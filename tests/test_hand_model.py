@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as npst
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics
 from scipy.optimize import minimize
 
-from vd.assets_usd.hand_author import hand_usd
+from vd.assets_usd.hands import hand_usd
 from vd.assets_usd.hand_model import HandError, HandModel, open_stage, read_hand
 
 HANDS = ("dclaw3", "dclaw4")

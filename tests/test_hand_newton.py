@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from vd.assets_usd.hand_author import hand_usd
+from vd.assets_usd.hands import hand_usd
 from vd.assets_usd.hand_model import HandModel, open_stage, read_hand
 
 MOUNT = ((0.0, 0.0, 0.25), (0.0, 1.0, 0.0, 0.0))

@@ -21,7 +21,7 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PACKAGE_DIRS: dict[str, str] = PROJECT["tool"]["setuptools"]["package-dir"]
 MAX_POLICY_BYTES = 10 * 2**20
 # One module of every top-level package, among them the ones whose folder lies outside vd/.
-IMPORTED = ["vd.paper", "vd.kernels", "vd.assets_usd", "vd.assets_usd.hand_spec", "vd.train", "vd.deploy"]
+IMPORTED = ["vd.paper", "vd.kernels", "vd.assets_usd", "vd.assets_usd.hands", "vd.train", "vd.deploy"]
 
 
 def installed_names() -> set[str]:
