@@ -50,7 +50,7 @@ Estimate = float | Sequence[float]
 
 
 class _Number(NamedTuple):
-    """Where a parameter is in USD: its attribute, the factor from SI to its unit, and the name of intervals."""
+    """Where a parameter is in USD: its attribute, and the factor from SI to its unit."""
 
     group: str
     parameter: Parameter

@@ -11,8 +11,8 @@ import sys
 import numpy as np
 import pytest
 
-from vd.assets_usd.hand_layer import read_bare_layer
 from vd.assets_usd.hand_data import HandError
+from vd.assets_usd.hand_layer import read_bare_layer
 from vd.gap import cli, steps
 from vd.gap.chain import chains
 from vd.gap.close import counterparts, simulate_again, write_identified

@@ -44,6 +44,7 @@ from vd.assets_usd.objects.plan import (
 from vd.assets_usd.objects.reading import declared_unit, load_mesh, mesh_kind
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.files import atomic_path, make_folder
+from vd.warp_quiet import quiet_warp
 
 IMPORT_VERSION = 5
 """Part of every content hash: raise it when the import computes something else."""
@@ -214,12 +215,17 @@ def _decomposition(
     return parts, True
 
 
+def _import_quietly(job: Job, settings: ImportSettings) -> ImportResult:
+    quiet_warp()
+    return import_mesh(job, settings)
+
+
 def _import_in_child(job: Job, settings: ImportSettings) -> ImportResult:
     """Import one mesh in a child of its own."""
     # A busy machine is no reason: processor time is limited, this only ends what hangs.
     limit = RUNS * HANG_S * settings.decompose.time_limit_s + WORKER_OVERHEAD_S
     try:
-        return in_child(import_mesh, job, settings, start="spawn", limit_s=limit)
+        return in_child(_import_quietly, job, settings, start="spawn", limit_s=limit)
     except ChildError as error:
         reason = f"the import ended with {error}; what it said is above"
         return ImportResult(job.source, job.name, job.target, "refused", reason)

@@ -31,6 +31,18 @@ SURFACE_POINTS = 500
 SUFFIXES = (".usd", ".usda", ".usdc")
 IDENTITY = np.array([[0.0, 0.0, 0.0, 1.0]])
 _CUSTOM = "visualDexterity"
+_STORED: dict[str, type] = {
+    "licence": str,
+    "source": str,
+    "file": str,
+    "family": str,
+    "split": str,
+    "scale": float,
+    "volume_error": float,
+    "volume_method": str,
+    "content_hash": str,
+}
+"""Fields of :class:`ObjectModel` that are custom data under their names in camel case."""
 
 
 class ObjectError(ValueError):
@@ -86,11 +98,6 @@ class ObjectModel:
     warnings: tuple[str, ...] = ()
 
     @property
-    def com(self) -> np.ndarray:
-        """Centre of mass in the object frame: zero by construction, [3]."""
-        return np.zeros(3)
-
-    @property
     def inertia_matrix(self) -> np.ndarray:
         """Inertia about the centre of mass in the object frame, [3, 3], kg m^2."""
         axes = Rotation.from_quat(self.inertia_quat).as_matrix()
@@ -100,19 +107,6 @@ class ObjectModel:
     def longest_side(self) -> float:
         """Longest side of the axis-aligned bounding box of the visual mesh, m."""
         return float(np.ptp(self.vertices, axis=0).max())
-
-    @property
-    def diameter(self) -> float:
-        """Largest distance between two points of the object, m."""
-        from scipy.spatial import ConvexHull
-        from scipy.spatial.distance import pdist
-
-        return float(pdist(self.vertices[ConvexHull(self.vertices).vertices]).max())
-
-    @property
-    def radius(self) -> float:
-        """Largest distance of the surface from the centre of mass, m."""
-        return float(np.linalg.norm(self.vertices, axis=1).max())
 
 
 def build_model(
@@ -231,15 +225,7 @@ def write_object(path: Path, model: ObjectModel) -> Path:
         _CUSTOM,
         {
             "formatVersion": FORMAT_VERSION,
-            "licence": model.licence,
-            "source": model.source,
-            "file": model.file,
-            "family": model.family,
-            "split": model.split,
-            "scale": float(model.scale),
-            "volumeError": float(model.volume_error),
-            "volumeMethod": model.volume_method,
-            "contentHash": model.content_hash,
+            **{_key(name): kind(getattr(model, name)) for name, kind in _STORED.items()},
             "notes": "\n".join(model.notes),
             "warnings": "\n".join(model.warnings),
             "symmetry": Vt.DoubleArray.FromNumpy(
@@ -251,6 +237,12 @@ def write_object(path: Path, model: ObjectModel) -> Path:
         if not stage.GetRootLayer().Export(str(temporary)):
             raise OSError(f"{path}: USD could not write the object; is the disk full?")
     return path
+
+
+def _key(name: str) -> str:
+    """A field's name in camel case."""
+    first, *rest = name.split("_")
+    return first + "".join(word.title() for word in rest)
 
 
 def _open(path: Path) -> tuple[Any, Any, dict[str, Any]]:
@@ -342,7 +334,6 @@ def read_object(path: Path) -> ObjectModel:
     mass = UsdPhysics.MassAPI(prim)
     axes = mass.GetPrincipalAxesAttr().Get()
     quat = np.array([*axes.GetImaginary(), axes.GetReal()], dtype=np.float64)
-    notes = str(data["notes"])
     return ObjectModel(
         name=prim.GetName(),
         vertices=array("visual", "points", 3, np.float32),
@@ -353,16 +344,8 @@ def read_object(path: Path) -> ObjectModel:
         inertia_quat=quat / np.linalg.norm(quat),
         surface_points=array("surface_points", "points", 3, np.float32),
         symmetry=np.array(data["symmetry"], dtype=np.float64).reshape(-1, 4),
-        licence=str(data["licence"]),
-        source=str(data["source"]),
-        file=str(data.get("file", "")),
-        family=str(data["family"]),
-        split=str(data["split"]),
-        scale=float(data["scale"]),
-        volume_error=float(data["volumeError"]),
-        volume_method=str(data["volumeMethod"]),
-        content_hash=str(data["contentHash"]),
-        notes=tuple(notes.splitlines()),
+        **{name: kind(data.get(_key(name), "")) for name, kind in _STORED.items()},
+        notes=tuple(str(data["notes"]).splitlines()),
         warnings=tuple(str(data.get("warnings", "")).splitlines()),
     )
 
