@@ -6,10 +6,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.objects import procedural
-from vd.assets_usd.objects.families import HELD_OUT, TRAINING
 from vd.assets_usd.objects.geometry import hull_depth, random_surface_points, union_depth
 from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, MEAN_WIDTH_M, THINNEST_M, mean_width
 from vd.assets_usd.objects.model import ObjectModel
+from vd.assets_usd.objects.procedural import HELD_OUT, TRAINING
 
 COUNT = 18
 """Three of each of the six families."""

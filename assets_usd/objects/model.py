@@ -245,58 +245,38 @@ def _key(name: str) -> str:
     return first + "".join(word.title() for word in rest)
 
 
-def _open(path: Path) -> tuple[Any, Any, dict[str, Any]]:
-    """Stage, root prim and custom data of an object file."""
-    from pxr import Sdf, Tf, Usd
+def _layer(path: Path) -> Any:
+    """The layer of a USD file as it is now; None if it is none."""
+    from pxr import Sdf, Tf
 
-    path = Path(path)
-    if not path.is_file():
-        raise ObjectError(f"{path}: no such object file")
-    what = "not a USD file, or a damaged one; remove it, and import or author the object again"
     try:
         # Anonymous: a layer cached by path would hide that the file was written anew.
-        layer = Sdf.Layer.OpenAsAnonymous(str(path))
-    except Tf.ErrorException as error:
-        raise ObjectError(f"{path}: {what}") from error
-    if layer is None:
-        raise ObjectError(f"{path}: {what}")
-    stage = Usd.Stage.Open(layer)
-    prim = stage.GetDefaultPrim()
-    data = dict(prim.GetCustomDataByKey(_CUSTOM) or {}) if prim else {}
-    version = data.get("formatVersion")
-    if version != FORMAT_VERSION:
-        raise ObjectError(
-            f"{path}: formatVersion is {version}, this version reads {FORMAT_VERSION}; "
-            "write the object again with vd-assets import or vd-assets objects"
-        )
-    return stage, prim, data
-
-
-def read_hash(path: Path) -> str | None:
-    """The content hash of an object file, or None where there is no readable one."""
-    try:
-        return str(_open(path)[2]["contentHash"])
-    except ObjectError:
+        return Sdf.Layer.OpenAsAnonymous(str(path))
+    except Tf.ErrorException:
         return None
+
+
+def _custom(layer: Any) -> dict[str, Any]:
+    """Custom data of an object's root prim; empty if the layer is no object of ours."""
+    prim = layer.GetPrimAtPath(f"/{layer.defaultPrim}") if layer and layer.defaultPrim else None
+    return dict(prim.customData.get(_CUSTOM, {})) if prim else {}
 
 
 def is_object(stage: Any) -> bool:
     """Whether a stage is an object file of ours, of any version."""
-    prim = stage.GetDefaultPrim()
-    return bool(prim and prim.GetCustomDataByKey(_CUSTOM))
+    return bool(_custom(stage.GetRootLayer()))
 
 
 def read_origin(path: Path) -> tuple[str, str] | None:
     """``source`` and ``file`` of an object file of any version; None if it is no object file of ours."""
-    from pxr import Sdf, Tf
-
-    try:
-        layer = Sdf.Layer.OpenAsAnonymous(str(path))
-    except Tf.ErrorException:
-        return None
-    prim = layer.GetPrimAtPath(f"/{layer.defaultPrim}") if layer and layer.defaultPrim else None
-    data = prim.customData.get(_CUSTOM) if prim else None
+    data = _custom(_layer(path))
     return (str(data.get("source", "")), str(data.get("file", ""))) if data else None
+
+
+def read_hash(path: Path) -> str | None:
+    """The content hash of an object file of this version, or None."""
+    data = _custom(_layer(path))
+    return str(data["contentHash"]) if data.get("formatVersion") == FORMAT_VERSION else None
 
 
 def read_object(path: Path) -> ObjectModel:
@@ -308,10 +288,24 @@ def read_object(path: Path) -> ObjectModel:
     Raises:
         ObjectError: The file is missing, no USD, of another version, or a part is missing.
     """
-    from pxr import UsdGeom, UsdPhysics
+    from pxr import Usd, UsdGeom, UsdPhysics
 
     path = Path(path)
-    stage, prim, data = _open(path)
+    if not path.is_file():
+        raise ObjectError(f"{path}: no such object file")
+    layer = _layer(path)
+    if layer is None:
+        raise ObjectError(
+            f"{path}: not a USD file, or a damaged one; remove it, and import or author the object again"
+        )
+    data = _custom(layer)
+    if data.get("formatVersion") != FORMAT_VERSION:
+        raise ObjectError(
+            f"{path}: formatVersion is {data.get('formatVersion')}, this version reads {FORMAT_VERSION}; "
+            "write the object again with vd-assets import or vd-assets objects"
+        )
+    stage = Usd.Stage.Open(layer)
+    prim = stage.GetDefaultPrim()
     root = prim.GetPath()
 
     def array(relative: str, attribute: str, columns: int, dtype: Any) -> np.ndarray:

@@ -50,7 +50,8 @@ def usd_unit(path: Path) -> float | None:
 
 def usd_files(path: Path) -> list[Path]:
     """The files that a USD is composed of, itself included, sorted."""
-    used = {Path(layer.realPath).resolve() for layer in opened(path).GetUsedLayers() if layer.realPath}
+    stage = opened(path)  # its layers live as long as it does
+    used = {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath}
     # Layers within a package have paths such as x.usdz[y.usdc].
     return sorted(file for file in used | {path.resolve()} if file.is_file())
 
