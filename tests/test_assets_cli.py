@@ -123,15 +123,6 @@ def test_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     assert "another hand" in capsys.readouterr().err and path.read_text() == mine
 
 
-def test_a_folder_that_cannot_be_made_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    mesh = tmp_path / "a.stl"
-    trimesh.creation.box((0.12, 0.05, 0.03)).export(mesh)
-    assert run(monkeypatch, "import", mesh, "--out", mesh / "out") == 2
-    assert str(mesh / "out") in capsys.readouterr().err
-
-
 def test_help_is_fast_and_names_the_commands():
     code = (
         "import sys; from vd.assets_usd import cli; sys.argv = ['vd-assets', '--help']\n"

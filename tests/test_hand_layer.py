@@ -44,21 +44,6 @@ def overs(joint: str, *attributes: str) -> str:
     return f'{HEADER}over "dclaw3"\n{{\n    over "{joint}"\n    {{\n{lines}\n    }}\n}}\n'
 
 
-def test_a_hand_without_effects_has_the_plain_servo(hand):
-    servo = hand.servo
-    for column, values in (
-        (actuators.KP, hand.kp),
-        (actuators.KD, hand.kd),
-        (actuators.VELOCITY_LIMIT, hand.velocity_limit),
-        (actuators.INERTIA, hand.armature),
-    ):
-        assert np.array_equal(servo[:, column], values)
-    for effect in EFFECTS.values():
-        for parameter in effect.parameters:
-            assert (servo[:, parameter.column] == parameter.neutral).all()
-    assert hand.layer is None and np.isnan(hand.servo_interval).all()
-
-
 def test_every_number_comes_back(hand, tmp_path):
     drive = {"kp": (2.0, 1.9, 2.2), "kd": 0.21, "velocity_limit": (3.0, 2.5, 3.5), "inertia": 0.002}
     drive["kd_off"] = (0.01, 0.008, 0.012)

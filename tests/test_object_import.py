@@ -101,13 +101,6 @@ def test_bad_meshes_are_refused_with_the_reason(imported, name: str):
     assert not (out / f"{name}.usd").exists()
 
 
-def test_the_rest_still_imports(imported):
-    _, out, _, results = imported
-    good = {name for name, r in results.items() if r.status == "imported"}
-    assert good == {"bracket", "clamp", "brick_in_mm"}
-    assert {p.stem for p in out.glob("*.usd")} == good
-
-
 def test_hulls_are_convex_contain_the_mesh_and_keep_its_volume(imported):
     model = read_object(imported[1] / "bracket.usd")
     assert 2 <= len(model.hulls) <= 8

@@ -119,20 +119,6 @@ def test_load_set_takes_files_folders_and_names(tmp_path: Path, cache: Path, exa
     assert load_set("shelf")[0].name == example.name
 
 
-def test_a_built_in_set_of_an_older_version_is_authored_anew(
-    cache: Path, example: procedural.ObjectModel, monkeypatch: pytest.MonkeyPatch
-):
-    load_set("cube")
-    path = sets.built_in_folder("cube") / "cube.usd"
-    before = path.stat().st_mtime_ns
-    load_set("cube")
-    assert path.stat().st_mtime_ns == before
-    monkeypatch.setattr(procedural, "PROCEDURAL_VERSION", procedural.PROCEDURAL_VERSION + 1)
-    load_set("cube")
-    assert path.stat().st_mtime_ns == before
-    assert (sets.built_in_folder("cube") / "cube.usd").stat().st_mtime_ns > before
-
-
 @pytest.mark.parametrize("name", ["cube", "cuboid", "symmetric", "procedural-2-seed5"])
 def test_a_users_folder_with_the_name_of_a_built_in_set_is_left_alone(
     name: str, cache: Path, example: procedural.ObjectModel

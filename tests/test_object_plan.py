@@ -143,35 +143,18 @@ def test_unit_size_and_mass(
 
 
 @pytest.mark.parametrize(
-    ("sizing", "words"),
+    ("settings", "words"),
     [
-        (m.Sizing("mm", density=2.7), "--density 2.7.*water"),
-        (m.Sizing("mm", density=1000.0, mass_kg=0.1), "--density and --mass"),
-        (m.Sizing("mm", mass_kg=-1.0), "--mass -1"),
-        (m.Sizing("foot"), "--units foot: choose"),
+        (ImportSettings(sizing=m.Sizing("mm", density=2.7)), "--density 2.7.*water"),
+        (ImportSettings(sizing=m.Sizing("mm", density=1000.0, mass_kg=0.1)), "--density and --mass"),
+        (ImportSettings(sizing=m.Sizing("mm", mass_kg=-1.0)), "--mass -1"),
+        (ImportSettings(DecomposeSettings(max_hulls=0)), "--max-hulls 0: give 1 or more"),
+        (ImportSettings(DecomposeSettings(threshold=5.0)), "--threshold 5: give 0.01 to 1"),
     ],
 )
-def test_sizes_that_cannot_be_meant_are_refused_before_anything_is_written(
-    sizing: m.Sizing, words: str, tmp_path: Path
+def test_what_cannot_be_meant_is_refused_before_anything_is_written(
+    settings: ImportSettings, words: str, tmp_path: Path
 ):
-    with pytest.raises(m.MeshError, match=words):
-        import_meshes([brick(tmp_path / "x.stl")], tmp_path / "out", ImportSettings(sizing=sizing))
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("setting", "words"),
-    [
-        ({"max_hulls": 0}, "--max-hulls 0: give 1 or more"),
-        ({"threshold": 5.0}, "--threshold 5: give 0.01 to 1"),
-        ({"max_hull_vertices": 3}, "--max-hull-vertices 3: give 4 or more"),
-        ({"time_limit_s": -3.0}, "--time-limit -3: give 1 or more"),
-    ],
-)
-def test_a_decomposition_that_cannot_be_is_refused_before_anything_is_written(
-    setting: dict[str, float], words: str, tmp_path: Path
-):
-    settings = ImportSettings(DecomposeSettings(**setting))
     with pytest.raises(m.MeshError, match=words):
         import_meshes([brick(tmp_path / "x.stl")], tmp_path / "out", settings)
     assert not (tmp_path / "out").exists()
