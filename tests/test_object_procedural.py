@@ -24,7 +24,7 @@ def held_out() -> list[ObjectModel]:
 
 
 def test_only_what_has_no_rotational_symmetry_is_for_training(training: list[ObjectModel]):
-    """A symmetric solid is told by turning it, and none is drawn; a copy on the other side makes one of any."""
+    """A symmetric solid is told by turning it, and none is drawn; a turned copy makes one of any."""
     for model in (procedural.cube(), procedural.cuboid()):
         assert procedural.asymmetry(model) < procedural.MIN_ASYMMETRY / 10
     for model in training:

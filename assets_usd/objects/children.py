@@ -9,6 +9,9 @@ from typing import Any, Literal
 
 from vd.interrupt import end_with_parent
 
+ENDING_S = 5.0
+"""Time for a child to leave things in order before it is killed."""
+
 
 class ChildError(RuntimeError):
     """A child ended without an answer.
@@ -69,7 +72,3 @@ def in_child(
         child.kill()
         child.join()
         receiver.close()
-
-
-ENDING_S = 5.0
-"""Time for a child to leave things in order before it is killed."""

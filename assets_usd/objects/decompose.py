@@ -45,8 +45,8 @@ MERGED_HULLS = (8, 12, 16, 24, 32)
 NEARLY = 1.1
 """More parts are not taken for an error less than a tenth smaller, unless it becomes good."""
 
-RUNS = 4
-"""Most runs of CoACD for one mesh: two decompositions, each also on a remeshed copy."""
+RUNS = 2
+"""Most runs of CoACD for one mesh."""
 
 HANG_S = 20.0
 """Wall-clock time, per second of processor time allowed, after which CoACD is taken to hang: a busy machine
@@ -98,7 +98,7 @@ class Decomposition:
 
     Attributes:
         hulls: The parts.
-        method: ``coacd``, ``coacd, remeshed`` or ``one hull``.
+        method: ``coacd``, ``coacd, merged`` or ``one hull``.
         fallback: What fell back, and why; empty for a full result.
         error: :func:`vd.assets_usd.objects.bodies.error_of_parts`.
     """
@@ -109,9 +109,7 @@ class Decomposition:
     error: float = 0.0
 
 
-def _coacd_parts(
-    vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings, preprocess: str
-) -> list[np.ndarray]:
+def _coacd_parts(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings) -> list[np.ndarray]:
     """Vertices of CoACD's parts."""
     import coacd
 
@@ -120,7 +118,7 @@ def _coacd_parts(
         coacd.Mesh(vertices.astype(np.float64), faces.astype(np.int32)),
         threshold=settings.threshold,
         max_convex_hull=settings.max_hulls,
-        preprocess_mode=preprocess,
+        preprocess_mode="auto",
         mcts_iterations=settings.mcts_iterations,
         max_ch_vertex=settings.max_hull_vertices,
         seed=settings.seed,
@@ -129,7 +127,7 @@ def _coacd_parts(
 
 
 def _within_limits(
-    vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings, preprocess: str
+    vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings
 ) -> list[np.ndarray] | str:
     """CoACD in this process, which its limit of processor time ends; the parts, or why there are none."""
     seconds = int(time.process_time()) + max(1, round(settings.time_limit_s))
@@ -138,21 +136,18 @@ def _within_limits(
     os.environ["OMP_WAIT_POLICY"] = "passive"  # threads that wait for each other take no processor time
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
-        return _coacd_parts(vertices, faces, settings, preprocess) or "CoACD returned no part"
+        return _coacd_parts(vertices, faces, settings) or "CoACD returned no part"
     except Exception as error:  # the reason travels to the parent
         return f"{type(error).__name__}: {error}"
 
 
-def run_coacd(
-    vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings, preprocess: str = "auto"
-) -> list[np.ndarray] | str:
+def run_coacd(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings) -> list[np.ndarray] | str:
     """CoACD in a child process.
 
     Args:
         vertices: [V, 3].
         faces: [T, 3].
         settings: Limits.
-        preprocess: CoACD's remeshing to a manifold: ``auto``, ``on`` or ``off``.
 
     Returns:
         The vertices of each part, or the reason why there are none.
@@ -162,7 +157,7 @@ def run_coacd(
     """
     limit, hang = settings.time_limit_s, HANG_S * settings.time_limit_s
     try:
-        return in_child(_within_limits, vertices, faces, settings, preprocess, start="fork", limit_s=hang)
+        return in_child(_within_limits, vertices, faces, settings, start="fork", limit_s=hang)
     except ChildError as error:
         if error.code is None:
             raise MeshError(
@@ -193,9 +188,7 @@ def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ..
 
 
 def decompose(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings) -> Decomposition:
-    """Split a mesh into convex parts.
-
-    CoACD as the mesh is; then CoACD on a remeshed copy; then the convex hull alone.
+    """Split a mesh into convex parts: by CoACD, or its convex hull alone.
 
     Args:
         vertices: [V, 3], m.
@@ -205,18 +198,15 @@ def decompose(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettin
     Raises:
         MeshError: CoACD hangs.
     """
-    fallback = []
-    for preprocess, method in (("auto", "coacd"), ("on", "coacd, remeshed")):
-        parts = run_coacd(vertices, faces, settings, preprocess)
-        if isinstance(parts, str):
-            fallback.append(f"{method} failed: {parts}")
-            continue
-        hulls = tidy_hulls(parts, settings.max_hull_vertices)
-        if hulls:
-            return Decomposition(hulls, method, tuple(fallback))
-        fallback.append(f"{method} gave only slivers")
+    parts = run_coacd(vertices, faces, settings)
+    hulls = () if isinstance(parts, str) else tidy_hulls(parts, settings.max_hull_vertices)
+    if hulls:
+        return Decomposition(hulls, "coacd")
+    why = parts if isinstance(parts, str) else "it gave only slivers"
     hull = simplify_hull(convex_hull(vertices), settings.max_hull_vertices)
-    return Decomposition((hull,), "one hull", (*fallback, "one convex hull stands for the whole mesh"))
+    return Decomposition(
+        (hull,), "one hull", (f"coacd failed: {why}", "one convex hull stands for the whole mesh")
+    )
 
 
 def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:

@@ -4,6 +4,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import time
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
@@ -62,6 +63,9 @@ thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as par
 
 WORKER_OVERHEAD_S = 600.0
 """Wall-clock time that a child gets beside its runs of CoACD before it is taken to hang."""
+
+POLL_S = 0.1
+"""Between two looks whether all children have ended."""
 
 
 @dataclass(frozen=True)
@@ -319,6 +323,8 @@ def _import_in_children(
                 finish(future.result())
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
-            for child in multiprocessing.active_children():
-                child.terminate()
+            while any(future.running() for future in pending):
+                for child in multiprocessing.active_children():
+                    child.terminate()
+                time.sleep(POLL_S)
             raise
