@@ -108,8 +108,9 @@ def test_wheel_ships_every_policy_that_has_a_name(wheel):
         assert sizes[f"vd/policies/{name}.pt"] == path.stat().st_size < MAX_POLICY_BYTES
 
 
-def test_wheel_ships_templates_types_and_licence(wheel):
+def test_wheel_ships_hands_templates_types_and_licence(wheel):
     names = zipfile.ZipFile(wheel).namelist()
+    assert {"vd/assets_usd/usd/dclaw3.usda", "vd/assets_usd/usd/dclaw4.usda"} <= names
     templates = {name for name in names if name.endswith(".html")}
     assert templates == {f"vd/templates/{path.name}" for path in (ROOT / "vd/templates").iterdir()}
     assert "vd/py.typed" in names
