@@ -109,7 +109,7 @@ def test_wheel_ships_every_policy_that_has_a_name(wheel):
 
 
 def test_wheel_ships_hands_templates_types_and_licence(wheel):
-    names = zipfile.ZipFile(wheel).namelist()
+    names = set(zipfile.ZipFile(wheel).namelist())
     assert {"vd/assets_usd/usd/dclaw3.usda", "vd/assets_usd/usd/dclaw4.usda"} <= names
     templates = {name for name in names if name.endswith(".html")}
     assert templates == {f"vd/templates/{path.name}" for path in (ROOT / "vd/templates").iterdir()}

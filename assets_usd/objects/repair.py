@@ -31,6 +31,9 @@ APART = 0.02
 """Pieces whose boxes are farther from each other than this share of the longest side are apart: 2 mm of
 10 cm. Models put together from pieces touch or overlap."""
 
+MOST_PIECES = 2000
+"""A surface of more pieces is torn, and no collection of bodies."""
+
 OTHER_BODIES = 0.05
 """Bodies apart that hold less than this share of the volume are debris and are left out. With more there are
 several objects: which of them is meant cannot be known, and one rigid body cannot stand for them."""
@@ -137,16 +140,29 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
 
 @dataclass(frozen=True)
 class _Pieces:
-    """The connected pieces of a mesh: piece of each face, and of each piece area, closedness, volume."""
+    """The connected pieces of a mesh.
+
+    Attributes:
+        of_face: Piece of each face [T].
+        faces: Faces of each piece.
+        low: Lower corner of the box of each [P, 3].
+        high: Upper corner [P, 3].
+        area: Area of each [P].
+        closed: Which are closed [P].
+        volume: Signed volume of each, 0 of open ones [P].
+    """
 
     of_face: np.ndarray
+    faces: list[np.ndarray]
+    low: np.ndarray
+    high: np.ndarray
     area: np.ndarray
     closed: np.ndarray
     volume: np.ndarray
 
 
 def _pieces(mesh: Any) -> _Pieces:
-    """Connected pieces; the volume is signed, and 0 where a piece is open."""
+    """The connected pieces of a ``trimesh.Trimesh``."""
     import trimesh
 
     of_face = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
@@ -158,9 +174,11 @@ def _pieces(mesh: Any) -> _Pieces:
     closed = np.bincount(of_face[mesh.edges_face], count[index] != 2, number) == 0
     corner = mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0)
     six_volume = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))
-    return _Pieces(
-        of_face, area, closed, np.where(closed, np.bincount(of_face, six_volume, number) / 6.0, 0.0)
-    )
+    order = np.argsort(of_face, kind="stable")
+    faces = np.split(mesh.faces[order], np.cumsum(np.bincount(of_face))[:-1])
+    low, high = (np.array([b(mesh.vertices[f.ravel()], axis=0) for f in faces]) for b in (np.min, np.max))
+    volume = np.where(closed, np.bincount(of_face, six_volume, number) / 6.0, 0.0)
+    return _Pieces(of_face, faces, low, high, area, closed, volume)
 
 
 def _kept(mesh: Any, keep: np.ndarray) -> Any:
@@ -224,23 +242,19 @@ def _bodies(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
 
     pieces = _pieces(mesh)
     number = len(pieces.area)
-    corners = [mesh.vertices[mesh.faces[pieces.of_face == k].ravel()] for k in range(number)]
-    low, high = (np.array([bound(c, axis=0) for c in corners]) for bound in (np.min, np.max))
-    margin = APART * float(np.ptp(mesh.vertices, axis=0).max())
-    near = ((low[:, None] <= high[None] + margin) & (low[None] <= high[:, None] + margin)).all(axis=2)
+    if number > MOST_PIECES:
+        return np.zeros(len(mesh.faces), dtype=int), np.ones(1)
+    low, high = pieces.low, pieces.high + APART * float(np.ptp(mesh.vertices, axis=0).max())
+    near = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
     body = trimesh.graph.connected_component_labels(np.argwhere(near), node_count=number)
-    merged = [np.concatenate([corners[k] for k in np.flatnonzero(body == b)]) for b in range(body.max() + 1)]
-    return body[pieces.of_face], np.array([hull_volume(points) for points in merged])
+    of_face = body[pieces.of_face]
+    corners = [mesh.vertices[mesh.faces[of_face == b].ravel()] for b in range(body.max() + 1)]
+    return of_face, np.array([hull_volume(points) for points in corners])
 
 
 def _containers(mesh: Any, pieces: _Pieces) -> dict[int, int]:
     """Of each piece that lies wholly in a closed one: the smallest such one."""
-    order = np.argsort(pieces.of_face, kind="stable")
-    groups = np.split(mesh.faces[order], np.cumsum(np.bincount(pieces.of_face))[:-1])
-    low, high = (
-        np.array([bound(mesh.vertices[faces.ravel()], axis=0) for faces in groups])
-        for bound in (np.min, np.max)
-    )
+    groups, low, high = pieces.faces, pieces.low, pieces.high
     found: dict[int, int] = {}
     for outer in np.argsort(np.abs(pieces.volume))[::-1]:  # smaller ones last: they overrule
         if not pieces.closed[outer]:
