@@ -427,16 +427,3 @@ def test_a_fall_back_is_said_and_done_again(tmp_path: Path, monkeypatch: pytest.
     again = import_meshes([tmp_path / "bracket.stl"], tmp_path, settings)[0]
     assert (again.status, again.model.warnings) == ("imported", ()) and len(again.model.hulls) > 1
     assert import_meshes([tmp_path / "bracket.stl"], tmp_path, settings)[0].status == "cached"
-
-
-def test_a_real_mesh(shared_dir: Path, tmp_path: Path):
-    duck = shared_dir / "objects" / "test" / "duck.stl"
-    if not duck.is_file():
-        pytest.skip(f"no {duck}")
-    result = import_meshes([duck], tmp_path, ImportSettings(d.DecomposeSettings(mcts_iterations=5)))[0]
-    assert result.status == "imported", result.reason
-    model = read_object(Path(result.target))
-    assert model.volume_error < 0.15
-    assert model.licence.startswith("Apache-2.0") and model.split == "test"
-    assert model.longest_side == pytest.approx(0.096, abs=1e-3)
-    assert Path(result.target).stat().st_size < 60_000
