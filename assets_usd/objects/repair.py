@@ -88,8 +88,8 @@ class RepairedMesh:
 def repair_mesh(mesh: Any) -> RepairedMesh:
     """Find the object in a mesh and close it.
 
-    Merges vertices, drops degenerate and duplicate faces, strays and debris, fills small holes, turns the
-    pieces outward and tells cavities from solids.
+    Merges vertices, drops degenerate and duplicate faces, opens seams at which surfaces only touch, drops
+    strays and debris, fills small holes, turns the pieces outward and tells cavities from solids.
 
     Args:
         mesh: A ``trimesh.Trimesh`` in any unit.
@@ -110,7 +110,7 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
         raise MeshError(f"degenerate: all {before} faces have no area")
     if len(mesh.faces) < before:
         notes.append(f"removed {before - len(mesh.faces)} degenerate or duplicate faces")
-    mesh = _largest_body(_without_strays(mesh, notes, warnings), warnings)
+    mesh = _largest_body(_without_strays(_opened_seams(mesh), notes, warnings), warnings)
     sides = sides_along_axes(mesh.vertices)
     if sides.min() < SLIVER_THICKNESS * sides.max():
         raise MeshError(
@@ -136,6 +136,33 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
         tuple(notes),
         tuple(warnings),
     )
+
+
+def _opened_seams(mesh: Any) -> Any:
+    """The mesh with edges of more than two faces opened: each sheet of faces gets vertices of its own.
+
+    Surfaces that only touch along an edge are closed, yet no manifold; apart from each other they are.
+    """
+    import trimesh
+
+    count = np.bincount(mesh.edges_unique_inverse)
+    if count.max() <= 2:
+        return mesh
+    # Corners of faces that meet in a plain edge share a vertex, others do not.
+    faces = mesh.faces
+    edges = mesh.edges_unique_inverse.reshape(-1, 3)  # (a, b), (b, c), (c, a) of every face
+    order = np.argsort(edges.ravel(), kind="stable")
+    plain = order[count[edges.ravel()[order]] == 2].reshape(-1, 2)
+    face, start = np.divmod(plain, 3)
+    links = []
+    for first in (start, (start + 1) % 3):  # the edge's ends on one face, and the same on the other
+        vertex = faces[face[:, 0], first[:, 0]]
+        other = np.argmax(faces[face[:, 1]] == vertex[:, None], axis=1)
+        links.append(np.stack([3 * face[:, 0] + first[:, 0], 3 * face[:, 1] + other]))
+    corner = trimesh.graph.connected_component_labels(np.concatenate(links, axis=1).T, node_count=faces.size)
+    vertices = np.zeros((corner.max() + 1, 3))
+    vertices[corner] = mesh.vertices[faces.ravel()]
+    return trimesh.Trimesh(vertices, corner.reshape(-1, 3), process=False)
 
 
 @dataclass(frozen=True)
@@ -168,10 +195,8 @@ def _pieces(mesh: Any) -> _Pieces:
     of_face = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
     number = of_face.max() + 1
     area = np.bincount(of_face, triangle_areas(mesh.vertices, mesh.faces), number)
-    # An edge where pieces only touch has two faces of each.
-    edge = mesh.edges_unique_inverse * number + of_face[mesh.edges_face]
-    _, index, count = np.unique(edge, return_inverse=True, return_counts=True)
-    closed = np.bincount(of_face[mesh.edges_face], count[index] != 2, number) == 0
+    open_edges = np.bincount(mesh.edges_unique_inverse)[mesh.edges_unique_inverse] != 2
+    closed = np.bincount(of_face[mesh.edges_face], open_edges, number) == 0
     corner = mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0)
     six_volume = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))
     order = np.argsort(of_face, kind="stable")
