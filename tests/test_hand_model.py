@@ -168,8 +168,8 @@ def test_limits_gains_and_masses(hand: HandModel) -> None:
 
 def drawn(hand: HandModel, link: str, prefix: str = "") -> trimesh.Trimesh:
     """The drawn meshes of a link, as one."""
-    parts = []
-    for prim in open_stage(hand.path).GetPrimAtPath(f"/{hand.name}/{link}/visual").GetChildren():
+    stage, parts = open_stage(hand.path), []
+    for prim in stage.GetPrimAtPath(f"/{hand.name}/{link}/visual").GetChildren():
         if prim.GetName().startswith(prefix):
             points = np.array(prim.GetAttribute("points").Get(), dtype=float)
             faces = np.array(prim.GetAttribute("faceVertexIndices").Get()).reshape(-1, 3)
