@@ -315,7 +315,7 @@ def _write_numbers(where: str, joint: Sdf.PrimSpec, group: str, values: Mapping[
             raise HandError(f"{where}: {group} has no parameter {name!r}; one of {', '.join(known)}")
         number, unit = known[name], known[name].parameter.unit
         alone = isinstance(estimate, (int, float))
-        value, *bounds = [float(estimate)] if alone else map(float, estimate)  # type: ignore[arg-type, list-item]
+        value, *bounds = [float(estimate)] if alone else map(float, estimate)  # type: ignore[arg-type]
         checked = _checked(where, number.attribute, number.parameter, value)
         own = number.attribute.startswith(f"{NAMESPACE}:")
         kind = Sdf.ValueTypeNames.Double if own else Sdf.ValueTypeNames.Float

@@ -54,7 +54,7 @@ def in_child(
     Raises:
         ChildError: It ended without an answer, or hangs.
     """
-    context = multiprocessing.get_context(start)
+    context: Any = multiprocessing.get_context(start)
     receiver, sender = context.Pipe(duplex=False)
     child = context.Process(target=_work, args=(sender, os.getpid(), start == "spawn", work, *arguments))
     child.start()

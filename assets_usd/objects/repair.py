@@ -121,7 +121,7 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
         notes.append("fixed winding")
         trimesh.repair.fix_winding(mesh)
     mesh = _filled_holes(mesh, notes)
-    mesh, *cavities = _turned_outward(mesh, warnings)
+    mesh, cavity_vertices, cavity_faces = _turned_outward(mesh, warnings)
     pieces = convex_pieces(mesh)
     closed = bool(mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0.0)
     if pieces:
@@ -132,7 +132,8 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
         closed,
         closed and mesh.body_count == 1,
         pieces,
-        *cavities,
+        cavity_vertices,
+        cavity_faces,
         tuple(notes),
         tuple(warnings),
     )

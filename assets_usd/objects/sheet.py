@@ -49,7 +49,7 @@ def _draw(axes: Any, parts: Sequence[tuple[np.ndarray, np.ndarray]], colours: Se
     order = np.argsort(corners[:, :, 2].mean(axis=1))
     shaded = (colour * light[:, None])[order]
     axes.add_collection(
-        PolyCollection(corners[order, :, :2], facecolors=shaded, edgecolors=shaded, linewidths=0.3)
+        PolyCollection(list(corners[order, :, :2]), facecolors=shaded, edgecolors=shaded, linewidths=0.3)
     )
     low, high = corners[:, :, :2].min(axis=(0, 1)), corners[:, :, :2].max(axis=(0, 1))
     middle, half = (low + high) / 2, 0.54 * (high - low).max()
@@ -72,7 +72,7 @@ def _sheet(models: Sequence[ObjectModel], columns: int, *, parts: bool, title: s
         meshes = [([(model.vertices, model.faces)], [MESH_COLOUR]), (hulls, hues)]
         for k, (drawn, colours) in enumerate(meshes[:wide]):
             place = (left + k * TILE_IN, top - TILE_IN, TILE_IN, TILE_IN)
-            axes = figure.add_axes(np.divide(place, (*size, *size)))
+            axes = figure.add_axes(tuple(np.divide(place, (*size, *size))))
             axes.set_axis_off()
             _draw(axes, drawn, colours)
         lines = [model.name]
