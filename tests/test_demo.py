@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 import tyro
-from test_evaluate_report import PNG
 from test_evaluate_trace import compared
 from test_gap_report import sample_curves, sample_report
+from test_page import PNG
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.loop.log import LogWriter
-from vd.evaluate.comparison import Comparison
+from vd.evaluate.result import Result
 from vd.gap.report import write_report
 from vd.hand_log import JOINT_CHANNELS
 from vd.train import demo
@@ -33,8 +33,8 @@ def option(line: list[str], flag: str) -> Path:
 
 
 def leave_evaluation(line: list[str]) -> None:
-    rows, prediction = compared()
-    Comparison(tuple(rows), (prediction,)).write(option(line, "--out") / "eval.json")
+    rows = compared()
+    Result(tuple(rows)).write(option(line, "--out") / "eval.json")
 
 
 def leave_report(line: list[str]) -> None:
@@ -245,4 +245,4 @@ def test_what_an_earlier_demo_left_is_replaced(played, tmp_path):
         assert (tmp_path / "camera" / "eval.json").is_file()
     assert main(["--out", str(tmp_path), "--quick"]) == 0
     assert not (tmp_path / "camera" / "old.txt").exists()
-    assert Comparison.read(tmp_path / "camera" / "eval.json").rows
+    assert Result.read(tmp_path / "camera" / "eval.json").rows

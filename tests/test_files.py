@@ -51,7 +51,6 @@ WRITERS = {
     "page.html": _text,
     "model.pt": _checkpoint,
     "cache.npz": _arrays,
-    "film.gif": _picture,
     "film.mp4": _picture,
     "cube.usda": _object,
 }
@@ -120,8 +119,8 @@ def commands(taken: str) -> dict[str, list[str]]:
         "vd-train   ": ["average", "a", "b", "--out", f"{taken}/x.pt"],
         "vd-train    ": ["bundle", "dclaw4-cube", f"{taken}/x"],
         "vd-train     ": ["tracker", "dclaw4-table", "--objects", "cube", "--out", f"{taken}/x.pt"],
-        "vd-eval": ["--agent", "zero", "--out", taken],
-        "vd-play": ["--agent", "zero", "--video", f"{taken}/x.mp4"],
+        "vd-eval": ["zero", "--out", taken],
+        "vd-play": ["zero", "--video", f"{taken}/x.mp4"],
         "vd-gap": ["run", "recording", "--out", taken],
         "vd-gap ": ["identify", "recording", "--out", f"{taken}/x.usda"],
         "vd-deploy": ["record", "--twin", "--hand", "dclaw3", "--out", taken],

@@ -180,7 +180,6 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.second_view import with_second_view
     from vd.sim.cfg import coarser
     from vd.train.runner import TeacherRunner
     from vd.train.vec_env import ReorientVecEnv
@@ -190,12 +189,9 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     # TF32 halves the update on a GPU; the simulator is not touched by it.
     torch.set_float32_matmul_precision("high")
     physics = coarser(cfg.env.sim) if cfg.run.coarse_physics else cfg.env.sim
-    seen = with_second_view(cfg.env.observation) if cfg.second_view else cfg.env.observation
-    simulation = ReorientEnv(
-        replace(cfg.env, seed=cfg.env.seed + rank, sim=physics, observation=seen), device
-    )
+    simulation = ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank, sim=physics), device)
     simulation.dump_dir = cfg.run.out
-    env = ReorientVecEnv(simulation, second_view=cfg.second_view)
+    env = ReorientVecEnv(simulation)
     deadline = cfg.run.deadline(started)
     runner = TeacherRunner(
         env, cfg.ppo, cfg.policy, cfg.run, task=to_dict(cfg.env), device=device, deadline=deadline

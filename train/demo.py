@@ -212,15 +212,14 @@ def turn_unseen(demo: Demo) -> dict[str, Any]:
         ["vd-eval", *options, "--episodes", str(EPISODES), "--out", demo.folder()],
         ["vd-play", *options, "--cells", "4", "--seconds", str(FILM_S), "--video", film],
     )
-    from vd.evaluate.comparison import Comparison
-    from vd.evaluate.comparison_page import percent
+    from vd.evaluate.page import percent
+    from vd.evaluate.result import Result
 
-    rows = Comparison.read(demo.folder("eval.json")).rows
-    result = next(row.result for row in rows if row.stopped_by == "prediction")
+    row = next(row for row in Result.read(demo.folder("eval.json")).rows if row.headline)
     tolerance = str(PAPER.success.rotation_rad)
     lines = [
-        (one.name, one.episodes, percent(one.success[tolerance]), percent(one.drop_rate))
-        for one in (*result.per_object, result.overall)
+        (one.name, one.episodes, percent(one.success[tolerance]), percent(one.outcomes["object falls"]))
+        for one in (*row.per_object, row.overall)
     ]
     return {
         "policy": CAMERA_POLICY,

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from vd.config import Dropped
 from vd.envs.cfg import (
     CurriculumCfg,
     GoalCfg,
@@ -31,7 +32,7 @@ TRAINING_SET = ("procedural-150-seed0",)
 class TeacherCfg:
     """Train the teacher: PPO on the simulator's state."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None}
+    RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None, "second_view": Dropped(False)}
     preset: PresetName = "paper"
     """Settings to start from; every other flag overrides one of them. By default what learns on this
     machine."""
@@ -46,10 +47,6 @@ class TeacherCfg:
     init_stage: tuple[float, float] | None = None
     """Difficulty and tightness of the curriculum at which a run with --init begins. None: those of what it
     begins from; 1 and 1 for a policy that does not say, which is the task as configured."""
-    second_view: bool = False
-    """Look again at goals that are not reached in 3 s, once a second, in a view that is drawn, of those that
-    vd-eval --second-view chooses from: more is learned there of what is stuck. For policies that see their
-    goals in views (--env.observation.view goal or mirrored)."""
     smoke: bool = False
     """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute. It learns nothing,
     and keeps nothing unless --out is given."""

@@ -31,6 +31,11 @@ RENAMED = {
     "--num-worlds": "--num-envs",
 }
 """Flags of earlier versions, and what they are called in all commands."""
+GONE = {
+    "--agent": "name zero or random in place of a policy",
+    "--second-view": "symmetry-view selection gained too little (docs/lessons.md)",
+}
+"""Flags of earlier versions that are no more, and what to do, or why."""
 
 P = ParamSpec("P")
 
@@ -82,9 +87,10 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
 
 
 def _renamed(arguments: Sequence[str]) -> str:
-    """What flags of earlier versions are called now; empty without such flags."""
+    """What became of flags of earlier versions; empty without such flags."""
     flags = [str(argument).partition("=")[0].replace("_", "-") for argument in arguments]
-    return ", ".join(f"{flag} is {RENAMED[flag]} now" for flag in flags if flag in RENAMED)
+    words = [f"{flag} is {RENAMED[flag]} now" for flag in flags if flag in RENAMED]
+    return ", ".join(words + [f"{flag} is no more: {GONE[flag]}" for flag in flags if flag in GONE])
 
 
 def _status(status: Any) -> Any:

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from vd.assets_usd.hand_data import HandModel
-from vd.envs.cfg import ObservationCfg, View
+from vd.envs.cfg import ObservationCfg
 from vd.envs.view_tables import ViewTables, view_tables
 from vd.kernels.task.observations import JOINTS_PER_FINGER, teacher_observation_slices
 
@@ -31,8 +31,6 @@ class ViewMaps(nn.Module):
         values: O.
         num_actions: D.
 
-    Attributes:
-        first: Views that :meth:`choose` chooses from, the first ones.
     """
 
     source: torch.Tensor
@@ -44,7 +42,6 @@ class ViewMaps(nn.Module):
 
     def __init__(self, views: int, values: int, num_actions: int) -> None:
         super().__init__()
-        self.first = views
         self.register_buffer("source", torch.zeros((views, values, TERMS), dtype=torch.long))
         self.register_buffer("factor", torch.zeros((views, values, TERMS)))
         self.register_buffer("offset", torch.zeros((views, values)))
@@ -57,25 +54,18 @@ class ViewMaps(nn.Module):
     def __len__(self) -> int:
         return len(self.sector)
 
-    @property
-    def fingers(self) -> int:
-        """Fingers of the hand: as many as there are views without those in the mirror."""
-        return self.joints.shape[1] // JOINTS_PER_FINGER
-
     @classmethod
-    def of(cls, hand: HandModel, seen: ObservationCfg, view: View) -> "ViewMaps":
-        """The views of a hand: those of ``view``, of which those of ``seen.view`` are chosen from.
+    def of(cls, hand: HandModel, seen: ObservationCfg) -> "ViewMaps":
+        """The views in which a hand's teacher sees its goals.
 
         Args:
             hand: The hand.
             seen: What its teacher observes.
-            view: What goals may be seen in.
         """
-        tables = view_tables(hand, seen, view)
+        tables = view_tables(hand, seen, seen.view)
         views, values = tables.offset.shape
         maps = cls(views, values, hand.num_joints)
         maps.adopt(tables)
-        maps.first = seen.views(hand.num_fingers)
         return maps
 
     def adopt(self, tables: ViewTables) -> None:
@@ -86,14 +76,10 @@ class ViewMaps(nn.Module):
 
     def choose(self, observation: torch.Tensor) -> torch.Tensor:
         """Views [..] of observations [.., O]: the axis of the wanted rotation is in their sector."""
-        return self.nearness(observation)[..., : self.first].argmax(dim=-1)
-
-    def nearness(self, observation: torch.Tensor) -> torch.Tensor:
-        """How near to the middle of each view's sector that axis is [.., F], the larger the nearer."""
         turn = observation[..., self._turn]
         # Observed is the object from the goal; wanted is the other way, by less than half a turn.
         axis = torch.where(turn[..., 3:] < 0.0, turn[..., :3], -turn[..., :3])
-        return axis @ self.sector.T
+        return (axis @ self.sector.T).argmax(dim=-1)
 
     def take(self, observation: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
         """Observations [.., O] as views [..] show them."""

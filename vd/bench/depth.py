@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
-from vd.bench.sim import captured, own_kernel_names, seconds_per_call
+from vd.bench.sim import captured, seconds_per_call
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg, Method
 from vd.sensors.depth_camera import DepthCamera
@@ -50,22 +50,15 @@ class DepthRow:
     height: int
     """Pixels."""
     newton: float
-    """Newton's ``SensorCamera``, forward depth only, in the faster of two orders of traversal."""
-    newton_order: str
-    """That order."""
-    newton_refit_share: float
-    """Share of its time that refitting its hierarchies takes."""
+    """Newton's ``SensorCamera``, forward depth only."""
     images: dict[Method, float] = field(default_factory=dict)
     """Ours, depth images alone, by method."""
-    clouds: dict[str, float] = field(default_factory=dict)
-    """Ours with a cloud of each image, by method (and block of pixels a ray)."""
+    clouds: dict[Method, float] = field(default_factory=dict)
+    """Ours with a cloud of each image, by method."""
     with_sensor: float = 0.0
     """Ours with a cloud and every error of the sensor, by the faster method."""
     images_over_newton: float = 0.0
     """The faster of ours over Newton's, images alone."""
-    kernels_ms: dict[str, float] = field(default_factory=dict)
-    """Device time of each kernel for one image in every world [ms], both methods with clouds and the sensor's
-    errors; empty on the CPU."""
     points: float = 0.0
     """Points of a cloud, mean over environments."""
     different: float = 0.0
@@ -114,13 +107,12 @@ def pose(scene: Scene, state: Any, generator: np.random.Generator) -> None:
 class NewtonCamera:
     """Newton's ray-traced camera with the hand's viewpoint in every world, forward depth only."""
 
-    def __init__(self, scene: Scene, camera_q: np.ndarray, order: str = "PIXEL_PRIORITY"):
+    def __init__(self, scene: Scene, camera_q: np.ndarray):
         """Prepare rays and image.
 
         Args:
             scene: Environments, built with visual shapes.
             camera_q: Optical frames in the world frame, shape [N, 7].
-            order: Name of a ``SensorCamera.RenderOrder``.
         """
         self.model, camera = scene.model, scene.hand.camera
         device = self.model.device
@@ -130,7 +122,6 @@ class NewtonCamera:
         poses = np.concatenate([camera_q[:, :3], turned], axis=1).astype(np.float32)
         self.poses = wp.array(poses, dtype=wp.transformf, device=device)
         self.depth = self.sensor.allocate_image_depth_forward(len(poses), camera.width, camera.height)
-        self.config = SensorCamera.RenderConfig(render_order=SensorCamera.RenderOrder[order])
 
     def refit(self, state: Any) -> None:
         """Follow the bodies with the hierarchies."""
@@ -138,9 +129,7 @@ class NewtonCamera:
 
     def render(self, state: Any) -> None:
         """Draw, without a refit."""
-        self.sensor.update(
-            state, self.poses, self.rays, forward_depth_image=self.depth, render_config=self.config
-        )
+        self.sensor.update(state, self.poses, self.rays, forward_depth_image=self.depth)
 
 
 def newton_rays(camera: CameraModel, device: str) -> wp.array:
@@ -182,71 +171,39 @@ def measure(
         depths[method], camera_q = ours.depth.numpy().copy(), ours.camera_q.numpy()
     best = max(images, key=lambda method: images[method])
 
-    clouds: dict[str, float] = {}
+    clouds: dict[Method, float] = {}
     points = 0.0
-    variants: tuple[tuple[Method, int], ...] = (("rays", 1), ("rays", 2), ("rays", 3), ("raster", 1))
-    for method, block in variants:
-        ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method, block=block))
+    for method in methods:
+        ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method))
         ours.capture()
-        clouds[method if block == 1 else f"{method}/{block}"] = rate(
-            envs, captured(ours.capture, device), device
-        )
-        if block == 1:
-            points = float(ours.count.numpy().mean())
+        clouds[method] = rate(envs, captured(ours.capture, device), device)
+        points = float(ours.count.numpy().mean())
     ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=best, sensor=DepthSensorCfg.realistic()))
     ours.capture()
     with_sensor = rate(envs, captured(ours.capture, device), device)
-    kernels = {**_kernel_times(scene, body_q, "rays"), **_kernel_times(scene, body_q, "raster")}
     del ours
 
-    newton_rates: dict[str, float] = {}
-    reference = np.empty(0)
-    refit_s = 0.0
-    for order in ("PIXEL_PRIORITY", "TILED"):
-        theirs = NewtonCamera(scene, camera_q, order)
+    theirs = NewtonCamera(scene, camera_q)
 
-        def frame(theirs: NewtonCamera = theirs) -> None:
-            theirs.refit(state)
-            theirs.render(state)
+    def frame() -> None:
+        theirs.refit(state)
+        theirs.render(state)
 
-        newton_rates[order] = rate(envs, frame, device)
-        refit_s = 1.0 / rate(1, lambda theirs=theirs: theirs.refit(state), device)
-        reference = theirs.depth.numpy().copy()
-    order = max(newton_rates, key=lambda name: newton_rates[name])
-    fastest = newton_rates[order]
+    newton_rate = rate(envs, frame, device)
+    reference = theirs.depth.numpy()
     return DepthRow(
         envs=envs,
         width=camera.width,
         height=camera.height,
-        newton=fastest,
-        newton_order=order,
-        newton_refit_share=refit_s * fastest / envs,
+        newton=newton_rate,
         images=images,
         clouds=clouds,
         with_sensor=with_sensor,
-        images_over_newton=images[best] / fastest,
-        kernels_ms=kernels,
+        images_over_newton=images[best] / newton_rate,
         points=points,
         different=_different(np.where(reference > camera.far, 0.0, reference), depths["rays"]),
         methods_different=_different(depths["raster"], depths["rays"]),
     )
-
-
-def _kernel_times(scene: Scene, body_q: wp.array, method: Method) -> dict[str, float]:
-    """Device time of each kernel of a capture with all errors of the sensor [ms]; empty on the CPU."""
-    camera = DepthCamera.of_scene(
-        scene, body_q, DepthCameraCfg(method=method, sensor=DepthSensorCfg.realistic())
-    )
-    camera.capture()
-    with wp.ScopedTimer("capture", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True) as timer:
-        camera.capture()
-    # Warp reports "forward kernel NAME_HASH".
-    times = [(result.name.split()[-1], float(result.elapsed)) for result in timer.timing_results]
-    return {
-        kernel: round(sum(elapsed for name, elapsed in times if name.startswith(f"{kernel}_")), 4)
-        for kernel in sorted(own_kernel_names())
-        if any(name.startswith(f"{kernel}_") for name, _ in times)
-    }
 
 
 def _different(a: np.ndarray, b: np.ndarray) -> float:

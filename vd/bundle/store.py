@@ -138,8 +138,7 @@ def write_tracking(folder: Path, policy: "TrackingPolicy", hand: HandModel) -> C
         software=installed_versions(_PACKAGES),
     )
     weights = {f"actor.{name}": value for name, value in teacher.weights.items()}
-    if teacher.has_critic:
-        weights |= {f"critic.{name}": value for name, value in teacher.critic_weights.items()}
+    weights |= {f"critic.{name}": value for name, value in teacher.critic_weights.items()}
     _write(folder, contract, weights, teacher_golden(teacher))
     return contract
 

@@ -139,7 +139,6 @@ class StudentActor:
         env: Any,
         student: SavedStudent,
         *,
-        rendered: bool | None = None,
         goals: Goals = "mesh",
         sensor_errors: bool = False,
         seed: int = 0,
@@ -149,7 +148,6 @@ class StudentActor:
         Args:
             env: The environment.
             student: The student.
-            rendered: See by a depth camera, or complete clouds; as its stage was trained by default.
             goals: What it knows shapes and goals by (:mod:`vd.evaluate.scanned`).
             sensor_errors: Give its camera the errors of a real one, in place of those of its training.
             seed: Of the errors of camera and scans.
@@ -166,7 +164,7 @@ class StudentActor:
                 f"{env.num_actions}; use the hand it was trained for"
             )
         self.env, self.num_actions, self._student = env, spec.num_actions, student.network
-        self.rendered = spec.stage == RENDERED if rendered is None else rendered
+        self.rendered = spec.stage == RENDERED
         depth = from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
         if sensor_errors:
             depth = depth.with_errors()
