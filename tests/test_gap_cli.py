@@ -269,7 +269,7 @@ def test_effects_of_the_layer_that_was_started_from_stay(recording, tmp_path):
 def test_layers_that_are_none_are_named(recording, tmp_path):
     report, _ = servo_report(recording)
     layer = tmp_path / "identified.usda"
-    with pytest.raises(HandError, match="no such layer"):
+    with pytest.raises(HandError, match="no such hand layer"):
         read_bare_layer(layer, (JOINT,))
     layer.write_text("not USD")
     with pytest.raises(HandError, match=re.escape(str(layer))):
