@@ -36,9 +36,8 @@ TASK = ReorientCfg(
 )
 
 
-def make_student(stage=1, goal="merged", num_actions=9, cfg=TINY):
+def make_student(stage=1, num_actions=9, cfg=TINY):
     torch.manual_seed(stage)
-    cfg = replace(cfg, goal=goal)
     spec = StudentSpec(network=cfg, num_actions=num_actions, stage=stage, teacher="dclaw3-table")
     network = Student(cfg, num_actions).eval().requires_grad_(False)
     return SavedStudent(spec, network, to_dict(TASK), to_dict(DepthCameraCfg(points=300)), 1, 100)
@@ -75,18 +74,18 @@ def test_worlds_are_seen_in_parts_without_a_difference(env, monkeypatch):
     for clouds in (256, 2):
         monkeypatch.setattr(module, "CLOUDS", clouds)
         env.load_state_dict(state)
-        actor = StudentActor(env, make_student(goal="separate"))
+        actor = StudentActor(env, make_student())
         for _ in range(3):
             action = actor.act(wp.to_torch(env.observation))
             env.step(wp.from_torch(action.contiguous()))
         found.append(torch.cat([action, actor.predicted[:, None]], dim=1))
     torch.testing.assert_close(*found, atol=1e-4, rtol=0.0)
     env.load_state_dict(state)
-    actor = StudentActor(env, make_student(goal="separate"))
+    actor = StudentActor(env, make_student())
     actor.active = torch.tensor([True, False, True])
     some = actor.act(wp.to_torch(env.observation))
     env.load_state_dict(state)
-    whole = StudentActor(env, make_student(goal="separate")).act(wp.to_torch(env.observation))
+    whole = StudentActor(env, make_student()).act(wp.to_torch(env.observation))
     torch.testing.assert_close(some[[0, 2]], whole[[0, 2]], atol=1e-4, rtol=0.0)
     assert not some[1].any()
     assert (actor.predicted > 0.0).any() or (actor.predicted < 0.0).any()

@@ -78,11 +78,13 @@ def test_an_error_of_the_writer_itself_stays_what_it_is(tmp_path):
 
 def test_a_bundle_that_does_not_fit_is_not_there(tmp_path):
     from vd.assets_usd.hands import load_hand
-    from vd.bundle.write import write_bundle
+    from vd.bundle.store import write_bundle
+    from vd.evaluate.agents import open_policy
 
-    load_hand("dclaw4")  # authored on first use
-    with small_files(LIMIT), pytest.raises(OutputError, match=r"cannot write .*first: the file would be"):
-        write_bundle("dclaw4-cube", tmp_path / "first")
+    load_hand("dclaw3")  # authored on first use
+    policy = open_policy("dclaw3-table", "cpu")
+    with small_files(LIMIT), pytest.raises(OutputError, match=r"cannot write .*first: .*the file would be"):
+        write_bundle(policy, tmp_path / "first")
     assert not list(tmp_path.iterdir())
 
 

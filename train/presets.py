@@ -42,7 +42,7 @@ class TeacherCfg:
     init: str | None = None
     """Begin a new run with networks, curriculum and counters of another: the name of an installed policy
     (dclaw3-table), a policy, a checkpoint or a run's folder. Of a policy without a critic or an optimiser the
-    critic learns alone first (--ppo.critic-warmup-iterations). Without --preset its task and its networks are
+    critic learns alone first. Without --preset its task and its networks are
     this run's defaults. It may have observed less: what is new starts without effect."""
     init_stage: tuple[float, float] | None = None
     """Difficulty and tightness of the curriculum at which a run with --init begins. None: those of what it
@@ -194,18 +194,7 @@ def cpu_demo() -> TeacherCfg:
         preset="cpu-demo",
         run=RunCfg(out=Path("runs/cpu-demo"), device="cpu", max_steps=200_000, save_every=10),
         # Many optimiser steps per sample: samples are what a CPU is short of.
-        ppo=PpoCfg(
-            rollout_steps=8,
-            minibatch_size=256,
-            epochs=5,
-            actor_learning_rate=1e-3,
-            schedule="adaptive",
-            desired_kl=0.02,
-            clip=0.2,
-            gamma=0.97,
-            value_coefficient=1.0,
-            entropy_coefficient=1e-3,
-        ),
+        ppo=replace(SHORT_ROLLOUTS, minibatch_size=256, actor_learning_rate=1e-3),
         policy=PolicyCfg(
             hidden=(256, 128, 64),
             distribution="state-dependent",

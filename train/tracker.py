@@ -72,10 +72,10 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     from vd.config import to_dict
     from vd.tracking.policy import tracking_export
     from vd.train.checkpoint import save_checkpoint
-    from vd.train.progress import waiting
 
-    with waiting("running the episodes", not cfg.json):
-        policy, found, precise = make_tracker(cfg)
+    if not cfg.json:
+        print("running the episodes ...", flush=True)
+    policy, found, precise = make_tracker(cfg)
     save_checkpoint(cfg.out, tracking_export(policy))
     if cfg.json:
         print(json.dumps(to_dict(found) | {"precise": precise and to_dict(precise)}, indent=1))

@@ -226,6 +226,15 @@ def _tensors_finite(value: Any) -> Iterator[bool]:
             yield from _tensors_finite(item)
 
 
+def holds(path: Path, part: str) -> bool:
+    """Whether a file of torch is a dictionary with such a key, as far as it can be read."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception:  # whoever reads it says what is wrong with it
+        return False
+    return isinstance(state, dict) and part in state
+
+
 def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:
     """Rebuild the actor from a checkpoint of ``vd-train`` or from an exported ``policy.pt``.
 

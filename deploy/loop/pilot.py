@@ -117,8 +117,8 @@ class StudentPilot:
         """Mean action and predicted distance."""
         with torch.inference_mode():
             seen = self.frame(sensed)
-            sites = self.sight.sites(seen)
-            output = self._network.act(sites[0], self._network.senses(seen), self._hidden, *sites[1:])
+            known = self._network.proprioception(seen)
+            output = self._network.act(self.sight.sites(seen), known, self._hidden)
         self._hidden = output.hidden
         return Decision(output.mean[0].numpy().copy(), float(output.distance[0, -1]))
 

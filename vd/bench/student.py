@@ -91,9 +91,9 @@ class StudentStep:
         )
         size = self._clouds.item.start + self._camera.cloud.points.shape[1]
         self._points = wp.empty((1, size), dtype=wp.vec3, device="cpu")
-        self._marks = self._clouds.ends if "marks" in net.cfg.encoder.inputs else ()
+        self._marks = self._clouds.ends if net.cfg.marked else ()
         self._voxelise = Voxeliser(net.cfg.voxel_m)
-        self._senses, self._hidden = torch.zeros(1, net.num_senses), net.initial_hidden(1)
+        self._known, self._hidden = torch.zeros(1, net.num_proprioception), net.initial_hidden(1)
         self.parts: Parts = {"points": self._see, "voxels": self._cells, "maps and network": self._act}
 
     def _see(self) -> None:
@@ -106,7 +106,7 @@ class StudentStep:
         self._sites = self._voxelise(self._points, ends=self._marks)
 
     def _act(self) -> None:
-        self._hidden = self._net.act(self._sites, self._senses, self._hidden).hidden
+        self._hidden = self._net.act(self._sites, self._known, self._hidden).hidden
 
 
 class TrackingStep:

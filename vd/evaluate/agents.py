@@ -28,12 +28,13 @@ BUILT_IN = ("zero", "random")
 SHIPPED_POLICIES = {path.stem: path for path in sorted((Path(__file__).parents[1] / "policies").glob("*.pt"))}
 """Trained policies that are installed with the package, by name: ``<hand>-<task>``."""
 
-RENAMED = {
+REPLACED = {
     "dclaw3-student": "dclaw3-tracking",
     "dclaw4-table-student": "dclaw4-tracking",
     "dclaw4-student": "dclaw4-air-tracking",
+    "dclaw3-procedural": "dclaw3-table",
 }
-"""Former names of installed policies, and what they are called now."""
+"""Names of policies that were installed once, and what to take instead."""
 
 DEFAULT_POLICY = "dclaw4-cube"
 DEFAULT_HAND = "dclaw4"
@@ -55,10 +56,10 @@ def find_policy(name: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: There is none.
-        ValueError: An installed policy has another name now.
+        ValueError: A policy of that name was installed once.
     """
-    if str(name) in RENAMED:
-        raise ValueError(f"the policy {name} is called {RENAMED[str(name)]} now: it tracks a known shape")
+    if str(name) in REPLACED:
+        raise ValueError(f"the policy {name} is not installed any more; take {REPLACED[str(name)]}")
     if str(name) in SHIPPED_POLICIES:
         return SHIPPED_POLICIES[str(name)]
     path = Path(name)
@@ -127,7 +128,7 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | Track
     if is_bundle(path):
         from vd.bundle.store import read_bundle
 
-        return read_bundle(path, device).policy
+        return read_bundle(path, device)
     if is_tracking(path):
         return load_tracking(path, device)
     return load_student(path, device) if is_student(path) else load_policy(path, device)

@@ -101,7 +101,7 @@ class StudentView:
 
     def sites(
         self, frame: Mapping[str, torch.Tensor], envs: torch.Tensor | None = None, *, augment: bool
-    ) -> tuple[Sites, ...]:
+    ) -> Sites:
         """Voxels of frames (:meth:`vd.vision.sight.Sight.sites`)."""
         return self.sight.sites(frame, envs, augment=augment)
 
@@ -189,13 +189,13 @@ class StudentActor:
         """
         frame = self._view.frame()
         self._hidden.masked_fill_((self._steps == 0)[:, None], 0.0)
-        senses = self._student.senses(frame)
+        known = self._student.proprioception(frame)
         mean = frame["action"].new_zeros(frame["action"].shape)
         with torch.no_grad():
             for rows in self.active.nonzero().flatten().split(CLOUDS):
                 seen = {key: value[rows] for key, value in frame.items()}
                 sites = self._view.sites(seen, rows, augment=False)
-                output = self._student.act(sites[0], senses[rows], self._hidden[rows], *sites[1:])
+                output = self._student.act(sites, known[rows], self._hidden[rows])
                 self._hidden[rows] = output.hidden
                 self.predicted[rows] = output.distance[:, -1]
                 mean[rows] = output.mean

@@ -79,7 +79,7 @@ class Tracker:
         self._teacher = teacher.network.to(place)
         self._maps: ViewMaps | None = None
         if seen.view != "world":
-            self._maps = ViewMaps.of(hand, seen).to(place)
+            self._maps = ViewMaps(hand, seen, place)
 
     def step(self, senses: Senses) -> Decision:
         """One control step: see, find, observe, choose a view, act."""
