@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -223,12 +222,12 @@ class ReplayCommand:
 class GapCommand:
     """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
 
-    One result file per case: run it again to go on, give --shard on each machine, then --merge and --collect
-    for the figures. rows.csv has all results in little space, to go on from elsewhere or later.
+    One result file per case: run it again to go on. Give --shard on each machine, bring the files together,
+    and --collect makes the figures.
     """
 
     out: Path = Path("runs/gap-battery")
-    """Folder of the results, of all in one table (rows.csv), figures (summary.json) and tables."""
+    """Folder of the results, their figures (summary.json) and tables (summary.md)."""
     model: str = "dclaw3"
     """dclaw3 or dclaw4 (one finger), or servo or pendulum, which are quick."""
     kinds: tuple[str, ...] = ("single", "none", "pair", "outside")
@@ -245,20 +244,12 @@ class GapCommand:
     """Recordings with nothing hidden, or only other stiffness, damping and mass."""
     pairs: int | None = None
     """Pairs of effects, drawn at random; all by default."""
-    pair_size: int = 2
-    """Size of both effects of a pair."""
     shard: str = "1/1"
     """Part i/n of the cases, for n machines."""
-    backwards: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Begin with the last case: two machines meet wherever they are when the time is over."""
-    merge: tuple[Path, ...] = ()
-    """Results from elsewhere, folders or their rows.csv: their cases are not run again."""
     jobs: int = 1
     """Cases at a time, one process and one thread each."""
     limit_s: float = 1800.0
     """Longest time of a case [s]; one that takes longer has failed."""
-    stop_after_s: float = math.inf
-    """Time [s] after which to end, with the figures of what is done; run it again to go on."""
     device: str = "cpu"
     """Warp device."""
     collect: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -268,10 +259,9 @@ class GapCommand:
 
     def run(self) -> int:
         """Run the cases, then write and print the tables."""
-        from vd.bench.gap import battery, collect, parse_shard, run_battery, take_over
-        from vd.bench.gap_rows import write_rows
+        from vd.bench.gap import battery, collect, parse_shard, run_battery
         from vd.bench.gap_score import markdown, summary
-        from vd.files import make_folder, write_json, write_text
+        from vd.files import write_json, write_text
 
         cases = battery(
             self.model,
@@ -282,11 +272,7 @@ class GapCommand:
             first_seed=self.first_seed,
             nothing=self.nothing,
             pairs=self.pairs,
-            pair_size=self.pair_size,
         )
-        if self.merge:
-            make_folder(self.out)
-            print(f"{take_over(self.merge, self.out)} results taken over")
         if not self.collect:
             device = resolve_device(self.device)
             shard = parse_shard(self.shard)
@@ -294,17 +280,14 @@ class GapCommand:
                 cases,
                 self.out,
                 shard=shard,
-                backwards=self.backwards,
                 jobs=max(self.jobs, 1),
                 device=device,
                 keep=self.keep,
                 limit_s=self.limit_s,
-                stop_after_s=self.stop_after_s,
             )
         results = collect(self.out)
         if not results:
             raise ValueError(f"{self.out} holds no results; run the battery without --collect first")
-        write_rows(self.out / "rows.csv", results)
         write_json(self.out / "summary.json", summary(results))
         write_text(self.out / "summary.md", markdown(results))
         print(markdown(results))

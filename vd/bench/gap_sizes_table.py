@@ -1,4 +1,4 @@
-"""Strengths measured by ``python -m vd.gap.sizes``, as multiples of an effect's typical parameters."""
+"""Strengths measured by ``python -m vd.bench.gap_sizes``, as multiples of an effect's typical parameters."""
 
 SCALES: dict[str, dict[str, tuple[float, ...]]] = {
     "servo": {

@@ -1,24 +1,23 @@
 """Random delays as the cause of what a search leaves, and the search for what there is beside them.
 
-No single prediction shows them (:mod:`vd.gap.jitter`). So the same search is made once more through what they
-do to the samples (:mod:`vd.gap.veil`); they and what is found beside them are looked for in turn.
+No single prediction shows them (:mod:`vd.gap.jitter`). So the same search is made once more with samples
+weighted by what delays do (:mod:`vd.gap.sample_weighting`); they and what is found beside them are looked for
+in turn.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vd.gap.candidates import BETTER, FULL_ITERATIONS, SCREEN_ITERATIONS, Call
 from vd.gap.explanation import Accepted, Explanation, Trial
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import NO_GAP, RANDOM, REPEATABLE
-from vd.gap.veil import Veil
+from vd.gap.judge import JITTER, NO_GAP, REPEATABLE
+from vd.gap.sample_weighting import SampleWeighting
+from vd.gap.search import Search
 
-if TYPE_CHECKING:
-    from vd.gap.select import Selection
-
-SIGMA, DROP = (f"{RANDOM}.{name}" for name in ("sigma_s", "p_drop"))
+SIGMA, DROP = (f"{JITTER}.{name}" for name in ("sigma_s", "p_drop"))
 FIXED = "command_delay"
 """What is the mean of random delays, too."""
 LATE = (FIXED, "read_delay", "command_filter", "payload_inertia")
@@ -34,22 +33,22 @@ MOST = 0.2
 """Share of commands dropped from which the spread is as wide as the motion, and hides any cause.
 
 An acceleration limit of 32 noise floors was imitated with 0.37."""
-VEILS = 2
+PASSES = 2
 """Searches for what there is beside random delays, each with these as they are beside what the last found."""
 NOT_NEAR = 1.5
-"""Error after the first of them, in that of the model without chance, from which the next is not made."""
+"""Error after the first of them, in that of the model without them, from which the next is not made."""
 HOPELESS = 3.0
-"""The same of what is left through it, in what may be left in the end: the first is too narrow a veil."""
+"""The same of what is left through it, in what may be left in the end: the first weighting is too narrow."""
 SAME_SPREAD = 0.1
 """Relative change of their standard deviation up to which they are the same."""
 SPREAD = "its spread is what is measured"
 """Why they are named."""
 
 
-def try_random(
-    search: "Selection", baseline: JointFit, present: JointFit
+def try_jitter(
+    search: Search, baseline: JointFit, present: JointFit
 ) -> tuple[JointFit, tuple[Accepted, ...], list[Trial]]:
-    """What nothing else explains can be chance: random delays, and what is to be found beside them.
+    """What nothing else explains can be random delays, and what is to be found beside them.
 
     Args:
         search: The search that has come to its end.
@@ -61,12 +60,12 @@ def try_random(
     """
     if not _tried(search):
         return present, (), []
-    random, beside, rows, left = with_random(search, baseline, present)
-    others = [name for name in random.effects if name != RANDOM]
+    random, beside, rows, left = with_jitter(search, baseline, present)
+    others = [name for name in random.effects if name != JITTER]
     if others:
-        rest = search.look_beside(search.refit(random, others), search.whole)
+        rest = search.search_nearby(search.refit(random, others), search.whole)
         if search.white(rest) and not search.better(rest, random)[0]:
-            # No chance is needed: it has only smoothed the way to where the search before did not come.
+            # No jitter is needed: it has only smoothed the way to where the search before did not come.
             search.report(f"+ {' and '.join(others)}: {1e3 * rest.held_out_rmse:.2f} mrad held out")
             return rest, (), []
     accepted, why = search.better(present, random)
@@ -77,7 +76,7 @@ def try_random(
         accepted, why = False, f"leaves {left / search.floor:.1f} noise floors besides, more than chance does"
     gain, ci = search.gain(present, random)
     decision = "named" if accepted else "rejected"
-    row = Trial(1, RANDOM, random, gain, ci, decision, SPREAD if accepted else why)
+    row = Trial(1, JITTER, random, gain, ci, decision, SPREAD if accepted else why)
     if not accepted:
         return present, (), [row]
     random = bounded(search, random)
@@ -87,7 +86,7 @@ def try_random(
     return random, beside, [row, *rows]
 
 
-def at_once(search: "Selection", baseline: JointFit) -> tuple[JointFit, Veil] | None:
+def at_once(search: Search, baseline: JointFit) -> tuple[JointFit, SampleWeighting] | None:
     """Random delays of a model in which nothing else is missing but what a fixed delay can stand for.
 
     Given where they leave noise and are likelier than that delay: then no wide search is worth its time. A
@@ -116,7 +115,7 @@ def at_once(search: "Selection", baseline: JointFit) -> tuple[JointFit, Veil] | 
     return beside
 
 
-def in_place(search: "Selection", present: JointFit) -> tuple[JointFit, Veil] | None:
+def in_place(search: Search, present: JointFit) -> tuple[JointFit, SampleWeighting] | None:
     """Random delays in the place of what is late in a model of several effects, as :func:`at_once` has them.
 
     A search that goes on from there adds what imitates their spread, motion by motion, and drops it again.
@@ -135,7 +134,7 @@ def in_place(search: "Selection", present: JointFit) -> tuple[JointFit, Veil] | 
     return None
 
 
-def unlimited(search: "Selection", late: JointFit, random: JointFit) -> bool:
+def unlimited(search: Search, late: JointFit, random: JointFit) -> bool:
     """Whether random delays are likelier than a limit of the torque beside what is late, from every start.
 
     Lest the early end of a search be for the want of a start: so two torque-speed lines beside a delay or a
@@ -154,54 +153,54 @@ def unlimited(search: "Selection", late: JointFit, random: JointFit) -> bool:
     return all(search.likelier(fit, random) for fit in fits)
 
 
-def _tried(search: "Selection") -> bool:
+def _tried(search: Search) -> bool:
     """Whether random delays are among what a search may find."""
-    return not search.veiled and RANDOM in search.candidates and RANDOM not in search.vetoes
+    return not search.behind_jitter and JITTER in search.candidates and JITTER not in search.vetoes
 
 
 def _spread(
-    search: "Selection", baseline: JointFit, rest: JointFit, late: JointFit, promising: float = np.inf
-) -> tuple[JointFit, Veil] | None:
+    search: Search, baseline: JointFit, rest: JointFit, late: JointFit, promising: float = np.inf
+) -> tuple[JointFit, SampleWeighting] | None:
     """Random delays beside nothing but a model, as :func:`at_once` has them.
 
     Args:
         search: The search.
         baseline: Model for the first guess.
         rest: The model beside them.
-        late: The model without chance that they have to be likelier than.
+        late: The model without them that they have to be likelier than.
         promising: Error through the first guess from which no better one is looked for [rad].
     """
 
-    def through(veil: Veil) -> JointFit:
-        return search.run([("fit", {**refit, "veil": veil})])[0]
+    def weighted(weighting: SampleWeighting) -> JointFit:
+        return search.run([("fit", {**refit, "weighting": weighting})])[0]
 
     refit = {**search.call(rest, (), [rest.values], FULL_ITERATIONS)[1], "refits": 0}
-    jitter, veil = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
-    if through(veil).rmse > promising:
+    jitter, weighting = search.run([("look", {"fit": baseline, "scales": search.scales})])[0]
+    if weighted(weighting).rmse > promising:
         return None
-    for _ in range(VEILS):
-        call = {"fit": through(veil), "scales": search.scales, "start": jitter}
-        random, veil = search.run([("fit_jitter", call)])[0]
+    for _ in range(PASSES):
+        call = {"fit": weighted(weighting), "scales": search.scales, "start": jitter}
+        random, weighting = search.run([("fit_jitter", call)])[0]
         jitter = random.values[SIGMA], random.values[DROP]
         if not search.likelier(late, random) or jitter[1] > MOST:
             return None
-    return (random, veil) if through(veil).rmse < NO_GAP * search.floor else None
+    return (random, weighting) if weighted(weighting).rmse < NO_GAP * search.floor else None
 
 
-def as_random(search: "Selection", baseline: JointFit, loose: str) -> Explanation | None:
+def jitter_as_another(search: Search, baseline: JointFit, loose: str) -> Explanation | None:
     """The explanation of a joint by random delays where another of its finger has them, without a search.
 
-    The commands of a finger go out together: what is late by chance on one joint is on all. None where more
+    The commands of a finger go out together: what is late at random on one joint is on all. None where more
     than noise is left, or where they are not likelier than the plain model.
 
     Args:
-        search: Of the joint; :attr:`~vd.gap.select.Selection.random` is what the other has.
+        search: Of the joint; :attr:`~vd.gap.search.Search.jittered` is what the other has.
         baseline: The plain model.
         loose: What of the baseline the motions leave open.
     """
-    if not search.random[0] or not _tried(search):
+    if not search.jittered[0] or not _tried(search):
         return None
-    random, beside, rows, left = with_random(search, baseline, baseline)
+    random, beside, rows, left = with_jitter(search, baseline, baseline)
     if left > NO_GAP * search.floor or not search.likelier(baseline, random):
         return None
     random = bounded(search, random)
@@ -210,50 +209,50 @@ def as_random(search: "Selection", baseline: JointFit, loose: str) -> Explanatio
     search.report(
         f"+ {names}, as on another joint: as likely as {1e3 * after:.2f} mrad, before {1e3 * before:.2f}"
     )
-    row = Trial(1, RANDOM, random, gain, ci, "named", f"as on another joint: {SPREAD}")
+    row = Trial(1, JITTER, random, gain, ci, "named", f"as on another joint: {SPREAD}")
     return search.conclude(baseline, random, {}, [row, *rows], loose, known=beside)
 
 
-def bounded(search: "Selection", random: JointFit) -> JointFit:
+def bounded(search: Search, random: JointFit) -> JointFit:
     """A model with the intervals of its random delays."""
     return search.run([("bound_jitter", {"fit": random, "scales": search.scales})])[0]
 
 
-def with_random(
-    search: "Selection", baseline: JointFit, present: JointFit
+def with_jitter(
+    search: Search, baseline: JointFit, present: JointFit
 ) -> tuple[JointFit, tuple[Accepted, ...], list[Trial], float]:
     """The model with random delays, what is named beside them, and the evidence for that.
 
-    The arguments are those of :func:`try_random`. The last result is the error of the rest of the model, seen
+    The arguments are those of :func:`try_jitter`. The last result is the error of the rest of the model, seen
     through what the delays do [rad]: the noise floor if it is right. What another joint of the finger is sure
     to have beside random delays is tried first, and its delays are where the search begins.
     """
-    names, values = search.random
-    like = tuple(name for name in names if name != RANDOM)
-    beside_them = like, {key: value for key, value in values.items() if not key.startswith(RANDOM)}
+    names, values = search.jittered
+    like = tuple(name for name in names if name != JITTER)
+    beside_them = like, {key: value for key, value in values.items() if not key.startswith(JITTER)}
     known = None if like else at_once(search, baseline) or in_place(search, present)
     if known is not None:
         # Nearly all is known of them: there is no need to begin with less than the likeliest.
-        jitter, veil = (known[0].values[SIGMA], known[0].values[DROP]), known[1]
+        jitter, weighting = (known[0].values[SIGMA], known[0].values[DROP]), known[1]
     else:
         look = {"fit": baseline, "scales": search.scales}
         look |= {"start": (values[SIGMA], values[DROP])} if names else {}
-        jitter, veil = search.run([("look", look)])[0]
-    for _ in range(VEILS):
-        inner = replace(behind(search, veil), like=beside_them)
+        jitter, weighting = search.run([("look", look)])[0]
+    for _ in range(PASSES):
+        inner = replace(behind(search, weighting), like=beside_them)
         plain = inner.run([inner.plain(baseline)])[0]
         found = inner.explain(plain)
         clear = found.verdict in ("effects", "ambiguous")
         rest, beside = (found.final, found.accepted) if clear else (plain, ())
         call = {"fit": rest, "scales": search.scales, "start": jitter}
-        random, veil = search.run([("fit_jitter", call)])[0]
+        random, weighting = search.run([("fit_jitter", call)])[0]
         before, jitter = jitter, (random.values[SIGMA], random.values[DROP])
         same = abs(np.log(jitter[0] / before[0])) < SAME_SPREAD
         hopeless = rest.rmse > HOPELESS * REPEATABLE * search.floor
         if same or hopeless or equivalent(random) > NOT_NEAR * equivalent(present):
             break
     rows = [
-        replace(row, round=row.round + 1, fit=replace(row.fit, effects=(RANDOM, *row.fit.effects)))
+        replace(row, round=row.round + 1, fit=replace(row.fit, effects=(JITTER, *row.fit.effects)))
         for row in found.trials
     ]
     return random, beside, rows, rest.rmse
@@ -264,22 +263,22 @@ def equivalent(fit: JointFit) -> float:
     return float(np.exp(0.5 * np.sum(fit.count * np.log(fit.sse / fit.count)) / fit.count.sum()))
 
 
-def behind(search: "Selection", veil: Veil) -> "Selection":
-    """The same search, through what chance does to the samples."""
+def behind(search: Search, weighting: SampleWeighting) -> Search:
+    """The same search, samples weighted by what random delays do to them."""
 
     def run(calls: list[Call]) -> list[Any]:
-        return search.run([(name, {**options, "veil": veil}) for name, options in calls])
+        return search.run([(name, {**options, "weighting": weighting}) for name, options in calls])
 
     return replace(
         search,
         run=run,
-        candidates=[name for name in search.candidates if name != RANDOM],
+        candidates=[name for name in search.candidates if name != JITTER],
         restarts=0,
         like=((), {}),
         changing=((), {}),
-        random=((), {}),
-        veiled=True,
-        report=lambda line: search.report(f"beside {RANDOM}: {line}"),
+        jittered=((), {}),
+        behind_jitter=True,
+        report=lambda line: search.report(f"beside {JITTER}: {line}"),
         without={},
         apart={},
         promised={},

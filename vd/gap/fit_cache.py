@@ -1,7 +1,7 @@
-"""Answers to the questions of a search, kept in files, so that an interrupted search goes on where it was.
+"""Results of the calls of a search, kept in files, so that an interrupted search goes on where it was.
 
-A search is nothing but questions, each asked with all that its answer depends on. Made again with the answers
-at hand it takes the same path, in no time, to where it was ended.
+A search is nothing but calls, each with all that its result depends on. Made again with the results at hand
+it takes the same path, in no time, to where it was ended.
 """
 
 import hashlib
@@ -16,17 +16,17 @@ import numpy as np
 
 from vd.files import atomic_path
 
-FOLDER = "answers"
+FOLDER = "fit-cache"
 """Where an analysis keeps what a step has found, while it runs."""
 MADE_OF = {
     "vd.gap.coordinates": {"Coordinate", "Scales"},
     "vd.gap.joint_fit": {"JointFit"},
-    "vd.gap.veil": {"Veil"},
+    "vd.gap.sample_weighting": {"SampleWeighting"},
     "numpy": {"dtype", "ndarray"},
     "numpy._core.multiarray": {"_reconstruct", "scalar"},
     "numpy._core.numeric": {"_frombuffer"},
 }
-"""What an answer consists of, by module: a file from elsewhere can make nothing else, and run nothing."""
+"""What a result consists of, by module: a file from elsewhere can make nothing else, and run nothing."""
 
 
 class Digest(Protocol):
@@ -40,7 +40,7 @@ def digest_of(*values: Any) -> str:
     """A hash of values, the same for equal ones in any process.
 
     Raises:
-        TypeError: A value, or one inside, is of another kind than what is asked and answered here.
+        TypeError: A value, or one inside, is of another kind than what calls and their results are.
     """
     digest = hashlib.sha256()
     _feed(digest, values)
@@ -71,51 +71,51 @@ def _feed(digest: Digest, value: Any) -> None:
         raise TypeError(f"a {type(value).__name__} has no digest")
 
 
-class Answers:
-    """Answers by the digest of their questions, in memory and in a folder.
+class FitCache:
+    """Results by the digest of their calls, in memory and in a folder.
 
     Args:
         folder: Where to keep them; None: in memory only.
-        about: What all of them depend on besides; answers about something else are not found.
+        about: What all of them depend on besides; results about something else are not found.
     """
 
     def __init__(self, folder: Path | None = None, about: str = ""):
         self.folder, self.about = folder, about
         self._known: dict[str, Any] = {}
 
-    def __contains__(self, question: str) -> bool:
-        """Whether an answer is known; one that was cut short is not."""
-        if question not in self._known and self.folder is not None:
+    def __contains__(self, call: str) -> bool:
+        """Whether a result is known; one that was cut short is not."""
+        if call not in self._known and self.folder is not None:
             try:
-                with self._file(question).open("rb") as file:
-                    self._known[question] = _Reader(file).load()
+                with self._file(call).open("rb") as file:
+                    self._known[call] = _Reader(file).load()
             except (FileNotFoundError, EOFError, pickle.UnpicklingError):
                 return False
-        return question in self._known
+        return call in self._known
 
-    def __getitem__(self, question: str) -> Any:
-        """The answer; the same object every time."""
-        return self._known[question]
+    def __getitem__(self, call: str) -> Any:
+        """The result; the same object every time."""
+        return self._known[call]
 
-    def add(self, question: str, answer: Any) -> None:
-        """Keep an answer."""
-        self._known[question] = answer
+    def add(self, call: str, result: Any) -> None:
+        """Keep a result."""
+        self._known[call] = result
         if self.folder is not None:
-            with atomic_path(self._file(question)) as path:
-                path.write_bytes(pickle.dumps(answer))
+            with atomic_path(self._file(call)) as path:
+                path.write_bytes(pickle.dumps(result))
 
     def forget(self) -> None:
         """Delete the files."""
         if self.folder is not None:
             shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _file(self, question: str) -> Path:
+    def _file(self, call: str) -> Path:
         assert self.folder is not None
-        return self.folder / f"{digest_of(self.about, question)}.pickle"
+        return self.folder / f"{digest_of(self.about, call)}.pickle"
 
 
 class _Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         if name not in MADE_OF.get(module, ()):
-            raise pickle.UnpicklingError(f"an answer is not made of {module}.{name}")
+            raise pickle.UnpicklingError(f"no result is made of {module}.{name}")
         return super().find_class(module, name)

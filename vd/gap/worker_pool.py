@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from vd.gap.answers import Answers, digest_of
 from vd.gap.chain import Chain
-from vd.gap.crowd import Crowd
 from vd.gap.fit import JointProblem
+from vd.gap.fit_cache import FitCache, digest_of
 from vd.gap.jitter import CALLS
+from vd.gap.launch_batch import LaunchBatch
 from vd.gap.recording import Recording
 from vd.gap.rollout import Rollouts
 from vd.interrupt import end_with_parent
@@ -53,7 +53,7 @@ class JointSpec:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
+class Made:
     """What a call returned, how many trajectories it simulated, and how long it took [s]."""
 
     result: Any
@@ -61,7 +61,7 @@ class Answer:
     seconds: float
 
 
-class Bench:
+class Problems:
     """The problems of a recording, made when they are first asked for.
 
     Args:
@@ -69,7 +69,7 @@ class Bench:
         chains: Its chains.
         dt: Time step of the rollouts [s].
         device: Warp device.
-        crowd: Threads whose simulations are made together.
+        batch: Threads whose simulations are made together.
     """
 
     def __init__(
@@ -78,14 +78,14 @@ class Bench:
         chains: Sequence[Chain],
         dt: float,
         device: str,
-        crowd: Crowd | None = None,
+        batch: LaunchBatch | None = None,
     ):
         self.recording, self.chains, self.dt, self.device = recording, chains, dt, device
-        self.crowd = crowd
+        self.batch = batch
         self._rollouts: dict[tuple[int, int | None], Rollouts] = {}
         self._problems: dict[tuple[int, int], JointProblem] = {}
 
-    def problem(self, spec: JointSpec) -> JointProblem:
+    def of(self, spec: JointSpec) -> JointProblem:
         """The problem of a joint."""
         key = spec.chain, spec.joint
         if key not in self._problems:
@@ -95,7 +95,7 @@ class Bench:
                 parts = dict(zip(spec.trajectories, spec.pieces, strict=bool(spec.pieces)))
                 recording, chain = self.recording.cut(parts), self.chains[spec.chain]
                 self._rollouts[shared] = Rollouts(
-                    chain, recording, dt=self.dt, device=self.device, crowd=self.crowd
+                    chain, recording, dt=self.dt, device=self.device, batch=self.batch
                 )
             self._problems[key] = JointProblem(
                 self._rollouts[shared],
@@ -107,70 +107,70 @@ class Bench:
             )
         return self._problems[key]
 
-    def call(self, spec: JointSpec, call: Call) -> Answer:
-        """Run a method of the problem, seen through the ``veil`` among its arguments, or at a finer step."""
+    def call(self, spec: JointSpec, call: Call) -> Made:
+        """Run a method of the problem, its samples weighted if its arguments say how, or at a finer step."""
         name, options = call[0], dict(call[1])
-        veil, finer = options.pop("veil", None), options.pop("finer", False)
-        problem = self.problem(spec).finer() if finer else self.problem(spec)
+        weighting, finer = options.pop("weighting", None), options.pop("finer", False)
+        problem = self.of(spec).finer() if finer else self.of(spec)
         # Calls side by side count, and change the time step.
-        problem = copy.copy(problem) if veil is None else problem.through(veil)
+        problem = copy.copy(problem) if weighting is None else problem.weighted(weighting)
         problem.simulated, begin = 0, time.perf_counter()
         method = partial(CALLS[name], problem) if name in CALLS else getattr(problem, name)
         result = method(**options)
-        return Answer(result, problem.simulated, time.perf_counter() - begin)
+        return Made(result, problem.simulated, time.perf_counter() - begin)
 
 
-_bench: Bench | None = None
+_problems: Problems | None = None
 """Of a worker process."""
 
 
-def _start(bench: Bench, parent: int) -> None:
-    global _bench
+def _start(problems: Problems, parent: int) -> None:
+    global _problems
     end_with_parent(parent)
     quiet_warp()
-    _bench = bench
+    _problems = problems
 
 
-def _work(spec: JointSpec, call: Call) -> Answer:
-    assert _bench is not None
-    return _bench.call(spec, call)
+def _work(spec: JointSpec, call: Call) -> Made:
+    assert _problems is not None
+    return _problems.call(spec, call)
 
 
-class Team:
+class WorkerPool:
     """Runs calls in worker processes, on a GPU in threads, or one by one with ``workers`` below 2.
 
     Args:
-        bench: The problems.
+        problems: The problems.
         workers: Processes.
-        answers: To calls that were made before, and where new ones go.
+        cache: Results of calls that were made before, and where new ones go.
 
     Attributes:
         simulated: Trajectories simulated so far.
         spent: Trajectories simulated and time taken [s], summed over workers, by kind of call.
     """
 
-    def __init__(self, bench: Bench, workers: int, answers: Answers | None = None):
-        self.bench, self.workers = bench, workers
-        self.answers = Answers() if answers is None else answers
+    def __init__(self, problems: Problems, workers: int, cache: FitCache | None = None):
+        self.problems, self.workers = problems, workers
+        self.cache = FitCache() if cache is None else cache
         self.simulated = 0
         self.spent: dict[str, tuple[int, float]] = {}
         self._lock = threading.Lock()
-        self._pool: Executor | None = None
+        self._executor: Executor | None = None
 
-    def __enter__(self) -> "Team":
-        if self.bench.crowd is not None:
-            self._pool = ThreadPoolExecutor(THREADS)
+    def __enter__(self) -> "WorkerPool":
+        if self.problems.batch is not None:
+            self._executor = ThreadPoolExecutor(THREADS)
         elif self.workers > 1:
             # Not forked: Warp and its threads may be running.
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(
-                self.workers, mp_context=context, initializer=_start, initargs=(self.bench, os.getpid())
+            self._executor = ProcessPoolExecutor(
+                self.workers, mp_context=context, initializer=_start, initargs=(self.problems, os.getpid())
             )
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        if self._executor is not None:
+            self._executor.shutdown(cancel_futures=True)
 
     @property
     def summary(self) -> str:
@@ -184,34 +184,34 @@ class Team:
         # Searches that meet ask for the same fits.
         keys = [digest_of(spec.chain, spec.joint, call) for call in calls]
         with self._lock:
-            new = {key: call for key, call in zip(keys, calls, strict=True) if key not in self.answers}
-        answers = dict(zip(new, self._made(spec, list(new.values())), strict=True))
+            new = {key: call for key, call in zip(keys, calls, strict=True) if key not in self.cache}
+        made = dict(zip(new, self._made(spec, list(new.values())), strict=True))
         with self._lock:
-            for key, answer in answers.items():
+            for key, one in made.items():
                 name = new[key][0]
                 rollouts, seconds = self.spent.get(name, (0, 0.0))
-                self.spent[name] = rollouts + answer.simulated, seconds + answer.seconds
-                self.simulated += answer.simulated
-                self.answers.add(key, answer.result)
-            return [self.answers[key] for key in keys]
+                self.spent[name] = rollouts + one.simulated, seconds + one.seconds
+                self.simulated += one.simulated
+                self.cache.add(key, one.result)
+            return [self.cache[key] for key in keys]
 
-    def _made(self, spec: JointSpec, calls: Sequence[Call]) -> list[Answer]:
+    def _made(self, spec: JointSpec, calls: Sequence[Call]) -> list[Made]:
         """Run calls.
 
         Raises:
             ChildProcessError: A worker process was killed.
         """
-        if self._pool is None:
+        if self._executor is None:
             with self._lock:
-                return [self.bench.call(spec, call) for call in calls]
-        crowd = self.bench.crowd
-        if crowd is not None:
+                return [self.problems.call(spec, call) for call in calls]
+        batch = self.problems.batch
+        if batch is not None:
             with self._lock:
-                self.bench.problem(spec)  # made once, before threads ask for it
-            crowd.join(len(calls))
-        work = _work if crowd is None else self._together
+                self.problems.of(spec)  # made once, before threads ask for it
+            batch.join(len(calls))
+        work = _work if batch is None else self._together
         try:
-            waiting: list[Future] = [self._pool.submit(work, spec, call) for call in calls]
+            waiting: list[Future] = [self._executor.submit(work, spec, call) for call in calls]
             return [future.result() for future in waiting]
         except BrokenProcessPool as error:
             raise ChildProcessError(
@@ -219,20 +219,20 @@ class Team:
                 "give fewer processors (taskset), and run the same command again, which goes on with its step"
             ) from error
 
-    def _together(self, spec: JointSpec, call: Call) -> Answer:
+    def _together(self, spec: JointSpec, call: Call) -> Made:
         """Run a call in one of the threads that simulate together."""
-        assert self.bench.crowd is not None
+        assert self.problems.batch is not None
         try:
-            return self.bench.call(spec, call)
+            return self.problems.call(spec, call)
         finally:
-            self.bench.crowd.leave()
+            self.problems.batch.leave()
 
 
 def parallel(work: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
     """Results in order; threads, since the work waits for processes."""
-    pool = ThreadPoolExecutor(max(len(items), 1))
+    threads = ThreadPoolExecutor(max(len(items), 1))
     try:
-        return list(pool.map(work, items))
+        return list(threads.map(work, items))
     finally:
-        # Nobody waits for the others after a failure or Ctrl-C: they end with the team's processes.
-        pool.shutdown(wait=False, cancel_futures=True)
+        # Nobody waits for the others after a failure or Ctrl-C: they end with the pool's processes.
+        threads.shutdown(wait=False, cancel_futures=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.hidden_finger import Finger, FingerBody, slip
+from vd.bench.hidden_finger import Finger, FingerBody, slip
 
 STEP_S = 4.0e-4
 """Time step [s]: five times finer than the fitted model's, second order where the motion is smooth."""

@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vd.gap.chain import chains
-from vd.gap.excitations import MENU, JointRange, excitation_set
-from vd.gap.hidden_plant import FULL_DUTY_RAD, OUTSIDE
-from vd.gap.hide import (
+from vd.bench.gap_sizes import showing, sized_effect
+from vd.bench.hidden_plant import FULL_DUTY_RAD, OUTSIDE
+from vd.bench.hide import (
     ENCODER_COUNT,
     FULL_P_GAIN,
     Hiding,
@@ -20,10 +19,11 @@ from vd.gap.hide import (
     simulate_hidden,
     truth_path,
 )
+from vd.gap.chain import chains
+from vd.gap.excitations import MENU, JointRange, excitation_set
 from vd.gap.recording import read_recording
-from vd.gap.sizes import showing, sized_effect
-from vd.gap.team import JointSpec
 from vd.gap.telemetry import late_side, vetoes
+from vd.gap.worker_pool import JointSpec
 from vd.kernels.servo.effects import EFFECTS
 
 

@@ -13,22 +13,22 @@ import numpy as np
 
 
 class Rollouts(Protocol):
-    """What answers several calls by one launch (:class:`vd.gap.rollout.Rollouts`)."""
+    """What makes several calls in one launch (:class:`vd.gap.rollout.Rollouts`)."""
 
     def simulate(self, calls: Sequence[Any]) -> list[np.ndarray]:
-        """The answers, in order."""
+        """Their results, in order."""
         ...
 
 
 class _Waiting:
-    """A call that waits for its answer."""
+    """A call that waits for its result."""
 
     def __init__(self, rollouts: Rollouts, call: Any):
         self.rollouts, self.call = rollouts, call
-        self.answer: np.ndarray | Exception | None = None
+        self.result: np.ndarray | Exception | None = None
 
 
-class Crowd:
+class LaunchBatch:
     """Threads whose calls are simulated together once all that are at work wait for one.
 
     Attributes:
@@ -53,7 +53,7 @@ class Crowd:
             self._launch_if_all_wait()
 
     def simulate(self, rollouts: Rollouts, call: Any) -> np.ndarray:
-        """The answer to a call, once the others that are at work have made theirs.
+        """The result of a call, once the others that are at work have made theirs.
 
         Raises:
             Exception: Whatever the launch raised.
@@ -62,11 +62,11 @@ class Crowd:
         with self._condition:
             self._waiting.append(own)
             self._launch_if_all_wait()
-            while own.answer is None:
+            while own.result is None:
                 self._condition.wait()
-        if isinstance(own.answer, Exception):
-            raise own.answer
-        return own.answer
+        if isinstance(own.result, Exception):
+            raise own.result
+        return own.result
 
     def _launch_if_all_wait(self) -> None:
         if not self._waiting or len(self._waiting) < self._working:
@@ -78,11 +78,11 @@ class Crowd:
         for group in groups.values():
             self.launches += 1
             try:
-                answers: list[np.ndarray | Exception] = list(
+                results: list[np.ndarray | Exception] = list(
                     group[0].rollouts.simulate([each.call for each in group])
                 )
             except Exception as error:  # each of those who wait has to hear of it
-                answers = [error] * len(group)
-            for each, answer in zip(group, answers, strict=True):
-                each.answer = answer
+                results = [error] * len(group)
+            for each, result in zip(group, results, strict=True):
+                each.result = result
         self._condition.notify_all()

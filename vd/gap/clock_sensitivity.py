@@ -3,11 +3,11 @@
 A profile of bounded acceleration that cannot follow its command turns at moments that hang on ever smaller
 things: a tenth of a millisecond is tens of milliradians some seconds later, and no fit of the right model
 leaves noise there. Such samples say little. Weighted by how surely they are known
-(:class:`vd.gap.veil.Veil`), the right model leaves noise again, and a search ends with it.
+(:mod:`vd.gap.sample_weighting`), the right model leaves noise again, and a search ends with it.
 """
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +15,9 @@ from vd.gap.candidates import Call
 from vd.gap.explanation import Explanation
 from vd.gap.jitter import CALLS
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import RANDOM
-from vd.gap.veil import Veil
-
-if TYPE_CHECKING:
-    from vd.gap.select import Selection
+from vd.gap.judge import JITTER
+from vd.gap.sample_weighting import SampleWeighting
+from vd.gap.search import Search
 
 GROWN = 1.5
 """Spread of the samples of a motion, in that of the noise alone, from which they are weighted. Motions that
@@ -28,46 +26,49 @@ WEIGHTED = "where errors of the recording's clock grow, samples count by how sur
 """What a reason says of it."""
 
 
-def swayed(search: "Selection", fit: JointFit) -> Veil | None:
+def clock_sensitivity(search: Search, fit: JointFit) -> SampleWeighting | None:
     """What errors of the clock do under a model that leaves more than noise; None where they do not grow.
 
     Args:
         search: Whose model it is; one that weighs its samples already does not ask again.
         fit: The model.
     """
-    if search.clocked or search.veiled or RANDOM in fit.effects or search.no_gap(fit):
+    if search.clocked or search.behind_jitter or JITTER in fit.effects or search.no_gap(fit):
         return None
-    veil = search.run([("sway", {"fit": fit, "scales": search.scales})])[0]
+    weighting = search.run([("clock_weighting", {"fit": fit, "scales": search.scales})])[0]
     ends = np.cumsum(fit.count.astype(int))[:-1]
-    spread = [float(np.sqrt(np.mean(part**2))) for part in np.split(veil.growth, ends)]
-    return veil if max(spread) > GROWN else None
+    spread = [float(np.sqrt(np.mean(part**2))) for part in np.split(weighting.growth, ends)]
+    return weighting if max(spread) > GROWN else None
 
 
-def weighted(search: "Selection", veil: Veil) -> "Selection":
+def weighted(search: Search, weighting: SampleWeighting) -> Search:
     """The same search with samples weighted by how surely they are known."""
 
     def run(calls: list[Call]) -> list[Any]:
-        # What chance does is more than what the clock does, and is measured on the samples themselves.
+        # What jitter does is more than what the clock does, and is measured on the samples themselves.
         return search.run(
-            [(name, options if name in CALLS else {"veil": veil, **options}) for name, options in calls]
+            [
+                (name, options if name in CALLS else {"weighting": weighting, **options})
+                for name, options in calls
+            ]
         )
 
     return replace(search, run=run, clocked=True, without={}, apart={}, promised={}, added={})
 
 
-def explain_weighted(search: "Selection", baseline: JointFit, veil: Veil) -> Explanation:
+def explain_weighted(search: Search, baseline: JointFit, weighting: SampleWeighting) -> Explanation:
     """What a search finds with samples weighted by how surely they are known.
 
     Args:
         search: The search.
         baseline: The plain model, fitted to samples that all count the same.
-        veil: What errors of the clock do.
+        weighting: What errors of the clock do.
     """
     search.report("errors of the clock grow: samples are weighted by how surely they are known")
-    seen = weighted(search, veil)
-    return told(seen.explain(seen.run([seen.plain(baseline)])[0]), veil)
+    inner = weighted(search, weighting)
+    return told(inner.explain(inner.run([inner.plain(baseline)])[0]), weighting)
 
 
-def told(found: Explanation, veil: Veil) -> Explanation:
+def told(found: Explanation, weighting: SampleWeighting) -> Explanation:
     """What was found with samples weighted, which says so."""
-    return replace(found, veil=veil, reason=f"{found.reason}; {WEIGHTED}")
+    return replace(found, weighting=weighting, reason=f"{found.reason}; {WEIGHTED}")

@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from vd.bench.gap_sizes_table import SCALES
+from vd.bench.hidden_plant import OUTSIDE, Plant, Run, simulate
+from vd.bench.hide import Hiding, effect_parameters, machine, noise_floor
 from vd.gap.excitations import excitation_set
-from vd.gap.hidden_plant import OUTSIDE, Plant, Run, simulate
-from vd.gap.hide import Hiding, effect_parameters, machine, noise_floor
-from vd.gap.sizes_table import SCALES
 from vd.kernels.servo.effects import EFFECTS
 
 GAPS = (1.5, 3.0, 6.0, 12.0)

@@ -1,6 +1,6 @@
 """Make recordings in which an effect is hidden, to test what finds it.
 
-The recording comes from :mod:`vd.gap.hidden_plant`: random base parameters, sensor noise, encoder
+The recording comes from :mod:`vd.bench.hidden_plant`: random base parameters, sensor noise, encoder
 counts and jittered stamps. What is hidden is written beside the folder, never into it.
 """
 
@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from vd.bench.hidden_finger import FingerBody
+from vd.bench.hidden_plant import OUTSIDE, Plant, Run, simulate, simulate_with_duty
 from vd.files import write_json
 from vd.gap.excitations import Excitation, JointRange, excitation_set
-from vd.gap.hidden_finger import FingerBody
-from vd.gap.hidden_plant import OUTSIDE, Plant, Run, simulate, simulate_with_duty
 from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording, Trajectory, write_recording
 from vd.kernels.servo.effects import EFFECTS
 

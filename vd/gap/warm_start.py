@@ -22,7 +22,7 @@ Fit = Callable[[tuple[str, ...], Mapping[str, float]], JointFit]
 """Fits a joint with these effects from these values."""
 
 
-def outline(search: Selection, baseline: JointFit) -> JointFit | None:
+def rough_model(search: Selection, baseline: JointFit) -> JointFit | None:
     """What a joint mostly lacks: the best model with one effect, where it explains nearly all but not all.
 
     The search makes the same fits, and does not make them again.
@@ -38,7 +38,9 @@ def outline(search: Selection, baseline: JointFit) -> JointFit | None:
     return best if best.rmse < SHARP * baseline.rmse and not search.white(best) else None
 
 
-def sketched(rough: JointFit, plain: Mapping[str, JointFit], fits: Mapping[str, Fit]) -> dict[str, JointFit]:
+def warm_starts(
+    rough: JointFit, plain: Mapping[str, JointFit], fits: Mapping[str, Fit]
+) -> dict[str, JointFit]:
     """Models of the other joints with what one mostly lacks, of those which that explains for the most part.
 
     Args:
