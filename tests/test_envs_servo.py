@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vd.assets_usd.hand_author import hand_usd
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hand_model import read_hand
+from vd.assets_usd.hands import hand_usd
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.envs.servo import needs_servo, servo_ranges

@@ -372,7 +372,7 @@ def _missed(rate_hz: float, wanted_hz: float) -> str:
 
 def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":
     """The recording in the folder, or an empty one."""
-    from vd.assets_usd.hand_spec import HANDS
+    from vd.assets_usd.hands import HANDS
     from vd.gap.recording import Recording, read_recording
 
     hand = connection.hand

@@ -7,10 +7,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, unwritten
 
-from vd.assets_usd.objects.geometry import winding_numbers
 from vd.kernels.sensor.winding import inside_kernel, winding_kernel
 
 SHAPE = (5, 4, 3)
+
+
+def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Generalised winding numbers [n] of a mesh at points [n, 3]: 1 inside, 0 outside of a closed one.
+
+    The solid angles of all triangles over 4 pi (van Oosterom and Strackee 1983).
+    """
+    total = np.zeros(len(points))
+    for i, point in enumerate(np.asarray(points, dtype=np.float64)):
+        a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, k]] - point for k in range(3))
+        la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+        dots = [np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (b, c), (c, a))]
+        spread = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
+        total[i] = np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), spread).sum() / (2.0 * np.pi)
+    return total
 
 
 def run(device, samples, areas, *, width, corner, pitch, shape=SHAPE):
