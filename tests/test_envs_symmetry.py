@@ -99,22 +99,6 @@ def test_turned_worlds_look_and_move_the_same(hand):
         assert np.median(error) < 1e-4 and np.quantile(error, 0.9) < 0.05
 
 
-def test_without_the_axes_of_the_file_all_else_is_seen_as_before(device):
-    seeing = dataclasses.replace(CFG.observation, view="mirrored")
-    env, without = (
-        ReorientEnv(dataclasses.replace(CFG, observation=dataclasses.replace(seeing, file_axes=axes)), device)
-        for axes in (True, False)
-    )
-    for each in (env, without):
-        look(each)
-    expected = env.observation.numpy().copy()
-    slices = teacher_observation_slices(env.num_fingers)
-    for name in ("object_orientation", "goal_orientation"):
-        assert np.abs(expected[:, slices[name]]).max() > 0.1
-        expected[:, slices[name]] = 0.0
-    np.testing.assert_array_equal(without.observation.numpy(), expected)
-
-
 def test_mirrored_worlds_look_and_move_the_same():
     """With a cuboid, which is its own mirror image; a reflection in the plane of one finger."""
     cfg = dataclasses.replace(CFG, observation=ObservationCfg(shape="full", view="mirrored"))

@@ -10,7 +10,6 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.kernels.servo import actuators as servo
 from vd.paper import PAPER
-from vd.sim.actuators import has_effects
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import build_scene
 from vd.sim.simulator import Simulator
@@ -84,14 +83,6 @@ def test_without_rows_nothing_of_the_servo_is_launched(monkeypatch):
     assert launched and not any("joint_servo" in kernel.module.name for kernel in launched)
 
 
-def test_only_effects_count_as_effects():
-    assert not has_effects(HAND.servo)
-    assert not has_effects(rows(KP=1.0, KD=0.1, VELOCITY_LIMIT=2.0, INERTIA=0.01))
-    assert has_effects(rows(COMMAND_DELAY=1e-3)) and has_effects(
-        np.tile(rows(PAYLOAD_INERTIA=1e-4), (2, 1, 1))
-    )
-
-
 def test_a_servo_without_effects_moves_as_the_plain_drive():
     plain, _ = response(simulator(None))
     with_servo, measured = response(simulator(rows()))
@@ -112,13 +103,6 @@ def test_delays_shift_the_motion_and_the_measurement():
     assert np.array_equal(true[:, 2], true[:, 0])
     assert np.allclose(measured[2:, 2], true[:-2, 2] + 0.01, atol=1e-6)
     assert np.allclose(measured[0, 2], START + 0.01, atol=1e-6)
-
-
-def test_a_command_that_is_lost_does_nothing():
-    lost, _ = response(simulator(rows(JITTER_DROP=1.0)))
-    assert np.abs(lost - START).max() < 0.05  # what gravity does
-    kept, _ = response(simulator(rows(JITTER_DROP=0.0)))
-    assert np.abs(kept[-1] - START).min() > 0.1
 
 
 def test_dry_friction_holds_what_it_can_and_no_more():

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, device_array, unwritten
+from kernel_oracle import EXAMPLES, device_array, launch, unwritten
 
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
@@ -64,13 +64,7 @@ def steps_of(device, rows, command, position=0.0, speed=0.0, *, coupled=0.0, pow
         for v in (coupled, position, speed, power)
     ]
     parameters = device_array(rows, float, device)
-    wp.launch(
-        step_kernel,
-        dim=count,
-        inputs=[device_array(command, float, device), *each, command.shape[1], dt, parameters],
-        outputs=[state, out],
-        device=device,
-    )
+    launch(step_kernel, count, [command, *each, command.shape[1], dt, parameters, state, out], device)
     assert np.isfinite(out.numpy()).all() and np.isfinite(state.numpy()).all(), "not written, or no number"
     return out.numpy(), state.numpy()
 
@@ -183,43 +177,6 @@ def test_a_profile_takes_the_least_time_and_stops(device, limit, way):
     assert np.abs(out[0, :, REFERENCE]).max() <= abs(way) + rounding, "overshoot beyond single precision"
 
 
-@EXAMPLES
-@given(width=floats(0.0, 0.5), seed=st.integers(0, 2**31))
-def test_backlash_is_the_play_operator(device, width, seed):
-    command = np.cumsum(np.random.default_rng(seed).uniform(-0.2, 0.2, 60))
-    out, _ = steps_of(device, row_of(BACKLASH_WIDTH=width), command)
-    got = out[0, :, REFERENCE]
-    assert (np.abs(got - command) <= width / 2 + 1e-6).all()
-    moves = np.diff(got)
-    touching = np.abs(np.abs(got[1:] - command[1:]) - width / 2) < 1e-5
-    assert (touching | (np.abs(moves) < 1e-7)).all(), "it moves only when pushed"
-    assert (moves[np.abs(moves) > 1e-6] * np.diff(command)[np.abs(moves) > 1e-6] > 0).all()
-
-
-@EXAMPLES
-@given(width=floats(0.0, 0.5), error=floats(-1.0, 1.0), position=floats(-1.0, 1.0))
-def test_the_dead_zone_takes_its_half_width_off_the_error(device, width, error, position):
-    out, _ = steps_of(device, row_of(DEAD_ZONE_WIDTH=width), [position + error], position)
-    expected = 3.0 * np.sign(error) * max(abs(error) - width / 2, 0.0)
-    assert total(out, position, 0.0)[0, 0] == pytest.approx(expected, abs=1e-5)
-
-
-@EXAMPLES
-@given(gain=floats(0.01, 100.0), error=floats(-1.0, 1.0), steps=st.integers(1, 100))
-def test_integral_action_adds_up_the_error(device, gain, error, steps):
-    row = row_of(INTEGRAL_GAIN=gain)
-    out, _ = steps_of(device, row, np.full(steps, error))
-    expected = 3.0 * error + gain * error * DT * np.arange(1, steps + 1)
-    np.testing.assert_allclose(total(out, 0.0, 0.0)[0], expected, rtol=1e-4, atol=1e-6)
-    off, state = steps_of(device, row, np.full(steps, error), power=0.0)
-    assert not total(off, 0.0, 0.0).any() and state[0, servo.STATE_INTEGRAL] == 0.0
-
-
-def test_coupling_moves_the_reference(device):
-    out, _ = steps_of(device, row_of(), [0.25], coupled=0.5)
-    assert out[0, 0, REFERENCE] == 0.75
-
-
 # --- The motor ---
 
 MOTOR = {
@@ -244,13 +201,6 @@ def test_a_loss_of_the_motor_is_its_formula(device, stage, size, error, speed, s
     expected = MOTOR[stage](wanted, size, speed, (steps - 1) * DT)
     assert total(out, 0.0, speed)[0, -1] == pytest.approx(expected, rel=1e-3, abs=1e-5)
     assert out[0, -1, DAMPING] >= 0.0 and out[0, -1, STIFFNESS] >= 0.0
-
-
-def test_the_torque_speed_line_damps(device):
-    row = row_of(kp=100.0, kd=0.0, STALL_TORQUE=1.0, NO_LOAD_SPEED=4.0)
-    out, _ = steps_of(device, row, [1.0], 0.0, 2.0)
-    assert total(out, 0.0, 2.0)[0, 0] == pytest.approx(0.5)
-    assert out[0, 0, DAMPING] == pytest.approx(0.25), "the slope of the line, for the implicit step"
 
 
 @EXAMPLES
@@ -303,62 +253,6 @@ def test_friction_adds_up_and_each_direction_has_its_own(
 
 
 # --- The load ---
-
-
-@EXAMPLES
-@given(torque=floats(0, 5), phase=floats(-3, 3), position=floats(-3, 3))
-def test_gravity_pulls_to_its_phase(device, torque, phase, position):
-    out, _ = steps_of(device, row_of(GRAVITY_TORQUE=torque, GRAVITY_PHASE=phase), [position], position)
-    assert total(out, position, 0.0)[0, 0] == pytest.approx(-torque * np.sin(position + phase), abs=1e-5)
-
-
-@wp.kernel
-def swing_kernel(
-    angle: float,
-    rate: float,
-    dt: float,
-    parameters: wp.array2d[float],
-    state: wp.array2d[float],
-    angle_out: wp.array2d[float],
-    torque_out: wp.array2d[float],
-):
-    """The second mass of a joint that stands still, started elsewhere. Launch: [R]; out [R, steps]."""
-    row = wp.tid()
-    servo.start_servo(0.0, 0.0, row, state)
-    state[row, servo.STATE_ELASTIC] = angle
-    state[row, servo.STATE_ELASTIC_SPEED] = rate
-    for k in range(angle_out.shape[1]):
-        angle_out[row, k] = state[row, servo.STATE_ELASTIC]
-        load = servo.elastic_load(0.0, 0.0, dt, parameters, row, state)
-        torque_out[row, k] = load[0]
-
-
-@EXAMPLES
-@given(stiffness=floats(0.5, 20.0), damping=floats(0.0, 0.02), inertia=floats(5e-4, 1e-2))
-def test_the_second_mass_swings_like_an_oscillator(device, stiffness, damping, inertia):
-    dt, count, start = 1 / 960, 300, 0.3
-    row = row_of(ELASTIC_STIFFNESS=stiffness, ELASTIC_DAMPING=damping, ELASTIC_INERTIA=inertia)
-    matrix = np.array([[0.0, 1.0], [-stiffness / inertia, -damping / inertia]])
-    values, vectors = np.linalg.eig(matrix)
-    weights = np.linalg.solve(vectors, [start, 0.0])
-    t = np.arange(count) * dt
-    motion = np.real(vectors @ (weights[:, None] * np.exp(values[:, None] * t)))
-    # Leapfrog: the velocity at the start is that of half a step before.
-    rate = np.real(vectors[1] @ (weights * np.exp(-values * dt / 2)))
-    angle, torque = unwritten((1, count), float, device), unwritten((1, count), float, device)
-    wp.launch(
-        swing_kernel,
-        dim=1,
-        inputs=[start, rate, dt, device_array(row[None], float, device)],
-        outputs=[unwritten((1, servo.STATE_COLUMNS), float, device), angle, torque],
-        device=device,
-    )
-    # A phase error of (omega dt)^2 / 24 a radian, over all the time.
-    omega = np.sqrt(stiffness / inertia)
-    tolerance = start * (0.2 * (omega * dt) ** 2 * (1 + omega * t[-1]) + 1e-3)
-    np.testing.assert_allclose(angle.numpy()[0], motion[0], atol=tolerance)
-    expected = stiffness * motion[0] + damping * motion[1]
-    np.testing.assert_allclose(torque.numpy()[0], expected, atol=tolerance * (stiffness + damping * omega))
 
 
 @EXAMPLES

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 from kernel_oracle import (
     ALPHA,
     EXAMPLES,
-    device_array,
     floats,
     goals,
+    launch,
     pose_matrix,
     quaternions,
     relative_quaternion,
@@ -68,29 +68,29 @@ def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=T
         canonical=float(canonical),
     )
     rng = streams(worlds, seed, device)
-    wp.launch(
+    launch(
         teacher_observation_kernel,
-        dim=worlds,
-        inputs=[
-            device_array(scene["lower"], float, device),
-            device_array(scene["upper"], float, device),
-            device_array(scene["tip_body"], int, device),
-            device_array(scene["tip_offset"], wp.transform, device),
-            device_array(scene["body_com"], wp.vec3, device),
+        worlds,
+        [
+            scene["lower"],
+            scene["upper"],
+            scene["tip_body"],
+            scene["tip_offset"],
+            scene["body_com"],
             params,
-            device_array(scene["measured_q"], float, device),
-            device_array(scene["measured_qd"], float, device),
-            device_array(scene["q"], float, device),
-            device_array(scene["qd"], float, device),
-            device_array(scene["body_q"], wp.transform, device),
-            device_array(scene["body_qd"], wp.spatial_vector, device),
-            device_array(scene["goal"], wp.quat, device),
-            device_array(scene["smoothed"], float, device),
-            device_array(scene["offset"], float, device),
+            scene["measured_q"],
+            scene["measured_qd"],
+            scene["q"],
+            scene["qd"],
+            scene["body_q"],
+            scene["body_qd"],
+            scene["goal"],
+            scene["smoothed"],
+            scene["offset"],
             rng,
+            out,
         ],
-        outputs=[out],
-        device=device,
+        device,
     )
     return out.numpy(), rng.numpy()
 
@@ -199,16 +199,11 @@ def test_canonical_orientations_do_not_tell_which_quaternion_they_came_from(devi
 def test_fingertip_positions_are_those_observed(device, scene):
     worlds, fingers = len(scene["q"]), len(scene["tip_body"])
     out = unwritten((worlds, fingers), wp.vec3, device)
-    wp.launch(
+    launch(
         fingertip_kernel,
-        dim=(worlds, fingers),
-        inputs=[
-            device_array(scene["tip_body"], int, device),
-            device_array(scene["tip_offset"], wp.transform, device),
-            device_array(scene["body_q"], wp.transform, device),
-        ],
-        outputs=[out],
-        device=device,
+        (worlds, fingers),
+        [scene["tip_body"], scene["tip_offset"], scene["body_q"], out],
+        device,
     )
     tip = pose_matrix(scene["body_q"])[:, scene["tip_body"]] @ pose_matrix(scene["tip_offset"])
     np.testing.assert_allclose(out.numpy(), tip[..., :3, 3], atol=1e-6)

@@ -4,7 +4,7 @@ import numpy as np
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, SENTINEL, device_array, unwritten
+from kernel_oracle import EXAMPLES, SENTINEL, device_array, launch, unwritten
 
 from vd.kernels.pair_order import KEY_BITS, pair_key_kernel, reorder_pairs_kernel
 
@@ -22,16 +22,10 @@ def test_pairs_are_sorted_by_kind_and_else_as_they_were(device, seed, most, fill
     world, counted = device_array(worlds, int, device), device_array(np.array([count]), int, device)
     key, order = (unwritten(2 * most, int, device) for _ in range(2))
     inputs = [device_array(kinds, int, device), counted, found[0]]
-    wp.launch(pair_key_kernel, dim=most, inputs=inputs, outputs=[key, order], device=device)
+    launch(pair_key_kernel, most, [*inputs, key, order], device)
     wp.utils.radix_sort_pairs(key, order, most, end_bit=KEY_BITS)
     out = [unwritten(most, dtype, device) for dtype in (wp.vec2i, wp.vec2i, int)]
-    wp.launch(
-        reorder_pairs_kernel,
-        dim=most,
-        inputs=[counted, order, *found, world],
-        outputs=out,
-        device=device,
-    )
+    launch(reorder_pairs_kernel, most, [counted, order, *found, world, *out], device)
     there = min(count, most)
     expected = np.argsort((kinds[pairs[:there, 0]] * 8 + kinds[pairs[:there, 1]]), kind="stable")
     for values, given_ in zip((pairs, ids, worlds), out, strict=True):

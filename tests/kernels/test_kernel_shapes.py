@@ -8,6 +8,7 @@ from kernel_oracle import (
     device_array,
     floats,
     goals,
+    launch,
     pose_matrix,
     quaternions,
     transforms,
@@ -59,35 +60,27 @@ def observe(device, scene, *, first=2):
     ]
     q = device_array(scene["q"], float, device)
     slices = shape_observation_slices(fingers)
-    wp.launch(
+    launch(
         surface_kernel,
-        dim=(worlds, fingers),
-        inputs=[
+        (worlds, fingers),
+        [
             *common,
-            device_array(scene["tip_body"], int, device),
-            device_array(scene["tip_offset"], wp.transform, device),
+            scene["tip_body"],
+            scene["tip_offset"],
             3 * fingers,
             first + slices["surface"].start,
             q,
-            device_array(scene["body_q"], wp.transform, device),
+            scene["body_q"],
+            out,
         ],
-        outputs=[out],
-        device=device,
+        device,
     )
     directions = extent_directions(fingers)
-    wp.launch(
+    launch(
         extent_kernel,
-        dim=(worlds, ORIENTATIONS, len(directions)),
-        inputs=[
-            *common,
-            device_array(directions, wp.vec3, device),
-            3 * fingers,
-            first + slices["extent"].start,
-            q,
-            device_array(scene["goal"], wp.quat, device),
-        ],
-        outputs=[out],
-        device=device,
+        (worlds, ORIENTATIONS, len(directions)),
+        [*common, directions, 3 * fingers, first + slices["extent"].start, q, scene["goal"], out],
+        device,
     )
     return out.numpy()
 
@@ -165,19 +158,11 @@ def test_nothing_else_is_written(device, scene):
 def test_clearance_is_the_lowest_point_above_the_table(device, scene, table_top):
     worlds, joints = len(scene["q"]), 3 * len(scene["tip_body"])
     out = unwritten(worlds, float, device)
-    wp.launch(
+    launch(
         clearance_kernel,
-        dim=worlds,
-        inputs=[
-            device_array(scene["points"], wp.vec3, device),
-            device_array(scene["object"], int, device),
-            device_array(scene["scale"], float, device),
-            joints,
-            table_top,
-            device_array(scene["q"], float, device),
-        ],
-        outputs=[out],
-        device=device,
+        worlds,
+        [scene["points"], scene["object"], scene["scale"], joints, table_top, scene["q"], out],
+        device,
     )
     for world, q in enumerate(np.asarray(scene["q"], np.float64)):
         cloud = scene["scale"][world] * np.asarray(scene["points"][scene["object"][world]], np.float64)
