@@ -34,20 +34,6 @@ def test_sim_rows_add_up(tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["worlds"] == 4
 
 
-def test_a_dense_jacobian_has_a_row_beside_the_sparse_one(capsys):
-    SimCommand(
-        envs=(2,),
-        objects=("cube",),
-        hand="dclaw3",
-        device="cpu",
-        jacobian=("sparse", "dense"),
-        allegro=False,
-    ).run()
-    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
-    assert [row["jacobian"] for row in rows] == ["sparse", "dense"]
-    assert all(row["physics_only"] > 0.0 for row in rows)
-
-
 def test_a_teacher_acts_in_its_own_task(tmp_path, capsys):
     SimCommand(
         envs=(4,), objects=("cube",), hand="dclaw3", policy="dclaw4-cube", device="cpu", allegro=False

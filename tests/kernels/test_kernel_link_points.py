@@ -97,7 +97,7 @@ def points_of(scene, device, *, with_object=True, spare=0, shown=None):
 @EXAMPLES
 @given(scene=scenes())
 def test_points_match_homogeneous_matrices(device, scene):
-    np.testing.assert_allclose(launch(scene, device), expected_points(scene), atol=1e-6)
+    np.testing.assert_allclose(points_of(scene, device), expected_points(scene), atol=1e-6)
 
 
 @EXAMPLES

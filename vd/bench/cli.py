@@ -1,13 +1,12 @@
 """``vd-bench``: measure speed, physics, depth, student and gap workflow; rates are ratios within one run."""
 
 import dataclasses
-import itertools
 import json
 import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import tyro
 
@@ -35,8 +34,6 @@ class SimCommand:
     """Name or file of a teacher whose mean actions are taken, in the task it was trained in (hand and
     randomisation are then that task's); by default a network with random weights closes the hand now and
     then."""
-    jacobian: tuple[Literal["dense", "sparse"], ...] = ("sparse",)
-    """How the solver keeps the constraints' Jacobian; with both there is a row for each."""
     kernels: int = 0
     """On a GPU list as many kernels, those that take the most time of a control step."""
     allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
@@ -61,12 +58,11 @@ class SimCommand:
         device = resolve_device(self.device)
         teacher = None if self.policy is None else load_policy(find_policy(self.policy), device)
         rows: list[dict[str, Any]] = []
-        for envs, jacobian in itertools.product(self.envs, self.jacobian):
+        for envs in self.envs:
             if teacher is None:
                 cfg = task(self.objects, envs, self.hand, self.randomise)
             else:
                 cfg = teacher_task(teacher, self.objects, envs)
-            cfg = dataclasses.replace(cfg, sim=dataclasses.replace(cfg.sim, jacobian=jacobian))
             row = measure(cfg, device, teacher=teacher)
             record: dict[str, Any] = dataclasses.asdict(row)
             record["kernels"] = record["kernels"][: self.kernels]

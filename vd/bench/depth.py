@@ -5,7 +5,7 @@ table. Rates count images, each from new poses: Newton's include the refit of it
 bodies need, ours the placing of meshes. Images of both are compared, so that a wrong one cannot look fast.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import newton
@@ -19,7 +19,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.bench.sim import captured, own_kernel_names, seconds_per_call
 from vd.paper import PAPER
-from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg, Method
+from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import Scene, build_scene
@@ -55,23 +55,21 @@ class DepthRow:
     """That order."""
     newton_refit_share: float
     """Share of its time that refitting its hierarchies takes."""
-    images: dict[Method, float] = field(default_factory=dict)
-    """Ours, depth images alone, by method."""
-    clouds: dict[str, float] = field(default_factory=dict)
-    """Ours with a cloud of each image, by method (and block of pixels a ray)."""
-    with_sensor: float = 0.0
-    """Ours with a cloud and every error of the sensor, by the faster method."""
-    images_over_newton: float = 0.0
-    """The faster of ours over Newton's, images alone."""
-    kernels_ms: dict[str, float] = field(default_factory=dict)
-    """Device time of each kernel for one image in every world [ms], both methods with clouds and the sensor's
-    errors; empty on the CPU."""
-    points: float = 0.0
+    images: float
+    """Ours, depth images alone."""
+    clouds: float
+    """Ours with a cloud of each image."""
+    with_sensor: float
+    """Ours with a cloud and every error of the sensor."""
+    images_over_newton: float
+    """Ours over Newton's, images alone."""
+    kernels_ms: dict[str, float]
+    """Device time of each kernel for one image in every world [ms], cloud and sensor included; empty on the
+    CPU."""
+    points: float
     """Points of a cloud, mean over environments."""
-    different: float = 0.0
+    different: float
     """Share of pixels that differ by more than 1 mm between Newton's image and ours (silhouettes)."""
-    methods_different: float = 0.0
-    """The same between ray casting and rasterisation."""
 
 
 def bench_scene(
@@ -171,32 +169,17 @@ def measure(
     body_q = state.body_q.reshape((envs, -1))
     camera = scene.hand.camera
 
-    images: dict[Method, float] = {}
-    depths: dict[Method, np.ndarray] = {}
-    camera_q = np.empty(0)
-    methods: tuple[Method, ...] = ("rays", "raster")
-    for method in methods:
-        ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method, points=0))
+    rates = []
+    for cfg in (
+        DepthCameraCfg(points=0),
+        DepthCameraCfg(),
+        DepthCameraCfg(sensor=DepthSensorCfg.realistic()),
+    ):
+        ours = DepthCamera.of_scene(scene, body_q, cfg)
         ours.capture()
-        images[method] = rate(envs, captured(ours.capture, device), device)
-        depths[method], camera_q = ours.depth.numpy().copy(), ours.camera_q.numpy()
-    best = max(images, key=lambda method: images[method])
-
-    clouds: dict[str, float] = {}
-    points = 0.0
-    variants: tuple[tuple[Method, int], ...] = (("rays", 1), ("rays", 2), ("rays", 3), ("raster", 1))
-    for method, block in variants:
-        ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method, block=block))
-        ours.capture()
-        clouds[method if block == 1 else f"{method}/{block}"] = rate(
-            envs, captured(ours.capture, device), device
-        )
-        if block == 1:
-            points = float(ours.count.numpy().mean())
-    ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=best, sensor=DepthSensorCfg.realistic()))
-    ours.capture()
-    with_sensor = rate(envs, captured(ours.capture, device), device)
-    kernels = {**_kernel_times(scene, body_q, "rays"), **_kernel_times(scene, body_q, "raster")}
+        rates.append(rate(envs, captured(ours.capture, device), device))
+    depth, camera_q = ours.true_depth.numpy().copy(), ours.camera_q.numpy()
+    points, kernels = float(ours.count.numpy().mean()), _kernel_times(ours)
     del ours
 
     newton_rates: dict[str, float] = {}
@@ -212,6 +195,7 @@ def measure(
         newton_rates[order] = rate(envs, frame, device)
         refit_s = 1.0 / rate(1, lambda theirs=theirs: theirs.refit(state), device)
         reference = theirs.depth.numpy().copy()
+    reference = np.where(reference > camera.far, 0.0, reference)
     order = max(newton_rates, key=lambda name: newton_rates[name])
     fastest = newton_rates[order]
     return DepthRow(
@@ -221,23 +205,18 @@ def measure(
         newton=fastest,
         newton_order=order,
         newton_refit_share=refit_s * fastest / envs,
-        images=images,
-        clouds=clouds,
-        with_sensor=with_sensor,
-        images_over_newton=images[best] / fastest,
+        images=rates[0],
+        clouds=rates[1],
+        with_sensor=rates[2],
+        images_over_newton=rates[0] / fastest,
         kernels_ms=kernels,
         points=points,
-        different=_different(np.where(reference > camera.far, 0.0, reference), depths["rays"]),
-        methods_different=_different(depths["raster"], depths["rays"]),
+        different=float(np.mean(np.abs(reference - depth) > SAME_DEPTH_M)),
     )
 
 
-def _kernel_times(scene: Scene, body_q: wp.array, method: Method) -> dict[str, float]:
-    """Device time of each kernel of a capture with all errors of the sensor [ms]; empty on the CPU."""
-    camera = DepthCamera.of_scene(
-        scene, body_q, DepthCameraCfg(method=method, sensor=DepthSensorCfg.realistic())
-    )
-    camera.capture()
+def _kernel_times(camera: DepthCamera) -> dict[str, float]:
+    """Device time of each kernel of a capture [ms]; empty on the CPU."""
     with wp.ScopedTimer("capture", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True) as timer:
         camera.capture()
     # Warp reports "forward kernel NAME_HASH".
@@ -247,8 +226,3 @@ def _kernel_times(scene: Scene, body_q: wp.array, method: Method) -> dict[str, f
         for kernel in sorted(own_kernel_names())
         if any(name.startswith(f"{kernel}_") for name, _ in times)
     }
-
-
-def _different(a: np.ndarray, b: np.ndarray) -> float:
-    """Share of pixels that differ by more than :data:`SAME_DEPTH_M`."""
-    return float(np.mean(np.abs(a - b) > SAME_DEPTH_M))

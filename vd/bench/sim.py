@@ -22,7 +22,6 @@ import warp as wp
 from vd.envs.cfg import ReorientCfg, RewardCfg
 from vd.envs.curriculum import Stage
 from vd.envs.reorient import ReorientEnv
-from vd.sim.pair_order import leave_pairs, sort_pairs
 
 if TYPE_CHECKING:
     from vd.policy import TrainedPolicy
@@ -53,17 +52,12 @@ class SimRow:
     """What was simulated."""
     envs: int
     """Environments side by side."""
-    jacobian: str
-    """How the solver keeps the constraints' Jacobian: dense or sparse."""
     physics_only: float
     """Control steps/s of the physics alone, over all environments."""
     whole_step: float
     """Control steps/s of the environment's step."""
     with_policy: float
     """Control steps/s with a policy network and, of the stand-in for an untrained one, its noise."""
-    pair_order_gain: float
-    """Physics only with candidate pairs sorted by kind (:mod:`vd.sim.pair_order`), as on any GPU, over that
-    with pairs as they are found; 0 on the CPU, where they are not sorted."""
     own_kernels: float
     """Share of our kernels in the device time of a control step, in [0, 1]; 0 on the CPU, not measured."""
     memory_gb: float
@@ -221,11 +215,7 @@ def measure(
     # The same policy acts in all of them, so that the hand moves and pushes alike.
     policy_s = seconds_per_call(policy, calls, device)
     step_s = seconds_per_call(lambda: env.step(env.action), calls, device, before=policy)
-    physics_s, unsorted_s, solver = physics_seconds(), 0.0, env.sim.solver
-    if on_gpu:
-        leave_pairs(solver.mjw_data)
-        unsorted_s = physics_seconds()
-        sort_pairs(solver.mjw_model, solver.mjw_data)
+    physics_s, solver = physics_seconds(), env.sim.solver
     env.check()
     data = solver.mjw_data
     contacts, rows = float(data.nacon.numpy()[0]), int(np.max(data.nefc.numpy()))
@@ -234,11 +224,9 @@ def measure(
     return SimRow(
         scene=label,
         envs=n,
-        jacobian=cfg.sim.jacobian,
         physics_only=n / physics_s,
         whole_step=n / step_s,
         with_policy=n / (policy_s + step_s),
-        pair_order_gain=unsorted_s / physics_s,
         own_kernels=own_share(kernels),
         memory_gb=memory,
         start_s=start_s,

@@ -15,7 +15,7 @@ from vd.kernels.task.environments import place_table_kernel
 from vd.kernels.task.guard import collect_overflow_kernel, guard_kernel, put_back_kernel
 from vd.paper import PAPER
 from vd.sim.actuators import JointServo
-from vd.sim.cfg import SimCfg
+from vd.sim.cfg import CONE, IMPRATIO, JACOBIAN, TOLERANCE, SimCfg
 from vd.sim.pair_order import sort_pairs
 from vd.sim.restitution import Restitution
 from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
@@ -82,15 +82,15 @@ def make_solver(model: newton.Model, cfg: SimCfg) -> SolverMuJoCo:
         model,
         solver="newton",
         integrator="implicitfast",
-        cone=cfg.cone,
-        impratio=cfg.impratio,
+        cone=CONE,
+        impratio=IMPRATIO,
         iterations=cfg.iterations,
         ls_iterations=cfg.ls_iterations,
-        tolerance=cfg.tolerance,
-        jacobian=cfg.jacobian,
+        tolerance=TOLERANCE,
+        jacobian=JACOBIAN,
         njmax=rows,
         nconmax=math.ceil(room * cfg.nconmax),
-        enable_multiccd=cfg.multiccd,
+        enable_multiccd=False,  # the table is a plane, whose contacts are exact, and fingertips are round
         kinematic_switchable_roots=False,
     )
     solver.mjw_model.opt.warn_overflow = False
@@ -281,12 +281,10 @@ class Simulator:
                 data.contact.worldid,
                 data.contact.geom,
                 data.contact.efc_address,
-                data.contact.dim,
                 data.efc.force,
                 self._geom_kind,
                 SHAPE_TABLE,
                 SHAPE_OBJECT,
-                int(self.cfg.cone == "pyramidal"),
             ],
             outputs=[self.table_force],
             device=self.device,
