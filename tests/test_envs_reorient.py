@@ -1,6 +1,7 @@
 """Behaviour of the environment: determinism, fresh observations, goals, guards, randomisation."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -240,10 +241,9 @@ def test_a_state_that_is_not_finite_stops_the_run_and_can_be_replayed(tmp_path):
     env.sim.joint_qd.numpy()[2, 0] = np.nan
     with pytest.raises(SimulationError, match=r"world 2, object cube"):
         run(env, 3)
-    (dump,) = env.sim.dumps()
-    assert dump.world == 2 and dump.object_name == "cube"
-    assert np.allclose(dump.joint_q, good[2])
-    assert np.isnan(dump.joint_qd[0]), "the dump is of the step that went bad"
+    dump = json.loads((tmp_path / "dump_cube_2.json").read_text())
+    assert np.allclose(dump["joint_q"], good[2])
+    assert dump["joint_qd"][0] is None, "the dump is of the step that went bad"
     lines = list(replay(tmp_path / "dump_cube_2.json"))
     assert "cube" in lines[0] and "NOT FINITE" in lines[1]
     (tmp_path / "bad.json").write_text("{}")

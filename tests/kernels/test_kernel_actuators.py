@@ -25,7 +25,6 @@ floats = st.floats
 @wp.kernel
 def step_kernel(
     command: wp.array2d[float],
-    coupled: wp.array[float],
     position: wp.array[float],
     speed: wp.array[float],
     power: wp.array[float],
@@ -39,8 +38,19 @@ def step_kernel(
     row = wp.tid()
     servo.start_servo(command[row, 0], position[row], row, state)
     for k in range(steps):
-        drive = servo.servo(
-            command[row, k], coupled[row], position[row], speed[row], power[row], dt, parameters, row, state
+        reference = servo.shape_command(command[row, k], dt, parameters, row, state)
+        drive = servo.drive_joint(
+            reference,
+            reference,
+            0.0,
+            position[row],
+            speed[row],
+            power[row],
+            dt,
+            servo.NO_EFFORT_LIMIT,
+            parameters,
+            row,
+            state,
         )
         out[row, k, 0] = drive.reference
         out[row, k, 1] = drive.stiffness
@@ -52,7 +62,7 @@ def step_kernel(
 REFERENCE, STIFFNESS, DAMPING, TORQUE, FRICTION = range(5)
 
 
-def steps_of(device, rows, command, position=0.0, speed=0.0, *, coupled=0.0, power=1.0, dt=DT):
+def steps_of(device, rows, command, position=0.0, speed=0.0, *, power=1.0, dt=DT):
     """Run the servos of rows [R, P] through commands [T] or [R, T]: out [R, T, 5], final state [R, S]."""
     rows = np.atleast_2d(rows)
     count = len(rows)
@@ -61,7 +71,7 @@ def steps_of(device, rows, command, position=0.0, speed=0.0, *, coupled=0.0, pow
     out = unwritten((count, command.shape[1], 5), float, device)
     each = [
         device_array(np.broadcast_to(v, count).astype(np.float32), float, device)
-        for v in (coupled, position, speed, power)
+        for v in (position, speed, power)
     ]
     parameters = device_array(rows, float, device)
     launch(step_kernel, count, [command, *each, command.shape[1], dt, parameters, state, out], device)

@@ -16,7 +16,7 @@ from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.starts import SETTLE_S, rest_poses
-from vd.envs.state import load_arrays, motion_arrays, save_failed_step, save_state, saved_stage
+from vd.envs.state import load_arrays, motion_arrays, save_state, saved_stage
 from vd.envs.table import table_array
 from vd.envs.task_state import build_task
 from vd.kernels.task.actions import apply_action_kernel
@@ -26,6 +26,7 @@ from vd.kernels.task.resets import episode_kernel, give_goal_kernel, reset_kerne
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.task.success import success_kernel
 from vd.paper import PAPER
+from vd.sim.replay import save_failed_step
 from vd.sim.simulator import SimulationError
 
 FAILURES_AT_FIRST = 10.0
@@ -54,6 +55,7 @@ class ReorientEnv:
         self.device = str(wp.get_device(device))
         self.state = state = build_task(cfg, self.device)
         """What this and its parts share."""
+        self._launch = state.launch
         self.hand, self.objects, self.scene, self.sim = state.hand, state.objects, state.scene, state.sim
         self.fingers, self.parameters = state.fingers, state.parameters
         self.measured_q, self.measured_qd = state.measured_q, state.measured_qd
@@ -180,7 +182,7 @@ class ReorientEnv:
         self._reset.fill_(1)
         self._new_goal.zero_()
         self.randomiser.draw(self._reset)
-        self._reset_worlds(use_start=object_quat is not None, use_goal=goal_quat is not None)
+        self._reset_envs(use_start=object_quat is not None, use_goal=goal_quat is not None)
         self.randomiser.push()
         self.observe()
 
@@ -191,12 +193,10 @@ class ReorientEnv:
             goal_quat: Goal orientations, xyzw, either sign, shape [N, 4].
         """
         self._given_goal.assign(np.asarray(goal_quat, dtype=np.float32))
-        wp.launch(
+        self._launch(
             give_goal_kernel,
-            dim=self.num_envs,
-            inputs=[self._given_goal, self.sim.joint_q, self.num_actions + 3],
-            outputs=[self.goal_quat, self.goal_steps],
-            device=self.device,
+            [self._given_goal, self.sim.joint_q, self.num_actions + 3],
+            [self.goal_quat, self.goal_steps],
         )
         if self.views is not None:
             self._new_goal.fill_(1)
@@ -245,10 +245,9 @@ class ReorientEnv:
         action = self.action
         if self.views is not None and self.acts_in_view:
             action = self.views.world_action(action)
-        wp.launch(
+        self._launch(
             apply_action_kernel,
-            dim=self.num_envs,
-            inputs=[
+            [
                 self.state.lower,
                 self.state.upper,
                 p.action,
@@ -258,8 +257,7 @@ class ReorientEnv:
                 self.smoothed,
                 self.state.rng,
             ],
-            outputs=[sim.target],
-            device=self.device,
+            [sim.target],
         )
 
     def launch_step(self) -> None:
@@ -278,24 +276,17 @@ class ReorientEnv:
             self.observer.shapes.measure_clearance(self.clearance)
         self._judge()
         self._end_episodes()
-        wp.launch(
-            record_step_kernel,
-            dim=self.num_envs,
-            inputs=[sim.joint_q, self.num_actions],
-            outputs=[self.object_pose_end],
-            device=self.device,
-        )
+        self._launch(record_step_kernel, [sim.joint_q, self.num_actions], [self.object_pose_end])
         self.randomiser.redraw(self._reset)
-        self._reset_worlds()
+        self._reset_envs()
         self.observe()
 
     def _judge(self) -> None:
         """Success and reward of the step, before resets."""
-        n, p, sim = self.num_envs, self.parameters, self.sim
-        wp.launch(
+        p, sim = self.parameters, self.sim
+        self._launch(
             success_kernel,
-            dim=n,
-            inputs=[
+            [
                 p.success,
                 sim.joint_q,
                 sim.joint_qd,
@@ -304,13 +295,11 @@ class ReorientEnv:
                 sim.table_force,
                 self.must_lift,
             ],
-            outputs=[self.rotation_error, self.still, self.success, self.fell],
-            device=self.device,
+            [self.rotation_error, self.still, self.success, self.fell],
         )
-        wp.launch(
+        self._launch(
             reward_kernel,
-            dim=n,
-            inputs=[
+            [
                 p.reward,
                 sim.joint_q,
                 sim.joint_qd,
@@ -323,24 +312,20 @@ class ReorientEnv:
                 self.fell,
                 self.previous_error,
             ],
-            outputs=[self.reward, self.reward_terms],
-            device=self.device,
+            [self.reward, self.reward_terms],
         )
         if self.cfg.failures_per_million > 0.0:
-            wp.launch(
+            self._launch(
                 void_step_kernel,
-                dim=n,
-                inputs=[sim.failed],
-                outputs=[self.reward, self.reward_terms, self.still, self.success, self.fell],
-                device=self.device,
+                [sim.failed],
+                [self.reward, self.reward_terms, self.still, self.success, self.fell],
             )
 
     def _end_episodes(self) -> None:
         """Which episodes end and which goals are new, and counts of goals."""
-        wp.launch(
+        self._launch(
             episode_kernel,
-            dim=self.num_envs,
-            inputs=[
+            [
                 self.success,
                 self.fell,
                 self.max_episode_steps,
@@ -349,24 +334,16 @@ class ReorientEnv:
                 self.goal_steps,
                 self.goals_reached,
             ],
-            outputs=[self.timed_out, self.done, self._reset, self._new_goal],
-            device=self.device,
+            [self.timed_out, self.done, self._reset, self._new_goal],
         )
-        wp.launch(
-            count_goals_kernel,
-            dim=self.num_envs,
-            inputs=[self.success, self.fell, self.done],
-            outputs=[self.goal_counts],
-            device=self.device,
-        )
+        self._launch(count_goals_kernel, [self.success, self.fell, self.done], [self.goal_counts])
 
-    def _reset_worlds(self, *, use_start: bool = False, use_goal: bool = False) -> None:
+    def _reset_envs(self, *, use_start: bool = False, use_goal: bool = False) -> None:
         """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too."""
         sim, p = self.sim, self.parameters
-        wp.launch(
+        self._launch(
             reset_kernel,
-            dim=self.num_envs,
-            inputs=[
+            [
                 self._reset_q,
                 p.start,
                 p.goal,
@@ -380,7 +357,7 @@ class ReorientEnv:
                 sim.joint_q,
                 self.state.rng,
             ],
-            outputs=[
+            [
                 sim.joint_qd,
                 self.smoothed,
                 self.step_count,
@@ -389,18 +366,11 @@ class ReorientEnv:
                 self.goal_quat,
                 self.previous_error,
             ],
-            device=self.device,
         )
         if self.views is not None:
             self.views.choose(self._reset, self._new_goal)
         # The solver warm-starts from the last accelerations, which mean nothing after a reset.
-        wp.launch(
-            world_mask_kernel,
-            dim=self.num_envs,
-            inputs=[self._reset],
-            outputs=[self._world_mask],
-            device=self.device,
-        )
+        self._launch(world_mask_kernel, [self._reset], [self._world_mask])
         sim.solver.reset(sim.state, world_mask=self._world_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
         if sim.servo is not None:
@@ -433,7 +403,15 @@ class ReorientEnv:
         try:
             self.sim.check(tolerated)
         except SimulationError as error:
-            path = save_failed_step(self.sim, self.cfg, self.dump_dir)
+            cfg = self.cfg
+            path = save_failed_step(
+                self.sim,
+                self.dump_dir,
+                hand=cfg.hand,
+                fingertip=cfg.fingertip,
+                hand_layer=cfg.hand_layer,
+                objects=cfg.objects,
+            )
             if path is None:
                 raise
             raise SimulationError(f"{error} (dump: {path})") from error

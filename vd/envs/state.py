@@ -1,16 +1,14 @@
 """Saving an environment in the middle of its episodes, and going on from there."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from vd.envs.cfg import CurriculumCfg, ReorientCfg
+from vd.envs.cfg import CurriculumCfg
 from vd.envs.curriculum import Stage, first_stage
 from vd.envs.task_state import TaskState
-from vd.sim.replay import save_dump
 from vd.sim.simulator import Simulator
 
 
@@ -80,23 +78,6 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         )
     for name, array in here.items():
         array.assign(arrays[name])
-
-
-def save_failed_step(sim: Simulator, cfg: ReorientCfg, folder: Path) -> Path | None:
-    """Save the first control step that failed for ``vd-bench replay``; returns its file, None if none did."""
-    dumps = sim.dumps()
-    if not dumps:
-        return None
-    dump = dumps[0]
-    return save_dump(
-        folder / f"dump_{dump.object_name}_{dump.world}.json",
-        dump,
-        hand=cfg.hand,
-        fingertip=cfg.fingertip,
-        hand_layer=cfg.hand_layer,
-        objects=cfg.objects,
-        sim=cfg.sim,
-    )
 
 
 def _objects(task: TaskState) -> list[tuple[str, int]]:

@@ -51,6 +51,12 @@ class TaskState:
     rng: wp.array
     """Random stream of each world, shape [N]."""
 
+    def launch(
+        self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any], *, dim: int | tuple[int, ...] = 0
+    ) -> None:
+        """Launch a kernel on the task's device; ``dim`` is N unless it is given."""
+        wp.launch(kernel, dim=dim or self.num_envs, inputs=inputs, outputs=outputs, device=self.device)
+
     @property
     def num_envs(self) -> int:
         """N."""
