@@ -27,11 +27,11 @@ def test_sim_rows_add_up(tmp_path, capsys):
     out = tmp_path / "rows.json"
     SimCommand(envs=(4,), objects=("cube",), hand="dclaw3", device="cpu", allegro=False, json=out).run()
     (row,) = json.loads(out.read_text())["rows"]
-    assert row["worlds"] == 4 and row["rows_max"] > 0
+    assert row["envs"] == 4 and row["rows_max"] > 0
     # The step alone is what is left when the policy's time is taken off; how fast either is depends on what
     # else runs here.
     assert 0.0 < row["with_policy"] < row["whole_step"]
-    assert json.loads(capsys.readouterr().out)["worlds"] == 4
+    assert json.loads(capsys.readouterr().out)["envs"] == 4
 
 
 def test_a_teacher_acts_in_its_own_task(tmp_path, capsys):

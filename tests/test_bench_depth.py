@@ -13,7 +13,7 @@ def test_rows_hold_rates_and_agreement(tmp_path, capsys, monkeypatch):
     out = tmp_path / "depth.json"
     DepthCommand(envs=(1, 2), objects=("cube",), hand="dclaw3", device="cpu", json=out).run()
     report = json.loads(out.read_text())
-    assert [row["worlds"] for row in report["rows"]] == [1, 2]
+    assert [row["envs"] for row in report["rows"]] == [1, 2]
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == report["rows"]
     for row in report["rows"]:
         assert row["images_over_newton"] == pytest.approx(row["images"] / row["newton"])

@@ -125,23 +125,6 @@ def test_velocity_limit_and_inertia_are_per_world():
     assert speed[:, 0].max() <= 0.5 + 1e-4 < speed[:, 1].max()
 
 
-def test_reset_forgets_commands_and_motion_of_its_worlds_only():
-    sim = simulator(rows(COMMAND_DELAY=0.1, INTEGRAL_GAIN=2.0), worlds=2)
-    assert sim.servo is not None
-    response(sim, steps=3)
-    before = sim.servo.state.numpy().reshape(2, D, -1)
-    state = sim.joint_q.numpy()
-    state[1, :D] = START
-    sim.joint_q.assign(state)
-    sim.servo.reset(wp.array([0, 1], dtype=wp.int32))
-    after = sim.servo.state.numpy().reshape(2, D, -1)
-    assert np.array_equal(after[0], before[0])
-    assert np.all(after[1, :, servo.STATE_TIME] == 0.0) and np.all(after[1, :, servo.STATE_INTEGRAL] == 0.0)
-    command(sim, 0.0)
-    positions, _ = response(sim, offset=0.0)
-    assert np.abs(positions[:, 1] - START).max() < 0.05 < np.abs(positions[:, 0] - START).max()
-
-
 @pytest.mark.parametrize(
     ("bad", "message"),
     [

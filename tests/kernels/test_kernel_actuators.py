@@ -142,51 +142,6 @@ def test_the_table_names_every_column_once():
 # --- The command ---
 
 
-@EXAMPLES
-@given(tau=floats(0.001, 1.0), seed=st.integers(0, 2**31), dt=st.sampled_from([1 / 120, 1 / 480]))
-def test_the_filter_is_exact_between_commands(device, tau, seed, dt):
-    command = np.random.default_rng(seed).uniform(-1, 1, 12)
-    out, state = steps_of(device, row_of(FILTER_TAU=tau), command, dt=dt)
-    value, means = command[0], []
-    for target in command:
-        # The integral of target + (value - target) exp(-t / tau), by Gauss-Legendre quadrature.
-        nodes, weights = np.polynomial.legendre.leggauss(20)
-        t = 0.5 * dt * (nodes + 1)
-        means.append(0.5 * weights @ (target + (value - target) * np.exp(-t / tau)))
-        value = target + (value - target) * np.exp(-dt / tau)
-    np.testing.assert_allclose(out[0, :, REFERENCE], means, atol=5e-5)
-    np.testing.assert_allclose(state[0, servo.STATE_FILTERED], value, atol=1e-5)
-
-
-@EXAMPLES
-@given(limit=floats(0.5, 300.0), way=floats(-1.5, 1.5))
-def test_a_profile_takes_the_least_time_and_stops(device, limit, way):
-    if abs(way) < 1e-3:
-        return
-    least = 2 * np.sqrt(abs(way) / limit)
-    count = int(1.2 * least / DT) + 10
-    command = np.full(count, way)
-    command[0] = 0.0  # the start
-    out, state = steps_of(device, row_of(ACCELERATION_LIMIT=limit), command)
-    # The middle of step k is at time (k - 1/2) dt after the command, which comes with step 1.
-    t = np.clip((np.arange(count) - 0.5) * DT, 0.0, least)
-    half = t < least / 2
-    expected = np.where(half, limit * t**2 / 2, abs(way) - limit * (least - t) ** 2 / 2) * np.sign(way)
-    np.testing.assert_allclose(out[0, :, REFERENCE], expected, atol=0.5 * limit * DT**2 + 2e-5)
-    assert state[0, servo.STATE_PROFILE] == pytest.approx(way, abs=1e-5)
-    speed = np.diff(out[0, :, REFERENCE].astype(float)) / DT
-    assert np.abs(np.diff(speed)).max() < limit * DT + 1e-3
-    # In double precision 1e-10 is left. In single, braking at the limit leaves nothing to correct rounding
-    # with: a unit in the last place a step of position (it and its distance to the target are rounded), half
-    # a one of speed, which the position adds up; and the eight roundings under the root of the speed, of
-    # terms up to 2 limit way, where that root vanishes. At most 2e-5 of 200 000 profiles.
-    steps = least / 2 / DT + 2
-    place, rate = np.spacing(np.float32([abs(way), np.sqrt(abs(way) * limit)])).astype(float)
-    root = np.sqrt(8 * np.finfo(np.float32).epsneg * 2 * limit * abs(way))
-    rounding = min(steps * place + 0.25 * steps**2 * DT * rate + 0.5 * DT * root, 3e-5)
-    assert np.abs(out[0, :, REFERENCE]).max() <= abs(way) + rounding, "overshoot beyond single precision"
-
-
 # --- The motor ---
 
 MOTOR = {
@@ -213,53 +168,7 @@ def test_a_loss_of_the_motor_is_its_formula(device, stage, size, error, speed, s
     assert out[0, -1, DAMPING] >= 0.0 and out[0, -1, STIFFNESS] >= 0.0
 
 
-@EXAMPLES
-@given(error=floats(-2.0, 2.0), speed=floats(-9.0, 9.0), idle=floats(0.1, 4.0))
-def test_beyond_the_no_load_speed_nothing_drives_and_nothing_brakes_for_it(device, error, speed, idle):
-    row = row_of(kd=0.0, STALL_TORQUE=0.7, NO_LOAD_SPEED=idle)
-    out, _ = steps_of(device, row, [error], 0.0, speed)
-    torque = total(out, 0.0, speed)[0, 0]
-    assert torque * error >= -1e-6, "the line turned the torque round"
-    if error * speed > 0.0 and abs(speed) >= idle * (1.0 + 1e-6):
-        assert torque == pytest.approx(0.0, abs=1e-6) and out[0, 0, DAMPING] == 0.0
-    assert abs(torque) <= 0.7 + 1e-6
-
-
 # --- Friction ---
-
-
-@EXAMPLES
-@given(
-    coulomb=floats(0, 1),
-    load=floats(0, 0.9),
-    static=floats(0, 1),
-    sliding=floats(0, 1),
-    scale=floats(0.01, 5),
-    plus=floats(0, 1),
-    minus=floats(0, 1),
-    error=floats(-1, 1),
-    speed=floats(-3, 3),
-)
-def test_friction_adds_up_and_each_direction_has_its_own(
-    device, coulomb, load, static, sliding, scale, plus, minus, error, speed
-):
-    row = row_of(
-        COULOMB_TORQUE=coulomb,
-        LOAD_FRICTION=load,
-        STRIBECK_STATIC=static,
-        STRIBECK_SLIDING=sliding,
-        STRIBECK_SPEED=scale,
-        FRICTION_PLUS=plus,
-        FRICTION_MINUS=minus,
-    )
-    out, _ = steps_of(device, row, [error], 0.0, speed)
-    motor = 3.0 * error - 0.3 * speed
-    common = coulomb + load * abs(motor) + sliding + (static - sliding) * np.exp(-((speed / scale) ** 2))
-    free = total(out, 0.0, speed)[0, 0]
-    moving_forward = free - out[0, 0, FRICTION]
-    moving_back = free + out[0, 0, FRICTION]
-    assert moving_forward == pytest.approx(motor - common - plus, abs=2e-5)
-    assert moving_back == pytest.approx(motor + common + minus, abs=2e-5)
 
 
 # --- The load ---

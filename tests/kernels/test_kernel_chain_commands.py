@@ -92,15 +92,6 @@ def test_dropped_commands_leave_the_one_before_in_force(device):
 # --- Bounds ---
 
 
-def test_speed_and_stops_bound_the_motion(device):
-    time = np.arange(0, 1.0, DT)
-    rows = rows_of({servo.VELOCITY_LIMIT: 2.0})
-    got = one_joint(device, rows, time, np.full(len(time), 3.0), stops=1.2)[0]
-    assert np.diff(got).max() / DT == pytest.approx(2.0, rel=1e-3)
-    assert got.max() == pytest.approx(1.2, abs=1e-6)
-    assert got[-1] == got.max()
-
-
 def test_a_coupled_joint_follows_its_neighbour(device):
     time = np.arange(0, 2.0, 0.01)
     command = np.zeros((1, len(time), 2))

@@ -229,20 +229,6 @@ def test_an_effect_follows_a_finer_integration(device, effects_reference, effect
         assert np.sqrt(np.mean((got - without) ** 2, axis=1)).max() > 3e-3, "the effect does nothing"
 
 
-def test_all_effects_together_follow_a_finer_integration(device):
-    rng = np.random.default_rng(8)
-    rows = np.tile(rows_of({})[:, 0], (20, 1))
-    for name in DETERMINISTIC:
-        for parameter in EFFECTS[name].parameters:
-            size = parameter.typical * rng.uniform(0.2, 1.0, len(rows))
-            rows[:, parameter.column] = size
-    time, command = excitation(rng)
-    got = one_joint(device, rows[:, None], time, command)
-    expected = integrate(rows, time, command, 0.0, DT / FINE)
-    error = np.sqrt(np.mean((got - expected) ** 2, axis=1))
-    assert np.median(error) < 3e-3 and error.max() < 1e-2
-
-
 def test_the_error_falls_with_the_square_of_the_step(device):
     time = np.arange(0, 1.5, 0.05)
     command = 0.3 * np.sin(2 * np.pi * np.arange(0, 1.5, 0.05))

@@ -58,15 +58,3 @@ def test_references_are_those_of_the_damped_spring(device, data):
             np.testing.assert_allclose(out[w, g], expected, rtol=2e-5)
             # The stiffness, which sets how deep a resting object sinks, stays.
             assert np.prod(out[w, g]) == pytest.approx(np.prod(nominal[w, g]), rel=1e-5)
-
-
-def test_without_restitution_every_bit_stays(device):
-    kind = np.array([[TABLE, HAND]])
-    nominal = np.array([[[1 / 60, 1.0], [0.02, 0.9]]], np.float32)
-    out = references(device, nominal, kind, np.full((1, 9), 5.0), np.zeros((3, 1)))
-    np.testing.assert_array_equal(out, nominal)
-
-
-def test_the_ratio_has_a_floor(device):
-    out = references(device, [[[0.01, 1.0]]], np.array([[TABLE]]), np.full((1, 9), 5.0), np.ones((3, 1)))
-    np.testing.assert_allclose(out[0, 0], [0.01 / LOWEST, LOWEST], rtol=1e-6)

@@ -18,7 +18,6 @@ from kernel_oracle import (
     unwritten,
 )
 from scipy import stats
-from scipy.spatial.transform import Rotation
 
 from vd.kernels.task.observations import (
     ObservationParams,
@@ -207,26 +206,6 @@ def test_fingertip_positions_are_those_observed(device, scene):
     )
     tip = pose_matrix(scene["body_q"])[:, scene["tip_body"]] @ pose_matrix(scene["tip_offset"])
     np.testing.assert_allclose(out.numpy(), tip[..., :3, 3], atol=1e-6)
-
-
-@EXAMPLES
-@given(scene=scenes())
-def test_fingertip_velocity_is_the_derivative_of_its_position(device, scene):
-    fingers, step = len(scene["tip_body"]), 1e-5
-    scene["offset"][:] = 0.0
-    out, _ = observe(device, scene)
-    scene = {name: np.asarray(value, np.float64) for name, value in scene.items()}
-    tips = out[:, teacher_observation_slices(fingers)["fingertips"]].reshape(len(out), fingers, 13)
-    for world in range(len(out)):
-        for finger, body in enumerate(scene["tip_body"].astype(int)):
-            pose, twist = scene["body_q"][world, body], scene["body_qd"][world, body]
-            com_in_body, in_body = scene["body_com"][body], scene["tip_offset"][finger, :3]
-            rotation = Rotation.from_quat(pose[3:])
-            com = pose[:3] + rotation.apply(com_in_body)
-            moved = Rotation.from_rotvec(step * twist[3:]) * rotation
-            after = com + step * twist[:3] + moved.apply(in_body - com_in_body)
-            velocity = (after - (pose[:3] + rotation.apply(in_body))) / step
-            np.testing.assert_allclose(tips[world, finger, 7:10], velocity, atol=2e-4)
 
 
 def uniform_scene(fingers, worlds):

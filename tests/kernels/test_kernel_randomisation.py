@@ -183,15 +183,6 @@ def test_only_masked_worlds_are_drawn(device, mask, fingers):
         assert np.all(after[mask == 1] != before[mask == 1])
 
 
-def test_draws_repeat_with_the_seed_whatever_the_other_worlds_do(device):
-    everything = draw_dynamics(device, np.ones(64, int), seed=4)
-    half = draw_dynamics(device, np.arange(64) % 2, seed=4)
-    other = draw_dynamics(device, np.ones(64, int), seed=5)
-    for name in OUTPUTS:
-        np.testing.assert_array_equal(everything[name][1::2], half[name][1::2])
-        assert not np.array_equal(everything[name], other[name])
-
-
 @wp.kernel(enable_backward=False)
 def walk_kernel(rng: wp.array[wp.uint32], out: wp.array[float]):
     world = wp.tid()

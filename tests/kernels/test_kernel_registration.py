@@ -373,21 +373,6 @@ def test_the_best_poses_that_differ_are_kept(device, seed, known):
     np.testing.assert_allclose(arrays[0].numpy()[there], expected_pose[there], atol=1e-6)
 
 
-def test_a_pose_that_is_not_to_be_looked_at_stays(device):
-    scene = Scene(0)
-    row_world, seen, count = scene.inputs(device)
-    rows = scene.pose.shape[:2]
-    pose, misfit = device_array(scene.pose, wp.transform, device), np.zeros(rows)
-    misfit[:, 1] = NEVER
-    left = device_array(misfit, float, device)
-    nearness = device_array(scene.nearness, float, device)
-    inputs = [scene.model(device), scene.camera(), FAR, 3, 1, 1, row_world, seen, count, nearness]
-    launch(fit_poses_kernel, rows, [*inputs, pose, left], device)
-    stays = np.abs(pose.numpy() - scene.pose).max(axis=(0, 2)) < 1e-6
-    assert stays[1] and not stays[0]
-    assert (left.numpy()[:, 1] == np.float32(NEVER)).all() and (left.numpy()[:, 0] < 1.0).all()
-
-
 def test_rows_of_no_world_are_left_out(device):
     """They are neither placed nor improved nor kept, in a launch that is of all rows."""
     scene = Scene(0)

@@ -103,14 +103,6 @@ def test_directions_are_even_and_as_symmetric_as_the_hand(fingers):
     assert cKDTree(directions).query(turned)[0].max() < 1e-12
 
 
-@pytest.mark.parametrize(("fingers", "size"), [(3, 67), (4, 88)])
-def test_columns_tile_the_values(fingers, size):
-    slices = list(shape_observation_slices(fingers).values())
-    columns = np.concatenate([np.arange(s.start, s.stop) for s in slices])
-    assert shape_observation_size(fingers) == size
-    np.testing.assert_array_equal(columns, np.arange(size))
-
-
 @EXAMPLES
 @given(scene=scenes())
 def test_fingertips_are_told_the_nearest_point_of_the_surface(device, scene):
@@ -143,14 +135,6 @@ def test_extents_are_the_support_function_now_and_at_the_goal(device, scene):
             support = (placed(scene, world, quat) @ np.array(extent_directions(fingers)).T).max(axis=0)
             values = EXTENT_CENTRE_M + SHAPE_UNIT_M * out[world, first:][slices[name]]
             np.testing.assert_allclose(values, support, atol=2e-6)
-
-
-@EXAMPLES
-@given(scene=scenes())
-def test_nothing_else_is_written(device, scene):
-    out = observe(device, scene, first=2)
-    assert np.isnan(out[:, :2]).all() and np.isnan(out[:, -1]).all()
-    assert np.isfinite(out[:, 2:-1]).all()
 
 
 @EXAMPLES

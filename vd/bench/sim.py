@@ -163,8 +163,8 @@ def own_kernel_names() -> set[str]:
     import vd.kernels
 
     names = set()
-    for info in pkgutil.iter_modules(vd.kernels.__path__):
-        module = importlib.import_module(f"vd.kernels.{info.name}")
+    for info in pkgutil.walk_packages(vd.kernels.__path__, "vd.kernels."):
+        module = importlib.import_module(info.name)
         names |= {value.key for value in vars(module).values() if isinstance(value, wp.Kernel)}
     return names
 

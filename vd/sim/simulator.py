@@ -320,7 +320,7 @@ class Simulator:
                 if np.any(overflow & bit)
             ]
             raise SimulationError(
-                f"{len(worlds)} of {self.num_envs} worlds lost contacts (first: world {worlds[0]}; "
+                f"{len(worlds)} of {self.num_envs} environments lost contacts (first: {worlds[0]}; "
                 f"objects: {', '.join(sorted(names)[:5])}): {'; '.join(lines)}"
             )
         failures = self.failures.numpy()
@@ -328,8 +328,8 @@ class Simulator:
             worlds = np.flatnonzero(failures)
             name = self.scene.objects[self.scene.world_object[worlds[0]]].name
             raise SimulationError(
-                f"{len(worlds)} of {self.num_envs} worlds left the finite numbers or exceeded "
-                f"{MAX_SPEED:g} m/s or rad/s (first: world {worlds[0]}, object {name}). "
+                f"{len(worlds)} of {self.num_envs} environments left the finite numbers or "
+                f"exceeded {MAX_SPEED:g} m/s or rad/s (first: world {worlds[0]}, object {name}). "
                 "Replay the saved dump with "
                 "`vd-bench replay DUMP`; then raise sim.physics_hz or sim.contact_time_constant_s"
             )
