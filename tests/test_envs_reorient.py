@@ -22,7 +22,7 @@ from vd.envs.cfg import (
     TighteningCfg,
 )
 from vd.envs.reorient import ReorientEnv
-from vd.envs.table import ALWAYS, must_lift, table_steps
+from vd.envs.setup import ALWAYS, must_lift, table_steps
 from vd.kernels.task.observations import teacher_observation_size, teacher_observation_slices
 from vd.kernels.task.shapes import (
     EXTENT_CENTRE_M,

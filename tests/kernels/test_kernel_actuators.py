@@ -172,16 +172,3 @@ def test_a_loss_of_the_motor_is_its_formula(device, stage, size, error, speed, s
 
 
 # --- The load ---
-
-
-@EXAMPLES
-@given(seed=st.integers(0, 2**31))
-def test_any_parameters_within_their_bounds_give_numbers(device, seed):
-    rng = np.random.default_rng(seed)
-    rows = np.tile(row_of(), (40, 1))
-    for p in (*BASELINE, *(p for effect in EFFECTS.values() for p in effect.parameters)):
-        low = -p.upper if p.signed else p.lower
-        rows[:, p.column] = rng.choice([low, p.upper, p.neutral, p.typical], 40)
-    command = rng.uniform(-3, 3, (40, 30))
-    out, _ = steps_of(device, rows, command, rng.uniform(-3, 3, 40), rng.choice([0.0, -1e2, 1e-6, 5.0], 40))
-    assert (out[..., [STIFFNESS, DAMPING, FRICTION]] >= 0.0).all()

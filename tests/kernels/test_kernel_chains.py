@@ -240,26 +240,6 @@ def test_the_error_falls_with_the_square_of_the_step(device):
     assert errors[1] < 1e-3 and errors[0] / errors[1] > 3.0, errors
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {servo.TORQUE_LIMIT: 0.15},
-        {servo.SATURATION_TORQUE: 0.2},
-        {servo.SUPPLY_SAG: 4.0},
-        {servo.STALL_TORQUE: 0.3, servo.NO_LOAD_SPEED: 3.0},
-        {servo.LOAD_FRICTION: 0.3},
-    ],
-)
-def test_a_motor_at_its_limit_needs_no_finer_step(device, settings):
-    """Neither the implicit damping nor a command within a step changes a torque at its limit."""
-    time = np.arange(0, 1.5, 0.01)
-    command = np.where((time > 0.1) & (time < 0.8), 0.6, 0.0)
-    rows = rows_of(settings)
-    truth = one_joint(device, rows, time, command, dt=1 / 15360)
-    coarse = one_joint(device, rows, time, command, dt=DT)
-    assert np.sqrt(np.mean((coarse - truth) ** 2)) < 2e-4
-
-
 def test_a_drive_gives_no_more_than_its_effort(device):
     rng = np.random.default_rng(3)
     time, command = excitation(rng)

@@ -1,4 +1,4 @@
-"""Depth by rasterisation against closed forms and trimesh's ray engine.
+"""Depth by rasterisation against closed forms; against Newton's camera see test_depth_camera.py.
 
 Rule of the silhouette: a pixel is left out of a comparison if the oracle, cast through four points a
 hundredth of a pixel around its centre, does not see one flat surface, or sees it at the very end of the
@@ -8,11 +8,10 @@ camera's range. Single precision cannot say there.
 import numpy as np
 import trimesh
 import warp as wp
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, floats, quaternions
 from scipy.spatial.transform import Rotation
-from trimesh.ray.ray_triangle import ray_triangle_id
 
 from vd.assets_usd.hand_data import CameraModel
 from vd.paper import PAPER
@@ -137,54 +136,6 @@ def test_table_is_a_box_seen_from_above(device, height, tilt):
     compare(depth, box_oracle(pose, 1.0, half), atol=1e-5)
     bare = shoot(device, [solid(BOX)], far_away, [1.0], eye=eye, table=False)
     assert not bare.any()
-
-
-class AllTriangles:
-    """A search tree that finds every triangle: trimesh's own needs a package more."""
-
-    def __init__(self, triangles):
-        flat = triangles.reshape(-1, 3)
-        self.bounds = np.concatenate([flat.min(axis=0), flat.max(axis=0)])
-        self._all = list(range(len(triangles)))
-
-    def intersection(self, _bounds):
-        """Indices of all triangles."""
-        return self._all
-
-
-def trimesh_oracle(meshes, poses, scales):
-    """Nearest depth along each direction by trimesh's ray engine, in float64."""
-
-    def depth(rays):
-        flat = rays.reshape(-1, 3)
-        nearest = np.full(len(flat), np.inf)
-        for mesh, pose, scale in zip(meshes, poses, scales, strict=True):
-            corners = Rotation.from_quat(pose[3:]).apply(scale * mesh.vertices.astype(float)) + pose[:3]
-            triangles = corners[mesh.faces]
-            _, ray, location = ray_triangle_id(
-                triangles, np.zeros_like(flat), flat, tree=AllTriangles(triangles)
-            )
-            if len(ray):
-                np.minimum.at(nearest, ray, location[:, 2])
-        return nearest.reshape(rays.shape[:-1])
-
-    return depth
-
-
-SHAPES = [
-    solid(trimesh.creation.torus(0.1, 0.04, major_sections=12, minor_sections=8)),
-    solid(trimesh.creation.cylinder(0.05, 0.2, sections=10)),
-    solid(trimesh.creation.icosphere(subdivisions=1, radius=0.08)),
-]
-
-
-@settings(EXAMPLES, max_examples=8)  # trimesh tests every triangle against every ray
-@given(place=placements(count=3))
-def test_several_meshes_by_the_ray_engine_of_trimesh(device, place):
-    poses, scales = place
-    model = camera(width=19, height=13, focal=15.0)
-    depth = shoot(device, SHAPES, poses, scales, model=model)
-    compare(depth, trimesh_oracle(SHAPES, poses, scales), model, atol=2e-5)
 
 
 def test_closed_surfaces_have_no_cracks(device):

@@ -371,32 +371,3 @@ def test_the_best_poses_that_differ_are_kept(device, seed, known):
     np.testing.assert_allclose(arrays[1].numpy(), np.minimum(expected, NEVER), rtol=1e-5)
     there = np.isfinite(expected_pose)
     np.testing.assert_allclose(arrays[0].numpy()[there], expected_pose[there], atol=1e-6)
-
-
-def test_rows_of_no_world_are_left_out(device):
-    """They are neither placed nor improved nor kept, in a launch that is of all rows."""
-    scene = Scene(0)
-    before, rows = scene.pose.copy(), scene.pose.shape[:2]
-    scene.row_world = np.full(len(scene.row_world), -1)
-    row_world, seen, count = scene.inputs(device)
-    started, misfit = unwritten(rows, wp.transform, device), unwritten(rows, float, device)
-    pose, nearness = (
-        device_array(before, wp.transform, device),
-        device_array(scene.nearness, float, device),
-    )
-    shapes, eye, first = scene.model(device), scene.camera(), wp.zeros(rows[0], dtype=int, device=device)
-    rotation = device_array(np.eye(4)[3:], wp.quat, device)
-    starting = [shapes, eye, 1, 1, row_world, first, rotation, seen, count]
-    launch(start_poses_kernel, rows, [*starting, started], device)
-    fitting = [shapes, eye, FAR, 1, 1, 1, row_world, seen, count, nearness]
-    launch(fit_poses_kernel, rows, [*fitting, pose, misfit], device)
-    kept, average = (
-        unwritten((scene.worlds, 2), wp.transform, device),
-        wp.zeros((scene.worlds, 2), dtype=float, device=device),
-    )
-    keeping = [0.3, 0.8, 0.1, 0, row_world, pose]
-    outputs = [misfit, kept, average]
-    launch(keep_poses_kernel, rows[0], [*keeping, *outputs], device)
-    for array in (started, misfit, kept):
-        assert np.isnan(array.numpy()).all()
-    np.testing.assert_array_equal(pose.numpy(), np.float32(before))

@@ -196,7 +196,7 @@ def test_starts_and_goals_are_uniform_and_independent(device):
     )
 
 
-@pytest.mark.parametrize("max_angle", [0.3, 1.0])
+@pytest.mark.parametrize("max_angle", [0.01, 0.3, 1.0, 2.5])
 def test_new_goals_stay_within_their_angle_of_the_present_orientation(device, max_angle):
     worlds = 20_000
     everywhere = np.ones(worlds, int)

@@ -250,7 +250,7 @@ def begin_from(path: Path, student: "Student", device: str) -> list[str]:
 def _pretrainer(cfg: StudentTrainCfg, task: ReorientCfg, student: "Student", world_size: int) -> Any:
     from vd.assets_usd.hands import load_hand
     from vd.assets_usd.objects.sets import load_set
-    from vd.envs.objects import object_scales
+    from vd.envs.setup import object_scales
     from vd.train.student.pretrain import Pretrainer, RandomScenes
 
     objects = load_set(list(task.objects))

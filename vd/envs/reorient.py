@@ -15,9 +15,8 @@ from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
-from vd.envs.starts import SETTLE_S, rest_poses
+from vd.envs.setup import SETTLE_S, rest_poses, table_steps
 from vd.envs.state import load_arrays, motion_arrays, save_state, saved_stage
-from vd.envs.table import table_array
 from vd.envs.task_state import build_task
 from vd.kernels.task.actions import apply_action_kernel
 from vd.kernels.task.environments import count_goals_kernel, record_step_kernel, world_mask_kernel
@@ -87,7 +86,9 @@ class ReorientEnv:
         """The views in which the policy observes and acts; None where that is the world frame."""
         self.acts_in_view = True
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
-        self._table_steps = table_array(cfg, self.device)
+        self._table_steps: wp.array | None = None
+        if cfg.table.away_share > 0.0:
+            self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device)
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""

@@ -11,10 +11,9 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.assets_usd.objects.sets import load_set
 from vd.envs.cfg import ReorientCfg
 from vd.envs.fingers import Fingers
-from vd.envs.objects import object_scales
 from vd.envs.parameters import TaskParameters
 from vd.envs.servo import needs_servo, servo_ranges
-from vd.envs.table import must_lift
+from vd.envs.setup import must_lift, object_scales
 from vd.kernels.rng import init_rng_kernel
 from vd.sim.scene import Scene, build_scene
 from vd.sim.simulator import Simulator
