@@ -16,7 +16,7 @@ from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
 from vd.envs.setup import SETTLE_S, rest_poses, table_steps
-from vd.envs.state import load_arrays, motion_arrays, save_state, saved_stage
+from vd.envs.state import load_arrays, save_state, saved_stage
 from vd.envs.task_state import build_task
 from vd.kernels.task.actions import apply_action_kernel
 from vd.kernels.task.environments import count_goals_kernel, record_step_kernel, world_mask_kernel
@@ -225,8 +225,15 @@ class ReorientEnv:
         self.randomiser.after_step(self.steps)
 
     def motion(self) -> dict[str, wp.array]:
-        """What the motion goes on from, see :func:`vd.envs.state.motion_arrays`; not copies."""
-        return motion_arrays(self.sim)
+        """What the motion goes on from, the last targets included: arrays with a row for each; not copies."""
+        sim = self.sim
+        return {
+            "joint_q": sim.joint_q,
+            "joint_qd": sim.joint_qd,
+            "target": sim.target,
+            "warm_start": sim.solver.mjw_data.qacc_warmstart,
+            **({} if sim.servo is None else sim.servo.stateful()),
+        }
 
     def hold(self) -> None:
         """One control step in which no policy acts and the hand keeps its last targets; nothing is reset."""

@@ -9,7 +9,6 @@ import warp as wp
 from vd.envs.cfg import CurriculumCfg
 from vd.envs.curriculum import Stage, first_stage
 from vd.envs.task_state import TaskState
-from vd.sim.simulator import Simulator
 
 
 def save_state(task: TaskState, arrays: Mapping[str, wp.array], stage: Stage, steps: int) -> dict[str, Any]:
@@ -84,14 +83,3 @@ def _objects(task: TaskState) -> list[tuple[str, int]]:
     """Environments of each object, in the order of the environments."""
     counts = np.bincount(task.scene.world_object, minlength=len(task.objects))
     return [(item.name, int(count)) for item, count in zip(task.objects, counts, strict=True)]
-
-
-def motion_arrays(sim: Simulator) -> dict[str, wp.array]:
-    """What the motion of every world goes on from, the last targets included: arrays with a row for each."""
-    return {
-        "joint_q": sim.joint_q,
-        "joint_qd": sim.joint_qd,
-        "target": sim.target,
-        "warm_start": sim.solver.mjw_data.qacc_warmstart,
-        **({} if sim.servo is None else sim.servo.stateful()),
-    }
