@@ -67,30 +67,10 @@ def observe(device, scene, *, noise_mean=0.0, noise_std=0.0, seed=0, file_axes=T
         canonical=float(canonical),
     )
     rng = streams(worlds, seed, device)
-    launch(
-        teacher_observation_kernel,
-        worlds,
-        [
-            scene["lower"],
-            scene["upper"],
-            scene["tip_body"],
-            scene["tip_offset"],
-            scene["body_com"],
-            params,
-            scene["measured_q"],
-            scene["measured_qd"],
-            scene["q"],
-            scene["qd"],
-            scene["body_q"],
-            scene["body_qd"],
-            scene["goal"],
-            scene["smoothed"],
-            scene["offset"],
-            rng,
-            out,
-        ],
-        device,
-    )
+    model = [scene[name] for name in ("lower", "upper", "tip_body", "tip_offset", "body_com")]
+    names = ["measured_q", "measured_qd", "q", "qd", "body_q", "body_qd", "goal", "smoothed", "offset"]
+    seen = [scene[name] for name in names]
+    launch(teacher_observation_kernel, worlds, [*model, params, *seen, rng, out], device)
     return out.numpy(), rng.numpy()
 
 

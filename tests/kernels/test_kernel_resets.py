@@ -92,22 +92,11 @@ class World:
             "error": np.full(worlds, np.nan, np.float32),
         }
 
-    def reset(
-        self,
-        mask,
-        new_goal,
-        max_angle=np.pi,
-        noise=NOISE,
-        start_quat=None,
-        goal_quat=None,
-        vertical=0,
-        rest=None,
-    ):
+    def reset(self, mask, new_goal, max_angle=np.pi, noise=NOISE, *, vertical=0, rest=None, **given):
         """Launch; returns every array by name."""
         types = {"rng": wp.uint32, "steps": int, "age": int, "goals": int, "goal": wp.quat}
         state = {n: device_array(a, types.get(n, float), self.device) for n, a in self.before.items()}
         none = np.zeros((0, 4), np.float32)
-        rest = np.zeros((len(mask), 0, 7)) if rest is None else rest
         launch(
             reset_kernel,
             len(mask),
@@ -118,10 +107,10 @@ class World:
                 np.zeros((len(mask), 0, 7)) if rest is None else rest,
                 mask,
                 new_goal,
-                none if start_quat is None else start_quat,
-                int(start_quat is not None),
-                none if goal_quat is None else goal_quat,
-                int(goal_quat is not None),
+                given.get("start_quat", none),
+                int("start_quat" in given),
+                given.get("goal_quat", none),
+                int("goal_quat" in given),
                 state["q"],
                 state["rng"],
                 *[state[n] for n in ("qd", "smoothed", "steps", "age", "goals", "goal", "error")],
@@ -139,7 +128,8 @@ def test_only_masked_worlds_change_and_only_in_what_is_theirs(device, data, fing
     start = data.draw(quaternions((worlds,))) if given_quats else None
     goal = data.draw(quaternions((worlds,))) if given_quats else None
     world = World(device, worlds, fingers, orientation=data.draw(quaternions((worlds,))))
-    after = world.reset(mask, new_goal, start_quat=start, goal_quat=goal)
+    given = {"start_quat": start, "goal_quat": goal} if given_quats else {}
+    after = world.reset(mask, new_goal, **given)
     joints = world.joints
     untouched = (mask == 0) & (new_goal == 0)
     for name, array in after.items():

@@ -1,11 +1,9 @@
 import numpy as np
 import pytest
-import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import (
     EXAMPLES,
-    device_array,
     floats,
     goals,
     launch,
@@ -53,35 +51,16 @@ def observe(device, scene, *, first=2):
     """Launch both kernels behind ``first`` columns and before one more; returns all columns."""
     worlds, fingers = len(scene["q"]), len(scene["tip_body"])
     out = unwritten((worlds, first + shape_observation_size(fingers) + 1), float, device)
-    common = [
-        device_array(scene["points"], wp.vec3, device),
-        device_array(scene["object"], int, device),
-        device_array(scene["scale"], float, device),
-    ]
-    q = device_array(scene["q"], float, device)
-    slices = shape_observation_slices(fingers)
-    launch(
-        surface_kernel,
-        (worlds, fingers),
-        [
-            *common,
-            scene["tip_body"],
-            scene["tip_offset"],
-            3 * fingers,
-            first + slices["surface"].start,
-            q,
-            scene["body_q"],
-            out,
-        ],
-        device,
+    common = [scene[name] for name in ("points", "object", "scale")]
+    surface, extent = (
+        first + shape_observation_slices(fingers)[name].start for name in ("surface", "extent")
     )
+    tips = [scene["tip_body"], scene["tip_offset"]]
+    inputs = [*common, *tips, 3 * fingers, surface, scene["q"], scene["body_q"], out]
+    launch(surface_kernel, (worlds, fingers), inputs, device)
     directions = extent_directions(fingers)
-    launch(
-        extent_kernel,
-        (worlds, ORIENTATIONS, len(directions)),
-        [*common, directions, 3 * fingers, first + slices["extent"].start, q, scene["goal"], out],
-        device,
-    )
+    inputs = [*common, directions, 3 * fingers, extent, scene["q"], scene["goal"], out]
+    launch(extent_kernel, (worlds, ORIENTATIONS, len(directions)), inputs, device)
     return out.numpy()
 
 
