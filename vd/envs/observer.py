@@ -39,8 +39,7 @@ class Observer:
         self.seen = SeenState(state)
         width = max(columns.stop for columns in self.parts.values())
 
-        def zeros(*shape: int, dtype: Any = float) -> wp.array:
-            return wp.zeros(shape, dtype=dtype, device=device)
+        zeros = state.zeros
 
         self.all_values = self.world_values = zeros(n, width)
         self.views = Views(state, self.all_values) if cfg.view != "world" else None

@@ -48,8 +48,7 @@ class Randomiser:
         n, d = state.num_envs, state.num_actions
         device = state.device
 
-        def zeros(*shape: int, dtype: Any = float) -> wp.array:
-            return wp.zeros(shape, dtype=dtype, device=device)
+        zeros = state.zeros
 
         self.kp, self.kd = zeros(n, d), zeros(n, d)
         """Joint stiffness [N m/rad] and damping [N m s/rad], shape [N, D]."""

@@ -109,8 +109,7 @@ class ReorientEnv:
         """Arrays of what a step decides, and of its counts."""
         n, d, f = self.num_envs, self.num_actions, self.num_fingers
 
-        def zeros(*shape: int, dtype: Any = float) -> wp.array:
-            return wp.zeros(shape, dtype=dtype, device=self.device)
+        zeros = self.state.zeros
 
         self.action = zeros(n, d)
         """Action of the present step in [-1, 1], shape [N, D]."""

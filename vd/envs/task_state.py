@@ -50,6 +50,10 @@ class TaskState:
     rng: wp.array
     """Random stream of each world, shape [N]."""
 
+    def zeros(self, *shape: int, dtype: Any = float) -> wp.array:
+        """An array of zeros on the task's device."""
+        return wp.zeros(shape, dtype=dtype, device=self.device)
+
     def launch(
         self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any], *, dim: int | tuple[int, ...] = 0
     ) -> None:
