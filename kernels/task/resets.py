@@ -54,7 +54,6 @@ def episode_kernel(
     # In/Out:
     step_count: wp.array[int],
     goal_steps: wp.array[int],
-    goals_reached: wp.array[int],
     # Out:
     timed_out_out: wp.array[int],
     done_out: wp.array[int],
@@ -74,7 +73,6 @@ def episode_kernel(
             (evaluation).
         step_count: Control steps since the reset, shape [N].
         goal_steps: Control steps since the goal was given, shape [N].
-        goals_reached: Successes since the reset, shape [N].
         timed_out_out: 1 where the episode ends only by its length, shape [N].
         done_out: 1 where the return ends for the learner: success, fall or time-out, shape [N].
         reset_out: 1 where the world is to be reset, shape [N].
@@ -85,8 +83,6 @@ def episode_kernel(
     fell = fell_in[world] != 0
     steps = step_count[world] + 1
     step_count[world] = steps
-    if success:
-        goals_reached[world] = goals_reached[world] + 1
     goal_steps[world] = goal_steps[world] + 1
 
     at_end = steps >= max_steps
@@ -119,7 +115,6 @@ def reset_kernel(
     smoothed_out: wp.array2d[float],
     step_count_out: wp.array[int],
     goal_steps_out: wp.array[int],
-    goals_reached_out: wp.array[int],
     goal_quat_out: wp.array[wp.quat],
     previous_error_out: wp.array[float],
 ):
@@ -150,7 +145,6 @@ def reset_kernel(
         smoothed_out: Smoothed action, shape [N, D].
         step_count_out: Control steps since the reset, shape [N].
         goal_steps_out: Control steps since the goal was given, shape [N].
-        goals_reached_out: Successes since the reset, shape [N].
         goal_quat_out: Goal orientation, shape [N].
         previous_error_out: Rotation error to the new goal [rad], shape [N].
     """
@@ -183,7 +177,6 @@ def reset_kernel(
         for i in range(joints + 6):
             joint_qd_out[world, i] = 0.0
         step_count_out[world] = 0
-        goals_reached_out[world] = 0
 
     goal_steps_out[world] = 0
     for joint in range(joints):

@@ -37,7 +37,6 @@ def end_episodes(device, success, fell, before, *, age, hold):
     state = {
         "steps": device_array(before, int, device),
         "age": device_array(age, int, device),
-        "goals": device_array(np.full(count, 5), int, device),
     }
     out = {n: unwritten(count, int, device) for n in ("timed_out", "done", "reset", "new_goal")}
     launch(episode_kernel, count, [*(success, fell), 10, hold, *state.values(), *list(out.values())], device)
@@ -52,7 +51,6 @@ def test_episode_ends_as_stated_in_every_case(device, hold):
     out = end_episodes(device, success, fell, before, age=np.full(count, 8), hold=hold)
     np.testing.assert_array_equal(out["steps"], before + 1)
     np.testing.assert_array_equal(out["age"], 9)
-    np.testing.assert_array_equal(out["goals"], 5 + success)
     for i, (s, f, b) in enumerate(cases):
         end = b + 1 >= 10
         assert out["timed_out"][i] == int(end and not s and not f)
@@ -87,14 +85,13 @@ class World:
             "smoothed": np.full((worlds, joints), np.nan, np.float32),
             "steps": np.full(worlds, SENTINEL, np.int32),
             "age": np.full(worlds, SENTINEL, np.int32),
-            "goals": np.full(worlds, SENTINEL, np.int32),
             "goal": np.full((worlds, 4), np.nan, np.float32),
             "error": np.full(worlds, np.nan, np.float32),
         }
 
     def reset(self, mask, new_goal, max_angle=np.pi, noise=NOISE, *, vertical=0, rest=None, **given):
         """Launch; returns every array by name."""
-        types = {"rng": wp.uint32, "steps": int, "age": int, "goals": int, "goal": wp.quat}
+        types = {"rng": wp.uint32, "steps": int, "age": int, "goal": wp.quat}
         state = {n: device_array(a, types.get(n, float), self.device) for n, a in self.before.items()}
         none = np.zeros((0, 4), np.float32)
         launch(
@@ -113,7 +110,7 @@ class World:
                 int("goal_quat" in given),
                 state["q"],
                 state["rng"],
-                *[state[n] for n in ("qd", "smoothed", "steps", "age", "goals", "goal", "error")],
+                *[state[n] for n in ("qd", "smoothed", "steps", "age", "goal", "error")],
             ],
             self.device,
         )
@@ -137,14 +134,14 @@ def test_only_masked_worlds_change_and_only_in_what_is_theirs(device, data, fing
         assert array[untouched].tobytes() == before[untouched].tobytes(), (
             f"{name} of a world outside the masks"
         )
-    for name in ("q", "qd", "steps", "goals"):
+    for name in ("q", "qd", "steps"):
         kept = mask == 0
         assert after[name][kept].tobytes() == world.before[name][kept].tobytes(), f"{name} at a new goal"
 
     reset = mask == 1
     np.testing.assert_array_equal(after["q"][reset, :joints], np.tile(world.reset_q, (reset.sum(), 1)))
     assert np.abs(after["q"][reset, joints : joints + 3] - START).max(initial=0.0) <= NOISE + 1e-6
-    for name in ("qd", "steps", "goals"):
+    for name in ("qd", "steps"):
         assert not after[name][reset].any(), name
     changed = ~untouched
     assert not after["smoothed"][changed].any() and not after["age"][changed].any()

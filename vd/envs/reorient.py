@@ -63,7 +63,6 @@ class ReorientEnv:
         self.num_envs = cfg.num_envs
         self.num_fingers = self.hand.num_fingers
         self.num_actions = self.hand.num_joints
-        self.sees_shape = cfg.observation.shape != "none"
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
         self.reward_term_names = REWARD_TERMS
@@ -71,7 +70,8 @@ class ReorientEnv:
         self._allocate()
         self._lifts = cfg.reward.lift != 0.0
         self.randomiser = Randomiser(state)
-        self.observer = Observer(state, self.randomiser, shapes=self.sees_shape or self._lifts)
+        shapes = cfg.observation.shape != "none" or self._lifts
+        self.observer = Observer(state, self.randomiser, shapes=shapes)
         """Writes what is observed."""
         self.num_observations = self.observer.num_observations
         self.observation, self.privileged = self.observer.split(self.observer.all_values)
@@ -133,8 +133,6 @@ class ReorientEnv:
         """Control steps since the world's reset, shape [N]."""
         self.goal_steps = zeros(n, dtype=wp.int32)
         """Control steps since the world's goal was given, shape [N]."""
-        self.goals_reached = zeros(n, dtype=wp.int32)
-        """Goals reached since the world's reset, shape [N]."""
         self.object_pose_end = zeros(n, dtype=wp.transform)
         """Object pose at the end of the step, before resets, shape [N]."""
         self.goal_counts = zeros(3)
@@ -339,7 +337,6 @@ class ReorientEnv:
                 int(self.cfg.success_ends_episode),
                 self.step_count,
                 self.goal_steps,
-                self.goals_reached,
             ],
             [self.timed_out, self.done, self._reset, self._new_goal],
         )
@@ -369,7 +366,6 @@ class ReorientEnv:
                 self.smoothed,
                 self.step_count,
                 self.goal_steps,
-                self.goals_reached,
                 self.goal_quat,
                 self.previous_error,
             ],
@@ -471,7 +467,6 @@ class ReorientEnv:
             "goal_quat": self.goal_quat,
             "step_count": self.step_count,
             "goal_steps": self.goal_steps,
-            "goals_reached": self.goals_reached,
             "previous_error": self.previous_error,
             "goal_counts": self.goal_counts,
             "observation": self.observer.all_values,

@@ -53,8 +53,9 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         ValueError: If it belongs to another number of environments, other objects, another hand or servo
         model.
     """
-    # Checkpoints from before goals had an age: no goal is older than its episode.
+    # Checkpoints from before goals had an age: no goal is older than its episode. Later ones counted them.
     arrays = {"goal_steps": state["arrays"]["step_count"]} | state["arrays"]
+    arrays.pop("goals_reached", None)
     if arrays.keys() != here.keys():
         raise ValueError(
             "the saved environment has other servos, views, memory, latency or contacts; resume with "
