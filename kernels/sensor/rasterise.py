@@ -186,7 +186,7 @@ def rasterise_kernel(
     a = rotation * points[corner[0]] + position
     b = rotation * points[corner[1]] + position
     c = rotation * points[corner[2]] + position
-    if wp.max(a[2], wp.max(b[2], c[2])) <= 0.0:
+    if not (wp.max(a[2], wp.max(b[2], c[2])) > 0.0):  # behind the camera, or no number
         return
 
     height = depth_bits.shape[1]
