@@ -91,20 +91,6 @@ def test_a_servo_without_effects_moves_as_the_plain_drive():
     assert np.array_equal(measured, with_servo)
 
 
-def test_delays_shift_the_motion_and_the_measurement():
-    """World 0 has none, world 1 a command two control steps late, world 2 measures two steps late."""
-    late = 2.0 * CFG.control_dt
-    each = np.stack([rows(), rows(COMMAND_DELAY=late), rows(READ_DELAY=late, ENCODER_BIAS=0.01)])
-    true, measured = response(simulator(each, worlds=3))
-    still, _ = response(simulator(rows()), offset=0.0, steps=2)
-    assert np.allclose(true[:2, 1], still[:, 0], atol=1e-6)
-    # What gravity did in the two steps before the command stays a small difference.
-    assert np.abs(true[2:, 1] - true[:-2, 0]).max() < 5e-3
-    assert np.array_equal(true[:, 2], true[:, 0])
-    assert np.allclose(measured[2:, 2], true[:-2, 2] + 0.01, atol=1e-6)
-    assert np.allclose(measured[0, 2], START + 0.01, atol=1e-6)
-
-
 def test_dry_friction_holds_what_it_can_and_no_more():
     """The drive's torque is kp times the offset; gravity on a finger is below 0.1 N m."""
     hold, _ = response(simulator(rows(COULOMB_TORQUE=0.5)), offset=0.05, steps=30)

@@ -13,7 +13,7 @@ from vd.kernels.task.environments import (
     write_friction_kernel,
     write_object_force_kernel,
 )
-from vd.kernels.task.guard import collect_overflow_kernel, guard_kernel, put_back_kernel, void_step_kernel
+from vd.kernels.task.guard import collect_overflow_kernel, guard_kernel
 
 FRICTION = 0.8
 
@@ -98,28 +98,6 @@ def test_guard_freezes_the_start_of_the_bad_step(device, where, value):
     for dump in dumps:
         assert (dump.numpy()[bad] == good).all(), "frozen at the first step that failed"
         assert (dump.numpy()[[0, 2]] == good + 2.0).all(), "good worlds go on"
-
-
-def test_a_failed_step_is_put_back_and_counts_for_nothing(device):
-    failed = device_array([0, 1, 0], int, device)
-    start = np.arange(12.0).reshape(3, 4)
-    q, qd = (device_array(np.full((3, n), np.nan), float, device) for n in (4, 3))
-    steps = device_array([5, 5, 5], int, device)
-    launch(put_back_kernel, 3, [failed, start, 59, q, qd, steps], device)
-    np.testing.assert_array_equal(q.numpy()[1], start[1])
-    np.testing.assert_array_equal(qd.numpy()[1], 0.0)
-    assert np.isnan(q.numpy()[[0, 2]]).all() and np.isnan(qd.numpy()[[0, 2]]).all(), "others are left alone"
-    np.testing.assert_array_equal(steps.numpy(), [5, 59, 5])
-
-    reward, terms = (
-        device_array([1.0, np.nan, 1.0], float, device),
-        device_array([[1.0], [np.nan], [1.0]], float, device),
-    )
-    still, success, fell = (device_array([1, 1, 1], int, device) for _ in range(3))
-    outputs = [reward, terms, still, success, fell]
-    launch(void_step_kernel, 3, [failed, *outputs], device)
-    for array in outputs:
-        np.testing.assert_array_equal(array.numpy().ravel(), [1, 0, 1])
 
 
 @EXAMPLES
