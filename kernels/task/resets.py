@@ -54,6 +54,7 @@ def episode_kernel(
     # In/Out:
     step_count: wp.array[int],
     goal_steps: wp.array[int],
+    counts: wp.array[float],
     # Out:
     timed_out_out: wp.array[int],
     done_out: wp.array[int],
@@ -73,6 +74,7 @@ def episode_kernel(
             (evaluation).
         step_count: Control steps since the reset, shape [N].
         goal_steps: Control steps since the goal was given, shape [N].
+        counts: Goals ended, goals reached and objects lost, over all environments, shape [3]; added to.
         timed_out_out: 1 where the episode ends only by its length, shape [N].
         done_out: 1 where the return ends for the learner: success, fall or time-out, shape [N].
         reset_out: 1 where the world is to be reset, shape [N].
@@ -89,6 +91,12 @@ def episode_kernel(
     reset = fell or at_end or (success and hold != 0)
     timed_out_out[world] = wp.where(at_end and not success and not fell, 1, 0)
     done_out[world] = wp.where(success or fell or at_end, 1, 0)
+    if success or fell or at_end:
+        wp.atomic_add(counts, 0, 1.0)
+    if success:
+        wp.atomic_add(counts, 1, 1.0)
+    if fell:
+        wp.atomic_add(counts, 2, 1.0)
     reset_out[world] = wp.where(reset, 1, 0)
     new_goal_out[world] = wp.where(success and not reset, 1, 0)
 
@@ -117,6 +125,7 @@ def reset_kernel(
     goal_steps_out: wp.array[int],
     goal_quat_out: wp.array[wp.quat],
     previous_error_out: wp.array[float],
+    env_mask_out: wp.array[wp.bool],
 ):
     """Reset the worlds of one mask; draw a goal for those of either mask. Launch: [N].
 
@@ -147,9 +156,12 @@ def reset_kernel(
         goal_steps_out: Control steps since the goal was given, shape [N].
         goal_quat_out: Goal orientation, shape [N].
         previous_error_out: Rotation error to the new goal [rad], shape [N].
+        env_mask_out: Whether each environment is reset, as Newton wants it, shape [N + 1]; the last entry, of
+            what is in no environment, stays.
     """
     world = wp.tid()
     reset = reset_in[world] != 0
+    env_mask_out[world] = reset
     if not reset and new_goal_in[world] == 0:
         return
 

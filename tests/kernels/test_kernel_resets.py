@@ -37,9 +37,10 @@ def end_episodes(device, success, fell, before, *, age, hold):
     state = {
         "steps": device_array(before, int, device),
         "age": device_array(age, int, device),
+        "counts": device_array([1.0, 2.0, 3.0], float, device),
     }
     out = {n: unwritten(count, int, device) for n in ("timed_out", "done", "reset", "new_goal")}
-    launch(episode_kernel, count, [*(success, fell), 10, hold, *state.values(), *list(out.values())], device)
+    launch(episode_kernel, count, [success, fell, 10, hold, *state.values(), *out.values()], device)
     return {name: array.numpy() for name, array in (state | out).items()}
 
 
@@ -51,6 +52,7 @@ def test_episode_ends_as_stated_in_every_case(device, hold):
     out = end_episodes(device, success, fell, before, age=np.full(count, 8), hold=hold)
     np.testing.assert_array_equal(out["steps"], before + 1)
     np.testing.assert_array_equal(out["age"], 9)
+    np.testing.assert_array_equal(out["counts"] - [1, 2, 3], [out["done"].sum(), success.sum(), fell.sum()])
     for i, (s, f, b) in enumerate(cases):
         end = b + 1 >= 10
         assert out["timed_out"][i] == int(end and not s and not f)
@@ -93,7 +95,7 @@ class World:
         """Launch; returns every array by name."""
         types = {"rng": wp.uint32, "steps": int, "age": int, "goal": wp.quat}
         state = {n: device_array(a, types.get(n, float), self.device) for n, a in self.before.items()}
-        none = np.zeros((0, 4), np.float32)
+        none, env_mask = np.zeros((0, 4), np.float32), wp.zeros(len(mask) + 1, wp.bool, device=self.device)
         launch(
             reset_kernel,
             len(mask),
@@ -111,9 +113,11 @@ class World:
                 state["q"],
                 state["rng"],
                 *[state[n] for n in ("qd", "smoothed", "steps", "age", "goal", "error")],
+                env_mask,
             ],
             self.device,
         )
+        np.testing.assert_array_equal(env_mask.numpy(), [*(np.asarray(mask) != 0), False])
         return {name: array.numpy() for name, array in state.items()}
 
 

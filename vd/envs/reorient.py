@@ -19,7 +19,7 @@ from vd.envs.setup import SETTLE_S, rest_poses, table_steps
 from vd.envs.state import load_arrays, save_state, saved_stage
 from vd.envs.task_state import build_task
 from vd.kernels.task.actions import apply_action_kernel
-from vd.kernels.task.environments import count_goals_kernel, record_step_kernel, world_mask_kernel
+from vd.kernels.task.environments import record_step_kernel
 from vd.kernels.task.guard import void_step_kernel
 from vd.kernels.task.resets import episode_kernel, give_goal_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
@@ -142,7 +142,7 @@ class ReorientEnv:
         self.previous_error = zeros(n)
         """Rotation error at the end of the last step, for the progress in it [rad], shape [N]."""
         self._reset, self._new_goal = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
-        self._world_mask = zeros(n + 1, dtype=wp.bool)
+        self._env_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         self._reset_q = wp.array(np.tile(PAPER.scene.reset_joint_rad, f), dtype=float, device=self.device)
@@ -337,10 +337,10 @@ class ReorientEnv:
                 int(self.cfg.success_ends_episode),
                 self.step_count,
                 self.goal_steps,
+                self.goal_counts,
             ],
             [self.timed_out, self.done, self._reset, self._new_goal],
         )
-        self._launch(count_goals_kernel, [self.success, self.fell, self.done], [self.goal_counts])
 
     def _reset_envs(self, *, use_start: bool = False, use_goal: bool = False) -> None:
         """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too."""
@@ -368,13 +368,13 @@ class ReorientEnv:
                 self.goal_steps,
                 self.goal_quat,
                 self.previous_error,
+                self._env_mask,
             ],
         )
         if self.views is not None:
             self.views.choose(self._reset, self._new_goal)
         # The solver warm-starts from the last accelerations, which mean nothing after a reset.
-        self._launch(world_mask_kernel, [self._reset], [self._world_mask])
-        sim.solver.reset(sim.state, world_mask=self._world_mask, flags=newton.StateFlags(0))
+        sim.solver.reset(sim.state, world_mask=self._env_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
         if sim.servo is not None:
             sim.servo.reset(self._reset)
