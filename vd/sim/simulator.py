@@ -121,19 +121,15 @@ class Simulator:
         self._observables = self.solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW})
         self._overflow_mask = sum(OVERFLOW_REMEDY)
 
-        self.joint_q = self.state.joint_q.reshape((n, -1))
-        self.joint_qd = self.state.joint_qd.reshape((n, -1))
+        def per_env(state: newton.State) -> list[wp.array]:
+            arrays = state.joint_q, state.joint_qd, state.body_q, state.body_qd, state.body_f
+            return [array.reshape((n, -1)) for array in arrays]
+
+        self.joint_q, self.joint_qd, self.body_q, self.body_qd, self.body_force = per_env(self.state)
+        *self._next_arrays, self._next_body_force = per_env(self._next)
         self.target = self.control.joint_target_q.reshape((n, -1))
         self.servo: JointServo | None = None
         """The identified servos, or None: then ``target`` goes to the solver's drives as it is."""
-        self.body_q = self.state.body_q.reshape((n, -1))
-        self.body_qd = self.state.body_qd.reshape((n, -1))
-        self.body_force = self.state.body_f.reshape((n, -1))
-        self._next_body_force = self._next.body_f.reshape((n, -1))
-        self._next_body_q = self._next.body_q.reshape((n, -1))
-        self._next_body_qd = self._next.body_qd.reshape((n, -1))
-        self._next_q = self._next.joint_q.reshape((n, -1))
-        self._next_qd = self._next.joint_qd.reshape((n, -1))
 
         def array(values: np.ndarray, dtype: type = wp.int32) -> wp.array:
             return wp.array(values, dtype=dtype, device=self.device)
@@ -211,7 +207,7 @@ class Simulator:
     def _physics_steps(self, *, ours: bool) -> None:
         """The physics steps of one control step, with our additions; states end where they began."""
         here = self.state, self.joint_q, self.joint_qd, self.body_q, self.body_qd
-        there = self._next, self._next_q, self._next_qd, self._next_body_q, self._next_body_qd
+        there = self._next, *self._next_arrays
         for step in range(self.cfg.substeps):
             if ours and step == self.force_steps:
                 wp.copy(self.body_force, self.lasting_force)
