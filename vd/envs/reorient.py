@@ -2,6 +2,7 @@
 
 World frame: z up, table top at z = 0. SI units, radians, quaternions xyzw. Everything but the
 physics is Warp kernels; a step copies nothing to the host, and it is one captured graph, on CPU and CUDA.
+What a step does stands in :meth:`ReorientEnv.launch_step`, in its order.
 """
 
 from pathlib import Path
