@@ -1,6 +1,7 @@
 """A student small enough to train in a second: clouds of two bars whose lengths are the teacher's action."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,6 @@ from vd.config import to_dict
 from vd.train.config import RunCfg
 from vd.train.student.config import DaggerCfg
 from vd.train.student.dagger import Dagger
-from vd.train.student.runner import StudentRunner
 from vd.train.vec_env import ReorientVecEnv
 from vd.vision.cfg import EncoderCfg, NoiseCfg, StudentCfg
 from vd.vision.network import Student
@@ -25,7 +25,7 @@ VOXEL_M = 0.01
 TINY = StudentCfg(
     encoder=EncoderCfg(channels=(8, 16), blocks=1, pooled_stages=0, embedding=16, inputs=("constant",)),
     voxel_m=VOXEL_M,
-    senses=("action",),
+    proprioception=("action",),
     action_hidden=4,
     memory=16,
     head_hidden=16,
@@ -72,7 +72,7 @@ class DummyView:
         for axis in range(2):
             points[:, axis, :, axis] = along[:, axis]
             points[:, axis, :, 2] = 0.1 * axis
-        return (self._voxelise(points.flatten(1, 2).contiguous(), augment=augment),)
+        return self._voxelise(points.flatten(1, 2).contiguous(), augment=augment)
 
     def state_dict(self) -> dict[str, Any]:
         """Random state, and the action that the dummy environment does not keep."""
@@ -85,9 +85,15 @@ class DummyView:
 
 
 def make_dagger(
-    *, envs: int = 8, seed: int = 0, noise: NoiseCfg | None = STILL, world_size: int = 1, **settings
+    run_dir: Path = Path("unused"),
+    *,
+    envs: int = 8,
+    seed: int = 0,
+    noise: NoiseCfg | None = STILL,
+    save_every: int = 2,
+    **settings: Any,
 ) -> Dagger:
-    """An imitation learner on the dummy, deterministic from ``seed``."""
+    """An imitation of the dummy teacher, deterministic from ``seed``."""
     torch.manual_seed(seed)
     env = DummyEnv(num_envs=envs, seed=seed)
     return Dagger(
@@ -96,25 +102,11 @@ def make_dagger(
         Student(TINY, 2),
         DummyTeacher(),
         replace(QUICK, **settings),
-        world_size=world_size,
-    )
-
-
-def make_student_runner(
-    run_dir, dagger: Dagger | None = None, *, deadline=None, processes=None, **run
-) -> StudentRunner:
-    """A runner around :func:`make_dagger`."""
-    dagger = dagger or make_dagger()
-    settings = RunCfg(out=run_dir, device="cpu", **{"save_every": 2, "tensorboard": False, **run})
-    return StudentRunner(
-        dagger,
-        settings,
+        RunCfg(out=run_dir, device="cpu", save_every=save_every, tensorboard=False),
         spec=StudentSpec(network=TINY, num_actions=2, stage=1, teacher="dummy"),
         task={"hand": "dummy"},
         depth=to_dict(STILL),
         device="cpu",
-        processes=processes,
-        deadline=deadline,
     )
 
 

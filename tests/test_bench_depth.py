@@ -17,7 +17,6 @@ def test_rows_hold_rates_and_agreement(tmp_path, capsys, monkeypatch):
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == report["rows"]
     for row in report["rows"]:
         assert row["images_over_newton"] == pytest.approx(row["images"] / row["newton"])
-        assert 0 < row["newton_refit_share"] < 1
         # The hand covers some of the picture, and nobody sees it otherwise.
         assert row["points"] > 500
         assert row["different"] < 1e-3

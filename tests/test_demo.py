@@ -11,17 +11,17 @@ from pathlib import Path
 
 import pytest
 import tyro
-from test_evaluate_report import PNG
 from test_evaluate_trace import compared
 from test_gap_report import sample_curves, sample_report
+from test_page import PNG
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.loop.log import LogWriter
-from vd.evaluate.comparison import Comparison
+from vd.evaluate.result import Result
 from vd.gap.report import write_report
 from vd.hand_log import JOINT_CHANNELS
 from vd.train import demo
-from vd.train.demo import Demo, DemoCfg, FailureError, Part, all_parts, main
+from vd.train.demo import Demo, FailureError, Part, main
 from vd.train.metrics import PROGRESS_FILE
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -33,8 +33,8 @@ def option(line: list[str], flag: str) -> Path:
 
 
 def leave_evaluation(line: list[str]) -> None:
-    rows, prediction = compared()
-    Comparison(tuple(rows), (prediction,)).write(option(line, "--out") / "eval.json")
+    rows = compared()
+    Result(tuple(rows)).write(option(line, "--out") / "eval.json")
 
 
 def leave_report(line: list[str]) -> None:
@@ -89,7 +89,7 @@ def played(monkeypatch):
         parse(*args, **kwargs)
         raise ParsedError
 
-    def command(self, *commands, seconds=None):
+    def run(self, *commands, seconds=None):
         monkeypatch.setattr(tyro, "cli", only_parse)
         for words in commands:
             line = [str(word) for word in words]
@@ -102,9 +102,8 @@ def played(monkeypatch):
                 if start in " ".join(line):
                     leave(line)
         monkeypatch.setattr(tyro, "cli", parse)
-        return [0] * len(commands)
 
-    monkeypatch.setattr(Demo, "command", command)
+    monkeypatch.setattr(Part, "run", run)
     return lines
 
 
@@ -155,62 +154,48 @@ def test_meshes_of_which_none_is_imported_fail_with_the_remedy(played, tmp_path,
     assert "none of a.obj was imported" in capsys.readouterr().err
 
 
-def fail(_demo):
-    raise FailureError("vd-x <y> ended with status 1: no such motor")
-
-
 def test_a_part_that_fails_is_named_and_the_others_go_on(tmp_path, monkeypatch, capsys):
     seen = []
 
-    def look(demo):
+    def fail(demo, part):
         seen.append(demo.page.read_text())
-        fail(demo)
+        raise FailureError("vd-x <y> ended with status 1: no such motor")
 
-    parts = [Part("camera", "One", fail), Part("gap", "Two", look), Part("twin", "Three", fail)]
-    monkeypatch.setattr(demo, "all_parts", lambda: parts)
+    for name in ("camera", "gap", "twin", "training"):
+        monkeypatch.setattr(Demo, name, fail)
     assert main(["--out", str(tmp_path)]) == 1
-    assert "failed: One, Two, Three" in capsys.readouterr().err
-    assert "http-equiv" in seen[0] and "This part failed.</b> vd-x &lt;y&gt; ended" in seen[0]
-    assert '<p class="small">running' in seen[0] and '<p class="small">waiting' in seen[0]
+    assert "failed: Objects never seen, turned by camera, A hidden effect" in capsys.readouterr().err
+    assert "http-equiv" in seen[1] and "This part failed.</b> vd-x &lt;y&gt; ended" in seen[1]
+    assert '<p class="small">running' in seen[1] and '<p class="small">waiting' in seen[1]
 
 
 def test_an_interrupted_demo_leaves_the_page_with_what_is_there(played, tmp_path, monkeypatch):
-    def interrupted(demo):
+    def interrupted(demo, part):
         raise KeyboardInterrupt
 
-    parts = all_parts()
-    monkeypatch.setattr(parts[1], "work", interrupted)
-    monkeypatch.setattr(demo, "all_parts", lambda: parts)
+    monkeypatch.setattr(Demo, "gap", interrupted)
     assert main(["--out", str(tmp_path)]) == 130
     text = (tmp_path / "index.html").read_text()
     assert text.count("<video") == 1 and "interrupted" in text and "http-equiv" not in text
 
 
-def demo_of(tmp_path: Path) -> Demo:
-    made = Demo(DemoCfg(out=tmp_path), [Part("x", "X", lambda demo: {})])
-    made.folder().mkdir(parents=True)
-    return made
-
-
 def test_a_command_that_fails_says_which_and_why(tmp_path):
     with pytest.raises(FailureError, match=r"(?s)vd-play nosuch .*with status 1: .*no policy at nosuch"):
-        demo_of(tmp_path).command(["vd-play", "nosuch", "--video", tmp_path / "x.mp4"])
+        Part("x", "X", tmp_path).run(["vd-play", "nosuch", "--video", tmp_path / "x.mp4"])
 
 
 def test_a_command_is_ended_with_its_time(tmp_path, monkeypatch):
     began = time.monotonic()
     monkeypatch.setattr(demo.sys, "executable", "/bin/sh")
-    (status,) = demo_of(tmp_path).command(["sleep", "100"], seconds=0.2)
-    assert status == -signal.SIGTERM and time.monotonic() - began < 50.0
-    assert demo_of(tmp_path / "y").command(["false"], seconds=50.0) == [1], "some meshes are refused"
+    Part("x", "X", tmp_path).run(["sleep", "100"], ["false"], seconds=0.2)
+    assert time.monotonic() - began < 50.0
 
 
 def test_ctrl_c_ends_the_command_under_way(tmp_path):
     script = (
-        "import sys; from pathlib import Path; from vd.train import demo; sys.executable = '/bin/sh'\n"
-        "work = lambda demo: demo.command(['sleep', '100'])\n"
-        "demo.all_parts = lambda: [demo.Part('camera', 'X', work)]\n"
-        "sys.exit(demo.main(['--out', sys.argv[1]]))"
+        "import sys; from vd.train import demo; sys.executable = '/bin/sh'\n"
+        "demo.Demo.camera = lambda demo, part: part.run(['sleep', '100'])\n"
+        "sys.exit(demo.main(['--quick', '--out', sys.argv[1]]))"
     )
     process = subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE)
     while b"$ sleep" not in process.stdout.readline():
@@ -236,13 +221,3 @@ def test_settings_that_cannot_be_used_are_refused_before_anything_is_written(
     assert main(arguments) == 1
     assert message in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
-
-
-def test_what_an_earlier_demo_left_is_replaced(played, tmp_path):
-    for _ in range(2):
-        assert main(["--out", str(tmp_path), "--quick"]) == 0
-        (tmp_path / "camera" / "old.txt").touch()
-        assert (tmp_path / "camera" / "eval.json").is_file()
-    assert main(["--out", str(tmp_path), "--quick"]) == 0
-    assert not (tmp_path / "camera" / "old.txt").exists()
-    assert Comparison.read(tmp_path / "camera" / "eval.json").rows

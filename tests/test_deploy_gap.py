@@ -63,7 +63,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
 
     @contextlib.contextmanager
     def connect(_):
-        plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=3840.0))
+        plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=1920.0))
         with simulated_bus(hand, joints, plant) as (_, bus):
             yield Connection(hand, joints, bus)
 
@@ -137,6 +137,6 @@ def test_a_flight_alone_is_given_no_name(tmp_path):
     hand = load_hand("dclaw3")
     servo = hand.servo.copy()
     servo[:, COMMAND_DELAY] = 0.06
-    folder = fly(tmp_path / "log", replace(hand, servo=servo), 6.0)
-    report = explain(folder, hand, tmp_path / "gap", effects=("command_delay", "backlash"))
+    folder = fly(tmp_path / "log", replace(hand, servo=servo), 4.0)
+    report = explain(folder, hand, tmp_path / "gap", effects=("command_delay",), workers=1)
     assert report.verdict == "under_excited" and not report.effects

@@ -73,16 +73,16 @@ def test_a_student_sees_on_a_hand_what_it_sees_in_the_simulator(hand, rendered, 
         assert torch.equal(there_is, torch.isfinite(points).all(dim=-1))
         assert (points[there_is] - expected[there_is]).abs().max() < POINT_M
         ours, theirs = sight.sites(known), view.sites(seen, augment=False)
-        apart += len(keys(ours[0]) ^ keys(theirs[0]))
+        apart += len(keys(ours) ^ keys(theirs))
         borders += near_border(expected[0].numpy(), network.voxel_m)
         names = ("action", "position", "velocity")
         assert all((known[name] - seen[name]).abs().max() < SENSE for name in names)
-        senses, wanted = student.senses(known), student.senses(seen)
+        felt, wanted = student.proprioception(known), student.proprioception(seen)
         with torch.inference_mode():
-            one = student.act(ours[0], senses, hidden, *ours[1:])
-            other = student.act(theirs[0], wanted, there, *theirs[1:])
+            one = student.act(ours, felt, hidden)
+            other = student.act(theirs, wanted, there)
         hidden, there = one.hidden, other.hidden
-        if keys(ours[0]) == keys(theirs[0]):
+        if keys(ours) == keys(theirs):
             np.testing.assert_allclose(one.mean, other.mean, atol=2e-2)
             compared += 1
         action = rng.uniform(-1.0, 1.0, env.num_actions).astype(np.float32)

@@ -156,8 +156,8 @@ def test_a_log_is_shown(tmp_path, capsys):
     assert [shot.fell for shot in replay.snapshots].index(True) == STEPS - 1
     assert replay.snapshots[-1].goals == 1 and replay.snapshots[-1].drops == 1
     np.testing.assert_allclose(replay.snapshots[12].goal_quat, GOALS[1])
-    assert play([str(folder), "--video", str(tmp_path / "log.png")]) == 0
-    assert (tmp_path / "log.png").is_file() and f"({STEPS} frames)" in capsys.readouterr().out
+    assert play([str(folder), "--video", str(tmp_path / "log.mp4")]) == 0
+    assert (tmp_path / "log.mp4").is_file() and f"({STEPS} frames)" in capsys.readouterr().out
 
 
 def test_the_viewer_steps_through_a_log(tmp_path):
@@ -179,5 +179,5 @@ def test_a_log_of_what_is_not_here_cannot_be_shown(tmp_path, capsys):
     (folder / "run.json").write_text(json.dumps(run))
     with pytest.raises(LogError, match="cannot be shown"):
         Replay(read_log(folder))
-    assert play([str(folder), "--video", str(tmp_path / "log.png")]) == 1
+    assert play([str(folder), "--video", str(tmp_path / "log.mp4")]) == 1
     assert "cannot be shown" in capsys.readouterr().err

@@ -4,14 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 import warp as wp
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.envs.symmetry import WorldOrder
 from vd.envs.view_tables import SECTOR
 from vd.kernels.task.observations import teacher_observation_slices
 
@@ -202,24 +200,3 @@ def test_the_world_frame_is_a_view_too():
         assert any(np.array_equal(np.roll(block, roll, axis=0).ravel(), order[world]) for roll in range(3))
         if view == 0:
             assert np.array_equal(order[world], viewed.action.numpy()[world])
-
-
-def test_a_policy_of_views_gives_labels_in_the_order_of_the_world():
-    class Constant:
-        num_observations, num_actions = 0, 9
-
-        def act(self, observation):
-            return torch.arange(9.0).repeat(WORLDS, 1)
-
-    env = ReorientEnv(CFG, "cpu")
-    label = WorldOrder(Constant(), env.views).act(None)
-    env.acts_in_view = False
-    env.action.assign(label.numpy())
-    env.step(env.action)
-    by_label = env.sim.joint_q.numpy().copy()
-    again = ReorientEnv(CFG, "cpu")
-    act(again, Constant().act(None).numpy())
-    assert np.array_equal(again.sim.joint_q.numpy(), by_label)
-    assert len({tuple(row) for row in label.tolist()}) > 1
-    plain = ReorientEnv(dataclasses.replace(CFG, observation=ObservationCfg()), "cpu")
-    assert torch.equal(WorldOrder(Constant(), plain.views).act(None), Constant().act(None))

@@ -51,7 +51,6 @@ WRITERS = {
     "page.html": _text,
     "model.pt": _checkpoint,
     "cache.npz": _arrays,
-    "film.gif": _picture,
     "film.mp4": _picture,
     "cube.usda": _object,
 }
@@ -79,11 +78,13 @@ def test_an_error_of_the_writer_itself_stays_what_it_is(tmp_path):
 
 def test_a_bundle_that_does_not_fit_is_not_there(tmp_path):
     from vd.assets_usd.hands import load_hand
-    from vd.bundle.write import write_bundle
+    from vd.bundle.store import write_bundle
+    from vd.evaluate.agents import open_policy
 
-    load_hand("dclaw4")  # authored on first use
-    with small_files(LIMIT), pytest.raises(OutputError, match=r"cannot write .*first: the file would be"):
-        write_bundle("dclaw4-cube", tmp_path / "first")
+    load_hand("dclaw3")  # authored on first use
+    policy = open_policy("dclaw3-table", "cpu")
+    with small_files(LIMIT), pytest.raises(OutputError, match=r"cannot write .*first: .*the file would be"):
+        write_bundle(policy, tmp_path / "first")
     assert not list(tmp_path.iterdir())
 
 
@@ -120,8 +121,8 @@ def commands(taken: str) -> dict[str, list[str]]:
         "vd-train   ": ["average", "a", "b", "--out", f"{taken}/x.pt"],
         "vd-train    ": ["bundle", "dclaw4-cube", f"{taken}/x"],
         "vd-train     ": ["tracker", "dclaw4-table", "--objects", "cube", "--out", f"{taken}/x.pt"],
-        "vd-eval": ["--agent", "zero", "--out", taken],
-        "vd-play": ["--agent", "zero", "--video", f"{taken}/x.mp4"],
+        "vd-eval": ["zero", "--out", taken],
+        "vd-play": ["zero", "--video", f"{taken}/x.mp4"],
         "vd-gap": ["run", "recording", "--out", taken],
         "vd-gap ": ["identify", "recording", "--out", f"{taken}/x.usda"],
         "vd-deploy": ["record", "--twin", "--hand", "dclaw3", "--out", taken],

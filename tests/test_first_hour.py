@@ -38,17 +38,32 @@ sys.exit(status)
     ],
 )
 def test_a_wrong_name_is_refused_before_anything_slow_is_imported(line, said, tmp_path):
+    assert refused(line, said, tmp_path, HEAVY) == []
+    assert not list(tmp_path.iterdir()), "a command that is refused leaves nothing behind"
+
+
+def refused(line, said, folder, heavy):
+    """Run a command in a folder, which refuses with these words; returns what it imported of ``heavy``."""
     command, *arguments = shlex.split(line)
     module = SCRIPTS[command].partition(":")[0]
-    done = subprocess.run(
-        [sys.executable, "-c", RUN.format(heavy=HEAVY), module, *arguments],
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-    )
+    run = [sys.executable, "-c", RUN.format(heavy=heavy), module, *arguments]
+    done = subprocess.run(run, capture_output=True, text=True, cwd=folder)
     assert said in done.stderr and done.returncode == 1, done.stderr
-    assert done.stdout.splitlines()[-1].split() == ["imported:"]
-    assert not list(tmp_path.iterdir()), "a command that is refused leaves nothing behind"
+    return done.stdout.splitlines()[-1].split()[1:]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "vd-eval bad.pt",
+        "vd-play bad.pt",
+        "vd-bench student --networks bad.pt",
+        "vd-bench sim --policy bad.pt",
+    ],
+)
+def test_a_policy_that_cannot_be_used_is_told_before_the_simulator_is_imported(line, tmp_path):
+    (tmp_path / "bad.pt").write_text("no policy")
+    assert refused(line, "bad.pt", tmp_path, ("newton", "mujoco", "pxr")) == []
 
 
 @pytest.mark.skipif(wp.is_cuda_available(), reason="this machine has a GPU driver")

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vd.bench.hide import Hiding, simulate_hidden
 from vd.gap.cautions import cautions
-from vd.gap.hide import Hiding, simulate_hidden
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ import pytest
 
 from vd.assets_usd.bare_layer import read_bare_layer
 from vd.assets_usd.hand_data import HandError
+from vd.bench.hide import hide
 from vd.gap import cli, steps
 from vd.gap.chain import chains
 from vd.gap.close import counterparts, simulate_again, write_identified
-from vd.gap.hide import hide
-from vd.gap.plan import _fitted, discard_plan, plan, write_plan
+from vd.gap.plan import discard_plan, plan, write_plan
 from vd.gap.recording import read_recording
 from vd.gap.result import (
     Candidate,
@@ -162,14 +162,22 @@ def test_run_writes_everything_and_says_what_was_found(fitted, recording, tmp_pa
     assert report.closing.identified_rmse_rad < 0.5 * report.closing.baseline_rmse_rad
     assert report.command.startswith(f"vd-gap run {recording}")
     assert {path.name for path in out.iterdir()} >= {"identified.usda", "report.html", "gap.png"}
+    assert cli.main(["run", str(recording), "--out", str(out), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads((out / "report.json").read_text())
 
 
-def test_finished_steps_are_kept_until_something_changes(fitted, recording, tmp_path, capsys, monkeypatch):
-    def without_figures(report, curves, folder):
+@pytest.fixture
+def no_figures(monkeypatch):
+    """The report as JSON alone: its page has a test of its own."""
+
+    def write(report, curves, folder):
         report.write(folder / "report.json")
         (folder / "report.html").write_text("")
 
-    monkeypatch.setattr("vd.gap.report.write_report", without_figures)
+    monkeypatch.setattr("vd.gap.report.write_report", write)
+
+
+def test_finished_steps_are_kept_until_something_changes(fitted, no_figures, recording, tmp_path, capsys):
     out = str(tmp_path / "gap")
     arguments = ["run", str(recording), "--out", out]
     assert cli.main(arguments) == cli.main(arguments) == 0
@@ -184,7 +192,7 @@ def test_finished_steps_are_kept_until_something_changes(fitted, recording, tmp_
     assert (fitted["find"], fitted["explain"]) == (3, 4)
 
 
-def test_steps_go_on_from_what_the_one_before_wrote(fitted, recording, tmp_path, capsys):
+def test_steps_go_on_from_what_the_one_before_wrote(fitted, no_figures, recording, tmp_path, capsys):
     out = str(tmp_path / "gap")
     assert cli.main(["explain", str(recording), "--out", out]) == 1
     assert "run vd-gap find --out" in capsys.readouterr().err
@@ -193,12 +201,6 @@ def test_steps_go_on_from_what_the_one_before_wrote(fitted, recording, tmp_path,
         assert cli.main([step, "--out", out]) == 0, step
     assert fitted["find"] == 1
     assert "--seed 7" in Report.read(tmp_path / "gap" / "report.json").command
-
-
-def test_json_is_the_report(fitted, recording, tmp_path, capsys):
-    out = tmp_path / "gap"
-    assert cli.main(["run", str(recording), "--out", str(out), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out) == json.loads((out / "report.json").read_text())
 
 
 def test_unusable_recordings_exit_with_2_and_a_message(tmp_path, capsys):
@@ -346,17 +348,6 @@ def test_plan_counts_the_pairs_of_every_set_that_a_motion_tells_apart(recording)
     assert f"tells {told[0]} of 2 pairs" in result.sentence
 
 
-def test_plan_takes_an_effect_as_it_was_fitted_beside_the_others(recording):
-    report, _ = servo_report(recording)
-    early = report.evidence[1]
-    late = dataclasses.replace(early, round=7, parameters={"width_rad": 0.02}, given=("command_delay",))
-    report = dataclasses.replace(report, evidence=(*report.evidence, late))
-    assert _fitted(report, JOINT, "backlash", set()) == {"width_rad": 0.08}
-    assert _fitted(report, JOINT, "backlash", {"command_delay"}) == {"width_rad": 0.02}
-    assert _fitted(report, JOINT, "backlash", {"supply_sag"}) == {"width_rad": 0.02}
-    assert _fitted(report, JOINT, "supply_sag", set()) == {}
-
-
 def test_plan_for_motions_that_show_too_little(recording):
     report, _ = servo_report(recording, verdict="under_excited")
     slow = read_recording(recording).subset([3])
@@ -364,25 +355,6 @@ def test_plan_for_motions_that_show_too_little(recording):
     assert tuple(result.competing) == (JOINT,)
     assert "what these motions do not show" in result.sentence
     assert slow.trajectories[0].excitation not in {motion.name for motion in result.motions}
-
-
-def test_plan_says_when_nothing_would_help(recording):
-    """An effect and its twin: the same model twice."""
-    report, _ = servo_report(
-        recording, verdict="ambiguous", ambiguous=(("coulomb_friction", "stribeck_friction"),)
-    )
-    twins = {
-        "coulomb_friction": {"tau_c_nm": FRICTION},
-        "stribeck_friction": {"tau_s_nm": FRICTION, "tau_c_nm": FRICTION, "v_s_rad_s": 0.1},
-    }
-    rows = tuple(
-        dataclasses.replace(row, name=name, parameters=twins[name])
-        for row, name in zip(report.evidence, twins, strict=True)
-    )
-    result = plan(dataclasses.replace(report, evidence=rows), read_recording(recording), None)
-    assert (
-        "No motion of the menu would decide between coulomb friction and stribeck friction" in result.sentence
-    )
 
 
 def test_other_fingers_take_the_model_of_the_recorded_one():

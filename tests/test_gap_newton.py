@@ -113,29 +113,6 @@ def test_load_friction_follows_what_the_drive_gives_not_what_its_controller_want
     assert np.sqrt(np.mean((newton - predicted) ** 2, axis=1)).max() < 2e-3
 
 
-def test_positions_come_in_the_columns_of_the_recording():
-    recording = motions("sine_0.50hz", ("f0_j1", "f0_j2"), 0.3)
-    columns = [4, 1, 0]
-    shuffled = replace(
-        recording,
-        joints=tuple(recording.joints[c] for c in columns),
-        trajectories=tuple(
-            replace(
-                t,
-                command=t.command[:, columns],
-                position=t.position[:, columns],
-                enabled=t.enabled[:, columns],
-            )
-            for t in recording.trajectories
-        ),
-    )
-    whole = simulate_hand(recording, HAND, rows(), dt=1.0 / 240.0, indices=[1])
-    part = simulate_hand(shuffled, HAND, rows(), dt=1.0 / 240.0, indices=[1])
-    assert part.shape == (len(recording.trajectories[1].time), 3)
-    # Joint f0_j3 now stands at zero, not at its centre, which moves f0_j1 and f0_j2 a little.
-    assert np.abs(part - whole[:, columns]).max() < 0.02 < np.ptp(whole[:, 1])
-
-
 def test_torque_off_lets_a_finger_hang():
     recording = motions("step_large", ("f0_j2",), 1.0)
     (trajectory,) = recording.trajectories

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vd.bench.hide import Hiding, simulate_hidden
 from vd.gap.cautions import cautions
-from vd.gap.hide import Hiding, simulate_hidden
 from vd.gap.recording import Recording, RecordingError, Trajectory, read_recording, write_recording
 from vd.gap.recording_checks import check_motion
 
@@ -359,15 +359,14 @@ def test_large_effects_of_real_servos_are_no_faults_of_the_recording(tmp_path):
 
 def test_a_file_that_is_none_is_refused(tmp_path, folder):
     refused(tmp_path / "nowhere", "nowhere", "no such file")
+    table = (folder / "a.csv").read_text()
+    (folder / "a.csv").write_text("")
+    refused(folder, "a.csv", "empty")
+    (folder / "a.csv").write_text(table)
     (folder / "recording.json").write_text("{")
     refused(folder, "recording.json", "not JSON")
     (folder / "recording.json").write_text("[1]")
     refused(folder, "recording.json", "object")
-
-
-def test_an_empty_table_is_refused(folder):
-    (folder / "a.csv").write_text("")
-    refused(folder, "a.csv", "empty")
 
 
 @pytest.mark.parametrize(

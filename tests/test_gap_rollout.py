@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hands import load_hand
 from vd.gap.chain import GRAVITY_M_S2, chains
-from vd.gap.recording import Recording, Trajectory, read_recording
+from vd.gap.recording import Recording, Trajectory
 from vd.gap.rollout import Rollouts
 from vd.kernels.servo import actuators as servo
 from vd.sim.scene import hand_mount
@@ -118,12 +118,6 @@ def test_trajectories_come_in_the_order_asked_for():
     np.testing.assert_array_equal(again.predict(rows), everything)
 
 
-def test_excited_joints_are_marked():
-    data = recording("servo", ("j", "k"), trajectory("a", wave(joints=2), joints=("k",)))
-    marks = [Rollouts(chain, data).excited.all() for chain in chains(data)]
-    assert marks == [False, True]
-
-
 @pytest.mark.parametrize(("sent_s", "delay_s", "same_as"), [(0.007, 0.0, 0.007), (-0.003, 0.003, 0.0)])
 def test_commands_act_from_when_they_were_sent(hand, device, sent_s, delay_s, same_as):
     """Sent after the rows' stamps they act as delayed ones; sent before them and late, as at the stamps."""
@@ -171,23 +165,6 @@ def test_play_begins_where_the_joint_rests():
     droop = 0.04 * np.cos(got[:, -1])
     np.testing.assert_allclose(got[0], start[0], atol=1e-6)
     np.testing.assert_allclose(got[1:, -1] + droop[1:], 0.23, atol=1e-4)
-
-
-def test_a_finger_with_play_rests_where_its_weight_asks(hand):
-    """What a finger without play comes to rest at, one with play keeps."""
-    names = tuple(hand.joint_names[:3])
-    target = np.array([0.3, 0.5, -0.7])
-    command = np.tile(target, (200, 1))
-    (chain,) = chains(recording("dclaw3", names, trajectory("a", command, position=command)), hand)
-    data = recording("dclaw3", names, trajectory("a", command, position=command))
-    rest = Rollouts(chain, data).predict(chain.start_row[None])[0, -1]
-    assert np.abs(rest - target).max() > 2e-3
-    again = recording("dclaw3", names, trajectory("a", command, position=np.tile(rest, (200, 1))))
-    row = chain.start_row.copy()
-    row[:, servo.BACKLASH_WIDTH] = 0.05
-    np.testing.assert_allclose(
-        Rollouts(chain, again).predict(row[None])[0], np.tile(rest, (200, 1)), atol=1e-4
-    )
 
 
 def test_a_finger_droops_as_its_weight_asks(hand):
@@ -264,21 +241,6 @@ def test_bad_input_says_what_to_do(hand):
         Rollouts(chain, data).predict(chain.start_row)
 
 
-def test_an_unfitted_servo_already_resembles_a_real_one(shared_dir):
-    data = read_recording(shared_dir / "measured" / "xl330_pendulum")
-    (chain,) = chains(data)
-    rollouts = Rollouts(chain, data)
-    stiff = np.array([8, 9, 10, 11])
-    rows = np.repeat(chain.start_row[None], 2, axis=0)
-    rows[1, 0, servo.LOAD_FRICTION] = 0.3
-    assert {data.trajectories[i].conditions["p_gain"] for i in stiff} == {800}
-    predicted = rollouts.predict(rows, list(stiff))[..., 0]
-    measured = rollouts.measured[np.isin(rollouts.sample_trajectory, stiff), 0]
-    assert predicted.shape == (2, len(measured)) and np.isfinite(predicted).all()
-    # The signs, units and times of servo and pendulum are right.
-    assert np.corrcoef(predicted[0], measured)[0, 1] > 0.9
-
-
 @pytest.mark.parametrize(("rate", "samples"), [(480.0, 411), (2400.0, 1171)])
 def test_every_sample_is_predicted_wherever_its_stamp_falls_within_a_step(rate, samples):
     """4.1 s and 11.7 s are whole numbers of steps only up to rounding."""
@@ -291,38 +253,3 @@ def test_every_sample_is_predicted_wherever_its_stamp_falls_within_a_step(rate, 
         del left  # memory that the predictions are likely to get
         predicted = Rollouts(chain, found, dt=1.0 / rate).predict(chain.start_row[None])
         np.testing.assert_allclose(predicted, 0.1, atol=1e-5)
-
-
-def test_what_was_simulated_a_short_while_ago_is_the_same(monkeypatch):
-    """Asked for again, in another order, with others, of all joints or one, rollouts are those made anew."""
-    motions = recording("servo", ("joint",), *(trajectory(f"m{i}", wave(phase=i)) for i in range(3)))
-    chain = chains(motions, None)[0]
-    rows = np.repeat(chain.start_row[None], 5, axis=0)
-    rows[:, 0, servo.KP] *= np.linspace(0.8, 1.2, 5)
-    rollouts = Rollouts(chain, motions)
-    first = rollouts.predict(rows[:4], [0, 2])
-    launched = []
-    launch = Rollouts._launch
-    monkeypatch.setattr(Rollouts, "_launch", lambda self, *a: (launched.append(len(a[1])), launch(self, *a)))
-    again = rollouts.predict(rows[[4, 2, 0]], [2, 0])
-    assert launched == [2]
-    one = rollouts.predict(rows[[4, 2, 0]], [2, 0], joint=0)
-    assert launched == [2, 6], "a single joint's are kept apart"
-    fresh = Rollouts(chain, motions).predict(rows[[4, 2, 0]], [2, 0])
-    np.testing.assert_array_equal(again, fresh)
-    np.testing.assert_array_equal(one, fresh[:, :, 0])
-    again[:] = np.nan
-    np.testing.assert_array_equal(rollouts.predict(rows[:4], [0, 2]), first)
-
-
-def test_few_rollouts_are_kept(monkeypatch):
-    monkeypatch.setattr("vd.gap.rollout.RECALLED", 3)
-    motions = recording("servo", ("joint",), *(trajectory(f"m{i}", wave(phase=i)) for i in range(3)))
-    chain = chains(motions, None)[0]
-    rows = np.repeat(chain.start_row[None], 5, axis=0)
-    rows[:, 0, servo.KP] *= np.linspace(0.8, 1.2, 5)
-    rollouts = Rollouts(chain, motions)
-    first = rollouts.predict(rows, [0])
-    assert len(rollouts._recent) == 3
-    np.testing.assert_array_equal(rollouts.predict(rows, [0]), first)
-    assert len(rollouts._recent) == 3

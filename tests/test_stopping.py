@@ -72,9 +72,13 @@ def test_hands_that_are_never_still_get_both_bounds_together():
     assert found.rule.action_norm > 1.0 and max(shares) <= found.success + 2 / 60
 
 
-def test_a_predictor_that_says_too_much_gets_a_wider_bound():
+def test_bounds_follow_the_predictor_and_the_tolerance():
+    """Who says too much gets a wider bound; off by 0.03 rad, a bound of 0.1 is too wide for 0.1."""
     high, low = (calibrate(*episodes(3, bias=bias, noise=0.0)).rule for bias in (0.3, -0.1))
     assert high.distance_rad > low.distance_rad
+    data = episodes(7, noise=0.03)
+    wide, near = calibrate(*data), calibrate(*data, tolerance_rad=0.1)
+    assert near.rule.distance_rad < 0.1 < wide.rule.distance_rad and near.success > 0.0
 
 
 def test_steps_after_a_fall_count_for_nothing():
@@ -104,13 +108,6 @@ def test_each_tolerance_has_the_rule_that_was_calibrated_for_it():
     known = dataclasses.replace(other, calibrated_on="cube: 8 episodes")
     assert known.calibrated_for(0.2) and known.calibrated_for(0.1) and not known.calibrated_for(0.4)
     assert not spec.calibrated_for(TOLERANCE), "the paper's bounds are of no episodes"
-
-
-def test_a_rule_for_less_is_stricter():
-    """Predictions with an error of 0.03 rad: asked for 0.1 rad, a bound of 0.1 stops too many outside."""
-    data = episodes(7, noise=0.03)
-    wide, near = calibrate(*data), calibrate(*data, tolerance_rad=0.1)
-    assert near.rule.distance_rad < 0.1 < wide.rule.distance_rad and near.success > 0.0
 
 
 def test_a_recorded_trace_gives_the_same_rule():

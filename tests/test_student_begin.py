@@ -4,16 +4,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from student_dummy import TINY, make_student_runner
+from student_dummy import TINY, make_dagger
 
-from vd.policy import PolicySpec
 from vd.train.student.build import begin_from
 from vd.vision.cfg import StudentCfg
 from vd.vision.network import Student
-from vd.vision.state import state_cfg
 
 ACTIONS = 3
-HEAD = state_cfg(PolicySpec(100, ACTIONS, (8,), "elu", "gaussian", False))
 
 
 @pytest.fixture
@@ -22,8 +19,8 @@ def saved(tmp_path):
 
     def write(stage: int, network: StudentCfg = TINY, actions: int = ACTIONS):
         torch.manual_seed(7)
-        runner = make_student_runner(tmp_path / str(stage))
-        runner.learner.student = student = Student(network, actions)
+        runner = make_dagger(tmp_path / str(stage))
+        runner.student = student = Student(network, actions)
         runner.spec = replace(runner.spec, stage=stage, network=network, num_actions=actions)
         for value in student.state_dict().values():
             if value.is_floating_point():
@@ -56,14 +53,6 @@ def test_an_encoder_serves_another_hand_and_a_policy_does_not(saved):
     path, _ = saved(1)
     with pytest.raises(ValueError, match="same hand"):
         begin_from(path, Student(TINY, ACTIONS + 1), "cpu")
-
-
-def test_a_head_for_another_teachers_observation_adds_nothing_to_begin_with(saved):
-    """What was added to the actions of another teacher is not taken over."""
-    path, there = saved(1, replace(TINY, state=HEAD))
-    here = Student(replace(TINY, state=replace(HEAD, hidden=(9,))), ACTIONS)
-    assert begin_from(path, here, "cpu") == ["mean", "state"]
-    assert same(here, there, "memory") and not here.mean.weight.any() and not here.mean.bias.any()
 
 
 def test_another_network_is_refused_but_for_what_an_encoder_does_not_need(saved):

@@ -3,22 +3,21 @@
 import math
 import os
 import signal
-from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from student_dummy import TINY, DummyTeacher, make_dagger, make_student_runner, weights
+from student_dummy import TINY, DummyTeacher, make_dagger, weights
 
 from vd.train.checkpoint import list_checkpoints
 from vd.train.cli import main
 from vd.train.ending import Interrupted, TrainingDivergedError
 from vd.train.metrics import read_progress
-from vd.train.student.losses import distance_loss, imitation_loss, poses, unexplained
-from vd.train.student.optimise import scheduled
+from vd.train.student.losses import imitation_figures, imitation_loss, poses
 from vd.train.student.rollout import taken
+from vd.train.student.runner import scheduled
 from vd.vision.cfg import NoiseCfg
-from vd.vision.network import Student
 from vd.vision.saved import load_student
 
 
@@ -33,7 +32,7 @@ def test_the_losses_fall_on_one_rollout():
 
 
 def test_the_student_acts_more_and_more_like_the_teacher(tmp_path):
-    runner = make_student_runner(tmp_path, make_dagger(envs=16, epochs=4))
+    runner = make_dagger(tmp_path, envs=16, epochs=4)
     runner.learn(16)
     errors = [row["student/action_error"] for row in read_progress(tmp_path / "progress.jsonl")]
     assert np.mean(errors[-3:]) < 0.6 * np.mean(errors[:3])
@@ -56,7 +55,7 @@ def test_gradients_equal_those_of_an_unrolled_loop(kind):
     gru, hidden, total = student.memory, rollout.hidden, torch.zeros(())
     for step in range(5):
         frame = {name: value[step] for name, value in rollout.frames.items()}
-        embedding = student.encode(*dagger.view.sites(frame, augment=True))
+        embedding = student.encode(dagger.view.sites(frame, augment=True))
         inputs = student.merge_action(torch.cat([embedding, student.action_layers(frame["action"])], dim=-1))
         gates_in = (inputs @ gru.weight_ih_l0.T + gru.bias_ih_l0).chunk(3, dim=-1)
         gates_hidden = (hidden @ gru.weight_hh_l0.T + gru.bias_hh_l0).chunk(3, dim=-1)
@@ -95,7 +94,7 @@ def test_no_gradient_crosses_the_end_of_an_episode():
     student = dagger.student.eval()
     with torch.no_grad():
         frames = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
-        embedding = student.encode(*dagger.view.sites(frames, augment=True)).view(4, 2, -1)
+        embedding = student.encode(dagger.view.sites(frames, augment=True)).view(4, 2, -1)
         output = student(embedding, action, rollout.hidden, rollout.done)
         rollout.label[0] = output.mean[0]  # no error in the first step: its own loss has no gradient
     (gradient,) = torch.autograd.grad(dagger.losses(rollout)["imitation"], action)
@@ -103,33 +102,14 @@ def test_no_gradient_crosses_the_end_of_an_episode():
     assert float(gradient[1, 0].abs().max()) > 1e-6
 
 
-def test_losses_are_what_they_say():
-    torch.manual_seed(0)
-    dagger = make_dagger(envs=2, rollout_steps=3)
-    rollout = dagger.collect()
-    frames = {name: value.flatten(0, 1) for name, value in rollout.frames.items()}
-    embedding = dagger.student.encode(*dagger.view.sites(frames, augment=True)).view(3, 2, -1)
-    output = dagger.student(embedding, rollout.frames["action"], rollout.hidden, rollout.done)
-    normal = torch.distributions.Normal(output.mean, output.log_std.exp())
-    expected = -normal.log_prob(rollout.label).sum(-1).mean()
-    torch.testing.assert_close(imitation_loss(output, rollout.label, "likelihood"), expected)
-    squared = (output.mean - rollout.label).square().sum(-1).mean()
-    torch.testing.assert_close(imitation_loss(output, rollout.label, "squared"), squared)
-    # what the environment clips alike is no error, but for labels short of the bound
-    beyond = replace(output, mean=torch.tensor([[[1.5, -1.5]]]))
+def test_what_the_environment_clips_alike_is_no_error():
+    output = SimpleNamespace(mean=torch.tensor([[[1.5, -1.5]]]))
     for label, left in (([1.0, -1.0], 0.0), ([0.5, -1.0], 1.0), ([-1.0, 1.0], 12.5), ([1.0, -2.0], 0.25)):
-        loss = imitation_loss(beyond, torch.tensor([[label]]), "squared", bounded=True)
+        loss = imitation_loss(output, torch.tensor([[label]]), "squared", bounded=True)
         assert float(loss) == pytest.approx(left)
-    assert float(distance_loss(torch.tensor([[[1.0, 3.0]]]), torch.tensor([[1.0]]))) == 2.0
-
-
-def test_minibatches_hold_every_world_once_a_pass():
-    dagger = make_dagger(envs=10, minibatch_envs=4, epochs=3)
-    batches = [batch.tolist() for batch in dagger.minibatches(1)]
-    assert [len(batch) for batch in batches] == [4, 4, 2] * 3
-    passes = [[world for batch in batches[i : i + 3] for world in batch] for i in (0, 3, 6)]
-    assert all(sorted(one) == list(range(10)) for one in passes)
-    assert len({tuple(one) for one in passes}) == 3
+    label = torch.rand(50, 8, 3)
+    figures = imitation_figures(label.mean(dim=(0, 1)).expand_as(label), label)
+    assert float(figures["student/unexplained"]) == pytest.approx(1.0), "of a constant all is left"
 
 
 def test_kept_rollouts_are_learned_from_too():
@@ -142,7 +122,7 @@ def test_kept_rollouts_are_learned_from_too():
         torch.testing.assert_close(loss, 0.5 * (parts[0][name] + parts[1][name]))
     drawn = torch.cat([batch for _ in range(40) for batch in dagger.minibatches(2)])
     assert len(drawn) == 120 and set(drawn.tolist()) == set(range(6))
-    assert [len(dagger._kept) for _ in range(4) if dagger.iterate(lambda: False)] == [1, 2, 3, 3]
+    assert [len(dagger._kept) for _ in range(4) if dagger._iterate()] == [1, 2, 3, 3]
 
 
 def test_a_rollout_pairs_each_frame_with_its_label_and_end():
@@ -189,59 +169,6 @@ def test_the_teacher_acts_in_its_share_which_falls_to_none():
     assert not torch.equal(*(lambda r: (r.frames["action"][1:], r.label[:-1]))(dagger.collect()))
 
 
-def test_the_teachers_share_can_stay_and_is_drawn_by_world():
-    dagger = make_dagger(
-        envs=40, teacher_share=0.9, teacher_share_last=0.4, teacher_share_iterations=2, rollout_steps=3
-    )
-    assert [dagger.teacher_share() for dagger.iteration in range(4)] == pytest.approx([0.9, 0.65, 0.4, 0.4])
-    dagger.iteration = 5
-    rollout = dagger.collect()
-    own = (rollout.frames["action"][1:] == rollout.label[:-1]).all(dim=-1)
-    # a world is the teacher's for the whole rollout, or the student's
-    assert torch.equal(own.all(dim=0), own.any(dim=0)) and 4 <= int(own[0].sum()) <= 28
-
-
-def test_nothing_is_learned_from_worlds_that_are_held_out():
-    dagger = make_dagger(envs=5, minibatch_envs=2, epochs=2, validation_envs=2, keep_rollouts=2)
-    drawn = torch.cat(list(dagger.minibatches(2)))
-    assert len(drawn) == 6 and set((drawn % 5).tolist()) <= {0, 1, 2} and int(drawn.max()) < 10
-    with pytest.raises(ValueError, match="validation-envs"):
-        make_dagger(envs=2, validation_envs=2)
-
-
-def test_the_fixed_set_is_the_first_episode_of_the_worlds_held_out():
-    """Its error is that of the student acting through the episode, memory and all, without noise."""
-    dagger = make_dagger(envs=5, validation_envs=2, reset=False, imitation="squared", teacher_share=1.0)
-    rollouts = math.ceil(dagger.env.max_episode_length / 6)
-    rows = [dagger.iterate(lambda: False) for _ in range(rollouts + 2)]
-    assert [row["validation/unexplained"] is None for row in rows] == [True] * (rollouts - 1) + [False] * 3
-    parts = [{name: value.clone() for name, value in part.frames.items()} for part in dagger._held_out]
-    dagger.iterate(lambda: False)
-    assert len(dagger._held_out) == rollouts
-    for before, part in zip(parts, dagger._held_out, strict=True):
-        assert all(torch.equal(before[name], part.frames[name]) for name in before)
-    student, hidden, means, labels = dagger.student.eval(), torch.zeros(2, TINY.memory), [], []
-    with torch.no_grad():
-        for part in dagger._held_out:
-            for step in range(6):
-                frame = {name: value[step] for name, value in part.frames.items()}
-                output = student.act(*dagger.view.sites(frame, augment=False), frame["action"], hidden)
-                hidden = output.hidden.masked_fill(part.done[step][:, None], 0.0)
-                means.append(output.mean.clamp(-1.0, 1.0))
-                labels.append(part.label[step].clamp(-1.0, 1.0))
-    error, label = torch.stack(means) - torch.stack(labels), torch.stack(labels)
-    figures = dagger.validate()
-    assert figures["validation/action_error"] == pytest.approx(float(error.square().mean().sqrt()), rel=1e-4)
-    assert figures["validation/zero_error"] == pytest.approx(float(label.square().mean().sqrt()), rel=1e-5)
-
-
-def test_a_constant_leaves_all_of_the_variance_unexplained():
-    true = torch.randn(50, 8, 3)
-    assert float(unexplained(true.mean(dim=(0, 1)).expand_as(true), true)) == pytest.approx(1.0)
-    assert float(unexplained(true, true)) == 0.0
-    assert float(unexplained(torch.zeros_like(true), true)) > 1.0
-
-
 def test_the_learning_rate_rises_and_falls():
     rates = [scheduled(1.0, step, warmup=10, decay_after=100) for step in (1, 5, 10, 100, 400)]
     assert rates == pytest.approx([0.1, 0.5, 1.0, 1.0, 0.5])
@@ -279,8 +206,8 @@ def test_poses_are_read_from_frames_and_learned(monkeypatch):
         last = dagger.update([rollout])
     assert last["loss/pose"] < 0.3 * first["loss/pose"]
     again = make_dagger(pose_weight=1.0, seed=3)
-    again.load_state_dict(dagger.state_dict(), 41)
-    for one, two in zip(again.pose.parameters(), dagger.pose.parameters(), strict=True):
+    again._load_learner(dagger._learner())
+    for one, two in zip(*(d.heads["pose"].parameters() for d in (again, dagger)), strict=True):
         assert torch.equal(one, two)
 
 
@@ -305,72 +232,43 @@ def test_labels_are_clipped_where_asked_for():
 def test_a_run_that_goes_on_is_the_run_that_never_stopped(tmp_path):
     for reset in (True, False):
         options = {"noise": NoiseCfg(), "reset": reset, "keep_rollouts": 1 if reset else 2}
-        options |= {"validation_envs": 0 if reset else 2, "warmup_steps": 6}
-        whole = make_student_runner(tmp_path / f"whole{reset}", make_dagger(**options))
+        options |= {"warmup_steps": 6}
+        whole = make_dagger(tmp_path / f"whole{reset}", **options)
         whole.learn(4)
-        make_student_runner(tmp_path / f"parts{reset}", make_dagger(**options)).learn(2)
+        make_dagger(tmp_path / f"parts{reset}", **options).learn(2)
         torch.manual_seed(99)  # whatever happened in between
-        again = make_student_runner(tmp_path / f"parts{reset}", make_dagger(**options, seed=5))
+        again = make_dagger(tmp_path / f"parts{reset}", **options, seed=5)
         again.load(list_checkpoints(tmp_path / f"parts{reset}")[-1])
         assert again.new_episodes == "" and again.iteration == 2
         again.learn(2)
-        np.testing.assert_array_equal(weights(again.learner.student), weights(whole.learner.student))
+        np.testing.assert_array_equal(weights(again.student), weights(whole.student))
         rows = [read_progress(tmp_path / f"{name}{reset}" / "progress.jsonl") for name in ("whole", "parts")]
         assert [row["iteration"] for row in rows[1]] == [1, 2, 3, 4]
         for first, second in zip(*rows, strict=True):
             assert first["loss/imitation"] == second["loss/imitation"]
 
 
-def test_curves_of_a_student_are_drawn(tmp_path):
-    make_student_runner(tmp_path).learn(3)
-    assert main(["curves", str(tmp_path)]) == 0
-    assert (tmp_path / "curves.png").stat().st_size > 20_000
-
-
 def test_other_worlds_start_anew(tmp_path):
-    make_student_runner(tmp_path).learn(2)
-    again = make_student_runner(tmp_path, make_dagger(envs=6))
+    make_dagger(tmp_path).learn(2)
+    again = make_dagger(tmp_path, envs=6)
     again.load(list_checkpoints(tmp_path)[-1])
-    assert "8 worlds" in again.new_episodes
+    assert "8 environments" in again.new_episodes
     again.learn(1)
     assert again.iteration == 3
 
 
-def test_a_student_comes_back_from_its_file(tmp_path):
-    runner = make_student_runner(tmp_path)
+def test_a_student_is_exported_from_a_checkpoint(tmp_path, capsys):
+    runner = make_dagger(tmp_path)
     runner.learn(1)
-    saved = load_student(tmp_path / "student.pt")
-    np.testing.assert_array_equal(weights(saved.network), weights(runner.learner.student))
-    assert saved.spec.network == TINY and saved.iteration == 1 and not saved.network.training
-    assert "optimizer" not in torch.load(tmp_path / "student.pt", weights_only=True)
-
-
-def test_a_student_is_written_small_and_used_as_before(tmp_path, capsys):
-    runner = make_student_runner(tmp_path)
-    runner.learn(1)
-    whole, small = tmp_path / "student.pt", tmp_path / "small.pt"
-    assert main(["export", str(whole), str(small)]) == 0
-    before, after = load_student(whole), load_student(small)
-    assert after.spec == before.spec and after.env_steps == before.env_steps
-    for name, value in before.network.state_dict().items():
-        found = after.network.state_dict()[name]
-        assert found.dtype == value.dtype
-        if value.ndim == 3:  # convolutions
-            step = value.abs().amax(dim=(0, 1)) / 127
-            assert ((found - value).abs() <= 0.501 * step).all() and not torch.equal(found, value)
-        elif value.ndim == 2:
-            torch.testing.assert_close(found, value.half().float(), rtol=0.0, atol=0.0)
-        else:
-            assert torch.equal(found, value)
-    again = tmp_path / "again.pt"
-    assert main(["export", str(small), str(again)]) == 0
-    np.testing.assert_array_equal(weights(load_student(again).network), weights(after.network))
-    assert main(["export", "--resumable", str(whole), str(again)]) == 1
+    (checkpoint,), out = list_checkpoints(tmp_path), tmp_path / "out.pt"
+    assert main(["export", str(checkpoint), str(out)]) == 0
+    np.testing.assert_array_equal(weights(load_student(out).network), weights(runner.student))
+    assert main(["export", "--resumable", str(checkpoint), str(out)]) == 1
     assert "--init" in capsys.readouterr().err
 
 
 def test_ctrl_c_saves_within_a_rollout(tmp_path):
-    dagger = make_dagger(rollout_steps=50)
+    dagger = make_dagger(tmp_path, rollout_steps=50, save_every=100)
     step, calls = dagger.env.step, []
 
     def interrupt(action):
@@ -381,44 +279,22 @@ def test_ctrl_c_saves_within_a_rollout(tmp_path):
 
     dagger.env.step = interrupt
     with pytest.raises(Interrupted):
-        make_student_runner(tmp_path, dagger, save_every=100).learn(5)
+        dagger.learn(5)
     assert len(calls) == 60  # at once, not at the end of the rollout
-    again = make_student_runner(tmp_path, make_dagger(rollout_steps=50))
+    again = make_dagger(tmp_path, rollout_steps=50)
     again.load(list_checkpoints(tmp_path)[-1])
     assert again.iteration == 1
 
 
 def test_values_that_are_not_finite_stop_the_run_with_a_remedy(tmp_path):
-    runner = make_student_runner(tmp_path)
+    runner = make_dagger(tmp_path)
     runner.learn(2)
     with torch.no_grad():
-        runner.learner.student.mean.weight[0, 0] = torch.nan
+        runner.student.mean.weight[0, 0] = torch.nan
     before = list_checkpoints(tmp_path)
     with pytest.raises(TrainingDivergedError, match=r"iteration 3: .*--dagger\.learning-rate.*--resume"):
         runner.learn(2)
     assert list_checkpoints(tmp_path) == before
-
-
-def test_one_scene_begins_every_rollout():
-    dagger = make_dagger(same_scene=True)
-    first, second = dagger.collect(), dagger.collect()
-    assert torch.equal(first.label[0], second.label[0])
-    other = make_dagger()
-    assert not torch.equal(other.collect().label[0], other.collect().label[0])
-
-
-def test_clouds_are_augmented_in_training():
-    dagger = make_dagger()
-    dagger.update([dagger.collect()])
-    assert all(dagger.view.asked)
-
-
-def test_weights_of_another_network_are_refused(tmp_path):
-    make_student_runner(tmp_path).learn(1)
-    other = make_dagger()
-    other.student = Student(replace(TINY, memory=8), 2)
-    with pytest.raises(ValueError, match="does not fit this run's network"):
-        make_student_runner(tmp_path, other).load(list_checkpoints(tmp_path)[-1])
 
 
 def test_half_precision_of_the_encoder_hardly_changes_the_losses():

@@ -19,24 +19,22 @@ from vd.deploy.loop.pilot import TrackingPilot
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
-from vd.evaluate.agents import RENAMED, SHIPPED_POLICIES, find_policy, open_policy, sees_clouds, task_for
-from vd.evaluate.comparison import Comparison
+from vd.evaluate.agents import REPLACED, SHIPPED_POLICIES, find_policy, open_policy, sees_clouds, task_for
+from vd.evaluate.result import Result
 from vd.evaluate.senses import EnvironmentSenses
 from vd.evaluate.trace import Trace
 from vd.evaluate.tracking import TrackingActor
 from vd.kernels.task.observations import teacher_observation_slices
 from vd.kernels.task.shapes import shape_observation_size
 from vd.policy import PolicySpec, TrainedPolicy, load_policy, perceptron
-from vd.senses import Senses
 from vd.sensors.cfg import DepthCameraCfg
 from vd.tracking.observer import UNSEEN, Observer
 from vd.tracking.policy import TrackingPolicy, TrackingSpec, is_tracking, load_tracking, tracking_export
-from vd.tracking.tracker import NEAREST, Tracker
-from vd.tracking.views import AFTER_S, EVERY_S
+from vd.tracking.tracker import Tracker
 from vd.train.checkpoint import save_checkpoint
 from vd.train.cli import main as vd_train
 
-TRACKERS = sorted(RENAMED.values())
+TRACKERS = [name for name in SHIPPED_POLICIES if name.endswith("-tracking")]
 WORLDS = 12
 EXACT = RandomisationCfg(enabled=False)
 CLOSE_RAD = 0.15
@@ -134,34 +132,19 @@ def teacher(request):
         columns["previous_action"].stop, columns["joint_position"].stop, (16, 8), "elu", "gaussian", True
     )
     torch.manual_seed(0)
-    actor, critic = (
-        {f"mlp.{name}": value for name, value in perceptron(part).state_dict().items()}
-        | {
-            "obs_normalizer._mean": torch.randn(1, spec.num_observations),
-            "obs_normalizer._std": 0.5 + torch.rand(1, spec.num_observations),
-        }
-        for part in (spec, replace(spec, num_actions=1))
-    )
-    return TrainedPolicy(spec, actor, task=to_dict(task), critic=critic)
+    weights = {f"mlp.{name}": value for name, value in perceptron(spec).state_dict().items()}
+    weights["obs_normalizer._mean"] = torch.randn(1, spec.num_observations)
+    weights["obs_normalizer._std"] = 0.5 + torch.rand(1, spec.num_observations)
+    return TrainedPolicy(spec, weights, task=to_dict(task))
 
 
-def tracker_of(
-    teacher: TrainedPolicy, monkeypatch, world: torch.Tensor, angle: torch.Tensor, **settings
-) -> Tracker:
+def tracker_of(teacher: TrainedPolicy, monkeypatch, world: torch.Tensor, angle: torch.Tensor) -> Tracker:
     """A tracker that observes what it is told."""
     hand, envs = load_hand(teacher.hand), len(world)
     policy = TrackingPolicy(teacher, TrackingSpec())
-    tracker = Tracker(
-        policy, hand, load_set("cube"), hand.camera, world_object=np.zeros(envs, dtype=int), **settings
-    )
+    tracker = Tracker(policy, hand, load_set("cube"), hand.camera, world_object=np.zeros(envs, dtype=int))
     monkeypatch.setattr(Observer, "__call__", lambda self, senses: (world, angle))
     return tracker
-
-
-def at_step(joints: int, step: int) -> Senses:
-    """Senses of which only the time of the goal counts."""
-    none = torch.zeros(WORLDS, joints)
-    return Senses(none, none, none, none, none, none, torch.full((WORLDS,), step, dtype=torch.int32))
 
 
 def observations(teacher: TrainedPolicy, angle: torch.Tensor) -> torch.Tensor:
@@ -181,7 +164,7 @@ def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_ca
     angle = torch.full((WORLDS,), 2.0)
     world = observations(teacher, angle)
     tracker = tracker_of(teacher, monkeypatch, world, angle)
-    decision, maps = tracker.step(at_step(teacher.num_actions, 0)), tracker._maps
+    decision, maps = tracker.step(None), tracker._maps
     assert torch.equal(decision.angle, angle)
     seen = world if maps is None else maps.take(world, maps.choose(world))
     told, columns = seen.clone(), teacher_observation_slices(teacher.num_actions // 3)
@@ -191,34 +174,6 @@ def test_its_teacher_acts_in_the_nearest_view_but_is_told_the_mean_of_what_no_ca
     action = action if maps is None else maps.world_action(action, maps.choose(world))
     torch.testing.assert_close(decision.action, action)
     assert (teacher.act(seen) - teacher.act(told)).abs().max() > 1e-3
-
-
-def test_other_views_of_far_goals_are_selected_after_a_while_and_kept(teacher, monkeypatch):
-    angle = torch.where(torch.arange(WORLDS) < 3, 0.3, 2.0)
-    world = observations(teacher, angle)
-    if teacher.task["observation"]["view"] == "world":
-        with pytest.raises(ValueError, match="does not see its goals in views"):
-            tracker_of(teacher, monkeypatch, world, angle, second_view=True)
-        return
-    tracker = tracker_of(teacher, monkeypatch, world, angle, second_view=True)
-    maps, joints, hz = tracker._maps, teacher.num_actions, ReorientCfg().sim.control_hz
-    fingers, nearest, better = maps.fingers, maps.choose(world).tolist(), []
-    for row in range(WORLDS):
-        near = maps.nearness(world[row]).reshape(-1, fingers).argmax(dim=1)
-        offered = [int(near[0]), int(near[1]) + fingers] if len(near) == 2 else range(fingers)
-        seen = [tracker._guessed(maps.take(world[row : row + 1], torch.tensor([view]))) for view in offered]
-        better.append(list(offered)[int(np.argmax([float(teacher.value(one)[0]) for one in seen]))])
-    assert better[3:] != nearest[3:]
-    late = round(AFTER_S * hz)
-    for step in range(round((AFTER_S + EVERY_S) * hz)):
-        tracker.step(at_step(joints, step))
-        taken = torch.where(tracker._selected == NEAREST, torch.tensor(nearest), tracker._selected).tolist()
-        assert taken == nearest[:3] + (better if step >= late else nearest)[3:]
-    # With a new goal it begins anew.
-    again = at_step(joints, step + 1)
-    again.goal_steps[4] = 0
-    tracker.step(again)
-    assert tracker._selected[4] == NEAREST and (tracker._selected[5:] != NEAREST).all()
 
 
 def test_a_teacher_that_observes_what_no_camera_shows_is_refused():
@@ -237,7 +192,6 @@ def test_an_installed_one_is_its_teacher_and_has_rules_from_episodes(name):
     teacher = load_policy(find_policy(policy.spec.teacher))
     observation = torch.randn(5, teacher.num_observations)
     assert torch.equal(policy.teacher.act(observation), teacher.act(observation))
-    assert torch.equal(policy.teacher.value(observation), teacher.value(observation))
 
 
 def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):
@@ -251,17 +205,13 @@ def test_a_file_comes_back_and_a_damaged_one_is_told(tmp_path):
         load_tracking(tmp_path / "other.pt")
 
 
-@pytest.mark.parametrize("name", sorted(RENAMED))
-def test_a_former_name_is_refused_with_the_new_one(name, capsys, tmp_path):
+@pytest.mark.parametrize("name", sorted(REPLACED))
+def test_a_former_name_is_refused_with_the_one_to_take(name, capsys, tmp_path):
     assert cli.main([name, "--out", str(tmp_path)]) == 1
-    assert RENAMED[name] in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", sorted(RENAMED))
-def test_other_commands_tell_a_former_name_too(name, capsys):
+    assert REPLACED[name] in capsys.readouterr().err
     assert vd_deploy([name, "--twin"]) == 1
-    assert RENAMED[name] in capsys.readouterr().err
-    with pytest.raises(ValueError, match=RENAMED[name]):
+    assert REPLACED[name] in capsys.readouterr().err
+    with pytest.raises(ValueError, match=REPLACED[name]):
         StudentCommand(networks=("lean", name)).run()
 
 
@@ -320,30 +270,27 @@ def test_a_pilot_decides_on_a_hand_as_in_the_simulator():
 
 
 @pytest.mark.slow
-def test_an_evaluation_in_the_air_by_scans_with_views_selected(tmp_path, capsys):
+def test_an_evaluation_in_the_air_by_scans(tmp_path):
     flags = ["--in-air", "--goals", "scan", "--episodes", "1", "--device", "cpu", "--episode-s", "0.5"]
-    assert cli.main(["dclaw3-tracking", *flags, "--second-view", "--out", str(tmp_path)]) == 0
-    by_prediction = Comparison.read(tmp_path / "eval.json").rows[0]
-    assert (by_prediction.kind, by_prediction.sees) == ("tracking", "rendered clouds")
-    protocol = by_prediction.result.protocol
-    assert protocol.goals == "scan" and protocol.sensor_errors and protocol.second_view and protocol.in_air
-    assert "symmetry-view selection" in (tmp_path / "eval.html").read_text()
-    assert cli.main(["dclaw3-tracking", "--sees", "complete", "--device", "cpu", "--out", str(tmp_path)]) == 1
-    assert "tracks by a depth camera" in capsys.readouterr().err
+    assert cli.main(["dclaw3-tracking", *flags, "--out", str(tmp_path)]) == 0
+    row = Result.read(tmp_path / "eval.json").rows[0]
+    assert (row.kind, row.sees, row.stopped_by) == ("tracking", "rendered clouds", "prediction")
+    assert row.protocol.goals == "scan" and row.protocol.sensor_errors and row.protocol.in_air
+    assert row.prediction is not None and row.held is not None
 
 
 @pytest.mark.slow
 def test_it_is_shown(tmp_path):
     from vd.play.cli import PlayCfg, record_video
 
-    assert record_video(PlayCfg(policy="dclaw3-tracking", seconds=0.5, device="cpu"), tmp_path / "m.png") == 6
+    assert record_video(PlayCfg(policy="dclaw3-tracking", seconds=0.5, device="cpu"), tmp_path / "m.mp4") == 7
 
 
 def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(tmp_path, monkeypatch, capsys):
     asked = []
 
-    def spy(cfg, env, actor, *_others):
-        asked.append((cfg, actor._tracker._selection is not None))
+    def spy(cfg, *_others):
+        asked.append(cfg)
         seen = np.zeros((1, 1, 4))
         norms, quat = np.array([[[0.0, 0.5, 0.4, 0.3]]]), np.zeros((1, 1, 4))
         return Trace(quat, quat, seen, seen, norms, seen, np.full((1, 1), 4), np.zeros((1, 1), bool))
@@ -353,16 +300,14 @@ def test_the_command_writes_a_policy_with_rules_for_the_conditions_it_was_told(t
     flags = ["tracker", "dclaw3-table", "--objects", "cube", "--episodes", "1", "--device", "cpu"]
     flags += ["--out", str(path)]
     assert vd_train(flags) == 0
-    policy, (cfg, selects) = load_tracking(path), asked[-1]
+    policy, cfg = load_tracking(path), asked[-1]
     assert policy.spec.calibrated_on == "cube: 1 episodes, goals by points, tolerance 0.4 rad, seed 1000"
     assert policy.spec.teacher == "dclaw3-table" and policy.spec.precise is not None
     assert 0.0 < policy.spec.stopping.action_norm < 1.0
-    assert cfg.sensor_errors and cfg.goals == "points" and not selects
+    assert cfg.sensor_errors and cfg.goals == "points"
     capsys.readouterr()
-    assert vd_train([*flags, "--second-view", "--in-air", "--json"]) == 0
+    assert vd_train([*flags, "--in-air", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["episodes"] == 1
-    spec, (cfg, selects) = load_tracking(path).spec, asked[-1]
-    assert cfg.in_air and selects
-    assert all(words in spec.calibrated_on for words in ("in the air", "views selected"))
+    assert asked[-1].in_air and "in the air" in load_tracking(path).spec.calibrated_on
     assert vd_train(["tracker", "dclaw3-tracking", *flags[2:]]) == 1
     assert "give a teacher" in capsys.readouterr().err

@@ -1,13 +1,8 @@
 """Presets, flags and the configuration file of training."""
 
-import ast
 import dataclasses
-import inspect
-import itertools
 import json
 import re
-import textwrap
-import types
 import typing
 from pathlib import Path
 
@@ -15,14 +10,12 @@ import pytest
 
 from vd.config import from_dict, to_dict
 from vd.device import resolve_device
-from vd.envs.cfg import CurriculumCfg, ObservationCfg, SuccessCfg
+from vd.envs.cfg import ObservationCfg
 from vd.paper import PAPER
 from vd.train.cli import main
 from vd.train.config import minibatches, validate
 from vd.train.flags import OF_HELP_ALL, parse_teacher
-from vd.train.presets import PRESETS, PresetName, TeacherCfg, smoke
-from vd.train.student.config import StudentTrainCfg
-from vd.train.tracker import TrackerCfg
+from vd.train.presets import PRESETS, TeacherCfg
 
 
 @pytest.mark.parametrize("name", sorted(PRESETS))
@@ -35,10 +28,6 @@ def test_every_preset_parses_validates_and_survives_a_file(name):
     assert from_dict(TeacherCfg, json.loads(json.dumps(to_dict(preset)))) == preset
 
 
-def test_presets_are_the_choices_of_the_flag():
-    assert set(typing.get_args(PresetName)) == set(PRESETS)
-
-
 def test_paper_preset_is_the_paper():
     cfg, paper = PRESETS["paper"](), PAPER.teacher
     assert cfg.env.num_envs == paper.num_envs == 32000
@@ -47,7 +36,7 @@ def test_paper_preset_is_the_paper():
     assert cfg.env.num_envs * cfg.ppo.rollout_steps // 4 == paper.minibatch_size == 64000
     assert (cfg.ppo.actor_learning_rate, cfg.ppo.critic_learning_rate) == (3e-4, 1e-3)
     assert (cfg.ppo.clip, cfg.ppo.gamma, cfg.ppo.gae_lambda) == (0.1, 0.99, 0.95)
-    assert (cfg.ppo.schedule, cfg.ppo.optimizer) == ("fixed", "adam")
+    assert cfg.ppo.schedule == "fixed"
     assert cfg.policy.hidden == (512, 256, 256)
     assert cfg.policy.distribution == "gaussian" and not cfg.policy.normalise_observations
     seen = ObservationCfg(canonical=True)
@@ -91,44 +80,6 @@ def test_a_preset_for_a_hand_of_its_own_serves_the_other():
         assert parse_teacher(flags).env.observation.view == "world"
 
 
-def test_our_presets_bound_a_state_dependent_std():
-    for name in ("gpu", "multi-gpu", "cpu-demo"):
-        policy = PRESETS[name]().policy
-        assert policy.distribution == "state-dependent"
-        assert 0.0 < policy.std_range[0] < policy.initial_std < policy.std_range[1] <= 1.0
-
-
-def test_several_gpus_train_by_the_recipe_of_one():
-    one, several = PRESETS["gpu"](), PRESETS["multi-gpu"]()
-    assert dataclasses.replace(several, preset=one.preset, run=one.run) == one
-
-
-def test_the_recipe_loosens_stillness_that_an_evaluation_asks_for_in_full():
-    """Fingers that explore cannot be still: training asks for less, and no policy is judged by that."""
-    from vd.evaluate.agents import task_for
-
-    trained = PRESETS["gpu"]().env
-    policy = types.SimpleNamespace(task=to_dict(trained))
-    success, loose = PAPER.success, trained.curriculum.tightening
-    assert loose.enabled
-    for name in ("joint_speed_rad_s", "object_speed_m_s", "object_spin_rad_s", "action_norm"):
-        assert getattr(loose, name) > getattr(trained.success, name) >= getattr(success, name)
-    judged = task_for(
-        policy,
-        hand=None,
-        objects=("cube",),
-        num_envs=1,
-        seed=0,
-        stop_tolerance_rad=success.rotation_rad,
-        max_goal_angle_rad=None,
-        episode_s=PAPER.scene.episode_s,
-        randomised=False,
-        success_ends_episode=True,
-    )
-    assert judged.success == SuccessCfg() and judged.curriculum == CurriculumCfg()
-    assert judged.max_episode_steps == 120
-
-
 def _flags(cls: type, prefix: str = "--") -> list[str]:
     """Flags that the nested dataclass ``cls`` should have."""
     flags = []
@@ -161,41 +112,6 @@ def test_help_lists_at_most_80_flags_and_help_all_the_others_too(capsys):
     assert all(any(flag == name or flag.startswith(f"{name}.") for name in hidden) for flag in left_out)
     assert all(any(flag == name or flag.startswith(f"{name}.") for flag in left_out) for name in hidden)
     assert parse_teacher(["--preset", "gpu", "--env.sim.njmax", "200"]).env.sim.njmax == 200
-
-
-def _undescribed(cls: type, prefix: str = "") -> list[str]:
-    """Fields of the nested dataclass ``cls`` that no docstring follows."""
-    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-    assert isinstance(tree, ast.ClassDef)
-    described = {
-        line.target.id
-        for line, after in itertools.pairwise(tree.body)
-        if isinstance(line, ast.AnnAssign)
-        and isinstance(line.target, ast.Name)
-        and isinstance(after, ast.Expr)
-        and isinstance(after.value, ast.Constant)
-    }
-    hints, missing = typing.get_type_hints(cls), []
-    for field in dataclasses.fields(cls):
-        if dataclasses.is_dataclass(hints[field.name]):
-            missing += _undescribed(hints[field.name], f"{prefix}{field.name}.")
-        elif field.name not in described:
-            missing.append(prefix + field.name)
-    return missing
-
-
-@pytest.mark.parametrize("cls", [TeacherCfg, StudentTrainCfg, TrackerCfg])
-def test_every_flag_is_described(cls):
-    assert _undescribed(cls) == []
-    assert not [flag for flag in _flags(cls) if ".no-" in flag], "--no-no- would be its other side"
-
-
-def test_a_command_names_itself_in_its_help(capsys):
-    for command in ("teacher", "student", "tracker", "average", "export"):
-        with pytest.raises(SystemExit):
-            main([command, "--help"])
-        text = capsys.readouterr().out
-        assert text.startswith(f"usage: vd-train {command} ")
 
 
 def test_help_needs_neither_torch_nor_the_simulator():
@@ -231,12 +147,6 @@ def test_flags_override_the_preset_and_short_forms_mean_the_environment():
     assert cfg.env.reward.energy == -1.5 and cfg.ppo.epochs == 3
     assert cfg.run.out == Path("runs/x") and cfg.run.max_minutes == 2.5
     assert cfg.policy == PRESETS["gpu"]().policy
-
-
-def test_smoke_is_small_and_short():
-    cfg = parse_teacher(["--smoke", "--num-envs", "8"])
-    assert cfg.smoke and cfg.run.device == "cpu" and cfg.run.max_minutes == 1.0 and cfg.env.num_envs == 8
-    assert smoke().env.num_envs * smoke().ppo.rollout_steps * 20 > smoke().run.max_steps
 
 
 def test_a_smoke_test_leaves_nothing_and_can_be_done_again(tmp_path, monkeypatch, capsys):
@@ -315,7 +225,7 @@ def test_export_and_curves_commands(tmp_path, capsys):
     assert main(["export", "--resumable", str(whole), str(small)]) == 0
     resumed = make_runner(tmp_path)
     resumed.load(str(small))
-    assert resumed.current_learning_iteration == 1 and resumed.new_episodes
+    assert resumed.iteration == 1 and resumed.new_episodes
     assert main(["export", "--resumable", str(tmp_path / "out.pt"), str(small)]) == 1
     assert "not a checkpoint" in capsys.readouterr().err
     assert main(["curves", str(tmp_path)]) == 0

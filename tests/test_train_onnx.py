@@ -33,9 +33,3 @@ def test_a_file_with_other_actions_is_not_passed(tmp_path):
     policy.network.layers[-1].bias += 0.1
     with pytest.raises(RuntimeError, match="differ"):
         onnx_difference(policy, tmp_path / "policy.onnx")
-
-
-def test_a_resumable_checkpoint_is_no_network(tmp_path, capsys):
-    flags = ["export", "--resumable", str(SHIPPED_POLICIES["dclaw4-cube"]), str(tmp_path / "policy.onnx")]
-    assert main(flags) == 1
-    assert "leave one of them out" in capsys.readouterr().err

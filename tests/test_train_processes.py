@@ -123,56 +123,37 @@ def test_the_error_of_one_process_is_told_and_ends_it_at_once(tmp_path):
 
 
 HANGING = """
-import os, signal, sys, time
+import os, sys, time
 from datetime import timedelta
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
 sys.path.insert(0, {tests!r})
 from train_dummy import DummyEnv, make_runner
-from vd.train import distributed, watchdog
-distributed.COLLECTIVE_TIMEOUT = timedelta(seconds=6)
-watchdog.REPORT_AFTER_S, watchdog.PUBLISH_EVERY_S = 1.5, 0.2
+from vd.train import distributed
+distributed.COLLECTIVE_TIMEOUT, distributed.REPORT_AFTER_S = timedelta(seconds=6), 1.5
 rank = int(os.environ["RANK"])
 env = DummyEnv(num_envs=8, seed=rank)
 runner = make_runner(Path({folder!r}), env=env, seed=rank)
-def check():
+def hang():
     if rank == 1 and env.steps >= 16:
-        {hang}
-env.check = check
+        time.sleep(600)
+env.check = hang
 with distributed.ending_together():
     runner.learn(5)
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("hang", "named"),
-    [
-        ("time.sleep(600)", "Process 1 does something else while the others wait for it."),
-        ("os.kill(os.getpid(), signal.SIGSTOP)", "Process 1 does not answer: the others wait for it."),
-    ],
-)
-def test_a_process_that_hangs_is_named_and_the_run_ends(tmp_path, hang, named):
-    code = HANGING.format(tests=str(Path(__file__).parent), folder=str(tmp_path), hang=hang)
+def test_the_stack_of_a_process_that_hangs_is_shown_and_the_run_ends(tmp_path):
+    code = HANGING.format(tests=str(Path(__file__).parent), folder=str(tmp_path))
     processes = _two_processes(code, stderr=subprocess.PIPE, text=True)
     try:
         _, error = processes[0].communicate(timeout=PATIENCE_S)
         assert processes[0].returncode == 1
-        assert named in error and "--resume" in error
-        assert "process 0: iteration 2, waits for others at vd.train." in error
-        assert "process 0 failed and ends the run" in error  # the wait reached its limit
+        assert "process 0 failed and ends the run; --resume" in error  # the wait reached its limit
     finally:
         for process in processes:
             process.kill()
-
-
-def test_the_odd_one_out_is_named_where_no_wait_shows():
-    from vd.train.watchdog import verdict
-
-    def messages(*places):
-        return {rank: [1, 1, False, place] for rank, place in enumerate(places)}
-
-    assert "Process 1 is elsewhere" in verdict(messages("a", "b", "a"), [], 3)
-    assert "Nothing tells" in verdict(messages("a", "b"), [], 2)
-    assert "Nothing tells" in verdict(messages("a", "a", "a"), [], 3)
+    _, error = processes[1].communicate()
+    assert "in hang" in error and "distributed" not in error.split("Thread")[-1]

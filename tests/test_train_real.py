@@ -79,14 +79,6 @@ def test_what_is_learned_in_coarser_physics_is_judged_in_the_default(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_run_that_has_nothing_left_to_do_does_not_speak_of_a_policy(tmp_path, capsys):
-    flags = ["--init", "dclaw4-cube", "--num-envs", "4", "--ppo.minibatch-size", "4", "--device", "cpu"]
-    assert main(["teacher", *flags, "--max-steps", "32", "--out", str(tmp_path)]) == 0
-    assert "nothing was trained" in (told := capsys.readouterr().out) and "raise it" in told
-    assert not (tmp_path / "policy.pt").exists()
-
-
-@pytest.mark.slow
 def test_a_blind_run_goes_on_with_shape_and_memory_and_its_policy_is_evaluated(tmp_path):
     import numpy as np
     import warp as wp

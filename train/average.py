@@ -1,4 +1,4 @@
-"""One policy of the mean weights of several that went on from the same one.
+"""Weight averaging: one policy of the mean weights of several that went on from the same one.
 
 Once a policy is learned, an update is nearly all noise (docs/lessons.md), and every run ends somewhere
 around what it has learned, not at it. Their mean is nearer to that. Weights of runs that began apart are not
@@ -8,15 +8,12 @@ alike, and their mean is nothing; so it has to be judged, like any policy.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import tyro
 
 from vd.files import check_file
 from vd.train.begin import find_start, unlike
-
-if TYPE_CHECKING:
-    import torch
 
 NETWORKS = ("actor_state_dict", "critic_state_dict")
 
@@ -56,6 +53,8 @@ def average_policies(policies: Sequence[str], output: Path) -> None:
         ValueError: There are fewer than two, or one is no teacher, or has other networks, observations or
             actions than the first.
     """
+    import torch
+
     from vd.policy import policy_export
     from vd.train.checkpoint import load_checkpoint, save_checkpoint
 
@@ -64,43 +63,25 @@ def average_policies(policies: Sequence[str], output: Path) -> None:
     paths = [find_start(name, flag="vd-train average") for name in policies]
     states = [policy_export(load_checkpoint(path, flag="vd-train average")) for path in paths]
     first = states[0]
-    for name, state in zip(policies[1:], states[1:], strict=True):
-        _check_alike(policies[0], first, name, state)
+    for name, state in zip(policies, states, strict=True):
+        theirs, ours = state["policy"], first["policy"]
+        different = [
+            f"policy.{key} {ours.get(key)}, there {v}" for key, v in theirs.items() if ours.get(key) != v
+        ]
+        different += [w.replace(", here ", ", there ") for w in unlike(first["task"], state["task"])]
+        if different:
+            raise ValueError(
+                f"{name} is no policy to take a mean with {policies[0]} of ({'; '.join(different)}); give "
+                "policies of runs that went on from the same one"
+            )
     mean = {key: value for key, value in first.items() if key not in NETWORKS}
-    for key in NETWORKS:
-        if all(key in state for state in states):
-            mean[key] = _mean([state[key] for state in states])
+    for network in NETWORKS:
+        if all(network in state for state in states):
+            mean[network] = {  # counts, which are no weights, are those of the first
+                name: torch.stack([state[network][name] for state in states]).mean(dim=0)
+                if value.is_floating_point()
+                else value
+                for name, value in first[network].items()
+            }
     mean["env_steps"] = max(state["env_steps"] for state in states)
     save_checkpoint(output, mean)
-
-
-def _check_alike(first_name: str, first: dict[str, Any], name: str, state: dict[str, Any]) -> None:
-    """Refuse a policy whose weights mean something else than those of the first.
-
-    Raises:
-        ValueError: It says what differs.
-    """
-    different = [
-        f"policy.{k} {first['policy'][k]}, there {v}"
-        for k, v in state["policy"].items()
-        if first["policy"].get(k) != v
-    ]
-    hands = [f"env.hand {t.get('hand')}" for t in (first["task"], state["task"])]
-    if hands[0] != hands[1]:
-        different.append(f"{hands[0]}, there {hands[1].removeprefix('env.hand ')}")
-    different += [words.replace(", here ", ", there ") for words in unlike(first["task"], state["task"])]
-    if different:
-        raise ValueError(
-            f"{name} is no policy to take a mean with {first_name} of ({'; '.join(different)}); give "
-            "policies of runs that went on from the same one"
-        )
-
-
-def _mean(weights: "Sequence[dict[str, torch.Tensor]]") -> "dict[str, torch.Tensor]":
-    """Means of the numbers, shape by shape; counts, which are no weights, are those of the first."""
-    import torch
-
-    return {
-        name: torch.stack([one[name] for one in weights]).mean(dim=0) if value.is_floating_point() else value
-        for name, value in weights[0].items()
-    }

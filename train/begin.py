@@ -16,11 +16,11 @@ CRITIC_WARMUP = 50
 to 8 steps later, 4.5 in the mean, so an error of states that last shrinks by gamma^4.5 a time: to a tenth."""
 MOMENTS_WARMUP = 3
 """Iterations of it where only the optimiser is missing: about a hundred steps, for Adam's second moment."""
-FINE_KL, FINE_LEARNING_RATE = 0.03, 1e-4
-"""Divergence and first rate of a policy that has learned, for one that does not say how it was trained."""
+NETWORK = ("hidden", "distribution", "normalise_observations")
+"""Settings of ``PolicyCfg`` that a network's shape decides."""
 _APPENDED = {"history": 0, "dynamics": "none"}
 """Settings of the observation whose values come last, as they are in a policy without them."""
-_SENSES = ("fingertip", "hand_layer", "sim", "action", "observation")
+_SENSES = ("hand", "fingertip", "hand_layer", "sim", "action", "observation")
 """Parts of a task that say what a policy's observations and actions mean."""
 
 
@@ -54,38 +54,27 @@ def find_start(name: str, flag: str = "--init") -> Path:
 def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     """Settings with which a run goes on as what it begins from was trained, where no preset is asked for.
 
-    Task and networks are those of the file. So is the learner, if the file says; else it is that of ``base``,
-    with the small steps of a policy that has learned.
-
     Args:
         name: What ``--init`` names.
-        base: Settings for what the file does not say.
+        base: Settings of the run, such as when to save.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: It is no teacher, or its settings are not of this version.
     """
     from vd.envs.cfg import ReorientCfg
-    from vd.policy import PolicySpec
     from vd.train.checkpoint import load_checkpoint
     from vd.train.config import PolicyCfg, PpoCfg
 
     path = find_start(name)
     state = load_checkpoint(path, flag="--init")
+    if "learner" not in state:
+        raise ValueError(f"--init: {path} does not say how it was trained; add --preset")
     try:
         env = from_dict(ReorientCfg, state["task"], where="task")
-        if "learner" in state:
-            learner = state["learner"]
-            ppo = from_dict(PpoCfg, learner["ppo"], where="learner.ppo")
-            policy = from_dict(PolicyCfg, learner["policy"], where="learner.policy")
-        else:
-            spec = from_dict(PolicySpec, state["policy"], where="policy")
-            ppo = replace(base.ppo, desired_kl=FINE_KL, actor_learning_rate=FINE_LEARNING_RATE)
-            policy = replace(base.policy, **_networks(spec))
-            if (
-                spec.distribution == "gaussian"
-            ):  # it has learned its std, and whatever bounds it had are unknown
-                policy = replace(policy, std_range=PolicyCfg().std_range, quiet_std=None)
+        learner, how = state["learner"], {"critic_warmup_iterations": None, "imitation_iterations": 0}
+        ppo = from_dict(PpoCfg, learner["ppo"] | how, where="learner.ppo")  # how it began is its own
+        policy = from_dict(PolicyCfg, learner["policy"], where="learner.policy")
     except ValueError as error:
         raise ValueError(
             f"--init: {path} was written by another version ({error}); add --preset and the settings that it "
@@ -95,21 +84,14 @@ def settings_of(name: str, base: "TeacherCfg") -> "TeacherCfg":
     return replace(
         base,
         run=run,
-        ppo=replace(ppo, critic_warmup_iterations=None, imitation_iterations=0),
+        ppo=ppo,
         policy=policy,
         env=env,
     )
 
 
-def warmup_iterations(state: Mapping[str, Any], wanted: int | None) -> int:
-    """Iterations in which the critic is to learn alone after a begin from ``state``.
-
-    Args:
-        state: Checkpoint or exported policy.
-        wanted: What ``--ppo.critic-warmup-iterations`` asks for; None: what the state needs.
-    """
-    if wanted is not None:
-        return wanted
+def warmup_iterations(state: Mapping[str, Any]) -> int:
+    """Iterations in which the critic has to learn alone after a begin from a checkpoint or policy."""
     if "critic_state_dict" not in state:
         return CRITIC_WARMUP
     if "optimizer_state_dict" not in state:
@@ -124,7 +106,7 @@ def completed(state: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
     A policy without a stage of the curriculum has come to the end of it.
 
     Args:
-        state: The policy, of as many observations as the run; a whole checkpoint passes unchanged.
+        state: The policy, widened for the run; a whole checkpoint passes unchanged.
         own: Networks, optimiser and window of the run: ``critic_state_dict``, ``optimizer_state_dict``,
             ``window``.
     """
@@ -166,13 +148,14 @@ def at_stage(state: dict[str, Any], stage: tuple[float, float]) -> dict[str, Any
     return state | {"ranks": [rank | {"env": rank["env"] | moved} for rank in state["ranks"]]}
 
 
-def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, Any], path: str) -> None:
-    """Refuse networks that a run cannot take over, with the flag that would let it.
+def check_fit(
+    state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, Any], path: str | Path
+) -> None:
+    """Refuse networks that a run cannot take over, with the remedy.
 
     Raises:
         ValueError: Another hand, or networks of another shape.
     """
-    from vd.envs.cfg import ObservationCfg
     from vd.policy import PolicySpec
 
     found = from_dict(PolicySpec, state["policy"], where="policy")
@@ -182,33 +165,29 @@ def check_fit(state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, A
             f"--init: {path} moves {found.num_actions} joints of {hand}, and this run's hand, {here}, has "
             f"{spec.num_actions}; give --hand {hand}"
         )
-    if found.activation != spec.activation:
-        raise ValueError(f"--init: {path} has {found.activation} units, this version {spec.activation} alone")
-    wanted, given = _networks(found), _networks(spec)
-    for name, value in wanted.items():
-        if value != given[name]:
+    remedy = "give the policy's settings, or leave --preset out, which takes them over"
+    for name in ("activation", *NETWORK):
+        theirs, ours = getattr(found, name), getattr(spec, name)
+        if theirs != ours:
             flag = f"--policy.{name.replace('_', '-')}"
-            words = " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-            raise ValueError(
-                f"--init: the networks of {path} have {flag} {words}, those of this run {given[name]}; "
-                f"give {_as_flag(flag, value, words)}, or leave --preset out to go on with its settings"
-            )
-    seen = from_dict(ObservationCfg, state["task"].get("observation", {}), where="task.observation")
+            raise ValueError(f"--init: {path} has {flag} {theirs}, and this run {ours}; {remedy}")
     before, now = (
         {name: t.get("observation", {}).get(name, default) for name, default in _APPENDED.items()}
         for t in (state["task"], task)
     )
     if before not in (_APPENDED, now):
+        flags = [
+            " ".join(f"--env.observation.{name} {value}" for name, value in one.items())
+            for one in (before, now)
+        ]
         raise ValueError(
-            f"--init: {path} observes {_flags(before)} and this run {_flags(now)}; only a policy "
-            "without them can go on with others: give those of the policy"
+            f"--init: {path} observes {flags[0]} and this run {flags[1]}; only a policy without them can go "
+            f"on with others: {remedy}"
         )
     if found.num_observations > spec.num_observations:
-        observed = _flags(to_dict(seen))
         raise ValueError(
             f"--init: {path} reads {found.num_observations} values and this run observes "
-            f"{spec.num_observations}, but a run can only go on with more; give what it was trained with: "
-            f"--hand {hand} {observed}"
+            f"{spec.num_observations}, but a run can only go on with more: {remedy}"
         )
 
 
@@ -226,24 +205,6 @@ def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
     )
     before = {k: default[k] for k in now if k in default} | before
     return [f"{k} {before[k]}, here {now[k]}" for k in before if k in now and before[k] != now[k]]
-
-
-def _networks(spec: "PolicySpec") -> dict[str, Any]:
-    """The settings of ``PolicyCfg`` that a network's shape decides."""
-    names = ("hidden", "distribution", "normalise_observations")
-    return {name: getattr(spec, name) for name in names}
-
-
-def _flags(settings: Mapping[str, Any]) -> str:
-    return " ".join(f"--env.observation.{name} {value}" for name, value in settings.items())
-
-
-def _as_flag(flag: str, value: Any, words: str) -> str:
-    """``flag`` as it is typed."""
-    if isinstance(value, bool):
-        group, _, name = flag.rpartition(".")
-        return flag if value else f"{group}.no-{name}"
-    return f"{flag} {words}"
 
 
 def _leaves(values: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:

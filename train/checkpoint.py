@@ -1,15 +1,14 @@
-"""Checkpoints: whole or absent, readable without running code, with every random state."""
+"""Checkpoints: whole or absent, readable without running code, with the random state."""
 
 import os
-import random
-import re
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from vd.files import atomic_path, writing
+from vd.files import atomic_path
 from vd.policy import read_state
 
 CHECKPOINT_FOLDER = "checkpoints"
@@ -20,7 +19,6 @@ AUTO = "auto"
 """``--resume auto`` goes on with a run where there is one, and starts it otherwise."""
 _NEEDED = {"actor": ("policy", "task", "iter", "env_steps"), "student": ("spec", "task", "iter", "env_steps")}
 """What belongs to the weights of a teacher or a student. Other projects' files have an actor too."""
-_NAME = re.compile(r"model_(\d+)\.pt")
 _ARRAY = "__numpy__"
 # Key in the environment's state under which that of its environments lies.
 _WORLDS = "arrays"
@@ -33,8 +31,7 @@ def checkpoint_path(run_dir: Path, iteration: int) -> Path:
 
 def list_checkpoints(run_dir: Path) -> list[Path]:
     """Periodic checkpoints of a run, oldest first (``best.pt`` is not among them)."""
-    files = [p for p in (run_dir / CHECKPOINT_FOLDER).glob("model_*.pt") if _NAME.fullmatch(p.name)]
-    return sorted(files, key=_iteration_of)
+    return sorted((run_dir / CHECKPOINT_FOLDER).glob(f"model_{'[0-9]' * 7}.pt"))
 
 
 def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") -> Path | None:
@@ -72,40 +69,20 @@ def find_checkpoint(run_dir: Path, which: str | None, network: str = "actor") ->
 
 
 def _newest_sound(files: list[Path], network: str) -> Path:
-    """The last of ``files`` that can be read."""
+    """The last of ``files`` that can be read; those after it are named on stderr."""
     reasons = []
     for path in reversed(files):
-        reason = damage(path, network)
-        if not reason:
-            return path
-        reasons.append(reason)
+        try:
+            load_checkpoint(path, network=network)
+        except ValueError as error:
+            reasons.append(str(error).partition(";")[0])
+            continue
+        if reasons and os.environ.get("RANK", "0") == "0":
+            print(f"{'; '.join(reasons)}; {path.name}, which is sound, takes its place", file=sys.stderr)
+        return path
     raise ValueError(
         f"--resume: no checkpoint is sound ({', '.join(reasons)}); start anew with another --out"
     )
-
-
-def damage(path: Path, network: str = "actor") -> str:
-    """What is wrong with a checkpoint; empty if it is sound."""
-    try:
-        load_checkpoint(path, network=network)
-    except ValueError as error:
-        return str(error).partition(";")[0]
-    return ""
-
-
-def damaged_after(run_dir: Path, checkpoint: Path | None, network: str = "actor") -> dict[Path, str]:
-    """Damaged checkpoints that are newer than the one a run goes on from, and what is wrong with each."""
-    if checkpoint is None:
-        return {}
-    newer = [path for path in list_checkpoints(run_dir) if _iteration_of(path) > _iteration_of(checkpoint)]
-    return {path: reason for path in newer if (reason := damage(path, network))}
-
-
-def set_aside(damaged: dict[Path, str]) -> None:
-    """Rename damaged checkpoints, so that they are no longer taken for the latest."""
-    for path in damaged:
-        with writing(path):
-            path.rename(path.with_name(f"{path.name}.damaged"))
 
 
 def prune_checkpoints(run_dir: Path, newest: int, every: int | None = None) -> None:
@@ -116,8 +93,9 @@ def prune_checkpoints(run_dir: Path, newest: int, every: int | None = None) -> N
         newest: Iteration of the newest; what a run that went on from an older one finds after it, stays.
         every: Keep those after every so many iterations, besides the newest; None: no others.
     """
-    for path in [path for path in list_checkpoints(run_dir) if _iteration_of(path) <= newest][:-KEEP_LAST]:
-        if every is None or _iteration_of(path) % every:
+    numbered = [(int(path.stem.removeprefix("model_")), path) for path in list_checkpoints(run_dir)]
+    for number, path in [pair for pair in numbered if pair[0] <= newest][:-KEEP_LAST]:
+        if every is None or number % every:
             path.unlink(missing_ok=True)
     for path in (run_dir / CHECKPOINT_FOLDER).glob(".*.pt"):
         path.unlink(missing_ok=True)
@@ -172,14 +150,8 @@ def saved_worlds(rank: dict[str, Any]) -> int:
 
 
 def random_state(device: str) -> dict[str, Any]:
-    """State of the random generators of Python, NumPy and torch (CPU, and ``device`` if it is a GPU)."""
-    version, internal, gauss = random.getstate()
-    name, keys, position, has_gauss, cached = np.random.get_state()  # noqa: NPY002  # others' code may use it
-    state: dict[str, Any] = {
-        "python": [version, list(internal), gauss],
-        "numpy": [str(name), np.asarray(keys), int(position), int(has_gauss), float(cached)],
-        "torch": torch.get_rng_state(),
-    }
+    """State of torch's random generators: of the CPU, and of ``device`` if it is a GPU."""
+    state = {"torch": torch.get_rng_state()}
     if device.startswith("cuda"):
         state["cuda"] = torch.cuda.get_rng_state(device)
     return state
@@ -187,17 +159,9 @@ def random_state(device: str) -> dict[str, Any]:
 
 def set_random_state(state: dict[str, Any], device: str) -> None:
     """Restore what :func:`random_state` gave. A GPU state is skipped where there is no GPU."""
-    version, internal, gauss = state["python"]
-    random.setstate((version, tuple(internal), gauss))
-    np.random.set_state(tuple(state["numpy"]))  # noqa: NPY002
     torch.set_rng_state(state["torch"].cpu())
     if device.startswith("cuda") and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)
-
-
-def _iteration_of(path: Path) -> int:
-    match = _NAME.fullmatch(path.name)
-    return int(match.group(1)) if match else -1
 
 
 def _plain(value: Any) -> Any:

@@ -4,7 +4,7 @@ import importlib
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -16,9 +16,9 @@ import tyro
 from vd import interrupt
 from vd.config import to_dict
 from vd.device import resolve_device
-from vd.files import check_file, check_folder, write_json
+from vd.files import check_file, check_folder
 from vd.train.begin import find_start
-from vd.train.flags import CONFIG_NAME, parse_teacher
+from vd.train.flags import parse_teacher, write_config
 from vd.train.presets import SMOKE_RUN, TeacherCfg
 from vd.warp_quiet import quiet_warp
 
@@ -31,13 +31,12 @@ commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --out runs/first
   student    imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
   tracker    let it act by a camera, learn nothing vd-train tracker dclaw3-table --objects SET
-  average    mean weights of several teachers     vd-train average runs/a runs/b --out policy.pt
+  average    mean weights of several teachers     vd-train average runs/a runs/b --output policy.pt
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
   bundle     write a policy as it is deployed     vd-train bundle student.pt bundles/first
   curves     draw the curves of a run             vd-train curves runs/first
-  precompile compile CUDA kernels without a GPU   vd-train precompile FOLDER --preset gpu
 
 Several GPUs:  torchrun --standalone --nproc-per-node 4 -m vd.train.cli teacher --preset multi-gpu
 Several nodes: torchrun --nnodes 2 --nproc-per-node 8 --rdzv-backend c10d --rdzv-endpoint HOST:29500 \\
@@ -53,7 +52,13 @@ vd-train COMMAND --help lists the flags of a command."""
 
 _TRACKER = "vd-train tracker TEACHER --objects SET writes a tracking policy and its stopping rules"
 _UNUSED = "nothing takes its place, since no training needed it"
-GONE = {"calibrate": _TRACKER, "follow": _TRACKER, "noise": _UNUSED, "profile": _UNUSED}
+GONE = {
+    "calibrate": _TRACKER,
+    "follow": _TRACKER,
+    "noise": _UNUSED,
+    "profile": _UNUSED,
+    "precompile": "kernels stay in the folder that WARP_CACHE_PATH names, from one start to the next",
+}
 """Commands that are no more, and what to do."""
 
 
@@ -119,7 +124,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "export": _export,
         "bundle": _bundle,
         "curves": _curves,
-        "precompile": _precompile,
     }
     if not arguments or arguments[0] in ("-h", "--help"):
         print(USAGE)
@@ -161,11 +165,10 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
         FileExistsError: The run folder holds another run and ``resume`` is not set.
         FileNotFoundError: There is nothing to resume or to begin from.
     """
-    from vd.train.checkpoint import damaged_after, find_checkpoint, load_checkpoint, set_aside
+    from vd.train.checkpoint import find_checkpoint, load_checkpoint
 
     check_folder(cfg.run.out)
     rank, device = int(os.environ.get("RANK", "0")), resolve_device(cfg.run.device)
-    cfg = replace(cfg, run=replace(cfg.run, device=device))
     checkpoint = find_checkpoint(cfg.run.out, cfg.resume)
     init = find_start(cfg.init) if checkpoint is None and cfg.init is not None else None
     if init is not None:
@@ -180,7 +183,6 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     # A line for each of some hundred kernels would scroll the progress away.
     quiet_warp()
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.second_view import with_second_view
     from vd.sim.cfg import coarser
     from vd.train.runner import TeacherRunner
     from vd.train.vec_env import ReorientVecEnv
@@ -190,34 +192,25 @@ def build_teacher(cfg: TeacherCfg, *, started: float | None = None) -> "TeacherR
     # TF32 halves the update on a GPU; the simulator is not touched by it.
     torch.set_float32_matmul_precision("high")
     physics = coarser(cfg.env.sim) if cfg.run.coarse_physics else cfg.env.sim
-    seen = with_second_view(cfg.env.observation) if cfg.second_view else cfg.env.observation
-    simulation = ReorientEnv(
-        replace(cfg.env, seed=cfg.env.seed + rank, sim=physics, observation=seen), device
-    )
+    simulation = ReorientEnv(replace(cfg.env, seed=cfg.env.seed + rank, sim=physics), device)
     simulation.dump_dir = cfg.run.out
-    env = ReorientVecEnv(simulation, second_view=cfg.second_view)
-    deadline = cfg.run.deadline(started)
     runner = TeacherRunner(
-        env, cfg.ppo, cfg.policy, cfg.run, task=to_dict(cfg.env), device=device, deadline=deadline
+        ReorientVecEnv(simulation),
+        cfg.ppo,
+        cfg.policy,
+        cfg.run,
+        task=to_dict(cfg.env),
+        device=device,
+        deadline=cfg.run.deadline(started),
     )
     if checkpoint is not None:
-        runner.load(str(checkpoint))
+        runner.load(checkpoint)
     elif init is not None:
-        runner.begin_from(str(init), cfg.init_stage)
+        runner.begin_from(init, cfg.init_stage)
     if rank == 0:
         # After all that can refuse: settings that a run cannot have must not take the place of its own.
-        saved = to_dict(replace(cfg, resume=None))
-        saved["run"]["device"] = "auto"  # a resumed run may find itself on another machine
-        write_json(cfg.run.out / CONFIG_NAME, saved)
-        runner.damaged = damaged_after(cfg.run.out, checkpoint)
-        set_aside(runner.damaged)
+        write_config(cfg)
     return runner
-
-
-def print_damaged(damaged: dict[Path, str]) -> None:
-    """Say which checkpoints were passed over, and why."""
-    for path, reason in damaged.items():
-        print(f"{reason}; it is {path.name}.damaged now, and the newest sound checkpoint takes its place")
 
 
 def _teacher(arguments: list[str], started: float) -> int:
@@ -230,53 +223,44 @@ def _teacher(arguments: list[str], started: float) -> int:
 
 
 def _train_teacher(cfg: TeacherCfg, main_process: bool, started: float) -> int:
-    from vd.train.ending import finished
-    from vd.train.progress import waiting
+    from vd.train.progress import BUILDING
 
-    with waiting(
-        "building the environments (the first start compiles the kernels: a minute or two)", main_process
-    ):
-        runner = build_teacher(cfg, started=started)
-    folder = cfg.run.out
-    if main_process:
-        print_damaged(runner.damaged)
-    if runner.current_learning_iteration and main_process:
-        _print_begin(cfg, runner)
-    whole = finished(runner.learn, runner.env.close, distributed=runner.is_distributed)
-    runner.shutdown()
-    if not whole:
-        if main_process and not cfg.smoke:
-            print(f"saved in {folder}; go on with: vd-train teacher --out {folder} --resume")
+    folder, say = cfg.run.out, partial(print, flush=True) if main_process else (lambda _: None)
+    say(BUILDING)
+    runner = build_teacher(cfg, started=started)
+    for line in _beginning(cfg, runner) if runner.iteration else []:
+        say(line)
+    if not runner.run_to_end():
+        if not cfg.smoke:
+            say(f"saved in {folder}; go on with: vd-train teacher --out {folder} --resume")
         return interrupt.INTERRUPTED
     from vd.train.runner import POLICY_NAME  # loads torch, which the first message should not wait for
 
-    if main_process and cfg.smoke:
-        print(f"done: everything runs. {runner.env_steps} steps are a test, and the policy is of no use")
-    elif main_process and not (folder / POLICY_NAME).exists():
-        print(
+    if cfg.smoke:
+        say(f"done: everything runs. {runner.env_steps} steps are a test, and the policy is of no use")
+    elif not (folder / POLICY_NAME).exists():
+        say(
             f"done: nothing was trained, so {folder} has no {POLICY_NAME}: the {runner.env_steps} steps "
             f"done before are more than --max-steps {cfg.run.max_steps}; raise it"
         )
-    elif main_process:
-        print(f"done: {folder}/{POLICY_NAME} is the best policy, vd-train curves {folder} draws the curves")
+    else:
+        say(f"done: {folder}/{POLICY_NAME} is the best policy, vd-train curves {folder} draws the curves")
     return 0
 
 
-def _print_begin(cfg: TeacherCfg, runner: "TeacherRunner") -> None:
+def _beginning(cfg: TeacherCfg, runner: "TeacherRunner") -> Iterator[str]:
     """What a run that does not begin from nothing begins with."""
     how = f"begins from {cfg.init}" if runner.begun else "resumed"
-    print(f"{how} after iteration {runner.current_learning_iteration} of {runner.total_iterations}")
+    yield f"{how} after iteration {runner.iteration} of {runner.total_iterations}"
     if runner.new_episodes and not runner.begun:
-        print(
-            f"episodes start anew, since the checkpoint does not fit the environments: {runner.new_episodes}"
-        )
+        yield f"episodes start anew, the checkpoint does not fit the environments: {runner.new_episodes}"
     if runner.new_inputs:
-        print(f"{runner.new_inputs} observed values are new to the networks and start without effect")
+        yield f"{runner.new_inputs} observed values are new to the networks and start without effect"
     if runner.critic_warmup:
         actor = "stays as it is" if runner.imitation is None else "imitates what it began from"
-        print(f"the critic learns alone for {runner.critic_warmup} iterations, the actor {actor}")
+        yield f"the critic learns alone for {runner.critic_warmup} iterations, the actor {actor}"
     for difference in runner.unlike:
-        print(f"the policy was trained with other observations or actions: {difference}")
+        yield f"the policy was trained with other observations or actions: {difference}"
 
 
 def _export(arguments: list[str], _started: float) -> int:
@@ -285,14 +269,16 @@ def _export(arguments: list[str], _started: float) -> int:
 
     from vd.policy import policy_export
     from vd.train.checkpoint import load_checkpoint, save_checkpoint, without_worlds
-    from vd.vision.saved import is_student, read_student, student_export
+    from vd.vision.saved import is_student, read_student, saved_spec, student_export
 
     if is_student(cfg.checkpoint):
         if cfg.resumable or cfg.output.suffix == ".onnx":
             raise ValueError(
                 f"{cfg.checkpoint} is a student, which goes on with --init; leave --resumable out"
             )
-        save_checkpoint(cfg.output, student_export(read_student(cfg.checkpoint), small=True))
+        student = read_student(cfg.checkpoint)
+        saved_spec(student, cfg.checkpoint)  # refuses one that nothing reads any more
+        save_checkpoint(cfg.output, student_export(student))
         print(cfg.output)
         return 0
     if cfg.output.suffix == ".onnx":
@@ -328,9 +314,12 @@ def _bundle(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(BundleCfg, args=arguments, prog="vd-train bundle")
     check_folder(cfg.output.parent)
 
-    from vd.bundle.write import write_bundle
+    from vd.bundle.store import write_bundle
+    from vd.evaluate.agents import find_policy, open_policy
 
-    contract = write_bundle(cfg.policy, cfg.output)
+    policy = open_policy(str(find_policy(cfg.policy)), "cpu")
+    assert policy is not None  # a file was found
+    contract = write_bundle(policy, cfg.output)
     if cfg.json:
         print(json.dumps(to_dict(contract), indent=1))
     else:
@@ -342,24 +331,15 @@ def _bundle(arguments: list[str], _started: float) -> int:
 def _curves(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(CurvesCfg, args=arguments, prog="vd-train curves")
 
-    from vd.train.curves import plot_curves, read_runs
+    from vd.train.curves import plot_curves
     from vd.train.metrics import PROGRESS_FILE
-    from vd.train.student.curves import plot_student_curves
 
     files = [run / PROGRESS_FILE if run.is_dir() else run for run in cfg.runs]
     output = cfg.out or files[0].with_name("curves.png")
     check_file(output)
-    first = next(iter(read_runs(files).values()))[0]
-    plot = plot_student_curves if any(key.startswith("student/") for key in first) else plot_curves
-    plot(files, output)
+    plot_curves(files, output)
     print(output)
     return 0
-
-
-def _precompile(arguments: list[str], _started: float) -> int:
-    from vd.train.precompile import precompile_command
-
-    return precompile_command(arguments, partial(parse_teacher, unnamed="gpu"), build_teacher)
 
 
 if __name__ == "__main__":

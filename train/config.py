@@ -8,10 +8,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
-from vd.config import Renamed
+from vd.config import Dropped, Renamed
 from vd.paper import PAPER
+
+if TYPE_CHECKING:
+    from vd.train.distributed import Processes
 
 ACTIVATION = "elu"
 """Activation of the hidden layers, as in the paper (MLP 512-256-256 ELU)."""
@@ -19,8 +22,13 @@ ACTIVATION = "elu"
 
 @dataclass
 class PpoCfg:
-    """Proximal policy optimisation."""
+    """Proximal policy optimisation, with Adam as in the paper."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "optimizer": "adam",
+        "critic_warmup_iterations": Dropped(None),
+        "imitation_learning_rate": Dropped(1e-3),
+    }
     rollout_steps: int = PAPER.teacher.rollout_steps
     """Control steps of every world between two updates."""
     minibatch_size: int = PAPER.teacher.minibatch_size
@@ -49,20 +57,12 @@ class PpoCfg:
     """Weight of the squared excess of mean actions beyond [-1, 1], where the environment clips them."""
     grad_norm: float = PAPER.teacher.grad_norm_code
     """Joint gradient norm of actor and critic is clipped to this."""
-    optimizer: Literal["adam", "adamw"] = "adam"
-    """Optimiser: the paper says Adam, its code uses AdamW."""
     cuda_graph: bool = False
     """Record forward and backward pass of a minibatch once as a CUDA graph, and replay it: where launching
     some hundred kernels takes longer than running them, as on busy processors. On one GPU; else ignored."""
-    critic_warmup_iterations: int | None = None
-    """Iterations at the begin of a run in which the critic learns alone; the actor acts and stays as it is.
-    None: as many as what --init begins from needs, 50 without a critic, 3 without an optimiser, else 0."""
-
     imitation_iterations: int = 0
     """Iterations after --init in which the actor imitates, in what it does itself, the policy that it began
     from, which sees the present state and shape (--env.observation.dynamics); the critic learns alone."""
-    imitation_learning_rate: float = 1e-3
-    """The actor's rate at the begin of that; it falls to zero."""
 
 
 @dataclass
@@ -123,16 +123,42 @@ class RunCfg:
             return None
         return (time.monotonic() if started is None else started) + 60.0 * self.max_minutes
 
-    def check_kept(self) -> None:
-        """Refuse checkpoints to be kept that are never written.
+    def validate(self) -> None:
+        """Refuse limits that are none, and checkpoints to be kept that are never written.
 
         Raises:
-            ValueError: ``keep_every`` is no multiple of ``save_every``.
+            ValueError: The flag, its value and what it has to be.
         """
-        if self.keep_every is not None and (self.keep_every < 1 or self.keep_every % self.save_every):
+        require_positive(self, "--", "max_steps", "max_minutes", "save_every", "keep_every")
+        if self.keep_every is not None and self.keep_every % self.save_every:
             raise ValueError(
                 f"--keep-every is {self.keep_every}; give a multiple of --save-every {self.save_every}"
             )
+
+
+def require_positive(cfg: Any, prefix: str, *names: str, or_zero: bool = False) -> None:
+    """Refuse fields that are not positive; those that are ``None`` are not set.
+
+    Raises:
+        ValueError: The flag, its value and what it has to be.
+    """
+    for name in names:
+        value = getattr(cfg, name)
+        if value is not None and not (value > 0 or (or_zero and value == 0)):
+            wanted = "zero or positive" if or_zero else "positive"
+            raise ValueError(f"{prefix}{name.replace('_', '-')} is {value}; it has to be {wanted}")
+
+
+def require_share(cfg: Any, prefix: str, *names: str) -> None:
+    """Refuse fields outside of [0, 1].
+
+    Raises:
+        ValueError: The flag and its value.
+    """
+    for name in names:
+        value = getattr(cfg, name)
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"{prefix}{name.replace('_', '-')} is {value}; it has to be in [0, 1]")
 
 
 def minibatches(ppo: PpoCfg, num_envs: int) -> int:
@@ -146,38 +172,13 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
     Raises:
         ValueError: The flag, its value and what it has to be.
     """
-    positive = {
-        "--ppo.rollout-steps": ppo.rollout_steps,
-        "--ppo.minibatch-size": ppo.minibatch_size,
-        "--ppo.epochs": ppo.epochs,
-        "--ppo.actor-learning-rate": ppo.actor_learning_rate,
-        "--ppo.critic-learning-rate": ppo.critic_learning_rate,
-        "--ppo.imitation-learning-rate": ppo.imitation_learning_rate,
-        "--ppo.desired-kl": ppo.desired_kl,
-        "--ppo.clip": ppo.clip,
-        "--ppo.grad-norm": ppo.grad_norm,
-        "--policy.initial-std": policy.initial_std,
-        "--policy.hidden": min(policy.hidden, default=0),
-        "--max-steps": run.max_steps,
-        "--save-every": run.save_every,
-    }
-    if run.max_minutes is not None:
-        positive["--max-minutes"] = run.max_minutes
-    for flag, value in positive.items():
-        if not value > 0:
-            raise ValueError(f"{flag} is {value}; it has to be positive")
-    run.check_kept()
-    not_negative = {
-        "--ppo.critic-warmup-iterations": ppo.critic_warmup_iterations or 0,
-        "--ppo.imitation-iterations": ppo.imitation_iterations,
-        "--ppo.bound-coefficient": ppo.bound_coefficient,
-    }
-    for flag, value in not_negative.items():
-        if value < 0:
-            raise ValueError(f"{flag} is {value}; it has to be zero or positive")
-    for flag, share in {"--ppo.gamma": ppo.gamma, "--ppo.gae-lambda": ppo.gae_lambda}.items():
-        if not 0.0 <= share <= 1.0:
-            raise ValueError(f"{flag} is {share}; it has to be in [0, 1]")
+    run.validate()
+    require_positive(ppo, "--ppo.", "rollout_steps", "minibatch_size", "epochs", "clip", "grad_norm")
+    require_positive(ppo, "--ppo.", "actor_learning_rate", "critic_learning_rate", "desired_kl")
+    require_positive(ppo, "--ppo.", "imitation_iterations", "bound_coefficient", or_zero=True)
+    require_share(ppo, "--ppo.", "gamma", "gae_lambda")
+    if not min(policy.hidden, default=0) > 0:
+        raise ValueError(f"--policy.hidden is {policy.hidden}; widths have to be positive")
     low, high = policy.std_range
     if not 0.0 < low < policy.initial_std < high:
         raise ValueError(
@@ -194,15 +195,16 @@ def validate(ppo: PpoCfg, policy: PolicyCfg, run: RunCfg) -> None:
 
 
 def rsl_rl_config(
-    ppo: PpoCfg, policy: PolicyCfg, num_envs: int, groups: Sequence[str] = ("policy",)
+    ppo: PpoCfg, policy: PolicyCfg, num_envs: int, groups: Sequence[str], processes: "Processes"
 ) -> dict[str, Any]:
-    """The dictionary that rsl-rl's runner builds algorithm and models from.
+    """The dictionary that rsl-rl builds algorithm and models from.
 
     Args:
         ppo: Algorithm settings.
         policy: Network settings.
         num_envs: Environments.
         groups: Groups of observations; the actor reads the first, the critic all.
+        processes: Place of this process in the run.
     """
     from vd.train.distribution import BoundedStdGaussian, FreeStdGaussian  # imports torch
     from vd.train.ppo import TeacherPPO
@@ -218,7 +220,9 @@ def rsl_rl_config(
         "activation": ACTIVATION,
         "obs_normalization": policy.normalise_observations,
     }
+    several = {"global_rank": processes.rank, "world_size": processes.world_size}
     return {
+        "multi_gpu": several if processes.world_size > 1 else None,
         "num_steps_per_env": ppo.rollout_steps,
         "obs_groups": {"actor": [groups[0]], "critic": list(groups)},
         "actor": network | {"distribution_cfg": distribution},
@@ -239,7 +243,7 @@ def rsl_rl_config(
             "bound_coef": ppo.bound_coefficient,
             "cuda_graph": ppo.cuda_graph,
             "max_grad_norm": ppo.grad_norm,
-            "optimizer": ppo.optimizer,
+            "optimizer": "adam",
             "use_clipped_value_loss": False,
         },
     }

@@ -1,7 +1,7 @@
-"""What the project is for, on the machine at hand: ``python -m vd.train.demo`` (``make demo``).
+"""``python -m vd.train.demo`` (``make demo``): what the project is for, on the machine at hand.
 
 A script over the public commands, in four parts: an installed policy turns objects that it has never seen,
-by camera; an effect that is hidden in a servo is found and closed; a hand flies behind the protocol of its
+by camera; an effect that is hidden in a servo is found and closed; a hand runs behind the protocol of its
 motors; a small training learns. ``index.html`` is written anew whenever a part begins or ends. A part that
 fails says so there, and the others go on.
 """
@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,20 +29,18 @@ UNSEEN, UNSEEN_ONE = "procedural-heldout-4-seed0", "procedural-heldout-1-seed0"
 MESHES, IMPORT_S, IMPORT_SEARCH = 4, 40.0, 5
 """Of the user's meshes so many, the smallest, are imported in so much time [s], with a quarter of the usual
 search effort: a stapler then takes 8 s of CPU time in place of 29, and its parts are as good."""
-EPISODES = 4
+EPISODES = 3
 """Starts and goals of every object: what two cores simulate in half a minute."""
-FILM_S = 10.0
+FILM_S = 8.0
 """Length of the films [s]."""
 HIDDEN = "backlash:width_rad=0.06"
 """Effect that is hidden in a single servo: a quarter of a finger's time."""
 MISSES = "12"
 """Deadlines missed in a row at which the twin stops: a second, since the machine may do other things too."""
-LEAST_TRAINING_MIN, AFTER_TRAINING_MIN = 1.0, 0.5
+LEAST_TRAINING_MIN, AFTER_TRAINING_MIN = 1.0, 1.2
 """Time that training gets at least [min], and that its curve and film take after it."""
 REFRESH_S = 15
 """Seconds after which a browser reads an unfinished page again."""
-ENDING_S = 20.0
-"""Time for an interrupted command to save [s]."""
 REASON_LINES = 4
 """Last lines of a command's output that tell why it failed."""
 
@@ -69,11 +67,11 @@ class DemoCfg:
 
 @dataclass
 class Part:
-    """One part of the demo and what the page says of it."""
+    """One part under way: its commands, and what the page says of it."""
 
     name: str
     title: str
-    work: "Callable[[Demo], dict[str, Any]]"
+    folder: Path
     state: str = "waiting"
     """waiting, running, done, failed or interrupted."""
     seconds: float = 0.0
@@ -82,100 +80,31 @@ class Part:
     shown: dict[str, Any] = field(default_factory=dict)
     """What the template takes, once it is done."""
 
-
-class Demo:
-    """A demo under way.
-
-    Args:
-        cfg: Settings.
-        parts: What it shows.
-    """
-
-    def __init__(self, cfg: DemoCfg, parts: Sequence[Part]):
-        self.cfg, self.parts = cfg, list(parts[:1] if cfg.quick else parts)
-        self.started = time.monotonic()
-        self.part = self.parts[0]
-        self.objects: tuple[str, str] = (UNSEEN, UNSEEN_ONE)
-        """Set of the first part, and the object of the twin."""
-
-    @property
-    def page(self) -> Path:
-        """The page."""
-        return self.cfg.out / "index.html"
-
-    @property
-    def minutes_left(self) -> float:
-        """Time that is left [min]; negative once it is over."""
-        return self.cfg.minutes - (time.monotonic() - self.started) / 60.0
-
-    def folder(self, name: str = "") -> Path:
-        """A path in the folder of the present part."""
-        return self.cfg.out / self.part.name / name
-
-    def run(self) -> int:
-        """All parts; returns the exit status.
-
-        Raises:
-            KeyboardInterrupt: Interrupted; the page says so and has what is there.
-        """
-        for number, part in enumerate(self.parts, start=1):
-            self.part, part.state, began = part, "running", time.monotonic()
-            print(f"\n[{number}/{len(self.parts)}] {part.title}", flush=True)
-            shutil.rmtree(self.folder(), ignore_errors=True)
-            self.folder().mkdir(parents=True)
-            self.write(running=True)
-            try:
-                part.shown, part.state = part.work(self), "done"
-            except KeyboardInterrupt:
-                part.state = "interrupted"
-                self.write(running=False)
-                raise
-            except Exception as error:  # whatever it is, the other parts go on
-                part.state, part.error = "failed", str(error) or type(error).__name__
-                print(f"  failed: {part.error}", file=sys.stderr, flush=True)
-            part.seconds = time.monotonic() - began
-            self.write(running=part is not self.parts[-1])
-        return 1 if any(part.state == "failed" for part in self.parts) else 0
-
-    def write(self, *, running: bool) -> None:
-        """Write the page; one of a demo that is ``running`` is read again by the browser."""
-        from vd.page import write_html
-
-        minutes = (time.monotonic() - self.started) / 60.0
-        refresh = REFRESH_S if running else None
-        write_html(self.page, "demo.html", parts=self.parts, refresh=refresh, minutes=minutes)
-
-    def command(self, *commands: Sequence[str | Path], seconds: float | None = None) -> list[int]:
+    def run(self, *commands: Sequence[str | Path], seconds: float | None = None) -> None:
         """Run public commands side by side, the output of each in a file of the part's folder.
 
         Args:
             commands: Their words, the name first.
-            seconds: Time after which they are interrupted. Whoever says so looks for what they left, and no
-                exit status is a failure.
-
-        Returns:
-            Their exit statuses.
+            seconds: Time after which they are ended. Whoever says so looks for what they left, and no exit
+                status is a failure.
 
         Raises:
             FailureError: One failed; the others are ended.
         """
-        running = []
-        until = None if seconds is None else time.monotonic() + seconds
+        running, until = [], None if seconds is None else time.monotonic() + seconds
         try:
             for words in commands:
                 line = [str(word) for word in words]
-                self.part.commands.append(" ".join(line))
+                self.commands.append(" ".join(line))
                 print(f"  $ {' '.join(line)}", flush=True)
-                log = self.folder(f"{len(self.part.commands)}-{line[0]}.txt")
-                program = Path(sys.executable).with_name(line[0])
+                log = self.folder / f"{len(self.commands)}-{line[0]}.txt"
                 with log.open("w") as output:
-                    # Ctrl-C reaches this process alone, which then ends them.
                     process = subprocess.Popen(
-                        [program, *line[1:]],
+                        [Path(sys.executable).with_name(line[0]), *line[1:]],
                         stdin=subprocess.DEVNULL,
                         stdout=output,
                         stderr=subprocess.STDOUT,
-                        start_new_session=True,
+                        start_new_session=True,  # Ctrl-C reaches this process alone, which then ends them
                     )
                 running.append((process, line, log))
             for process, line, log in running:
@@ -188,51 +117,139 @@ class Demo:
                     raise FailureError(f"{' '.join(line)} ended with status {status}: {reason.strip()}")
         finally:
             for process, _, _ in running:
-                _end(process)
-        return [process.wait() for process, _, _ in running]
+                process.terminate()  # nothing to one that has ended; another saves first
+                process.wait()
 
 
-def _end(process: "subprocess.Popen[bytes]") -> None:
-    """End a process that still runs; it has a while to save."""
-    if process.poll() is None:
-        process.terminate()
-        try:
-            process.wait(ENDING_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
+class Demo:
+    """The parts, in their order; each is a method of its name."""
+
+    def __init__(self, cfg: DemoCfg) -> None:
+        self.cfg, self.page, self.started = cfg, cfg.out / "index.html", time.monotonic()
+        titles = {
+            "camera": "Objects never seen, turned by camera",
+            "gap": "A hidden effect, found and closed",
+            "twin": "A hand behind its motors",
+            "training": "A small training",
+        }
+        parts = [Part(name, title, cfg.out / name) for name, title in titles.items()]
+        self.parts = parts[:1] if cfg.quick else parts
+        self.objects: tuple[str, str] = (UNSEEN, UNSEEN_ONE)
+        """Set of the first part, and the object of the twin."""
+
+    @property
+    def minutes(self) -> float:
+        """Time so far [min]."""
+        return (time.monotonic() - self.started) / 60.0
+
+    def run(self) -> int:
+        """All parts; returns the exit status.
+
+        Raises:
+            KeyboardInterrupt: Interrupted; the page says so and has what is there.
+        """
+        for number, part in enumerate(self.parts, start=1):
+            began, part.state = time.monotonic(), "running"
+            print(f"\n[{number}/{len(self.parts)}] {part.title}", flush=True)
+            shutil.rmtree(part.folder, ignore_errors=True)
+            part.folder.mkdir(parents=True)
+            self.write(running=True)
+            try:
+                part.shown = getattr(self, part.name)(part)
+                part.state = "done"
+            except KeyboardInterrupt:
+                part.state = "interrupted"
+                self.write(running=False)
+                raise
+            except Exception as error:  # whatever it is, the other parts go on
+                part.state, part.error = "failed", str(error) or type(error).__name__
+                print(f"  failed: {part.error}", file=sys.stderr, flush=True)
+            part.seconds = time.monotonic() - began
+            self.write(running=part is not self.parts[-1])
+        return int(any(part.state == "failed" for part in self.parts))
+
+    def write(self, *, running: bool) -> None:
+        """Write the page; one of a demo that is ``running`` is read again by the browser."""
+        from vd.page import write_html
+
+        refresh = REFRESH_S if running else None
+        write_html(self.page, "demo.html", parts=self.parts, refresh=refresh, minutes=self.minutes)
+
+    def camera(self, part: Part) -> dict[str, Any]:
+        """The shipped policy turns objects that it has never seen, by camera: film, and success."""
+        film, out = part.folder / "film.mp4", part.folder
+        if self.cfg.meshes is not None:
+            self.objects = import_meshes(part, self.cfg.meshes)
+        options = (CAMERA_POLICY, "--objects", self.objects[0], "--seed", str(self.cfg.seed))
+        part.run(
+            ["vd-eval", *options, "--episodes", str(EPISODES), "--out", out],
+            ["vd-play", *options, "--cells", "4", "--seconds", str(FILM_S), "--video", film],
+        )
+        from vd.evaluate.page import percent
+        from vd.evaluate.result import Result
+
+        row = next(row for row in Result.read(out / "eval.json").rows if row.headline)
+        tolerance = str(PAPER.success.rotation_rad)
+        lines = [
+            (one.name, one.episodes, percent(one.success[tolerance]), percent(one.outcomes["object falls"]))
+            for one in (*row.per_object, row.overall)
+        ]
+        shown = {"policy": CAMERA_POLICY, "meshes": self.cfg.meshes, "film": film, "rows": lines}
+        return shown | {"tolerance_rad": tolerance, "page": self.link(out / "eval.html")}
+
+    def gap(self, part: Part) -> dict[str, Any]:
+        """An effect hidden in a simulated servo, found and closed."""
+        recording, analysis = part.folder / "recording", part.folder / "analysis"
+        seed = ("--seed", str(self.cfg.seed))
+        part.run(["vd-gap", "hide", "servo", "--effect", HIDDEN, "--out", recording, *seed])
+        part.run(["vd-gap", "run", recording, "--out", analysis, *seed])
+        from vd.gap.result import Report
+        from vd.gap.words import verdict_sentence
+
+        verdict = verdict_sentence(Report.read(analysis / "report.json"))
+        pictures = sorted(analysis.glob("overlay_*.png"), key=lambda path: path.stat().st_mtime)
+        page = self.link(analysis / "report.html")
+        return {"hidden": HIDDEN, "verdict": verdict, "picture": pictures[0], "page": page}
+
+    def twin(self, part: Part) -> dict[str, Any]:
+        """A simulated hand behind the protocol of its motors, with the policy that sees."""
+        log = part.folder / "log"
+        words = ["vd-deploy", CAMERA_POLICY, "--hand", "dclaw4", "--twin", "--object", self.objects[1]]
+        words += ["--random-goals", "2", "--seed", str(self.cfg.seed), "--safety.misses", MISSES]
+        part.run([*words, "--log", log])
+        from vd.hand_log import read_log
+
+        run = read_log(log)
+        sent, stops = sorted(1e3 * run.columns["sent_s"]), ", ".join(stop.outcome for stop in run.stops)
+        late = f"{sent[len(sent) // 2]:.0f}, at most {sent[-1]:.0f}"
+        row = (len(sent), f"{run.columns['missed'][-1]:.0f}", late, stops)
+        film, name = log / "run.mp4", run.run["object"]["name"]
+        return {"film": film, "row": row, "object": name, "page": self.link(log / "run.html")}
+
+    def training(self, part: Part) -> dict[str, Any]:
+        """A small training, with its curve."""
+        run, film, curves = part.folder / "run", part.folder / "film.mp4", part.folder / "curves.png"
+        minutes = max(self.cfg.minutes - self.minutes - AFTER_TRAINING_MIN, LEAST_TRAINING_MIN)
+        seed = ("--seed", str(self.cfg.seed))
+        words = ("vd-train", "teacher", "--preset", "cpu-demo", *seed, "--max-minutes", f"{minutes:.2f}")
+        part.run([*words, "--out", run])
+        part.run(
+            ["vd-train", "curves", run, "--out", curves],
+            ["vd-play", run, "--cells", "4", "--seconds", str(FILM_S), *seed, "--video", film],
+        )
+        from vd.train.metrics import PROGRESS_FILE, read_progress
+
+        rows = [row for row in read_progress(run / PROGRESS_FILE) if row["goals_per_episode"] is not None]
+        goals = [row["goals_per_episode"] for row in rows]
+        shown = {"film": film, "curves": curves, "low": min(goals), "last": goals[-1]}
+        return shown | {"steps": rows[-1]["env_steps"]}
+
+    def link(self, path: Path) -> str:
+        """A file as the page names it."""
+        return path.relative_to(self.cfg.out).as_posix()
 
 
-def turn_unseen(demo: Demo) -> dict[str, Any]:
-    """The shipped policy turns objects that it has never seen, by camera: film, and success."""
-    cfg, film = demo.cfg, demo.folder("film.mp4")
-    if cfg.meshes is not None:
-        demo.objects = import_meshes(demo, cfg.meshes)
-    options = (CAMERA_POLICY, "--objects", demo.objects[0], "--seed", str(cfg.seed))
-    demo.command(
-        ["vd-eval", *options, "--episodes", str(EPISODES), "--out", demo.folder()],
-        ["vd-play", *options, "--cells", "4", "--seconds", str(FILM_S), "--video", film],
-    )
-    from vd.evaluate.comparison import Comparison
-    from vd.evaluate.comparison_page import percent
-
-    rows = Comparison.read(demo.folder("eval.json")).rows
-    result = next(row.result for row in rows if row.stopped_by == "prediction")
-    tolerance = str(PAPER.success.rotation_rad)
-    lines = [
-        (one.name, one.episodes, percent(one.success[tolerance]), percent(one.drop_rate))
-        for one in (*result.per_object, result.overall)
-    ]
-    return {
-        "policy": CAMERA_POLICY,
-        "meshes": cfg.meshes,
-        "film": film,
-        "rows": lines,
-        "tolerance_rad": tolerance,
-        "page": demo.folder("eval.html").relative_to(cfg.out).as_posix(),
-    }
-
-
-def import_meshes(demo: Demo, meshes: Path) -> tuple[str, str]:
+def import_meshes(part: Part, meshes: Path) -> tuple[str, str]:
     """Import the smallest meshes for a while.
 
     Returns:
@@ -245,85 +262,17 @@ def import_meshes(demo: Demo, meshes: Path) -> tuple[str, str]:
     from vd.assets_usd.objects.plan import find_meshes
 
     chosen = sorted(find_meshes([meshes]), key=lambda path: (path.stat().st_size, path))[:MESHES]
-    out = demo.folder("objects")
-    demo.command(
-        ["vd-assets", "import", *chosen, "--out", out, "--mcts-iterations", str(IMPORT_SEARCH)],
-        seconds=IMPORT_S,
-    )
+    out = part.folder / "objects"
+    options = ("--out", out, "--mcts-iterations", str(IMPORT_SEARCH))
+    part.run(["vd-assets", "import", *chosen, *options], seconds=IMPORT_S)
     found = object_files(out) if out.is_dir() else []
     if not found:
         names = ", ".join(path.name for path in chosen)
         raise FailureError(
-            f"none of {names} was imported within {IMPORT_S:.0f} s; the files in {demo.folder()} say why. "
+            f"none of {names} was imported within {IMPORT_S:.0f} s; the files in {part.folder} say why. "
             f"By hand, without haste: vd-assets import {meshes}"
         )
     return str(out), str(found[0])
-
-
-def close_gap(demo: Demo) -> dict[str, Any]:
-    """An effect hidden in a simulated servo, found and closed."""
-    recording, analysis, seed = demo.folder("recording"), demo.folder("analysis"), str(demo.cfg.seed)
-    demo.command(["vd-gap", "hide", "servo", "--effect", HIDDEN, "--out", recording, "--seed", seed])
-    demo.command(["vd-gap", "run", recording, "--out", analysis, "--seed", seed])
-    from vd.gap.result import Report
-    from vd.gap.words import verdict_sentence
-
-    verdict = verdict_sentence(Report.read(analysis / "report.json"))
-    pictures = sorted(analysis.glob("overlay_*.png"), key=lambda path: path.stat().st_mtime)
-    page = (analysis / "report.html").relative_to(demo.cfg.out)
-    return {"hidden": HIDDEN, "verdict": verdict, "picture": pictures[0], "page": page.as_posix()}
-
-
-def fly_twin(demo: Demo) -> dict[str, Any]:
-    """A simulated hand behind the protocol of its motors, flown by the policy that sees."""
-    log = demo.folder("log")
-    demo.command(
-        [
-            *("vd-deploy", CAMERA_POLICY, "--hand", "dclaw4", "--twin", "--object", demo.objects[1]),
-            *("--random-goals", "2", "--seed", str(demo.cfg.seed), "--safety.misses", MISSES, "--log", log),
-        ]
-    )
-    from vd.hand_log import read_log
-
-    flight = read_log(log)
-    sent = sorted(1e3 * flight.columns["sent_s"])
-    late = f"{sent[len(sent) // 2]:.0f}, at most {sent[-1]:.0f}"
-    row = (len(sent), f"{flight.columns['missed'][-1]:.0f}", late, ", ".join(s.outcome for s in flight.stops))
-    page = (log / "run.html").relative_to(demo.cfg.out).as_posix()
-    return {"film": log / "run.mp4", "row": row, "object": flight.run["object"]["name"], "page": page}
-
-
-def train_small(demo: Demo) -> dict[str, Any]:
-    """A small training, with its curve."""
-    run, film = demo.folder("run"), demo.folder("film.mp4")
-    minutes = max(demo.minutes_left - AFTER_TRAINING_MIN, LEAST_TRAINING_MIN)
-    seed = ("--seed", str(demo.cfg.seed))
-    demo.command(
-        [
-            *("vd-train", "teacher", "--preset", "cpu-demo", "--out", run, *seed),
-            *("--max-minutes", f"{minutes:.2f}"),
-        ]
-    )
-    curves = run / "curves.png"
-    demo.command(
-        ["vd-train", "curves", run, "--out", curves],
-        ["vd-play", run, "--cells", "4", "--seconds", str(FILM_S), *seed, "--video", film],
-    )
-    from vd.train.metrics import PROGRESS_FILE, read_progress
-
-    rows = [row for row in read_progress(run / PROGRESS_FILE) if row["goals_per_episode"] is not None]
-    low, last = min(row["goals_per_episode"] for row in rows), rows[-1]["goals_per_episode"]
-    return {"film": film, "curves": curves, "low": low, "last": last, "steps": rows[-1]["env_steps"]}
-
-
-def all_parts() -> list[Part]:
-    """The parts, in their order."""
-    return [
-        Part("camera", "Objects never seen, turned by camera", turn_unseen),
-        Part("gap", "A hidden effect, found and closed", close_gap),
-        Part("twin", "A hand behind its motors", fly_twin),
-        Part("training", "A small training", train_small),
-    ]
 
 
 def check(cfg: DemoCfg) -> None:
@@ -348,16 +297,15 @@ def check(cfg: DemoCfg) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; returns the exit status: 1 if a part failed."""
     cfg = tyro.cli(DemoCfg, args=arguments, prog="python -m vd.train.demo")
-    demo = Demo(cfg, all_parts())
+    demo = Demo(cfg)
     try:
         check(cfg)
         status = demo.run()
     except (ValueError, OSError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
-    failed = [part.title for part in demo.parts if part.state == "failed"]
-    print(f"\n{demo.page} is ready after {cfg.minutes - demo.minutes_left:.1f} min; open it in a browser")
-    if failed:
+    print(f"\n{demo.page} is ready after {demo.minutes:.1f} min; open it in a browser")
+    if failed := [part.title for part in demo.parts if part.state == "failed"]:
         print(f"demo: failed: {', '.join(failed)}", file=sys.stderr)
     return status
 

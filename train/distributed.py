@@ -16,15 +16,14 @@ from torch.distributed import PrefixStore
 from torch.distributed.rendezvous import rendezvous
 
 from vd.files import OutputError
-from vd.train import watchdog
 
 START_TIMEOUT = timedelta(minutes=20)
 """Longest wait for the slowest process to build its environments; compiling kernels takes 3 minutes."""
 COLLECTIVE_TIMEOUT = timedelta(minutes=2)
 """Longest wait in a collective: an iteration takes about a second and a checkpoint a few. NCCL's default of
 10 minutes is that much of every GPU lost when one process hangs."""
-
-_watchdog: watchdog.Watchdog | None = None  # one for the process, as its group
+REPORT_AFTER_S = 90.0
+"""An iteration that takes this long is reported, before the others' wait in a collective ends."""
 
 
 @dataclass(frozen=True)
@@ -33,17 +32,15 @@ class Processes:
 
     Attributes:
         rank: Number among all processes; 0 logs and saves.
-        local_rank: Number among those of this machine, and of its GPU.
         world_size: Processes of the run.
     """
 
-    rank: int
-    local_rank: int
-    world_size: int
+    rank: int = 0
+    world_size: int = 1
 
 
 def join_processes(device: str) -> Processes:
-    """Meet the other processes that ``torchrun`` started; NCCL on GPUs, gloo on CPUs.
+    """Meet the other processes that ``torchrun`` started, if it did; NCCL on GPUs, gloo on CPUs.
 
     Args:
         device: Torch device of this process.
@@ -51,6 +48,8 @@ def join_processes(device: str) -> Processes:
     Raises:
         ValueError: The device is not the GPU that belongs to this process.
     """
+    if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+        return Processes()
     local_rank = int(os.environ.get("LOCAL_RANK", "0"))
     cuda = device.startswith("cuda")
     if cuda and device != f"cuda:{local_rank}":
@@ -75,22 +74,18 @@ def join_processes(device: str) -> Processes:
         world_size=world_size,
         timeout=COLLECTIVE_TIMEOUT,
     )
-    global _watchdog
-    _watchdog = watchdog.Watchdog(store.clone(), rank, world_size)
-    return Processes(rank, local_rank, world_size)
+    return Processes(rank, world_size)
 
 
 def watch_iteration() -> None:
-    """Print every thread's stack on stderr, and who is waited for, if this is not called again soon.
+    """Print every thread's stack on stderr if this is not called again within ``REPORT_AFTER_S``.
 
-    After ``watchdog.REPORT_AFTER_S``. A process that hangs outside of a collective says nothing otherwise:
-    only those that wait for it do.
+    Of a run that hangs, the process whose main thread is not in ``torch.distributed`` is the one that the
+    others wait for.
     """
-    if _watchdog is not None:
-        _watchdog.beat()
     # A stderr without a file, as in a notebook, cannot be written to by the watching thread.
     with contextlib.suppress(AttributeError, ValueError, io.UnsupportedOperation):
-        faulthandler.dump_traceback_later(watchdog.REPORT_AFTER_S, file=sys.stderr)
+        faulthandler.dump_traceback_later(REPORT_AFTER_S, file=sys.stderr)
 
 
 @contextlib.contextmanager
@@ -111,14 +106,12 @@ def ending_together(*agreed: type[BaseException]) -> Iterator[None]:
         _abandon(error)
     finally:
         faulthandler.cancel_dump_traceback_later()
-        if _watchdog is not None:
-            _watchdog.stop()
 
 
 def _abandon(error: BaseException) -> NoReturn:
     """Print the error and end without any clean-up that could wait for other processes."""
     rank = os.environ.get("RANK", "0")
-    print(f"vd-train: process {rank} failed and ends the run", file=sys.stderr)
+    print(f"vd-train: process {rank} failed and ends the run; --resume goes on with it", file=sys.stderr)
     if isinstance(error, OutputError):
         print(error, file=sys.stderr)
     else:

@@ -1,15 +1,16 @@
-"""The ways a run can be asked to end: Ctrl-C, SIGTERM and a deadline, agreed on by all its processes."""
+"""The ways a run ends: Ctrl-C, SIGTERM, a deadline that all processes agree on, and divergence."""
 
 import contextlib
+import math
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from types import FrameType
 
 import torch
+from torch import nn
 
 from vd import interrupt
-from vd.train.distributed import ending_together
 
 
 class Interrupted(Exception):  # noqa: N818  # not an error: the run was asked to stop and has saved
@@ -18,6 +19,20 @@ class Interrupted(Exception):  # noqa: N818  # not an error: the run was asked t
 
 class TrainingDivergedError(RuntimeError):
     """Observations, rewards, losses or parameters are no longer finite."""
+
+
+def check_update(losses: Mapping[str, float | None], networks: nn.Module, remedy: str) -> None:
+    """Stop when a loss, a gradient or a parameter is not finite; one wait for the device.
+
+    Raises:
+        TrainingDivergedError: It names what is not, and the remedy.
+    """
+    bad = [name for name, value in losses.items() if value is None or not math.isfinite(value)]
+    # A sum is finite only if all its terms are.
+    if not math.isfinite(float(torch.stack([p.detach().sum() for p in networks.parameters()]).sum())):
+        bad.append("parameters")
+    if bad:
+        raise TrainingDivergedError(f"{', '.join(bad)} not finite after the update; {remedy}")
 
 
 class EndRequest:
@@ -63,34 +78,7 @@ class EndRequest:
         interrupt.note(self.signal)
         return bool(self.signal) or bool(wishes[1])
 
-    def time_left(self, done: int, left: int) -> float | None:
-        """Estimate from this command's own pace, and the deadline if that is nearer [s].
-
-        Args:
-            done: Iterations since the start of this command.
-            left: Iterations to the end.
-        """
-        pace = (time.monotonic() - self._started) / max(done, 1)
-        estimate = pace * left
+    def time_left(self, done: int, left: int) -> float:
+        """Time for ``left`` iterations at the pace of the ``done``, at most to the deadline [s]."""
+        estimate = (time.monotonic() - self._started) / max(done, 1) * left
         return estimate if self._deadline is None else min(estimate, self._deadline - time.monotonic())
-
-
-def finished(learn: Callable[[], None], close: Callable[[], None], *, distributed: bool) -> bool:
-    """Run a training to its end and close what it simulates.
-
-    Args:
-        learn: Trains; raises :class:`Interrupted` once a run that was asked to stop has saved.
-        close: Releases the environments, however the training ends.
-        distributed: Whether a failure must end the other processes as well.
-
-    Returns:
-        Whether it came to its own end, rather than being interrupted.
-    """
-    try:
-        with ending_together(Interrupted) if distributed else contextlib.nullcontext():
-            learn()
-    except Interrupted:
-        return False
-    finally:
-        close()
-    return True

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_type_hints
@@ -13,6 +13,7 @@ import tyro
 from vd.config import from_dict, to_dict
 from vd.device import resolve_device
 from vd.evaluate.agents import check_names
+from vd.files import write_json
 from vd.train.begin import settings_of
 from vd.train.presets import PRESETS, TeacherCfg, for_hand, smoke
 
@@ -27,8 +28,8 @@ TEACHER_HELP = """Train the teacher: PPO on the simulator's state.
 
 Flags start from --preset, or with --resume from the run's config.json. Without either the machine decides:
 gpu, under torchrun multi-gpu, and cpu-demo where there is no GPU. Short forms: --hand, --hand-layer,
---objects, --num-envs and --seed stand for --env.hand and so on. Ctrl-C saves. --help-all lists the flags of
-physics, reward, success and of the ranges of Table S3 too."""
+--objects, --num-envs and --seed stand for --env.hand and so on, --randomise for --env.randomisation.enabled.
+Ctrl-C saves. --help-all lists the flags of physics, reward, success and of the ranges of Table S3 too."""
 
 _RARE = {
     "env": "sim action reward success visuals table_friction",
@@ -41,13 +42,13 @@ _RARE = {
 OF_HELP_ALL = frozenset(f"{group}.{name}" for group, names in _RARE.items() for name in names.split())
 """Settings that few runs change: ``--help`` leaves them out, ``--help-all`` does not, and all are flags."""
 
-SHORT_FORMS = ("hand", "hand-layer", "objects", "num-envs", "seed")
-"""Fields of the environment that are common enough to be flags without the ``--env.`` prefix."""
+SHORT_FORMS = {name: f"env.{name}" for name in ("hand", "hand-layer", "objects", "num-envs", "seed")} | {
+    "randomise": "env.randomisation.enabled"
+}
+"""Flags that are short for others: fields of the environment that are common enough."""
 
 
-def parse_teacher(
-    arguments: Sequence[str], *, unnamed: str | None = None, say: Callable[[str], object] | None = None
-) -> TeacherCfg:
+def parse_teacher(arguments: Sequence[str], *, say: Callable[[str], object] | None = None) -> TeacherCfg:
     """The configuration that command-line flags ask for.
 
     The first pass finds where to start from (``--preset``, ``--smoke``, what ``--init`` begins from, or the
@@ -55,21 +56,20 @@ def parse_teacher(
 
     Args:
         arguments: Flags.
-        unnamed: Preset where nothing says another; None: that of the machine.
         say: Is told which preset the machine decided.
 
     Raises:
         FileNotFoundError: ``--resume`` names a run without a configuration.
         ValueError: The run's configuration is not one of this version, or ``--init`` is no teacher.
     """
-    arguments = normalise(arguments, SHORT_FORMS, "env")
+    arguments = normalise(arguments, SHORT_FORMS)
     preset, init, resume = (value_of(arguments, flag) for flag in ("--preset", "--init", "--resume"))
     saved = resume is not None and _has_config(arguments)
     if "--smoke" in arguments:
         start = smoke()
     elif preset is None and init is not None:
         start = settings_of(init, PRESETS["gpu"]())
-    elif preset is None and unnamed is None and not saved:
+    elif preset is None and not saved:
         # Wrong flags and names, and --help, do not wait for torch.
         _parsed(arguments, PRESETS["gpu"]())
         preset, reason = machine_preset(value_of(arguments, "--device"))
@@ -77,14 +77,11 @@ def parse_teacher(
         if say is not None:
             say(f"preset {preset}, since none is named: {reason}")
     else:  # the second pass refuses an unknown name
-        start = PRESETS.get(preset or unnamed or "gpu", PRESETS["gpu"])()
+        start = PRESETS.get(preset or "gpu", PRESETS["gpu"])()
     if init is None:
         start = for_hand(start, value_of(arguments, "--env.hand"))
     base = (saved_config(arguments, start) or start) if resume is not None else start
-    cfg = _parsed(arguments, base)
-    if cfg.env.observation.view == "either":
-        raise ValueError("env.observation.view either is of evaluations; train with goal, which it looks at")
-    return cfg
+    return _parsed(arguments, base)
 
 
 def machine_preset(device: str | None) -> tuple[str, str]:
@@ -103,18 +100,20 @@ def machine_preset(device: str | None) -> tuple[str, str]:
     return "gpu", "the recipe that learns, on one GPU; Ctrl-C or --max-minutes ends it"
 
 
-def normalise(arguments: Sequence[str], short_forms: Sequence[str], group: str) -> list[str]:
-    """Spell out flags of ``group`` in their short forms, ``--flag=value``, and a bare ``--resume``."""
+def normalise(arguments: Sequence[str], short_forms: Mapping[str, str]) -> list[str]:
+    """Spell out flags in their short forms, ``--flag=value``, and a bare ``--resume``."""
     result: list[str] = []
     for argument in arguments:
         flag, equals, value = argument.partition("=")
-        if argument.startswith("--"):
-            flag = flag.replace("_", "-")
-            if flag.removeprefix("--") in short_forms:
-                flag = f"--{group}.{flag.removeprefix('--')}"
-            result += [flag, value] if equals else [flag]
-        else:
+        if not argument.startswith("--"):
             result.append(argument)
+            continue
+        name = flag[2:].replace("_", "-")
+        off = name.startswith("no-") and name[3:] in short_forms
+        if name in short_forms or off:
+            group, _, field = short_forms[name[3:] if off else name].rpartition(".")
+            name = f"{group}.{'no-' if off else ''}{field}"
+        result += [f"--{name}", value] if equals else [f"--{name}"]
     for index, argument in enumerate(result):
         if argument == "--resume" and (index + 1 == len(result) or result[index + 1].startswith("--")):
             result[index + 1 : index + 1] = ["latest"]
@@ -187,3 +186,9 @@ def saved_config(arguments: list[str], start: Cfg) -> Cfg | None:
             f"{path}: {error}; it was written by another version, start anew or edit it"
         ) from error
     return replace(cfg, run=replace(cfg.run, out=run_dir))
+
+
+def write_config(cfg: "TeacherCfg | StudentTrainCfg") -> None:
+    """Save the resolved configuration in the run's folder, as ``--resume`` takes it, on any machine."""
+    run = replace(cfg.run, device="auto")
+    write_json(cfg.run.out / CONFIG_NAME, to_dict(replace(cfg, resume=None, run=run)))

@@ -7,6 +7,7 @@ state, in the states that it comes to itself (DAgger, Ross et al. 2011).
 
 from collections.abc import Mapping
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,6 +19,8 @@ from vd.train.config import PpoCfg
 from vd.train.ppo import OBSERVED, TeacherPPO
 from vd.train.vec_env import OBSERVATION_GROUP, PRIVILEGED_GROUP
 
+LEARNING_RATE = 1e-3
+"""The actor's rate at the begin; it falls to zero."""
 IMITATED = "imitated_state_dict"
 """What a checkpoint calls the weights of the policy that is being imitated."""
 
@@ -32,19 +35,18 @@ class Imitation:
         learner: The learner, whose actor has the weights of the policy to imitate.
         inputs: Values that this policy read, the first that the actor observes. As many of the present state
             are the last that the critic is told.
-        learning_rate: The rate at the begin.
 
     Attributes:
         teacher: The policy to imitate. It gets what the actor observes with the present state in its place;
             it has no weights for what the actor observes more.
     """
 
-    def __init__(self, learner: TeacherPPO, inputs: int, learning_rate: float) -> None:
-        self._learner, self._inputs, self._rate = learner, inputs, learning_rate
+    def __init__(self, learner: TeacherPPO, inputs: int) -> None:
+        self._learner, self._inputs = learner, inputs
         self.teacher: MLPModel = deepcopy(learner.actor).requires_grad_(False)
         if hasattr(self.teacher.distribution, "log_floor"):  # it falls for both as stillness tightens
             self.teacher.distribution.log_floor = learner.actor.distribution.log_floor
-        self._optimizer = torch.optim.Adam(learner.actor.parameters(), lr=learning_rate)
+        self._optimizer = torch.optim.Adam(learner.actor.parameters())
 
     def update(self, left: float) -> dict[str, float]:
         """All epochs over the learner's latest rollout.
@@ -55,7 +57,7 @@ class Imitation:
         Returns:
             ``imitation``: mean squared error of means and standard deviations of the actions.
         """
-        self._optimizer.param_groups[0]["lr"] = self._rate * left
+        self._optimizer.param_groups[0]["lr"] = LEARNING_RATE * left
         learner, samples = self._learner, self._learner.samples
         seen, told = samples[OBSERVED + OBSERVATION_GROUP], samples[OBSERVED + PRIVILEGED_GROUP]
         present = torch.cat((told[:, -self._inputs :], seen[:, self._inputs :]), dim=1)
@@ -79,7 +81,7 @@ class Imitation:
 
 
 def begin_imitation(
-    learner: TeacherPPO, ppo: PpoCfg, present: int, state: Mapping[str, Any], path: str
+    learner: TeacherPPO, ppo: PpoCfg, present: int, state: Mapping[str, Any], path: str | Path
 ) -> Imitation | None:
     """What the actor of a run does first that begins from another; None: it stays as it is.
 
@@ -101,7 +103,7 @@ def begin_imitation(
             f"--ppo.imitation-iterations: {path} reads {read} values, and the critic is told {present} of "
             "the present; give --env.observation.dynamics critic, and --init a policy of state and shape"
         )
-    return Imitation(learner, present, ppo.imitation_learning_rate)
+    return Imitation(learner, present)
 
 
 def resumed_imitation(
@@ -110,7 +112,7 @@ def resumed_imitation(
     """The imitation that a checkpoint was in; None: it was over, or there was none, or it is turned off."""
     if IMITATED not in state or not ppo.imitation_iterations:
         return None
-    imitation = Imitation(learner, present, ppo.imitation_learning_rate)
+    imitation = Imitation(learner, present)
     imitation.teacher.load_state_dict(state[IMITATED])
     return imitation
 

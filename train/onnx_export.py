@@ -20,39 +20,28 @@ TOLERANCE = 1e-4
 
 
 def export_onnx(policy: TrainedPolicy, path: Path) -> None:
-    """Write the network of ``policy``.
-
-    Args:
-        policy: The teacher, on the CPU.
-        path: File to write.
+    """Write the network of ``policy``, which is on the CPU, to ``path``.
 
     Raises:
         RuntimeError: What the export needs is not installed.
     """
     if find_spec("onnxscript") is None:
         raise RuntimeError("ONNX export needs onnxscript: pip install -e '.[export]'")
-    example = torch.zeros(2, policy.num_observations)
     # It warns of libraries that this network does not need, and of its own future.
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)
-            program = torch.onnx.export(
-                policy.network,
-                (example,),
-                input_names=[INPUT],
-                output_names=[OUTPUT],
-                dynamic_shapes=({0: torch.export.Dim("worlds")},),
-                dynamo=True,
-                verbose=False,
-            )
-    finally:
-        logger.setLevel(level)
-    assert program is not None
-    with atomic_path(path) as temporary:
-        program.save(temporary, external_data=False)
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+    with warnings.catch_warnings(), atomic_path(path) as temporary:
+        warnings.simplefilter("ignore", FutureWarning)
+        torch.onnx.export(
+            policy.network,
+            (torch.zeros(2, policy.num_observations),),
+            temporary,
+            input_names=[INPUT],
+            output_names=[OUTPUT],
+            dynamic_shapes=({0: torch.export.Dim("environments")},),
+            dynamo=True,
+            external_data=False,
+            verbose=False,
+        )
 
 
 def onnx_difference(policy: TrainedPolicy, path: Path) -> float | None:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 
+from vd.config import Dropped
 from vd.envs.cfg import (
     CurriculumCfg,
     GoalCfg,
@@ -31,7 +32,7 @@ TRAINING_SET = ("procedural-150-seed0",)
 class TeacherCfg:
     """Train the teacher: PPO on the simulator's state."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None}
+    RETIRED: ClassVar[dict[str, Any]] = {"focus_on": None, "second_view": Dropped(False)}
     preset: PresetName = "paper"
     """Settings to start from; every other flag overrides one of them. By default what learns on this
     machine."""
@@ -41,15 +42,11 @@ class TeacherCfg:
     init: str | None = None
     """Begin a new run with networks, curriculum and counters of another: the name of an installed policy
     (dclaw3-table), a policy, a checkpoint or a run's folder. Of a policy without a critic or an optimiser the
-    critic learns alone first (--ppo.critic-warmup-iterations). Without --preset its task and its networks are
+    critic learns alone first. Without --preset its task and its networks are
     this run's defaults. It may have observed less: what is new starts without effect."""
     init_stage: tuple[float, float] | None = None
     """Difficulty and tightness of the curriculum at which a run with --init begins. None: those of what it
     begins from; 1 and 1 for a policy that does not say, which is the task as configured."""
-    second_view: bool = False
-    """Look again at goals that are not reached in 3 s, once a second, in a view that is drawn, of those that
-    vd-eval --second-view chooses from: more is learned there of what is stuck. For policies that see their
-    goals in views (--env.observation.view goal or mirrored)."""
     smoke: bool = False
     """Check the installation: the cpu-demo preset, tiny, on the CPU, for at most a minute. It learns nothing,
     and keeps nothing unless --out is given."""
@@ -197,18 +194,7 @@ def cpu_demo() -> TeacherCfg:
         preset="cpu-demo",
         run=RunCfg(out=Path("runs/cpu-demo"), device="cpu", max_steps=200_000, save_every=10),
         # Many optimiser steps per sample: samples are what a CPU is short of.
-        ppo=PpoCfg(
-            rollout_steps=8,
-            minibatch_size=256,
-            epochs=5,
-            actor_learning_rate=1e-3,
-            schedule="adaptive",
-            desired_kl=0.02,
-            clip=0.2,
-            gamma=0.97,
-            value_coefficient=1.0,
-            entropy_coefficient=1e-3,
-        ),
+        ppo=replace(SHORT_ROLLOUTS, minibatch_size=256, actor_learning_rate=1e-3),
         policy=PolicyCfg(
             hidden=(256, 128, 64),
             distribution="state-dependent",

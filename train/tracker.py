@@ -51,8 +51,6 @@ class TrackerCfg:
     """What it knows shapes by: mesh, points (500 exact ones, as the paper's) or scan."""
     sensor_errors: bool = EvalCfg.sensor_errors
     """Its camera errs as a D415 does."""
-    second_view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Select symmetry views where a goal is not reached in 3 s: the rule of a policy that is to fly so."""
     num_envs: int | None = None
     """Environments simulated at once; as of vd-eval by default."""
     seed: int = 1000
@@ -74,10 +72,10 @@ def tracker_command(arguments: Sequence[str], _started: float) -> int:
     from vd.config import to_dict
     from vd.tracking.policy import tracking_export
     from vd.train.checkpoint import save_checkpoint
-    from vd.train.progress import waiting
 
-    with waiting("running the episodes", not cfg.json):
-        policy, found, precise = make_tracker(cfg)
+    if not cfg.json:
+        print("running the episodes ...", flush=True)
+    policy, found, precise = make_tracker(cfg)
     save_checkpoint(cfg.out, tracking_export(policy))
     if cfg.json:
         print(json.dumps(to_dict(found) | {"precise": precise and to_dict(precise)}, indent=1))
@@ -105,7 +103,7 @@ def make_tracker(cfg: TrackerCfg) -> tuple["TrackingPolicy", "Calibration", "Cal
         near its goal.
 
     Raises:
-        ValueError: The teacher is none, or observes what no camera shows, or has no views to select, or no
+        ValueError: The teacher is none, or observes what no camera shows, or no
             rule stops any episode within the tolerance.
     """
     from vd.device import resolve_device
@@ -155,13 +153,12 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
     """Episodes that nothing stops."""
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.compare import STUDENT_WORLDS_GPU, actor_of, run_episodes, task_of, worlds_for
+    from vd.evaluate.compare import actor_of, envs_for, run_episodes, task_of
     from vd.tracking.symmetry import with_symmetries
 
     count = len(load_set(list(cfg.objects)))
     each = math.ceil(cfg.episodes / count)
-    limit = None if device == "cpu" else STUDENT_WORLDS_GPU
-    envs = cfg.num_envs or worlds_for(count, each, device, limit=limit)
+    envs = cfg.num_envs or envs_for(count, each, device, camera=True)
     evaluation = EvalCfg(
         policies=(cfg.teacher,),
         objects=cfg.objects,
@@ -172,13 +169,14 @@ def _episodes(cfg: TrackerCfg, policy: "TrackingPolicy", device: str) -> "Trace"
         in_air=cfg.in_air,
         goals=cfg.goals,
         sensor_errors=cfg.sensor_errors,
-        second_view=cfg.second_view,
         seed=cfg.seed,
         device=device,
     )
     env = ReorientEnv(task_of(evaluation, policy, cfg.objects, envs), device)
     env.objects = with_symmetries(env.objects, device)
-    actor, _, _, rules = actor_of(evaluation, cfg.teacher, policy, env, device)
+    actor, _, _, rules = actor_of(
+        cfg.teacher, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
+    )
     trace = run_episodes(evaluation, env, actor, cfg.teacher, rules, math.inf)
     env.close()
     return trace
@@ -192,7 +190,6 @@ def _with_rules(
     parts += [] if cfg.goals == "mesh" else [f"goals by {cfg.goals}"]
     parts += ["in the air"] if cfg.in_air else []
     parts += [] if cfg.sensor_errors else ["without sensor errors"]
-    parts += ["views selected"] if cfg.second_view else []
     parts += [f"tolerance {cfg.tolerance_rad:g} rad", f"seed {cfg.seed}"]
     return replace(
         spec,

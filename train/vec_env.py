@@ -9,9 +9,7 @@ from tensordict import TensorDict
 
 from vd.config import to_dict
 from vd.envs.state import saved_stage
-from vd.evaluate.second_view import view_maps
 from vd.paper import PAPER
-from vd.tracking.views import ViewSelection
 
 OBSERVATION_GROUP = "policy"
 """What actor and critic both read; all there is in the paper."""
@@ -37,9 +35,6 @@ class ReorientVecEnv(VecEnv):
 
     Args:
         env: The environment, already reset.
-        second_view: Look again at goals that are not reached in time, in a view that is drawn
-            (:mod:`vd.evaluate.second_view`, where the critic chooses): what is stuck in one view is then
-            learned from in the others too.
 
     Attributes:
         num_envs: Environments N.
@@ -50,13 +45,8 @@ class ReorientVecEnv(VecEnv):
         cfg: The environment's configuration as a dictionary.
     """
 
-    def __init__(self, env: Any, *, second_view: bool = False) -> None:
+    def __init__(self, env: Any) -> None:
         self.env = env
-        self._others = None
-        if second_view:
-            self._others = ViewSelection(view_maps(env), env.cfg.sim.control_hz)
-            self._goal_steps = wp.to_torch(env.goal_steps)
-            self._world, self._view = wp.to_torch(env.world_observation), wp.to_torch(env.views.view)
         self.num_envs = env.num_envs
         self.num_actions = env.num_actions
         self.num_present = env.num_present
@@ -118,8 +108,6 @@ class ReorientVecEnv(VecEnv):
         """
         self._action.copy_(actions)
         self.env.step(self.env.action)
-        if self._others is not None:
-            self._look_again(self._others)
         reached = self._success > 0
         dropped = (self._fell > 0) & ~reached
         timed_out = (self._timed_out > 0) & ~reached & ~dropped
@@ -142,15 +130,6 @@ class ReorientVecEnv(VecEnv):
             done.long(),
             {"time_outs": timed_out.float(), "log": log},
         )
-
-    def _look_again(self, others: ViewSelection) -> None:
-        """Draw a view for the environments that are due, and observe in it; nothing waits on the host."""
-        views = others.of(self._world)
-        drawn = torch.randint(len(views), views.shape[1:], device=views.device)
-        chosen = views.gather(0, drawn[None])[0].to(self._view.dtype)
-        due = others.due(self._goal_steps) & (self._rotation_error > PAPER.success.rotation_rad)
-        self._view.copy_(torch.where(due, chosen, self._view))
-        self.env.views.observe()
 
     def check(self) -> None:
         """Let the environment raise on NaN or on a contact capacity that overflowed. Copies to the host."""

@@ -5,11 +5,9 @@ from typing import Any
 import torch
 from torch import nn
 
-MOMENT, SECOND_MOMENT = "exp_avg", "exp_avg_sq"
-"""Adam's running means of a gradient and of its square."""
-_FIRST = "mlp.0.weight"
-_FILLS = {
-    _FIRST: 0.0,
+FIRST = "mlp.0.weight"
+NEW_INPUTS = {
+    FIRST: 0.0,
     "obs_normalizer._mean": 0.0,
     "obs_normalizer._var": 1.0,
     "obs_normalizer._std": 1.0,
@@ -17,34 +15,7 @@ _FILLS = {
 """What reads or normalises the inputs, and what it has for new ones."""
 
 
-def new_inputs(state: dict[str, Any], num_observations: int, critic_observations: int | None = None) -> int:
-    """How many more values a run observes than the networks of a checkpoint read.
-
-    Args:
-        state: The checkpoint, with or without a critic.
-        num_observations: Values that the run's actor reads.
-        critic_observations: Values that its critic reads; as many by default.
-
-    Raises:
-        ValueError: They are fewer.
-    """
-    before = int(state["policy"]["num_observations"])
-    read = [(before, num_observations)]
-    if "critic_state_dict" in state:
-        of_critic = state["critic_state_dict"]["mlp.0.weight"].shape[1]
-        read.append((of_critic, num_observations if critic_observations is None else critic_observations))
-    for then, now in read:
-        if now < then:
-            raise ValueError(
-                f"its networks read {then} values and this run observes {now}, but a run can only "
-                "go on with more"
-            )
-    return max(now - then for then, now in read)
-
-
-def widen(
-    state: dict[str, Any], actor: nn.Module, critic: nn.Module, *, num_observations: int
-) -> dict[str, Any]:
+def widen(state: dict[str, Any], actor: nn.Module, critic: nn.Module) -> tuple[dict[str, Any], int]:
     """A checkpoint with the networks of a run that observes more, acting as before.
 
     What was there reads nothing of what is new: those weights are zero, and normalisation of new inputs
@@ -55,38 +26,38 @@ def widen(
     Args:
         state: The checkpoint, as :func:`vd.train.checkpoint.load_checkpoint` reads it; not changed. Critic
             and optimiser may be missing, as in an exported policy.
-        actor: The actor it is for.
+        actor: The actor it is for, which reads at least as much as that of the checkpoint.
         critic: The critic it is for.
-        num_observations: Values that the run observes, at least as many as the checkpoint's networks read.
+
+    Returns:
+        The checkpoint, and how many inputs are new, of the network with the most of them.
     """
-    optimiser = state.get("optimizer_state_dict", {"state": {}})
-    moments = dict(optimiser["state"])
-    widened = dict(state)
+    widened, count = dict(state), 0
+    moments = dict(state.get("optimizer_state_dict", {"state": {}})["state"])
     index = 0  # the optimiser counts the actor's parameters, then the critic's
-    for network, module in (("actor", actor), ("critic", critic)):
-        weights = dict(state.get(f"{network}_state_dict", {}))
-        own = module.state_dict()
-        for name, parameter in module.named_parameters():
-            if name == _FIRST and index in moments:
+    for key, network in (("actor_state_dict", actor), ("critic_state_dict", critic)):
+        weights, own = dict(state.get(key, {})), network.state_dict()
+        for name in weights.keys() & NEW_INPUTS.keys():
+            extra = own[name].shape[-1] - weights[name].shape[-1]
+            count = max(count, extra)
+            weights[name] = nn.functional.pad(weights[name], (0, extra), value=NEW_INPUTS[name])
+        if weights:
+            widened[key] = weights
+        for name, parameter in network.named_parameters():
+            if name == FIRST and index in moments:
                 moments[index] = _wider_moments(moments[index], parameter.shape[1])
             index += 1
-        for name in weights.keys() & _FILLS.keys():
-            extra = own[name].shape[-1] - weights[name].shape[-1]
-            weights[name] = nn.functional.pad(weights[name], (0, extra), value=_FILLS[name])
-        if weights:
-            widened[f"{network}_state_dict"] = weights
     if "optimizer_state_dict" in state:
-        widened["optimizer_state_dict"] = optimiser | {"state": moments}
-    widened["policy"] = state["policy"] | {"num_observations": num_observations}
-    return widened
+        widened["optimizer_state_dict"] = state["optimizer_state_dict"] | {"state": moments}
+    return widened, count
 
 
 def _wider_moments(moment: dict[str, Any], inputs: int) -> dict[str, Any]:
     """Adam's moments of the first layer, for more inputs."""
-    first, second = moment[MOMENT], moment[SECOND_MOMENT]
+    first, second = moment["exp_avg"], moment["exp_avg_sq"]
     extra = inputs - first.shape[1]
-    means = second.mean(dim=1, keepdim=True).expand(-1, extra)
+    mean = second.mean(dim=1, keepdim=True).expand(-1, extra)
     return moment | {
-        MOMENT: nn.functional.pad(first, (0, extra)),
-        SECOND_MOMENT: torch.cat((second, means), dim=1),
+        "exp_avg": nn.functional.pad(first, (0, extra)),
+        "exp_avg_sq": torch.cat((second, mean), dim=1),
     }

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 
 from vd.assets_usd.hand_data import HandModel
@@ -141,36 +140,3 @@ class HandKinematics:
             outputs=[body_q],
             device=self.device,
         )
-
-
-def spread(
-    coordinates: torch.Tensor, chosen: torch.Tensor, clouds: int, most: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Centres of some voxels, a row for each cloud; waits for the device.
-
-    Args:
-        coordinates: Rows (cloud, x, y, z) of voxels, sorted by cloud, int [K, 4].
-        chosen: Which, bool [K].
-        clouds: B.
-        most: Voxels of a cloud at most. Of more, every so many-th one is taken in the order of the rows, in
-            which neighbours follow each other.
-
-    Returns:
-        Centres [voxels], zeros where a cloud has fewer, shape [B, P, 3], and 1 where there is one,
-        shape [B, P, 1].
-    """
-    rows = coordinates[chosen]
-    cloud = rows[:, 0].long()
-    first = torch.searchsorted(cloud, torch.arange(clouds + 1, device=rows.device))
-    counts, rank = first.diff(), torch.arange(len(cloud), device=rows.device) - first[cloud]
-    # Voxels that are left out would share a place with the one before them.
-    share = counts.clamp(min=most)[cloud]
-    place = rank * most // share
-    taken = (rank == 0) | ((rank - 1) * most // share < place)
-    size = min(most, max(1, int(counts.max())))
-    # The last row takes what is left out.
-    filled = torch.zeros((clouds * size + 1, 4), device=rows.device)
-    values = torch.nn.functional.pad(rows[:, 1:] + 0.5, (0, 1), value=1.0)
-    filled[torch.where(taken, cloud * size + place, clouds * size)] = values
-    points, present = filled[:-1].view(clouds, size, 4).split((3, 1), dim=-1)
-    return points, present

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from types import FrameType
@@ -29,8 +30,16 @@ RENAMED = {
     "--goal-s": "--episode-s",
     "--air": "--in-air",
     "--num-worlds": "--num-envs",
+    "--network.senses": "--network.proprioception",
 }
 """Flags of earlier versions, and what they are called in all commands."""
+GONE = {
+    "--from-scratch": "stage 2 begins from what --init names",
+    "--ppo.optimizer": "Adam is the only one",
+    "--agent": "name zero or random in place of a policy",
+    "--second-view": "symmetry-view selection gained too little (docs/lessons.md)",
+}
+"""Flags of earlier versions that are no more, and what to do, or why."""
 
 P = ParamSpec("P")
 
@@ -55,6 +64,9 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
         name: What the command is called.
     """
 
+    def format_warning(message: Warning | str, *_: Any, **__: Any) -> str:
+        return f"{name}: {message}\n"  # a user has no use for the line of the source
+
     def wrap(main: Callable[P, Any]) -> Callable[P, Any]:
         @functools.wraps(main)
         def run(*args: P.args, **kwargs: P.kwargs) -> Any:
@@ -65,6 +77,7 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
                 return USAGE_ERROR
             if given and not {"-h", "--help"} & set(given):
                 print(f"{name}: starting", file=sys.stderr, flush=True)  # what it imports takes seconds
+            warnings.formatwarning = format_warning
             with _terminated():
                 try:
                     status = main(*args, **kwargs)
@@ -82,9 +95,10 @@ def command(name: str) -> Callable[[Callable[P, Any]], Callable[P, Any]]:
 
 
 def _renamed(arguments: Sequence[str]) -> str:
-    """What flags of earlier versions are called now; empty without such flags."""
+    """What became of flags of earlier versions; empty without such flags."""
     flags = [str(argument).partition("=")[0].replace("_", "-") for argument in arguments]
-    return ", ".join(f"{flag} is {RENAMED[flag]} now" for flag in flags if flag in RENAMED)
+    words = [f"{flag} is {RENAMED[flag]} now" for flag in flags if flag in RENAMED]
+    return ", ".join(words + [f"{flag} is no more: {GONE[flag]}" for flag in flags if flag in GONE])
 
 
 def _status(status: Any) -> Any:

@@ -8,7 +8,6 @@ mailed, opened from a disk, printed, and read in a light or dark browser.
 import base64
 import io
 import re
-from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -83,101 +82,3 @@ def _embed(image: "Figure | bytes | Path") -> str:
         image.savefig(buffer, format="png", dpi=FIGURE_DPI, bbox_inches="tight")
         data = buffer.getvalue()
     return f"data:{kind};base64,{base64.b64encode(data).decode()}"
-
-
-class Page:
-    """A page built from top to bottom; all text is escaped.
-
-    Args:
-        title: Heading and window title.
-        lead: One sentence under the heading.
-    """
-
-    def __init__(self, title: str, lead: str = ""):
-        self._title, self._lead = title, lead
-        self._parts: list[str] = []
-
-    def section(self, title: str) -> None:
-        """Start a section."""
-        self._parts.append(f"<h2>{escape(title)}</h2>")
-
-    def text(self, text: str, *, small: bool = False) -> None:
-        """Add a paragraph."""
-        self._parts.append(f'<p class="small">{escape(text)}</p>' if small else f"<p>{escape(text)}</p>")
-
-    def code(self, text: str) -> None:
-        """Add a line of code, such as a command."""
-        self._parts.append(f"<p><code>{escape(text)}</code></p>")
-
-    def link(self, text: str, target: str) -> None:
-        """Add a line that leads to another file.
-
-        Args:
-            text: What is there.
-            target: Path relative to the page.
-        """
-        self._parts.append(f'<p><a href="{escape(target)}">{escape(text)}</a></p>')
-
-    def tiles(self, tiles: Sequence[tuple[str, str, str]]) -> None:
-        """Add headline numbers: (value, what it is, small print such as its interval) each."""
-        cells = "".join(
-            f'<div class="tile"><span>{escape(label)}</span><b>{escape(value)}</b>'
-            f"<span>{escape(note)}</span></div>"
-            for value, label, note in tiles
-        )
-        self._parts.append(f'<div class="tiles">{cells}</div>')
-
-    def table(
-        self,
-        header: Sequence[str],
-        rows: Sequence[Sequence[object]],
-        *,
-        words: Sequence[int] = (),
-        folded: str = "",
-    ) -> None:
-        """Add a table. The first column is text, the others are numbers already formatted.
-
-        Args:
-            header: Names of the columns.
-            rows: Cells of each row.
-            words: Further columns that hold text, which is set from the left and wrapped.
-            folded: Heading under which the table is folded away; empty shows it.
-        """
-        kinds = [' class="words"' if column in words else "" for column in range(len(header))]
-        head = "".join(f"<th{kind}>{escape(name)}</th>" for kind, name in zip(kinds, header, strict=True))
-        body = "".join(
-            "<tr>"
-            + "".join(f"<td{kind}>{_cell(cell)}</td>" for kind, cell in zip(kinds, row, strict=True))
-            + "</tr>"
-            for row in rows
-        )
-        table = (
-            f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-        )
-        if folded:
-            table = f"<details><summary>{escape(folded)}</summary>{table}</details>"
-        self._parts.append(table)
-
-    def points(self, texts: Sequence[str]) -> None:
-        """Add a list with a bullet for each text."""
-        self._parts.append(f"<ul>{''.join(f'<li>{escape(text)}</li>' for text in texts)}</ul>")
-
-    def figure(self, image: "Figure | bytes | Path", caption: str) -> None:
-        """Add a picture: a matplotlib figure, PNG bytes, or the path of a PNG or GIF file."""
-        self._add_figure(f'<img alt="{escape(caption)}" src="{_embed(image)}">', caption)
-
-    def video(self, path: Path, caption: str) -> None:
-        """Add an MP4 file; it plays muted and in a loop."""
-        source = _embed(path)
-        self._add_figure(f'<video controls autoplay loop muted playsinline src="{source}"></video>', caption)
-
-    def _add_figure(self, content: str, caption: str) -> None:
-        self._parts.append(f"<figure>{content}<figcaption>{escape(caption)}</figcaption></figure>")
-
-    def html(self) -> str:
-        """The whole document."""
-        return render("parts.html", title=self._title, lead=self._lead, parts=Markup("\n".join(self._parts)))
-
-    def write(self, path: Path) -> None:
-        """Write the page to ``path`` atomically."""
-        write_text(path, self.html())

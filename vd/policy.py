@@ -4,8 +4,7 @@ Reading a policy needs torch only, no simulator and no rsl-rl, and executes noth
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -101,6 +100,7 @@ class TrainedPolicy:
     Attributes:
         hand: Name of the hand it moves, as ``task`` says ("" if it does not).
         weights: What it was built from.
+        critic_weights: State of its critic; empty if the file has none.
         network: From observations [N, O] to mean actions [N, D]; what an exporter needs.
     """
 
@@ -118,47 +118,8 @@ class TrainedPolicy:
         self.spec, self.task, self.iteration, self.env_steps = spec, task, iteration, env_steps
         self.hand = str(task.get("hand", ""))
         self.num_observations, self.num_actions = spec.num_observations, spec.num_actions
-        self.weights = weights
+        self.weights, self.critic_weights = weights, critic or {}
         self.network = MeanAction(spec, weights).to(device)
-        self._critic, self._device = critic, device
-
-    @property
-    def has_critic(self) -> bool:
-        """Whether the file has one."""
-        return self._critic is not None
-
-    @property
-    def critic_weights(self) -> dict[str, torch.Tensor]:
-        """State of its critic; empty if the file has none."""
-        return self._critic or {}
-
-    @cached_property
-    def critic(self) -> MeanAction:
-        """What it expects: from observations [N, O] to values [N, 1].
-
-        Raises:
-            ValueError: The file has no critic.
-        """
-        if self._critic is None:
-            raise ValueError(
-                "the policy has no critic; export it again from a checkpoint of its run (vd-train export)"
-            )
-        if self._critic["mlp.0.weight"].shape[1] != self.num_observations:
-            raise ValueError(
-                "the policy's critic was told what no sensor knows (observation.dynamics), so it can be "
-                "asked in its own training only"
-            )
-        spec = replace(self.spec, num_actions=1, distribution="gaussian")
-        return MeanAction(spec, self._critic).to(self._device)
-
-    def value(self, observation: torch.Tensor) -> torch.Tensor:
-        """The return that the critic expects [N] from observations [N, O], in the training's rewards.
-
-        Raises:
-            ValueError: The file has no critic.
-        """
-        with torch.no_grad():
-            return self.critic(observation)[:, 0]
 
     def act(self, observation: torch.Tensor) -> torch.Tensor:
         """Mean action.
@@ -263,6 +224,15 @@ def _tensors_finite(value: Any) -> Iterator[bool]:
     elif isinstance(value, (dict, list, tuple)):
         for item in value.values() if isinstance(value, dict) else value:
             yield from _tensors_finite(item)
+
+
+def holds(path: Path, part: str) -> bool:
+    """Whether a file of torch is a dictionary with such a key, as far as it can be read."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception:  # whoever reads it says what is wrong with it
+        return False
+    return isinstance(state, dict) and part in state
 
 
 def load_policy(path: str | Path, device: str = "cpu") -> TrainedPolicy:

@@ -34,6 +34,8 @@ LIGHT_DIRECTION = (0.35, 0.9, -0.8)
 IN_PLACE, OUT_OF_SIGHT = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), (0.0, 0.0, -100.0, 0.0, 0.0, 0.0, 1.0)
 """Poses, [m] and xyzw, of what is shown at the origin and of what is hidden far below: viewers have no
 cheaper way to hide one shape."""
+BALL_SHARE = 0.8
+"""Share of the picture's height that the ball takes at which a camera is aimed."""
 SKY, GROUND = (0.42, 0.43, 0.46), (0.22, 0.21, 0.20)
 
 
@@ -78,28 +80,14 @@ class Camera:
         """Pose in the world."""
         return wp.transform(wp.vec3(*self.eye), wp.quat(*Rotation.from_matrix(self.rotation).as_quat()))
 
-    def project(self, points: np.ndarray, width: int, height: int) -> np.ndarray:
-        """Pixel coordinates (column, row) of world points, shape [n, 2].
-
-        Args:
-            points: World points [m], shape [n, 3], in front of the camera.
-            width: Picture width [pixel].
-            height: Picture height [pixel].
-        """
-        seen = (np.asarray(points, dtype=float) - np.asarray(self.eye)) @ self.rotation
-        scale = 0.5 * height / math.tan(0.5 * self.fov)
-        flat = seen[:, :2] / -seen[:, 2:]
-        return np.stack([0.5 * width + scale * flat[:, 0], 0.5 * height - scale * flat[:, 1]], axis=1)
-
-    def aimed_at(self, point: Sequence[float], radius: float, *, fill: float = 0.8) -> "Camera":
+    def aimed_at(self, point: Sequence[float], radius: float) -> "Camera":
         """A camera that looks in the same direction at a ball around ``point``, which fills the picture.
 
         Args:
             point: Centre [m].
             radius: Of the ball [m].
-            fill: Share of the picture's height that the ball takes.
         """
-        distance = radius / math.sin(math.atan(fill * math.tan(0.5 * self.fov)))
+        distance = radius / math.sin(math.atan(BALL_SHARE * math.tan(0.5 * self.fov)))
         eye = np.asarray(point, dtype=float) + distance * self.rotation[:, 2]
         return replace(self, eye=_vector(eye), target=_vector(point))
 
@@ -200,8 +188,6 @@ class Renderer:
         height: Height of a cell's picture [pixel].
         goal_size: Side of the square picture of the goal [pixel].
         camera: Where from.
-        samples: Rays a pixel; 4 smooths edges and takes about twice as long.
-        shadows: Cast shadows.
         device: Warp device; the CPU is quick enough for video (see ``tests/test_render.py``).
     """
 
@@ -214,8 +200,6 @@ class Renderer:
         height: int = 400,
         goal_size: int = 144,
         camera: Camera | None = None,
-        samples: int = 1,
-        shadows: bool = True,
         device: str = "cpu",
     ):
         self.width, self.height = width, height
@@ -223,25 +207,14 @@ class Renderer:
         self.pictured = PictureModel(hand, objects, device=device)
         cells = len(objects)
         self._sensor = SensorCamera(self.pictured.model)
-        self._sensor.create_default_light(enable_shadows=shadows, direction=_light(self.camera))
+        self._sensor.create_default_light(enable_shadows=True, direction=_light(self.camera))
         self._sensor.set_ambient_light(SKY, GROUND)
-        antialiasing = SensorCamera.AntiAliasing.MSAA if samples > 1 else SensorCamera.AntiAliasing.NONE
-        self._config = SensorCamera.RenderConfig(enable_shadows=shadows, anti_aliasing=antialiasing)
+        self._config = SensorCamera.RenderConfig(enable_shadows=True)
         radius = max(float(np.linalg.norm(item.vertices, axis=1).max()) for item in objects)
         goal_camera = self.camera.aimed_at((0.0, 0.0, 0.0), radius)
-        self._scene_view = _View(
-            self._sensor, self.camera, width, height, samples, range(cells), BACKGROUND, device
-        )
-        self._goal_view = _View(
-            self._sensor,
-            goal_camera,
-            goal_size,
-            goal_size,
-            samples,
-            range(cells, 2 * cells),
-            BACKGROUND,
-            device,
-        )
+        self._scene_view = _View(self._sensor, self.camera, (width, height), range(cells), device)
+        goals, square = range(cells, 2 * cells), (goal_size, goal_size)
+        self._goal_view = _View(self._sensor, goal_camera, square, goals, device)
 
     def render(
         self, joint_q: np.ndarray, goal_quat: np.ndarray, table: np.ndarray | bool = True
@@ -285,21 +258,16 @@ class _View:
         self,
         sensor: SensorCamera,
         camera: Camera,
-        width: int,
-        height: int,
-        samples: int,
+        size: tuple[int, int],
         envs: Sequence[int],
-        background: int,
         device: str,
     ):
         self._sensor = sensor
-        self._rays = SensorCamera.compute_camera_rays_pinhole(
-            width, height, camera_fov=camera.fov, sample_count=samples, device=device
-        )
+        self._rays = SensorCamera.compute_camera_rays_pinhole(*size, camera_fov=camera.fov, device=device)
         self._transforms = wp.array([camera.transform] * len(envs), dtype=wp.transformf, device=device)
         self._worlds = wp.array(list(envs), dtype=wp.int32, device=device)
-        self._image = sensor.allocate_image_color(len(envs), width, height)
-        self._clear = SensorCamera.ClearData(clear_color=background)
+        self._image = sensor.allocate_image_color(len(envs), *size)
+        self._clear = SensorCamera.ClearData(clear_color=BACKGROUND)
 
     def draw(self, state: newton.State, config: SensorCamera.RenderConfig) -> np.ndarray:
         """RGB bytes of every world, shape [environments, height, width, 3]."""

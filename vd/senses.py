@@ -21,5 +21,3 @@ class Senses:
     """What the camera sees, base frame [m], NaN for none [N, K, 3]."""
     fresh: torch.Tensor
     """Where an episode begins: where the object was before means nothing; bool [N]."""
-    goal_steps: torch.Tensor
-    """Control steps since the goal was new, int [N]."""

@@ -1,123 +1,50 @@
 """The symmetry frames ("views") of a teacher that sees its goals in them, for those without a simulator.
 
 The simulator keeps a view as long as a goal (:mod:`vd.envs.symmetry`). Here it is chosen anew in every step,
-from the rotation as it is known: a teacher acts as well so, and nothing has to be remembered. F views, O
-values of the observation, D actions. World frame: z up; quaternions xyzw.
+from the rotation as it is known: a teacher acts as well so, and nothing has to be remembered. O values of the
+observation, D actions. World frame: z up; quaternions xyzw.
 """
 
-from typing import Any
-
 import torch
-from torch import nn
 
 from vd.assets_usd.hand_data import HandModel
-from vd.envs.cfg import ObservationCfg, View
-from vd.envs.view_tables import ViewTables, view_tables
-from vd.kernels.task.observations import JOINTS_PER_FINGER, teacher_observation_slices
-
-TERMS = 4
-"""Most values that a value of a view is made of, those of a quaternion."""
-BUFFERS = ("source", "factor", "offset", "joints", "sign", "sector")
-"""What views are made of."""
+from vd.envs.cfg import ObservationCfg
+from vd.envs.view_tables import TERMS, view_tables
+from vd.kernels.task.observations import teacher_observation_slices
 
 
-class ViewMaps(nn.Module):
+class ViewMaps:
     """From observations in the world frame to views, and from actions in views to the world's joints.
 
-    They map nothing to nothing until :meth:`adopt`.
-
     Args:
-        views: F, as many as the hand has fingers, or twice that with those in the mirror.
-        values: O.
-        num_actions: D.
-
-    Attributes:
-        first: Views that :meth:`choose` chooses from, the first ones.
+        hand: The hand.
+        seen: What its teacher observes, and in which views.
+        device: Torch device.
     """
 
-    source: torch.Tensor
-    factor: torch.Tensor
-    offset: torch.Tensor
-    joints: torch.Tensor
-    sign: torch.Tensor
-    sector: torch.Tensor
+    def __init__(self, hand: HandModel, seen: ObservationCfg, device: str | torch.device = "cpu") -> None:
+        def array(values: object, dtype: torch.dtype) -> torch.Tensor:
+            return torch.as_tensor(values).to(device=device, dtype=dtype)
 
-    def __init__(self, views: int, values: int, num_actions: int) -> None:
-        super().__init__()
-        self.first = views
-        self.register_buffer("source", torch.zeros((views, values, TERMS), dtype=torch.long))
-        self.register_buffer("factor", torch.zeros((views, values, TERMS)))
-        self.register_buffer("offset", torch.zeros((views, values)))
-        self.register_buffer("joints", torch.zeros((views, num_actions), dtype=torch.long))
-        self.register_buffer("sign", torch.ones((views, num_actions)))
-        self.register_buffer("sector", torch.zeros((views, 3)))
-        self._turn = teacher_observation_slices(num_actions // JOINTS_PER_FINGER)["relative_orientation"]
-        self._register_load_state_dict_pre_hook(self._complete)
-
-    def __len__(self) -> int:
-        return len(self.sector)
-
-    @property
-    def fingers(self) -> int:
-        """Fingers of the hand: as many as there are views without those in the mirror."""
-        return self.joints.shape[1] // JOINTS_PER_FINGER
-
-    @classmethod
-    def of(cls, hand: HandModel, seen: ObservationCfg, view: View) -> "ViewMaps":
-        """The views of a hand: those of ``view``, of which those of ``seen.view`` are chosen from.
-
-        Args:
-            hand: The hand.
-            seen: What its teacher observes.
-            view: What goals may be seen in.
-        """
-        tables = view_tables(hand, seen, view)
-        views, values = tables.offset.shape
-        maps = cls(views, values, hand.num_joints)
-        maps.adopt(tables)
-        maps.first = seen.views(hand.num_fingers)
-        return maps
-
-    def adopt(self, tables: ViewTables) -> None:
-        """Take over the tables of a hand."""
-        for name in BUFFERS:
-            buffer = getattr(self, name)
-            buffer.copy_(torch.as_tensor(getattr(tables, name), dtype=buffer.dtype))
+        tables = view_tables(hand, seen, seen.view)
+        self._source, self._joints = (array(v, torch.long) for v in (tables.source, tables.joints))
+        self._factor, self._offset, self._sign, self._sector = (
+            array(v, torch.float32) for v in (tables.factor, tables.offset, tables.sign, tables.sector)
+        )
+        self._turn = teacher_observation_slices(hand.num_fingers)["relative_orientation"]
 
     def choose(self, observation: torch.Tensor) -> torch.Tensor:
         """Views [..] of observations [.., O]: the axis of the wanted rotation is in their sector."""
-        return self.nearness(observation)[..., : self.first].argmax(dim=-1)
-
-    def nearness(self, observation: torch.Tensor) -> torch.Tensor:
-        """How near to the middle of each view's sector that axis is [.., F], the larger the nearer."""
         turn = observation[..., self._turn]
         # Observed is the object from the goal; wanted is the other way, by less than half a turn.
         axis = torch.where(turn[..., 3:] < 0.0, turn[..., :3], -turn[..., :3])
-        return axis @ self.sector.T
+        return (axis @ self._sector.T).argmax(dim=-1)
 
     def take(self, observation: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
         """Observations [.., O] as views [..] show them."""
-        values = observation.gather(-1, self.source[view].flatten(-2)).unflatten(-1, (-1, TERMS))
-        return (self.factor[view] * values).sum(dim=-1) + self.offset[view]
+        values = observation.gather(-1, self._source[view].flatten(-2)).unflatten(-1, (-1, TERMS))
+        return (self._factor[view] * values).sum(dim=-1) + self._offset[view]
 
     def world_action(self, action: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
         """Actions [.., D] of views [..] with the joints in the world's order."""
-        return self.sign[view] * action.gather(-1, self.joints[view])
-
-    def world_moments(self, mean: torch.Tensor, std: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and standard deviation of values in the world frame [O], from those in a view [O].
-
-        Every view is taken to be as likely as the others, and its values to be uncorrelated.
-        """
-        views, values, _ = self.source.shape
-        maps = mean.new_zeros((views, values, values)).scatter_add(2, self.source, self.factor)
-        means = torch.einsum("kvw,kv->kw", maps, mean - self.offset)  # maps are orthogonal
-        variance = torch.einsum("kvw,v->kw", maps.square(), std.square()) + means.square()
-        centre = means.mean(dim=0)
-        return centre, (variance.mean(dim=0) - centre.square()).clamp(min=0.0).sqrt()
-
-    def _complete(self, state: dict[str, Any], prefix: str, *_: Any) -> None:
-        """Students from before there were mirrors have neither signs nor offsets."""
-        if prefix + "joints" in state:
-            state.setdefault(prefix + "sign", torch.ones_like(self.sign))
-            state.setdefault(prefix + "offset", torch.zeros_like(self.offset))
+        return self._sign[view] * action.gather(-1, self._joints[view])

@@ -1,12 +1,14 @@
 """Processes for many long tasks of unequal length: one that hangs or dies costs its own task only."""
 
 import os
+import signal
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
-from multiprocessing import connection, get_context
+from multiprocessing import get_context
 from typing import Any
 
 from vd.interrupt import end_with_parent
@@ -15,8 +17,6 @@ SINGLE = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR
 """Variables that keep the linear algebra of a worker to one thread; it reads them when it starts."""
 LONGEST_WAIT_S = 1.0
 """Between two looks at the clock [s]."""
-GRACE_S = 5.0
-"""Time for an idle worker to end by itself [s]."""
 
 
 def one_thread_without_gpu(device: str) -> None:
@@ -29,14 +29,6 @@ def one_thread_without_gpu(device: str) -> None:
 
     if device == "cpu" and SINGLE[0] not in os.environ:
         torch.set_num_threads(1)
-
-
-@dataclass
-class _Worker:
-    process: Any
-    pipe: connection.Connection
-    task: int = -1
-    begun: float = 0.0
 
 
 def run_tasks(
@@ -64,102 +56,63 @@ def run_tasks(
     Returns:
         The tasks left over.
     """
-    end = time.monotonic() + stop_after_s
-    pool = _Pool(work, tasks, finished, limit_s)
+    end, waiting = time.monotonic() + stop_after_s, deque(tasks)
+    # A pool for each process: one that dies takes its pool along.
+    idle = [_worker() for _ in range(min(jobs, len(tasks)))]
+    running: dict[Future[Any], tuple[Any, ProcessPoolExecutor, float]] = {}
     try:
         with _environment(gpu):
-            for _ in range(min(jobs, len(tasks))):
-                pool.start()
-            while pool.busy and time.monotonic() < end:
-                pool.look()
-        return len(pool.waiting) + len(pool.busy)
+            while (waiting or running) and time.monotonic() < end:
+                while idle and waiting:
+                    worker, task = idle.pop(), waiting.popleft()
+                    running[worker.submit(work, task)] = task, worker, time.monotonic()
+                wait(running, LONGEST_WAIT_S, FIRST_COMPLETED)
+                for future, (task, worker, begun) in list(running.items()):
+                    if future.done() or time.monotonic() - begun > limit_s:
+                        del running[future]
+                        idle.append(_end(future, task, worker, finished, limit_s))
+        return len(waiting) + len(running)
     finally:
-        pool.stop()
+        for worker in (*idle, *(worker for _, worker, _ in running.values())):
+            _kill(worker)
 
 
-class _Pool:
-    """The workers of :func:`run_tasks`, whose arguments it takes, and the tasks that wait for them."""
-
-    def __init__(
-        self,
-        work: Callable[[Any], Any],
-        tasks: Sequence[Any],
-        finished: Callable[[Any, Any, str], None],
-        limit_s: float,
-    ):
-        self.waiting = deque(range(len(tasks)))
-        self._work, self._tasks, self._finished, self._limit_s = work, tasks, finished, limit_s
-        self._workers: list[_Worker] = []
-        self._context = get_context("spawn")  # Warp and a CUDA context do not survive a fork
-
-    @property
-    def busy(self) -> list[_Worker]:
-        """Workers that have a task."""
-        return [worker for worker in self._workers if worker.task >= 0]
-
-    def start(self) -> None:
-        """Start a worker and give it a task."""
-        mine, theirs = self._context.Pipe()
-        process = self._context.Process(target=_serve, args=(self._work, theirs, os.getpid()), daemon=True)
-        process.start()
-        theirs.close()
-        self._workers.append(_Worker(process, mine))
-        self._give(self._workers[-1])
-
-    def look(self) -> None:
-        """Wait for workers that have finished or died, at most ``LONGEST_WAIT_S``, and for those too slow."""
-        busy = self.busy
-        ready = connection.wait([worker.pipe for worker in busy], LONGEST_WAIT_S)
-        for worker in busy:
-            if worker.pipe in ready:
-                self._receive(worker)
-            elif time.monotonic() - worker.begun > self._limit_s:
-                self._replace(worker, f"it took longer than {self._limit_s:.0f} s")
-
-    def stop(self) -> None:
-        """End all workers, those at work at once."""
-        for worker in self.busy:
-            worker.process.kill()
-        for worker in self._workers:
-            worker.pipe.close()  # an idle worker ends when it sees this
-        for worker in self._workers:
-            worker.process.join(GRACE_S)
-            if worker.process.is_alive():
-                worker.process.kill()
-
-    def _give(self, worker: _Worker) -> None:
-        worker.task, worker.begun = self.waiting.popleft(), time.monotonic()
-        worker.pipe.send(self._tasks[worker.task])
-
-    def _receive(self, worker: _Worker) -> None:
-        try:
-            result = worker.pipe.recv()
-        except (EOFError, OSError):
-            self._replace(worker, "its process died: out of memory, or killed")
-            return
-        self._finished(self._tasks[worker.task], result, "")
-        worker.task = -1
-        if self.waiting:
-            self._give(worker)
-
-    def _replace(self, worker: _Worker, why: str) -> None:
-        worker.process.kill()
-        worker.process.join()
-        worker.pipe.close()
-        self._workers.remove(worker)
-        self._finished(self._tasks[worker.task], None, why)
-        if self.waiting:
-            self.start()
+def _worker() -> ProcessPoolExecutor:
+    """One process, which starts with its first task."""
+    context = get_context("spawn")  # Warp and a CUDA context do not survive a fork
+    return ProcessPoolExecutor(1, mp_context=context, initializer=_begin, initargs=(os.getpid(),))
 
 
-def _serve(work: Callable[[Any], Any], pipe: connection.Connection, parent: int) -> None:
-    """A worker: tasks in, results out, until the other end closes."""
+def _begin(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and end with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent(parent)
-    try:
-        while True:
-            pipe.send(work(pipe.recv()))
-    except (EOFError, OSError, KeyboardInterrupt):
-        return
+
+
+def _end(
+    future: Future[Any],
+    task: Any,
+    worker: ProcessPoolExecutor,
+    finished: Callable[[Any, Any, str], None],
+    limit_s: float,
+) -> ProcessPoolExecutor:
+    """Tell what became of a task that is done or too slow; returns the worker, or one in its place."""
+    why = f"it took longer than {limit_s:.0f} s"
+    if future.done():
+        try:
+            finished(task, future.result(), "")
+            return worker
+        except BrokenProcessPool:
+            why = "its process died: out of memory, or killed"
+    _kill(worker)
+    finished(task, None, why)
+    return _worker()
+
+
+def _kill(worker: ProcessPoolExecutor) -> None:
+    for process in list((worker._processes or {}).values()):
+        process.kill()
+    worker.shutdown(wait=False, cancel_futures=True)
 
 
 @contextmanager

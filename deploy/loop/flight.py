@@ -66,7 +66,6 @@ def make_flight(
     item: ObjectModel,
     *,
     tolerance_rad: float = PAPER.success.rotation_rad,
-    second_view: bool = False,
     seed: int = 0,
 ) -> Flight:
     """Load a policy, and make it ready.
@@ -78,16 +77,12 @@ def make_flight(
         hand: The hand.
         item: The object.
         tolerance_rad: How near to the goal it is to stop [rad].
-        second_view: Whether goals that are not reached are looked at in other views
-            (:mod:`vd.evaluate.second_view`).
         seed: Of the choice of camera points.
 
     Raises:
-        ValueError: It is for another hand, or cannot act, or has no second view.
+        ValueError: It is for another hand, or cannot act.
     """
     if name == STILL:
-        if second_view:
-            raise ValueError(f"--second-view is for policies; {STILL} does nothing")
         return Flight(name, STILL, StillPilot(hand.num_joints), ReorientCfg(hand=hand_name))
     policy: Any = open_policy(name, "cpu")
     if policy is None:
@@ -100,13 +95,9 @@ def make_flight(
     if student or is_tracking_policy(policy):
         pilot: StudentPilot | TrackingPilot
         if student:
-            if second_view:
-                raise ValueError(f"--second-view: {name} is a student, which has no views to select")
             pilot = StudentPilot(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
         else:
-            pilot = TrackingPilot(
-                policy, hand, item, tolerance_rad=tolerance_rad, second_view=second_view, seed=seed
-            )
+            pilot = TrackingPilot(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
         return Flight(
             name,
             "student" if student else "tracking",
@@ -116,12 +107,12 @@ def make_flight(
             needs_truth=pilot.camera is None,
             calibrated=policy.spec.calibrated_for(tolerance_rad),
         )
-    task = mirror_task(policy, hand_name, item_name, second_view=second_view)
-    teacher = TeacherPilot(policy, Mirror(task), tolerance_rad, second_view=second_view)
+    task = mirror_task(policy, hand_name, item_name)
+    teacher = TeacherPilot(policy, Mirror(task), tolerance_rad)
     return Flight(name, "teacher", teacher, task, needs_truth=True)
 
 
-def mirror_task(policy: Any, hand_name: str, item_name: str, *, second_view: bool = False) -> ReorientCfg:
+def mirror_task(policy: Any, hand_name: str, item_name: str) -> ReorientCfg:
     """The environment of a policy's training as a mirror takes it: one world, not randomised."""
     return task_for(
         policy,
@@ -135,7 +126,6 @@ def mirror_task(policy: Any, hand_name: str, item_name: str, *, second_view: boo
         randomised=False,
         success_ends_episode=False,
         at_rest=False,
-        second_view=second_view,
     )
 
 

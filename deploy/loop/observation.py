@@ -48,20 +48,13 @@ def seen_points(cloud: CameraCloud, depth: np.ndarray | None) -> torch.Tensor:
     return seen
 
 
-def senses_of(
-    sensed: Sensed,
-    points: torch.Tensor,
-    *,
-    fresh: torch.Tensor | None = None,
-    goal_steps: torch.Tensor | None = None,
-) -> Senses:
+def senses_of(sensed: Sensed, points: torch.Tensor, *, fresh: torch.Tensor | None = None) -> Senses:
     """What a policy that sees by a camera is told of one hand.
 
     Args:
         sensed: What is known.
         points: What its camera sees [1, K, 3].
         fresh: Whether an episode begins [1]; not by default.
-        goal_steps: Control steps since the goal was new [1]; one by default.
     """
 
     def row(values: np.ndarray) -> torch.Tensor:
@@ -74,5 +67,4 @@ def senses_of(
         goal_quat=row(sensed.goal_quat),
         points=points,
         fresh=torch.zeros(1, dtype=torch.bool) if fresh is None else fresh,
-        goal_steps=torch.ones(1, dtype=torch.int32) if goal_steps is None else goal_steps,
     )

@@ -13,7 +13,6 @@ from vd.config import from_dict
 from vd.deploy.loop.mirror import Mirror, TeacherSight
 from vd.deploy.loop.observation import Sensed, seen_points, senses_of
 from vd.evaluate.agents import is_saved_student, is_tracking_policy
-from vd.evaluate.second_view import SecondView
 from vd.evaluate.student import PRETRAINED, RENDERED
 from vd.paper import PAPER
 from vd.policy import TrainedPolicy
@@ -118,8 +117,8 @@ class StudentPilot:
         """Mean action and predicted distance."""
         with torch.inference_mode():
             seen = self.frame(sensed)
-            sites = self.sight.sites(seen)
-            output = self._network.act(sites[0], self._network.senses(seen), self._hidden, *sites[1:])
+            known = self._network.proprioception(seen)
+            output = self._network.act(self.sight.sites(seen), known, self._hidden)
         self._hidden = output.hidden
         return Decision(output.mean[0].numpy().copy(), float(output.distance[0, -1]))
 
@@ -132,7 +131,6 @@ class TrackingPilot:
         hand: The hand.
         item: The object.
         tolerance_rad: How near to the goal it is to stop [rad].
-        second_view: Select symmetry views by its teacher's critic.
         seed: Of the choice of camera points.
 
     Attributes:
@@ -149,14 +147,12 @@ class TrackingPilot:
         item: ObjectModel,
         *,
         tolerance_rad: float = PAPER.success.rotation_rad,
-        second_view: bool = False,
         seed: int = 0,
     ):
         self.rule, depth = policy.spec.rule_for(tolerance_rad), policy.spec.depth
         self._cloud = partial(CameraCloud, points=depth.points, crop_m=depth.crop_m, seed=seed)
-        self._tracker_of = partial(Tracker, policy, hand, [item], second_view=second_view)
+        self._tracker_of = partial(Tracker, policy, hand, [item])
         self._fresh = torch.ones(1, dtype=torch.bool)
-        self._goal_steps = torch.zeros(1, dtype=torch.int32)
         self.look_by(hand.camera.at(policy.spec.camera))
 
     def look_by(self, camera: CameraModel) -> None:
@@ -170,15 +166,13 @@ class TrackingPilot:
 
     def new_goal(self) -> None:
         """A new goal; the object is followed on."""
-        self._goal_steps.zero_()
 
     def decide(self, sensed: Sensed) -> Decision:
         """Mean action, and the angle that was found."""
         points = seen_points(self._eye, sensed.depth)
-        senses = senses_of(sensed, points, fresh=self._fresh, goal_steps=self._goal_steps)
+        senses = senses_of(sensed, points, fresh=self._fresh)
         decided = self._tracker.step(senses)
         self._fresh.fill_(False)
-        self._goal_steps.add_(1)
         return Decision(decided.action[0].numpy().copy(), float(decided.angle[0]))
 
 
@@ -189,10 +183,6 @@ class TeacherPilot:
         policy: The teacher.
         mirror: A world of its training.
         tolerance_rad: How near to the goal it is to stop [rad].
-        second_view: Look twice at goals (:mod:`vd.evaluate.second_view`), in a mirror that has other views.
-
-    Raises:
-        ValueError: It is to look twice, and has no critic, or its mirror no other view.
     """
 
     def __init__(
@@ -200,11 +190,9 @@ class TeacherPilot:
         policy: TrainedPolicy,
         mirror: Mirror,
         tolerance_rad: float = PAPER.success.rotation_rad,
-        *,
-        second_view: bool = False,
     ):
         self.rule = StoppingRule(tolerance_rad)
-        self._sight = TeacherSight(SecondView(mirror.env, policy) if second_view else policy, mirror)
+        self._sight = TeacherSight(policy, mirror)
 
     def begin(self) -> None:
         """A teacher remembers nothing; its goal is a new one."""

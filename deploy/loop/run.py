@@ -75,8 +75,6 @@ class RunCfg(HandOptions):
     """How long the hand holds still between goals [s]."""
     precise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Stop within 0.1 rad rather than 0.4, as the paper's precise variant does: fewer goals, nearer."""
-    second_view: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Where a goal is not reached in 3 s, look at it in other views (vd-eval --help): more goals."""
     in_air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Take the twin's table away after 2 s, as the paper's test in the air does."""
     realistic: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -150,7 +148,6 @@ def run(cfg: RunCfg) -> int:
         hand,
         item,
         tolerance_rad=cfg.tolerance_rad,
-        second_view=cfg.second_view,
         seed=cfg.seed,
     )
     if cfg.precise and not flight.calibrated:
@@ -290,7 +287,6 @@ def _description(
         "control_hz": flight.task.sim.control_hz,
         "stopping": vars(flight.pilot.rule),
         "tolerance_rad": cfg.tolerance_rad,
-        "second_view": cfg.second_view,
         "action": vars(flight.task.action),
     }
 

@@ -12,8 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from vd.deploy.loop.mocap import Mocap, MocapError
-from vd.evaluate.result import TOLERANCES_RAD
-from vd.evaluate.statistics import Interval, median_interval, rate_intervals, symmetric_error
+from vd.evaluate.statistics import TOLERANCES_RAD, Interval, median_interval, rate_intervals, symmetric_error
 from vd.hand_log import HandLog
 
 NEAR_S = 0.1

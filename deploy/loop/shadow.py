@@ -143,7 +143,7 @@ class Shadow:
         self._mirror.take(sensed)
         # The simulator looks for the object anew where an episode begins.
         wp.to_torch(env.step_count).fill_(self._compared)
-        steps = torch.full((1,), self._compared, dtype=torch.int32)
+        fresh = torch.full((1,), self._compared == 0)
         self._compared += 1
         pixels, found_rad = None, None
         if image is None:
@@ -152,7 +152,7 @@ class Shadow:
             points, shown = seen_points(self._eye, image), self._simulated.read()
             pixels = self._pixels(image)
             self._theirs(shown)
-        observed, _ = self._ours(senses_of(sensed, points, fresh=steps == 0, goal_steps=steps))
+        observed, _ = self._ours(senses_of(sensed, points, fresh=fresh))
         if image is not None:
             found_rad = self._found_apart()
         apart = observed - wp.to_torch(env.world_observation)[:, : observed.shape[1]]

@@ -3,14 +3,16 @@
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import cast
 
 import tyro
 
 from vd import interrupt
-from vd.train.student.build import build_student, default_init
-from vd.train.student.config import PRESETS, PRETRAINING, Stage, StudentTrainCfg
+from vd.train.flags import normalise, saved_config, value_of
+from vd.train.student.build import build_student
+from vd.train.student.config import PRESETS, PRETRAINING, STUDENT_NAME, Stage, StudentTrainCfg
 
 HELP = """Train the student: imitate the teacher from point clouds.
 
@@ -19,8 +21,8 @@ those of a depth camera. Flags start from --preset and --stage, or with --resume
 the network from --init. Short forms: --objects, --num-envs and --seed stand for --task.objects and so on.
 Ctrl-C saves."""
 
-SHORT_FORMS = ("objects", "num-envs", "seed")
-"""Fields of the task that are flags without the ``--task.`` prefix too."""
+SHORT_FORMS = {name: f"task.{name}" for name in ("objects", "num-envs", "seed")}
+"""Flags that are short for others."""
 
 
 def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
@@ -33,9 +35,7 @@ def parse_student(arguments: Sequence[str]) -> StudentTrainCfg:
         FileNotFoundError: ``--resume`` or ``--init`` name what is not there.
         ValueError: What they name is not of this version.
     """
-    from vd.train.flags import normalise, saved_config, value_of
-
-    arguments = normalise(arguments, SHORT_FORMS, "task")
+    arguments = normalise(arguments, SHORT_FORMS)
     preset, stage = value_of(arguments, "--preset") or "gpu", value_of(arguments, "--stage") or "1"
     # The second pass refuses unknown names.
     number = cast(Stage, int(stage)) if stage in ("0", "1", "2") else 1
@@ -54,32 +54,22 @@ def student_command(arguments: list[str], started: float) -> int:
     from vd.evaluate.agents import check_names
 
     check_names([] if cfg.teacher is None else [cfg.teacher], cfg.task.objects)
-    from vd.train.cli import print_damaged
-    from vd.train.ending import finished
-    from vd.train.progress import waiting
+    from vd.train.progress import BUILDING
 
     main_process = os.environ.get("RANK", "0") == "0"
-    with waiting(
-        "building the environments (the first start compiles the kernels: a minute or two)", main_process
-    ):
-        runner = build_student(cfg, started=started)
-    folder = cfg.run.out
-    if main_process:
-        print_damaged(runner.damaged)
-    if main_process and runner.iteration:
-        print(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
+    folder, say = cfg.run.out, partial(print, flush=True) if main_process else (lambda _: None)
+    say(BUILDING)
+    runner = build_student(cfg, started=started)
+    if runner.iteration:
+        say(f"resumed after iteration {runner.iteration} of {runner.total_iterations}")
         if runner.new_episodes:
-            print(f"episodes start anew, the checkpoint does not fit the environments: {runner.new_episodes}")
-    elif main_process and cfg.init is not None:
-        print(f"begins with the weights of {cfg.init}")
-    whole = finished(runner.learn, runner.learner.close, distributed=runner.is_distributed)
-    runner.shutdown()
-    if not whole:
-        if main_process:
-            print(f"saved in {folder}; go on with: vd-train student --out {folder} --resume")
+            say(f"episodes start anew, the checkpoint does not fit the environments: {runner.new_episodes}")
+    elif cfg.init is not None:
+        say(f"begins with the weights of {cfg.init}")
+    if not runner.run_to_end():
+        say(f"saved in {folder}; go on with: vd-train student --out {folder} --resume")
         return interrupt.INTERRUPTED
-    if main_process:
-        print(f"done: {folder}/student.pt is the student, vd-train curves {folder} draws the curves")
+    say(f"done: {folder}/{STUDENT_NAME} is the student, vd-train curves {folder} draws the curves")
     return 0
 
 
@@ -88,14 +78,10 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
 
     A pre-trained one has an encoder to give, whatever else it needed to be trained.
     """
-    from vd.train.flags import value_of
-
-    given, run_dir = value_of(arguments, "--init"), value_of(arguments, "--out")
-    if given is None and "--from-scratch" in arguments:
+    given = value_of(arguments, "--init")
+    if given is None:
         return base
-    path = Path(given) if given else default_init(base.stage, Path(run_dir) if run_dir else base.run.out)
-    if path is None:
-        return base
+    path = Path(given)
     from vd.vision.saved import read_student, saved_spec
 
     spec = saved_spec(read_student(path), path)
@@ -103,8 +89,7 @@ def _with_init(arguments: list[str], base: StudentTrainCfg) -> StudentTrainCfg:
     assert camera is None or len(camera) == 7
     network = spec.network
     if spec.stage == PRETRAINING:
-        sees = {name: getattr(network, name) for name in ("encoder", "voxel_m", "goal")}
-        network = replace(base.network, **sees)
+        network = replace(base.network, encoder=network.encoder, voxel_m=network.voxel_m)
     return replace(
         base, init=path, network=network, camera=camera, teacher=base.teacher or spec.teacher or None
     )

@@ -3,8 +3,8 @@
 T steps, N environments, D actions, G the student's memory.
 """
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -20,7 +20,7 @@ class Rollout:
     frames: dict[str, torch.Tensor]
     """Frames before each step, tensors [T, N, ...]."""
     label: torch.Tensor
-    """The teacher's mean action of each state [T, N, D], or one in each of its views [T, N, F, D]."""
+    """The teacher's mean action of each state [T, N, D]."""
     done: torch.Tensor
     """Where the goal or the episode ended with the step [T, N], bool."""
     hidden: torch.Tensor
@@ -28,15 +28,26 @@ class Rollout:
     envs: torch.Tensor
     """World of each sequence [N]."""
 
+    def state_dict(self) -> dict[str, Any]:
+        """Its tensors, on the CPU."""
+        return _moved({field.name: getattr(self, field.name) for field in fields(self)}, "cpu")
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any], device: torch.device) -> "Rollout":
+        """What :meth:`state_dict` gave, on ``device``."""
+        return cls(**_moved({field.name: state[field.name] for field in fields(cls)}, device))
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of its frames, which are nearly all of it."""
+        return sum(frame.nbytes for frame in self.frames.values())
+
 
 def taken(rollouts: Sequence[Rollout], sequences: torch.Tensor) -> Rollout:
     """Some sequences of rollouts of N environments each, as one: k N + n is sequence n of rollout k."""
     envs = len(rollouts[0].envs)
-    parts = []
-    for index, rollout in enumerate(rollouts):
-        own = sequences[sequences // envs == index] - index * envs if len(rollouts) > 1 else sequences
-        if len(own):
-            parts.append((rollout, own))
+    parts = [(r, sequences[sequences // envs == k] - k * envs) for k, r in enumerate(rollouts)]
+    parts = [(rollout, own) for rollout, own in parts if len(own)]
     return Rollout(
         {name: torch.cat([r.frames[name][:, own] for r, own in parts], dim=1) for name in rollouts[0].frames},
         torch.cat([r.label[:, own] for r, own in parts], dim=1),
@@ -46,16 +57,8 @@ def taken(rollouts: Sequence[Rollout], sequences: torch.Tensor) -> Rollout:
     )
 
 
-def rollout_bytes(rollout: Rollout) -> int:
-    """Memory of a rollout's tensors."""
-    tensors = (*rollout.frames.values(), rollout.label, rollout.done, rollout.hidden)
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors)
-
-
-def moved(rollout: Rollout | dict[str, Any], device: str | torch.device) -> dict[str, Any]:
-    """A rollout, or the dictionary of one, as a dictionary of tensors on ``device``."""
-    values = rollout if isinstance(rollout, dict) else asdict(rollout)
+def _moved(values: Mapping[str, Any], device: str | torch.device) -> dict[str, Any]:
     return {
-        name: moved(value, device) if isinstance(value, dict) else value.to(device)
+        name: _moved(value, device) if isinstance(value, Mapping) else value.to(device)
         for name, value in values.items()
     }

@@ -2,8 +2,8 @@
 
 import dataclasses
 import json
-import math
 import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,75 +16,67 @@ from vd.files import check_file, check_folder
 from vd.warp_quiet import quiet_warp
 
 
+def report(rows: Iterable[dict[str, Any]], device: str, path: Path | None) -> None:
+    """Print rows as they come, a line of JSON each, and write a file after each: the next may fail."""
+    import warp as wp
+
+    from vd.files import write_json
+
+    done = []
+    for row in rows:
+        done.append(row)
+        print(json.dumps(row), flush=True)
+        if path:
+            write_json(path, {"device": str(wp.get_device(device).name), "rows": done})
+
+
 @dataclass(frozen=True)
 class SimCommand:
     """Control steps per second, memory and start-up of the simulation under a policy's actions."""
 
     envs: tuple[int, ...] = (4096, 8192, 16384)
-    """World counts to measure."""
+    """Numbers of environments to measure."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets, mixed over the environments."""
-    hand: str = "dclaw4"
-    """Hand."""
     device: str = "auto"
     """Warp device; auto is the first GPU, or else the CPU."""
-    randomise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Domain randomisation on."""
-    policy: str | None = None
-    """Name or file of a teacher whose mean actions are taken, in the task it was trained in (hand and
-    randomisation are then that task's); by default a network with random weights closes the hand now and
-    then."""
-    kernels: int = 0
-    """On a GPU list as many kernels, those that take the most time of a control step."""
-    allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = True
-    """Also step Newton's own Allegro example at the same world counts, with a hand of boxes of that size."""
-    fetch_allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Let Newton download that example's own hand (17.8 MB) in place of the boxes."""
-    allegro_file: Path | None = None
-    """URDF of an Allegro hand for that example in place of its asset."""
+    policy: str = "dclaw4-table"
+    """Name or file of a teacher whose mean actions are taken, in the task it was trained in."""
+    allegro: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Also step Newton's own Allegro example with as many environments; it downloads its hand (17.8 MB)."""
     json: Path | None = None
     """Write the rows to this file as JSON."""
 
     def run(self) -> int:
         """Measure and print."""
-        import warp as wp
+        from vd.evaluate.agents import open_teacher
 
-        from vd.bench.allegro import allegro_rate
-        from vd.bench.sim import measure, task, teacher_task
-        from vd.evaluate.agents import find_policy
-        from vd.policy import load_policy
-
-        quiet_warp()
         device = resolve_device(self.device)
-        teacher = None if self.policy is None else load_policy(find_policy(self.policy), device)
-        rows: list[dict[str, Any]] = []
-        for envs in self.envs:
-            if teacher is None:
-                cfg = task(self.objects, envs, self.hand, self.randomise)
-            else:
-                cfg = teacher_task(teacher, self.objects, envs)
-            row = measure(cfg, device, teacher=teacher)
-            record: dict[str, Any] = dataclasses.asdict(row)
-            record["kernels"] = record["kernels"][: self.kernels]
-            substeps = cfg.sim.substeps
-            if self.allegro:
-                try:
-                    beside = allegro_rate(envs, device, file=self.allegro_file, fetch=self.fetch_allegro)
-                    record["allegro_hand"] = beside.hand
-                    record["allegro_physics_steps_s"] = beside.physics_steps_s
-                    record["allegro_dt_s"] = beside.dt_s
-                    record["physics_steps_over_allegro"] = (
-                        row.physics_only * substeps / beside.physics_steps_s
-                    )
-                except RuntimeError as error:
-                    record["allegro"] = str(error)
-            rows.append(record)
-            print(json.dumps(record), flush=True)
-        if self.json:
-            from vd.files import write_json
-
-            write_json(self.json, {"device": str(wp.get_device(device).name), "rows": rows})
+        teacher = open_teacher(self.policy, device)
+        if teacher is None:
+            raise ValueError(f"--policy {self.policy} has no network; give a teacher")
+        quiet_warp()
+        report((self._row(envs, device, teacher) for envs in self.envs), device, self.json)
         return 0
+
+    def _row(self, envs: int, device: str, teacher: Any) -> dict[str, Any]:
+        from vd.bench.allegro import allegro_rate
+        from vd.bench.sim import measure, teacher_task
+
+        cfg = teacher_task(teacher, self.objects, envs)
+        row: dict[str, Any] = dataclasses.asdict(measure(cfg, device, teacher=teacher))
+        if not self.allegro:
+            return row
+        try:
+            beside = allegro_rate(envs, device)
+        except RuntimeError as error:
+            return row | {"allegro": str(error)}
+        ratio = row["physics_only"] * cfg.sim.substeps / beside.physics_steps_s
+        return row | {
+            "allegro_physics_steps_s": beside.physics_steps_s,
+            "allegro_dt_s": beside.dt_s,
+            "physics_steps_over_allegro": ratio,
+        }
 
 
 RESTITUTIONS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -106,32 +98,27 @@ class PhysicsCommand:
 
     def run(self) -> int:
         """Measure and print."""
+        quiet_warp()
         from vd.assets_usd.objects.sets import load_set
         from vd.bench.physics import bounce, pinch, rest, slide
         from vd.sim.cfg import SimCfg
 
-        quiet_warp()
         cfg = SimCfg()
         results = rest(load_set(list(self.objects)), cfg, device=self.device, seed=self.seed)
         moving = [r for r in results if not r.rests]
-        held = pinch(load_set("cube")[0], cfg, device=self.device)
         measured, coulomb = slide(cfg, device=self.device)
-        report = {
+        row = {
             "objects": len(results),
             "at_rest_share": 1.0 - len(moving) / len(results),
             "deepest_contact_m": max(r.penetration for r in results),
             "moving": [dataclasses.asdict(r) for r in moving],
-            "pinch": dataclasses.asdict(held),
+            "pinch": dataclasses.asdict(pinch(load_set("cube")[0], cfg, device=self.device)),
             "slide_m": measured,
             "slide_coulomb_m": coulomb,
             "slide_bouncing_m": slide(cfg, device=self.device, restitution=1.0)[0],
             "bounce": [dataclasses.asdict(bounce(cfg, e, device=self.device)) for e in RESTITUTIONS],
         }
-        print(json.dumps(report, indent=1))
-        if self.json:
-            from vd.files import write_json
-
-            write_json(self.json, report)
+        report([row], self.device, self.json)
         return 0
 
 
@@ -140,7 +127,7 @@ class DepthCommand:
     """Depth images and clouds per second, beside Newton's camera at the same size in the same run."""
 
     envs: tuple[int, ...] = (256, 1024, 4096)
-    """World counts to measure; 1 for the figure at deployment on a CPU."""
+    """Numbers of environments to measure; 1 for the figure at deployment on a CPU."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets, mixed over the environments."""
     hand: str = "dclaw4"
@@ -154,45 +141,30 @@ class DepthCommand:
 
     def run(self) -> int:
         """Measure and print."""
-        import warp as wp
-
+        quiet_warp()
         from vd.assets_usd.objects.sets import load_set
         from vd.bench.depth import measure
-        from vd.files import write_json
 
-        quiet_warp()
-        device = resolve_device(self.device)
-        objects = load_set(list(self.objects))
-        rows: list[dict[str, Any]] = []
-        for envs in self.envs:
-            row = dataclasses.asdict(measure(objects, envs, device, hand=self.hand, seed=self.seed))
-            rows.append(row)
-            print(json.dumps(row), flush=True)
-            if self.json:  # after each row: a later one may not fit the device
-                write_json(self.json, {"device": str(wp.get_device(device).name), "rows": rows})
+        device, objects = resolve_device(self.device), load_set(list(self.objects))
+        rows = (measure(objects, envs, device, hand=self.hand, seed=self.seed) for envs in self.envs)
+        report(map(dataclasses.asdict, rows), device, self.json)
         return 0
 
 
 @dataclass(frozen=True)
 class StudentCommand:
-    """Latency of a camera policy's control step on the CPU, and on a GPU a student's clouds per second."""
+    """Latency of a camera policy's control step on the CPU."""
 
-    networks: tuple[str, ...] = ("lean", "paper")
-    """Presets to measure; for the latency also camera policies, installed ones by name, or their files."""
+    networks: tuple[str, ...] = ("lean", "dclaw4-tracking")
+    """Camera policies, installed ones by name, or their files; or presets of students."""
     objects: tuple[str, ...] = ("procedural-150-seed0",)
-    """Object sets."""
+    """Object sets, of which the first object lies on the table."""
     hand: str = "dclaw4"
-    """Hand."""
-    device: str = "auto"
-    """Device of the training rows: auto is the first GPU, none without one; cpu for a few clouds there."""
+    """Hand of a preset."""
     threads: int = 2
-    """Threads of torch for the latency on the CPU."""
-    half: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Encoder in bfloat16 for the latency: for processors that multiply in it."""
+    """Threads of torch."""
     calls: int = 300
-    """Control steps to time; 0 leaves the latency out."""
-    envs: tuple[int, ...] = (10, 40)
-    """Sequences of a minibatch, 80 steps each."""
+    """Control steps to time."""
     seed: int = 0
     """Of poses and weights."""
     json: Path | None = None
@@ -200,11 +172,10 @@ class StudentCommand:
 
     def run(self) -> int:
         """Measure and print."""
-        from vd.evaluate.agents import find_policy
+        from vd.evaluate.agents import find_policy, open_policy
         from vd.vision.cfg import PRESETS
 
-        presets = [name for name in self.networks if name in PRESETS]
-        for name in (name for name in self.networks if name not in presets):
+        for name in (name for name in self.networks if name not in PRESETS):
             try:
                 find_policy(name)
             except FileNotFoundError as error:
@@ -212,44 +183,19 @@ class StudentCommand:
                     f"--networks {name}: no such preset or policy; choose of {', '.join(PRESETS)}, or give "
                     "a camera policy"
                 ) from error
-        import warp as wp
-
-        from vd.assets_usd.objects.sets import load_set
-        from vd.bench.student import measure_latency, measure_training
-        from vd.files import write_json
-
+            open_policy(name, "cpu")  # a file that cannot be used is told before anything slow
         quiet_warp()
-        device = resolve_device(self.device)
+        from vd.assets_usd.objects.sets import load_set
+        from vd.bench.student import measure_latency
+
         objects = load_set(list(self.objects))
-        rows: dict[str, list[dict[str, Any]]] = {"latency": [], "training": []}
-
-        def add(kind: str, row: Any) -> None:
-            rows[kind].append(dataclasses.asdict(row))
-            print(json.dumps(rows[kind][-1]), flush=True)
-            if self.json:  # after each row: a later one may not fit the device
-                write_json(self.json, {"device": str(wp.get_device(device).name), **rows})
-
-        for name in self.networks if self.calls else ():
-            add(
-                "latency",
-                measure_latency(
-                    objects,
-                    name,
-                    hand=self.hand,
-                    threads=self.threads,
-                    half=self.half,
-                    calls=self.calls,
-                    seed=self.seed,
-                ),
+        rows = (
+            measure_latency(
+                objects, name, hand=self.hand, threads=self.threads, calls=self.calls, seed=self.seed
             )
-        training = device != "cpu" or self.device == "cpu"
-        for name in presets if training else ():
-            for envs in self.envs:
-                for half in (True, False):
-                    row = measure_training(
-                        objects, name, device, hand=self.hand, envs=envs, half=half, seed=self.seed
-                    )
-                    add("training", row)
+            for name in self.networks
+        )
+        report(map(dataclasses.asdict, rows), "cpu", self.json)
         return 0
 
 
@@ -264,9 +210,9 @@ class ReplayCommand:
 
     def run(self) -> int:
         """Replay and print."""
+        quiet_warp()
         from vd.sim.replay import replay
 
-        quiet_warp()
         for line in replay(self.dump, device=self.device):
             print(line)
         return 0
@@ -276,12 +222,12 @@ class ReplayCommand:
 class GapCommand:
     """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
 
-    One result file per case: run it again to go on, give --shard on each machine, then --merge and --collect
-    for the figures. rows.csv has all results in little space, to go on from elsewhere or later.
+    One result file per case: run it again to go on. Give --shard on each machine, bring the files together,
+    and --collect makes the figures.
     """
 
     out: Path = Path("runs/gap-battery")
-    """Folder of the results, of all in one table (rows.csv), figures (summary.json) and tables."""
+    """Folder of the results, their figures (summary.json) and tables (summary.md)."""
     model: str = "dclaw3"
     """dclaw3 or dclaw4 (one finger), or servo or pendulum, which are quick."""
     kinds: tuple[str, ...] = ("single", "none", "pair", "outside")
@@ -298,20 +244,12 @@ class GapCommand:
     """Recordings with nothing hidden, or only other stiffness, damping and mass."""
     pairs: int | None = None
     """Pairs of effects, drawn at random; all by default."""
-    pair_size: int = 2
-    """Size of both effects of a pair."""
     shard: str = "1/1"
     """Part i/n of the cases, for n machines."""
-    backwards: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Begin with the last case: two machines meet wherever they are when the time is over."""
-    merge: tuple[Path, ...] = ()
-    """Results from elsewhere, folders or their rows.csv: their cases are not run again."""
     jobs: int = 1
     """Cases at a time, one process and one thread each."""
     limit_s: float = 1800.0
     """Longest time of a case [s]; one that takes longer has failed."""
-    stop_after_s: float = math.inf
-    """Time [s] after which to end, with the figures of what is done; run it again to go on."""
     device: str = "cpu"
     """Warp device."""
     collect: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -321,10 +259,9 @@ class GapCommand:
 
     def run(self) -> int:
         """Run the cases, then write and print the tables."""
-        from vd.bench.gap import battery, collect, parse_shard, run_battery, take_over
-        from vd.bench.gap_rows import write_rows
+        from vd.bench.gap import battery, collect, parse_shard, run_battery
         from vd.bench.gap_score import markdown, summary
-        from vd.files import make_folder, write_json, write_text
+        from vd.files import write_json, write_text
 
         cases = battery(
             self.model,
@@ -335,11 +272,7 @@ class GapCommand:
             first_seed=self.first_seed,
             nothing=self.nothing,
             pairs=self.pairs,
-            pair_size=self.pair_size,
         )
-        if self.merge:
-            make_folder(self.out)
-            print(f"{take_over(self.merge, self.out)} results taken over")
         if not self.collect:
             device = resolve_device(self.device)
             shard = parse_shard(self.shard)
@@ -347,17 +280,14 @@ class GapCommand:
                 cases,
                 self.out,
                 shard=shard,
-                backwards=self.backwards,
                 jobs=max(self.jobs, 1),
                 device=device,
                 keep=self.keep,
                 limit_s=self.limit_s,
-                stop_after_s=self.stop_after_s,
             )
         results = collect(self.out)
         if not results:
             raise ValueError(f"{self.out} holds no results; run the battery without --collect first")
-        write_rows(self.out / "rows.csv", results)
         write_json(self.out / "summary.json", summary(results))
         write_text(self.out / "summary.md", markdown(results))
         print(markdown(results))
@@ -375,18 +305,19 @@ Command = (
 
 
 @interrupt.command("vd-bench")
-def main() -> None:
-    """Entry point of ``vd-bench``."""
-    command = tyro.cli(Command, prog="vd-bench", description=__doc__)
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``vd-bench``; returns the exit status."""
+    command = tyro.cli(Command, args=arguments, prog="vd-bench", description=__doc__)
     try:
         if isinstance(command, GapCommand):
             check_folder(command.out)
         elif not isinstance(command, ReplayCommand) and command.json is not None:
             check_file(command.json)
-        sys.exit(command.run())
+        return command.run()
     except (ValueError, OSError) as error:
-        sys.exit(f"vd-bench: {error}")
+        print(f"vd-bench: {error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hand_data import CameraModel
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
-from vd.bench.sim import captured, own_kernel_names, seconds_per_call
+from vd.bench.sim import captured, seconds_per_call
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
@@ -50,11 +50,7 @@ class DepthRow:
     height: int
     """Pixels."""
     newton: float
-    """Newton's ``SensorCamera``, forward depth only, in the faster of two orders of traversal."""
-    newton_order: str
-    """That order."""
-    newton_refit_share: float
-    """Share of its time that refitting its hierarchies takes."""
+    """Newton's ``SensorCamera``, forward depth only."""
     images: float
     """Ours, depth images alone."""
     clouds: float
@@ -63,9 +59,6 @@ class DepthRow:
     """Ours with a cloud and every error of the sensor."""
     images_over_newton: float
     """Ours over Newton's, images alone."""
-    kernels_ms: dict[str, float]
-    """Device time of each kernel for one image in every world [ms], cloud and sensor included; empty on the
-    CPU."""
     points: float
     """Points of a cloud, mean over environments."""
     different: float
@@ -112,13 +105,12 @@ def pose(scene: Scene, state: Any, generator: np.random.Generator) -> None:
 class NewtonCamera:
     """Newton's ray-traced camera with the hand's viewpoint in every world, forward depth only."""
 
-    def __init__(self, scene: Scene, camera_q: np.ndarray, order: str = "PIXEL_PRIORITY"):
+    def __init__(self, scene: Scene, camera_q: np.ndarray):
         """Prepare rays and image.
 
         Args:
             scene: Environments, built with visual shapes.
             camera_q: Optical frames in the world frame, shape [N, 7].
-            order: Name of a ``SensorCamera.RenderOrder``.
         """
         self.model, camera = scene.model, scene.hand.camera
         device = self.model.device
@@ -128,7 +120,6 @@ class NewtonCamera:
         poses = np.concatenate([camera_q[:, :3], turned], axis=1).astype(np.float32)
         self.poses = wp.array(poses, dtype=wp.transformf, device=device)
         self.depth = self.sensor.allocate_image_depth_forward(len(poses), camera.width, camera.height)
-        self.config = SensorCamera.RenderConfig(render_order=SensorCamera.RenderOrder[order])
 
     def refit(self, state: Any) -> None:
         """Follow the bodies with the hierarchies."""
@@ -136,9 +127,7 @@ class NewtonCamera:
 
     def render(self, state: Any) -> None:
         """Draw, without a refit."""
-        self.sensor.update(
-            state, self.poses, self.rays, forward_depth_image=self.depth, render_config=self.config
-        )
+        self.sensor.update(state, self.poses, self.rays, forward_depth_image=self.depth)
 
 
 def newton_rays(camera: CameraModel, device: str) -> wp.array:
@@ -179,50 +168,27 @@ def measure(
         ours.capture()
         rates.append(rate(envs, captured(ours.capture, device), device))
     depth, camera_q = ours.true_depth.numpy().copy(), ours.camera_q.numpy()
-    points, kernels = float(ours.count.numpy().mean()), _kernel_times(ours)
+    points = float(ours.count.numpy().mean())
     del ours
 
-    newton_rates: dict[str, float] = {}
-    reference = np.empty(0)
-    refit_s = 0.0
-    for order in ("PIXEL_PRIORITY", "TILED"):
-        theirs = NewtonCamera(scene, camera_q, order)
+    theirs = NewtonCamera(scene, camera_q)
 
-        def frame(theirs: NewtonCamera = theirs) -> None:
-            theirs.refit(state)
-            theirs.render(state)
+    def frame() -> None:
+        theirs.refit(state)
+        theirs.render(state)
 
-        newton_rates[order] = rate(envs, frame, device)
-        refit_s = 1.0 / rate(1, lambda theirs=theirs: theirs.refit(state), device)
-        reference = theirs.depth.numpy().copy()
+    newton_rate = rate(envs, frame, device)
+    reference = theirs.depth.numpy()
     reference = np.where(reference > camera.far, 0.0, reference)
-    order = max(newton_rates, key=lambda name: newton_rates[name])
-    fastest = newton_rates[order]
     return DepthRow(
         envs=envs,
         width=camera.width,
         height=camera.height,
-        newton=fastest,
-        newton_order=order,
-        newton_refit_share=refit_s * fastest / envs,
+        newton=newton_rate,
         images=rates[0],
         clouds=rates[1],
         with_sensor=rates[2],
-        images_over_newton=rates[0] / fastest,
-        kernels_ms=kernels,
+        images_over_newton=rates[0] / newton_rate,
         points=points,
         different=float(np.mean(np.abs(reference - depth) > SAME_DEPTH_M)),
     )
-
-
-def _kernel_times(camera: DepthCamera) -> dict[str, float]:
-    """Device time of each kernel of a capture [ms]; empty on the CPU."""
-    with wp.ScopedTimer("capture", cuda_filter=wp.TIMING_KERNEL, print=False, synchronize=True) as timer:
-        camera.capture()
-    # Warp reports "forward kernel NAME_HASH".
-    times = [(result.name.split()[-1], float(result.elapsed)) for result in timer.timing_results]
-    return {
-        kernel: round(sum(elapsed for name, elapsed in times if name.startswith(f"{kernel}_")), 4)
-        for kernel in sorted(own_kernel_names())
-        if any(name.startswith(f"{kernel}_") for name, _ in times)
-    }

@@ -1,6 +1,6 @@
 """The battery of the gap workflow: does it name what is hidden, and nothing else?
 
-Every case is a recording from :mod:`vd.gap.hide`, analysed by :mod:`vd.gap.workflow` from the recording
+Every case is a recording from :mod:`vd.bench.hide`, analysed by :mod:`vd.gap.workflow` from the recording
 alone, and compared with the truth: every effect of the table at four sizes, all pairs at one, nothing
 hidden, and effects outside the table. Results are one JSON file per case, so that a run can be
 interrupted, resumed and split over machines.
@@ -8,12 +8,11 @@ interrupted, resumed and split over machines.
 
 import itertools
 import json
-import math
 import shutil
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,13 +20,12 @@ from typing import Any
 import numpy as np
 
 from vd.bench.gap_beside import beside
-from vd.bench.gap_rows import merged
 from vd.bench.gap_score import KINDS, Case, said, score
+from vd.bench.gap_sizes import GAPS, showing
+from vd.bench.hidden_plant import OUTSIDE
+from vd.bench.hide import simulate_hidden, write_hidden
 from vd.files import make_folder, write_json
-from vd.gap.hidden_plant import OUTSIDE
-from vd.gap.hide import simulate_hidden, write_hidden
 from vd.gap.recording import BARE_MODELS
-from vd.gap.sizes import GAPS, showing
 from vd.versions import source_commit
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
@@ -49,7 +47,6 @@ def battery(
     first_seed: int = 0,
     nothing: int = NOTHING_HIDDEN,
     pairs: int | None = None,
-    pair_size: int = PAIR_SIZE,
 ) -> list[Case]:
     """The cases, in a random order with all kinds mixed in proportion: any first part is a fair sample.
 
@@ -62,14 +59,13 @@ def battery(
         first_seed: Seed of the first: recordings that the method has not been tuned on.
         nothing: Recordings with nothing hidden.
         pairs: Pairs of effects, drawn at random; all if None.
-        pair_size: Size of both effects of a pair.
 
     Raises:
         ValueError: An unknown kind, effect or size.
     """
     if unknown := sorted(set(kinds) - set(KINDS)):
         raise ValueError(f"no kinds of cases are called {', '.join(unknown)}; choose from {', '.join(KINDS)}")
-    if bad := [size for size in (*sizes, pair_size) if size not in range(len(GAPS))]:
+    if bad := [size for size in sizes if size not in range(len(GAPS))]:
         raise ValueError(f"there is no size {bad[0]}; sizes are 0 to {len(GAPS) - 1}")
     shown = showing(model)
     if unknown := sorted(set(effects) - set(shown)):
@@ -88,7 +84,7 @@ def battery(
             Case("none", model, (), 0, first_seed + i, changes[i % len(changes)]) for i in range(nothing)
         ],
         "pair": [
-            Case("pair", model, pair, pair_size, first_seed + number)
+            Case("pair", model, pair, PAIR_SIZE, first_seed + number)
             for number, pair in enumerate(itertools.combinations(names, 2))
         ],
         "outside": [
@@ -129,7 +125,7 @@ def run_case(case: Case, folder: Path, device: str = "cpu", keep: bool = False) 
         (hidden,) = simulate_hidden([case.hiding()])
         write_hidden(hidden, work / "recording")
         hand = None if case.model in BARE_MODELS else load_hand(case.model)
-        report = workflow.run(
+        report = workflow.explain(
             work / "recording", hand, work / "analysis", seed=case.seed, device=device, workers=1
         )
         result = score(case, report.to_dict(), hidden.truth)
@@ -149,12 +145,10 @@ def run_battery(
     folder: Path,
     *,
     shard: tuple[int, int] = (0, 1),
-    backwards: bool = False,
     jobs: int = 0,
     device: str = "cpu",
     keep: bool = False,
     limit_s: float = CASE_LIMIT_S,
-    stop_after_s: float = math.inf,
     report: Callable[[str], None] = print,
 ) -> list[dict[str, Any]]:
     """Run what has no result yet of one shard of the cases; what failed before comes last.
@@ -163,19 +157,17 @@ def run_battery(
         cases: The battery.
         folder: Folder of results; those of all shards may lie in one.
         shard: (index, count): this process takes every ``count``-th case from ``index`` on.
-        backwards: The last case first: a second machine meets the first one half way.
         jobs: Processes; 0 runs the cases in this one, without limits of time.
         device: Warp device of the analyses.
         keep: Keep recordings and analyses.
         limit_s: Longest time of a case [s]; one that takes longer has failed.
-        stop_after_s: Time [s] after which to end; cases that run then have no result.
         report: Called with a line per case.
 
     Returns:
         The results of the shard's cases, in order.
     """
     make_folder(folder)
-    mine = list(cases[shard[0] :: shard[1]])[:: -1 if backwards else 1]
+    mine = cases[shard[0] :: shard[1]]
     done = {case: read_result(folder / f"{case.name}.json") for case in mine}
     failed = [case for case in mine if "error" in (done[case] or {})]
     open_cases = [*(case for case in mine if done[case] is None), *failed]
@@ -200,11 +192,7 @@ def run_battery(
     if open_cases:
         _prepare(device, {case.model for case in open_cases})
     gpu = device.startswith("cuda")
-    left = run_tasks(
-        work, open_cases, finished, jobs=jobs, limit_s=limit_s, stop_after_s=stop_after_s, gpu=gpu
-    )
-    if left:
-        report(f"stopped after {stop_after_s:.0f} s with {left} cases to run: run it again to go on")
+    run_tasks(work, open_cases, finished, jobs=jobs, limit_s=limit_s, gpu=gpu)
     return [result for result in done.values() if result is not None]
 
 
@@ -230,23 +218,6 @@ def read_result(path: Path) -> dict[str, Any] | None:
         return None
 
 
-def take_over(sources: Sequence[Path], folder: Path) -> int:
-    """Add results of other folders, or of their ``rows.csv``, to a folder; returns how many are new to it.
-
-    Raises:
-        ValueError: A source is no folder or table, or is damaged.
-    """
-    new = 0
-    for result in merged(sources):
-        case = Case(**{**result["case"], "effects": tuple(result["case"]["effects"])})
-        path = folder / f"{case.name}.json"
-        known = read_result(path)
-        if known is None or ("error" in known and "error" not in result):
-            write_json(path, result)
-            new += 1
-    return new
-
-
 def collect(folder: Path) -> list[dict[str, Any]]:
     """All results in a folder, those of other shards too."""
     found = [read_result(path) for path in sorted(folder.glob("*-seed*.json"))]
@@ -263,9 +234,3 @@ def parse_shard(text: str) -> tuple[int, int]:
     if slash and index.isdigit() and count.isdigit() and 1 <= int(index) <= int(count):
         return int(index) - 1, int(count)
     raise ValueError(f"--shard is {text!r}; write i/n, such as 1/4 for the first of four parts")
-
-
-def quick(model: str = "servo", effects: Sequence[str] = ("coulomb_friction", "command_delay")) -> list[Case]:
-    """A battery of a minute: two effects, and nothing."""
-    single = battery(model, kinds=("single",), effects=effects, sizes=(3,), seeds=1)
-    return [*single, replace(single[0], kind="none", effects=(), size=0)]

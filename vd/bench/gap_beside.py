@@ -2,17 +2,17 @@
 
 A pair can be named only if the recording holds both: beside a profile that accelerates slowly, a limit of
 torque does not act. What an effect adds to the motion is compared with what the base parameters and the other
-effect's own can imitate, to first order, as the sizes of single effects are (:mod:`vd.gap.sizes`).
+effect's own can imitate, to first order, as the sizes of single effects are (:mod:`vd.bench.gap_sizes`).
 """
 
 from dataclasses import replace
 
 import numpy as np
 
+from vd.bench.gap_sizes import CALIBRATION_STEP_S, nudged
+from vd.bench.hidden_plant import Plant, Run, simulate
+from vd.bench.hide import Hiding, machine, noise_floor
 from vd.gap.excitations import excitation_set
-from vd.gap.hidden_plant import Plant, Run, simulate
-from vd.gap.hide import Hiding, machine, noise_floor
-from vd.gap.sizes import CALIBRATION_STEP_S, nudged
 
 NUDGE = 0.05
 """Relative change of an effect's parameter for its sensitivity."""

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from vd.gap.hidden_plant import CABLE, COGGING, WARMING
-from vd.gap.hide import Hiding
+from vd.bench.gap_sizes import sized_effect
+from vd.bench.hidden_plant import CABLE, COGGING, WARMING
+from vd.bench.hide import Hiding
 from vd.gap.recording import BARE_MODELS
-from vd.gap.sizes import sized_effect
 from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 
 KINDS = ("single", "none", "pair", "outside")

@@ -1,12 +1,10 @@
-"""``vd-bench student``: a camera policy's latency on a robot's computer, and a student's clouds per second.
+"""``vd-bench student``: a camera policy's latency on a robot's computer.
 
-Latency is that of a whole control step, batch 1, on the CPU: depth image and joint positions to action.
-Training is one minibatch of whole sequences: points, voxels, maps, forward and backward; simulation and
-optimiser are not in it.
+It is that of a whole control step, batch 1, on the CPU: depth image and joint positions to action.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +15,9 @@ import warp as wp
 from vd.assets_usd.hand_data import BASE_IN_WORLD
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
-from vd.bench.depth import JOINT_SPREAD_RAD, OBJECT_HEIGHT_M, bench_scene
+from vd.bench.depth import bench_scene
 from vd.clouds import HandKinematics, SceneClouds
 from vd.evaluate.agents import open_policy
-from vd.paper import PAPER
 from vd.senses import Senses
 from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
@@ -28,18 +25,15 @@ from vd.sensors.depth_cloud import CameraCloud
 from vd.sim.scene import Scene
 from vd.tracking.policy import TrackingPolicy
 from vd.tracking.tracker import Tracker
-from vd.vision.cfg import PRESETS, NoiseCfg
+from vd.vision.cfg import PRESETS
 from vd.vision.network import Student
 from vd.vision.saved import SavedStudent
-from vd.vision.sites import Sites
 from vd.vision.voxels import Voxeliser
 
 Parts = dict[str, Callable[[], None]]
 """Parts of a control step, in order."""
 WARM_UP = 5
 """Calls before timing: allocators have grown, kernels are loaded."""
-SEQUENCE_STEPS = 80
-"""Steps of a training sequence: the paper's."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +44,6 @@ class LatencyRow:
     """Preset, or the policy."""
     parameters: int
     """Numbers in the network."""
-    precision: str
-    """Of the encoder: float32 or bfloat16."""
     threads: int
     """Threads of torch; our kernels use one."""
     median_ms: float
@@ -64,28 +56,6 @@ class LatencyRow:
     """Medians of its parts."""
     parts_cpu_ms: dict[str, float]
     """The same, processor time of all threads."""
-
-
-@dataclass(frozen=True)
-class TrainingRow:
-    """One minibatch of sequences, and one step of as many environments."""
-
-    network: str
-    """Preset."""
-    precision: str
-    """Of the products: float32 or bfloat16."""
-    clouds: int
-    """Clouds of the minibatch."""
-    voxels: float
-    """Voxels of a cloud, mean."""
-    clouds_per_s: float
-    """Points, voxels, maps, forward and backward."""
-    parts_ms: dict[str, float]
-    """Its parts."""
-    act_clouds_per_s: float
-    """The same number of environments acting one step: points, voxels, maps, forward."""
-    memory_gb: float
-    """Most memory that torch held at once [GB]; 0 on the CPU, not measured."""
 
 
 def take_turns(functions: dict[str, Callable[[], Any]], calls: int) -> dict[str, np.ndarray]:
@@ -121,9 +91,9 @@ class StudentStep:
         )
         size = self._clouds.item.start + self._camera.cloud.points.shape[1]
         self._points = wp.empty((1, size), dtype=wp.vec3, device="cpu")
-        self._marks = self._clouds.ends if "marks" in net.cfg.encoder.inputs else ()
+        self._marks = self._clouds.ends if net.cfg.marked else ()
         self._voxelise = Voxeliser(net.cfg.voxel_m)
-        self._senses, self._hidden = torch.zeros(1, net.num_senses), net.initial_hidden(1)
+        self._known, self._hidden = torch.zeros(1, net.num_proprioception), net.initial_hidden(1)
         self.parts: Parts = {"points": self._see, "voxels": self._cells, "maps and network": self._act}
 
     def _see(self) -> None:
@@ -136,7 +106,7 @@ class StudentStep:
         self._sites = self._voxelise(self._points, ends=self._marks)
 
     def _act(self) -> None:
-        self._hidden = self._net.act(self._sites, self._senses, self._hidden).hidden
+        self._hidden = self._net.act(self._sites, self._known, self._hidden).hidden
 
 
 class TrackingStep:
@@ -156,8 +126,7 @@ class TrackingStep:
     def _act(self) -> None:
         q = self._joint_q
         still, goal = torch.zeros_like(q), torch.tensor([[0.0, 0.0, 0.0, 1.0]])
-        steps = torch.ones(1, dtype=torch.int32)
-        senses = Senses(q, still, still, goal, self._points, fresh=self._fresh, goal_steps=steps)
+        senses = Senses(q, still, still, goal, self._points, fresh=self._fresh)
         self._tracker.step(senses)
         self._fresh.fill_(False)
 
@@ -185,7 +154,6 @@ def measure_latency(
     *,
     hand: str = "dclaw4",
     threads: int = 2,
-    half: bool = False,
     calls: int = 300,
     seed: int = 0,
 ) -> LatencyRow:
@@ -196,7 +164,6 @@ def measure_latency(
         network: Preset, or a camera policy: the name of an installed one or a file.
         hand: Hand of a preset; a policy has its own.
         threads: Threads of torch.
-        half: Encoder of a student in bfloat16.
         calls: Control steps to time.
         seed: Of poses and weights.
     """
@@ -213,8 +180,6 @@ def measure_latency(
         step = TrackingStep(policy, scene, image, joint_q)
     else:
         net = policy
-        if half:
-            policy.encoder.bfloat16()
         step = StudentStep(policy, scene, image, joint_q)
 
     def whole() -> None:
@@ -228,169 +193,10 @@ def measure_latency(
     return LatencyRow(
         network=network,
         parameters=sum(parameter.numel() for parameter in net.parameters()),
-        precision="bfloat16" if half else "float32",
         threads=threads,
         median_ms=float(np.median(times[:, 0])),
         p99_ms=float(np.percentile(times[:, 0], 99)),
         cpu_ms=float(np.median(times[:, 1])),
         parts_ms={name: float(np.median(part[:, 0])) for name, part in parts.items()},
         parts_cpu_ms={name: float(np.median(part[:, 1])) for name, part in parts.items()},
-    )
-
-
-class Scenes:
-    """Complete clouds of random scenes without a simulation, as many as wanted at once."""
-
-    def __init__(self, objects: Sequence[ObjectModel], hand_name: str, clouds: int, device: str, seed: int):
-        """Draw the scenes."""
-        hand = load_hand(hand_name)
-        links = len(hand.link_names)
-        generator = np.random.default_rng(seed)
-        reset = np.tile(PAPER.scene.reset_joint_rad, hand.num_fingers)
-        joints = reset + JOINT_SPREAD_RAD * generator.standard_normal((clouds, hand.num_joints))
-        poses = np.zeros((clouds, links + 1, 7), np.float32)
-        poses[:, links, 2] = OBJECT_HEIGHT_M
-        poses[:, links, 3:] = generator.standard_normal((clouds, 4))
-        poses[:, links, 3:] /= np.linalg.norm(poses[:, links, 3:], axis=1, keepdims=True)
-        goal = np.roll(poses[:, links, 3:], 1, axis=0)
-        self.body_q = wp.array(poses, dtype=wp.transform, device=device)
-        self.goal = wp.array(goal, dtype=wp.quat, device=device)
-        kinematics = HandKinematics(hand, link_body=np.arange(links), base=BASE_IN_WORLD, device=device)
-        limited = np.clip(joints, hand.lower, hand.upper)
-        kinematics.write(wp.array(limited, dtype=float, device=device), self.body_q)
-        self.clouds = SceneClouds(
-            hand,
-            objects,
-            link_body=np.arange(links),
-            object_body=links,
-            world_object=np.arange(clouds) % len(objects),
-            world_scale=np.ones(clouds),
-            device=device,
-        )
-        self.points = wp.empty((clouds, self.clouds.item.stop), dtype=wp.vec3, device=device)
-
-    def write(self) -> None:
-        """Make the points anew."""
-        self.clouds.write(self.points, self.body_q, self.goal)
-
-
-class _Stopwatch:
-    """Times of parts of the work on a device.
-
-    Attributes:
-        marks: Times [ms] by the part's name.
-    """
-
-    def __init__(self, place: torch.device):
-        self.place = place
-        self.marks: dict[str, list[float]] = {}
-
-    def stop(self, name: str, start: float) -> float:
-        """A part that began at ``start`` is done; the time now [s]."""
-        if self.place.type == "cuda":
-            torch.cuda.synchronize(self.place)
-        now = time.perf_counter()
-        self.marks.setdefault(name, []).append(1e3 * (now - start))
-        return now
-
-    def seconds(self, function: Callable[[], None], calls: int) -> float:
-        """Time of a call [s], the mean of several after one that does not count."""
-        function()
-        self.marks.clear()
-        start = time.perf_counter()
-        for _ in range(calls):
-            function()
-        self.stop("all", start)
-        return (time.perf_counter() - start) / calls
-
-
-def _build_maps(sites: Sites, stages: int, pooled: int) -> None:
-    """All maps that an encoder of so many stages, the first of them pooled, will ask for."""
-    for i in range(stages):
-        _ = sites.strided, i and sites.strided_back
-        sites = sites.coarser
-        if i < pooled:
-            _ = sites.windows
-            sites = sites.coarser
-        _ = sites.neighbours
-    _ = sites.offsets
-
-
-def measure_training(
-    objects: Sequence[ObjectModel],
-    network: str,
-    device: str,
-    *,
-    hand: str = "dclaw4",
-    envs: int = 40,
-    steps: int = SEQUENCE_STEPS,
-    half: bool = True,
-    calls: int = 5,
-    seed: int = 0,
-) -> TrainingRow:
-    """Measure one minibatch of ``envs`` sequences of ``steps`` steps.
-
-    Args:
-        objects: Objects, mixed over the clouds.
-        network: Preset.
-        device: Warp device.
-        hand: Hand.
-        envs: Sequences.
-        steps: Steps of a sequence.
-        half: Products in bfloat16.
-        calls: Minibatches to time.
-        seed: Of poses, weights and noise.
-    """
-    torch.manual_seed(seed)
-    clouds = envs * steps
-    scenes = Scenes(objects, hand, clouds, device, seed)
-    place = torch.device(wp.device_to_torch(wp.get_device(device)))
-    net = Student(PRESETS[network], load_hand(hand).num_joints).to(place)
-    voxelise = Voxeliser(net.cfg.voxel_m, noise=NoiseCfg(), clouds=clouds, seed=seed, device=device)
-    senses = torch.zeros(steps, envs, net.num_senses, device=place)
-    on_gpu = place.type == "cuda"
-    encoder = net.cfg.encoder
-    ends = scenes.clouds.ends if "marks" in encoder.inputs else ()
-    watch = _Stopwatch(place)
-    sizes: list[int] = []
-
-    def prepare(start: float, *, augment: bool) -> tuple[Sites, float]:
-        scenes.write()
-        start = watch.stop("points", start)
-        sites = voxelise(scenes.points, augment=augment, ends=ends)
-        start = watch.stop("voxels", start)
-        _build_maps(sites, len(encoder.channels), encoder.pooled_stages)
-        sizes.append(len(sites))
-        return sites, watch.stop("maps", start)
-
-    def minibatch() -> None:
-        net.train()
-        sites, start = prepare(time.perf_counter(), augment=True)
-        with torch.autocast(place.type, dtype=torch.bfloat16, enabled=half):
-            output = net(net.encode(sites).unflatten(0, (steps, envs)), senses, net.initial_hidden(envs))
-            loss = output.mean.square().mean() + output.log_std.mean() + output.distance.square().mean()
-        start = watch.stop("forward", start)
-        loss.backward()
-        watch.stop("backward", start)
-        net.zero_grad()
-
-    def act() -> None:
-        net.eval()
-        with torch.inference_mode(), torch.autocast(place.type, dtype=torch.bfloat16, enabled=half):
-            sites, _ = prepare(time.perf_counter(), augment=False)
-            net.act(sites, senses[0].repeat(steps, 1), net.initial_hidden(clouds))
-
-    acting = watch.seconds(act, calls)
-    if on_gpu:
-        torch.cuda.reset_peak_memory_stats(place)
-    training = watch.seconds(minibatch, calls)
-    return TrainingRow(
-        network=network,
-        precision="bfloat16" if half else "float32",
-        clouds=clouds,
-        voxels=float(np.mean(sizes)) / clouds,
-        clouds_per_s=clouds / training,
-        parts_ms={name: float(np.mean(times)) for name, times in watch.marks.items() if name != "all"},
-        act_clouds_per_s=clouds / acting,
-        memory_gb=torch.cuda.max_memory_allocated(place) / 1e9 if on_gpu else 0.0,
     )

@@ -8,13 +8,16 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-from vd.assets_usd.hand_data import HandModel
-from vd.config import from_dict, to_dict
+from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel
+from vd.config import Renamed, from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
+from vd.kernels.task.observations import teacher_observation_slices
+from vd.kernels.task.shapes import shape_observation_size
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg
+from vd.stopping import StoppingRule, StoppingRules
 from vd.vision.cfg import StudentCfg
 
 BUNDLE_FORMAT = "visual-dexterity bundle 1"
@@ -88,14 +91,13 @@ class ObservationPart:
 class CloudPart:
     """The cloud a student sees, base frame: points of the goal, the hand, the object (or of a camera)."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"goal": "merged", "senses": Renamed("proprioception")}
     point_names: tuple[str, ...]
     """Sets of the hand's points, in order."""
     points_per_set: int
     """Points of each of them."""
     voxel_m: float
     """Side of a voxel; true floor of coordinate / side."""
-    goal: str
-    """merged: one cloud; separate: the goal in a cloud of its own."""
     goal_position_m: tuple[float, float, float] = PAPER.cloud.goal_position_m
     """Where the goal's cloud, turned as wanted, is put in the base frame."""
     feature: float = PAPER.cloud.feature
@@ -103,7 +105,7 @@ class CloudPart:
     inputs: tuple[str, ...] = ("constant",)
     """Features of a voxel, in order. position: its centre in the base frame, in units of 0.1 m; marks:
     whether it holds points of the goal, and of the hand."""
-    senses: tuple[str, ...] = ("action",)
+    proprioception: tuple[str, ...] = ("action",)
     """What the network reads besides the cloud, in order: the smoothed action before [D], positions [rad] and
     0.2 times velocities [rad/s] of the joints as measured [D]."""
 
@@ -154,6 +156,27 @@ class StoppingPart:
     tolerance_rad: float = PAPER.success.rotation_rad
     """Tolerance that the first two are for [rad]."""
 
+    @classmethod
+    def of(cls, rules: StoppingRules) -> "StoppingPart":
+        """The rules of a policy."""
+        stop, precise = rules.stopping, rules.precise
+        return cls(
+            stop.distance_rad,
+            stop.action_norm,
+            rules.calibrated_on,
+            None if precise is None else (precise.distance_rad, precise.action_norm),
+            rules.tolerance_rad,
+        )
+
+    def rules(self) -> dict[str, Any]:
+        """The fields of :class:`vd.stopping.StoppingRules`."""
+        return {
+            "stopping": StoppingRule(self.distance_rad, self.action_norm),
+            "tolerance_rad": self.tolerance_rad,
+            "precise": None if self.precise is None else StoppingRule(*self.precise),
+            "calibrated_on": self.calibrated_on,
+        }
+
 
 @dataclass(frozen=True)
 class Provenance:
@@ -194,26 +217,35 @@ class Contract:
         """The environment of the training."""
         return from_dict(ReorientCfg, self.provenance.task, where="provenance.task")
 
+    @property
+    def own_camera(self) -> tuple[float, ...] | None:
+        """Where the training put the camera, optical frame in the base frame [7]; None: the hand's own."""
+        camera = self.interface.camera
+        return camera.pose_in_base if camera is not None and camera.source == "policy" else None
+
 
 def derive_interface(
     hand: HandModel,
-    task: ReorientCfg,
-    *,
-    network: StudentCfg | None = None,
-    depth: DepthCameraCfg | None = None,
+    kind: Kind,
+    network: dict[str, Any],
+    source: Provenance,
     camera: tuple[float, ...] | None = None,
 ) -> Interface:
     """What a policy of such a training and this hand have to agree on.
 
     Args:
         hand: The hand.
-        task: Environment of the training.
-        network: Of a student; None for a policy that acts by a teacher's layers.
-        depth: Depth camera of a policy that sees by one; None for others.
-        camera: Where the training put it, optical frame in the base frame [7]; None: the hand's own.
-    """
-    from vd.sim.scene import hand_mount
+        kind: Of the policy.
+        network: What rebuilds its network.
+        source: Where it comes from; ``depth`` is empty for one that sees by no camera.
+        camera: Where the training put that, optical frame in the base frame [7]; None: the hand's own.
 
+    Raises:
+        ContractError: A robot's loop cannot give what it observes.
+    """
+    task = from_dict(ReorientCfg, source.task, where="provenance.task")
+    depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth") if source.depth else None
+    student = kind == "student"
     return Interface(
         conventions=Conventions(),
         hand=HandPart(
@@ -221,29 +253,16 @@ def derive_interface(
             joint_names=hand.joint_names,
             lower_rad=_floats(hand.lower),
             upper_rad=_floats(hand.upper),
-            base_in_world=_floats(hand_mount()),
+            base_in_world=_floats(BASE_IN_WORLD),
         ),
         action=ActionPart(task.sim.control_hz, task.action.ema_alpha, task.action.scale_rad_s),
-        observation=_observation(hand, task) if network is None else None,
-        cloud=None
-        if network is None
-        else CloudPart(
-            point_names=hand.point_names,
-            points_per_set=hand.link_points.shape[1],
-            voxel_m=network.voxel_m,
-            goal=network.goal,
-            feature=network.encoder.feature,
-            inputs=network.encoder.inputs,
-            senses=network.senses,
-        ),
+        observation=None if student else _observation(hand, task),
+        cloud=_cloud(hand, from_dict(StudentCfg, network, where="network")) if student else None,
         camera=None if depth is None else _camera(hand, depth, camera),
     )
 
 
 def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
-    from vd.kernels.task.observations import teacher_observation_slices
-    from vd.kernels.task.shapes import shape_observation_size
-
     seen = task.observation
     if seen.history:
         raise ContractError(
@@ -252,25 +271,30 @@ def _observation(hand: HandModel, task: ReorientCfg) -> ObservationPart:
         )
     slices = teacher_observation_slices(hand.num_fingers)
     parts = {name: (part.start, part.stop) for name, part in slices.items()}
-    if task.observation.shape != "none":
+    if seen.shape != "none":
         end = slices["previous_action"].stop
         parts["shape"] = (end, end + shape_observation_size(hand.num_fingers))
-    return ObservationPart(parts, view=task.observation.view, file_axes=task.observation.file_axes)
+    return ObservationPart(parts, view=seen.view, file_axes=seen.file_axes)
+
+
+def _cloud(hand: HandModel, network: StudentCfg) -> CloudPart:
+    return CloudPart(
+        point_names=hand.point_names,
+        points_per_set=hand.link_points.shape[1],
+        voxel_m=network.voxel_m,
+        inputs=network.encoder.inputs,
+        proprioception=network.proprioception,
+    )
 
 
 def _camera(hand: HandModel, depth: DepthCameraCfg, pose: tuple[float, ...] | None) -> CameraPart:
-    camera = hand.camera
+    camera = hand.camera.at(pose)
     return CameraPart(
         source="hand" if pose is None else "policy",
-        width=camera.width,
-        height=camera.height,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        pose_in_base=_floats([*camera.position, *camera.quaternion] if pose is None else pose),
+        pose_in_base=_floats([*camera.position, *camera.quaternion]),
         points=depth.points,
         crop_m=depth.crop_m,
+        **{name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
     )
 
 
@@ -300,29 +324,13 @@ def check_hand(contract: Contract, hand: HandModel, where: str | Path) -> None:
     Raises:
         ContractError: The first field that differs, what the hand has, what the bundle wants, what to do.
     """
-    wanted = contract.interface
-    found = derive_interface(hand, contract.task, **_seeing_parts(contract))
-    for name, have, want in _differences(to_dict(found), to_dict(wanted)):
+    found = derive_interface(hand, contract.kind, contract.network, contract.provenance, contract.own_camera)
+    for name, have, want in _differences(to_dict(found), to_dict(contract.interface)):
         part = name.split(".")[0]
         raise ContractError(
             f"{where} does not fit the hand {hand.name} ({hand.path}): {name} is {_short(have)} here, but "
             f"{_short(want)} in the bundle; {_REMEDY[part]}"
         )
-
-
-def _seeing_parts(contract: Contract) -> dict[str, Any]:
-    """The arguments of :func:`derive_interface` that a policy has that sees clouds."""
-    if contract.kind == "teacher":
-        return {}
-    camera = contract.interface.camera
-    depth = from_dict(DepthCameraCfg, contract.provenance.depth, where="provenance.depth")
-    return {
-        "network": from_dict(StudentCfg, contract.network, where="network")
-        if contract.kind == "student"
-        else None,
-        "depth": None if camera is None else depth,
-        "camera": camera.pose_in_base if camera is not None and camera.source == "policy" else None,
-    }
 
 
 def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
@@ -337,15 +345,11 @@ def _differences(found: Any, wanted: Any, name: str = "") -> Iterator[tuple[str,
             return
         for index, (one, other) in enumerate(zip(found, wanted, strict=True)):
             yield from _differences(one, other, f"{name}[{index}]")
-    elif _is_number(found) and _is_number(wanted):
+    elif isinstance(found, float) and isinstance(wanted, float):
         if not math.isclose(found, wanted, rel_tol=RELATIVE_TOLERANCE, abs_tol=ABSOLUTE_TOLERANCE):
             yield name, found, wanted
     elif found != wanted:
         yield name, found, wanted
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
 def _short(value: Any) -> str:

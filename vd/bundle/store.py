@@ -4,155 +4,101 @@ import hashlib
 import json
 import shutil
 import tempfile
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
 import torch
 
-from vd.assets_usd.hand_data import HandModel
+from vd.assets_usd.hands import load_hand
 from vd.bundle import CONTRACT_FILE, is_bundle
 from vd.bundle.contract import (
     BUNDLE_FORMAT,
     Contract,
     ContractError,
+    Kind,
     Provenance,
     StoppingPart,
     derive_interface,
-)
-from vd.bundle.golden import (
-    TOLERANCE,
-    Golden,
-    student_golden,
-    student_outputs,
-    teacher_golden,
-    teacher_outputs,
-    worst_difference,
 )
 from vd.config import from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
 from vd.files import atomic_path, make_folder, write_json, writing
 from vd.policy import PolicySpec, TrainedPolicy
 from vd.sensors.cfg import DepthCameraCfg
+from vd.stopping import StoppingRules
+from vd.tracking.policy import TrackingPolicy, TrackingSpec
 from vd.versions import installed_versions
-
-if TYPE_CHECKING:
-    from vd.stopping import StoppingRules
-    from vd.tracking.policy import TrackingPolicy
-    from vd.vision.saved import SavedStudent
+from vd.vision.cfg import StudentCfg
+from vd.vision.network import Student
+from vd.vision.saved import SavedStudent, StudentSpec
+from vd.vision.voxels import Voxeliser
 
 WEIGHTS_FILE, GOLDEN_FILE = "weights.safetensors", "golden.safetensors"
 FILE_MODE, FOLDER_MODE = 0o644, 0o755
 """A bundle is for others to read."""
 RENDERED = 2
 """Stage of students that see a depth camera."""
+STATES, STEPS, GOLDEN_POINTS = 8, 3, 500
+"""Golden observations of a teacher; golden control steps of a student, one after the other since memory
+counts, and points of the goal and of the object in each; the hand has twice as many."""
+SCENE_VOXELS = 16
+"""Golden points lie within so many voxels of the base frame's origin."""
+TOLERANCE = 5e-3
+"""Largest difference of an output from the golden one. Actions are of size 1; processors, GPUs and other
+versions of torch differ by 1e-6 to 1e-3."""
+PROPRIOCEPTION = {"action": "previous_action", "position": "joint_q", "velocity": "joint_qd"}
+"""Golden input behind each part of a student's proprioception."""
 _PACKAGES = ("visual-dexterity", "torch", "warp-lang", "newton", "safetensors")
+_AGAIN = "write the bundle again with vd-train bundle"
+
+AnyPolicy = TrainedPolicy | SavedStudent | TrackingPolicy
+Tensors = dict[str, torch.Tensor]
 
 
-@dataclass(frozen=True)
-class Bundle:
-    """A bundle that was read: its contract, and its policy."""
-
-    contract: Contract
-    policy: "TrainedPolicy | SavedStudent | TrackingPolicy"
-
-
-def write_teacher(folder: Path, policy: TrainedPolicy, hand: HandModel) -> Contract:
-    """Write the bundle of a teacher.
+def write_bundle(policy: AnyPolicy, folder: Path) -> Contract:
+    """Write the bundle of a policy; one that is there is replaced.
 
     Args:
-        folder: To write; a bundle that is there is replaced.
-        policy: The teacher.
-        hand: The hand of its training.
+        policy: The policy, on the CPU.
+        folder: To write.
+
+    Raises:
+        ContractError: A robot's loop cannot give what it observes.
+        FileExistsError: The folder holds something else.
+        OutputError: It cannot be written.
     """
     task = from_dict(ReorientCfg, policy.task, where="task of the policy")
+    hand = load_hand(task.hand, task.fingertip, task.hand_layer)
+    kind: Kind = "teacher"
+    rules: StoppingRules | None = None
+    trained: TrainedPolicy | SavedStudent
+    if isinstance(policy, TrackingPolicy):
+        kind, rules, trained = "tracking", policy.spec, policy.teacher
+        source = _provenance(trained, policy.spec.teacher, None, to_dict(policy.spec.depth))
+        network, camera = {"policy": to_dict(trained.spec)}, policy.spec.camera
+        weights = {f"actor.{name}": value for name, value in trained.weights.items()}
+        weights |= {f"critic.{name}": value for name, value in trained.critic_weights.items()}
+    elif isinstance(policy, SavedStudent):
+        kind, rules, trained, spec = "student", policy.spec, policy, policy.spec
+        source = _provenance(policy, spec.teacher, spec.stage, policy.depth if spec.stage == RENDERED else {})
+        network, camera, weights = to_dict(spec.network), spec.camera, policy.network.state_dict()
+    else:
+        trained, source = policy, _provenance(policy, "", None, {})
+        network, camera, weights = to_dict(policy.spec), None, policy.weights
     contract = Contract(
-        kind="teacher",
-        interface=derive_interface(hand, task),
-        network=to_dict(policy.spec),
-        stopping=None,
-        provenance=_provenance(policy.task, "", None, policy.iteration, policy.env_steps),
+        kind=kind,
+        interface=derive_interface(hand, kind, network, source, camera),
+        network=network,
+        stopping=None if rules is None else StoppingPart.of(rules),
+        provenance=source,
         software=installed_versions(_PACKAGES),
     )
-    _write(folder, contract, policy.weights, teacher_golden(policy))
+    golden = _golden_inputs(policy)
+    _write(Path(folder), contract, weights, golden | _answers(policy, golden))
     return contract
-
-
-def write_student(folder: Path, student: "SavedStudent", hand: HandModel) -> Contract:
-    """Write the bundle of a student.
-
-    Args:
-        folder: To write; a bundle that is there is replaced.
-        student: The student, on the CPU.
-        hand: The hand of its training.
-    """
-    spec = student.spec
-    rendered = spec.stage == RENDERED
-    depth = (
-        from_dict(DepthCameraCfg, student.depth, where="depth camera of the student") if rendered else None
-    )
-    contract = Contract(
-        kind="student",
-        interface=derive_interface(
-            hand,
-            from_dict(ReorientCfg, student.task, where="task of the student"),
-            network=spec.network,
-            depth=depth,
-            camera=spec.camera,
-        ),
-        network=to_dict(spec.network),
-        stopping=_stopping(spec),
-        provenance=replace(
-            _provenance(student.task, spec.teacher, spec.stage, student.iteration, student.env_steps),
-            depth=student.depth if rendered else {},
-        ),
-        software=installed_versions(_PACKAGES),
-    )
-    _write(folder, contract, student.network.state_dict(), student_golden(student, hand))
-    return contract
-
-
-def write_tracking(folder: Path, policy: "TrackingPolicy", hand: HandModel) -> Contract:
-    """Write the bundle of a tracking policy.
-
-    Args:
-        folder: To write; a bundle that is there is replaced.
-        policy: The policy, on the CPU.
-        hand: The hand of its teacher's training.
-    """
-    teacher, spec = policy.teacher, policy.spec
-    contract = Contract(
-        kind="tracking",
-        interface=derive_interface(
-            hand,
-            from_dict(ReorientCfg, policy.task, where="task of the policy"),
-            depth=spec.depth,
-            camera=spec.camera,
-        ),
-        network={"policy": to_dict(teacher.spec)},
-        stopping=_stopping(spec),
-        provenance=replace(
-            _provenance(policy.task, spec.teacher, None, teacher.iteration, teacher.env_steps),
-            depth=to_dict(spec.depth),
-        ),
-        software=installed_versions(_PACKAGES),
-    )
-    weights = {f"actor.{name}": value for name, value in teacher.weights.items()}
-    if teacher.has_critic:
-        weights |= {f"critic.{name}": value for name, value in teacher.critic_weights.items()}
-    _write(folder, contract, weights, teacher_golden(teacher))
-    return contract
-
-
-def _stopping(rules: "StoppingRules") -> StoppingPart:
-    precise = rules.precise
-    return StoppingPart(
-        rules.stopping.distance_rad,
-        rules.stopping.action_norm,
-        rules.calibrated_on,
-        None if precise is None else (precise.distance_rad, precise.action_norm),
-        rules.tolerance_rad,
-    )
 
 
 def read_contract(folder: str | Path) -> Contract:
@@ -169,19 +115,14 @@ def read_contract(folder: str | Path) -> Contract:
         values = json.loads(path.read_text())
         found = values.get("format") if isinstance(values, dict) else None
         if found != BUNDLE_FORMAT:
-            raise ContractError(
-                f"{path}: format is {found!r}, this version reads {BUNDLE_FORMAT!r}; "
-                "write the bundle again with vd-train bundle"
-            )
+            raise ValueError(f"format is {found!r}, this version reads {BUNDLE_FORMAT!r}")
         return from_dict(Contract, values)
-    except ContractError:
-        raise
     except (ValueError, TypeError) as error:
-        raise ContractError(f"{path}: {error}; write the bundle again with vd-train bundle") from error
+        raise ContractError(f"{path}: {error}; {_AGAIN}") from error
 
 
-def read_bundle(folder: str | Path, device: str = "cpu") -> Bundle:
-    """Read a bundle, and see that its policy answers the golden inputs as it did when it was written.
+def read_bundle(folder: str | Path, device: str = "cpu") -> AnyPolicy:
+    """The policy of a bundle, once it has answered the golden inputs as it did when it was written.
 
     Args:
         folder: The bundle.
@@ -198,165 +139,156 @@ def read_bundle(folder: str | Path, device: str = "cpu") -> Bundle:
     golden = _tensors(folder / GOLDEN_FILE, contract, "cpu")
     try:
         _ = contract.task  # its settings are those of this version
-        bundle = _build(contract, weights, device)
+        policy = _policy_of(contract, weights, device)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         first = " ".join(str(error).split("\n\t")[:2])  # of torch's list of what does not fit
         raise ContractError(
-            f"{folder}: policy and {CONTRACT_FILE} do not fit this version ({first}); "
-            "another one wrote them: write the bundle again with vd-train bundle"
+            f"{folder}: policy and {CONTRACT_FILE} do not fit this version ({first}); another one wrote "
+            f"them: {_AGAIN}"
         ) from error
-    outputs = _outputs(bundle.policy, golden, device)
-    worst = worst_difference(outputs, golden)
-    if worst > TOLERANCE:
+    answers = _answers(policy, {name: value.to(device) for name, value in golden.items()})
+    worst = max(float((value - golden[name]).abs().max()) for name, value in answers.items())
+    if not worst <= TOLERANCE:  # NaN is wrong too
         raise ContractError(
             f"{folder}: the policy's outputs differ by {worst:.2g} from those in {GOLDEN_FILE} (at most "
-            f"{TOLERANCE:g}); it was written by other software ({contract.software}): write it again"
+            f"{TOLERANCE:g}); it was written by other software ({contract.software}): {_AGAIN}"
         )
-    return bundle
+    return policy
 
 
-def _outputs(policy: "TrainedPolicy | SavedStudent | TrackingPolicy", golden: Golden, device: str) -> Golden:
-    """What a policy makes of golden inputs."""
-    from vd.vision.saved import SavedStudent
+def _golden_inputs(policy: AnyPolicy) -> Tensors:
+    """Inputs, and the outputs that have to come back.
 
+    Of a teacher's layers ``observation`` [S, O] of size 1. Of a student ``goal_points`` [T, G, 3] and
+    ``scene_points`` [T, P, 3], hand and object [m], base frame, all at centres of voxels, where no rounding
+    decides; ``previous_action``, ``joint_q`` [rad] and ``joint_qd`` [rad/s] [T, D].
+    """
+    rng = np.random.default_rng(0)
     if isinstance(policy, SavedStudent):
-        return student_outputs(policy, golden)
-    teacher = policy if isinstance(policy, TrainedPolicy) else policy.teacher
-    return teacher_outputs(teacher, {name: value.to(device) for name, value in golden.items()})
+        side, joints = policy.spec.network.voxel_m, (STEPS, policy.spec.num_actions)
+        points = rng.integers(-SCENE_VOXELS, SCENE_VOXELS, (STEPS, 4 * GOLDEN_POINTS, 3)) + 0.5
+        drawn = {
+            "goal_points": side * points[:, :GOLDEN_POINTS],
+            "scene_points": side * points[:, GOLDEN_POINTS:],
+            **{name: rng.uniform(-1.0, 1.0, joints) for name in PROPRIOCEPTION.values()},
+        }
+    else:
+        teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
+        drawn = {"observation": rng.normal(size=(STATES, teacher.num_observations))}
+    return {name: torch.tensor(value, dtype=torch.float32) for name, value in drawn.items()}
 
 
-def _build(contract: Contract, weights: dict[str, torch.Tensor], device: str) -> Bundle:
+def _answers(policy: AnyPolicy, golden: Mapping[str, torch.Tensor]) -> Tensors:
+    """What a policy makes of golden inputs on its device: ``action``, of a student ``distance`` too [rad]."""
+    if not isinstance(policy, SavedStudent):
+        teacher = policy.teacher if isinstance(policy, TrackingPolicy) else policy
+        return {"action": teacher.act(golden["observation"]).cpu()}
+    network, goal, scene = policy.network, golden["goal_points"], golden["scene_points"]
+    voxelise = Voxeliser(network.cfg.voxel_m, device=str(goal.device))
+    # The object has as many points as the goal.
+    ends = (goal.shape[1], scene.shape[1]) if network.cfg.marked else ()
+    known = network.proprioception({part: golden[name] for part, name in PROPRIOCEPTION.items()})
+    hidden, actions, distances = network.initial_hidden(1), [], []
+    with torch.no_grad():
+        for step, points in enumerate(torch.cat([goal, scene], dim=1)):
+            sites = voxelise(points[None].contiguous(), ends=ends)
+            output = network.act(sites, known[step : step + 1], hidden)
+            hidden = output.hidden
+            actions.append(output.mean[0])
+            distances.append(output.distance[0])
+    return {"action": torch.stack(actions).cpu(), "distance": torch.stack(distances).cpu()}
+
+
+def _policy_of(contract: Contract, weights: Tensors, device: str) -> AnyPolicy:
     """The policy of a contract with weights."""
-    source = contract.provenance
+    source, network = contract.provenance, dict(contract.network)
     if contract.kind == "teacher":
-        policy = TrainedPolicy(
-            from_dict(PolicySpec, contract.network, where="network"),
-            weights,
-            task=source.task,
-            iteration=source.iterations,
-            env_steps=source.env_steps,
-            device=device,
-        )
-        return Bundle(contract, policy)
+        return _teacher(network, source, weights, device)
+    settings: dict[str, Any] = {"teacher": source.teacher, "camera": contract.own_camera}
+    if (stopping := contract.stopping) is not None:
+        settings |= stopping.rules()
     if contract.kind == "tracking":
-        return Bundle(contract, _tracking(contract, weights, device))
-    from vd.vision.cfg import StudentCfg
-    from vd.vision.network import Student
-    from vd.vision.saved import SavedStudent, StudentSpec
-
+        teacher = _teacher(network.pop("policy"), source, weights, device, parts=True)
+        spec = from_dict(TrackingSpec, network, where="network")
+        depth = from_dict(DepthCameraCfg, source.depth, where="provenance.depth")
+        return TrackingPolicy(teacher, replace(spec, depth=depth, **settings))
     assert source.stage is not None
-    spec = StudentSpec(
-        network=from_dict(StudentCfg, contract.network, where="network"),
+    student = StudentSpec(
+        network=from_dict(StudentCfg, network, where="network"),
         num_actions=len(contract.interface.hand.joint_names),
         stage=source.stage,
-        teacher=source.teacher,
-        **_settings(contract),
+        **settings,
     )
-    network = Student(spec.network, spec.num_actions).to(device)
-    network.load_state_dict(weights)
-    network.eval().requires_grad_(False)
-    student = SavedStudent(spec, network, source.task, source.depth, source.iterations, source.env_steps)
-    return Bundle(contract, student)
+    net = Student(student.network, student.num_actions).to(device)
+    net.load_state_dict(weights)
+    net.eval().requires_grad_(False)
+    return SavedStudent(student, net, source.task, source.depth, source.iterations, source.env_steps)
 
 
-def _tracking(contract: Contract, weights: dict[str, torch.Tensor], device: str) -> "TrackingPolicy":
-    """The tracking policy of a contract with weights."""
-    from vd.tracking.policy import TrackingPolicy, TrackingSpec
+def _teacher(
+    spec: dict[str, Any], source: Provenance, weights: Tensors, device: str, *, parts: bool = False
+) -> TrainedPolicy:
+    """A teacher; with ``parts`` the names of its weights say whether they are the actor's or the critic's."""
 
-    source, network = contract.provenance, dict(contract.network)
-    parts: dict[str, dict[str, torch.Tensor]] = {"actor": {}, "critic": {}}
-    for name, value in weights.items():
-        part, _, inside = name.partition(".")
-        parts[part][inside] = value
-    teacher = TrainedPolicy(
-        from_dict(PolicySpec, network.pop("policy"), where="network.policy"),
-        parts["actor"],
+    def of(part: str) -> Tensors:
+        return {n.removeprefix(part): value for n, value in weights.items() if n.startswith(part)}
+
+    return TrainedPolicy(
+        from_dict(PolicySpec, spec, where="network"),
+        of("actor.") if parts else weights,
         task=source.task,
         iteration=source.iterations,
         env_steps=source.env_steps,
         device=device,
-        critic=parts["critic"] or None,
+        critic=(of("critic.") or None) if parts else None,
     )
-    spec = replace(
-        from_dict(TrackingSpec, network, where="network"),
-        teacher=source.teacher,
-        depth=from_dict(DepthCameraCfg, source.depth, where="provenance.depth"),
-        **_settings(contract),
-    )
-    return TrackingPolicy(teacher, spec)
-
-
-def _settings(contract: Contract) -> dict[str, Any]:
-    """Camera and stopping rules of a policy that sees clouds, as its description names them."""
-    from vd.stopping import StoppingRule
-
-    assert contract.stopping is not None
-    camera, stopping = contract.interface.camera, contract.stopping
-    return {
-        "camera": camera.pose_in_base if camera is not None and camera.source == "policy" else None,
-        "stopping": StoppingRule(stopping.distance_rad, stopping.action_norm),
-        "tolerance_rad": stopping.tolerance_rad,
-        "precise": None if stopping.precise is None else StoppingRule(*stopping.precise),
-        "calibrated_on": stopping.calibrated_on,
-    }
 
 
 def _provenance(
-    task: dict[str, Any], teacher: str, stage: int | None, iterations: int, env_steps: int
+    trained: TrainedPolicy | SavedStudent, teacher: str, stage: int | None, depth: dict[str, Any]
 ) -> Provenance:
     """Where a policy comes from, without folders of the machine it was trained on."""
-    objects = tuple(Path(name).name for name in task.get("objects", ()))
+    objects = tuple(Path(name).name for name in trained.task.get("objects", ()))
     return Provenance(
-        teacher=Path(teacher).name if "/" in teacher else teacher,
+        teacher=Path(teacher).name,
         stage=stage,
         objects=objects,
-        iterations=iterations,
-        env_steps=env_steps,
-        task={**task, "objects": list(objects)},
+        iterations=trained.iteration,
+        env_steps=trained.env_steps,
+        task={**trained.task, "objects": list(objects)},
+        depth=depth,
     )
 
 
-def _write(folder: Path, contract: Contract, weights: dict[str, Any], golden: Golden) -> None:
+def _write(folder: Path, contract: Contract, weights: Tensors, golden: Tensors) -> None:
     """Write the files beside the place of the bundle, then put them there at once."""
-    folder = Path(folder)
+    from safetensors.torch import save_file
+
     if folder.exists() and not is_bundle(folder) and (not folder.is_dir() or any(folder.iterdir())):
         raise FileExistsError(f"{folder} exists and is no bundle; choose another name")
     make_folder(folder.parent)
-    with writing(folder):
-        temporary = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
-    try:
-        with writing(folder):
-            _write_into(temporary, contract, weights, golden)
-            if folder.exists():
-                shutil.rmtree(folder)
-            temporary.replace(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with writing(folder), tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as name:
+        made = Path(name) / folder.name
+        made.mkdir(FOLDER_MODE)
+        for file, tensors in ((WEIGHTS_FILE, weights), (GOLDEN_FILE, golden)):
+            with atomic_path(made / file) as path:
+                save_file({key: v.detach().cpu().contiguous() for key, v in tensors.items()}, path)
+            (made / file).chmod(FILE_MODE)  # the library writes for the owner's eyes only
+        digests = {file: _digest(made / file) for file in (WEIGHTS_FILE, GOLDEN_FILE)}
+        write_json(made / CONTRACT_FILE, to_dict(replace(contract, files=digests)))
+        if folder.exists():
+            shutil.rmtree(folder)
+        made.replace(folder)
 
 
-def _write_into(folder: Path, contract: Contract, weights: dict[str, Any], golden: Golden) -> None:
-    """Write the files of a bundle into an empty folder."""
-    from safetensors.torch import save_file
-
-    folder.chmod(FOLDER_MODE)
-    for name, tensors in ((WEIGHTS_FILE, weights), (GOLDEN_FILE, golden)):
-        plain = {key: value.detach().cpu().contiguous() for key, value in tensors.items()}
-        with atomic_path(folder / name) as file:
-            save_file(plain, file)
-        (folder / name).chmod(FILE_MODE)  # the library writes for the owner's eyes only
-    digests = {name: _digest(folder / name) for name in (WEIGHTS_FILE, GOLDEN_FILE)}
-    write_json(folder / CONTRACT_FILE, to_dict(replace(contract, files=digests)))
-
-
-def _tensors(path: Path, contract: Contract, device: str) -> dict[str, torch.Tensor]:
+def _tensors(path: Path, contract: Contract, device: str) -> Tensors:
     """Tensors of a file of the bundle, after its digest was compared."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     if not path.is_file():
         raise FileNotFoundError(f"the bundle has no {path}; copy the whole folder again")
-    wanted = contract.files.get(path.name)
-    if _digest(path) != wanted:
+    if _digest(path) != contract.files.get(path.name):
         raise ContractError(
             f"{path} is not the file that {CONTRACT_FILE} was written with (its SHA-256 differs); "
             "copy the whole folder again"

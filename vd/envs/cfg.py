@@ -10,7 +10,7 @@ from vd.sim.cfg import SimCfg
 
 MAX_LATENCY_S = 0.5
 """Largest latency of observations that can be drawn [s] (ours): every world keeps all of it in memory."""
-View = Literal["world", "goal", "mirrored", "either"]
+View = Literal["world", "goal", "mirrored"]
 """What a policy sees its goals in, see :attr:`ObservationCfg.view`."""
 
 
@@ -89,8 +89,7 @@ class ObservationCfg:
     vertical from finger to finger, and the fingers renamed, so that the axis of the wanted rotation lies in
     one sector: an F-th of the goals to learn. The fingers must be spaced evenly. mirrored: in the mirror too,
     where the wanted rotation would be clockwise from above: half of that. The hand must be its own mirror
-    image, as dclaw3 is; of dclaw4 all fingers lean the same way round. either: as goal, and the same views in
-    the mirror, if the hand has them, are there for who looks twice (vd-eval --second-view)."""
+    image, as dclaw3 is; of dclaw4 all fingers lean the same way round."""
     file_axes: bool = True
     """See how the axes of the object's file lie, now and at the goal, as in the paper. No cloud shows which
     they are; students know the rotation from one to the other alone. Ours: without them a teacher sees zeros
@@ -112,7 +111,7 @@ class ObservationCfg:
 
     def views(self, fingers: int) -> int:
         """Views in which a hand of so many fingers sees its goals; 0: it sees the world as it is."""
-        return {"world": 0, "goal": fingers, "mirrored": 2 * fingers, "either": fingers}[self.view]
+        return {"world": 0, "goal": fingers, "mirrored": 2 * fingers}[self.view]
 
 
 @dataclass(frozen=True)

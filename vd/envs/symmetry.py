@@ -1,7 +1,5 @@
 """The views of :mod:`vd.kernels.task.symmetry` in the environments of a task: their launches."""
 
-from typing import Any
-
 import warp as wp
 
 from vd.envs.task_state import TaskState
@@ -68,20 +66,3 @@ class Views:
             world_action_kernel, [self._joints, self._sign, self.view, action], [out], dim=action.shape
         )
         return out
-
-
-class WorldOrder:
-    """A policy of views with its actions in the world's order: a teacher for a student that acts there."""
-
-    def __init__(self, policy: Any, views: Views | None):
-        """Wrap ``policy``; without ``views`` of its environment it acts as before."""
-        self._policy, self._views = policy, views
-        self.num_observations, self.num_actions = policy.num_observations, policy.num_actions
-
-    def act(self, observation: Any) -> Any:
-        """Actions [N, D] (torch) of an environment's observation."""
-        action = self._policy.act(observation)
-        if self._views is None:
-            return action
-        ordered = self._views.world_action(wp.from_torch(action.contiguous()))
-        return wp.to_torch(ordered).clone()

@@ -67,13 +67,8 @@ def view_tables(hand: HandModel, observation: ObservationCfg, view: View) -> Vie
     """
     fingers, tips = hand.num_fingers, _tips(hand, np.zeros(JOINTS_PER_FINGER))
     turns = [_turn(step, fingers) for step in range(fingers)]
-    try:
-        mirror = _mirror(hand, tips) if view in ("mirrored", "either") else None
-    except ValueError:
-        if view == "mirrored":
-            raise
-        mirror = None  # either: those that there are
-    if mirror is not None:
+    if view == "mirrored":
+        mirror = _mirror(hand, tips)
         turns += [turn @ mirror for turn in turns]
     direction = SECTOR + UP if view == "mirrored" else SECTOR
     maps = np.stack([_observation_map(observation, tips, turn) for turn in turns])

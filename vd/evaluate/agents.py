@@ -1,6 +1,6 @@
 """Agents by name or file, and the task they act in: shared by vd-eval and vd-play."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -28,12 +28,13 @@ BUILT_IN = ("zero", "random")
 SHIPPED_POLICIES = {path.stem: path for path in sorted((Path(__file__).parents[1] / "policies").glob("*.pt"))}
 """Trained policies that are installed with the package, by name: ``<hand>-<task>``."""
 
-RENAMED = {
+REPLACED = {
     "dclaw3-student": "dclaw3-tracking",
     "dclaw4-table-student": "dclaw4-tracking",
     "dclaw4-student": "dclaw4-air-tracking",
+    "dclaw3-procedural": "dclaw3-table",
 }
-"""Former names of installed policies, and what they are called now."""
+"""Names of policies that were installed once, and what to take instead."""
 
 DEFAULT_POLICY = "dclaw4-cube"
 DEFAULT_HAND = "dclaw4"
@@ -55,10 +56,10 @@ def find_policy(name: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: There is none.
-        ValueError: An installed policy has another name now.
+        ValueError: A policy of that name was installed once.
     """
-    if str(name) in RENAMED:
-        raise ValueError(f"the policy {name} is called {RENAMED[str(name)]} now: it tracks a known shape")
+    if str(name) in REPLACED:
+        raise ValueError(f"the policy {name} is not installed any more; take {REPLACED[str(name)]}")
     if str(name) in SHIPPED_POLICIES:
         return SHIPPED_POLICIES[str(name)]
     path = Path(name)
@@ -127,7 +128,7 @@ def open_policy(name: str, device: str) -> "TrainedPolicy | SavedStudent | Track
     if is_bundle(path):
         from vd.bundle.store import read_bundle
 
-        return read_bundle(path, device).policy
+        return read_bundle(path, device)
     if is_tracking(path):
         return load_tracking(path, device)
     return load_student(path, device) if is_student(path) else load_policy(path, device)
@@ -150,36 +151,6 @@ def sees_clouds(name: str) -> bool:
     from vd.vision.saved import is_student
 
     return is_student(path) or is_tracking(path)
-
-
-def has_second_view(name: str) -> bool:
-    """Whether :mod:`vd.evaluate.second_view` is for it.
-
-    It is for teachers that see their goals in views, and tracking policies of such.
-
-    Raises:
-        FileNotFoundError: There is no such policy.
-        ValueError: The file is no policy.
-    """
-    if name in BUILT_IN:
-        return False
-    policy = open_policy(name, "cpu")
-    return not is_saved_student(policy) and trained_task(policy).observation.view != "world"
-
-
-def check_second_view(names: Sequence[str]) -> None:
-    """Refuse ``--second-view`` where none of the policies has one.
-
-    Raises:
-        FileNotFoundError: There is no such policy.
-        ValueError: None has, or a file is no policy.
-    """
-    if not any(map(has_second_view, names)):
-        raise ValueError(
-            "--second-view is for teachers that see their goals in views (observation.view goal or "
-            f"mirrored), as dclaw3-table does, and tracking policies; {', '.join(names)} has no other view, "
-            "or no critic to ask"
-        )
 
 
 def open_teacher(name: str, device: str) -> "TrainedPolicy | None":
@@ -270,7 +241,6 @@ def task_for(
     success_ends_episode: bool,
     at_rest: bool | None = None,
     hand_layer: str | None = None,
-    second_view: bool = False,
     condition: RandomisationCfg | None = None,
 ) -> ReorientCfg:
     """The task in which an agent is evaluated or watched.
@@ -293,21 +263,12 @@ def task_for(
         at_rest: Start at rest on the table rather than from a drop; None: as trained.
         hand_layer: Layer over the hand with an identified servo model; ``none``: the hand as it is, None: as
             trained.
-        second_view: Whether a teacher looks twice at goals (:mod:`vd.evaluate.second_view`); a student needs
-            nothing of the task for that.
         condition: What is drawn, in place of ``randomised`` (:mod:`vd.evaluate.conditions`).
-
-    Raises:
-        ValueError: The teacher does not see its goals in views.
     """
     base = trained_task(policy) if policy is not None else ReorientCfg(hand=DEFAULT_HAND)
     if is_saved_student(policy) or is_tracking_policy(policy):
         # Who does not look at its teacher's observation.
         base = replace(base, observation=ObservationCfg())
-    elif second_view and policy is not None:
-        from vd.evaluate.second_view import with_second_view
-
-        base = replace(base, observation=with_second_view(base.observation))
     if base.observation.dynamics == "critic":  # whom nobody asks here
         base = replace(base, observation=replace(base.observation, dynamics="none"))
     return replace(

@@ -16,8 +16,6 @@ from vd.paper import PAPER
 if TYPE_CHECKING:
     from vd.envs.cfg import RandomisationCfg
 
-# Environments simulated at once by default: enough to keep the device busy, few enough to fit anywhere.
-WORLDS_CPU, WORLDS_GPU = 64, 8192
 # Seconds between progress lines where they go to a file.
 LOG_EVERY_S = 10.0
 DEFAULT_OBJECTS = ("cube",)
@@ -33,13 +31,11 @@ OF_THE_SUITE = (
     "condition",
     "goals",
     "sensor_errors",
-    "second_view",
-    "sees",
 )
 """Settings that a suite decides."""
 POLICY_HELP = (
-    "A policy.pt or student.pt, a checkpoint, the folder of a bundle or of a run, or the name of an "
-    f"installed policy: {', '.join(SHIPPED_POLICIES)}."
+    "A policy.pt or student.pt, a checkpoint, the folder of a bundle or of a run, the name of an installed "
+    f"policy ({', '.join(SHIPPED_POLICIES)}), or zero or random, which have no file."
 )
 """What names a policy on a command line."""
 
@@ -50,7 +46,7 @@ class EvalCfg:
 
     Objects fall into the hand from orientations uniform on SO(3), or, with --at-rest, lie on the table.
 
-    Writes eval.json (every episode) and eval.html (one page with figures) and prints tables. Episodes are
+    Writes eval.json (every episode) and eval.html (one page) and prints tables. Episodes are
     recorded to their ends; rules that stop them are applied to the record. Camera policies stop by the
     distance that they predict and, for comparison, by the true one; others by the true one and, as a second
     row, at the first step at which all success criteria of training hold, stillness included.
@@ -60,8 +56,6 @@ class EvalCfg:
     """
 
     policies: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = ()
-    agent: str | None = None
-    """zero or random, alone or beside policies."""
     suite: Literal["paper"] | None = None
     """Run the paper's evaluations, on the installed policies if none is named. --objects training=FOLDER
     held-out=FOLDER names the objects; without, our procedural sets stand for them."""
@@ -82,7 +76,7 @@ class EvalCfg:
     max_goal_angle: float = math.pi
     """Goals are within this angle [rad] of the start; pi is all of SO(3)."""
     at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Start at rest on the table; the default is as trained, and a drop for --agent zero and random. The
+    """Start at rest on the table; the default is as trained, and a drop for zero and random. The
     environment draws such starts and their goals; they depend on --num-envs too."""
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
@@ -94,26 +88,18 @@ class EvalCfg:
     """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
     table_friction: float | None = None
     """Coefficient of the table, of which contacts with objects get the mean of the two; 0.5 by default."""
-    second_view: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Ours: where a policy has not come to its goal in 3 s, look at it once a second from other fingers'
-    sides, or in the mirror, and go on in the view of which its critic, or its teacher's, expects
-    most."""
     goals: Goals = "mesh"
     """What camera policies know shapes and goals by: the exact mesh; 500 exact points, as the paper's; or a
     scan, points with 4 mm of noise and a fifth missing. A surface is laid through points."""
     sensor_errors: bool = True
     """Cameras of policies err as a D415 does: noise, gaps, late images, not quite where it is believed
     (docs/concepts/perception.md). Without: as in their training."""
-    sees: Literal["auto", "complete", "rendered"] = "auto"
-    """What students see: complete clouds, a depth camera's, or what their stage was trained on."""
     randomise: bool = False
     """Randomise dynamics and add noise and disturbances as in training."""
     condition: Condition | None = None
     """Evaluate in a named condition, whatever the training: nominal; s3, Table S3; hard, the same with forces
     that last a control step; mixed, Table S3 with friction, backlash, late commands and observations;
     observation-late and command-late, 83 ms and nothing else."""
-    resample: Literal["auto", "object", "episode"] = "auto"
-    """What intervals speak about: objects (from 8 of them) or episodes within objects."""
     num_envs: int | None = None
     """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a GPU (1024
     with camera policies)."""
@@ -131,15 +117,11 @@ class EvalCfg:
         Raises:
             ValueError: Nothing is named.
         """
-        names = tuple(dict.fromkeys((*self.policies, *([] if self.agent is None else [self.agent]))))
-        if not names and self.suite is not None:
-            return tuple(SHIPPED_POLICIES)
-        if not names:
+        if not self.policies and self.suite is None:
             raise ValueError(
-                "name a policy: a file, --agent zero, --agent random, or an installed policy "
-                f"({', '.join(SHIPPED_POLICIES)})"
+                f"name a policy: a file, zero, random, or an installed one ({', '.join(SHIPPED_POLICIES)})"
             )
-        return names
+        return tuple(dict.fromkeys(self.policies or SHIPPED_POLICIES))
 
     @property
     def object_sets(self) -> tuple[str, ...]:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vd.evaluate.agents import (
-    BUILT_IN,
     built_in,
     check_bundle,
     is_tracking_policy,
@@ -18,32 +17,34 @@ from vd.evaluate.agents import (
     start_at_rest,
     task_for,
 )
-from vd.evaluate.cfg import LOG_EVERY_S, WORLDS_CPU, WORLDS_GPU, EvalCfg, parse_groups
+from vd.evaluate.cfg import LOG_EVERY_S, EvalCfg, parse_groups
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
     from vd.envs.cfg import ReorientCfg
-    from vd.evaluate.comparison import Comparison
-    from vd.evaluate.result import Protocol
+    from vd.evaluate.goals import Goals
+    from vd.evaluate.result import Protocol, Result
     from vd.evaluate.trace import Trace
     from vd.stopping import StoppingRule
 
-STUDENT_WORLDS_GPU = 1024
-"""Environments at once by default where a student looks at them: depth images and clouds take memory."""
+ENVS_CPU, ENVS_GPU, ENVS_CAMERA_GPU = 64, 8192, 1024
+"""Environments simulated at once by default: enough to keep the device busy, few enough to fit anywhere;
+images and clouds take memory."""
 _PACKAGES = ("visual-dexterity", "newton", "warp-lang", "mujoco-warp", "torch")
 
 
-def compare(cfg: EvalCfg, stop_at: float = math.inf) -> "Comparison":
-    """Run an evaluation and write its JSON and page into ``cfg.out``.
+def compare(cfg: EvalCfg, condition: str = "", stop_at: float = math.inf) -> "Result":
+    """Run an evaluation and write its JSON into ``cfg.out``.
 
     Args:
         cfg: Settings of the command line.
+        condition: Of the suite.
         stop_at: When to give up [s], on the monotonic clock.
 
     Raises:
         ValueError: A setting, object set or policy cannot be used.
         FileNotFoundError: There is no such policy.
-        vd.sim.simulator.SimulationError: Contacts were lost, or a world left the finite numbers.
+        vd.sim.simulator.SimulationError: Contacts were lost, or an environment left the finite numbers.
         TimeoutError: It was to give up.
     """
     quiet_warp()
@@ -53,19 +54,17 @@ def compare(cfg: EvalCfg, stop_at: float = math.inf) -> "Comparison":
     # A file that cannot be used is told before the simulator is imported.
     policies = {name: open_policy(name, device) for name in cfg.agent_names}
     from vd.assets_usd.objects.sets import load_set
-    from vd.assets_usd.objects.sheet import pictures
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.comparison import Comparison, judge
-    from vd.evaluate.comparison_page import write_comparison
+    from vd.evaluate.result import Result, judge
     from vd.tracking.symmetry import with_symmetries
 
     groups = parse_groups(cfg.object_sets)
     everything = tuple(dict.fromkeys(s for sets in groups.values() for s in sets))
     members = {name: [item.name for item in load_set(list(sets))] for name, sets in groups.items()}
     count = len(load_set(list(everything)))
-    limit = STUDENT_WORLDS_GPU if device != "cpu" and any(map(sees_clouds, cfg.agent_names)) else None
-    envs = cfg.num_envs or worlds_for(count, cfg.episodes, device, limit=limit)
-    rows, predictions = [], []
+    camera = any(map(sees_clouds, cfg.agent_names))
+    envs = cfg.num_envs or envs_for(count, cfg.episodes, device, camera=camera)
+    rows = []
     env: Any = None
     task, start = None, None
     for name, policy in policies.items():
@@ -79,29 +78,28 @@ def compare(cfg: EvalCfg, stop_at: float = math.inf) -> "Comparison":
             env.objects = with_symmetries(env.objects, device)
             task, start = wanted, env.state_dict()
         env.load_state_dict(start)
-        actor, kind, sees, rules = actor_of(cfg, name, policy, env, device)
+        actor, kind, sees, rules = actor_of(
+            name, policy, env, goals=cfg.goals, sensor_errors=cfg.sensor_errors, seed=cfg.seed
+        )
         trace = run_episodes(cfg, env, actor, name, rules, stop_at)
-        protocol = _protocol(cfg, name, wanted, sees)
         index = {item.name: number for number, item in enumerate(env.objects)}
         for group, sets in groups.items():
             chosen = [index[member] for member in members[group]]
-            found, prediction = judge(
+            rows += judge(
                 trace.of(chosen),
-                replace(protocol, objects=", ".join(sets)),
+                _protocol(cfg, wanted, sets, sees),
                 [env.objects[number] for number in chosen],
+                policy=name,
                 kind=kind,
                 sees=sees,
                 group=group,
                 rules=rules,
-                resample=cfg.resample,
+                condition=condition,
             )
-            rows += found
-            predictions += [] if prediction is None else [prediction]
     env.close()
-    comparison = Comparison(tuple(rows), tuple(predictions), software=_software(device))
-    comparison.write(cfg.out / "eval.json")
-    write_comparison(comparison, cfg.out / "eval.html", pictures=pictures(env.objects))
-    return comparison
+    result = Result(tuple(rows), software=_software(device))
+    result.write(cfg.out / "eval.json")
+    return result
 
 
 def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) -> "ReorientCfg":
@@ -121,14 +119,13 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
         success_ends_episode=True,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        second_view=cfg.second_view,
         condition=cfg.randomisation,
     )
     if cfg.table_friction is not None:
         task = replace(task, table_friction=cfg.table_friction)
     if cfg.randomised:
         return task
-    # Noise that is switched off anyway, and would keep a teacher and its student from sharing environments.
+    # Noise that is switched off anyway, and would keep a teacher and a tracker from sharing environments.
     exact = replace(
         task.randomisation,
         observation_noise_mean=0.0,
@@ -138,13 +135,12 @@ def task_of(cfg: EvalCfg, policy: Any | None, sets: tuple[str, ...], envs: int) 
     return replace(task, randomisation=exact)
 
 
-def _protocol(cfg: EvalCfg, name: str, task: "ReorientCfg", sees: str) -> "Protocol":
-    """How the episodes of one policy are run; its objects are those of a group."""
+def _protocol(cfg: EvalCfg, task: "ReorientCfg", sets: tuple[str, ...], sees: str) -> "Protocol":
+    """How the episodes of one policy with the objects of a group are run."""
     from vd.evaluate.result import Protocol
 
     return Protocol(
-        policy=name,
-        objects="",
+        objects=", ".join(sets),
         hand=task.hand,
         hand_layer=task.hand_layer,
         episodes=cfg.episodes,
@@ -153,60 +149,53 @@ def _protocol(cfg: EvalCfg, name: str, task: "ReorientCfg", sees: str) -> "Proto
         stop_tolerance_rad=cfg.stop_tolerance,
         episode_s=task.episode_s,
         control_hz=task.sim.control_hz,
-        randomised=cfg.randomised,
+        randomisation=cfg.condition or ("on" if cfg.randomised else "off"),
         at_rest=task.start.at_rest,
         goals_about_vertical=task.start.at_rest and task.goal.about_vertical,
         in_air=cfg.in_air,
         table_friction=cfg.table_friction,
         goals=cfg.goals,
         sensor_errors=cfg.sensor_errors and sees == "rendered clouds",
-        second_view=cfg.second_view and name not in BUILT_IN,
-        condition=cfg.condition,
     )
 
 
-def actor_of(cfg: EvalCfg, name: str, policy: Any | None, env: Any, device: str) -> tuple[Any, str, str, Any]:
-    """What acts, its kind, what it sees, and its rules to stop, by tolerance."""
+def actor_of(
+    name: str,
+    policy: Any | None,
+    env: Any,
+    *,
+    goals: "Goals" = "mesh",
+    sensor_errors: bool = False,
+    seed: int = 0,
+) -> tuple[Any, str, str, Any]:
+    """What acts in an environment, its kind, what it sees, and its rules to stop, by tolerance.
+
+    Args:
+        name: Of the policy.
+        policy: What :func:`open_policy` gave.
+        env: The environment.
+        goals: What a camera policy knows shapes and goals by.
+        sensor_errors: Its camera errs as a real one.
+        seed: Of everything random.
+    """
     from vd.policy import TrainedPolicy
     from vd.stopping import StoppingRule
 
-    if name in BUILT_IN:
-        return built_in(name, env.num_actions, seed=cfg.seed, device=device), name, "nothing", StoppingRule
+    if policy is None:
+        return built_in(name, env.num_actions, seed=seed, device=env.device), name, "nothing", StoppingRule
     if isinstance(policy, TrainedPolicy):
-        if cfg.second_view:
-            from vd.evaluate.second_view import SecondView
-
-            return SecondView(env, policy), "teacher", "state", StoppingRule
         return policy, "teacher", "state", StoppingRule
     from vd.workers import one_thread_without_gpu
 
-    assert policy is not None
-    one_thread_without_gpu(device)
+    one_thread_without_gpu(env.device)
+    settings: dict[str, Any] = {"goals": goals, "sensor_errors": sensor_errors, "seed": seed}
     if is_tracking_policy(policy):
         from vd.evaluate.tracking import TrackingActor
 
-        if cfg.sees == "complete":
-            raise ValueError(f"--sees complete: {name} tracks by a depth camera; leave it out")
-        tracker = TrackingActor(
-            env,
-            policy,
-            goals=cfg.goals,
-            sensor_errors=cfg.sensor_errors,
-            second_view=cfg.second_view,
-            seed=cfg.seed,
-        )
-        return tracker, "tracking", "rendered clouds", policy.spec.rule_for
+        return TrackingActor(env, policy, **settings), "tracking", "rendered clouds", policy.spec.rule_for
     from vd.evaluate.student import StudentActor
 
-    rendered = None if cfg.sees == "auto" else cfg.sees == "rendered"
-    actor = StudentActor(
-        env,
-        policy,
-        rendered=rendered,
-        goals=cfg.goals,
-        sensor_errors=cfg.sensor_errors,
-        seed=cfg.seed,
-    )
+    actor = StudentActor(env, policy, **settings)
     sees = "rendered clouds" if actor.rendered else "complete clouds"
     return actor, f"student of stage {policy.spec.stage}", sees, policy.spec.rule_for
 
@@ -227,10 +216,9 @@ def run_episodes(
     import numpy as np
     from tqdm import tqdm
 
-    from vd.evaluate.comparison import ways_to_stop
-    from vd.evaluate.result import air_table_steps
+    from vd.evaluate.result import ways_to_stop
     from vd.evaluate.rollout import draw_starts_and_goals
-    from vd.evaluate.trace import record
+    from vd.evaluate.trace import air_table_steps, record
 
     starts, goals = None, None
     if not env.cfg.start.at_rest:
@@ -264,9 +252,9 @@ def run_episodes(
     return trace
 
 
-def worlds_for(num_objects: int, episodes: int, device: str, *, limit: int | None = None) -> int:
+def envs_for(num_objects: int, episodes: int, device: str, *, camera: bool = False) -> int:
     """Environments to simulate at once: the same number for every object, at most one for each episode."""
-    limit = limit or (WORLDS_CPU if device == "cpu" else WORLDS_GPU)
+    limit = ENVS_CPU if device == "cpu" else ENVS_CAMERA_GPU if camera else ENVS_GPU
     return num_objects * max(1, min(episodes, limit // num_objects))
 
 

@@ -1,79 +1,57 @@
-"""Episodes of one policy as one rule ends them, and the summary computed from them.
+"""What an evaluation found: a row for each policy, group of objects, condition and way to stop.
 
-Angles are radians, times seconds, quaternions xyzw.
+Angles are radians, times seconds, quaternions xyzw. K objects, M episodes of each.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
-from vd.assets_usd.objects.model import ObjectModel
+from vd.config import from_dict, to_dict
 from vd.evaluate.goals import Goals
 from vd.evaluate.statistics import (
+    TOLERANCES_RAD,
     Interval,
     Unit,
-    chance_cdf,
     choose_unit,
     median_interval,
     order_interval,
+    paired_difference,
     rate_intervals,
-    rotation_angle,
 )
+from vd.evaluate.trace import Episode, StopsBy, Trace
+from vd.files import write_json
 from vd.paper import PAPER
+from vd.stopping import StoppingRule
 
-TOLERANCES_RAD = (0.1, 0.2, 0.4, 0.8)
-"""Errors at which success is reported; the paper's figures use 0.1, 0.4 and 0.8."""
+RESULT_FORMAT = "visual-dexterity evaluation 7"
+BOUNDS_RAD = (PAPER.success.precise_rad, PAPER.success.rotation_rad)
+"""Bounds on the distance at which predictions are judged, as in the paper."""
+OUTCOMES = ("success", "orientation error", "time-out", "object falls")
+"""Classes of episodes: stopped within the tolerance of the very goal, stopped outside of it, never stopped,
+lost."""
 
-
-def air_table_steps(control_hz: float) -> int:
-    """Control steps at this rate [Hz] after which the paper's in-air test takes the table away."""
-    return round(PAPER.scene.air_table_s * control_hz)
-
-
-@dataclass(frozen=True)
-class Episode:
-    """One start and one goal of one object, to its end or stop."""
-
-    object_index: int
-    """Index into :attr:`EvalResult.object_names`."""
-    start_quat: tuple[float, float, float, float]
-    """Object orientation at the reset."""
-    goal_quat: tuple[float, float, float, float]
-    """Goal orientation."""
-    start_error_rad: float
-    """Orientation error at the reset, up to the object's symmetry."""
-    error_rad: float
-    """Orientation error at the last step of the episode, up to the object's symmetry."""
-    exact_error_rad: float
-    """The same to the very goal, which is what counts."""
-    steps: int
-    """Control steps simulated."""
-    stopped: bool
-    """The rule that was asked for stopped it at the last step."""
-    fell: bool
-    """The object left the hand."""
-
-    @property
-    def scored_error_rad(self) -> float:
-        """The error that counts: pi, the largest there is, for a dropped object."""
-        return float(np.pi) if self.fell else self.exact_error_rad
+StoppedBy = Literal["prediction", "true distance", "success criteria of training"]
+SUCCESS: StoppedBy = "success criteria of training"
+OWN_NORM = "its own bound of the action"
+"""Mark of rows that are ours: stopped by the bound of the action's norm that a policy's file has."""
 
 
 @dataclass(frozen=True)
 class Protocol:
     """How the episodes were run."""
 
-    RETIRED: ClassVar[dict[str, Any]] = {"aim": False}
-    policy: str
-    """Checkpoint path, or the name of a built-in agent."""
     objects: str
-    """Object set as it was named."""
+    """Object sets as they were named."""
     hand: str
-    """Hand name."""
+    hand_layer: str | None
+    """Layer over the hand with an identified servo model, if any."""
     episodes: int
-    """Episodes per object, M."""
+    """Episodes of each object, M."""
     seed: int
     """Of starts, goals, and the randomisation if it is on."""
     max_goal_angle_rad: float
@@ -84,37 +62,21 @@ class Protocol:
     """Time limit."""
     control_hz: float
     """Policy rate."""
-    randomised: bool
-    """Domain randomisation, noise and disturbances as in training."""
+    randomisation: str = "off"
+    """What is drawn: ``off``, ``on`` as in training, or a name of :mod:`vd.evaluate.conditions`."""
     at_rest: bool = False
     """Objects start at rest on the table, and starts and goals are those the environment draws; otherwise
     they fall, with starts uniform on SO(3), the same for any environment."""
     goals_about_vertical: bool = False
     """Goals only turn the object about the vertical."""
-    hand_layer: str | None = None
-    """Layer over the hand with an identified servo model, if any."""
     in_air: bool = False
     """The table is taken away once the hand had time to grasp."""
     table_friction: float | None = None
     """Coefficient of the table if it is not the nominal one."""
     goals: Goals = "mesh"
-    """What students know shapes and goals by."""
+    """What camera policies know shapes and goals by."""
     sensor_errors: bool = False
-    """Cameras of students have the errors of a real one."""
-    second_view: bool = False
-    """A goal that is not reached is looked at in other views (:mod:`vd.evaluate.second_view`)."""
-    condition: str | None = None
-    """What was drawn, of :mod:`vd.evaluate.conditions`; None: as in training, if at all."""
-
-    @property
-    def randomisation_text(self) -> str:
-        """What was drawn, for people."""
-        return self.condition or ("on" if self.randomised else "off")
-
-    @property
-    def hand_name(self) -> str:
-        """The hand, and the layer over it."""
-        return self.hand if self.hand_layer is None else f"{self.hand} with {self.hand_layer}"
+    """Cameras have the errors of a real one."""
 
 
 @dataclass(frozen=True)
@@ -122,125 +84,321 @@ class Summary:
     """Rates and medians of all objects, or of one."""
 
     name: str
-    """Object name, or ``all``."""
+    """Object, or ``all``."""
     episodes: int
-    """Number of episodes behind it."""
     unit: Unit
     """What the intervals speak about."""
+    outcomes: dict[str, Interval]
+    """Share of episodes in each class of OUTCOMES."""
     success: dict[str, Interval]
-    """By tolerance [rad] (as text): share of episodes that ended within it of the very goal, not dropped."""
+    """By tolerance [rad] (as text): share of episodes that ended within it of the very goal, not lost."""
     symmetric: dict[str, Interval]
     """The same up to the object's symmetry."""
-    stop_rate: Interval
-    """Share of episodes that the rule stopped."""
-    drop_rate: Interval
-    """Share of episodes in which the object was dropped."""
     median_error_rad: Interval
-    """Median final error to the very goal; a dropped object counts as pi."""
-    mean_error_rad: float
-    """Mean final error to the very goal as measured, drops included, to compare with chance (2.21 rad)."""
-    time_to_success_s: Interval | None
-    """Median time to the stop of the episodes that stopped; None if none did."""
-    chance: dict[str, float]
-    """By tolerance: success of an orientation drawn uniformly from SO(3)."""
-    start: dict[str, float]
-    """By tolerance: success of leaving the object as it was at the reset."""
+    """Median final error to the very goal; a lost object counts as pi."""
+    time_s: Interval | None
+    """Median time to the stop of the episodes that succeeded; None if none did."""
 
 
 @dataclass(frozen=True)
-class EvalResult:
-    """Protocol, episodes and summaries."""
+class Prediction:
+    """Predicted beside true distances of a camera policy, in all states of all episodes."""
 
+    states: int
+    mean_error_rad: float
+    """Mean absolute difference."""
+    seen: dict[str, float | None]
+    """By bound [rad] (as text): share of the states truly within it that are predicted within it; None
+    without such states."""
+    right: dict[str, float | None]
+    """By bound: share of the states predicted within it that truly are; None without such states."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One policy on one group of objects in one condition, under one way to stop."""
+
+    policy: str
+    """As it was named."""
+    kind: str
+    """teacher, tracking, student of stage 1 or 2, zero, random."""
+    sees: str
+    """state, complete clouds, rendered clouds or nothing."""
+    group: str
+    """Name of the group of objects."""
+    condition: str
+    """Of the suite; empty: none."""
+    stopped_by: StoppedBy
+    rule: StoppingRule
+    """Bounds of the distance and of the action's norm."""
+    ours: str
+    """What of it is ours, not the paper's; empty for the conditions of the paper."""
     protocol: Protocol
     object_names: tuple[str, ...]
-    """K names."""
     overall: Summary
-    """Over all objects."""
     per_object: tuple[Summary, ...]
-    """In the order of ``object_names``."""
-    episodes: tuple[Episode, ...]
-    """K x M episodes, object by object."""
-    warnings: dict[str, str] = field(default_factory=dict)
+    held: Interval | None
+    """Share of episodes stopped so, and still there after the hand has held for HOLD_S; None: not tried."""
+    symmetric: Interval
+    """Share of episodes stopped within the tolerance of what looks like the goal; where the true distance
+    decides, it is that distance."""
+    precise: Interval
+    """Share of episodes that stop within 0.1 rad of the very goal, by the rule for that."""
+    prediction: Prediction | None
+    """What its predictions are worth; None: they do not stop it."""
+    warnings: dict[str, str]
     """By name of an object: what its import says may be wrong with it."""
+    episodes: tuple[Episode, ...]
+    """K x M, object by object."""
 
-    def errors(self) -> np.ndarray:
-        """Scored final errors [rad], shape [K, M]."""
-        errors = np.array([episode.scored_error_rad for episode in self.episodes])
-        return errors.reshape(len(self.object_names), -1)
+    @property
+    def successes(self) -> np.ndarray:
+        """Which episodes were stopped within the tolerance of the very goal, bool [K, M]."""
+        return _outcome_masks(self.episodes, self.protocol)[0].reshape(len(self.object_names), -1)
 
-    def start_errors(self) -> np.ndarray:
-        """Errors to the very goal at the reset [rad], shape [K, M]."""
-        quats = [np.array([getattr(e, name) for e in self.episodes]) for name in ("start_quat", "goal_quat")]
-        errors = rotation_angle(*quats)
-        return errors.reshape(len(self.object_names), -1)
-
-
-def warnings_of(objects: Iterable[ObjectModel]) -> dict[str, str]:
-    """What the import of objects says may be wrong with them, by name; nothing of those without a warning."""
-    return {item.name: "; ".join(item.warnings) for item in objects if item.warnings}
+    @property
+    def headline(self) -> bool:
+        """Whether it is the policy's own rule: by its prediction if it has one, else by the true distance."""
+        by = "prediction" if self.sees.endswith("clouds") else "true distance"
+        return self.stopped_by == by and not self.ours
 
 
-def summarise(
-    protocol: Protocol,
-    object_names: tuple[str, ...],
-    episodes: tuple[Episode, ...],
-    *,
-    resample: Literal["auto", "object", "episode"] = "auto",
-    warnings: dict[str, str] | None = None,
-) -> EvalResult:
-    """Compute every rate, median and interval of some episodes.
+@dataclass(frozen=True)
+class Result:
+    """Everything that was evaluated."""
+
+    rows: tuple[Row, ...]
+    software: dict[str, str] = field(default_factory=dict)
+    missing: tuple[tuple[str, str, str], ...] = ()
+    """Conditions of a suite that have no row, the policy, and why."""
+    format: str = RESULT_FORMAT
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """Names of the policies, in order."""
+        return tuple(dict.fromkeys(row.policy for row in self.rows))
+
+    @property
+    def warnings(self) -> dict[str, str]:
+        """What may be wrong with objects, by name."""
+        return {name: words for row in self.rows for name, words in row.warnings.items()}
+
+    def headlines(self) -> dict[tuple[str, str], dict[str, Row]]:
+        """The headline row of each policy, by condition and group."""
+        found: dict[tuple[str, str], dict[str, Row]] = {}
+        for row in self.rows:
+            if row.headline:
+                found.setdefault((row.condition, row.group), {})[row.policy] = row
+        return found
+
+    def differences(self) -> list[tuple[Row, Row, Interval]]:
+        """Every other policy beside the first, and how much larger its share of success is, paired."""
+        found = []
+        for rows in self.headlines().values():
+            first, *others = rows.values()
+            for other in others:
+                if other.protocol.episodes == first.protocol.episodes:
+                    unit = first.overall.unit
+                    found.append((first, other, paired_difference(other.successes, first.successes, unit)))
+        return found
+
+    def summary(self) -> dict[str, Any]:
+        """What is written, as JSON, without episodes."""
+        found = to_dict(self)
+        for row in found["rows"]:
+            del row["episodes"]
+        found["differences"] = [
+            {"policy": other.policy, "from": first.policy, "condition": first.condition, "group": first.group}
+            | to_dict(interval)
+            for first, other, interval in self.differences()
+        ]
+        return found
+
+    def write(self, path: Path) -> None:
+        """Write as JSON, atomically."""
+        write_json(path, to_dict(self))
+
+    @staticmethod
+    def read(path: Path) -> "Result":
+        """Read what :meth:`write` wrote.
+
+        Raises:
+            ValueError: Not such a file, or of another version.
+        """
+        values: Any = json.loads(Path(path).read_text())
+        found = values.get("format") if isinstance(values, dict) else None
+        if found != RESULT_FORMAT:
+            raise ValueError(f"{path}: format is {found!r}, expected {RESULT_FORMAT!r}; run vd-eval again")
+        return from_dict(Result, values)
+
+
+@dataclass(frozen=True)
+class Way:
+    """A way to stop the episodes of a policy."""
+
+    stopped_by: StoppedBy
+    rule: StoppingRule
+    by: StopsBy
+    ours: str = ""
+
+
+def ways_to_stop(
+    rules: Callable[[float], StoppingRule], tolerance_rad: float, *, predicts: bool
+) -> list[Way]:
+    """The ways to stop a policy, the headline first.
+
+    They are the bounds of the distance that it predicts, if it does, and of the true one, both with the
+    released code's bound of the action's norm; and, as ours, its own bound of the norm where that is another.
+    What predicts nothing is stopped by the success criteria of training, too.
 
     Args:
-        protocol: How it was run.
-        object_names: K names.
-        episodes: K x M episodes, object by object.
-        resample: What intervals speak about: ``object``, ``episode``, or by the number of objects.
-        warnings: What may be wrong with objects, by name.
+        rules: The policy's own rule for a tolerance [rad].
+        tolerance_rad: Of the stop; bound of the true distance, too.
+        predicts: Whether it predicts distances.
     """
-    by_object = [episodes[i : i + protocol.episodes] for i in range(0, len(episodes), protocol.episodes)]
-    if len(by_object) != len(object_names) or any(len(group) != protocol.episodes for group in by_object):
-        raise ValueError(
-            f"{len(episodes)} episodes are not {len(object_names)} objects x {protocol.episodes}"
+    own, norm = rules(tolerance_rad), PAPER.success.action_norm
+    ways = [Way("true distance", StoppingRule(tolerance_rad, norm), "exact")]
+    if predicts:
+        ways.insert(0, Way("prediction", replace(own, action_norm=norm), "predicted"))
+        if own.action_norm != norm:
+            ways.append(Way("prediction", own, "predicted", OWN_NORM))
+    else:
+        ways.append(Way(SUCCESS, StoppingRule(tolerance_rad, norm), "success"))
+    return ways
+
+
+def judge(
+    trace: Trace,
+    protocol: Protocol,
+    objects: list[Any],
+    *,
+    policy: str,
+    kind: str,
+    sees: str,
+    group: str,
+    rules: Callable[[float], StoppingRule],
+    condition: str = "",
+) -> list[Row]:
+    """Rows of one policy in one group, one for each way to stop.
+
+    Args:
+        trace: Its episodes with the objects of the group.
+        protocol: How they were run.
+        objects: The objects (name and warnings are read).
+        policy: Its name.
+        kind: Of the policy.
+        sees: What it sees.
+        group: Name of the group.
+        rules: The policy's own rule for a tolerance [rad], see :func:`ways_to_stop`.
+        condition: Of the suite.
+    """
+    rows, predicts, tolerance = [], trace.predicted is not None, protocol.stop_tolerance_rad
+    names, unit = tuple(item.name for item in objects), choose_unit(len(objects))
+    for way in ways_to_stop(rules, tolerance, predicts=predicts):
+        episodes = trace.episodes(way.rule, way.by)
+        by_object = [episodes[k : k + protocol.episodes] for k in range(0, len(episodes), protocol.episodes)]
+        rows.append(
+            Row(
+                policy=policy,
+                kind=kind,
+                sees=sees,
+                group=group,
+                condition=condition,
+                stopped_by=way.stopped_by,
+                rule=way.rule,
+                ours=way.ours,
+                protocol=protocol,
+                object_names=names,
+                overall=summarise("all", episodes, protocol, unit),
+                per_object=tuple(
+                    summarise(name, part, protocol, "episode")
+                    for name, part in zip(names, by_object, strict=True)
+                ),
+                held=_held(trace, way, tolerance, unit),
+                symmetric=_symmetric(trace, way, tolerance, unit),
+                precise=_precise(trace, rules, way, unit),
+                prediction=_prediction(trace) if way.by == "predicted" else None,
+                warnings={item.name: "; ".join(item.warnings) for item in objects if item.warnings},
+                episodes=episodes,
+            )
         )
-    return EvalResult(
-        protocol=protocol,
-        object_names=object_names,
-        overall=_summary("all", by_object, choose_unit(len(object_names), resample), protocol),
-        per_object=tuple(
-            _summary(name, [group], "episode", protocol)
-            for name, group in zip(object_names, by_object, strict=True)
-        ),
-        episodes=episodes,
-        warnings=warnings or {},
+    return rows
+
+
+def summarise(name: str, episodes: tuple[Episode, ...], protocol: Protocol, unit: Unit) -> Summary:
+    """Every rate, median and interval of some episodes, whole objects of them."""
+    shape = -1, protocol.episodes
+    errors, alike = (
+        np.array([np.pi if e.fell else getattr(e, attribute) for e in episodes]).reshape(shape)
+        for attribute in ("exact_error_rad", "error_rad")
     )
-
-
-def _summary(name: str, groups: list[tuple[Episode, ...]], unit: Unit, protocol: Protocol) -> Summary:
-    def table(attribute: str) -> np.ndarray:
-        return np.array([[getattr(episode, attribute) for episode in group] for group in groups])
-
-    errors, stopped, fell = table("scored_error_rad"), table("stopped"), table("fell")
-    alike = np.where(fell, np.pi, table("error_rad"))
-    start = rotation_angle(table("start_quat").reshape(-1, 4), table("goal_quat").reshape(-1, 4))
-    times = table("steps")[stopped] / protocol.control_hz
+    outcomes = _outcome_masks(episodes, protocol)
     within = [values <= tolerance for values in (errors, alike) for tolerance in TOLERANCES_RAD]
-    rates = rate_intervals(np.stack([*within, stopped, fell]), unit)
-    labels, count = [str(tolerance) for tolerance in TOLERANCES_RAD], len(TOLERANCES_RAD)
-    chance = chance_cdf(np.array(TOLERANCES_RAD))
+    rates = rate_intervals(np.stack([*outcomes.reshape(-1, *errors.shape), *within]), unit)
+    labels, first = [str(tolerance) for tolerance in TOLERANCES_RAD], len(OUTCOMES)
+    times = np.array([e.steps for e in episodes])[outcomes[0]] / protocol.control_hz
     return Summary(
         name=name,
-        episodes=errors.size,
+        episodes=len(episodes),
         unit=unit,
-        success=dict(zip(labels, rates[:count], strict=True)),
-        symmetric=dict(zip(labels, rates[count:-2], strict=True)),
-        stop_rate=rates[-2],
-        drop_rate=rates[-1],
+        outcomes=dict(zip(OUTCOMES, rates[:first], strict=True)),
+        success=dict(zip(labels, rates[first : first + len(labels)], strict=True)),
+        symmetric=dict(zip(labels, rates[first + len(labels) :], strict=True)),
         median_error_rad=median_interval(errors, unit),
-        mean_error_rad=float(table("exact_error_rad").mean()),
-        time_to_success_s=order_interval(times) if times.size else None,
-        chance=dict(zip(labels, map(float, chance), strict=True)),
-        start={
-            label: float((start <= tolerance).mean())
-            for label, tolerance in zip(labels, TOLERANCES_RAD, strict=True)
-        },
+        time_s=order_interval(times) if times.size else None,
     )
+
+
+def _outcome_masks(episodes: tuple[Episode, ...], protocol: Protocol) -> np.ndarray:
+    """Which episodes are in each class of OUTCOMES, bool [4, K M]."""
+    stopped, fell = (np.array([getattr(e, name) for e in episodes]) for name in ("stopped", "fell"))
+    right = np.array([e.exact_error_rad <= protocol.stop_tolerance_rad for e in episodes])
+    return np.stack([stopped & right, stopped & ~right, ~stopped & ~fell, ~stopped & fell])
+
+
+def _held(trace: Trace, way: Way, tolerance_rad: float, unit: Unit) -> Interval | None:
+    """Share of episodes stopped within the tolerance of the very goal, and still there after the hold."""
+    hold = trace.hold(way.rule, way.by)
+    if hold is None:
+        return None
+    _, error = _at_stop(trace, way.rule, way.by, trace.exact)
+    with np.errstate(invalid="ignore"):  # what was never stopped was not held
+        return rate_intervals(((error <= tolerance_rad) & (hold.exact <= tolerance_rad))[None], unit)[0]
+
+
+def _symmetric(trace: Trace, way: Way, tolerance_rad: float, unit: Unit) -> Interval:
+    """Share of episodes that are stopped within the tolerance of what looks like the goal."""
+    by: StopsBy = "error" if way.by == "exact" else way.by
+    stopped, error = _at_stop(trace, way.rule, by, trace.error)
+    return rate_intervals((stopped & (error <= tolerance_rad))[None], unit)[0]
+
+
+def _precise(trace: Trace, rules: Callable[[float], StoppingRule], way: Way, unit: Unit) -> Interval:
+    """Share of episodes that stop within 0.1 rad of the very goal, by the rule for it."""
+    bound = PAPER.success.precise_rad
+    ways = ways_to_stop(rules, bound, predicts=trace.predicted is not None)
+    same = next((w for w in ways if (w.by, w.ours) == (way.by, way.ours)), None)
+    # A rule that has the paper's bound for this tolerance has no other of its own.
+    stopped, error = _at_stop(trace, rules(bound) if same is None else same.rule, way.by, trace.exact)
+    return rate_intervals((stopped & (error <= bound))[None], unit)[0]
+
+
+def _at_stop(
+    trace: Trace, rule: StoppingRule, by: StopsBy, error: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Whether a rule stops each episode, and the error where it ends, one of the trace's [K, M]."""
+    steps, stopped = trace.ends(rule, by)
+    return stopped, np.take_along_axis(error, steps[..., None], axis=-1)[..., 0]
+
+
+def _prediction(trace: Trace) -> Prediction:
+    assert trace.predicted is not None
+    there = np.isfinite(trace.predicted)
+    true, predicted = trace.error[there], trace.predicted[there]
+    seen: dict[str, float | None] = {}
+    right: dict[str, float | None] = {}
+    for bound in BOUNDS_RAD:
+        near, said = true <= bound, predicted <= bound
+        seen[str(bound)] = float(said[near].mean()) if near.any() else None
+        right[str(bound)] = float(near[said].mean()) if said.any() else None
+    return Prediction(len(true), float(np.abs(predicted - true).mean()), seen, right)

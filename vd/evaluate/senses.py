@@ -49,7 +49,6 @@ class EnvironmentSenses:
             goal_quat=wp.to_torch(env.goal_quat),
             points=self._see(fresh),
             fresh=fresh,
-            goal_steps=wp.to_torch(env.goal_steps),
         )
 
     def _see(self, fresh: torch.Tensor) -> torch.Tensor:

@@ -23,13 +23,12 @@ from scipy.special import expit, logit
 Unit = Literal["object", "episode"]
 
 CONFIDENCE = 0.95
+TOLERANCES_RAD = (0.1, 0.2, 0.4, 0.8)
+"""Errors at which success is reported; the paper's figures use 0.1, 0.4 and 0.8."""
 # How much objects differ is not known from fewer than this.
 MIN_CLUSTERS = 8
 # Draws for chance on a symmetric object, for which no closed form is used: 0.5 % at a rate of one half.
 CHANCE_DRAWS = 40_000
-
-CHANCE_MEAN_RAD = np.pi / 2 + 2 / np.pi
-"""Mean angle between two uniform rotations: 2.2074 rad."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,8 @@ class Interval:
     low: float
     high: float
     method: str
-    """``logit-t``, ``clopper-pearson``, ``woodruff`` or ``order-statistics``: what gave the bounds."""
+    """``logit-t``, ``clopper-pearson``, ``woodruff``, ``order-statistics`` or ``paired-t``: what gave the
+    bounds."""
 
 
 def rotation_angle(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -102,11 +102,28 @@ def chance_cdf(angle: np.ndarray | float, symmetry: np.ndarray | None = None) ->
     return np.searchsorted(errors, angle, side="right") / CHANCE_DRAWS
 
 
-def choose_unit(num_objects: int, requested: Literal["auto", "object", "episode"] = "auto") -> Unit:
+def choose_unit(num_objects: int) -> Unit:
     """Objects where there are enough of them, else episodes within each object."""
-    if requested != "auto":
-        return requested
     return "object" if num_objects >= MIN_CLUSTERS else "episode"
+
+
+def paired_difference(outcomes: np.ndarray, others: np.ndarray, unit: Unit) -> Interval:
+    """How much larger the rate of some outcomes is than that of others on the same starts and goals.
+
+    Args:
+        outcomes: Booleans, shape [K, M]: K objects, M episodes each.
+        others: What they are compared with, likewise.
+        unit: What the statement is about.
+    """
+    pairs = outcomes.astype(float) - others
+    units = pairs.mean(axis=1)[None] if unit == "object" or pairs.shape[1] == 1 else pairs
+    strata, n = units.shape
+    half = np.inf
+    if n > 1:
+        error = np.sqrt(units.var(axis=1, ddof=1).sum() / n) / strata
+        half = float(stats.t.ppf((1 + CONFIDENCE) / 2, strata * (n - 1)) * error)
+    mean = float(pairs.mean())
+    return Interval(mean, max(mean - half, -1.0), min(mean + half, 1.0), "paired-t")
 
 
 def rate_intervals(outcomes: np.ndarray, unit: Unit) -> list[Interval]:

@@ -101,7 +101,7 @@ class StudentView:
 
     def sites(
         self, frame: Mapping[str, torch.Tensor], envs: torch.Tensor | None = None, *, augment: bool
-    ) -> tuple[Sites, ...]:
+    ) -> Sites:
         """Voxels of frames (:meth:`vd.vision.sight.Sight.sites`)."""
         return self.sight.sites(frame, envs, augment=augment)
 
@@ -139,7 +139,6 @@ class StudentActor:
         env: Any,
         student: SavedStudent,
         *,
-        rendered: bool | None = None,
         goals: Goals = "mesh",
         sensor_errors: bool = False,
         seed: int = 0,
@@ -149,7 +148,6 @@ class StudentActor:
         Args:
             env: The environment.
             student: The student.
-            rendered: See by a depth camera, or complete clouds; as its stage was trained by default.
             goals: What it knows shapes and goals by (:mod:`vd.evaluate.scanned`).
             sensor_errors: Give its camera the errors of a real one, in place of those of its training.
             seed: Of the errors of camera and scans.
@@ -166,7 +164,7 @@ class StudentActor:
                 f"{env.num_actions}; use the hand it was trained for"
             )
         self.env, self.num_actions, self._student = env, spec.num_actions, student.network
-        self.rendered = spec.stage == RENDERED if rendered is None else rendered
+        self.rendered = spec.stage == RENDERED
         depth = from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
         if sensor_errors:
             depth = depth.with_errors()
@@ -191,13 +189,13 @@ class StudentActor:
         """
         frame = self._view.frame()
         self._hidden.masked_fill_((self._steps == 0)[:, None], 0.0)
-        senses = self._student.senses(frame)
+        known = self._student.proprioception(frame)
         mean = frame["action"].new_zeros(frame["action"].shape)
         with torch.no_grad():
             for rows in self.active.nonzero().flatten().split(CLOUDS):
                 seen = {key: value[rows] for key, value in frame.items()}
                 sites = self._view.sites(seen, rows, augment=False)
-                output = self._student.act(sites[0], senses[rows], self._hidden[rows], *sites[1:])
+                output = self._student.act(sites, known[rows], self._hidden[rows])
                 self._hidden[rows] = output.hidden
                 self.predicted[rows] = output.distance[:, -1]
                 mean[rows] = output.mean

@@ -8,7 +8,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,111 +16,55 @@ from pathlib import Path
 from typing import Any
 
 from vd.config import to_dict
-from vd.evaluate.agents import (
-    BUILT_IN,
-    find_policy,
-    has_second_view,
-    sees_clouds,
-)
+from vd.evaluate.agents import BUILT_IN, find_policy, sees_clouds
 from vd.evaluate.cfg import EvalCfg, parse_groups
 from vd.evaluate.compare import compare
-from vd.evaluate.comparison import Comparison
-from vd.evaluate.comparison_page import labels, shown_name
+from vd.evaluate.page import NOTHING, labels, number, shown_name, write_page
+from vd.evaluate.result import SUCCESS, Result
+from vd.evaluate.statistics import Interval
 from vd.evaluate.suite import (
+    CLAIMS,
     CONDITIONS,
-    OUT_OF_TIME,
     OWN_SETS,
+    QUICK_CAMERA_EPISODES,
     QUICK_EPISODES,
     QUICK_OBJECTS,
     QUICK_S,
-    QUICK_STUDENT_EPISODES,
+    Claim,
     Condition,
     Group,
+    share_text,
 )
-from vd.evaluate.suite_page import write_suite
-from vd.evaluate.suite_result import Objects, SuiteResult
 from vd.files import make_folder, write_json
 from vd.workers import run_tasks
 
 SETTINGS_FILE = "settings.json"
 """Written last into a condition's folder: what it was run with."""
 RESULT_FILE, PAGE_FILE = "paper.json", "paper.html"
-PAGE_EVERY_S = 30.0
-"""Time between two pages of what there is [s]: drawing one takes seconds."""
 LOG_FILE = "log.txt"
 """Progress of an evaluation that ran beside others."""
+OUT_OF_TIME = "out of time; the same command goes on from here"
+"""Why evaluations of the reduced suite were not run."""
+NOT_RUN = "not run; the same command goes on from here"
 # Settings that say where and how an evaluation runs, not what it measures.
 _NOT_MEASURED = ("out", "device", "json", "num_envs", "jobs")
 
 
-def run_suite(cfg: EvalCfg, *, say: Callable[[str], object] | None = None) -> SuiteResult:
-    """Run what is not there yet, and write the page and its figures into ``cfg.out``.
+@dataclass(frozen=True)
+class Objects:
+    """The objects of one group.
 
-    Args:
-        cfg: Settings of the command line.
-        say: Takes lines of progress; standard error by default.
-
-    Raises:
-        ValueError: A setting, object set or policy cannot be used.
-        FileNotFoundError: There is no such policy.
+    Attributes:
+        sets: What vd-eval is given: sets, or chosen files of them.
+        text: The same for a reader.
     """
-    say = say or (lambda line: print(line, file=sys.stderr, flush=True))
-    stop_at = time.monotonic() + QUICK_S if cfg.quick else math.inf
-    groups = object_groups(cfg.objects, quick=cfg.quick)
-    conditions = tuple(c for c in CONDITIONS if (c.quick or not cfg.quick) and c.objects in groups)
-    result = SuiteResult(cfg.agent_names, groups, conditions, cfg.quick)
-    tasks = _tasks(cfg, result)
-    if cfg.quick:  # what takes long comes last
-        tasks.sort(key=lambda task: task.policy in result.students)
-    progress = _Progress(say, len(tasks))
-    try:
-        waiting = []
-        for task in tasks:
-            there = _read(task.cfg.out, task.wanted)
-            if there is None:
-                waiting.append(task)
-            else:
-                result.found[task.condition, task.policy] = there
-                progress.say(f"{task.text}, done before")
-        if cfg.jobs > 1:
-            _run_together(waiting, cfg, result, progress, stop_at)
-        else:
-            for task in waiting:
-                if time.monotonic() <= stop_at:
-                    progress.say(task.text)
-                _keep(task, _measure(task, stop_at), result, progress)
-                progress.show(result, cfg.out)
-    finally:
-        _write(result, cfg.out)
-    return result
 
-
-def _tasks(cfg: EvalCfg, result: SuiteResult) -> list["_Task"]:
-    """Everything that is to be measured. All names are looked up here, before anything slow."""
-    short = labels(result.policies)
-    views = {name: has_second_view(name) for name in result.policies}
-    prints = {name: fingerprint(name) for name in result.policies}
-    tasks = []
-    for condition in result.conditions:
-        objects = result.objects[condition.objects]
-        for name in result.policies:
-            if not condition.concerns(student=name in result.students, views=views[name]):
-                continue
-            one = settings(cfg, condition, name, objects)
-            one = replace(one, out=cfg.out / condition.name / short[name].replace("/", "-"))
-            text = f"{condition.title}: {short[name]} ({objects.text})"
-            tasks.append(_Task(condition.name, name, one, prints[name], text))
-    return tasks
-
-
-def _write(result: SuiteResult, folder: Path) -> None:
-    """The page and its figures, of what there is."""
-    write_json(folder / RESULT_FILE, result.summary())
-    write_suite(result, folder / PAGE_FILE)
+    sets: tuple[str, ...]
+    text: str
 
 
 @dataclass(frozen=True)
-class _Task:
+class Task:
     """One policy under one condition."""
 
     condition: str
@@ -128,7 +72,6 @@ class _Task:
     cfg: EvalCfg
     weights: str
     """Fingerprint of the policy."""
-    text: str
 
     @property
     def wanted(self) -> dict[str, Any]:
@@ -136,113 +79,136 @@ class _Task:
         settings = {key: value for key, value in to_dict(self.cfg).items() if key not in _NOT_MEASURED}
         return {"policy": self.weights} | settings
 
-
-class _Progress:
-    """Lines with the number of the evaluation and the minutes since the beginning."""
-
-    def __init__(self, say: Callable[[str], object], total: int):
-        self.line, self._total, self._number = say, total, 0
-        self._started = self._shown = time.monotonic()
-
-    def say(self, text: str) -> None:
-        self._number += 1
-        minutes = (time.monotonic() - self._started) / 60.0
-        self.line(f"[{self._number}/{self._total}, {minutes:.1f} min] {text}")
-
-    def show(self, result: SuiteResult, folder: Path) -> None:
-        """Write the page of what there is, should the rest not come; not if there was one just now."""
-        if time.monotonic() > self._shown + PAGE_EVERY_S:
-            _write(result, folder)
-            self._shown = time.monotonic()
-
-
-def _measure(task: _Task, stop_at: float = math.inf) -> str:
-    """Evaluate into the task's folder until ``stop_at``; returns why that failed, or nothing."""
-    if time.monotonic() > stop_at:  # the same clock in all processes
-        return OUT_OF_TIME
-    try:
-        compare(task.cfg, stop_at)
-    except TimeoutError:
-        return OUT_OF_TIME
-    except (RuntimeError, ValueError) as error:  # one world that flies off must not cost the others
-        return str(error)
-    return ""
-
-
-def _measure_apart(task: _Task, stop_at: float = math.inf) -> str:
-    """The same in a process of its own, whose progress goes to a file: several would mix."""
-    make_folder(task.cfg.out)
-    with (task.cfg.out / LOG_FILE).open("w") as log, redirect_stdout(log), redirect_stderr(log):
+    def there(self) -> Result | None:
+        """What an earlier call measured with the same settings; None: nothing."""
         try:
-            return _measure(task, stop_at)
-        except OSError as error:
-            return str(error)
+            told = json.loads((self.cfg.out / SETTINGS_FILE).read_text())
+            if told != json.loads(json.dumps(self.wanted)):
+                return None
+            return Result.read(self.cfg.out / "eval.json")
+        except (OSError, ValueError):  # not there, not whole, or of an older version: measure it
+            return None
 
 
-def _keep(task: _Task, failure: str, result: SuiteResult, progress: _Progress) -> None:
-    """Take what an evaluation left, and mark it as whole."""
-    if failure == OUT_OF_TIME:
-        result.late.append((task.condition, task.policy))
-        return
-    if failure:
-        result.failed[task.condition, task.policy] = failure
-        progress.line(f"  failed: {failure}")
-        return
-    result.found[task.condition, task.policy] = Comparison.read(task.cfg.out / "eval.json")
-    write_json(task.cfg.out / SETTINGS_FILE, task.wanted)
+def run_suite(cfg: EvalCfg) -> Result:
+    """Run what is not there yet, and write the page and its figures into ``cfg.out``.
+
+    Raises:
+        ValueError: A setting, object set or policy cannot be used.
+        FileNotFoundError: There is no such policy.
+    """
+    begun = time.monotonic()
+    stop_at = begun + QUICK_S if cfg.quick else math.inf
+    groups = object_groups(cfg.objects, quick=cfg.quick)
+    conditions = tuple(c for c in CONDITIONS if (c.quick or not cfg.quick) and c.objects in groups)
+    tasks = make_tasks(cfg, conditions, groups)
+    found = {(task.condition, task.policy): task.there() for task in tasks}
+    missing = {key: NOT_RUN for key, result in found.items() if result is None}
+    waiting = [task for task in tasks if (task.condition, task.policy) in missing]
+    print(f"{len(tasks) - len(waiting)} of {len(tasks)} evaluations were done before", file=sys.stderr)
+
+    def finished(task: Task, failure: str | None, died: str) -> None:
+        why, key = died if failure is None else failure, (task.condition, task.policy)
+        minutes = (time.monotonic() - begun) / 60.0
+        print(f"[{minutes:.1f} min] {task.condition}: {task.policy} {why or 'done'}", file=sys.stderr)
+        if why:
+            missing[key] = why
+            return
+        del missing[key]
+        found[key] = Result.read(task.cfg.out / "eval.json")
+        write_json(task.cfg.out / SETTINGS_FILE, task.wanted)
+
+    try:
+        _run(cfg, waiting, finished, stop_at)
+    finally:
+        rows = [row for one in found.values() if one for row in one.rows if row.stopped_by != SUCCESS]
+        software = next((one.software for one in found.values() if one), {})
+        left = tuple((*key, why) for key, why in missing.items())
+        result = Result(tuple(rows), software, left)
+        _write(result, cfg, conditions, groups)
+    return result
 
 
-def _run_together(
-    tasks: Sequence[_Task], cfg: EvalCfg, result: SuiteResult, progress: _Progress, stop_at: float
+def _run(
+    cfg: EvalCfg, waiting: list[Task], finished: Callable[[Task, str | None, str], None], stop_at: float
 ) -> None:
-    """Evaluate in processes side by side, those of students first, which take longest."""
+    """Evaluate one after the other, or in processes side by side."""
+    if cfg.jobs == 1:
+        for task in waiting:
+            finished(task, measure(task, stop_at), "")
+        return
     import warp as wp
 
     devices = [cfg.device]
     if cfg.device == "auto" and wp.is_cuda_available():
         devices = [device.alias for device in wp.get_cuda_devices()]
-    order = sorted(tasks, key=lambda task: task.policy not in result.students)
     spread = [
         replace(task, cfg=replace(task.cfg, device=devices[number % len(devices)]))
-        for number, task in enumerate(order)
+        for number, task in enumerate(waiting)
     ]
-
-    def finished(task: _Task, failure: str | None, died: str) -> None:
-        progress.say(task.text)
-        _keep(task, died if failure is None else failure, result, progress)
-        progress.show(result, cfg.out)
-
-    run_tasks(
-        partial(_measure_apart, stop_at=stop_at),
-        spread,
-        finished,
-        jobs=cfg.jobs,
-        limit_s=float("inf"),
-        gpu=True,
-    )
+    work = partial(_measure_apart, stop_at=stop_at)
+    run_tasks(work, spread, finished, jobs=cfg.jobs, limit_s=math.inf, gpu=True)
 
 
-def settings(cfg: EvalCfg, condition: Condition, policy: str, objects: Objects) -> EvalCfg:
+def measure(task: Task, stop_at: float = math.inf) -> str:
+    """Evaluate into the task's folder until ``stop_at``; returns why that failed, or nothing."""
+    if time.monotonic() > stop_at:  # the same clock in all processes
+        return OUT_OF_TIME
+    try:
+        compare(task.cfg, task.condition, stop_at)
+    except TimeoutError:
+        return OUT_OF_TIME
+    except (RuntimeError, ValueError) as error:  # one environment that fails must not cost the others
+        return str(error)
+    return ""
+
+
+def _measure_apart(task: Task, stop_at: float = math.inf) -> str:
+    """The same in a process of its own, whose progress goes to a file: several would mix."""
+    make_folder(task.cfg.out)
+    with (task.cfg.out / LOG_FILE).open("w") as log, redirect_stdout(log), redirect_stderr(log):
+        try:
+            return measure(task, stop_at)
+        except OSError as error:
+            return str(error)
+
+
+def make_tasks(cfg: EvalCfg, conditions: tuple[Condition, ...], groups: dict[Group, Objects]) -> list[Task]:
+    """Everything that is to be measured, camera policies at the end if time is short, else first.
+
+    All names are looked up here, before anything slow.
+    """
+    short = labels(cfg.agent_names)
+    camera = {name: sees_clouds(name) for name in cfg.agent_names}
+    prints = {name: fingerprint(name) for name in cfg.agent_names}
+    tasks = []
+    for condition in conditions:
+        for name in cfg.agent_names:
+            if condition.goals != "mesh" and not camera[name]:  # a teacher's goals are orientations
+                continue
+            one = settings(cfg, condition, name, groups[condition.objects], camera=camera[name])
+            one = replace(one, out=cfg.out / condition.name / short[name].replace("/", "-"))
+            tasks.append(Task(condition.name, name, one, prints[name]))
+    return sorted(tasks, key=lambda task: camera[task.policy] == cfg.quick)
+
+
+def settings(cfg: EvalCfg, condition: Condition, policy: str, objects: Objects, *, camera: bool) -> EvalCfg:
     """The evaluation of one policy under a condition: what ``vd-eval`` would be told."""
-    episodes, most = condition.episodes, QUICK_EPISODES
-    if sees_clouds(policy):
-        episodes, most = condition.student_episodes, QUICK_STUDENT_EPISODES
+    episodes = condition.camera_episodes if camera else condition.episodes
+    if cfg.quick:
+        episodes = min(episodes, QUICK_CAMERA_EPISODES if camera else QUICK_EPISODES)
     return replace(
         cfg,
         suite=None,
         quick=False,
         jobs=1,
-        policies=() if policy in BUILT_IN else (policy,),
-        agent=policy if policy in BUILT_IN else None,
+        policies=(policy,),
         objects=tuple(f"{condition.objects}={item}" for item in objects.sets),
-        episodes=min(episodes, most) if cfg.quick else episodes,
-        at_rest=False,
-        second_view=condition.second_view,
+        episodes=episodes,
         no_at_rest=True,  # the paper's objects fall into the hand, whatever a policy was trained with
         in_air=condition.in_air,
         table_friction=condition.table_friction,
         goals=condition.goals,
-        sensor_errors=condition.sensor_errors,
     )
 
 
@@ -272,7 +238,9 @@ def object_groups(objects: tuple[str, ...], *, quick: bool) -> dict[Group, Objec
         if quick and len(files) > QUICK_OBJECTS:
             sets = tuple(files[i * len(files) // QUICK_OBJECTS] for i in range(QUICK_OBJECTS))
             text = f"{len(sets)} of the {text}"
-        groups[group] = Objects(sets, text, group not in given)
+        if group not in given and group != "symmetric":
+            text += ", our own, since no others were given: they stand for the paper's meshes"
+        groups[group] = Objects(sets, text)
     return groups
 
 
@@ -292,11 +260,47 @@ def fingerprint(name: str) -> str:
     return digest.hexdigest()
 
 
-def _read(folder: Path, wanted: dict[str, Any]) -> Comparison | None:
-    """What an earlier call measured with the same settings; None: nothing."""
-    try:
-        if json.loads((folder / SETTINGS_FILE).read_text()) != json.loads(json.dumps(wanted)):
-            return None
-        return Comparison.read(folder / "eval.json")
-    except (OSError, ValueError):  # not there, not whole, or of an older version: measure it
-        return None
+def _write(
+    result: Result, cfg: EvalCfg, conditions: tuple[Condition, ...], groups: dict[Group, Objects]
+) -> None:
+    """The page and its figures, of what there is."""
+    figures = paper_figures(result, conditions)
+    write_json(cfg.out / RESULT_FILE, result.summary() | {"quick": cfg.quick, "figures": figures})
+    short = labels(result.policies)
+    table = [
+        [row["figure"], row["condition"], row["paper"] or NOTHING, *row["ours"].values()] for row in figures
+    ]
+    notes = [f"Objects, {group}: {objects.text}." for group, objects in groups.items()]
+    notes += ["Held-out objects judge, and nothing is chosen on them."]
+    write_page(
+        result,
+        cfg.out / PAGE_FILE,
+        title="The paper's evaluations",
+        lead=f"{', '.join(short.values())} beside the paper{', the reduced suite' if cfg.quick else ''}",
+        figures=(("figure", "condition", "paper", *short.values()), table),
+        notes=notes,
+        conditions=[(c.name, c.paper, c.flags) for c in conditions],
+    )
+
+
+def paper_figures(result: Result, conditions: tuple[Condition, ...]) -> list[dict[str, Any]]:
+    """The paper's figures beside ours, as text."""
+    names = {condition.name for condition in conditions}
+    return [
+        {
+            "figure": claim.text,
+            "condition": claim.condition,
+            "paper": claim.paper_text(),
+            "ours": {policy: _ours(result, claim, policy) for policy in result.policies},
+        }
+        for claim in CLAIMS
+        if claim.condition in names
+    ]
+
+
+def _ours(result: Result, claim: Claim, policy: str) -> str:
+    rows = [row for row in result.rows if (row.condition, row.policy) == (claim.condition, policy)]
+    value = claim.of(rows)
+    if isinstance(value, Interval):
+        return share_text(value.value, value.low, value.high) if claim.unit == "share" else number(value)
+    return NOTHING if value is None else share_text(value)

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from vd.evaluate.result import Episode
 from vd.evaluate.rollout import episode_rounds, unit_quats
 from vd.evaluate.statistics import rotation_angle, symmetric_error
 from vd.paper import PAPER
@@ -22,10 +21,38 @@ from vd.stopping import StoppingRule
 HOLD_S = 2.0
 """For how long a hand holds its object after a stop, before it is looked at again [s] (ours)."""
 StopsBy = Literal["predicted", "exact", "error", "success"]
-"""What a rule asks for: a distance, which is a student's prediction, or the true one to the very goal, or to
-what looks like it; or the success criteria of training, which are the true one and stillness."""
+"""What a rule asks for: a distance, which is a camera policy's prediction, or the true one to the very goal,
+or to what looks like it; or the success criteria of training, which are the true one and stillness."""
 NEVER_RAD = 1e-9
 """Orientation tolerance that no state meets: an environment with it stops no episode."""
+
+
+def air_table_steps(control_hz: float) -> int:
+    """Control steps at this rate [Hz] after which the paper's in-air test takes the table away."""
+    return round(PAPER.scene.air_table_s * control_hz)
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One start and one goal of one object, to its end or stop."""
+
+    object_index: int
+    start_quat: tuple[float, float, float, float]
+    """Object orientation at the reset."""
+    goal_quat: tuple[float, float, float, float]
+    """Goal orientation."""
+    start_error_rad: float
+    """Orientation error at the reset, up to the object's symmetry."""
+    error_rad: float
+    """Orientation error at the last step of the episode, up to the object's symmetry."""
+    exact_error_rad: float
+    """The same to the very goal, which is what counts."""
+    steps: int
+    """Control steps simulated."""
+    stopped: bool
+    """The rule that was asked for stopped it at the last step."""
+    fell: bool
+    """The object left the hand."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +82,7 @@ class Trace:
         error: Orientation error after t steps, up to the object's symmetry, NaN after the end [K, M, T + 1].
         exact: The same without symmetry [K, M, T + 1].
         action_norm: Norm of the smoothed action that led there, NaN after the end [K, M, T + 1].
-        predicted: What a student predicts of ``error`` there; None for other policies [K, M, T + 1].
+        predicted: What a camera policy predicts of ``error`` there; None for other policies [K, M, T + 1].
         steps: Steps to the fall or the time limit [K, M].
         fell: Whether the object was lost [K, M].
         still: Whether hand and object are as still after t steps as success asks; None: not known
@@ -110,7 +137,7 @@ class Trace:
             else:
                 distance = {"predicted": self.predicted, "exact": self.exact, "error": self.error}[by]
                 if distance is None:
-                    raise ValueError("only a student predicts distances; stop by the true distance")
+                    raise ValueError("only camera policies predict distances; stop by the true distance")
                 stops = (distance < rule.distance_rad) & (self.action_norm < rule.action_norm)
         stops[..., 0] = False  # before the first action there is nothing to stop
         stops &= np.arange(stops.shape[-1]) <= last[..., None]
@@ -160,7 +187,7 @@ def record(
 
     Args:
         env: An environment that no state ends (``success.rotation_rad`` of NEVER_RAD), as it was built.
-        policy: What acts; one with ``predicted`` is a student, and is told where it need not act any more.
+        policy: What acts; one with ``predicted`` is told where it need not act any more.
         episodes: M.
         starts: Initial orientations [K, M, 4]; None: the environment draws them.
         goals: Goal orientations [K, M, 4], with ``starts``.

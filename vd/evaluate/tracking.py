@@ -28,7 +28,6 @@ class TrackingActor:
         *,
         goals: Goals = "mesh",
         sensor_errors: bool = False,
-        second_view: bool = False,
         seed: int = 0,
     ):
         """Open its eyes in every world.
@@ -38,11 +37,10 @@ class TrackingActor:
             policy: The policy.
             goals: What it knows shapes and goals by (:mod:`vd.evaluate.scanned`).
             sensor_errors: Give its camera the errors of a real one.
-            second_view: Select symmetry views by its teacher's critic.
             seed: Of the errors of camera and scans.
 
         Raises:
-            ValueError: It is of another hand, or has no views to select.
+            ValueError: It is of another hand.
         """
         scene, camera, depth = env.scene, env.hand.camera.at(policy.spec.camera), policy.spec.depth
         self.num_actions = policy.num_actions
@@ -55,7 +53,6 @@ class TrackingActor:
             camera,
             world_object=scene.world_object,
             world_scale=scene.world_scale,
-            second_view=second_view,
             device=env.device,
         )
         place = wp.device_to_torch(env.device)

@@ -31,7 +31,7 @@ from vd.gap.result import (
 )
 from vd.gap.rollout import Rollouts
 from vd.gap.statistics import interval, resamples, rmse
-from vd.gap.team import Bench, JointSpec
+from vd.gap.worker_pool import JointSpec, Problems
 from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 
 CLOSE = 0.1
@@ -63,7 +63,7 @@ class Errors:
 
 
 def curves(
-    recording: Recording, bench: Bench, models: Sequence[tuple[str, JointSpec, np.ndarray]]
+    recording: Recording, problems: Problems, models: Sequence[tuple[str, JointSpec, np.ndarray]]
 ) -> np.ndarray:
     """Positions of all trajectories one after the other [S, J] [rad]; NaN where no joint was fitted.
 
@@ -71,19 +71,19 @@ def curves(
 
     Args:
         recording: The recording.
-        bench: Its chains.
+        problems: Its chains.
         models: Name, problem and parameter rows of each fitted joint.
     """
     total = sum(len(t.time) for t in recording.trajectories)
     result = np.full((total, len(recording.joints)), np.nan)
-    for index, chain in enumerate(bench.chains):
+    for index, chain in enumerate(problems.chains):
         fitted = [(spec, rows) for _, spec, rows in models if spec.chain == index]
         if not fitted:
             continue
         rows = chain.start_row.copy()
         for spec, own in fitted:
             rows[spec.joint] = own[spec.joint]
-        rollouts = Rollouts(chain, recording, dt=bench.dt / FINER[-1], device=bench.device)
+        rollouts = Rollouts(chain, recording, dt=problems.dt / FINER[-1], device=problems.device)
         predicted = rollouts.predict(rows[None])[0]
         result[:, chain.columns] = predicted
     return result
@@ -92,7 +92,7 @@ def curves(
 def assemble(
     recording: Recording,
     hand: HandModel | None,
-    bench: Bench,
+    problems: Problems,
     joints: Sequence[Analysed],
     findings: Sequence[Finding],
     *,
@@ -101,8 +101,8 @@ def assemble(
     simulated: int,
 ) -> tuple[Report, Predictions]:
     """The report of all joints, and the curves of its figures."""
-    before = curves(recording, bench, [(j.name, j.spec, j.explanation.baseline.rows) for j in joints])
-    after = curves(recording, bench, [(j.name, j.spec, j.explanation.final.rows) for j in joints])
+    before = curves(recording, problems, [(j.name, j.spec, j.explanation.baseline.rows) for j in joints])
+    after = curves(recording, problems, [(j.name, j.spec, j.explanation.final.rows) for j in joints])
     predictions = _predictions(recording, before, after)
     rng = np.random.default_rng(seed)
     errors = {j.name: _errors(j, predictions) for j in joints}

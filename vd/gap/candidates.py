@@ -8,7 +8,7 @@ import numpy as np
 
 from vd.gap.coordinates import Scales, beside, best_two, sizes, smaller, torque_power
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import AT_FLOOR, EXPLAINED, RANDOM, SHARP
+from vd.gap.judge import AT_FLOOR, EXPLAINED, JITTER, SHARP
 from vd.gap.telemetry import BEHIND_SENSOR
 from vd.kernels.servo.effects import EFFECTS, equivalent
 
@@ -75,9 +75,9 @@ class CandidateFits:
         promised: Share of the squared error that each candidate of the last round could remove at best.
         added: The last fits with one more effect, by the effects of the model to which it was added: that
             model first.
-        veiled: Whether the samples are seen through what chance does to them.
+        behind_jitter: Whether samples are weighted by what random delays do to them.
         fine: Whether rollouts have the step at which estimates are finished.
-        clocked: Whether samples are weighted by what errors of the clock do to them (:mod:`vd.gap.clock`).
+        clocked: The same by what errors of the clock do (:mod:`vd.gap.clock_sensitivity`).
     """
 
     floor: float
@@ -92,7 +92,7 @@ class CandidateFits:
     nominal: Mapping[str, float] = field(default_factory=dict)
     promised: dict[str, float] = field(default_factory=dict)
     added: dict[frozenset[str], tuple[JointFit, ...]] = field(default_factory=dict)
-    veiled: bool = False
+    behind_jitter: bool = False
     fine: bool = False
     clocked: bool = False
 
@@ -112,8 +112,8 @@ class CandidateFits:
             known: A fit with one that is left out; where it explains everything, what stays far from it is
                 not fitted to the end.
         """
-        out = {*present.effects, *(set(self.vetoes) - set(vetoed)), *skip, RANDOM}
-        white = 0.0 if self.veiled else EXPLAINED * self.floor
+        out = {*present.effects, *(set(self.vetoes) - set(vetoed)), *skip, JITTER}
+        white = 0.0 if self.behind_jitter else EXPLAINED * self.floor
         least = known.rmse if known is not None and known.rmse < white else np.inf
         names = [name for name in self.candidates if name not in out]
         starts = {
@@ -214,7 +214,7 @@ class CandidateFits:
         found = dict(zip([fit.effects for fit in near], self.run(calls), strict=True))
         return [min(fit, found.get(fit.effects, fit), key=lambda one: one.rmse) for fit in fits]
 
-    def look_beside(self, fit: JointFit, whole: float) -> JointFit:
+    def search_nearby(self, fit: JointFit, whole: float) -> JointFit:
         """The fit, or a better one beside it where nearly all of the error is gone.
 
         A profile that cannot follow its command leaves an error with many sharp valleys.
@@ -234,7 +234,7 @@ class CandidateFits:
 
     def look_wider(self, present: JointFit, fits: Mapping[str, JointFit]) -> dict[str, JointFit]:
         """The fits of a round, and those of all candidates from every start where these are better."""
-        out = {*present.effects, *self.vetoes, RANDOM}
+        out = {*present.effects, *self.vetoes, JITTER}
         least = min(fit.rmse for fit in fits.values())
         if least < NEARLY_ALL * present.rmse:
             out |= {name for name in self.candidates if name not in fits or fits[name].rmse > BEHIND * least}

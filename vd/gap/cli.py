@@ -180,7 +180,7 @@ class Hide:
 
     def run(self) -> int:
         """Write the recording."""
-        from vd.gap.hide import hide, parse_effect, truth_path
+        from vd.bench.hide import hide, parse_effect, truth_path
 
         parsed = [parse_effect(text) for text in self.effect]
         hidden = hide(

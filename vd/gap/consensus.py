@@ -2,10 +2,9 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from vd.gap.candidates import FULL_ITERATIONS
-from vd.gap.clock import swayed, told, weighted
+from vd.gap.clock_sensitivity import clock_sensitivity, told, weighted
 from vd.gap.coordinates import sizes
 from vd.gap.explanation import NAMED, Explanation, Trial, added, certain, estimates, intervals
 from vd.gap.joint_fit import JointFit
@@ -13,18 +12,16 @@ from vd.gap.judge import (
     AT_FLOOR,
     CONTAINED_FLOORS,
     EXPLAINED,
+    JITTER,
     MIN_GAIN,
     MIN_GAIN_FLOORS,
     NESTED,
-    RANDOM,
     RECOVERED,
     SMALL_EXCESS_FLOORS,
 )
+from vd.gap.search import Search
 from vd.gap.verdict import CANCELLING, UNEXPLAINED, explains
 from vd.gap.warming import LEVELS
-
-if TYPE_CHECKING:
-    from vd.gap.select import Selection
 
 OF_THE_MACHINE = {"command_delay", "read_delay", "command_jitter", "supply_sag", "gravity_load"}
 """What all joints of a machine have or have not: its bus, its supply, gravity."""
@@ -45,14 +42,14 @@ Fit = Callable[[tuple[str, ...], Sequence[Mapping[str, float]]], JointFit]
 """Fits the model with these effects to the end, from these starts."""
 
 
-def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanation | None:
+def as_another(search: Search, baseline: JointFit, loose: str) -> Explanation | None:
     """The explanation of a joint by what another of its finger certainly lacks, without a search of its own.
 
     The joints of a finger are built alike, and what leaves noise can only be equalled. None where it leaves
     more than that, or where a further effect promises to do better. What is not needed here is not named.
 
     Args:
-        search: Of the joint; :attr:`~vd.gap.select.Selection.like` is what the other lacks.
+        search: Of the joint; :attr:`~vd.gap.search.Search.like` is what the other lacks.
         baseline: The plain model.
         loose: What of the baseline the motions leave open.
     """
@@ -61,10 +58,10 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
         return None
     starts = [{**baseline.values, **values}, {**search.nominal, **values}]
     fit = search.run([search.call(baseline, effects, starts, FULL_ITERATIONS)])[0]
-    if veil := swayed(search, fit):
-        seen = weighted(search, veil)
-        found = as_another(seen, seen.run([seen.plain(baseline)])[0], loose)
-        return found and told(found, veil)
+    if weighting := clock_sensitivity(search, fit):
+        inner = weighted(search, weighting)
+        found = as_another(inner, inner.run([inner.plain(baseline)])[0], loose)
+        return found and told(found, weighting)
     if search.too_coarse(fit):
         search = search.finer()
         baseline, fit = search.run(
@@ -73,12 +70,11 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
     if fit.at_bound or not search.noise_only(fit, AT_FLOOR):
         fuller = _fuller(search, baseline)
         return as_another(fuller, baseline, loose) if fuller else None
-    others = [name for name in search.candidates if name not in {*effects, *search.vetoes, RANDOM}]
+    others = [name for name in search.candidates if name not in {*effects, *search.vetoes, JITTER}]
     further = [start for name in others for start in sizes(name, search.others, search.scales)]
     promise = search.run([("promise", {"fit": fit, "starts": further, "scales": search.scales})])[0]
     if promise.max(initial=0.0) > CONTAINED_FLOORS**2:
         return None
-    gain, ci = search.gain(baseline, fit)
     for name in effects:
         rest = tuple(other for other in effects if other != name)
         without = search.refit(fit, rest)
@@ -89,13 +85,17 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
             if simpler is not None or search.gain(without, fit)[1][0] <= 0.0:
                 return simpler
             needed = True
-        if not needed and baseline.held_out_rmse > UNEXPLAINED * search.floor:
-            return None
         if not needed:
-            return search.conclude(
-                baseline, baseline, {}, [Trial(1, name, fit, gain, ci, "rejected", why)], loose
-            )
+            row = Trial(1, name, fit, *search.gain(baseline, fit), "rejected", why)
+            gap = baseline.held_out_rmse > UNEXPLAINED * search.floor
+            return None if gap else search.conclude(baseline, baseline, {}, [row], loose)
         search.without[name] = without.held_out_rmse
+    return _as_named(search, baseline, fit, loose)
+
+
+def _as_named(search: Search, baseline: JointFit, fit: JointFit, loose: str) -> Explanation:
+    """The explanation by a fit with what another joint lacks, and its control."""
+    effects, (gain, ci) = fit.effects, search.gain(baseline, fit)
     names = " and ".join(effects)
     before, after = 1e3 * baseline.held_out_rmse, 1e3 * fit.held_out_rmse
     search.report(f"+ {names}, as on another joint: {before:.2f} -> {after:.2f} mrad held out")
@@ -109,7 +109,7 @@ def as_another(search: "Selection", baseline: JointFit, loose: str) -> Explanati
     return search.explained(search.conclude(baseline, fit, rivals, trials, loose, refined))
 
 
-def _fuller(search: "Selection", baseline: JointFit) -> "Selection | None":
+def _fuller(search: Search, baseline: JointFit) -> Search | None:
     """The search with the line of a motor whose ceiling another joint shows; None where it is not that.
 
     A slow joint shows the ceiling of the torque and not how it falls with speed, a quick one both.
@@ -127,13 +127,13 @@ def _fuller(search: "Selection", baseline: JointFit) -> "Selection | None":
     return None
 
 
-def as_changing(search: "Selection", baseline: JointFit, loose: str) -> Explanation | None:
+def as_changing(search: Search, baseline: JointFit, loose: str) -> Explanation | None:
     """No names on a joint, without a search, where another of its finger has a friction that changes.
 
     None where that friction does not explain most of the gap here, too.
 
     Args:
-        search: Of the joint; :attr:`~vd.gap.select.Selection.changing` is the other joint's model.
+        search: Of the joint; :attr:`~vd.gap.search.Search.changing` is the other joint's model.
         baseline: The plain model.
         loose: What of the baseline the motions leave open.
     """
@@ -235,7 +235,7 @@ def _models(own: Explanation, others: Sequence[Explanation]) -> list[Explanation
     models = sorted(fewer, key=lambda e: len(e.final.effects))
     if common:
         models = [most, *(e for e in models if e is not most)]
-    return [e for e in models if RANDOM not in e.final.effects and {*e.final.effects} != mine]
+    return [e for e in models if JITTER not in e.final.effects and {*e.final.effects} != mine]
 
 
 def _as(model: Explanation, own: Explanation, fit: Fit) -> JointFit:

@@ -7,10 +7,10 @@ import numpy as np
 
 from vd.gap.fit import RIDGE
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import RANDOM
+from vd.gap.judge import JITTER
 from vd.gap.result import Verdict
+from vd.gap.sample_weighting import SampleWeighting
 from vd.gap.statistics import covariance, half_width
-from vd.gap.veil import Veil
 from vd.kernels.servo.effects import EFFECTS
 
 NAMED = 0.9
@@ -67,8 +67,8 @@ class Explanation:
     trials: tuple[Trial, ...] = ()
     rivals: Mapping[str, Sequence[JointFit]] = field(default_factory=dict)
     """Fits with others in the place of each effect."""
-    veil: Veil | None = None
-    """What the samples were seen through; errors of the fits are in what it weighs them by."""
+    weighting: SampleWeighting | None = None
+    """How the samples were weighted; errors of the fits are in what it weighs them by."""
     warms: bool = False
     """Whether a friction of the final model changes over the recording, as none of the table does."""
 
@@ -116,20 +116,20 @@ def certain(explanation: Explanation) -> bool:
 
 def lacking(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
     """The effects that a joint is certain to lack, and their values by key; none where it is not."""
-    if not certain(explanation) or RANDOM in explanation.final.effects:
+    if not certain(explanation) or JITTER in explanation.final.effects:
         return (), {}
     return added(explanation.final)
 
 
-def by_chance(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
+def jitter_of(explanation: Explanation) -> tuple[tuple[str, ...], dict[str, float]]:
     """The random delays of a joint and what it is certain to lack beside them, and their values by key.
 
     None where it has none. One of a set is no certainty: another joint has to search for itself, or the first
     one's luck among several that fit alike would be the answer of all.
     """
     effects, values = added(explanation.final)
-    if RANDOM not in effects:
+    if JITTER not in effects:
         return (), {}
     if certain(explanation):
         return effects, values
-    return (RANDOM,), {key: value for key, value in values.items() if key.startswith(f"{RANDOM}.")}
+    return (JITTER,), {key: value for key, value in values.items() if key.startswith(f"{JITTER}.")}

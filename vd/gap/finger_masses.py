@@ -8,31 +8,31 @@ import numpy as np
 from vd.gap.candidates import FULL_ITERATIONS
 from vd.gap.explanation import NAMED, Accepted, Explanation, polished
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXCESS_FLOORS, NESTED, NO_GAP, RANDOM
+from vd.gap.judge import EXCESS_FLOORS, JITTER, NESTED, NO_GAP
 from vd.gap.masses import Masses, fit_masses, widened, with_free_masses
 from vd.gap.one_joint import REFITS, Explained, Joint, rest
 from vd.gap.statistics import resamples
-from vd.gap.team import Team, parallel
 from vd.gap.verdict import Verdicts, cancelled, explains
+from vd.gap.worker_pool import WorkerPool, parallel
 from vd.kernels.servo.effects import EFFECTS
 
 
-def masses_alone(team: Team, joints: Sequence[Joint]) -> dict[int, Masses]:
+def masses_alone(pool: WorkerPool, joints: Sequence[Joint]) -> dict[int, Masses]:
     """By chain, the masses of links that explain a gap on all joints that have one."""
     result = {}
-    for index, chain in enumerate(team.bench.chains):
+    for index, chain in enumerate(pool.problems.chains):
         own = [joint for joint in joints if joint.spec.chain == index]
         floors = np.array([NO_GAP * joint.spec.floor for joint in own])
         if not chain.bodies or all(j.fit.held_out_rmse < floor for j, floor in zip(own, floors, strict=True)):
             continue
-        masses = fit_masses([team.bench.problem(joint.spec) for joint in own], [joint.fit for joint in own])
+        masses = fit_masses([pool.problems.of(joint.spec) for joint in own], [joint.fit for joint in own])
         if (masses.errors < floors).all():
             result[index] = masses
     return result
 
 
 def masses_beside(
-    team: Team, joints: Sequence[Joint], explanations: Sequence[Explanation]
+    pool: WorkerPool, joints: Sequence[Joint], explanations: Sequence[Explanation]
 ) -> list[Explanation]:
     """Only what all joints of a finger lack, where other masses of its links are the rest.
 
@@ -40,7 +40,7 @@ def masses_beside(
     or has something else imitate the effect better.
     """
     result = list(explanations)
-    for index, chain in enumerate(team.bench.chains):
+    for index, chain in enumerate(pool.problems.chains):
         own = [i for i, joint in enumerate(joints) if joint.spec.chain == index]
         known = [(joints[i], explanations[i]) for i in own]
         models = {frozenset(found.final.effects) for _, found in known if found.verdict != "no_gap"}
@@ -48,11 +48,11 @@ def masses_beside(
         warms = any(found.warms for _, found in known)
         if not chain.bodies or not models or warms or (certain and len(models) == 1):
             continue
-        told = [found for core in _cores(known) if (found := _all_with(team, known, core))]
+        told = [found for core in _cores(known) if (found := _all_with(pool, known, core))]
         fewest = min((found.effects for found in told), default=0)
         best = sorted((found for found in told if found.effects == fewest), key=lambda found: found.left)
         if best and (len(best) == 1 or best[1].left - best[0].left > EXCESS_FLOORS**2):
-            problems = [team.bench.problem(joint.spec) for joint, _ in known]
+            problems = [pool.problems.of(joint.spec) for joint, _ in known]
             free = with_free_masses(problems, best[0].fits, best[0].masses)
             for i, explanation, extents in zip(own, best[0].explanations, free, strict=True):
                 floor = joints[i].spec.floor
@@ -71,7 +71,7 @@ def _cores(known: Explained) -> list[tuple[str, ...]]:
         can.append({*names, *(inside for name in names for inside in NESTED.get(name, ()))})
     most = [n for n in sorted(set().union(*can)) if sum(n in names for names in can) > len(gaps) // 2]
     cores = dict.fromkeys([common, *((name,) for name in most)])
-    return [core for core in cores if core and RANDOM not in core]
+    return [core for core in cores if core and JITTER not in core]
 
 
 @dataclass(frozen=True)
@@ -93,23 +93,15 @@ class _Finger:
     masses: Masses
 
 
-def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | None:
+def _all_with(pool: WorkerPool, known: Explained, core: tuple[str, ...]) -> _Finger | None:
     """The joints of a finger with these effects alone, if links of other mass then leave noise on all."""
-    start: dict[str, float] = {}
-    accepted: list[Accepted] = []
-    for name in core:
-        one, values = next((one for _, found in known for one in _can_have(found, name)), (None, {}))
-        if one is None:
-            return None
-        start |= {key: value for key, value in values.items() if key.startswith(f"{name}.")}
-        accepted.append(replace(one, tied=(), confidence=max(one.confidence, NAMED)))
+    begun = _begin_with(known, core)
+    if begun is None:
+        return None
+    start, accepted = begun
     rows = known[0][0].fit.rows.copy()
     for joint, found in known:
-        row = (found.final if {*core} <= {*found.final.effects} else joint.fit).rows[joint.spec.joint].copy()
-        for name in {*found.final.effects} - {*core}:
-            for parameter in EFFECTS[name].parameters:
-                row[parameter.column] = parameter.neutral
-        rows[joint.spec.joint] = row
+        rows[joint.spec.joint] = _row_with(joint, found, core)
 
     def fitted(one: tuple[Joint, Explanation]) -> JointFit:
         joint, found = one
@@ -118,10 +110,10 @@ def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | 
         starts = [{}] if {*core} <= {*found.final.effects} else [start]
         call = {"base": rows, "effects": core, "starts": starts, "scales": joint.scales}
         call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
-        return team.run(joint.spec, [("fit", call)])[0]
+        return pool.run(joint.spec, [("fit", call)])[0]
 
     fits = parallel(fitted, known)
-    problems = [team.bench.problem(joint.spec) for joint, _ in known]
+    problems = [pool.problems.of(joint.spec) for joint, _ in known]
     masses = fit_masses(problems, fits)
     floors = np.array([joint.spec.floor for joint, _ in known])
     if not masses.other or (masses.errors >= NO_GAP * floors).any():
@@ -132,16 +124,40 @@ def _all_with(team: Team, known: Explained, core: tuple[str, ...]) -> _Finger | 
         judge = Verdicts(floor=joint.spec.floor, weights=weights, whole=joint.fit.held_out_rmse)
         if judge.lack_of_fit(replace(fit, structure=structure)):
             return None  # other masses are not the rest either
-        column = int(team.bench.chains[joint.spec.chain].columns[joint.spec.joint])
-        begun = rest(team.bench.recording, column, joint.spec.trajectories)
-        if cancelled(fit, joint.spec.joint, begun):
+        column = int(pool.problems.chains[joint.spec.chain].columns[joint.spec.joint])
+        resting = rest(pool.problems.recording, column, joint.spec.trajectories)
+        if cancelled(fit, joint.spec.joint, resting):
             return None  # a spring, and no load and offset
         if found.verdict != "no_gap":
-            plain = replace(found, accepted=tuple(accepted), verdict="effects", reason=reason)
+            plain = replace(found, accepted=accepted, verdict="effects", reason=reason)
             found = polished(plain, fit, joint.spec.floor)
         explanations.append(found)
     left = float(np.sum((masses.errors / floors) ** 2))
     return _Finger(len(core), left, explanations, list(fits), masses)
+
+
+def _begin_with(
+    known: Explained, core: tuple[str, ...]
+) -> tuple[dict[str, float], tuple[Accepted, ...]] | None:
+    """Where fits with these effects begin, and the effects as joints have them; None if one has not."""
+    start: dict[str, float] = {}
+    accepted: list[Accepted] = []
+    for name in core:
+        one, values = next((one for _, found in known for one in _can_have(found, name)), (None, {}))
+        if one is None:
+            return None
+        start |= {key: value for key, value in values.items() if key.startswith(f"{name}.")}
+        accepted.append(replace(one, tied=(), confidence=max(one.confidence, NAMED)))
+    return start, tuple(accepted)
+
+
+def _row_with(joint: Joint, found: Explanation, core: tuple[str, ...]) -> np.ndarray:
+    """The parameter row of a joint without what it was found to have besides these effects."""
+    row = (found.final if {*core} <= {*found.final.effects} else joint.fit).rows[joint.spec.joint].copy()
+    for name in {*found.final.effects} - {*core}:
+        for parameter in EFFECTS[name].parameters:
+            row[parameter.column] = parameter.neutral
+    return row
 
 
 def _can_have(found: Explanation, name: str) -> Iterator[tuple[Accepted, dict[str, float]]]:

@@ -17,7 +17,7 @@ from vd.gap.descent import FIRST_DAMPING, LOG_TRUST, Descent, LeastSquares
 from vd.gap.holding import Holding
 from vd.gap.joint_fit import JointFit
 from vd.gap.rollout import Rollouts
-from vd.gap.veil import Veil
+from vd.gap.sample_weighting import SampleWeighting
 from vd.kernels.servo.chains import MAX_JOINTS
 
 RIDGE = 0.01
@@ -92,13 +92,13 @@ class JointProblem:
         fine.coarse, fine.rollouts = self.rollouts, self.rollouts.at(self.rollouts.dt / FINER[-1])
         return fine
 
-    def through(self, veil: Veil) -> "JointProblem":
-        """The same data seen through what chance does to them."""
+    def weighted(self, weighting: SampleWeighting) -> "JointProblem":
+        """The same data, samples weighted by how surely they are known."""
         seen = copy.copy(self)
         names = [int(t) for t in self.trajectories]
-        shift = dict(zip(names, self.split(veil.shift), strict=True))
+        shift = dict(zip(names, self.split(weighting.shift), strict=True))
         seen._measured = {t: self._measured[t] - shift[t] for t in names}
-        seen._growth = dict(zip(names, self.split(veil.growth), strict=True))
+        seen._growth = dict(zip(names, self.split(weighting.growth), strict=True))
         return seen
 
     def residuals(
@@ -341,7 +341,7 @@ class JointProblem:
             residual = self.residuals(result.rows[None])[0]
         finally:
             self.rollouts, self.coarse = given
-        structure = None if self._growth else self.structure(residual)  # chance has a memory
+        structure = None if self._growth else self.structure(residual)  # jitter has a memory
         return replace(
             result,
             held_out=fit.held_out,

@@ -10,7 +10,7 @@ import vd.kernels.servo.actuators as servo
 from vd.gap.candidates import FULL_ITERATIONS, HOPELESS, SCREEN_ITERATIONS, CandidateFits
 from vd.gap.coordinates import sizes
 from vd.gap.joint_fit import ONE_SIDED, JointFit
-from vd.gap.judge import RANDOM
+from vd.gap.judge import JITTER
 from vd.gap.verdict import Verdicts
 
 EXACTLY = {"coulomb_friction", "encoder_bias"}
@@ -76,7 +76,7 @@ class Frictions(CandidateFits, Verdicts):
             for offset in ("encoder_bias", "gravity_load")
             if {friction, offset} <= {*present.effects}
         ]
-        if not parts or ONE_SIDED not in usable or RANDOM in present.effects:
+        if not parts or ONE_SIDED not in usable or JITTER in present.effects:
             return present
         kept = [name for name in present.effects if name not in parts[0]]
         without = self.refit(present, kept)
@@ -96,7 +96,7 @@ class Frictions(CandidateFits, Verdicts):
         """
         dry, offset = "stribeck_friction", "encoder_bias"
         usable = {*self.candidates} - {*present.effects, *self.vetoes}
-        if not {dry, ONE_SIDED} <= {*present.effects} or offset not in usable or RANDOM in present.effects:
+        if not {dry, ONE_SIDED} <= {*present.effects} or offset not in usable or JITTER in present.effects:
             return present
         values, kp = present.values, float(present.rows[self.joint, servo.KP])
         plus, minus = (values[f"{ONE_SIDED}.tau_{side}_nm"] for side in ("plus", "minus"))

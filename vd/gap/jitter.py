@@ -1,10 +1,10 @@
-"""Fit a delay that varies by chance: no single prediction is right, so the spread is compared too.
+"""Fit a delay that varies at random: no single prediction is right, so the spread is compared too.
 
 Many draws of the delays give the mean and variance of the position at every sample. The likelihood of
 what was measured, under a normal distribution with that mean and that variance on top of the noise
 floor, is maximised over the jitter's two parameters; the rest of the model is fitted through what the
-delays do to the samples (:mod:`vd.gap.veil`). The result stands in the table as the RMSE that a normal
-distribution of constant width would need for the same likelihood.
+delays do to the samples (:mod:`vd.gap.sample_weighting`). The result stands in the table as the RMSE that a
+normal distribution of constant width would need for the same likelihood.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,9 +18,9 @@ from scipy.optimize import minimize
 from vd.gap.coordinates import Scales, coordinate
 from vd.gap.fit import JointProblem
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import RANDOM
+from vd.gap.judge import JITTER
 from vd.gap.rollout import Rollouts
-from vd.gap.veil import Veil
+from vd.gap.sample_weighting import SampleWeighting
 
 DRAWS = 16
 """Realisations of the delays."""
@@ -34,11 +34,11 @@ computer's clock, is not quite when it arrives (our choice)."""
 ROUNDS = 2
 """Searches, with the rest of the model linearised anew before the second."""
 NOISES = (1.0, 3.0, 10.0)
-"""Noise floors that the first guess allows: what the model lacks besides must not look like chance."""
+"""Noise floors that the first guess allows: what the model lacks besides must not look like jitter."""
 LARGEST = 2.0
 """Logarithm of the largest equivalent error squared [rad^2]: as good as none."""
 NARROW = 0.5
-"""Share of the first guess that is believed: behind more chance than there is an effect would not show."""
+"""Share of the first guess that is believed: behind more jitter than there is an effect would not show."""
 DAMPING = 1e-4
 TRUST = 0.5
 """Largest shift of a coordinate of the rest of the model in a round."""
@@ -83,7 +83,7 @@ class JitterFit:
             replace(recording, trajectories=copies),
             dt=problem.rollouts.dt,
             device=problem.rollouts.device,
-            crowd=problem.rollouts.crowd,
+            batch=problem.rollouts.batch,
         )
         self.measured = np.concatenate([t.position[:, self._column] for t in chosen])
         self.ends = np.cumsum([len(t.time) for t in chosen])[:-1]
@@ -91,7 +91,7 @@ class JitterFit:
 
     @cached_property
     def jacobian(self) -> np.ndarray:
-        """d(predicted)/dx of the rest of the model [P, N]; a veil alone needs none."""
+        """d(predicted)/dx of the rest of the model [P, N]; a weighting alone needs none."""
         return self.problem.jacobian(self.base)
 
     @property
@@ -151,11 +151,11 @@ class JitterFit:
         sigma, drop = START_SIGMA_DROP[int(np.argmin(totals))]
         return NARROW * sigma, NARROW * drop
 
-    def veil(self, sigma: float, drop: float) -> Veil:
+    def weighting(self, sigma: float, drop: float) -> SampleWeighting:
         """What the delays do to the samples, for fits of the rest of the model."""
         mean, spread = self.draws(sigma, drop)
         without = self.measured - self.problem.residuals(self.base.rows[None])[0]
-        return Veil(mean - without, np.sqrt(1.0 + spread / self.problem.floor**2))
+        return SampleWeighting(mean - without, np.sqrt(1.0 + spread / self.problem.floor**2))
 
     def search(self, start: tuple[float, float]) -> tuple[float, float]:
         """The values of the largest likelihood; the rest of the model moves along."""
@@ -253,7 +253,7 @@ class JitterFit:
         gram, gradient = np.zeros((self.size, size, size)), np.zeros((self.size, size))
         gram[:, : size - 2, : size - 2], gradient[:, : size - 2] = self.base.gram, self.base.gradient
         return JointFit(
-            effects=(*self.base.effects, RANDOM),
+            effects=(*self.base.effects, JITTER),
             coordinates=(*self.base.coordinates, *self.coordinates),
             x=np.concatenate([self.base.x, x]),
             rows=self.row(sigma, drop),
@@ -267,20 +267,20 @@ class JitterFit:
 
 def look(
     problem: JointProblem, fit: JointFit, scales: Scales, start: tuple[float, float] | None = None
-) -> tuple[tuple[float, float], Veil]:
+) -> tuple[tuple[float, float], SampleWeighting]:
     """A first guess of the jitter of a model, or what it starts from, and what it does to the samples."""
     jitter = JitterFit(problem, fit, scales)
     values = jitter.guess() if start is None else start
-    return values, jitter.veil(*values)
+    return values, jitter.weighting(*values)
 
 
 def fit_jitter(
     problem: JointProblem, fit: JointFit, scales: Scales, start: tuple[float, float]
-) -> tuple[JointFit, Veil]:
+) -> tuple[JointFit, SampleWeighting]:
     """The model with jitter of the largest likelihood, as any other fit, and what it does to the samples."""
     jitter = JitterFit(problem, fit, scales)
     values = jitter.search(start)
-    return jitter.result(*values), jitter.veil(*values)
+    return jitter.result(*values), jitter.weighting(*values)
 
 
 def bound_jitter(problem: JointProblem, fit: JointFit, scales: Scales) -> JointFit:
@@ -293,16 +293,16 @@ def bound_jitter(problem: JointProblem, fit: JointFit, scales: Scales) -> JointF
     return replace(fit, extents=JitterFit(problem, rest, scales).extents(sigma, drop))
 
 
-def sway(problem: JointProblem, fit: JointFit, scales: Scales) -> Veil:
+def clock_weighting(problem: JointProblem, fit: JointFit, scales: Scales) -> SampleWeighting:
     """What errors of the recording's clock add to the samples under a model: no mean, and their spread."""
-    veil = JitterFit(problem, fit, scales).veil(CLOCK_S, 0.0)
-    return Veil(np.zeros_like(veil.shift), veil.growth)
+    weighting = JitterFit(problem, fit, scales).weighting(CLOCK_S, 0.0)
+    return SampleWeighting(np.zeros_like(weighting.shift), weighting.growth)
 
 
 CALLS: dict[str, Callable[..., Any]] = {
     "look": look,
     "fit_jitter": fit_jitter,
     "bound_jitter": bound_jitter,
-    "sway": sway,
+    "clock_weighting": clock_weighting,
 }
 """What is asked of a joint's problem by name, besides its methods."""

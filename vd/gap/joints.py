@@ -8,15 +8,15 @@ from typing import Protocol
 import numpy as np
 
 from vd.gap.candidates import FULL_ITERATIONS
-from vd.gap.chance import FIXED
 from vd.gap.consensus import agree, no_constant_friction, no_spring, share
 from vd.gap.explanation import Explanation, polished
 from vd.gap.finger_masses import masses_alone, masses_beside
+from vd.gap.jitter_search import FIXED
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import RANDOM
+from vd.gap.judge import JITTER
 from vd.gap.masses import widened
-from vd.gap.one_joint import REFITS, Explained, Explainer, Joint, beside, seen
-from vd.gap.team import Team, parallel
+from vd.gap.one_joint import REFITS, Explained, Explainer, Joint, beside, weighting_of
+from vd.gap.worker_pool import WorkerPool, parallel
 
 
 def explain_joints(explainer: Explainer) -> list[Explanation]:
@@ -25,8 +25,8 @@ def explain_joints(explainer: Explainer) -> list[Explanation]:
     Args:
         explainer: Explains one.
     """
-    team, joints = explainer.team, explainer.joints
-    masses = masses_alone(team, joints)
+    pool, joints = explainer.pool, explainer.joints
+    masses = masses_alone(pool, joints)
 
     def one(joint: Joint, explained: Explained, own: Explanation | None = None) -> Explanation:
         if joint.spec.chain not in masses:
@@ -37,15 +37,15 @@ def explain_joints(explainer: Explainer) -> list[Explanation]:
 
     floors, fingers = ([getattr(j.spec, name) for j in joints] for name in ("floor", "chain"))
     alone = _in_turn(joints, one)
-    fits = [partial(_fitted, team, list(zip(joints, alone, strict=True)), joint) for joint in joints]
+    fits = [partial(_fitted, pool, list(zip(joints, alone, strict=True)), joint) for joint in joints]
     ends = [partial(_finished, fit) for fit in fits]
     agreed = agree(share(alone, floors, fingers, ends), floors, fingers, fits)
-    found = _consistent(team, joints, masses_beside(team, joints, agreed))
+    found = _consistent(pool, joints, masses_beside(pool, joints, agreed))
     return no_constant_friction(no_spring(found, fingers), fingers)
 
 
 def _fitted(
-    team: Team,
+    pool: WorkerPool,
     known: Explained,
     joint: Joint,
     effects: tuple[str, ...],
@@ -54,9 +54,9 @@ def _fitted(
     """A model of a joint with these effects, fitted to the end beside the joints as they are known."""
     call = {"base": beside(joint, known), "effects": effects, "starts": list(starts), "scales": joint.scales}
     call |= {"iterations": FULL_ITERATIONS, "refits": REFITS}
-    through = seen(next(found for other, found in known if other is joint))
-    whole = team.run(joint.spec, [("fit", {**call, **through})])[0]
-    return team.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales, **through})])[0]
+    weighting = weighting_of(next(found for other, found in known if other is joint))
+    whole = pool.run(joint.spec, [("fit", {**call, **weighting})])[0]
+    return pool.run(joint.spec, [("refine", {"fit": whole, "scales": joint.scales, **weighting})])[0]
 
 
 def _finished(
@@ -88,8 +88,8 @@ def _in_turn(joints: Sequence[Joint], explain: _Explain) -> list[Explanation]:
         own = [joint for joint in joints if joint.spec.chain == chain]
         for joint in sorted(own, key=lambda each: -each.spec.joint):
             found.append((joint, explain(joint, found)))
-        chance = [RANDOM in explanation.final.effects for _, explanation in found]
-        for i, (joint, before) in enumerate(found[: chance.index(True) if any(chance) else 0]):
+        late = [JITTER in explanation.final.effects for _, explanation in found]
+        for i, (joint, before) in enumerate(found[: late.index(True) if any(late) else 0]):
             # What a late command is the mean of, or what nothing explained.
             if FIXED in before.final.effects or before.verdict in ("unknown", "ambiguous"):
                 found[i] = joint, explain(joint, [*found[:i], *found[i + 1 :]], before)
@@ -101,7 +101,7 @@ def _in_turn(joints: Sequence[Joint], explain: _Explain) -> list[Explanation]:
 
 
 def _consistent(
-    team: Team, joints: Sequence[Joint], explanations: Sequence[Explanation]
+    pool: WorkerPool, joints: Sequence[Joint], explanations: Sequence[Explanation]
 ) -> list[Explanation]:
     """Final models with the other joints of their chain as these are in the end, not without effects.
 
@@ -113,11 +113,11 @@ def _consistent(
         joint, own = known[index]
         rows = beside(joint, known)
         changed = not np.array_equal(rows, joint.fit.rows)
-        if not changed or not own.final.effects or RANDOM in own.final.effects:
+        if not changed or not own.final.effects or JITTER in own.final.effects:
             return own
         rows[joint.spec.joint] = own.final.rows[joint.spec.joint]
-        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales, **seen(own)}
-        fit = team.run(joint.spec, [("refine", call)])[0]
+        call = {"fit": replace(own.final, rows=rows), "scales": joint.scales, **weighting_of(own)}
+        fit = pool.run(joint.spec, [("refine", call)])[0]
         if own.final.extents:
             fit = widened(fit, joint.spec.floor, own.final.extents)
         return polished(own, fit, joint.spec.floor)

@@ -26,10 +26,10 @@ MIN_GAIN = 0.05
 """Share of the held-out RMSE that an effect must remove."""
 MIN_GAIN_FLOORS = 0.7
 """Gap that an effect must close, as sqrt(before^2 - after^2), in noise floors."""
-VEILED_GAIN_FLOORS = 0.3
-"""The same through what chance does to the samples: an effect of six floors leaves half of one there."""
+JITTER_GAIN_FLOORS = 0.3
+"""The same beside random delays: an effect of six floors leaves half of one there."""
 MEMORY = 8.0
-"""Samples in a row that say the same through it: what a late command does lasts that long."""
+"""Samples in a row that say the same beside them: what a late command does lasts that long."""
 MIN_SHARE = 0.02
 """The same in whole gaps: no fit of a large effect is better than that. With half of it, an acceleration
 limit of 300 noise floors, whose optimum is sharp, comes with a second effect that is not there."""
@@ -49,7 +49,7 @@ SMALL_EXCESS_FLOORS = 0.05
 CONTAINED_FLOORS = 0.15
 """The same for one that the winner contains: with more parameters it imitates what the integrator misses."""
 FULLER_FLOORS = 0.04
-"""What a fuller form of a loss must leave less, in noise floors, not to be the simpler one: chance gives
+"""What a fuller form of a loss must leave less, in noise floors, not to be the simpler one: luck gives
 that much in one of two hundred recordings."""
 SHARP_SHARE = 0.002
 """All three in whole gaps: beside an acceleration limit of 283 noise floors one right model ended 0.5 floors
@@ -66,7 +66,7 @@ FORMS = {"torque_limit", "torque_speed_limit", "torque_saturation", "supply_sag"
 """Forms of one loss, of torque where much is asked."""
 SHARP = 0.1
 """Share of an error from which what an effect leaves of it lies in a valley that is sharp."""
-RANDOM = "command_jitter"
+JITTER = "command_jitter"
 """The effect that no single prediction shows (:mod:`vd.gap.jitter`): tried last, on what is left."""
 
 
@@ -80,7 +80,7 @@ class Judge:
         whole: Held-out RMSE of the baseline [rad]; what is small beside it is the model's own error.
         without: Held-out RMSE of the present model without each of its effects [rad].
         moves: Whether the joint's command changes, of each trajectory [S]; None: in all.
-        veiled: Whether the samples are seen through what chance does to them (:mod:`vd.gap.veil`).
+        behind_jitter: Whether samples are weighted by what random delays do (:mod:`vd.gap.sample_weighting`).
     """
 
     floor: float
@@ -88,15 +88,15 @@ class Judge:
     whole: float = 0.0
     without: dict[str, float] = field(default_factory=dict)
     moves: np.ndarray | None = None
-    veiled: bool = False
+    behind_jitter: bool = False
 
     def white(self, fit: JointFit) -> bool:
-        """Whether samples tell how good a fit is: it leaves no more than noise, or chance, on all of them."""
-        return self.veiled or fit.rmse < EXPLAINED * self.floor
+        """Whether samples tell how good a fit is: it leaves no more than noise, or jitter, on all of them."""
+        return self.behind_jitter or fit.rmse < EXPLAINED * self.floor
 
     def no_gap(self, fit: JointFit) -> bool:
-        """Whether a fit predicts as well as noise lets it; how well chance does is not known as exactly."""
-        return not self.veiled and fit.held_out_rmse < NO_GAP * self.floor
+        """Whether a fit predicts as well as noise lets it; beside jitter that is not known as exactly."""
+        return not self.behind_jitter and fit.held_out_rmse < NO_GAP * self.floor
 
     def scores(
         self, fits: Sequence[JointFit], weights: np.ndarray | None = None, fitted: bool = False
@@ -145,13 +145,13 @@ class Judge:
             after: The larger.
             tail: Share of the resamples that may see no gain.
         """
-        white = (self.white(before) or self.white(after)) and RANDOM not in before.effects
+        white = (self.white(before) or self.white(after)) and JITTER not in before.effects
         if white:
             before, after = (replace(fit, held_out=fit.sse) for fit in (before, after))
         old, new = (rmse(fit.held_out, fit.count, self.weights) for fit in (before, after))
         gain = 1.0 - after.held_out_rmse / before.held_out_rmse
         sampled = 1.0 - new / old
-        if RANDOM in after.effects:
+        if JITTER in after.effects:
             # Its errors are not held out: what it is compared with must not gain by being so either.
             fitted = replace(before, held_out=before.sse)
             sampled = _likelihood_gain(fitted, after, self.weights)
@@ -166,7 +166,7 @@ class Judge:
             return False, "its gain over trajectories is not distinguishable from 0"
         if closed < MIN_SHARE * self.whole and not white:
             return False, "what it removes is small beside the whole gap"
-        if closed < (VEILED_GAIN_FLOORS if self.veiled else MIN_GAIN_FLOORS) * self.floor:
+        if closed < (JITTER_GAIN_FLOORS if self.behind_jitter else MIN_GAIN_FLOORS) * self.floor:
             return False, "what it removes is below the noise floor"
         return True, ""
 
@@ -193,7 +193,7 @@ class Judge:
     def _own_widths(self, before: JointFit, after: JointFit) -> tuple[np.ndarray, np.ndarray]:
         """Log-likelihood gained by random delays over a model with a width for each motion, and samples; [S].
 
-        The other model has a width of its own for every motion, lest chance be credited with what any excuse
+        The other model has a width of its own for every motion, lest jitter be credited with what any excuse
         for some of them would gain. It is no less than the floor, nor does a motion count whose command stays
         as it is: nothing can be late there.
         """
@@ -223,7 +223,7 @@ class Judge:
             if excess > 0.0:  # what needs more parameters to do worse is no equal
                 more = max(len(other.x) - len(winner.x), 0)
                 excess += 2.0 * PENALTY * more * (winner.rmse / self.floor) ** 2
-            excess /= MEMORY if self.veiled else 1.0
+            excess /= MEMORY if self.behind_jitter else 1.0
             least = SHARP_SHARE * self.whole / self.floor
             contained, small, sure = (
                 max(floors, least) ** 2 for floors in (CONTAINED_FLOORS, SMALL_EXCESS_FLOORS, EXCESS_FLOORS)
@@ -246,15 +246,15 @@ class Judge:
 
 
 def _likelihood_gain(before: JointFit, after: JointFit, weights: np.ndarray) -> np.ndarray:
-    """Gain in log-likelihood of a model with chance in it over one without, per resample.
+    """Gain in log-likelihood of a model with random delays over one without, per resample.
 
-    What chance moves is in few motions, whose squared errors would decide all; their likelihood, of a
+    What they move is in few motions, whose squared errors would decide all; their likelihood, of a
     width that follows the motion, weighs every sample by how surely it is known.
     """
     count = before.count
     square = before.held_out.sum() / count.sum()
     old = 0.5 * (count * np.log(square) + before.held_out / square)
-    if RANDOM in before.effects:
+    if JITTER in before.effects:
         old = 0.5 * count * (np.log(before.held_out / count) + 1.0)
     spread = 0.5 * count * (np.log(after.held_out / count) + 1.0)
     return weights @ (old - spread)

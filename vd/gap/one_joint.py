@@ -9,19 +9,20 @@ import numpy as np
 
 from vd.gap.candidates import FULL_ITERATIONS, alike, stood_for
 from vd.gap.chain import candidates, others_in
-from vd.gap.chance import FIXED, as_random
-from vd.gap.clock import explain_weighted, swayed
+from vd.gap.clock_sensitivity import clock_sensitivity, explain_weighted
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.explanation import Explanation, added, by_chance, lacking
+from vd.gap.explanation import Explanation, added, jitter_of, lacking
+from vd.gap.jitter_search import FIXED, jitter_as_another
 from vd.gap.joint_fit import JointFit
-from vd.gap.judge import EXPLAINED, RANDOM
+from vd.gap.judge import EXPLAINED, JITTER
 from vd.gap.recording import Recording
-from vd.gap.select import LOOKS, RESTARTS, Selection
-from vd.gap.sketch import outline, sketched
+from vd.gap.search import LOOKS, RESTARTS
+from vd.gap.select import Selection
 from vd.gap.statistics import resamples
-from vd.gap.team import JointSpec, Team
 from vd.gap.telemetry import vetoes
+from vd.gap.warm_start import rough_model, warm_starts
 from vd.gap.warming import middles
+from vd.gap.worker_pool import JointSpec, WorkerPool
 from vd.kernels.servo.effects import EFFECTS
 
 POLISH_ITERATIONS = 5
@@ -51,7 +52,7 @@ class Explainer:
     """Explains joints, one at a time.
 
     Attributes:
-        team: Who fits.
+        pool: Who fits.
         joints: All joints of the recording, with their plain models.
         effects: Effects to consider.
         seed: Of everything random.
@@ -59,7 +60,7 @@ class Explainer:
         rough: Rough models of joints that are not explained yet, by chain: each has a thread of its own.
     """
 
-    team: Team
+    pool: WorkerPool
     joints: Sequence[Joint]
     effects: Sequence[str]
     seed: int
@@ -69,7 +70,7 @@ class Explainer:
     @cached_property
     def when(self) -> np.ndarray:
         """When each trajectory was recorded (:func:`vd.gap.warming.middles`)."""
-        return middles(self.team.bench.recording)
+        return middles(self.pool.problems.recording)
 
     def explain(self, joint: Joint, explained: Explained, own: Explanation | None = None) -> Explanation:
         """What a joint lacks.
@@ -82,37 +83,39 @@ class Explainer:
         selection = self.selection(joint, explained)
         baseline = self.plain(joint, explained)
         if own is not None:
-            return as_random(selection, baseline, selection.undetermined(baseline)) or own
-        found = None if explained else outline(selection, baseline)
+            return jitter_as_another(selection, baseline, selection.undetermined(baseline)) or own
+        found = None if explained else rough_model(selection, baseline)
         if found is not None:
-            self.sketch(joint, found)
+            self.warm_start(joint, found)
             baseline = self.plain(joint, explained)
             (found,) = selection.run(
                 [selection.call(baseline, found.effects, [found.values], FULL_ITERATIONS)]
             )
-        veil = None if found is None else swayed(selection, found)
-        result = explain_weighted(selection, baseline, veil) if veil else selection.explain(baseline)
+        weighting = None if found is None else clock_sensitivity(selection, found)
+        result = (
+            explain_weighted(selection, baseline, weighting) if weighting else selection.explain(baseline)
+        )
         self.progress(f"explain: {joint.name}: {result.verdict}: {result.reason}")
         return result
 
     def selection(self, joint: Joint, explained: Explained) -> Selection:
         """The search for what a joint lacks, with what the others of its finger say of it."""
-        chain, spec = self.team.bench.chains[joint.spec.chain], joint.spec
-        recording = self.team.bench.recording
+        chain, spec = self.pool.problems.chains[joint.spec.chain], joint.spec
+        recording = self.pool.problems.recording
         column = int(chain.columns[spec.joint])
-        random = next((like for _, found in explained if (like := by_chance(found))[0]), ((), {}))
-        # What is none of the table on one joint is none on the others, and what is chance on one is chance on
+        jittered = next((like for _, found in explained if (like := jitter_of(found))[0]), ((), {}))
+        # What is none of the table on one joint is none on the others, and jitter on one is jitter on
         # all: what is plain to see is enough there.
-        hidden = bool(random[0]) or any(found.verdict == "unknown" for _, found in explained)
+        hidden = bool(jittered[0]) or any(found.verdict == "unknown" for _, found in explained)
         names = candidates(chain, self.effects)
-        if _no_chance(explained):
-            names = [name for name in names if name != RANDOM]
+        if _no_jitter(explained):
+            names = [name for name in names if name != JITTER]
         told = vetoes(recording, chain, spec, joint.fit.rows)
         pairs = alike(self.effects, recording.model).items()
         same = {name: others for name, others in pairs if not {name, *others} & set(told)}
         rng = np.random.default_rng([self.seed, spec.chain, spec.joint])
         return Selection(
-            run=lambda calls: self.team.run(spec, calls),
+            run=lambda calls: self.pool.run(spec, calls),
             joint=spec.joint,
             others=others_in(chain, spec.joint),
             candidates=names,
@@ -135,7 +138,7 @@ class Explainer:
             when=self.when[list(spec.trajectories)],
             like=next((like for _, found in explained if (like := lacking(found))[0]), ((), {})),
             changing=next((added(found.final) for _, found in explained if found.warms), ((), {})),
-            random=random,
+            jittered=jittered,
         )
 
     def plain(self, joint: Joint, explained: Explained) -> JointFit:
@@ -149,35 +152,35 @@ class Explainer:
             return joint.fit
         call = {"base": rows, "effects": (), "starts": [{}], "scales": joint.scales}
         call |= {"iterations": POLISH_ITERATIONS, "refits": REFITS}
-        return self.team.run(joint.spec, [("fit", call)])[0]
+        return self.pool.run(joint.spec, [("fit", call)])[0]
 
-    def sketch(self, joint: Joint, found: JointFit) -> None:
-        """Take rough models of the other joints of a finger, beside a rough one of its first."""
+    def warm_start(self, joint: Joint, found: JointFit) -> None:
+        """Begin the other joints of a finger with rough models, beside a rough one of its first."""
 
         def fit(other: Joint, effects: tuple[str, ...], values: Mapping[str, float]) -> JointFit:
             rows = other.fit.rows.copy()
             rows[joint.spec.joint] = found.rows[joint.spec.joint]
             call = {"base": rows, "effects": effects, "starts": [values], "scales": other.scales}
-            return self.team.run(other.spec, [("fit", {**call, "iterations": FULL_ITERATIONS})])[0]
+            return self.pool.run(other.spec, [("fit", {**call, "iterations": FULL_ITERATIONS})])[0]
 
         others = {j.name: j for j in self.joints if j.spec.chain == joint.spec.chain and j is not joint}
         fits = {name: partial(fit, other) for name, other in others.items()}
-        models = sketched(found, {name: other.fit for name, other in others.items()}, fits)
+        models = warm_starts(found, {name: other.fit for name, other in others.items()}, fits)
         self.rough[joint.spec.chain] = {others[name]: model for name, model in models.items()}
         if models:
             names = " and ".join(models)
             self.progress(f"explain: {names}: roughly with {' and '.join(found.effects)} as well")
 
 
-def _no_chance(explained: Explained) -> bool:
+def _no_jitter(explained: Explained) -> bool:
     """Whether random delays are none on a joint, by what is known of the others of its finger.
 
     They are none where they were tried on one and refused, not where too little was left there to try them;
     and where another is explained without, as commands go out together.
     """
     unknown = any(found.verdict == "unknown" for _, found in explained)
-    random = any(RANDOM in found.final.effects for _, found in explained)
-    tried = any(row.name == RANDOM for _, found in explained for row in found.trials)
+    random = any(JITTER in found.final.effects for _, found in explained)
+    tried = any(row.name == JITTER for _, found in explained for row in found.trials)
     refused = unknown and tried and not random
     return refused or any(steady(other, found) for other, found in explained)
 
@@ -187,25 +190,25 @@ def steady(joint: Joint, explanation: Explanation) -> bool:
     final = explanation.final
     return (
         explanation.verdict == "effects"
-        and not {RANDOM, FIXED} & {*final.effects}
+        and not {JITTER, FIXED} & {*final.effects}
         and final.rmse < EXPLAINED * joint.spec.floor
     )
 
 
 def beside(joint: Joint, explained: Explained) -> np.ndarray:
-    """Rows of a joint's chain with its plain model, the others as they were found to be, chance aside."""
+    """Rows of a joint's chain with its plain model, the others as they were found to be, jitter aside."""
     rows = joint.fit.rows.copy()
     for other, found in explained:
         if other is not joint and other.spec.chain == joint.spec.chain and found.final.effects:
             rows[other.spec.joint] = found.final.rows[other.spec.joint]
-            for parameter in EFFECTS[RANDOM].parameters:
+            for parameter in EFFECTS[JITTER].parameters:
                 rows[other.spec.joint, parameter.column] = parameter.neutral
     return rows
 
 
-def seen(found: Explanation) -> dict[str, Any]:
-    """What the samples of an explained joint are to be seen through, as an argument of a call."""
-    return {} if found.veil is None else {"veil": found.veil}
+def weighting_of(found: Explanation) -> dict[str, Any]:
+    """How the samples of an explained joint are weighted, as an argument of a call."""
+    return {} if found.weighting is None else {"weighting": found.weighting}
 
 
 def rest(recording: Recording, column: int, trajectories: Sequence[int]) -> float:

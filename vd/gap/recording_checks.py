@@ -52,7 +52,7 @@ LEAD_STEP_S = 5e-3
 LEAD_SAMPLES = 2.0
 """Samples by which stamps alone may let a position lead."""
 LEAD_MISS = 0.5
-"""What a lead must leave of one less the correlation, in that of any lag: chance leaves 0.7."""
+"""What a lead must leave of one less the correlation, in that of any lag: luck leaves 0.7."""
 SPEED_RATIO = 2.0
 """How many times too fast or slow a velocity must be for its unit to be another (rpm are 9.5 rad/s)."""
 FOLLOWS = 0.9

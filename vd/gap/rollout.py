@@ -15,7 +15,7 @@ import numpy as np
 import warp as wp
 
 from vd.gap.chain import Chain, load_of
-from vd.gap.crowd import Crowd
+from vd.gap.launch_batch import LaunchBatch
 from vd.gap.recording import Recording
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.chains import MAX_JOINTS, Links, Samples, rollout_kernel
@@ -96,7 +96,7 @@ class Rollouts:
         *,
         dt: float = STEP_S,
         device: str = "cpu",
-        crowd: Crowd | None = None,
+        batch: LaunchBatch | None = None,
     ):
         """Prepare the trajectories.
 
@@ -105,7 +105,7 @@ class Rollouts:
             recording: The recording.
             dt: Time step [s].
             device: Warp device.
-            crowd: Threads whose calls are simulated together; None simulates each at once.
+            batch: Threads whose calls are simulated together; None simulates each at once.
 
         Raises:
             ValueError: ``dt`` is not positive.
@@ -113,7 +113,7 @@ class Rollouts:
         if not dt > 0.0:
             raise ValueError(f"dt is {dt}; give a positive time step in seconds")
         self.chain, self.recording, self.dt, self.device = chain, recording, dt, device
-        self.crowd = crowd
+        self.batch = batch
         self._finer: dict[float, Rollouts] = {}
         self._recent: dict[bytes, np.ndarray] = {}
         self.num_joints = len(chain.joints)
@@ -136,21 +136,21 @@ class Rollouts:
         with _MAKING:
             if dt not in self._finer:
                 self._finer[dt] = Rollouts(
-                    self.chain, self.recording, dt=dt, device=self.device, crowd=self.crowd
+                    self.chain, self.recording, dt=dt, device=self.device, batch=self.batch
                 )
             return self._finer[dt]
 
     def with_chain(self, chain: Chain) -> "Rollouts":
         """The same motions of a chain with other links; joints and columns are the same."""
         other = copy.copy(self)
-        other.chain, other.crowd, other._finer, other._recent = chain, None, {}, {}
+        other.chain, other.batch, other._finer, other._recent = chain, None, {}, {}
         other.__dict__.pop("_links", None)
         return other
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the device's arrays behind: another process makes its own."""
         kept = {key: value for key, value in self.__dict__.items() if key not in ("_samples", "_links")}
-        return {**kept, "crowd": None, "_finer": {}, "_recent": {}}
+        return {**kept, "batch": None, "_finer": {}, "_recent": {}}
 
     @cached_property
     def _samples(self) -> Samples:
@@ -222,7 +222,7 @@ class Rollouts:
             raise ValueError(f"rows has shape {rows.shape}; it must be (C, {n}, {servo.PARAMETER_COLUMNS})")
         chosen = np.arange(len(self._count)) if trajectories is None else np.asarray(trajectories, int)
         call = Call(rows, chosen, joint, keep)
-        return self.simulate([call])[0] if self.crowd is None else self.crowd.simulate(self, call)
+        return self.simulate([call])[0] if self.batch is None else self.batch.simulate(self, call)
 
     def simulate(self, calls: Sequence["Call"]) -> list[np.ndarray]:
         """The answers to calls of :meth:`predict`, in one launch if all want one joint, or all want all."""

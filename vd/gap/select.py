@@ -5,42 +5,27 @@ A step of the search is tentative; :mod:`vd.gap.verdict` has the last word.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from vd.gap.candidates import BETTER, HOPELESS, Call
-from vd.gap.chance import as_random, at_once, in_place, try_random, unlimited
-from vd.gap.clock import explain_weighted, swayed
+from vd.gap.candidates import BETTER, HOPELESS
+from vd.gap.clock_sensitivity import clock_sensitivity, explain_weighted
 from vd.gap.consensus import as_another, as_changing
 from vd.gap.explanation import Accepted, Explanation, Trial
-from vd.gap.frictions import EXACTLY, Frictions
-from vd.gap.jitter import CALLS
+from vd.gap.frictions import EXACTLY
+from vd.gap.jitter_search import at_once, in_place, jitter_as_another, try_jitter, unlimited
 from vd.gap.joint_fit import ONE_SIDED, JointFit
-from vd.gap.judge import EXPLAINED, MIN_GAIN_FLOORS, MIN_SHARE, NESTED, RANDOM, REPEATABLE, SHARP
+from vd.gap.judge import EXPLAINED, JITTER, NESTED, SHARP
+from vd.gap.search import NEAR, UNEARNED, WIDE, Search
 from vd.gap.telemetry import BEHIND_SENSOR
-from vd.gap.verdict import cancelled
 
 MIN_TRAJECTORIES = 3
 MAX_EFFECTS = 3
 MAX_ROUNDS = 6
 """Rounds in all, with those after a revision."""
-WIDE = 15.0
-"""Error of a round's best, in noise floors, up to which every start of every candidate is tried: a linear
-promise is no guide to where an effect that rings or brakes can be found."""
-LOOKS = 2
-"""Rounds in which they are: each costs as much as several others."""
-RESTARTS = 2
-"""Searches from another first effect, where the first search leaves a gap."""
-UNEARNED = float(np.hypot(1.0, MIN_GAIN_FLOORS))
-"""Error, in noise floors, from which down to the floor no further effect can close what it has to."""
-COARSE = 0.9
-"""Share of an error that a finer time step leaves, at which the search is made with that."""
 LARGE = 4.0
 """Gap, in noise floors, that two wrong effects together do not imitate: only a search that fails has to look
 that wide."""
-NEAR = 4.0
-"""A final error between ``NO_GAP`` and this, in noise floors, is worth a search from another first effect."""
 SEARCH_TAIL = 0.4
 """Share of the resamples that may see no gain from an effect while the search goes on: one of two causes
 alone can make some motions worse."""
@@ -48,37 +33,51 @@ KEEP_TAIL = 0.1
 """Share of the resamples that may see no gain from an effect that is in the model already: what was
 earned is not lost to the luck of another local fit."""
 
+Rivals = dict[str, list[JointFit]]
+"""Fits with others in the place of an effect, by its name."""
+
 
 @dataclass(kw_only=True)
-class Selection(Frictions):
-    """Forward selection for one joint.
-
-    Attributes:
-        restarts: Searches from another first effect, where the first search leaves a gap.
-        looks: Rounds in which every start may be tried (:meth:`look_wider`).
-        wide: Whether more is tried than the best starts and one effect after the other.
-        like: What another joint of the finger certainly lacks: effects, and values by key.
-        changing: The same of one whose friction changes over the recording: what comes nearest there.
-        random: The same of one that has random delays, these among the effects: what is sure beside them.
-    """
-
-    restarts: int = RESTARTS
-    looks: int = LOOKS
-    wide: bool = True
-    like: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
-    changing: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
-    random: tuple[tuple[str, ...], Mapping[str, float]] = ((), {})
+class Selection(Search):
+    """Forward selection for one joint."""
 
     def explain(self, baseline: JointFit, start: tuple[JointFit, list[Trial]] | None = None) -> Explanation:
-        """Select effects, starting from the fitted baseline.
-
-        Args:
-            baseline: The plain model.
-            start: A model that leaves noise, and the evidence for it, where a search with a coarser step has
-                found one: it is only compared with others.
-        """
+        """See :meth:`Search.explain`."""
         loose = self.undetermined(baseline)
         self.whole = baseline.held_out_rmse
+        known = self.without_search(baseline, loose)
+        if known is None and not start:
+            known = (
+                as_another(self, baseline, loose)
+                or as_changing(self, baseline, loose)
+                or jitter_as_another(self, baseline, loose)
+            )
+        if known is not None:
+            return known
+        trials = [] if start else self.contradicted(baseline)
+        present, rivals, rows = (start[0], {}, start[1]) if start else self.first(baseline)
+        trials += rows
+        if weighting := clock_sensitivity(self, present):
+            return explain_weighted(self, baseline, weighting)
+        present, rivals, rows = self.begun_elsewhere(baseline, present, rivals, rows)
+        trials += rows
+        if self.too_coarse(present):
+            return self.explain_finer(baseline, present, trials)
+        if present.effects:
+            earned, why = self.better(baseline, present)
+            if not earned:
+                self.report(f"taken back: {why}")
+                present, rivals = baseline, {}
+        present, rivals, beside, rows = self.with_jitter(baseline, present, rivals)
+        trials += rows
+        present, rivals = self.with_rivals(present, rivals)
+        evidence = self.settle(trials, present)
+        if not present.effects or JITTER in present.effects:
+            return self.conclude(baseline, present, rivals, evidence, loose, known=beside)
+        return self.confirmed(baseline, present, rivals, evidence, loose)
+
+    def without_search(self, baseline: JointFit, loose: str) -> Explanation | None:
+        """The explanation of a joint whose plain model leaves nothing to search for, or cannot be judged."""
         if len(baseline.sse) < MIN_TRAJECTORIES:
             text = (
                 f"{len(baseline.sse)} trajectories leave none to hold out; record {MIN_TRAJECTORIES} at least"
@@ -88,21 +87,28 @@ class Selection(Frictions):
             if loose:
                 return Explanation(baseline, baseline, "under_excited", loose)
             return Explanation(baseline, baseline, "no_gap", "the plain model is within the noise floor")
-        if veil := swayed(self, baseline):  # with an identified limit in it
-            return explain_weighted(self, baseline, veil)
-        known = None if start else as_another(self, baseline, loose) or as_changing(self, baseline, loose)
-        if not start and known is None:
-            known = as_random(self, baseline, loose)
-        if known is not None:
-            return known
-        trials = [] if start else self.contradicted(baseline)
-        present, rivals, rows = (start[0], {}, start[1]) if start else self.first(baseline)
-        trials += rows
-        if veil := swayed(self, present):
-            return explain_weighted(self, baseline, veil)
+        if weighting := clock_sensitivity(self, baseline):  # with an identified limit in it
+            return explain_weighted(self, baseline, weighting)
+        return None
+
+    def begun_elsewhere(
+        self, baseline: JointFit, present: JointFit, rivals: Rivals, rows: list[Trial]
+    ) -> tuple[JointFit, Rivals, list[Trial]]:
+        """The best of what was found and of searches from other first effects.
+
+        Args:
+            baseline: The plain model.
+            present: What the first search has found.
+            rivals: Fits with others in the place of each of its effects.
+            rows: The evidence of that search.
+
+        Returns:
+            The model, its rivals, and the further evidence.
+        """
         alone = [t for t in rows if t.round == 1 and len(t.fit.effects) == 1]
         first = {t.name: t.fit for t in alone if not t.placebo and np.isfinite(t.gain)}
         tied = {t.name for t in rows if t.round == 1 and t.decision == "tied"}
+        trials: list[Trial] = []
         for name in sorted(first, key=lambda n: first[n].rmse):
             if present.effects and (self.finished(present) or self.ended(present)):
                 break
@@ -117,40 +123,51 @@ class Selection(Frictions):
                 self.report(f"from {name}: {1e3 * other.held_out_rmse:.2f} mrad held out is better")
                 present, rivals = other, fits
                 trials += [replace(row, round=row.round + MAX_ROUNDS) for row in rows]
-        if self.too_coarse(present):
-            self.report(f"{' and '.join(present.effects)}: the time step shows, so again with a finer one")
-            fine, refined = self.finer(), self.refined(present)
-            plain = fine.run([fine.plain(baseline)])[0]
-            if refined.rmse > UNEARNED * self.floor or self.lack_of_fit(refined):
-                return fine.explain(plain)
-            return fine.explain(plain, (fine.refit(refined, refined.effects), trials))
-        if present.effects:
-            earned, why = self.better(baseline, present)
-            if not earned:
-                self.report(f"taken back: {why}")
-                present, rivals = baseline, {}
-        beside: tuple[Accepted, ...] = ()
-        # What is fitted well leaves none to chance, nor does a spring.
+        return present, rivals, trials
+
+    def explain_finer(self, baseline: JointFit, present: JointFit, trials: list[Trial]) -> Explanation:
+        """The explanation by a search with a finer time step, or by the model that leaves noise with it."""
+        self.report(f"{' and '.join(present.effects)}: the time step shows, so again with a finer one")
+        fine, refined = self.finer(), self.refined(present)
+        plain = fine.run([fine.plain(baseline)])[0]
+        if refined.rmse > UNEARNED * self.floor or self.lack_of_fit(refined):
+            return fine.explain(plain)
+        return fine.explain(plain, (fine.refit(refined, refined.effects), trials))
+
+    def with_jitter(
+        self, baseline: JointFit, present: JointFit, rivals: Rivals
+    ) -> tuple[JointFit, Rivals, tuple[Accepted, ...], list[Trial]]:
+        """The model, its rivals, what is known beside random delays, and the evidence, where these may be.
+
+        What is fitted well leaves nothing to them, nor does a spring.
+        """
         fitted = self.finished(present) or self.white(present) or self.noise_only(present)
-        if not fitted and not self.a_spring(present):
-            chance, beside, rows = try_random(self, baseline, present)
-            trials += [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
-            if chance is not present:
-                present, rivals = chance, {}
-                if RANDOM not in present.effects:
-                    present, rivals = self.revise(present)
+        if fitted or self.a_spring(present):
+            return present, rivals, (), []
+        found, beside, rows = try_jitter(self, baseline, present)
+        if found is not present:
+            present, rivals = found, {}
+            if JITTER not in present.effects:
+                present, rivals = self.revise(present)
+        return present, rivals, beside, [replace(row, round=row.round + 2 * MAX_ROUNDS) for row in rows]
+
+    def with_rivals(self, present: JointFit, rivals: Rivals) -> tuple[JointFit, Rivals]:
+        """The model with frictions put together, and fits with others in the place of each of its effects."""
         behind = set(BEHIND_SENSOR) & set(self.vetoes) & set(self.candidates)
         stale = any(len(fit.effects) != len(present.effects) for fits in rivals.values() for fit in fits)
-        named = present.effects and RANDOM not in present.effects
+        named = present.effects and JITTER not in present.effects
         if named and (behind or stale or set(rivals) != set(present.effects)):
             rivals = {name: self.rivals(present, name) for name in present.effects}
         together = self.as_an_offset(self.put_together(present))
         if together is not present:
             present = together
             rivals = {name: self.rivals(present, name) for name in present.effects}
-        evidence = self.settle(trials, present)
-        if not present.effects or RANDOM in present.effects:
-            return self.conclude(baseline, present, rivals, evidence, loose, known=beside)
+        return present, rivals
+
+    def confirmed(
+        self, baseline: JointFit, present: JointFit, rivals: Rivals, evidence: list[Trial], loose: str
+    ) -> Explanation:
+        """The conclusion on a model, once searched for from elsewhere and at finer time steps."""
         found = present
         again = self.search_again(present)
         if again is not None and again.rmse < BETTER * present.rmse:
@@ -164,7 +181,7 @@ class Selection(Frictions):
             result = self.conclude(baseline, present, {**rivals, **better}, evidence, loose, refined, again)
         return self.explained(result)
 
-    def beside_better(self, result: Explanation, final: JointFit) -> dict[str, list[JointFit]]:
+    def beside_better(self, result: Explanation, final: JointFit) -> Rivals:
         """Fits with others in the place of an effect, where all are sets, beside better members of others.
 
         What the final model lacks there is as large as what tells the members of a set apart.
@@ -186,40 +203,25 @@ class Selection(Frictions):
                 found[one.name] = self.rivals(replace(best, effects=order), one.name)
         return found
 
-    def explained(self, explanation: Explanation) -> Explanation:
-        """The explanation with what its names do not say.
-
-        What a member of a set means that telemetry contradicts by its name; and no names where two
-        effects are but one that is not in the table.
-        """
-        alike = cancelled(explanation.final, self.joint, self.rest)
-        if alike and explanation.verdict in ("effects", "ambiguous"):
-            return replace(explanation, verdict="unknown", reason=alike)
-        tied = {name for one in explanation.accepted for name in one.tied}
-        notes = [
-            f"{name} {BEHIND_SENSOR[name]}" for name in sorted(tied & set(BEHIND_SENSOR) & set(self.vetoes))
-        ]
-        return replace(explanation, reason="; ".join([explanation.reason, *notes]))
-
-    def first(self, baseline: JointFit) -> tuple[JointFit, dict[str, list[JointFit]], list[Trial]]:
-        """The first search; it looks wide at once where a gap is small, but not where chance fills it."""
-        if not self.veiled and (baseline.held_out_rmse > LARGE * self.floor or at_once(self, baseline)):
+    def first(self, baseline: JointFit) -> tuple[JointFit, Rivals, list[Trial]]:
+        """The first search; it looks wide at once where a gap is small, but not where jitter fills it."""
+        if not self.behind_jitter and (
+            baseline.held_out_rmse > LARGE * self.floor or at_once(self, baseline)
+        ):
             self.wide = False
             found = self.search(baseline, baseline)
             self.wide = True
             if self.finished(found[0]) or self.ended(found[0]):
                 return found
-            chance = at_once(self, baseline)
-            if chance and self.likelier(found[0], chance[0]) and unlimited(self, found[0], chance[0]):
-                self.report(f"{RANDOM} leaves noise: nothing else is tried from every start")
+            random = at_once(self, baseline)
+            if random and self.likelier(found[0], random[0]) and unlimited(self, found[0], random[0]):
+                self.report(f"{JITTER} leaves noise: nothing else is tried from every start")
                 self.restarts = 0
                 return found
             self.report("not explained: every candidate is tried from every start")
         return self.search(baseline, baseline)
 
-    def search(
-        self, baseline: JointFit, start: JointFit
-    ) -> tuple[JointFit, dict[str, list[JointFit]], list[Trial]]:
+    def search(self, baseline: JointFit, start: JointFit) -> tuple[JointFit, Rivals, list[Trial]]:
         """Forward and backward steps from a model; what it adds is tentative until the end."""
         present, trials, tried = start, [], len(start.effects)
         rivals = {start.effects[-1]: [start]} if start.effects else {}
@@ -231,7 +233,11 @@ class Selection(Frictions):
             rivals.update(added)
             grown = longer is not present
             present = longer
-            if (not grown and present is not start) or swayed(self, present) or self.too_coarse(present):
+            if (
+                (not grown and present is not start)
+                or clock_sensitivity(self, present)
+                or self.too_coarse(present)
+            ):
                 break
             if in_place(self, present):
                 break
@@ -279,13 +285,13 @@ class Selection(Frictions):
             if name in self.candidates
         ]
 
-    def extend(self, present: JointFit, done: int) -> tuple[JointFit, dict[str, list[JointFit]], list[Trial]]:
+    def extend(self, present: JointFit, done: int) -> tuple[JointFit, Rivals, list[Trial]]:
         """Add effects one by one while they are earned.
 
         Returns:
             The larger model, the fits with others in the place of each added effect, and the evidence.
         """
-        rivals: dict[str, list[JointFit]] = {}
+        rivals: Rivals = {}
         trials: list[Trial] = []
         for number in range(done + 1, MAX_ROUNDS + 1):
             fits = self.fit_candidates(present)
@@ -296,127 +302,83 @@ class Selection(Frictions):
                 self.looks -= 1
                 fits = self.look_wider(present, fits)
                 best = self.winner(list(fits.values()))
-            if not swayed(self, best):
-                best = fits[best.effects[-1]] = self.look_beside(best, self.whole)
-            accepted, why = self.better(present, best, SEARCH_TAIL)
-            if not accepted and self.whitens(present, best):
-                accepted, why = True, ""
-            if not accepted:
-                # The simpler of two stands for the one that contains it only if it earns its place as well.
-                name = best.effects[-1]
-                richer = [
-                    f for f in fits.values() if name in NESTED.get(f.effects[-1], ()) and not f.at_bound
-                ]
-                earned = [f for f in richer if self.better(present, f, SEARCH_TAIL)[0]]
-                if earned:
-                    best, accepted, why = earned[int(np.argmin(self.scores(earned)))], True, ""
+            if not clock_sensitivity(self, best):
+                best = fits[best.effects[-1]] = self.search_nearby(best, self.whole)
+            best, accepted, why = self.earned(present, best, fits)
             trials += self.judge(number, present, fits, best, accepted, why)
             trials += self.screened_out(number, present, fits)
             if not accepted:
                 break
-            room = MAX_EFFECTS - len(present.effects)
-            both = fits.get(ONE_SIDED)
-            # What explains everything needs no two in its place, unless it is what two do together; nor do
-            # two explain what both as one are far from.
-            open_ = best is both or (self.wide and best.rmse > EXPLAINED * self.floor)
-            if both is not None and open_ and both.rmse < HOPELESS * best.rmse and room >= 2:
-                apart = self.take_apart(present, both)
-                pair = self.winner(apart) if apart else best
-                if apart and best is both:
-                    self.apart[ONE_SIDED] = pair
-                better = int(np.argmin(self.scores([best, pair]))) == 1
-                same = best is both and {*pair.effects[-2:]} == EXACTLY
-                if better and not self.tied(pair, best, same)[0]:  # in a tie one effect is simpler than two
-                    before, after = present.held_out_rmse, pair.held_out_rmse
-                    names = " and ".join(pair.effects[-2:])
-                    self.report(f"+ {names}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
-                    gain, ci = self.gain(present, pair)
-                    trials += [
-                        Trial(
-                            number, name, pair, gain, ci, "named", f"{names} together: best on unseen motions"
-                        )
-                        for name in pair.effects[-2:]
-                    ]
-                    present = pair
-                    break
+            pair = self.as_two(present, best, fits)
+            if pair is not None:
+                trials += self.pair_rows(number, present, pair)
+                present = pair
+                break
             name, before, after = best.effects[-1], present.held_out_rmse, best.held_out_rmse
             self.report(f"+ {name}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
             rivals[name] = list(fits.values())
             self.added[frozenset(present.effects)] = (present, *fits.values())
             present = best
-            if self.finished(present) or swayed(self, present) or in_place(self, present):
-                break
-            if self.too_coarse(present) or self.a_spring(present):
-                break
-            if len(present.effects) >= MAX_EFFECTS:
+            if self.is_last(present):
                 break
         return present, rivals, trials
 
-    def too_coarse(self, present: JointFit) -> bool:
-        """Whether it is the time step of the search that keeps a model from leaving no more than noise."""
-        if self.fine or self.veiled or not present.effects or self.no_gap(present) or self.white(present):
-            return False
-        if present.rmse > WIDE * self.floor:
-            return False
-        return self.refined(present).rmse < COARSE * present.rmse
+    def earned(
+        self, present: JointFit, best: JointFit, fits: Mapping[str, JointFit]
+    ) -> tuple[JointFit, bool, str]:
+        """The candidate that a round adds, whether it is earned, and if not why."""
+        accepted, why = self.better(present, best, SEARCH_TAIL)
+        if accepted or self.whitens(present, best):
+            return best, True, ""
+        # The simpler of two stands for the one that contains it only if it earns its place as well.
+        name = best.effects[-1]
+        richer = [f for f in fits.values() if name in NESTED.get(f.effects[-1], ()) and not f.at_bound]
+        earned = [f for f in richer if self.better(present, f, SEARCH_TAIL)[0]]
+        return (earned[int(np.argmin(self.scores(earned)))], True, "") if earned else (best, False, why)
 
-    def finer(self) -> "Selection":
-        """The same search with the step at which estimates are finished."""
+    def as_two(self, present: JointFit, best: JointFit, fits: Mapping[str, JointFit]) -> JointFit | None:
+        """The model with two effects that together are friction with a direction, if they are the better.
 
-        def run(calls: list[Call]) -> list[Any]:
-            every = [
-                (name, options if name in CALLS else {**options, "finer": True}) for name, options in calls
-            ]
-            return self.run(every)
+        What explains everything needs no two in its place, unless it is what two do together; nor do two
+        explain what both as one are far from. In a tie one effect is simpler than two.
+        """
+        both = fits.get(ONE_SIDED)
+        open_ = best is both or (self.wide and best.rmse > EXPLAINED * self.floor)
+        room = MAX_EFFECTS - len(present.effects)
+        if both is None or not open_ or both.rmse >= HOPELESS * best.rmse or room < 2:
+            return None
+        apart = self.take_apart(present, both)
+        pair = self.winner(apart) if apart else best
+        if apart and best is both:
+            self.apart[ONE_SIDED] = pair
+        better = int(np.argmin(self.scores([best, pair]))) == 1
+        same = best is both and {*pair.effects[-2:]} == EXACTLY
+        return pair if better and not self.tied(pair, best, same)[0] else None
 
-        return replace(
-            self, run=run, fine=True, restarts=RESTARTS, looks=LOOKS, without={}, apart={}, added={}
-        )
+    def pair_rows(self, number: int, present: JointFit, pair: JointFit) -> list[Trial]:
+        """The rows of two effects that a round adds together."""
+        before, after = present.held_out_rmse, pair.held_out_rmse
+        names = " and ".join(pair.effects[-2:])
+        self.report(f"+ {names}: {1e3 * before:.2f} -> {1e3 * after:.2f} mrad held out")
+        gain, ci = self.gain(present, pair)
+        reason = f"{names} together: best on unseen motions"
+        return [Trial(number, name, pair, gain, ci, "named", reason) for name in pair.effects[-2:]]
 
-    def finished(self, present: JointFit) -> bool:
-        """Whether a model leaves nothing to explain: noise, of no more than its size."""
-        return self.no_gap(present) and not self.lack_of_fit(self.refined(present))
+    def is_last(self, present: JointFit) -> bool:
+        """Whether no further effect is to be added to a model."""
+        if self.finished(present) or clock_sensitivity(self, present) or in_place(self, present):
+            return True
+        if self.too_coarse(present) or self.a_spring(present):
+            return True
+        return len(present.effects) >= MAX_EFFECTS
 
     def ended(self, present: JointFit) -> bool:
         """Whether no other search would change what a model says."""
-        if swayed(self, present):
+        if clock_sensitivity(self, present):
             return True
         if self.noise_only(present) or self.too_coarse(present) or self.a_spring(present):
             return True
         return in_place(self, present) is not None
-
-    def a_spring(self, present: JointFit) -> bool:
-        """Whether a model is near enough to stand for a cause that the table has not: it is no answer."""
-        return present.rmse < NEAR * self.floor and bool(cancelled(present, self.joint, self.rest))
-
-    def noise_only(self, present: JointFit, floors: float = UNEARNED) -> bool:
-        """Whether a model leaves noise on what it was fitted to: no other search finds a better one.
-
-        It may be a little more than the floor: at rest the rounding to counts repeats. Beside a gap of some
-        sixty noise floors more than that is what no fit is better than: the times of a recording are good to
-        0.1 ms, a milliradian where a joint is fast.
-
-        Args:
-            present: The model.
-            floors: Error up to which it may be noise, in noise floors.
-        """
-        best = max(floors * self.floor, min(MIN_SHARE * self.whole, REPEATABLE * self.floor))
-        if not self.veiled and COARSE * present.rmse > best:
-            return False
-        refined = self.refined(present)  # without what the time step of the search leaves
-        return (self.veiled or refined.rmse < best) and not self.lack_of_fit(refined)
-
-    def whitens(self, before: JointFit, after: JointFit) -> bool:
-        """Whether a larger model leaves noise where the smaller leaves structure.
-
-        Such a step is earned however little of the error it removes: two limits of one motor do nearly the
-        same, and the smaller model would be refused for what it leaves.
-        """
-        if after.at_bound or after.rmse > EXPLAINED * self.floor or before.rmse > REPEATABLE * self.floor:
-            return False
-        if float(np.quantile(self.weights @ (before.sse - after.sse), 0.025)) <= 0.0:
-            return False
-        return bool(self.lack_of_fit(self.refined(before))) and not self.lack_of_fit(self.refined(after))
 
     def judge(
         self,
@@ -447,12 +409,12 @@ class Selection(Frictions):
             rows.append(Trial(number, best.effects[-1], best, gain, (gain, gain), reason=text, placebo=True))
         return rows
 
-    def revise(self, present: JointFit) -> tuple[JointFit, dict[str, list[JointFit]]]:
+    def revise(self, present: JointFit) -> tuple[JointFit, Rivals]:
         """Backward check: drop what is not needed, exchange what another effect does better.
 
         Returns the revised model and, for each of its effects, the fits with others in its place.
         """
-        rivals: dict[str, list[JointFit]] = {}
+        rivals: Rivals = {}
         for _ in range(MAX_EFFECTS):
             rivals, changed = {}, False
             for name in present.effects:

@@ -19,7 +19,7 @@ import numpy as np
 
 from vd.config import from_dict, to_dict
 from vd.files import make_folder, write_json
-from vd.gap.answers import FOLDER
+from vd.gap.fit_cache import FOLDER
 from vd.gap.recording import BARE_MODELS, Recording, read_recording
 from vd.gap.result import LAYER, Closing, Predictions, Report
 from vd.versions import installed_versions

@@ -10,7 +10,7 @@ import numpy as np
 import vd.kernels.servo.actuators as servo
 from vd.gap.chain import Chain
 from vd.gap.recording import Recording, Trajectory
-from vd.gap.team import JointSpec
+from vd.gap.worker_pool import JointSpec
 
 LINEAR = 0.995
 """Share of the duty cycle's variance that plain error and speed must explain for it to be linear."""

@@ -12,9 +12,9 @@ from vd.gap.judge import (
     AT_FLOOR,
     FORMS,
     FULLER_FLOORS,
+    JITTER,
     MIN_SHARE,
     NESTED,
-    RANDOM,
     RECOVERED,
     REPEATABLE,
     SHARP,
@@ -34,7 +34,7 @@ CANCELLING = ("gravity_load", "encoder_bias")
 """Effects that hold a joint off its command at rest. Where they cancel there, they are no two causes but one
 that pulls with the travel from there, a spring, which the table has not."""
 CANCELLED = 0.1
-"""Share of either that is left where they cancel; by chance they do so in a few of a hundred machines."""
+"""Share of either that is left where they cancel; by luck they do so in a few of a hundred machines."""
 DETERMINED = ("kp", "kd", "inertia")
 """Baseline parameters that every useful excitation determines."""
 WIDE = 10.0
@@ -109,19 +109,13 @@ class Verdicts(Judge):
             accepted.append(one)
         explanation = Explanation(baseline, told, "unknown", "", tuple(accepted), tuple(trials), rivals)
         if not accepted:
-            tried = [t for t in trials if not t.placebo and np.isfinite(t.gain)]
-            why = tried[0].reason if tried else "there is no candidate"
-            if baseline.held_out_rmse > UNEXPLAINED * self.floor:
-                return replace(explanation, reason=f"a gap that no candidate explains: the best {why}")
-            if loose:
-                return replace(explanation, verdict="under_excited", reason=loose)
-            return replace(explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}")
+            return self.nothing_earned(explanation, loose)
         # One motion can be all that shows a parameter: that no fit without it predicts it says nothing then.
-        fitted = self.white(final) and not self.veiled
+        fitted = self.white(final) and not self.behind_jitter
         before, after = ((f.rmse if fitted else f.held_out_rmse) ** 2 for f in (baseline, final))
         share = (before - after) / max(before - self.floor**2, 1e-30)
-        # What chance does to each sample stays, however well its size is known.
-        if share < RECOVERED and RANDOM not in final.effects:
+        # What jitter does to each sample stays, however well its size is known.
+        if share < RECOVERED and JITTER not in final.effects:
             text = f"the best candidate recovers {100.0 * share:.0f} % of the squared gap, less than half"
             return replace(explanation, reason=text)
         lack = self.lack_of_fit(told)
@@ -132,16 +126,17 @@ class Verdicts(Judge):
         if warms:
             text = f"{warms}: the cause is a friction that changes, as with temperature"
             return replace(explanation, warms=True, reason=text)
-        named = [a.name for a in accepted if a.named]
-        if named:
-            return replace(explanation, verdict="effects", reason=explains(named))
-        if all(a.at_bound for a in accepted):
-            return replace(explanation, reason=f"{accepted[0].name} fits only with a parameter at its bound")
-        sets = [" or ".join((a.name, *a.tied)) for a in accepted if a.tied and not a.at_bound]
-        if not sets:
-            doubts = [a.doubt for a in accepted if a.doubt]
-            return replace(explanation, reason=(doubts or ["nothing is chosen often enough"])[0])
-        return replace(explanation, verdict="ambiguous", reason=f"{'; '.join(sets)}: not told apart")
+        return _by_names(explanation)
+
+    def nothing_earned(self, explanation: Explanation, loose: str) -> Explanation:
+        """The verdict where no effect earned its place."""
+        tried = [t for t in explanation.trials if not t.placebo and np.isfinite(t.gain)]
+        why = tried[0].reason if tried else "there is no candidate"
+        if explanation.baseline.held_out_rmse > UNEXPLAINED * self.floor:
+            return replace(explanation, reason=f"a gap that no candidate explains: the best {why}")
+        if loose:
+            return replace(explanation, verdict="under_excited", reason=loose)
+        return replace(explanation, verdict="no_gap", reason=f"no effect is significant: the best {why}")
 
     def lack_of_fit(self, fit: JointFit) -> str:
         """Why residuals near the noise floor are more than noise, in words; empty if they are not.
@@ -164,7 +159,7 @@ class Verdicts(Judge):
 
     def warms(self, fit: JointFit) -> str:
         """Which friction of a model near the floor changes over the recording, in words, or nothing."""
-        if self.when is None or self.veiled or fit.rmse > REPEATABLE * self.floor:
+        if self.when is None or self.behind_jitter or fit.rmse > REPEATABLE * self.floor:
             return ""
         return warming(fit, self.when, self.floor)
 
@@ -263,6 +258,21 @@ class Verdicts(Judge):
             pull = abs(final.values["encoder_bias.bias_rad"]) * float(final.rows[self.joint, servo.KP])
             same = [other for other in same if other != ONE_SIDED or pull <= level]
         return tuple(same)
+
+
+def _by_names(explanation: Explanation) -> Explanation:
+    """The verdict by what of a model that fits is named, or a set, or neither."""
+    accepted = explanation.accepted
+    named = [a.name for a in accepted if a.named]
+    if named:
+        return replace(explanation, verdict="effects", reason=explains(named))
+    if all(a.at_bound for a in accepted):
+        return replace(explanation, reason=f"{accepted[0].name} fits only with a parameter at its bound")
+    sets = [" or ".join((a.name, *a.tied)) for a in accepted if a.tied and not a.at_bound]
+    if not sets:
+        doubts = [a.doubt for a in accepted if a.doubt]
+        return replace(explanation, reason=(doubts or ["nothing is chosen often enough"])[0])
+    return replace(explanation, verdict="ambiguous", reason=f"{'; '.join(sets)}: not told apart")
 
 
 def explains(names: Sequence[str]) -> str:

@@ -18,22 +18,21 @@ import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
 from vd.files import write_json
-from vd.gap.answers import FOLDER, Answers
 from vd.gap.assemble import Analysed, assemble, curves
 from vd.gap.chain import Chain, chains
 from vd.gap.coordinates import BASELINE_PARAMETERS, Scales
-from vd.gap.crowd import Crowd
 from vd.gap.design import design, pieces
-from vd.gap.explanation import Explanation
 from vd.gap.find import findings
+from vd.gap.fit_cache import FOLDER, FitCache
 from vd.gap.joint_fit import JointFit
 from vd.gap.joints import explain_joints
+from vd.gap.launch_batch import LaunchBatch
 from vd.gap.one_joint import POLISH_ITERATIONS, REFITS, Explainer, Joint, Progress
 from vd.gap.recording import Recording, read_recording
 from vd.gap.result import Finding, Report
 from vd.gap.rollout import STEP_S
 from vd.gap.statistics import noise_floor
-from vd.gap.team import Bench, JointSpec, Team, parallel
+from vd.gap.worker_pool import JointSpec, Problems, WorkerPool, parallel
 from vd.kernels.servo.effects import EFFECTS
 
 FIND_FORMAT = "vd-gap-find/1"
@@ -118,10 +117,10 @@ def find(
         progress("find: already done")
         return [Finding(**f) for f in known["findings"]]
     begin = time.perf_counter()
-    answers = Answers(out / FOLDER, key)
-    with _team(recording, hand, chosen, answers) as team:
-        joints = _identify(team, _specs(recording, team.bench.chains), chosen, progress)
-        predicted = curves(recording, team.bench, [(j.name, j.spec, j.fit.rows) for j in joints])
+    cache = FitCache(out / FOLDER, key)
+    with _workers(recording, hand, chosen, cache) as pool:
+        joints = _identify(pool, _specs(recording, pool.problems.chains), chosen, progress)
+        predicted = curves(recording, pool.problems, [(j.name, j.spec, j.fit.rows) for j in joints])
         floors = {j.name: j.spec.floor for j in joints}
         found = findings(recording, predicted, floors)
         value = {
@@ -129,12 +128,12 @@ def find(
             "key": key,
             "findings": [asdict(f) for f in found],
             "joints": {j.name: {"rows": j.fit.rows.tolist(), "rmse_rad": j.fit.rmse} for j in joints},
-            "simulated": team.simulated,
+            "simulated": pool.simulated,
             "seconds": time.perf_counter() - begin,
         }
-        progress(f"find: {team.summary}")
+        progress(f"find: {pool.summary}")
     write_json(out / "find.json", value)
-    answers.forget()
+    cache.forget()
     for finding in found:
         progress(f"  {finding.where}")
     return found
@@ -174,38 +173,33 @@ def explain(
     found = find(recording, hand, out, progress=progress, **options)
     known = json.loads((out / "find.json").read_text())
     begin = time.perf_counter()
-    answers = Answers(out / FOLDER, key)
-    with _team(recording, hand, chosen, answers) as team:
-        joints = _resume(team, _specs(recording, team.bench.chains), known["joints"])
-        explained = explain_joints(Explainer(team, joints, chosen.effects, chosen.seed, progress))
+    cache = FitCache(out / FOLDER, key)
+    with _workers(recording, hand, chosen, cache) as pool:
+        joints = _resume(pool, _specs(recording, pool.problems.chains), known["joints"])
+        explained = explain_joints(Explainer(pool, joints, chosen.effects, chosen.seed, progress))
         analysed = [
-            Analysed(j.name, j.spec, replace_baseline(e, j.fit), j.scales)
+            Analysed(j.name, j.spec, replace(e, baseline=j.fit), j.scales)
             for j, e in zip(joints, explained, strict=True)
         ]
         seconds = known["seconds"] + time.perf_counter() - begin
-        simulated = known["simulated"] + team.simulated
+        simulated = known["simulated"] + pool.simulated
         report, predictions = assemble(
             recording,
             hand,
-            team.bench,
+            pool.problems,
             analysed,
             found,
             seed=chosen.seed,
             seconds=seconds,
             simulated=simulated,
         )
-        progress(f"explain: {team.summary}")
+        progress(f"explain: {pool.summary}")
     predictions.write(out / "predictions.npz")
     report.write(out / "explain.json")
     write_json(out / "explain.key.json", {"key": key})
-    answers.forget()
+    cache.forget()
     progress(f"explain: {report.verdict} after {seconds:.0f} s")
     return report
-
-
-def run(recording: Recording | Path, hand: HandModel | None, out: Path, **options: Any) -> Report:
-    """Find and explain; see :func:`explain`."""
-    return explain(recording, hand, out, **options)
 
 
 def fingerprint(recording: Recording, hand: HandModel | None, options: Options) -> str:
@@ -240,12 +234,12 @@ def _read(path: Path, key: str) -> dict[str, Any] | None:
     return value if isinstance(value, dict) and value.get("key") == key else None
 
 
-def _team(recording: Recording, hand: HandModel | None, options: Options, answers: Answers) -> Team:
+def _workers(recording: Recording, hand: HandModel | None, options: Options, cache: FitCache) -> WorkerPool:
     length = sum(float(t.time[-1]) for t in recording.trajectories)
     dt = LONG_STEP_S if length > LONG_S else STEP_S
     parts = [_started(chain, options.start) for chain in chains(recording, hand)]
-    crowd = None if options.device == "cpu" else Crowd()
-    return Team(Bench(recording, parts, dt, options.device, crowd), options.processes, answers)
+    batch = None if options.device == "cpu" else LaunchBatch()
+    return WorkerPool(Problems(recording, parts, dt, options.device, batch), options.processes, cache)
 
 
 def _started(chain: Chain, start: Mapping[str, np.ndarray]) -> Chain:
@@ -281,32 +275,34 @@ def baseline_of(chain: Chain) -> tuple[str, ...]:
     return tuple(name for name in chain.baseline_free if name != anchor)
 
 
-def _identify(team: Team, specs: Sequence[JointSpec], options: Options, progress: Progress) -> list[Joint]:
+def _identify(
+    pool: WorkerPool, specs: Sequence[JointSpec], options: Options, progress: Progress
+) -> list[Joint]:
     """Baselines of all joints; the joints of a chain once more with the others' baselines."""
 
     def first(spec: JointSpec) -> Joint:
-        chain = team.bench.chains[spec.chain]
+        chain = pool.problems.chains[spec.chain]
         rows = chain.start_row.copy()
-        scales = team.run(spec, [("scales", {"row": rows[spec.joint], "residual": spec.floor})])[0]
+        scales = pool.run(spec, [("scales", {"row": rows[spec.joint], "residual": spec.floor})])[0]
         start = {"base": rows, "scales": scales, "seed": options.seed, "generations": CMA_GENERATIONS}
-        searched = team.run(spec, [("start_baseline", start)])[0]
+        searched = pool.run(spec, [("start_baseline", start)])[0]
         starts = [{}, *({"velocity_limit": f * scales.speed} for f in SPEED_STARTS)]
         # A short search can end where the inertia is too small to show, from where no descent comes back.
         nominal = {key: float(rows[spec.joint, BASELINE_PARAMETERS[key].column]) for key in spec.baseline}
         starts += [nominal, {**nominal, "velocity_limit": SPEED_STARTS[0] * scales.speed}]
         call = {"base": searched, "effects": (), "starts": starts, "scales": scales}
-        fit = team.run(spec, [("fit", {**call, "iterations": BASELINE_ITERATIONS})])[0]
+        fit = pool.run(spec, [("fit", {**call, "iterations": BASELINE_ITERATIONS})])[0]
         name = chain.joints[spec.joint]
         progress(f"find: {name}: baseline {1e3 * fit.rmse:.2f} mrad, noise floor {1e3 * spec.floor:.2f}")
-        return Joint(name, spec, _scales(team, spec, fit), fit)
+        return Joint(name, spec, _scales(pool, spec, fit), fit)
 
     joints = parallel(first, specs)
-    if all(len(chain.joints) == 1 for chain in team.bench.chains):
+    if all(len(chain.joints) == 1 for chain in pool.problems.chains):
         return joints
-    return _together(team, joints)
+    return _together(pool, joints)
 
 
-def _together(team: Team, joints: Sequence[Joint]) -> list[Joint]:
+def _together(pool: WorkerPool, joints: Sequence[Joint]) -> list[Joint]:
     """Refit each joint with the other joints of its chain as they were found."""
 
     def again(joint: Joint) -> Joint:
@@ -315,32 +311,27 @@ def _together(team: Team, joints: Sequence[Joint]) -> list[Joint]:
             if other.spec.chain == joint.spec.chain:
                 rows[other.spec.joint] = other.fit.rows[other.spec.joint]
         call = {"base": rows, "effects": joint.fit.effects, "starts": [{}], "scales": joint.scales}
-        fit = team.run(joint.spec, [("fit", {**call, "iterations": POLISH_ITERATIONS})])[0]
-        return replace(joint, fit=fit, scales=_scales(team, joint.spec, fit))
+        fit = pool.run(joint.spec, [("fit", {**call, "iterations": POLISH_ITERATIONS})])[0]
+        return replace(joint, fit=fit, scales=_scales(pool, joint.spec, fit))
 
     return parallel(again, joints)
 
 
-def _scales(team: Team, spec: JointSpec, fit: JointFit) -> Scales:
+def _scales(pool: WorkerPool, spec: JointSpec, fit: JointFit) -> Scales:
     call = {"row": fit.rows[spec.joint], "residual": fit.rmse}
-    return team.run(spec, [("scales", call)])[0]
+    return pool.run(spec, [("scales", call)])[0]
 
 
-def _resume(team: Team, specs: Sequence[JointSpec], known: dict[str, Any]) -> list[Joint]:
+def _resume(pool: WorkerPool, specs: Sequence[JointSpec], known: dict[str, Any]) -> list[Joint]:
     """The joints of an earlier ``find``, their fits recomputed from its rows."""
 
     def one(spec: JointSpec) -> Joint:
-        name = team.bench.chains[spec.chain].joints[spec.joint]
+        name = pool.problems.chains[spec.chain].joints[spec.joint]
         rows = np.array(known[name]["rows"])
-        scales = team.run(spec, [("scales", {"row": rows[spec.joint], "residual": known[name]["rmse_rad"]})])[
+        scales = pool.run(spec, [("scales", {"row": rows[spec.joint], "residual": known[name]["rmse_rad"]})])[
             0
         ]
         call = {"base": rows, "effects": (), "starts": [{}], "scales": scales, "iterations": 1}
-        return Joint(name, spec, scales, team.run(spec, [("fit", {**call, "refits": REFITS})])[0])
+        return Joint(name, spec, scales, pool.run(spec, [("fit", {**call, "refits": REFITS})])[0])
 
     return parallel(one, specs)
-
-
-def replace_baseline(explanation: Explanation, baseline: JointFit) -> Explanation:
-    """The explanation with the joint's baseline."""
-    return replace(explanation, baseline=baseline)

@@ -3,7 +3,10 @@
 ``vd-play LOG`` replays a run on a hand.
 """
 
+import contextlib
+import importlib
 import math
+import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -27,6 +30,15 @@ if TYPE_CHECKING:
     from vd.play.session import Session
 
 VIDEO_SECONDS = 10.0
+SLOWEST_MODULES = (
+    "newton._src.solvers.mujoco.kernels",
+    "mujoco_warp._src.smooth",
+    "newton._src.sim.articulation",
+    "newton._src.sensors.sensor_camera_render.camera_utils",
+    "newton._src.geometry.bvh",
+    "mujoco_warp._src.set_const",
+)
+"""Kernels that take longest to compile on a CPU, a third of a first start (found by Warp's own log)."""
 # A CPU simulates this many environments about in real time.
 FAST_WORLDS_CPU = 16
 
@@ -40,21 +52,17 @@ class PlayCfg:
     """
 
     policy: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = None
-    agent: str | None = None
-    """zero, random, or the same as POLICY."""
     hand: str | None = None
     """dclaw3, dclaw4 or a hand's USD; by default the policy's, or dclaw4."""
     hand_layer: Annotated[str | None, tyro.conf.arg(help=LAYER_HELP)] = None
     objects: tuple[str, ...] = ("cube",)
     """Object sets by name, folders or files; the viewer offers each object."""
     video: Path | None = None
-    """Write this file and exit: .mp4, .gif, or .png for six moments."""
+    """Write this file, .mp4, and exit."""
     seconds: float = VIDEO_SECONDS
     """Length of the video [s]."""
     cells: int = 1
     """Environments side by side in the video, of different objects as far as there are."""
-    samples: int = 1
-    """Rays a pixel in the video; 4 smooths edges."""
     port: int = 8080
     """Port of the viewer."""
     host: str = "127.0.0.1"
@@ -65,11 +73,9 @@ class PlayCfg:
     """Goals are within this angle [rad] of the object's orientation; pi is all of SO(3). By default as
     trained, and pi without a policy."""
     at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Start at rest on the table; the default is as trained, and a drop for --agent zero and random."""
+    """Start at rest on the table; the default is as trained, and a drop for zero and random."""
     no_at_rest: tyro.conf.FlagCreatePairsOff[bool] = False
     """Start from a drop, whatever the training."""
-    second_view: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Where a policy has not come to its goal in 3 s, look at it in other views (vd-eval --help)."""
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float | None = None
@@ -83,14 +89,8 @@ class PlayCfg:
 
     @property
     def agent_name(self) -> str:
-        """Which agent begins.
-
-        Raises:
-            ValueError: Two are named.
-        """
-        if self.policy is not None and self.agent is not None:
-            raise ValueError("name one agent: a policy, or --agent zero or --agent random")
-        return self.policy or self.agent or DEFAULT_POLICY
+        """Which agent begins."""
+        return self.policy or DEFAULT_POLICY
 
     @property
     def limit_s(self) -> float:
@@ -110,8 +110,8 @@ class PlayCfg:
             raise ValueError(
                 f"--max-goal-angle is {self.max_goal_angle}; it must be above 0 and at most pi rad"
             )
-        if self.video is not None and self.video.suffix.lower() not in (".mp4", ".gif", ".png"):
-            raise ValueError(f"--video is {self.video}; use a name that ends in .mp4, .gif or .png")
+        if self.video is not None and self.video.suffix.lower() != ".mp4":
+            raise ValueError(f"--video is {self.video}; use a name that ends in .mp4")
 
 
 @interrupt.command("vd-play")
@@ -156,7 +156,7 @@ def replay(cfg: PlayCfg) -> int:
         shown = Replay(log)
         _serve(lambda: ReplaySession(shown), cfg)
         return 0
-    frames = film(log, cfg.video, samples=cfg.samples)
+    frames = film(log, cfg.video)
     print(f"{cfg.video} ({frames} frames)")
     return 0
 
@@ -170,13 +170,11 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     """
     from tqdm import tqdm
 
-    from vd.evaluate.agents import built_in
     from vd.evaluate.cfg import LOG_EVERY_S
     from vd.play.video import GOAL_SHARE, GRID_CELL, SINGLE_CELL, record, write_frames
     from vd.render import Renderer
 
-    env, trained, device = _open(cfg, num_envs=cfg.cells)
-    policy = trained or built_in(cfg.agent_name, env.num_actions, seed=cfg.seed, device=device)
+    env, policy = _open(cfg, _policy(cfg), num_envs=cfg.cells)
     envs = spread(env.world_object, cfg.cells)
     width, height = SINGLE_CELL if cfg.cells == 1 else GRID_CELL
     renderer = Renderer(
@@ -185,8 +183,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
         width=width,
         height=height,
         goal_size=round(GOAL_SHARE * height),
-        samples=cfg.samples,
-        device=device,
+        device=env.device,
     )
     rate = env.cfg.sim.control_hz
     steps = max(1, round(cfg.seconds * rate))
@@ -199,9 +196,21 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     return count
 
 
+def compile_side_by_side() -> None:
+    """Compile what takes longest on a CPU with all cores, in place of one module after the other."""
+    import warp as wp
+
+    for name in SLOWEST_MODULES:
+        with contextlib.suppress(ImportError):  # they are not public, and may move
+            importlib.import_module(name)
+    modules = [wp.get_module(name) for name in SLOWEST_MODULES if name in sys.modules]
+    wp.force_load("cpu", modules, max_workers=os.cpu_count())
+
+
 def serve(cfg: PlayCfg) -> None:
     """Serve the viewer until Ctrl-C; the page is there, and says so, while the scene is being built."""
-    _serve(lambda: open_session(cfg), cfg)
+    trained = _policy(cfg)
+    _serve(lambda: open_session(cfg, trained), cfg)
 
 
 def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> None:
@@ -219,13 +228,11 @@ def _serve(open_it: "Callable[[], Session | ReplaySession]", cfg: PlayCfg) -> No
         page.viewer.close()
 
 
-def open_session(cfg: PlayCfg) -> "Session":
-    """The environment and agents behind the viewer."""
-    from vd.play.session import Session, agent_choices
+def open_session(cfg: PlayCfg, trained: Any) -> "Session":
+    """The environment and policy behind the viewer."""
+    from vd.play.session import Session
 
-    env, trained, device = _open(cfg, num_envs=1)
-    agents = agent_choices(cfg.agent_name, trained, env.num_actions, seed=cfg.seed, device=device)
-    return Session(env, agents, cfg.agent_name, seed=cfg.seed)
+    return Session(*_open(cfg, trained, num_envs=1), seed=cfg.seed)
 
 
 def spread(world_object: Sequence[int], cells: int) -> list[int]:
@@ -238,29 +245,28 @@ def spread(world_object: Sequence[int], cells: int) -> list[int]:
     return sorted(world for _, world in islice(sorted(rank), cells))
 
 
-def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
-    """Environment with at least one world for each object, trained agent if one is named, device."""
-    quiet_warp()
+def _policy(cfg: PlayCfg) -> Any:
+    """What is trained; a file that cannot be used is told before anything slow."""
+    from vd.evaluate.agents import open_policy
+
+    return open_policy(cfg.agent_name, resolve_device(cfg.device))
+
+
+def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
+    """Environment with at least one world for each object, and what acts in it."""
+    from vd.evaluate.agents import check_bundle, task_for
+
+    device = resolve_device(cfg.device)
+    if device == "cpu":
+        compile_side_by_side()
     from vd.assets_usd.objects.sets import load_set
     from vd.envs.cfg import TableCfg
     from vd.envs.reorient import ReorientEnv
-    from vd.evaluate.agents import (
-        check_bundle,
-        check_second_view,
-        is_saved_student,
-        is_tracking_policy,
-        open_policy,
-        task_for,
-    )
-    from vd.policy import TrainedPolicy
+    from vd.evaluate.compare import actor_of
 
-    device = resolve_device(cfg.device)
     count = len(load_set(list(cfg.objects)))
     if device == "cpu" and count > FAST_WORLDS_CPU:
         print(f"vd-play: {count} objects are {count} environments, slow on a CPU; name fewer with --objects")
-    if cfg.second_view:
-        check_second_view([cfg.agent_name])
-    trained = open_policy(cfg.agent_name, device)
     task = task_for(
         trained,
         hand=cfg.hand,
@@ -274,25 +280,12 @@ def _open(cfg: PlayCfg, *, num_envs: int) -> tuple[Any, Any, str]:
         success_ends_episode=False,
         at_rest=start_at_rest(cfg.at_rest, cfg.no_at_rest),
         hand_layer=cfg.hand_layer,
-        second_view=cfg.second_view,
     )
     if cfg.in_air:
         task = replace(task, table=TableCfg(away_share=1.0))
     check_bundle(cfg.agent_name, task)
     env = ReorientEnv(task, device)
-    if is_saved_student(trained):
-        from vd.evaluate.student import StudentActor
-
-        return env, StudentActor(env, trained, seed=cfg.seed), device
-    if is_tracking_policy(trained):
-        from vd.evaluate.tracking import TrackingActor
-
-        return env, TrackingActor(env, trained, second_view=cfg.second_view, seed=cfg.seed), device
-    if cfg.second_view and isinstance(trained, TrainedPolicy):
-        from vd.evaluate.second_view import SecondView
-
-        return env, SecondView(env, trained), device
-    return env, trained, device
+    return env, actor_of(cfg.agent_name, trained, env, seed=cfg.seed)[0]
 
 
 if __name__ == "__main__":

@@ -14,9 +14,6 @@ from vd.hand_log import HandLog, LogError
 from vd.play.video import GOAL_SHARE, SINGLE_CELL, Composer, Snapshot, write_frames
 from vd.render import OUT_OF_SIGHT, Renderer
 
-BARS = ("loop_time", "lateness", "largest_current", "largest_speed")
-"""What the bars show in place of the terms of a reward."""
-
 
 class Replay:
     """The steps of a log as snapshots.
@@ -54,15 +51,6 @@ class Replay:
         if pose is None:  # nobody measured it
             pose = np.tile(OUT_OF_SIGHT, (steps, 1))
         error = columns.get("error", columns["distance"])
-        loads = np.stack(
-            [
-                columns["sent_s"],
-                columns["late_s"],
-                np.abs(log.channel("current")).max(axis=1),
-                np.abs(log.channel("velocity")).max(axis=1),
-            ],
-            axis=1,
-        )
         ends = {stop.goal: stop for stop in log.stops}
         reached = lost = 0
         for step in range(steps):
@@ -85,23 +73,21 @@ class Replay:
                 fell=fell,
                 goals=reached,
                 drops=lost,
-                terms=loads[step],
             )
 
     def frames(self, renderer: Renderer) -> Iterator[np.ndarray]:
         """Draw one frame for each control step, RGB bytes [height, width, 3]."""
-        composer = Composer(BARS, 1)
+        composer = Composer(1)
         for shot in self.snapshots:
             yield composer.frame(renderer.render(shot.joint_q[None], shot.goal_quat[None]), [shot])
 
 
-def film(log: HandLog, path: Path, *, samples: int = 1) -> int:
+def film(log: HandLog, path: Path) -> int:
     """Write the film of a log; returns the number of frames.
 
     Args:
         log: The log.
-        path: .mp4, .gif, or .png for six moments.
-        samples: Rays a pixel; 4 smooths edges.
+        path: .mp4.
 
     Raises:
         LogError: Hand or object are not here.
@@ -113,7 +99,6 @@ def film(log: HandLog, path: Path, *, samples: int = 1) -> int:
         width=width,
         height=height,
         goal_size=round(GOAL_SHARE * height),
-        samples=samples,
     )
     return write_frames(path, shown.frames(renderer), shown.control_hz)
 
@@ -130,14 +115,11 @@ class ReplaySession:
         self.env = SimpleNamespace(
             hand=replay.hand,
             objects=[replay.item],
-            reward_term_names=BARS,
             cfg=SimpleNamespace(sim=SimpleNamespace(control_hz=replay.control_hz)),
             close=lambda: None,
         )
         self.object_name = replay.item.name
         self.object_names = [self.object_name]
-        self.agent = str(replay.log.run["policy"])
-        self.agent_names = [self.agent]
         self.snapshot = replay.snapshots[0]
 
     def step(self) -> Snapshot:
@@ -157,9 +139,6 @@ class ReplaySession:
         later = np.flatnonzero(number > number[self._next])
         self._next = int(later[0]) - 1 if len(later) else -1
         return self.step()
-
-    def choose_agent(self, name: str) -> None:
-        """There is one."""
 
     def choose_object(self, name: str) -> None:
         """There is one."""

@@ -1,7 +1,8 @@
-"""Frames and video files: the picture, the goal beside it, and a strip of numbers, curve and reward bars."""
+"""Frames and video files: the picture, the goal beside it, and a strip of numbers and the error's curve."""
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -22,10 +23,6 @@ SINGLE_CELL, GRID_CELL = (640, 400), (480, 300)
 GOAL_SHARE = 0.36
 STRIP_HEIGHT = 80
 MARGIN = 10
-# Share of a column of reward terms that their names take, and its width [pixel] from which 11 points fit.
-NAME_SHARE, FULL_COLUMN = 0.66, 140
-# Width of the column of numbers [pixel] from which 12 points fit.
-FULL_NUMBERS = 170
 # Error curve: as long as an episode of the paper.
 CURVE_STEPS = round(PAPER.scene.episode_s * PAPER.scene.control_hz)
 # A reached goal or a drop colours the frame's edge for this many control steps, half a second.
@@ -34,9 +31,7 @@ INK, SOFT, LINE, STRIP = (28, 35, 48), (110, 119, 134), (205, 211, 220), (250, 2
 GREEN, RED, BLUE = (0, 140, 100), (205, 70, 20), (0, 114, 178)
 GOAL_EDGE = (89, 173, 107)
 # H.264 quality of libx264 (0 lossless, 51 worst): no visible blocks at this size, about 0.5 MB for 10 s.
-VIDEO_CRF = 22
-# A PNG of a recording shows this many moments, evenly spaced, in rows of three.
-SHEET_FRAMES, SHEET_COLUMNS = 6, 3
+VIDEO_CRF, VIDEO_SUFFIX = 22, ".mp4"
 
 
 @dataclass(frozen=True)
@@ -61,8 +56,6 @@ class Snapshot:
     """Goals reached since the recording began."""
     drops: int
     """Drops since the recording began."""
-    terms: np.ndarray
-    """Reward terms of the step, shape [T]."""
     table: bool = True
     """The table was there."""
 
@@ -97,10 +90,10 @@ class Watcher:
         self.drops += fell
         self.steps += stepped
         q, goal = env.sim.joint_q.numpy()[envs], env.goal_quat.numpy()[envs]
-        error, terms = env.rotation_error.numpy()[envs], env.reward_terms.numpy()[envs]
+        error = env.rotation_error.numpy()[envs]
         table = env.has_table()[envs]
         if not stepped:  # what the environment holds is of the step before the reset
-            error, terms = rotation_angle(q[:, -4:].astype(float), goal.astype(float)), np.zeros_like(terms)
+            error = rotation_angle(q[:, -4:].astype(float), goal.astype(float))
         return [
             Snapshot(
                 name=env.objects[env.world_object[world]].name,
@@ -112,7 +105,6 @@ class Watcher:
                 fell=bool(fell[i]),
                 goals=int(self.goals[i]),
                 drops=int(self.drops[i]),
-                terms=terms[i].copy(),
                 table=bool(table[i]),
             )
             for i, world in enumerate(envs)
@@ -122,7 +114,10 @@ class Watcher:
 def record(
     env: Any, policy: Any, renderer: Renderer, envs: Sequence[int], steps: int
 ) -> Iterator[np.ndarray]:
-    """Reset, run a policy, and draw one frame after every control step.
+    """Reset, run a policy, and draw the start and every control step.
+
+    On a CPU a frame is drawn while the next step is simulated. So the kernels of both are compiled at the
+    same time.
 
     Args:
         env: The environment.
@@ -134,18 +129,27 @@ def record(
     Yields:
         Frames, RGB bytes [height, width, 3].
     """
-    watcher = Watcher(env, envs)
-    composer = Composer(env.reward_term_names, len(envs))
-    env.reset()
-    for _ in range(steps):
-        act(env, policy)
-        snapshots = watcher.read()
+    watcher, composer = Watcher(env, envs), Composer(len(envs))
+
+    def draw(snapshots: list[Snapshot]) -> np.ndarray:
         pictures = renderer.render(
             np.stack([one.joint_q for one in snapshots]),
             np.stack([one.goal_quat for one in snapshots]),
             np.array([one.table for one in snapshots]),
         )
-        yield composer.frame(pictures, snapshots)
+        return composer.frame(pictures, snapshots)
+
+    env.reset()
+    snapshots = watcher.read(stepped=False)
+    with ThreadPoolExecutor(max_workers=1) as pool:
+        for _ in range(steps):
+            frame = pool.submit(draw, snapshots)
+            if str(env.device) != "cpu":  # what others launch would become part of the step's graph
+                frame.result()
+            act(env, policy)
+            snapshots = watcher.read()
+            yield frame.result()
+    yield draw(snapshots)
 
 
 def act(env: Any, policy: Any) -> None:
@@ -158,13 +162,10 @@ class Composer:
     """Puts pictures and numbers together, cell by cell, into frames.
 
     Args:
-        term_names: Names of the reward terms, length T.
         cells: C.
     """
 
-    def __init__(self, term_names: Sequence[str], cells: int):
-        self.term_names = [name.replace("_", " ") for name in term_names]
-        self._largest = np.full(len(self.term_names), 1e-9)
+    def __init__(self, cells: int):
         self._errors: list[deque[float]] = [deque(maxlen=CURVE_STEPS) for _ in range(cells)]
         self._flash = [(0, INK)] * cells
 
@@ -178,7 +179,6 @@ class Composer:
         Returns:
             RGB bytes [height, width, 3], both even as video codecs want them.
         """
-        self._largest = np.maximum(self._largest, np.max([np.abs(one.terms) for one in snapshots], axis=0))
         cells = [self._cell(i, *pair) for i, pair in enumerate(zip(pictures, snapshots, strict=True))]
         return _grid(cells, int(np.ceil(np.sqrt(len(cells)))))
 
@@ -191,14 +191,10 @@ class Composer:
         self._edge(index, draw, shot, width, height)
         self._errors[index].append(shot.error_rad)
         top = height + MARGIN
-        third = (width - 4 * MARGIN) // 10
-        _numbers(draw, MARGIN, top, 3 * third, shot)
-        _curve(
-            draw,
-            (MARGIN + 3 * third, top, 2 * third + 2 * MARGIN, STRIP_HEIGHT - 2 * MARGIN),
-            self._errors[index],
-        )
-        self._bars(draw, 4 * MARGIN + 5 * third, top, width - MARGIN, shot)
+        half = width // 2
+        _numbers(draw, MARGIN, top, shot)
+        box = half, top, width - half - MARGIN, STRIP_HEIGHT - 2 * MARGIN
+        _curve(draw, box, self._errors[index])
         return np.asarray(canvas)
 
     def _goal(self, canvas: Image.Image, draw: ImageDraw.ImageDraw, goal: np.ndarray) -> None:
@@ -218,33 +214,14 @@ class Composer:
             draw.text((MARGIN + 4, MARGIN), text, fill=color, font=_font(22))
             self._flash[index] = (left - 1, color)
 
-    def _bars(self, draw: ImageDraw.ImageDraw, left: int, top: int, right: int, shot: Snapshot) -> None:
-        """Reward terms; each bar is relative to the largest value of its term so far."""
-        rows = max(1, (len(self.term_names) + 1) // 2)
-        pitch, column = (STRIP_HEIGHT - 2 * MARGIN) / rows, (right - left + MARGIN) // 2
-        font = _font(11 if column >= FULL_COLUMN else 9)
-        for i, (name, value) in enumerate(zip(self.term_names, shot.terms, strict=True)):
-            x, y = left + (i // rows) * column, top + (i % rows) * pitch
-            x0, x1 = x + int(NAME_SHARE * column), x + column - MARGIN
-            middle, half = (x0 + x1) / 2, (x1 - x0) / 2
-            draw.text((x, y), name, fill=SOFT, font=font)
-            draw.rectangle((x0, y + 3, x1, y + 11), fill=(236, 239, 243))
-            end = middle + half * float(np.clip(value / self._largest[i], -1.0, 1.0))
-            if abs(end - middle) >= 0.5:
-                color = BLUE if end > middle else RED
-                draw.rectangle((min(middle, end), y + 3, max(middle, end), y + 11), fill=color)
-            draw.line((middle, y + 2, middle, y + 12), fill=SOFT)
 
-
-def _numbers(draw: ImageDraw.ImageDraw, x: int, y: int, width: int, shot: Snapshot) -> None:
+def _numbers(draw: ImageDraw.ImageDraw, x: int, y: int, shot: Snapshot) -> None:
     name = shot.name if len(shot.name) <= 22 else shot.name[:21] + "…"
     within = shot.error_rad <= PAPER.success.rotation_rad
     draw.text((x, y - 2), name, fill=INK, font=_font(14))
     draw.text((x, y + 17), f"error {shot.error_rad:.2f} rad", fill=GREEN if within else INK, font=_font(18))
-    # As far apart as there is room beside the curve.
-    gap, size = ("   ", 12) if width >= FULL_NUMBERS else ("  ", 10)
-    counts = gap.join((f"{shot.time_s:.1f} s", f"goals {shot.goals}", f"drops {shot.drops}"))
-    draw.text((x, y + 43), counts, fill=SOFT, font=_font(size))
+    counts = f"{shot.time_s:.1f} s   goals {shot.goals}   drops {shot.drops}"
+    draw.text((x, y + 43), counts, fill=SOFT, font=_font(12))
 
 
 def _curve(draw: ImageDraw.ImageDraw, box: tuple[int, int, int, int], errors: Sequence[float]) -> None:
@@ -280,10 +257,10 @@ def _grid(cells: Sequence[np.ndarray], columns: int) -> np.ndarray:
 
 
 def write_frames(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
-    """Write frames to a file, atomically, as they come.
+    """Write frames to a video, H.264, which plays everywhere, atomically, as they come.
 
     Args:
-        path: ``.mp4`` (H.264, plays everywhere), ``.gif``, or ``.png`` for six moments side by side.
+        path: ``.mp4``.
         frames: RGB bytes [height, width, 3], all of one size.
         fps: Frames per second.
 
@@ -293,59 +270,33 @@ def write_frames(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
     Raises:
         ValueError: Another suffix, or no frames.
     """
-    path = Path(path)
-    writers = {".mp4": _write_mp4, ".gif": _write_gif, ".png": _write_sheet}
-    if path.suffix.lower() not in writers:
-        raise ValueError(f"{path}: cannot write '{path.suffix}' files; use {', '.join(writers)}")
-    with atomic_path(path) as temporary:
-        count = writers[path.suffix.lower()](temporary, frames, fps)
-        if count == 0:
-            raise ValueError(f"{path}: there are no frames to write")
-    return count
-
-
-def _write_mp4(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
     import imageio_ffmpeg
 
-    writer, count = None, 0
-    for frame in frames:
+    if path.suffix.lower() != VIDEO_SUFFIX:
+        raise ValueError(f"{path}: cannot write '{path.suffix}' files; use {VIDEO_SUFFIX}")
+    with atomic_path(path) as temporary:
+        writer, count = None, 0
+        for frame in frames:
+            if writer is None:
+                writer = imageio_ffmpeg.write_frames(
+                    str(temporary),
+                    (frame.shape[1], frame.shape[0]),
+                    fps=fps,
+                    codec="libx264",
+                    pix_fmt_out="yuv420p",
+                    quality=None,
+                    macro_block_size=2,
+                    ffmpeg_log_level="error",
+                    output_params=["-crf", str(VIDEO_CRF), "-movflags", "+faststart"],
+                )
+                writer.send(None)
+            writer.send(np.ascontiguousarray(frame))
+            count += 1
         if writer is None:
-            writer = imageio_ffmpeg.write_frames(
-                str(path),
-                (frame.shape[1], frame.shape[0]),
-                fps=fps,
-                codec="libx264",
-                pix_fmt_out="yuv420p",
-                quality=None,
-                macro_block_size=2,
-                ffmpeg_log_level="error",
-                output_params=["-crf", str(VIDEO_CRF), "-movflags", "+faststart"],
-            )
-            writer.send(None)
-        writer.send(np.ascontiguousarray(frame))
-        count += 1
-    if writer is not None:
+            raise ValueError(f"{path}: there are no frames to write")
         writer.close()
-        written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))  # the writer does not say if it failed
+        # The writer does not say if it failed.
+        written, _ = imageio_ffmpeg.count_frames_and_secs(str(temporary))
         if written != count:
             raise RuntimeError(f"{path}: {written} of {count} frames were written")
     return count
-
-
-def _write_gif(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
-    images = [Image.fromarray(frame).quantize(dither=Image.Dither.NONE) for frame in frames]
-    if images:
-        images[0].save(
-            path, format="GIF", save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0
-        )
-    return len(images)
-
-
-def _write_sheet(path: Path, frames: Iterable[np.ndarray], fps: float) -> int:
-    taken = list(frames)
-    if taken:
-        chosen = np.unique(np.linspace(0, len(taken) - 1, SHEET_FRAMES).round().astype(int))
-        Image.fromarray(_grid([taken[i] for i in chosen], min(SHEET_COLUMNS, len(chosen)))).save(
-            path, format="PNG"
-        )
-    return len(taken)

@@ -1,4 +1,4 @@
-"""The web viewer: Newton's viser viewer with goal ghost, reward bars and a choice of object and agent.
+"""The web viewer: Newton's viser viewer with goal ghost and a choice of object.
 
 Browser events arrive on viser's threads; they are queued and handled between steps on the thread that runs
 the simulation. Everything is served from this machine, so it works without a network.
@@ -28,7 +28,6 @@ GHOST_RIGHT, GHOST_HEIGHT = -0.22, 0.12
 CAMERA_DISTANCE = 1.25
 WAITING = "**Compiling kernels and building the scene.** The first start takes minutes."
 BESIDE, ON_OBJECT, HIDDEN = "beside the hand", "on the object", "hidden"
-POSITIVE, NEGATIVE, GROUND = "#3b82f6", "#e2683c", "rgba(128,128,128,.18)"
 
 
 class Page(NamedTuple):
@@ -64,7 +63,6 @@ class PlayViewer:
         self.camera = Camera.for_hand(session.env.hand)
         self._events: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self._models: dict[str, PictureModel] = {}
-        self._largest = np.full(len(session.env.reward_term_names), 1e-9)
         self._ghost = BESIDE
         self._show_object()
         self._set_camera()
@@ -106,8 +104,6 @@ class PlayViewer:
         self.viewer.log_state(self._pictured.state)
         self.viewer.log_scalar("orientation error [rad]", shot.error_rad)
         self._status.content = status_html(shot)
-        self._largest = np.maximum(self._largest, np.abs(shot.terms))
-        self._bars.content = bars_html(self.session.env.reward_term_names, shot.terms, self._largest)
         self.viewer.end_frame()
 
     def close(self) -> None:
@@ -123,7 +119,6 @@ class PlayViewer:
             self._models[name] = PictureModel(env.hand, [item], device="cpu", ghost_in_scene=True)
         self._pictured = self._models[name]
         self.viewer.set_model(self._pictured.model)
-        self._largest[:] = 1e-9
 
     def _set_camera(self) -> None:
         eye, target = np.asarray(self.camera.eye), np.asarray(self.camera.target)
@@ -147,18 +142,9 @@ class PlayViewer:
         gui, session = self.viewer.server.gui, self.session
         with gui.add_folder("Policy", order=-1.0):
             self._status = gui.add_html(status_html(session.snapshot))
-            agent = gui.add_dropdown("Agent", session.agent_names, initial_value=session.agent)
             chosen = gui.add_dropdown("Object", session.object_names, initial_value=session.object_name)
             ghost = gui.add_dropdown("Goal", (BESIDE, ON_OBJECT, HIDDEN), initial_value=self._ghost)
             new_goal = gui.add_button("New goal")
-        with gui.add_folder("Reward", order=-0.5):
-            self._bars = gui.add_html("")
-        self._agent_dropdown = agent
-
-        @agent.on_update
-        def _(event: Any) -> None:
-            if event.client_id is not None:  # not our own setting of the value
-                self._events.put(partial(self._choose_agent, agent.value))
 
         @chosen.on_update
         def _(event: Any) -> None:
@@ -177,14 +163,6 @@ class PlayViewer:
         self.session.choose_object(name)
         self._show_object()
 
-    def _choose_agent(self, name: str) -> None:
-        try:
-            self.session.choose_agent(name)
-        except (ValueError, FileNotFoundError) as error:
-            for client in self.viewer.server.get_clients().values():
-                client.add_notification("This agent cannot be used", str(error), color="red")
-            self._agent_dropdown.value = self.session.agent
-
 
 def status_html(shot: Snapshot) -> str:
     """Error, time and counts as HTML."""
@@ -195,23 +173,4 @@ def status_html(shot: Snapshot) -> str:
         f'<div style="font-size:1.5em;color:{color}">{shot.error_rad:.2f} rad</div>'
         f'<div style="opacity:.75">{shot.time_s:.1f} s &middot; goals reached {shot.goals}'
         f" &middot; drops {shot.drops}</div></div>"
-    )
-
-
-def bars_html(names: tuple[str, ...], terms: np.ndarray, largest: np.ndarray) -> str:
-    """One bar for each reward term, relative to the largest value it had; negative ones to the left."""
-    rows = []
-    for name, value, top in zip(names, terms, largest, strict=True):
-        share = 50.0 * float(np.clip(value / top, -1.0, 1.0))
-        left, width = (50.0, share) if share >= 0 else (50.0 + share, -share)
-        rows.append(
-            f"<span>{escape(name.replace('_', ' '))}</span>"
-            f'<span style="position:relative;background:{GROUND};border-radius:2px;height:.8em">'
-            f'<span style="position:absolute;left:{left:.1f}%;width:{width:.1f}%;top:0;bottom:0;'
-            f'background:{POSITIVE if share >= 0 else NEGATIVE}"></span></span>'
-            f'<span style="text-align:right">{value + 0.0:.3g}</span>'
-        )
-    return (
-        '<div style="display:grid;grid-template-columns:auto 1fr 4em;gap:.25em .6em;align-items:center;'
-        f'padding:.2em .8em;font-size:.85em;font-variant-numeric:tabular-nums">{"".join(rows)}</div>'
     )

@@ -3,7 +3,6 @@
 import torch
 import warp as wp
 
-from vd.clouds import spread
 from vd.kernels.sparse.coordinate_maps import beside
 from vd.kernels.sparse.voxels import coordinates, voxelise_marked
 
@@ -30,5 +29,16 @@ def object_points(
     of_hand = wp.to_torch(marks)[:, 0] > 0
     free = ~of_hand
     touches = wp.to_torch(beside(keys, wp.from_torch(free), wp.from_torch(of_hand)))
-    centres, present = spread(wp.to_torch(coordinates(keys)), free & ~touches, points.shape[0], most)
-    return voxel_m * centres, present.sum(dim=(1, 2)).int()
+    rows = wp.to_torch(coordinates(keys))[free & ~touches]
+    cloud = rows[:, 0].long()
+    first = torch.searchsorted(cloud, torch.arange(points.shape[0] + 1, device=rows.device))
+    counts, rank = first.diff(), torch.arange(len(cloud), device=rows.device) - first[cloud]
+    # Of more than ``most`` every so many-th is taken, in the order of the rows, in which neighbours follow
+    # each other: those left out would share a place with the one before them.
+    share = counts.clamp(min=most)[cloud]
+    place = rank * most // share
+    taken = (rank == 0) | ((rank - 1) * most // share < place)
+    size = min(most, max(1, int(counts.max())))
+    centres = torch.zeros((len(counts), size, 3), device=rows.device)
+    centres[cloud[taken], place[taken]] = rows[taken, 1:] + 0.5
+    return voxel_m * centres, counts.clamp(max=most).int()

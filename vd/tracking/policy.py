@@ -4,11 +4,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
-import torch
-
 from vd.config import Dropped, from_dict, to_dict
 from vd.envs.cfg import ReorientCfg
-from vd.policy import TrainedPolicy, policy_of, read_state
+from vd.policy import TrainedPolicy, holds, policy_of, read_state
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRules
 
@@ -67,11 +65,7 @@ class TrackingPolicy:
 
 def is_tracking(path: Path) -> bool:
     """Whether a file is a tracking policy, as far as it can be read."""
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception:  # whoever reads it says what is wrong with it
-        return False
-    return isinstance(state, dict) and "tracking" in state
+    return holds(path, "tracking")
 
 
 def tracking_export(policy: TrackingPolicy) -> dict[str, Any]:

@@ -11,15 +11,10 @@ from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict
 from vd.envs.cfg import ReorientCfg
-from vd.paper import PAPER
 from vd.senses import Senses
 from vd.tracking.observer import Observer
 from vd.tracking.policy import TrackingPolicy
-from vd.tracking.views import ViewSelection
 from vd.views import ViewMaps
-
-NEAREST = -1
-"""In place of a view: that in whose sector the goal is believed to lie."""
 
 
 @dataclass(frozen=True)
@@ -42,15 +37,13 @@ class Tracker:
         camera: What sees them, posed in the base frame.
         world_object: Object of each hand [N]; the first by default, of one hand.
         world_scale: Size factor of each hand's object [N]; 1 by default.
-        second_view: Select symmetry views by the teacher's critic where a goal is not reached.
         device: Warp device.
 
     Attributes:
         observer: Finds and follows the objects.
 
     Raises:
-        ValueError: The hand has other joints, or views are to be selected, and the teacher has none or no
-            critic.
+        ValueError: The hand has other joints.
     """
 
     def __init__(
@@ -62,7 +55,6 @@ class Tracker:
         *,
         world_object: np.ndarray | None = None,
         world_scale: np.ndarray | None = None,
-        second_view: bool = False,
         device: str = "cpu",
     ):
         teacher = policy.teacher
@@ -84,21 +76,10 @@ class Tracker:
             device=device,
         )
         place, seen = wp.device_to_torch(device), task.observation
-        self._teacher, self._value_of = teacher.network.to(place), teacher.value
+        self._teacher = teacher.network.to(place)
         self._maps: ViewMaps | None = None
-        self._selection: ViewSelection | None = None
         if seen.view != "world":
-            view = "either" if second_view and seen.view == "goal" else seen.view
-            self._maps = ViewMaps.of(hand, seen, view).to(place)
-        if second_view:
-            if self._maps is None:
-                raise ValueError(
-                    "--second-view: the policy's teacher does not see its goals in views (observation.view "
-                    "goal or mirrored)"
-                )
-            _ = teacher.critic  # refuses a file without one
-            self._selection = ViewSelection(self._maps, task.sim.control_hz)
-        self._selected = torch.full((len(objects_of),), NEAREST, device=place)
+            self._maps = ViewMaps(hand, seen, place)
 
     def step(self, senses: Senses) -> Decision:
         """One control step: see, find, observe, choose a view, act."""
@@ -106,26 +87,10 @@ class Tracker:
             observation, angle = self.observer(senses)
             if self._maps is None:
                 return Decision(self._teacher(self._guessed(observation)), angle)
-            view = self._view(observation, angle, senses.goal_steps)
+            view = self._maps.choose(observation)  # in whose sector the goal is believed to lie
             action = self._teacher(self._guessed(self._maps.take(observation, view)))
             return Decision(self._maps.world_action(action, view), angle)
-
-    def _view(self, world: torch.Tensor, angle: torch.Tensor, goal_steps: torch.Tensor) -> torch.Tensor:
-        """Views [N]: each the nearest, until the critic prefers another for a goal that is not reached."""
-        assert self._maps is not None
-        nearest = self._maps.choose(world)
-        if self._selection is None:
-            return nearest
-        self._selected[goal_steps == 0] = NEAREST
-        again = self._selection.due(goal_steps) & (angle > PAPER.success.rotation_rad)
-        if bool(again.any()):
-            self._selected[again] = self._selection.better(world[again], self._value)
-        return torch.where(self._selected == NEAREST, nearest, self._selected)
 
     def _guessed(self, seen: torch.Tensor) -> torch.Tensor:
         """Observations as a view shows them [N, O], with the teacher's mean for what no camera shows."""
         return torch.where(self.observer.known > 0.0, seen, self._teacher.offset)
-
-    def _value(self, seen: torch.Tensor) -> torch.Tensor:
-        """What the critic expects [M] of observations as a view shows them [M, O]."""
-        return self._value_of(self._guessed(seen))

@@ -22,8 +22,6 @@ LEAST = 16
 """Side of the smallest product of a GPU's matrix units."""
 GRADIENT_ROWS = 64
 """Outputs that a gradient of the weights sums at once."""
-POOL_ROWS = 16
-"""Windows of a program."""
 PROGRAMS = 2048
 """Programs that fill a GPU: a gradient of the weights is summed in so many parts."""
 SIZES = ["inputs", "outputs", "part_rows"]
@@ -138,68 +136,6 @@ def weight_gradient_kernel(
     )
 
 
-@triton.jit(do_not_specialize=SIZES[:2])
-def pool_kernel(
-    features,
-    table,
-    output,
-    winner,
-    inputs,
-    outputs,
-    CHANNELS: tl.constexpr,
-    WINDOW: tl.constexpr,
-    ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
-):
-    """output[m, c] = largest of features[table[m, :], c], winner[m, c] the first column that has it."""
-    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
-    column = tl.arange(0, COLUMNS)
-    asked = (row < outputs)[:, None] & (column < CHANNELS)[None, :]
-    best = tl.full((ROWS, COLUMNS), float("-inf"), dtype=tl.float32)
-    first = tl.full((ROWS, COLUMNS), WINDOW, dtype=tl.int32)
-    for k in tl.static_range(WINDOW):
-        source = tl.load(table + row * WINDOW + k, mask=row < outputs, other=inputs).to(tl.int64)
-        there = asked & (source < inputs)[:, None]
-        value = tl.load(features + source[:, None] * CHANNELS + column[None, :], mask=there, other=0.0)
-        value = value.to(tl.float32)
-        # A site's first value wins over none; NaN over any number, and then keeps its place.
-        better = there & ((first == WINDOW) | (value > best) | ((value != value) & (best == best)))
-        best = tl.where(better, value, best)
-        first = tl.where(better, k, first)
-    place = row[:, None] * CHANNELS + column[None, :]
-    tl.store(output + place, best.to(output.dtype.element_ty), mask=asked)
-    tl.store(winner + place, first.to(tl.int8), mask=asked)
-
-
-@triton.jit(do_not_specialize=SIZES[:2])
-def pool_gradient_kernel(
-    gradient,
-    table,
-    winner,
-    output,
-    inputs,
-    outputs,
-    CHANNELS: tl.constexpr,
-    WINDOW: tl.constexpr,
-    ROWS: tl.constexpr,
-    COLUMNS: tl.constexpr,
-):
-    """output[table[m, k], c] = gradient[m, c] where winner[m, c] is k, else 0; windows do not overlap."""
-    row = tl.program_id(0).to(tl.int64) * ROWS + tl.arange(0, ROWS)
-    column = tl.arange(0, COLUMNS)
-    asked = (row < outputs)[:, None] & (column < CHANNELS)[None, :]
-    place = row[:, None] * CHANNELS + column[None, :]
-    grads = tl.load(gradient + place, mask=asked, other=0.0)
-    first = tl.load(winner + place, mask=asked, other=WINDOW)
-    for k in tl.static_range(WINDOW):
-        source = tl.load(table + row * WINDOW + k, mask=row < outputs, other=inputs).to(tl.int64)
-        tl.store(
-            output + source[:, None] * CHANNELS + column[None, :],
-            tl.where(first == k, grads, 0.0),
-            mask=asked & (source < inputs)[:, None],
-        )
-
-
 def _side(size: int, most: int) -> int:
     """A power of two that holds ``size``, between what matrix units take and ``most``."""
     return min(most, max(LEAST, triton.next_power_of_2(size)))
@@ -279,48 +215,3 @@ def weight_gradient(features: torch.Tensor, table: torch.Tensor, gradient: torch
                 DEPTH=depth,
             )
     return partial.sum(dim=0)[:, :channels]
-
-
-def pool(features: torch.Tensor, table: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Largest of the rows ``table`` [M, K] of ``features`` [F, C], and the first k with it, both [M, C]."""
-    (inputs, channels), (outputs, window) = features.shape, table.shape
-    output = features.new_empty((outputs, channels))
-    winner = torch.empty((outputs, channels), dtype=torch.int8, device=features.device)
-    if outputs:
-        with torch.cuda.device_of(features):
-            pool_kernel[(triton.cdiv(outputs, POOL_ROWS),)](
-                features.contiguous(),
-                table,
-                output,
-                winner,
-                inputs,
-                outputs,
-                CHANNELS=channels,
-                WINDOW=window,
-                ROWS=POOL_ROWS,
-                COLUMNS=triton.next_power_of_2(channels),
-            )
-    return output, winner
-
-
-def pool_gradient(
-    gradient: torch.Tensor, table: torch.Tensor, winner: torch.Tensor, inputs: int
-) -> torch.Tensor:
-    """Gradient [inputs, C] of the features of :func:`pool`; each row is in one window."""
-    (outputs, channels), window = gradient.shape, table.shape[1]
-    output = gradient.new_empty((inputs, channels))
-    if outputs:
-        with torch.cuda.device_of(gradient):
-            pool_gradient_kernel[(triton.cdiv(outputs, POOL_ROWS),)](
-                gradient.contiguous(),
-                table,
-                winner,
-                output,
-                inputs,
-                outputs,
-                CHANNELS=channels,
-                WINDOW=window,
-                ROWS=POOL_ROWS,
-                COLUMNS=triton.next_power_of_2(channels),
-            )
-    return output

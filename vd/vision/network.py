@@ -12,11 +12,8 @@ from torch import nn
 
 from vd.paper import PAPER
 from vd.vision.cfg import EncoderCfg, StudentCfg
-from vd.vision.match import Matches
 from vd.vision.sites import Sites
 from vd.vision.sparse import SparseConv3d, SparseMaxPool3d, global_pool
-from vd.vision.state import StateHead
-from vd.vision.turn import TurnEncoder
 
 POSITION_SCALE_M = 0.1
 """Positions of voxels are given in units of this: about the size of the scene."""
@@ -39,19 +36,8 @@ class StudentOutput:
     distance: torch.Tensor
     """Predicted angle to the goal by each distance head [rad], in the order of the configuration: the last
     one is the one to stop by [.., H]."""
-    state: torch.Tensor
-    """Estimate of the teacher's observation, normalised [.., O]; O is 0 without such a head."""
-    view: torch.Tensor
-    """View in which the teacher's layers acted on it [..]; 0 if they have none."""
-    seen: torch.Tensor
-    """What that is read from: features of the memory, the embedding, the senses [.., W]."""
     hidden: torch.Tensor
     """Memory after the last step [N, G]."""
-
-
-def input_width(cfg: EncoderCfg) -> int:
-    """Features of a voxel."""
-    return sum(INPUT_WIDTHS[name] for name in cfg.inputs)
 
 
 def voxel_features(sites: Sites, cfg: EncoderCfg, voxel_m: float) -> torch.Tensor:
@@ -63,7 +49,7 @@ def voxel_features(sites: Sites, cfg: EncoderCfg, voxel_m: float) -> torch.Tenso
     parts = []
     for name in cfg.inputs:
         if name == "constant":
-            parts.append(torch.full((len(sites), 1), cfg.feature, device=sites.device))
+            parts.append(torch.full((len(sites), 1), PAPER.cloud.feature, device=sites.device))
         elif name == "position":
             parts.append(voxel_m / POSITION_SCALE_M * (sites.coordinates[:, 1:] + 0.5))
         else:
@@ -116,7 +102,7 @@ class VoxelEncoder(nn.Module):
     def __init__(self, cfg: EncoderCfg, voxel_m: float = PAPER.cloud.voxel_m):
         super().__init__()
         self.cfg, self.voxel_m = cfg, voxel_m
-        widths = (input_width(cfg), *cfg.channels)
+        widths = (sum(INPUT_WIDTHS[name] for name in cfg.inputs), *cfg.channels)
         self.stages = nn.ModuleList(
             EncoderStage(inner, outer, cfg.blocks, pooled=i < cfg.pooled_stages)
             for i, (inner, outer) in enumerate(zip(widths, cfg.channels, strict=False))
@@ -124,16 +110,13 @@ class VoxelEncoder(nn.Module):
         self.final = nn.Linear(2 * cfg.channels[-1], cfg.embedding)
         self.projector = nn.Linear(cfg.embedding, cfg.embedding)
 
-    def pooled(self, sites: Sites) -> torch.Tensor:
-        """Largest and mean features of the last stage [B, 2 C], of the clouds of ``sites`` (level 0)."""
+    def forward(self, sites: Sites) -> torch.Tensor:
+        """Embeddings [B, E] of the clouds of ``sites``, which has level 0."""
         features = voxel_features(sites, self.cfg, self.voxel_m).to(self.final.weight.dtype)
         for stage in self.stages:
             features, sites = stage(features, sites)
-        return global_pool(features, sites).to(self.final.weight.dtype)
-
-    def forward(self, sites: Sites) -> torch.Tensor:
-        """Embeddings [B, E] of the clouds of ``sites``, which has level 0."""
-        return torch.relu(self.projector(self.final(self.pooled(sites))))
+        pooled = global_pool(features, sites).to(self.final.weight.dtype)
+        return torch.relu(self.projector(self.final(pooled)))
 
 
 class Student(nn.Module):
@@ -157,15 +140,11 @@ class Student(nn.Module):
         cfg.validate()
         self.cfg = cfg
         self.num_actions = num_actions
-        self.num_senses = num_actions * len(cfg.senses)
+        self.num_proprioception = num_actions * len(cfg.proprioception)
         width = cfg.encoder.embedding
         self.encoder = VoxelEncoder(cfg.encoder, cfg.voxel_m)
-        self.goal_encoder = VoxelEncoder(cfg.encoder, cfg.voxel_m) if cfg.goal == "separate" else None
-        self.merge_goal = nn.Linear(2 * width, width) if cfg.goal == "separate" else None
-        self.turn = TurnEncoder(cfg.turn, cfg.voxel_m, width) if cfg.turn.vectors else None
-        self.merge_turn = nn.Linear(2 * width, width) if cfg.turn.vectors else None
         self.action_layers = nn.Sequential(
-            nn.Linear(self.num_senses, cfg.action_hidden),
+            nn.Linear(self.num_proprioception, cfg.action_hidden),
             nn.GELU(),
             nn.Linear(cfg.action_hidden, cfg.action_hidden),
         )
@@ -173,10 +152,6 @@ class Student(nn.Module):
         self.memory = nn.GRU(width, cfg.memory)
         self.head = nn.Sequential(nn.Linear(cfg.memory, cfg.head_hidden), nn.GELU())
         self.mean = nn.Linear(cfg.head_hidden, num_actions)
-        self.state: StateHead | None = None
-        if cfg.state.values:
-            self.state = StateHead(cfg.state, cfg.head_hidden + width + self.num_senses, num_actions)
-            self.forget_correction()
         self.log_std = nn.Linear(cfg.head_hidden, num_actions)
         if cfg.std_range is not None:
             # Broad at first, as without bounds: the likelihood weighs the error of random means by 1 / std^2.
@@ -192,63 +167,29 @@ class Student(nn.Module):
             }
         )
 
-    def forget_correction(self) -> None:
-        """Let what the teacher's layers do at the estimate stand, until there is something to add to it."""
-        nn.init.zeros_(self.mean.weight)
-        nn.init.zeros_(self.mean.bias)
-
-    def senses(self, frame: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    def proprioception(self, frame: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """What the student knows of itself [.., S].
 
         Args:
             frame: ``action`` [.., D], the (smoothed) action before the step, and as far as the configuration
                 names them ``position`` [rad] and ``velocity`` [rad/s] of the joints [.., D].
         """
-        parts = [
-            frame[name] * VELOCITY_SCALE if name == "velocity" else frame[name] for name in self.cfg.senses
-        ]
-        return torch.cat(parts, dim=-1)
+        names = self.cfg.proprioception
+        return torch.cat([frame[n] * VELOCITY_SCALE if n == "velocity" else frame[n] for n in names], dim=-1)
 
     def initial_hidden(self, envs: int) -> torch.Tensor:
         """The memory at the start of an episode: zeros [N, G]."""
         return self.mean.weight.new_zeros((envs, self.cfg.memory))
 
-    def encode(self, scene: Sites, goal: Sites | None = None) -> torch.Tensor:
-        """Embeddings [B, E] of clouds; arguments as of :meth:`look`."""
-        return self.look(scene, goal)[0]
-
-    def look(self, scene: Sites, goal: Sites | None = None) -> tuple[torch.Tensor, Matches | None]:
-        """Embeddings [B, E] of clouds, and what was found of the object on its goal, if that is looked for.
-
-        Args:
-            scene: Voxels of scene and goal together, or of the scene alone with separate encoders.
-            goal: Voxels of the goal, with separate encoders.
-
-        Raises:
-            ValueError: The goal is missing, or given although it is part of the scene.
-        """
-        if (goal is not None) != (self.goal_encoder is not None):
-            raise ValueError(
-                f"a student with goal = {self.cfg.goal!r} takes "
-                + ("scene and goal voxels" if goal is None else "the voxels of scene and goal as one cloud")
-            )
-        # The encoders may be of lower precision than the rest.
-        precision = self.mean.weight.dtype
-        embedding = self.encoder(scene).to(precision)
-        if self.goal_encoder is not None and self.merge_goal is not None and goal is not None:
-            both = torch.cat([embedding, self.goal_encoder(goal).to(precision)], dim=-1)
-            embedding = torch.relu(self.merge_goal(both))
-        matches = None
-        if self.turn is not None and self.merge_turn is not None:
-            turned, matches = self.turn(scene, goal)
-            both = torch.cat([embedding, turned.to(precision)], dim=-1)
-            embedding = torch.relu(self.merge_turn(both))
-        return embedding, matches
+    def encode(self, sites: Sites) -> torch.Tensor:
+        """Embeddings [B, E] of clouds, of scene and goal together."""
+        # The encoder may be of lower precision than the rest.
+        return self.encoder(sites).to(self.mean.weight.dtype)
 
     def forward(
         self,
         embedding: torch.Tensor,
-        senses: torch.Tensor,
+        proprioception: torch.Tensor,
         hidden: torch.Tensor,
         done: torch.Tensor | None = None,
     ) -> StudentOutput:
@@ -256,11 +197,11 @@ class Student(nn.Module):
 
         Args:
             embedding: From :meth:`encode`, shape [T, N, E].
-            senses: From :meth:`senses`, before each step, shape [T, N, S].
+            proprioception: From :meth:`proprioception`, before each step, shape [T, N, S].
             hidden: Memory before the first step, shape [N, G].
             done: Where a world ended with step t, so that step t + 1 starts without memory, shape [T, N].
         """
-        inputs = torch.cat([embedding, self.action_layers(senses)], dim=-1)
+        inputs = torch.cat([embedding, self.action_layers(proprioception)], dim=-1)
         remembered, hidden = self._remember(self.merge_action(inputs), hidden, done)
         features = self.head(remembered)
         places = {"before": embedding, "after": remembered}
@@ -269,37 +210,15 @@ class Student(nn.Module):
         if self.cfg.std_range is not None:
             low, high = (math.log(bound) for bound in self.cfg.std_range)
             log_std = low + (high - low) * torch.sigmoid(log_std)
-        mean, seen = self.mean(features), torch.cat([features, embedding, senses], dim=-1)
-        state, view = seen[..., :0], torch.zeros(mean.shape[:-1], dtype=torch.long, device=mean.device)
-        if self.state is not None:
-            state, action, view = self.state(seen)
-            mean = mean + action
         # Autocast may have computed in half precision; losses and the next step should not have to.
         precision = self.mean.weight.dtype
-        return StudentOutput(
-            mean.to(precision),
-            log_std.to(precision),
-            torch.cat(distance, dim=-1).to(precision),
-            state.to(precision),
-            view,
-            seen.to(precision),
-            hidden.to(precision),
-        )
+        parts = (self.mean(features), log_std, torch.cat(distance, dim=-1), hidden)
+        return StudentOutput(*(part.to(precision) for part in parts))
 
-    def act(
-        self, scene: Sites, senses: torch.Tensor, hidden: torch.Tensor, goal: Sites | None = None
-    ) -> StudentOutput:
-        """One step of N clouds: ``senses`` [N, S] and ``hidden`` [N, G] give leading shape [N]."""
-        output = self(self.encode(scene, goal)[None], senses[None], hidden)
-        return StudentOutput(
-            output.mean[0],
-            output.log_std[0],
-            output.distance[0],
-            output.state[0],
-            output.view[0],
-            output.seen[0],
-            output.hidden,
-        )
+    def act(self, sites: Sites, proprioception: torch.Tensor, hidden: torch.Tensor) -> StudentOutput:
+        """One step of N clouds: ``proprioception`` [N, S] and ``hidden`` [N, G] give leading shape [N]."""
+        output = self(self.encode(sites)[None], proprioception[None], hidden)
+        return StudentOutput(output.mean[0], output.log_std[0], output.distance[0], output.hidden)
 
     def _remember(
         self, inputs: torch.Tensor, hidden: torch.Tensor, done: torch.Tensor | None

@@ -4,14 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-
 from vd.config import from_dict
-from vd.policy import read_state
+from vd.policy import holds, read_state
 from vd.stopping import StoppingRules
 from vd.vision.cfg import StudentCfg
 from vd.vision.network import Student
-from vd.vision.packed import pack, unpack
 
 STUDENT_FORMAT = "visual-dexterity student 1"
 
@@ -51,32 +48,18 @@ class SavedStudent:
 
 def is_student(path: Path) -> bool:
     """Whether a file is a student, as far as it can be read."""
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception:  # whoever reads it says what is wrong with it
-        return False
-    return isinstance(state, dict) and "student_state_dict" in state
+    return holds(path, "student_state_dict")
 
 
-def student_export(state: dict[str, Any], *, small: bool = False) -> dict[str, Any]:
-    """The part of a checkpoint that :func:`load_student` needs, its weights packed if it is to be small."""
-    kept, weights = ("spec", "task", "depth", "iter", "env_steps"), state["student_state_dict"]
-    return {
-        "format": STUDENT_FORMAT,
-        **{key: state[key] for key in kept},
-        "student_state_dict": pack(weights)
-        if small
-        else {key: v.detach().cpu() for key, v in weights.items()},
-    }
+def student_export(state: dict[str, Any]) -> dict[str, Any]:
+    """The part of a checkpoint that :func:`load_student` needs."""
+    weights = {name: value.detach().cpu() for name, value in state["student_state_dict"].items()}
+    kept = {key: state[key] for key in ("spec", "task", "depth", "iter", "env_steps")}
+    return {"format": STUDENT_FORMAT, **kept, "student_state_dict": weights}
 
 
-def read_student(path: Path, device: str = "cpu", *, as_stored: bool = False) -> dict[str, Any]:
+def read_student(path: Path, device: str = "cpu") -> dict[str, Any]:
     """The contents of ``student.pt`` or of a checkpoint, without building the network.
-
-    Args:
-        path: The file.
-        device: Torch device.
-        as_stored: Leave weights packed where they are, to be written again.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -90,7 +73,7 @@ def read_student(path: Path, device: str = "cpu", *, as_stored: bool = False) ->
     state = read_state(path, device, remedy="copy it again, or give another file of its run")
     if not {"spec", "student_state_dict", "task", "depth"} <= state.keys():
         raise ValueError(f"{path} holds no student; give a file that vd-train student wrote")
-    return state if as_stored else state | {"student_state_dict": unpack(state["student_state_dict"])}
+    return state
 
 
 def saved_spec(state: dict[str, Any], path: Path) -> StudentSpec:

@@ -19,48 +19,13 @@ from vd.vision.cfg import NoiseCfg, StudentCfg
 from vd.vision.sites import Sites
 from vd.vision.voxels import Voxeliser
 
-BASE, OBJECT = 0, -1
-"""Columns of a frame's poses: the hand's base, and the object."""
+OBJECT = -1
+"""Column of a frame's poses that is the object's."""
 
 Frame = dict[str, torch.Tensor]
 """Tensors of N hands: ``body_q`` [N, L + 1, 7] (links as the encoders report the joints, then the object),
 ``goal_quat`` [N, 4], ``action`` [N, D] (smoothed, of the step before), ``position`` [rad] and ``velocity``
 [rad/s] of the joints [N, D] and, with a camera, ``points`` [N, K, 3] (base frame [m])."""
-
-
-def voxels(
-    points: torch.Tensor,
-    ends: tuple[int, int],
-    voxelise: Voxeliser,
-    *,
-    network: StudentCfg,
-    augment: bool,
-    complete: bool = False,
-) -> tuple[Sites, ...]:
-    """Voxels of clouds as the student takes them: of all points, or of scene and goal apart.
-
-    Args:
-        points: Points [m], shape [R, P, 3]: the goal's, the hand's, then others.
-        ends: Columns at which the goal's points end, and the hand's after them.
-        voxelise: Makes the voxels.
-        network: Whether the goal is a cloud of its own, and whether voxels are marked.
-        augment: Add noise, as in training.
-        complete: The other points are of the object alone, not a camera's.
-
-    Returns:
-        Arguments of :meth:`vd.vision.network.Student.encode`.
-    """
-    goal, hand = ends
-    marked = "marks" in network.encoder.inputs
-    if network.goal == "merged":
-        scene = voxelise(points, augment=augment, ends=(goal, hand) if marked else ())
-        scene.complete = complete
-        return (scene,)
-    rest, own = points[:, goal:].contiguous(), points[:, :goal].contiguous()
-    # Marks are of goal and hand in both: the one has no goal, the other no hand.
-    scene = voxelise(rest, augment=augment, ends=(0, hand - goal) if marked else ())
-    scene.complete = complete
-    return scene, voxelise(own, augment=augment, ends=(goal, goal) if marked else ())
 
 
 class Sight:
@@ -71,6 +36,7 @@ class Sight:
 
     Attributes:
         rng: Random streams of the noise.
+        ends: Columns of a cloud at which goal and hand end.
     """
 
     def __init__(
@@ -105,7 +71,7 @@ class Sight:
         """
         links = np.arange(len(hand.link_names))
         shapes = np.zeros(1, dtype=int) if world_object is None else world_object
-        self._network, self._complete = network, complete
+        self._complete = complete
         self._clouds = SceneClouds(
             hand,
             objects,
@@ -120,12 +86,8 @@ class Sight:
         self._voxelise = Voxeliser(
             network.voxel_m, noise=noise, clouds=max(batch, len(shapes)), seed=seed, device=device
         )
-        self._links, self.rng = len(links), self._voxelise.rng
-
-    @property
-    def ends(self) -> tuple[int, int]:
-        """Columns of a cloud at which goal and hand end."""
-        return self._clouds.ends
+        self._links, self.rng, self.ends = len(links), self._voxelise.rng, self._clouds.ends
+        self._marks = self.ends if network.marked else ()
 
     def frame(self, senses: Senses, object_pose: torch.Tensor | None = None) -> Frame:
         """A frame, of copies: later steps do not change it.
@@ -177,23 +139,12 @@ class Sight:
 
     def sites(
         self, frame: Mapping[str, torch.Tensor], envs: torch.Tensor | None = None, *, augment: bool = False
-    ) -> tuple[Sites, ...]:
-        """Voxels of frames; arguments as of :meth:`points`.
+    ) -> Sites:
+        """Voxels of frames, of scene and goal together.
 
         Args:
             frame: The frames.
-            envs: Hand of each row.
+            envs: Hand of each row, as of :meth:`points`.
             augment: Add noise, as in training.
-
-        Returns:
-            Arguments of :meth:`vd.vision.network.Student.encode`.
         """
-        points = self.points(frame, envs)
-        return voxels(
-            points,
-            self._clouds.ends,
-            self._voxelise,
-            network=self._network,
-            augment=augment,
-            complete=self._complete,
-        )
+        return self._voxelise(self.points(frame, envs), augment=augment, ends=self._marks)

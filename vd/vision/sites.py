@@ -6,10 +6,8 @@ from functools import cached_property
 import torch
 import warp as wp
 
-from vd.clouds import spread
 from vd.kernels.sparse.coordinate_maps import (
     HashTable,
-    beside,
     coarsen,
     hash_table,
     level_counts,
@@ -18,9 +16,6 @@ from vd.kernels.sparse.coordinate_maps import (
     window_table,
 )
 from vd.kernels.sparse.voxels import cloud_offsets, coordinates
-
-GOAL, HAND = 0, 1
-"""Columns of the marks of voxels."""
 
 
 class Sites:
@@ -34,10 +29,7 @@ class Sites:
         keys: Sorted keys of the cells (:mod:`vd.kernels.sparse.voxels`), shape [M].
         clouds: B.
         level: l.
-        complete: Whether all that bears no mark is of the object; a camera sees the hand too.
     """
-
-    complete: bool = False
 
     def __init__(
         self,
@@ -62,12 +54,6 @@ class Sites:
         self.clouds = clouds
         self.level = level
         self._marks, self._sizes = marks, sizes
-
-    def fresh(self) -> "Sites":
-        """The same cells without maps, as they come from the voxeliser."""
-        same = Sites(self.keys, self.clouds, self.level, marks=self._marks)
-        same.complete = self.complete
-        return same
 
     def __len__(self) -> int:
         return int(self.keys.shape[0])
@@ -97,40 +83,6 @@ class Sites:
         if self._marks is None:
             raise ValueError("the network reads marks of voxels; give the voxeliser the ends of the groups")
         return self._marks
-
-    @cached_property
-    def goal(self) -> torch.Tensor:
-        """Which voxels are the goal's, bool [M]."""
-        return self.marks[:, GOAL] > 0
-
-    @cached_property
-    def item(self) -> torch.Tensor:
-        """Which voxels are the object's, bool [M].
-
-        A voxel is the object's that holds no point of the goal, nor of the hand's own model. Of a camera's
-        points those of the hand that lie between that model's samples are left out too, with all that
-        touches it, by a corner at least.
-        """
-        hand = self.marks[:, HAND] > 0
-        free = ~(self.goal | hand)
-        if self.complete:
-            return free
-        touches = beside(self.keys, wp.from_torch(free), wp.from_torch(hand), self._slots)
-        return free & ~wp.to_torch(touches)
-
-    def places(self, chosen: torch.Tensor, most: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Coordinates of some voxels, a row for each cloud; waits for the device.
-
-        Args:
-            chosen: Which, bool [M].
-            most: Voxels of a cloud at most. Of more, every so many-th one is taken in the order of their
-                keys, in which neighbours follow each other.
-
-        Returns:
-            Coordinates of their centres [voxels], zeros where a cloud has fewer, shape [B, P, 3], and 1 where
-            there is one, shape [B, P, 1].
-        """
-        return spread(self.coordinates, chosen, self.clouds, most)
 
     @cached_property
     def _slots(self) -> HashTable:

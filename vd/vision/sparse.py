@@ -15,7 +15,7 @@ import math
 import warnings
 from subprocess import SubprocessError
 from types import ModuleType
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import nn
@@ -134,32 +134,6 @@ class _Convolution(torch.autograd.Function):
         return to_features, to_weight, None, None
 
 
-class _WindowMaximum(torch.autograd.Function):
-    """Largest of each window; the gradient goes to the first row that has it."""
-
-    @staticmethod
-    def forward(ctx: Any, features: torch.Tensor, table: torch.Tensor) -> torch.Tensor:
-        ctx.rows = features.shape[0]
-        if fused := fused_for(features):
-            values, winner = fused.pool(features, table)
-            ctx.save_for_backward(winner, table)
-        else:
-            values, winner = gather_rows(features, table, -math.inf).max(dim=1)
-            ctx.save_for_backward(table.gather(1, winner).long())
-        return values
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: torch.Tensor) -> tuple[torch.Tensor, None]:
-        winner, *table = ctx.saved_tensors
-        if table:
-            fused = fused_kernels(grad.device)
-            assert fused is not None
-            return fused.pool_gradient(grad, *table, winner, ctx.rows), None
-        # Windows do not overlap: no entry is written twice.
-        return grad.new_zeros((ctx.rows, grad.shape[1])).scatter_(0, winner, grad), None
-
-
 class SparseConv3d(nn.Module):
     """A 3x3x3 convolution without bias on occupied cells.
 
@@ -171,10 +145,8 @@ class SparseConv3d(nn.Module):
         :mod:`vd.kernels.sparse.coordinate_maps`.
     """
 
-    def __init__(self, in_channels: int, out_channels: int, *, stride: int = 1):
+    def __init__(self, in_channels: int, out_channels: int, *, stride: Literal[1, 2] = 1):
         super().__init__()
-        if stride not in (1, 2):
-            raise ValueError(f"stride {stride}: a sparse convolution has stride 1 or 2")
         self.stride = stride
         self.weight = nn.Parameter(torch.empty(KERNEL, in_channels, out_channels))
         # He et al., fan out: keeps the variance of gradients through ReLU.
@@ -190,19 +162,13 @@ class SparseConv3d(nn.Module):
         back = sites.strided_back if self.stride == 2 and features.requires_grad else None
         return _Convolution.apply(features, self.weight, table, back)
 
-    def extra_repr(self) -> str:
-        """Sizes, for ``print``."""
-        return f"{self.weight.shape[1]}, {self.weight.shape[2]}, stride={self.stride}"
-
 
 class SparseMaxPool3d(nn.Module):
     """Largest value in each 2x2x2 window, stride 2, over its occupied cells."""
 
     def forward(self, features: torch.Tensor, sites: Sites) -> torch.Tensor:
         """Pool ``features`` [M, C] to [coarser M, C]."""
-        if torch.is_grad_enabled() or fused_for(features):
-            return _WindowMaximum.apply(features, sites.windows)
-        return gather_rows(features, sites.windows, -math.inf).amax(dim=1)  # nobody asks which row it was
+        return gather_rows(features, sites.windows, -math.inf).max(dim=1).values
 
 
 def global_pool(features: torch.Tensor, sites: Sites) -> torch.Tensor:

@@ -1,0 +1,182 @@
+"""Recordings of the hidden plant: they hide what they hide, and are what the hidden machine did."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vd.bench.gap_sizes import showing, sized_effect
+from vd.bench.hidden_plant import FULL_DUTY_RAD, OUTSIDE
+from vd.bench.hide import (
+    ENCODER_COUNT,
+    FULL_P_GAIN,
+    Hiding,
+    effect_parameters,
+    hide,
+    noise_floor,
+    parse_effect,
+    simulate_hidden,
+    truth_path,
+)
+from vd.gap.chain import chains
+from vd.gap.excitations import MENU, JointRange, excitation_set
+from vd.gap.recording import read_recording
+from vd.gap.telemetry import late_side, vetoes
+from vd.gap.worker_pool import JointSpec
+from vd.kernels.servo.effects import EFFECTS
+
+
+def test_the_recording_tells_nothing_and_the_truth_lies_beside_it(tmp_path):
+    out = tmp_path / "r"
+    hidden = hide("servo", {"backlash": {"width_rad": 0.05}}, out, seed=4)
+    text = (out / "recording.json").read_text() + " ".join(p.name for p in out.iterdir())
+    assert not any(name in text for name in (*EFFECTS, *OUTSIDE, "seed", "truth"))
+    truth = json.loads(truth_path(out).read_text())
+    assert truth_path(out).parent == tmp_path
+    assert truth["effects"]["backlash"] == {"joints": ["joint"], "parameters": {"width_rad": {"joint": 0.05}}}
+    assert 2.4 <= truth["base"]["kp"]["joint"] <= 3.6
+    recording = read_recording(out)
+    trajectory, made = recording.trajectories[3], hidden.recording.trajectories[3]
+    np.testing.assert_allclose(trajectory.position, made.position, atol=1e-6)
+    np.testing.assert_allclose(trajectory.time, made.time, atol=1e-9)
+    counts = trajectory.position / ENCODER_COUNT
+    np.testing.assert_allclose(counts, np.round(counts), atol=1e-2)
+    assert 0.5e-3 < np.diff(trajectory.time).std() < 2.5e-3
+
+
+def test_the_duty_cycle_is_the_controllers_output():
+    """It follows the error that the controller sees, whatever a motor with limits makes of it."""
+    limits = {"torque_limit": {"tau_max_nm": 0.4}, "coulomb_friction": {"tau_c_nm": 0.05}}
+    bare = Hiding(model="servo", effects=limits, seed=2, excitations=("gain_ladder",))
+    plain, told = simulate_hidden([bare, replace(bare, pwm=True)])
+    assert all(t.pwm is None for t in plain.recording.trajectories)
+    gains = set()
+    for t in told.recording.trajectories:
+        assert np.abs(t.pwm).max() <= 1.0
+        gain = t.conditions["p_gain"] / FULL_P_GAIN
+        gains.add(gain)
+        expected = np.clip(gain * (t.command - t.position) / FULL_DUTY_RAD, -1.0, 1.0)
+        np.testing.assert_allclose(t.pwm, expected, atol=6e-3)
+    assert len(gains) > 1
+    # Everything else of the recording is the same.
+    for one, other in zip(plain.recording.trajectories, told.recording.trajectories, strict=True):
+        np.testing.assert_array_equal(one.position, other.position)
+
+
+@pytest.mark.parametrize("late", ["command_delay", "read_delay"])
+def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path):
+    hide("servo", {late: {"delay_s": 0.03}}, tmp_path / "r", seed=6, pwm=True)
+    recording = read_recording(tmp_path / "r")
+    (chain,) = chains(recording)
+    everything = tuple(range(len(recording.trajectories)))
+    spec = JointSpec(0, 0, everything, everything, 1e-3, ("kd",))
+    other = {"command_delay": "read_delay", "read_delay": "command_delay"}[late]
+    assert late_side(recording, chain, spec) == late
+    contradicted = set(vetoes(recording, chain, spec, chain.start_row))
+    assert {other, "command_filter", "dead_zone", "backlash"} <= contradicted and late not in contradicted
+    silent = replace(recording, trajectories=tuple(replace(t, pwm=None) for t in recording.trajectories))
+    assert late_side(silent, chain, spec) == ""
+
+
+def test_seeds_repeat_and_differ_alone_and_in_batches():
+    effects = {"command_jitter": {"sigma_s": 0.01}}
+    one, two, other = simulate_hidden([Hiding("servo", effects, seed=s) for s in (1, 1, 2)])
+    (alone,) = simulate_hidden([Hiding("servo", effects, seed=1)])
+    for a, b, c in zip(one.recording.trajectories, two.recording.trajectories,
+                       alone.recording.trajectories, strict=True):  # fmt: skip
+        np.testing.assert_array_equal(a.position, b.position)
+        np.testing.assert_array_equal(a.position, c.position)
+    assert one.truth["base"] != other.truth["base"]
+
+
+def test_the_noise_is_the_stated_floor():
+    quiet, noisy = (
+        simulate_hidden([Hiding("servo", seed=1, noise_rad=noise, jitter_s=0.0)])[0] for noise in (0.0, 3e-4)
+    )
+    slow = [i for i, t in enumerate(quiet.recording.trajectories) if t.excitation.startswith("sine")]
+    for hidden, noise in ((quiet, 0.0), (noisy, 3e-4)):
+        assert hidden.truth["noise_floor_rad"] == pytest.approx(noise_floor(noise))
+    differences = [noisy.recording.trajectories[i].position - quiet.recording.trajectories[i].position
+                   for i in slow]  # fmt: skip
+    both = np.concatenate(differences).std()
+    # Both are rounded, one is noisy: the variances of two roundings and of the noise, not quite independent.
+    assert noise_floor(3e-4) < both < np.sqrt(2.0) * noise_floor(3e-4)
+
+
+def test_a_finger_is_recorded_by_name():
+    motion = {"excitations": ("torque_release",)}
+    hidden = simulate_hidden([
+        Hiding("dclaw3", {"coulomb_friction": {"tau_c_nm": 0.05}},
+               effect_joints={"coulomb_friction": ("f0_j2",)}, **motion),
+        Hiding("dclaw4", joints=("f1_j1", "f1_j2", "f1_j3"), **motion),
+    ])  # fmt: skip
+    first, second = (h.recording for h in hidden)
+    assert first.joints == ("f0_j1", "f0_j2", "f0_j3") and second.joints[0] == "f1_j1"
+    assert hidden[0].truth["effects"]["coulomb_friction"]["parameters"]["tau_c_nm"] == {
+        "f0_j1": 0.0, "f0_j2": 0.05, "f0_j3": 0.0}  # fmt: skip
+    falling = first.trajectories[1]
+    assert falling.joints == ("f0_j2",) and not falling.enabled[-1, 1] and falling.enabled[-1, 0]
+    assert falling.position[150, 1] - falling.position[-1, 1] > 0.02
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"model": "dclaw9"}, "dclaw9"),
+        ({"model": "dclaw3", "joints": ("f0_j1", "f1_j2", "f0_j3")}, "one finger"),
+        ({"model": "servo", "effects": {"gremlins": {}}}, "gremlins"),
+        ({"model": "servo", "effects": {"backlash": {"depth": 1.0}}}, "depth"),
+        ({"model": "servo", "effects": {"backlash": {"width_rad": np.nan}}}, "finite"),
+        ({"model": "servo", "effects": {"backlash": {"width_rad": -0.04}}}, "negative"),
+        ({"model": "servo", "effects": {"joint_coupling": {}}}, "one joint"),
+        ({"model": "servo", "effects": {"backlash": {}}, "effect_joints": {"backlash": ("x",)}}, "'x'"),
+        ({"model": "servo", "excitations": ("dance",)}, "dance"),
+    ],
+)
+def test_what_cannot_be_hidden_is_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        simulate_hidden([Hiding(**options)])
+
+
+def test_effects_are_read_from_the_command_line():
+    assert parse_effect("command_delay") == ("command_delay", {}, ())
+    assert parse_effect("stribeck_friction@f0_j2+f0_j3:tau_s_nm=0.2, v_s_rad_s=1e-1") == (
+        "stribeck_friction",
+        {"tau_s_nm": 0.2, "v_s_rad_s": 0.1},
+        ("f0_j2", "f0_j3"),
+    )
+    for text, words in (
+        ("gremlins", "command_delay"),
+        ("backlash:depth=1", "width_rad"),
+        ("backlash:width_rad", "NUMBER"),
+        ("backlash:width_rad=wide", "NUMBER"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            parse_effect(text)
+
+
+def test_excitations_stay_within_the_joints_and_excite_one_each():
+    reach = JointRange(("a", "b"), np.array([-0.5, -2.0]), np.array([1.5, 2.0]), p_gain=800.0)
+    for name in MENU:
+        for motion in excitation_set(reach, (name,)):
+            still = [j for j, joint in enumerate(reach.joints) if joint not in motion.joints]
+            assert len(still) == 1 and np.ptp(motion.command[:, still]) == 0.0
+            assert (motion.command > reach.lower).all() and (motion.command < reach.upper).all()
+            assert motion.time[0] == 0.0 and np.allclose(np.diff(motion.time), 0.01)
+    paper = excitation_set(reach)
+    assert 40.0 < sum(m.duration for m in paper) / 2 < 60.0 and len(paper) == 16
+    assert {m.conditions["p_gain"] for m in excitation_set(reach, ("gain_ladder",))} == {200.0, 400.0, 800.0}
+
+
+def test_sizes_grow_and_stay_within_the_bounds():
+    for model in ("dclaw3", "servo", "pendulum"):
+        for name in showing(model):
+            sizes = [sized_effect(name, size, model) for size in range(4)]
+            assert sizes[0] != sizes[3]
+            for parameter in EFFECTS[name].parameters:
+                assert set(sizes[0]) == set(effect_parameters(name))
+                assert all(parameter.lower <= abs(s[parameter.name]) <= parameter.upper
+                           or name == "acceleration_limit" for s in sizes)  # fmt: skip
+    with pytest.raises(ValueError, match="does not show"):
+        sized_effect("joint_coupling", 1, "servo")

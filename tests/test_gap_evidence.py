@@ -1,0 +1,148 @@
+"""What decides, on made-up fits: gains on unseen motions, ties, bounds, structure, and other joints."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from gap_recordings import COUNT, FLOOR, made_up
+
+import vd.kernels.servo.actuators as servo
+from vd.gap.consensus import share
+from vd.gap.coordinates import Coordinate
+from vd.gap.explanation import Accepted, Explanation, intervals
+from vd.gap.statistics import resamples
+from vd.gap.verdict import Verdicts
+
+
+@pytest.fixture
+def judge() -> Verdicts:
+    return Verdicts(floor=FLOOR, weights=resamples(10, np.random.default_rng(0)))
+
+
+def test_a_gain_is_over_five_percent_over_the_noise_and_holds_over_trajectories(judge: Verdicts) -> None:
+    before, name = made_up((), 0.010), ("backlash",)
+    assert judge.better(before, made_up(name, 0.005))[0]
+    assert not judge.better(before, made_up(name, 0.0097))[0]
+    # One trajectory gains much, others lose a little: the interval over trajectories covers 0.
+    uneven = np.full(10, 0.0102)
+    uneven[0] = 0.0
+    assert not judge.better(before, made_up(name, uneven))[0]
+    accepted, why = judge.better(made_up((), 1.15e-3), made_up(name, 1.05e-3))
+    assert not accepted and "noise floor" in why
+
+
+def test_a_tie_on_unseen_motions_is_a_set(judge: Verdicts) -> None:
+    noise = np.random.default_rng(1).normal(0.0, 1e-3, 10)
+    winner = made_up(("coulomb_friction",), 0.004)
+    assert judge.tied(winner, made_up(("dead_zone",), 0.004 + noise - noise.mean()))[0]
+    assert not judge.tied(winner, made_up(("backlash",), 0.006))[0]
+
+
+def test_at_the_floor_samples_decide(judge: Verdicts) -> None:
+    """An explained recording tells candidates apart even if one motion alone shows the difference."""
+    winner, errors = made_up(("coulomb_friction",), FLOOR), np.full(10, FLOOR)
+    assert judge.tied(winner, made_up(("dead_zone",), errors))[0]
+    errors[3] = 1.5 * FLOOR
+    assert not judge.tied(winner, made_up(("dead_zone",), errors))[0]
+
+
+def test_the_simpler_of_nested_effects_wins_a_tie_and_a_bound_never_wins(judge: Verdicts) -> None:
+    simple = made_up(("coulomb_friction",), 1.000e-3)
+    fuller = made_up(("stribeck_friction",), 0.970e-3, fitted=0.999e-3)
+    assert judge.winner([fuller, simple]) is simple
+    worse = made_up(("coulomb_friction",), 1.6e-3)
+    assert judge.winner([fuller, worse]) is fuller
+    end = Coordinate("backlash.width_rad", servo.BACKLASH_WIDTH, False, 1.0, 0.0, 9.0)
+    stuck = made_up(("backlash",), 0.004)
+    stuck = replace(stuck, coordinates=(*stuck.coordinates[:-1], end), x=np.array([0.0, 0.0, 0.0, 9.0]))
+    inside = made_up(("dead_zone",), 0.005)
+    assert stuck.at_bound == ("backlash.width_rad",) and judge.winner([stuck, inside]) is inside
+
+
+def concluded(judge: Verdicts, left: float = FLOOR, **options: object) -> Explanation:
+    """A conclusion about Coulomb friction that is beyond doubt but for ``options``."""
+    final = made_up(("coulomb_friction",), left)
+    rivals = {"coulomb_friction": [final, made_up(("backlash",), 0.004)]}
+    return judge.conclude(made_up((), 0.010), final, rivals, [], "", **options)  # type: ignore[arg-type]
+
+
+def test_two_searches_that_disagree_by_more_than_the_gain_give_no_name(judge: Verdicts) -> None:
+    left, name = 1.5 * FLOOR, ("coulomb_friction",)
+    # Its gain is what the next best leaves: 4 - 1.5 mrad.
+    near = concluded(judge, left, again=made_up(name, 0.0035))
+    assert near.verdict == "effects" and near.accepted[0].named
+    far = concluded(judge, left, again=made_up(name, 0.0045))
+    assert far.verdict == "unknown" and not far.accepted[0].named
+    assert "two searches" in far.reason and "3.00 mrad" in far.reason
+    assert concluded(judge, again=made_up(name, 0.0095)).verdict == "effects", "at the floor it says nothing"
+
+
+def test_what_leaves_structure_is_not_explained(judge: Verdicts) -> None:
+    final, pairs = made_up(("coulomb_friction",), FLOOR), np.full(10, 400.0)
+
+    def with_structure(share: float, rms: float = 1.1 * FLOOR) -> Explanation:
+        left = replace(final, sse=COUNT * rms**2, structure=np.stack([share * FLOOR**2 * pairs, pairs]))
+        return concluded(judge, refined=left)
+
+    assert with_structure(0.03).verdict == "effects", "what the right models leave"
+    lacking = with_structure(0.3)
+    assert lacking.verdict == "unknown" and "structure" in lacking.reason
+    # Far from the floor a real machine's repeatability is not known.
+    assert with_structure(8.0, rms=5.0 * FLOOR).verdict == "effects"
+
+
+def test_what_the_time_step_leaves_open_widens_the_interval() -> None:
+    fit = made_up((), FLOOR)
+    plain = intervals(fit, FLOOR)["p0"]
+    wide = intervals(replace(fit, step_error=np.full(3, 0.5)), FLOOR)["p0"]
+    assert 0.5 * (wide[1] - wide[0]) == pytest.approx(np.hypot(0.5 * (plain[1] - plain[0]), 0.5))
+
+
+def test_sets_of_the_joints_of_a_finger_meet_in_one_name() -> None:
+    def explanation(name: str, *tied: str, verdict: str = "") -> Explanation:
+        accepted = Accepted(name, 0.6 if tied else 1.0, {}, (), tied, False)
+        fits = [made_up((other,), 0.01) for other in (name, *tied)]
+        verdict = verdict or ("ambiguous" if tied else "effects")
+        return Explanation(made_up((), 0.02), fits[0], verdict, "", (accepted,), (), {name: fits})
+
+    def names(*explanations: Explanation, groups: list[int] | None = None) -> list[str]:
+        shared = share(explanations, [FLOOR] * len(explanations), groups)
+        return [e.accepted[0].name if e.accepted[0].named else "?" for e in shared]
+
+    one, other = explanation("backlash", "dead_zone"), explanation("backlash", "coulomb_friction")
+    assert names(one, other) == ["backlash", "backlash"]
+    assert names(one, explanation("dead_zone")) == ["dead_zone", "dead_zone"]
+    assert names(one, explanation("thermal_drift")) == ["?", "thermal_drift"]
+    # Separate servos share gravity, not the play of one gear.
+    assert names(one, explanation("backlash"), groups=[0, 1]) == ["?", "backlash"]
+    load = explanation("encoder_bias", "gravity_load")
+    assert names(load, explanation("gravity_load"), groups=[0, 1]) == ["gravity_load", "gravity_load"]
+    # What comes nearest where nothing explains the gap settles no other joint's set.
+    assert names(one, explanation("backlash", verdict="unknown"))[0] == "?"
+
+
+@pytest.mark.parametrize(("falls", "verdict"), [(0.0, "effects"), (-0.8, "unknown")])
+def test_a_friction_that_changes_from_motion_to_motion_is_no_name(falls: float, verdict: str) -> None:
+    """A linear model of a gain and a constant friction, fitted where the friction falls by a share of it."""
+    rng, samples, when = np.random.default_rng(3), 400, np.linspace(3.0, 140.0, 12)
+    slopes = rng.normal(0.0, 20.0 * FLOOR, (len(when), samples, 2))
+    time = (when - when.mean()) / np.ptp(when)
+    measured = 2.0 * slopes[:, :, 0] + 0.3 * slopes[:, :, 1] * (1.0 + falls * time[:, None])
+    measured += rng.normal(0.0, FLOOR, measured.shape)
+    x = np.linalg.lstsq(slopes.reshape(-1, 2), measured.ravel(), rcond=None)[0]
+    keys, count = ("kp", "coulomb_friction.tau_c_nm"), np.full(len(when), float(samples))
+    final = replace(
+        made_up(("coulomb_friction",), FLOOR),
+        coordinates=tuple(Coordinate(key, i, False, 1.0, -9.0, 9.0) for i, key in enumerate(keys)),
+        x=x,
+        count=count,
+        sse=count * FLOOR**2,
+        held_out=count * FLOOR**2,
+        gram=np.einsum("sni,snj->sij", slopes, slopes),
+        gradient=np.einsum("sni,sn->si", slopes, measured - slopes @ x),
+    )
+    gap = count * (10.0 * FLOOR) ** 2
+    plain = replace(final, effects=(), held_out=gap, sse=gap)
+    judge = Verdicts(floor=FLOOR, weights=resamples(len(when), np.random.default_rng(0)), when=when)
+    found = judge.conclude(plain, final, {"coulomb_friction": [final]}, [], "")
+    assert found.verdict == verdict and ("changes" in found.reason) == bool(falls)

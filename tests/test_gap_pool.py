@@ -1,0 +1,195 @@
+"""Fits one by one, in processes, in threads that simulate together, and from what was kept of them."""
+
+import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gap_recordings import TRUE, made_up, recorded
+
+import vd.kernels.servo.actuators as servo
+from vd.gap.assemble import curves
+from vd.gap.chain import chains
+from vd.gap.design import design
+from vd.gap.fit_cache import FitCache, digest_of
+from vd.gap.launch_batch import LaunchBatch
+from vd.gap.rollout import STEP_S, Rollouts
+from vd.gap.statistics import noise_floor
+from vd.gap.worker_pool import Call, JointSpec, Problems, WorkerPool, parallel
+from vd.gap.workflow import baseline_of
+
+EFFECTS = ("coulomb_friction", "backlash", "load_friction")
+
+
+def fits(pool: WorkerPool, spec: JointSpec) -> list[Any]:
+    base = pool.problems.chains[0].start_row.copy()
+    for column, value in TRUE.items():
+        base[0, column] = 1.1 * value
+    scales = pool.run(spec, [("scales", {"row": base[0], "residual": 0.02})])[0]
+    given = {"base": base, "starts": [{}], "scales": scales, "iterations": 3, "refits": 2}
+    calls: list[Call] = [("fit", {**given, "effects": (effect,)}) for effect in EFFECTS]
+    return pool.run(spec, calls)
+
+
+def problem(extra: dict[int, float], batch: LaunchBatch | None = None) -> tuple[Problems, JointSpec]:
+    """A made-up recording of a servo, and what makes the problem of its joint."""
+    recording = recorded(extra)
+    (chain,) = chains(recording)
+    trajectories, folds = design(recording, chain, 0)
+    spec = JointSpec(0, 0, trajectories, folds, noise_floor(recording, 0), baseline_of(chain))
+    return Problems(recording, [chain], STEP_S, "cpu", batch), spec
+
+
+def test_threads_that_simulate_together_find_what_one_alone_finds() -> None:
+    extra = {servo.COULOMB_TORQUE: 0.06}
+    problems, spec = problem(extra)
+    with WorkerPool(problems, workers=1) as pool:
+        alone, simulated = fits(pool, spec), pool.simulated
+        again = fits(pool, spec)
+        assert pool.simulated == simulated, "a call that was made before is not made again"
+        assert all(one is other for one, other in zip(alone, again, strict=True))
+    batch = LaunchBatch()
+    with WorkerPool(problem(extra, batch)[0], workers=1) as pool:
+        together = fits(pool, spec)
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one.x, other.x)
+        np.testing.assert_array_equal(one.held_out, other.held_out)
+    assert pool.simulated == simulated, "every call counts its own"
+    # Start and end, three steps of a Jacobian and two sets of trials; two of the refits, whose first
+    # Jacobian is known; one prediction.
+    assert batch.launches <= 2 + 3 * 3 + (2 * 3 - 1) + 1
+
+
+PARENT = """
+import time
+import multiprocessing
+from test_gap_pool import problem
+from vd.gap.worker_pool import WorkerPool
+
+if __name__ == "__main__":
+    problems, spec = problem({})
+    with WorkerPool(problems, workers=2) as pool:
+        row = problems.chains[0].start_row[0]
+        pool.run(spec, [("scales", {"row": row, "residual": left}) for left in (0.01, 0.02)])
+        print(*(child.pid for child in multiprocessing.active_children()), flush=True)
+        time.sleep(60.0)
+"""
+ENDING_S = 120.0
+"""Time for orphans to end."""
+
+
+def test_workers_end_with_whom_they_work_for(tmp_path: Path) -> None:
+    script = tmp_path / "parent.py"
+    script.write_text(PARENT)
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    with subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, text=True, env={**os.environ, "PYTHONPATH": path}
+    ) as parent:
+        assert parent.stdout is not None
+        lines = iter(parent.stdout)
+        workers = [int(pid) for pid in next(line for line in lines if line[:1].isdigit()).split()]
+        assert len(workers) == 2 and all(map(runs, workers))
+        parent.send_signal(signal.SIGKILL)
+        parent.wait()
+        end = time.monotonic() + ENDING_S
+        while any(map(runs, workers)) and time.monotonic() < end:
+            time.sleep(0.1)
+        left = [pid for pid in workers if runs(pid)]
+        for pid in left:
+            os.kill(pid, signal.SIGKILL)
+        assert not left
+
+
+def runs(pid: int) -> bool:
+    """Whether a process runs, and is not merely waiting for somebody to ask how it ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_a_worker_that_is_killed_ends_the_run_with_what_to_change() -> None:
+    problems, spec = problem({})
+    others = multiprocessing.active_children()
+    with WorkerPool(problems, workers=2) as pool:
+        fits(pool, spec)
+        for process in multiprocessing.active_children():
+            if process not in others:
+                process.kill()
+        with pytest.raises(ChildProcessError, match=r"one of 2 processes was killed.*memory"):
+            pool.run(spec, [("scales", {"row": problems.chains[0].start_row[0], "residual": 0.03})])
+
+
+def test_a_failure_reaches_all_who_wait() -> None:
+    recording = recorded({})
+    (chain,) = chains(recording)
+    batch = LaunchBatch()
+    rollouts = Rollouts(chain, recording, batch=batch)
+    batch.join(1)
+    with pytest.raises(IndexError):
+        rollouts.predict(chain.start_row[None], [99])
+    batch.leave()
+    np.testing.assert_array_equal(
+        rollouts.predict(chain.start_row[None]), Rollouts(chain, recording).predict(chain.start_row[None])
+    )
+
+
+def test_whoever_stops_does_not_wait_for_the_other_joints() -> None:
+    released, ended = threading.Event(), []
+
+    def work(joint: int) -> None:
+        if joint == 0:
+            raise KeyboardInterrupt
+        ended.append(released.wait(60.0))
+
+    with pytest.raises(KeyboardInterrupt):
+        parallel(work, [0, 1])
+    assert not ended
+    released.set()
+
+
+def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
+    problems, spec = problem({servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2})
+    recording, (chain,) = problems.recording, problems.chains
+    rows = chain.start_row.copy()
+    for column, value in {**TRUE, servo.TORQUE_LIMIT: 0.8, servo.LOAD_FRICTION: 0.2}.items():
+        rows[0, column] = value
+    exact = Rollouts(chain, recording, dt=STEP_S / 32).predict(rows[None])[0]
+    drawn = curves(recording, problems, [("j", spec, rows)])
+    searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
+    assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)
+
+
+def test_equal_calls_have_one_digest_and_others_another() -> None:
+    call = ("fit", {"base": np.arange(3.0), "starts": [{"kp": 1.0, "kd": 2.0}], "fit": made_up((), 1.0)})
+    same = {"fit": made_up((), 1.0), "starts": [{"kd": 2.0, "kp": np.float64(1.0)}], "base": np.arange(3.0)}
+    assert digest_of(call) == digest_of(("fit", same)) == digest_of(pickle.loads(pickle.dumps(call)))
+    others = [
+        ("fits", call[1]),
+        ("fit", {**call[1], "base": np.arange(3)}),
+        ("fit", {**call[1], "starts": [{"kp": 1.0}, {"kd": 2.0}]}),
+        ("fit", {**call[1], "fit": made_up((), 1.1)}),
+    ]
+    assert len({digest_of(other) for other in (call, *others)}) == len(others) + 1
+
+
+def test_fits_that_are_kept_are_of_one_recording_and_those_that_are_damaged_none(tmp_path: Path) -> None:
+    FitCache(tmp_path / "a", "one").add("q", [made_up((), 1.0), 0.5])
+    again = FitCache(tmp_path / "a", "one")
+    assert "q" in again and again["q"][0].coordinates == made_up((), 1.0).coordinates
+    assert "q" not in FitCache(tmp_path / "a", "another")
+    (file,) = (tmp_path / "a").iterdir()
+    whole = file.read_bytes()
+    for content in (whole[: len(whole) // 2], b"", pickle.dumps(print)):
+        file.write_bytes(content)
+        assert "q" not in FitCache(tmp_path / "a", "one"), "nor is anything run that a file asks for"
+    again.forget()
+    assert not (tmp_path / "a").exists()

@@ -1,0 +1,232 @@
+"""The training loop of teachers and students: iterations, curves, checkpoints, and all ways to end."""
+
+import contextlib
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from vd.train.checkpoint import (
+    CHECKPOINT_FOLDER,
+    checkpoint_path,
+    prune_checkpoints,
+    random_state,
+    save_checkpoint,
+    set_random_state,
+)
+from vd.train.config import RunCfg
+from vd.train.distributed import ending_together, join_processes, watch_iteration
+from vd.train.ending import EndRequest, Interrupted, TrainingDivergedError
+from vd.train.metrics import ProgressFile
+from vd.train.progress import ProgressLines
+
+
+class TrainingLoop:
+    """Iterates until steps, time or the user end the run; goes on exactly where it stopped.
+
+    Under ``torchrun`` every process simulates its own environments and gradients are averaged. The first
+    process logs and saves, with the random and environment state of all. What an iteration does, and what a
+    checkpoint holds of it, is in the subclasses.
+
+    Args:
+        run: Run settings.
+        device: Torch device of networks and rollouts.
+        deadline: ``time.monotonic()`` at which to save and end; ``None`` for no limit.
+
+    Attributes:
+        iteration: Iterations completed, over all resumed runs.
+        env_steps: Control steps (clouds in stage 0) completed, over all environments and processes.
+        new_episodes: Why the checkpoint that was loaded could not restore the environments; empty if it did.
+    """
+
+    def __init__(self, run: RunCfg, *, device: str, deadline: float | None = None) -> None:
+        self.run, self.device, self.processes = run, device, join_processes(device)
+        self.iteration, self.env_steps, self._elapsed_s = 0, 0, 0.0
+        self.new_episodes = ""
+        self._end = EndRequest(deadline, device=device, distributed=self.is_distributed)
+
+    @property
+    def is_distributed(self) -> bool:
+        """Whether there are other processes."""
+        return self.processes.world_size > 1
+
+    @property
+    def is_main(self) -> bool:
+        """Whether this process logs and saves."""
+        return self.processes.rank == 0
+
+    @property
+    def steps_per_iteration(self) -> int:
+        """Control steps of an iteration, all environments and processes together."""
+        return self._samples() * self.processes.world_size
+
+    @property
+    def total_iterations(self) -> int:
+        """Iterations at the end of the run, those done included."""
+        left = max(0, self.run.max_steps - self.env_steps)
+        return self.iteration + math.ceil(left / self.steps_per_iteration)
+
+    def learn(self, iterations: int | None = None) -> None:
+        """Train until the steps, the time or the user end it, and save.
+
+        Args:
+            iterations: Iterations to do now; up to ``run.max_steps`` if ``None``.
+
+        Raises:
+            Interrupted: Ctrl-C or SIGTERM, after saving.
+            TrainingDivergedError: Something is not finite any more. The last checkpoint is from before.
+        """
+        first = saved = self.iteration
+        total = self.total_iterations if iterations is None else first + iterations
+        self._begin()
+        progress = ProgressLines(total, enabled=self.is_main)
+        with contextlib.ExitStack() as stack:
+            log: ProgressFile | None = None
+            if self.is_main:
+                log = ProgressFile(self.run.out, tensorboard=self.run.tensorboard, done=first)
+                stack.callback(log.close)
+            stack.enter_context(self._end.signals(progress.note))
+            stack.enter_context(progress)
+            while self.iteration < total and (row := self._row()) is not None:
+                if log is not None:
+                    log.write(row)
+                progress.update(row, self._end.time_left(self.iteration - first, total - self.iteration))
+                if self.iteration % self.run.save_every == 0:
+                    self.save()
+                    saved = self.iteration
+                if self._end.due():
+                    break
+            if saved < self.iteration or self.iteration == 0:
+                self.save()
+        if self._end.signal:
+            raise Interrupted
+
+    def save(self) -> None:
+        """Write a checkpoint, whole or not at all, and the policy. Every process has to call it."""
+        state = self._state()
+        if not self.is_main:
+            return
+        path = checkpoint_path(self.run.out, self.iteration)
+        save_checkpoint(path, state)
+        self._save_policy(path, state)
+        prune_checkpoints(self.run.out, self.iteration, self.run.keep_every)
+
+    def run_to_end(self) -> bool:
+        """Train, and release everything; whether it came to its own end, rather than being interrupted."""
+        whole = True
+        try:
+            with ending_together(Interrupted) if self.is_distributed else contextlib.nullcontext():
+                self.learn()
+        except Interrupted:
+            whole = False
+        finally:
+            self._close()
+        self.shutdown()
+        return whole
+
+    def shutdown(self) -> None:
+        """Leave the process group, so that torchrun ends without a warning.
+
+        All processes have to call it, so not after an error of one: see
+        :func:`vd.train.distributed.ending_together`.
+        """
+        if self.is_distributed:
+            torch.distributed.destroy_process_group()
+
+    def _row(self) -> dict[str, Any] | None:
+        """One iteration; its row for ``progress.jsonl``, or ``None`` if a signal cut its rollout short."""
+        if self.is_distributed:
+            watch_iteration()
+        start = time.perf_counter()
+        try:
+            figures = self._iterate()
+        except TrainingDivergedError as error:
+            raise TrainingDivergedError(
+                f"iteration {self.iteration + 1}: {error}. The last checkpoint in "
+                f"{self.run.out / CHECKPOINT_FOLDER} is from before; go on from it with --resume"
+            ) from error
+        if figures is None:
+            return None
+        passed = time.perf_counter() - start
+        self.iteration += 1
+        self.env_steps += self.steps_per_iteration
+        self._elapsed_s += passed
+        return {
+            "iteration": self.iteration,
+            "env_steps": self.env_steps,
+            "elapsed_s": round(self._elapsed_s, 3),
+            "steps_per_s": self.steps_per_iteration / passed,
+            **figures,
+        }
+
+    def _stopping(self) -> bool:
+        """Whether to cut a rollout short: not with other processes, which all do the same collectives."""
+        return bool(self._end.signal) and not self.is_distributed
+
+    def _state(self) -> dict[str, Any]:
+        """Everything a checkpoint holds."""
+        mine = {"random": random_state(self.device)} | self._own_state()
+        ranks: list[Any] = [mine]
+        if self.is_distributed:
+            ranks = [None] * self.processes.world_size
+            torch.distributed.all_gather_object(ranks, mine)
+        counters = {"iter": self.iteration, "env_steps": self.env_steps, "elapsed_s": self._elapsed_s}
+        return self._shared_state() | counters | {"ranks": ranks}
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        """Take over counters, environments and random state, all but the first only if they fit this run."""
+        self.iteration, self.env_steps = state["iter"], state["env_steps"]
+        self._elapsed_s = state["elapsed_s"]
+        ranks, count = state["ranks"], self.processes.world_size
+        self.new_episodes = (
+            f"it is of {len(ranks)} processes, this run has {count}" if len(ranks) != count else ""
+        ) or self._misfit(ranks)
+        if self.new_episodes:
+            self._start_anew(ranks)
+            return
+        mine = ranks[self.processes.rank]
+        self._load_own_state(mine)
+        set_random_state(mine["random"], self.device)
+
+    # What a subclass does.
+
+    def _samples(self) -> int:
+        """Control steps of an iteration in this process."""
+        raise NotImplementedError
+
+    def _begin(self) -> None:
+        """Before the first iteration: all processes get the networks of the first."""
+        raise NotImplementedError
+
+    def _iterate(self) -> dict[str, Any] | None:
+        """One rollout and update; its figures, or ``None`` if :meth:`_stopping` cut it short."""
+        raise NotImplementedError
+
+    def _shared_state(self) -> dict[str, Any]:
+        """What all processes have alike."""
+        raise NotImplementedError
+
+    def _own_state(self) -> dict[str, Any]:
+        """What belongs to this process: its environments."""
+        raise NotImplementedError
+
+    def _load_own_state(self, state: dict[str, Any]) -> None:
+        """Restore what :meth:`_own_state` gave."""
+        raise NotImplementedError
+
+    def _misfit(self, ranks: list[dict[str, Any]]) -> str:
+        """Why the environments of a checkpoint cannot be restored; empty if they can."""
+        raise NotImplementedError
+
+    def _close(self) -> None:
+        """Release the environments."""
+        raise NotImplementedError
+
+    def _start_anew(self, ranks: list[dict[str, Any]]) -> None:
+        """Begin new episodes, since the environments of the checkpoint do not fit."""
+
+    def _save_policy(self, path: Path, state: dict[str, Any]) -> None:
+        """Write what is used of a checkpoint that was saved as ``path``."""
+        raise NotImplementedError

@@ -1,0 +1,408 @@
+"""Make recordings in which an effect is hidden, to test what finds it.
+
+The recording comes from :mod:`vd.bench.hidden_plant`: random base parameters, sensor noise, encoder
+counts and jittered stamps. What is hidden is written beside the folder, never into it.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd.bench.hidden_finger import FingerBody
+from vd.bench.hidden_plant import OUTSIDE, Plant, Run, simulate, simulate_with_duty
+from vd.files import write_json
+from vd.gap.excitations import Excitation, JointRange, excitation_set
+from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording, Trajectory, write_recording
+from vd.kernels.servo.effects import EFFECTS
+
+ENCODER_COUNT = 2.0 * math.pi / 4096
+"""Twelve bits a turn, as of Dynamixel X and Feetech STS servos [rad]."""
+NOISE_RAD = 3.0e-4
+"""Standard deviation of the reading before it is rounded to counts [rad]."""
+STAMP_JITTER_S = 1.0e-3
+"""Standard deviation of the sampling instants about the regular ones [s]; the stamps tell them."""
+SHORTEST_PERIOD_S = 1.0e-3
+PWM_COUNTS = 885
+"""Counts of a full duty cycle, as of Dynamixel X servos."""
+BASE_SPREAD = 0.2
+"""Base parameters lie within this share of the hand's, as the paper's randomisation has it."""
+PAUSE_S = 2.0
+"""Between two trajectories of a session."""
+FULL_P_GAIN = 400.0
+"""P gain, in the units of Dynamixel X servos, at which the stiffness is the plant's."""
+PLANAR_TOLERANCE = 1.0e-6
+"""Distance [m] from the link's axis that the closed form of the finger ignores."""
+CHUNK = 48
+"""Trajectories simulated together: enough to amortise Python, few enough for memory."""
+
+SERVO = {"kp": 3.0, "kd": 0.3, "velocity_limit": 7.0, "inertia": 2.0e-3, "gravity": 0.0}
+"""A hobby servo that turns a small load about a vertical axis."""
+PENDULUM = {"kp": 3.0, "kd": 0.2, "velocity_limit": 8.0, "inertia": 6.0e-3, "gravity": 0.4}
+"""The rig of the XL330 recordings: some 0.4 kg on an arm of 0.1 m."""
+BARE = {"servo": SERVO, "pendulum": PENDULUM}
+BARE_REACH_RAD = 1.5
+"""Range of a bare servo about its centre [rad]."""
+INERTIA_SPREAD = math.log(2.0)
+"""The unknown inertia and gravity of a bare servo vary by a factor of two, log-uniform."""
+
+COUPLING = "joint_coupling"
+"""The effect that takes more than one joint."""
+
+Effects = Mapping[str, Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class Hiding:
+    """What to make a recording of.
+
+    Attributes:
+        model: A hand's name (one finger of it is recorded), ``servo`` or ``pendulum``.
+        effects: Name to parameter to value; absent parameters take typical values.
+        seed: Of base parameters, noise, jitter.
+        joints: Joints recorded; empty: the first finger, or the one joint of a bare model.
+        effect_joints: Joints that have the effect; absent or empty: all.
+        excitations: Sets of :data:`vd.gap.excitations.MENU`.
+        noise_rad: Noise of readings before rounding [rad].
+        jitter_s: Jitter of the sampling instants [s].
+        base_spread: Spread of stiffness, damping and speed limit about the hand's; 0: exactly the hand's.
+        mass_spread: Spread of the finger's masses and inertias about the hand's.
+        pwm: Record the duty cycle as well.
+    """
+
+    model: str
+    effects: Effects = field(default_factory=dict)
+    seed: int = 0
+    joints: tuple[str, ...] = ()
+    effect_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    excitations: tuple[str, ...] = ("steps_and_sines",)
+    noise_rad: float = NOISE_RAD
+    jitter_s: float = STAMP_JITTER_S
+    base_spread: float = BASE_SPREAD
+    mass_spread: float = 0.0
+    pwm: bool = False
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """A recording and what is hidden in it.
+
+    Attributes:
+        recording: The recording, not yet written.
+        truth: Model, seed, base parameters per joint, effects with their parameters and joints, noise.
+    """
+
+    recording: Recording
+    truth: dict[str, Any]
+
+
+def parse_effect(text: str) -> tuple[str, dict[str, float], tuple[str, ...]]:
+    """Read ``NAME[@joint+joint..][:p=v,..]``.
+
+    Returns:
+        Name, the parameters given, and the joints (empty: all).
+
+    Raises:
+        ValueError: Unknown name or parameter, or a value that is no finite number.
+    """
+    head, _, tail = text.partition(":")
+    name, _, joints = head.partition("@")
+    name = name.strip()
+    known = effect_parameters(name)
+    values: dict[str, float] = {}
+    for item in filter(None, (part.strip() for part in tail.split(","))):
+        key, equals, value = (part.strip() for part in item.partition("="))
+        if key not in known:
+            raise ValueError(f"effect {text!r}: {name} has no parameter {key!r}; it has {', '.join(known)}")
+        try:
+            values[key] = float(value) if equals else math.nan
+        except ValueError:
+            values[key] = math.nan
+        if not math.isfinite(values[key]):
+            raise ValueError(f"effect {text!r}: {key} is {value!r}; write {key}=NUMBER")
+    return name, values, tuple(filter(None, (joint.strip() for joint in joints.split("+"))))
+
+
+def effect_parameters(name: str) -> dict[str, float]:
+    """Parameters of an effect, of the table or outside, with typical values.
+
+    Raises:
+        ValueError: There is no such effect.
+    """
+    if name in EFFECTS:
+        return {parameter.name: parameter.typical for parameter in EFFECTS[name].parameters}
+    if name in OUTSIDE:
+        return dict(OUTSIDE[name])
+    raise ValueError(f"unknown effect {name!r}; choose from {', '.join((*EFFECTS, *OUTSIDE))}")
+
+
+def hide(
+    model: str,
+    effects: Effects,
+    out: str | Path,
+    *,
+    seed: int = 0,
+    **options: Any,
+) -> Hidden:
+    """Write a recording in which effects are hidden, and the truth beside it as ``OUT.truth.json``.
+
+    Args:
+        model: A hand's name, ``servo`` or ``pendulum``.
+        effects: Name to parameter to value; absent parameters take typical values.
+        out: Folder to write.
+        seed: Of everything random.
+        options: Further fields of :class:`Hiding`.
+
+    Raises:
+        ValueError: An unknown model, joint, effect, parameter or excitation.
+    """
+    (hidden,) = simulate_hidden([Hiding(model=model, effects=effects, seed=seed, **options)])
+    write_hidden(hidden, out)
+    return hidden
+
+
+def write_hidden(hidden: Hidden, out: str | Path) -> None:
+    """Write the recording to the folder ``out`` and the truth to ``OUT.truth.json`` beside it."""
+    out = Path(out)
+    write_recording(hidden.recording, out)
+    write_json(truth_path(out), hidden.truth)
+
+
+def truth_path(out: str | Path) -> Path:
+    """Where the truth about the recording in ``out`` is written."""
+    out = Path(out)
+    return out.parent / f"{out.name}.truth.json"
+
+
+def simulate_hidden(hidings: Sequence[Hiding]) -> list[Hidden]:
+    """Make recordings, many at a time: a batch costs little more than one.
+
+    Args:
+        hidings: What to hide; all of models with as many joints, all hands or none.
+
+    Raises:
+        ValueError: As of :func:`hide`.
+    """
+    sessions = [_Session(hiding) for hiding in hidings]
+    runs = [run for session in sessions for run in session.runs]
+    # Long trajectories with long ones: a batch runs as long as its longest.
+    order = sorted(range(len(runs)), key=lambda i: runs[i].time[-1])
+    positions: dict[int, np.ndarray] = {}
+    duties: dict[int, np.ndarray] = {}
+    for start in range(0, len(order), CHUNK):
+        part = order[start : start + CHUNK]
+        chosen = [runs[i] for i in part]
+        if any(hiding.pwm for hiding in hidings):
+            for i, (position, duty) in zip(part, simulate_with_duty(chosen), strict=True):
+                positions[i], duties[i] = position, duty
+        else:
+            positions.update(zip(part, simulate(chosen), strict=True))
+    results, first = [], 0
+    for session in sessions:
+        own = range(first, first + len(session.runs))
+        told = [duties[i] for i in own] if session.hiding.pwm else None
+        results.append(session.finish([positions[i] for i in own], told))
+        first += len(session.runs)
+    return results
+
+
+class _Session:
+    """One recording being made: what is drawn, what is to be simulated, what the sensor says."""
+
+    def __init__(self, hiding: Hiding):
+        self.hiding = hiding
+        self.rng = np.random.default_rng(hiding.seed)
+        reach, self.plant = machine(hiding, self.rng)
+        self.motions = excitation_set(reach, hiding.excitations)
+        self.runs: list[Run] = []
+        session_s = 0.0
+        for motion in self.motions:
+            time = self._stamps(motion)
+            seed = int(self.rng.integers(2**31))
+            self.runs.append(
+                Run(self.plant, time, motion.command, motion.enabled, motion.conditions, session_s, seed)
+            )
+            session_s += motion.duration + PAUSE_S
+
+    def _stamps(self, motion: Excitation) -> np.ndarray:
+        """The instants at which commands are written and positions read [T] [s], from 0."""
+        time = motion.time + self.rng.normal(0.0, self.hiding.jitter_s, len(motion.time))
+        time[0] = 0.0
+        # Late ones push the next; as many digits as are written, so that readers see the same stamps.
+        for i in range(1, len(time)):
+            time[i] = max(time[i], time[i - 1] + SHORTEST_PERIOD_S)
+        return np.round(time, 6)
+
+    def finish(self, positions: Sequence[np.ndarray], duties: Sequence[np.ndarray] | None = None) -> Hidden:
+        """Add noise and rounding; the recording and the truth."""
+        hiding = self.hiding
+        trajectories = []
+        for i, (motion, run, position) in enumerate(zip(self.motions, self.runs, positions, strict=True)):
+            noisy = position + self.rng.normal(0.0, hiding.noise_rad, position.shape)
+            trajectories.append(
+                Trajectory(
+                    file=f"{i:03d}_{motion.joints[0]}_{motion.name}.csv",
+                    excitation=motion.name,
+                    joints=motion.joints,
+                    conditions={"p_gain": self.plant.full_gain, **motion.conditions},
+                    time=run.time,
+                    command=motion.command,
+                    position=np.round(noisy / ENCODER_COUNT) * ENCODER_COUNT,
+                    enabled=motion.enabled,
+                    pwm=None if duties is None else np.round(duties[i] * PWM_COUNTS) / PWM_COUNTS,
+                )
+            )
+        servo: dict[str, Any] = {"model": "test rig", "p_gain": self.plant.full_gain}
+        if hiding.model in BARE_MODELS:  # without masses nothing else tells how large torques are
+            servo[STIFFNESS] = _by_joint(self.plant, self.plant.kp)
+        recording = Recording(
+            Path(),
+            hiding.model,
+            self.plant.joints,
+            servo if duties is None else {**servo, "pwm_full_scale": PWM_COUNTS},
+            ENCODER_COUNT,
+            tuple(trajectories),
+        )
+        return Hidden(recording, self._truth())
+
+    def _truth(self) -> dict[str, Any]:
+        plant, hiding = self.plant, self.hiding
+        return {
+            "format": "vd-hidden/1",
+            "model": hiding.model,
+            "seed": hiding.seed,
+            "noise_floor_rad": noise_floor(hiding.noise_rad),
+            "mass_spread": hiding.mass_spread,
+            "base": {
+                "kp": _by_joint(plant, plant.kp),
+                "kd": _by_joint(plant, plant.kd),
+                "velocity_limit": _by_joint(plant, plant.velocity_limit),
+                "inertia": _by_joint(plant, plant.inertia),
+                "gravity_torque": _by_joint(plant, plant.gravity_torque),
+            },
+            "effects": {
+                name: {
+                    "joints": list(_effect_joints(hiding, name, plant.joints)),
+                    "parameters": {key: _by_joint(plant, values) for key, values in parameters.items()},
+                }
+                for name, parameters in plant.effects.items()
+            },
+        }
+
+
+def noise_floor(noise_rad: float = NOISE_RAD, count_rad: float = ENCODER_COUNT) -> float:
+    """Standard deviation of a reading about the true position [rad]: noise, and rounding to counts."""
+    return math.hypot(noise_rad, count_rad / math.sqrt(12.0))
+
+
+def _by_joint(plant: Plant, values: np.ndarray) -> dict[str, float]:
+    return {joint: float(value) for joint, value in zip(plant.joints, values, strict=True)}
+
+
+def machine(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
+    """Draw the machine: the range of its joints, and the plant with its effects."""
+    reach, plant = _bare(hiding, rng) if hiding.model in BARE_MODELS else _finger(hiding, rng)
+    effects = {}
+    for name, given in hiding.effects.items():
+        typical = effect_parameters(name)
+        for key, value in given.items():
+            if key not in typical:
+                raise ValueError(f"{name} has no parameter {key!r}; it has {', '.join(typical)}")
+            if not math.isfinite(value):
+                raise ValueError(f"{name}: {key} is {value}; give a finite number")
+            if value < 0.0 and key not in _signed(name):
+                raise ValueError(f"{name}: {key} is {value}; it cannot be negative")
+        having = _effect_joints(hiding, name, plant.joints)
+        if name == COUPLING and len(plant.joints) == 1:
+            raise ValueError(f"{name}: {hiding.model} has one joint, which nothing can drive; take a hand")
+        on = np.array([joint in having for joint in plant.joints], dtype=float)
+        effects[name] = {key: on * given.get(key, value) for key, value in typical.items()}
+    return reach, Plant(**{**vars(plant), "effects": effects})
+
+
+def _signed(name: str) -> set[str]:
+    """Parameters of an effect that can be negative."""
+    known = EFFECTS[name].parameters if name in EFFECTS else ()
+    return {parameter.name for parameter in known if parameter.signed}
+
+
+def _effect_joints(hiding: Hiding, name: str, joints: tuple[str, ...]) -> tuple[str, ...]:
+    having = tuple(hiding.effect_joints.get(name, ())) or joints
+    for joint in having:
+        if joint not in joints:
+            raise ValueError(f"effect {name}: unknown joint {joint!r}; recorded are {', '.join(joints)}")
+    return having
+
+
+def _bare(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
+    nominal = BARE[hiding.model]
+    joints = hiding.joints or ("joint" if hiding.model == "servo" else "pendulum",)
+    count = len(joints)
+    near = _spread(rng, hiding.base_spread, (3, count))
+    far = np.exp(_spread(rng, INERTIA_SPREAD if hiding.base_spread else 0.0, (2, count)) - 1.0)
+    reach = JointRange(joints, np.full(count, -BARE_REACH_RAD), np.full(count, BARE_REACH_RAD), FULL_P_GAIN)
+    return reach, Plant(
+        joints=joints,
+        kp=nominal["kp"] * near[0],
+        kd=nominal["kd"] * near[1],
+        velocity_limit=nominal["velocity_limit"] * near[2],
+        inertia=nominal["inertia"] * far[0],
+        gravity_torque=nominal["gravity"] * far[1],
+        full_gain=FULL_P_GAIN,
+    )
+
+
+def _spread(rng: np.random.Generator, width: float, shape: tuple[int, ...]) -> np.ndarray:
+    """Factors 1 - width .. 1 + width."""
+    return 1.0 + rng.uniform(-width, width, shape)
+
+
+def _finger(hiding: Hiding, rng: np.random.Generator) -> tuple[JointRange, Plant]:
+    from vd.assets_usd.hands import load_hand
+
+    hand = load_hand(hiding.model)
+    joints = hiding.joints or hand.joint_names[:3]
+    if len(joints) != 3 or any(j not in hand.joint_names for j in joints):
+        raise ValueError(f"joints {', '.join(joints)}: name the three joints of a finger of {hiding.model}")
+    index = [hand.joint_names.index(joint) for joint in joints]
+    if index != list(range(index[0], index[0] + 3)) or index[0] % 3:
+        raise ValueError(f"joints {', '.join(joints)}: name the three joints of one finger, in order")
+    links = [int(hand.joint_child[i]) for i in index]
+    com, inertia = hand.link_com[links], hand.link_inertia[links]
+    frames = hand.joint_parent_frame[index[1:]]
+    tip = hand.tip_frame[index[0] // 3]
+    axes = np.eye(3)[[0, 1, 1]]
+    across = np.abs(np.concatenate([com[:, :2].ravel(), frames[:, :2].ravel(), tip[:2]])).max()
+    turned = np.abs(frames[:, 3:6]).max()
+    tilted = np.abs(inertia - np.einsum("lii,ij->lij", inertia, np.eye(3))).max() / inertia.max()
+    straight = (hand.joint_axis[index] == axes).all() and max(across, turned) < PLANAR_TOLERANCE
+    if not straight or tilted > PLANAR_TOLERANCE * 1e3:
+        raise ValueError(
+            f"{hiding.model}: hidden recordings need fingers of the D'Claw's kind (swing about x, bends "
+            "about y, links along z); use dclaw3, dclaw4, servo or pendulum"
+        )
+    near = _spread(rng, hiding.base_spread, (3, 3))
+    heavy = _spread(rng, hiding.mass_spread, (3,))
+    body = FingerBody(
+        mass=hand.link_mass[links] * heavy,
+        com=com[:, 2],
+        inertia=np.einsum("lii->li", inertia) * heavy[:, None],
+        offset=float(frames[0, 2]),
+        spacing=float(frames[1, 2]),
+        tip=float(tip[2]),
+    )
+    reach = JointRange(tuple(joints), hand.lower[index], hand.upper[index], FULL_P_GAIN)
+    return reach, Plant(
+        joints=tuple(joints),
+        kp=hand.kp[index] * near[0],
+        kd=hand.kd[index] * near[1],
+        velocity_limit=hand.velocity_limit[index] * near[2],
+        inertia=hand.armature[index],
+        gravity_torque=np.zeros(3),
+        body=body,
+        full_gain=FULL_P_GAIN,
+        effort=hand.effort[index],
+    )
