@@ -1,21 +1,129 @@
-"""Depth by rasterisation: one thread a triangle, which looks at the pixels it can cover.
+"""Depth images by rasterisation: one thread a triangle, which looks at the pixels it can cover.
 
-The same image as :mod:`vd.kernels.sensor.raycast`, by turning the loops around: a mesh of the size of these
-covers few pixels with each triangle. A pixel is covered if the ray through its centre meets the triangle,
-tested without dividing by depth, so that triangles beside and behind the camera need no clipping.
+Frames: *optical* is the camera's (x right, y down, z forward); depth is z of that frame, along the optical
+axis, not along the ray. Pixel (column, row) is seen along its centre, (column + 0.5, row + 0.5); the
+principal point is measured from the top left corner of the image. Metres, quaternions xyzw.
+
+A mesh of the size of these covers few pixels with each triangle. A pixel is covered if the ray through its
+centre meets the triangle, tested without dividing by depth, so that triangles beside and behind the camera
+need no clipping.
 
 Launch order: ``place_camera_kernel``, ``place_meshes_kernel``, then ``depth.fill_(NO_HIT)``,
-``rasterise_kernel``, and ``finish_depth_kernel`` (:mod:`vd.kernels.sensor.depth_views`).
+``rasterise_kernel`` and ``finish_depth_kernel``.
 """
 
 import warp as wp
 
-from vd.kernels.sensor.depth_views import View
-
 wp.set_module_options({"enable_backward": False})
+
+NO_HIT = wp.constant(1.0e9)
+"""Depth of nothing while the nearest surface is looked for [m]."""
+
+EMPTY = wp.constant(0.0)
+"""Depth in a finished image where nothing was measured."""
+
+TINY = wp.constant(1.0e-9)
+"""Stands in for a zero component of a direction, so that its reciprocal is finite."""
 
 MARGIN = wp.constant(1.0e-3)
 """Pixels by which a triangle's bounds are widened: above the rounding of a projection."""
+
+
+@wp.struct
+class View:
+    """A pinhole camera: focal lengths and principal point [pixel], nearest and farthest depth [m].
+
+    What is nearer than the range is opaque, but has no depth.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    near: float
+    far: float
+
+
+@wp.func
+def pixel_direction(view: View, column: int, row: int) -> wp.vec3:
+    """Direction through the centre of a pixel in the optical frame, z = 1: times depth it is the point."""
+    return wp.vec3(
+        (float(column) + 0.5 - view.cx) / view.fx,
+        (float(row) + 0.5 - view.cy) / view.fy,
+        1.0,
+    )
+
+
+@wp.func
+def box_depth(origin: wp.vec3, direction: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> float:
+    """Multiple of ``direction`` at which a ray enters a box; NO_HIT if it misses or starts inside."""
+    enter = wp.float32(0.0)
+    leave = wp.float32(NO_HIT)
+    for axis in range(3):
+        step = direction[axis]
+        if wp.abs(step) < TINY:
+            step = TINY
+        a = (lower[axis] - origin[axis]) / step
+        b = (upper[axis] - origin[axis]) / step
+        enter = wp.max(enter, wp.min(a, b))
+        leave = wp.min(leave, wp.max(a, b))
+    if enter > leave or enter <= 0.0:
+        return NO_HIT
+    return enter
+
+
+@wp.kernel
+def place_camera_kernel(
+    # Model:
+    camera_body: int,
+    # In:
+    extrinsics_in: wp.array[wp.transform],
+    body_q_in: wp.array2d[wp.transform],
+    # Out:
+    camera_q_out: wp.array[wp.transform],
+):
+    """Pose of each world's optical frame in the world frame, shape [N]. Launch: [N].
+
+    Args:
+        camera_body: Body that carries the camera, an index within a world; negative for the world itself.
+        extrinsics_in: Optical frame in the frame of that body, shape [N].
+        body_q_in: Body poses in the world frame, shape [N, B].
+        camera_q_out: Optical frame in the world frame, shape [N].
+    """
+    world = wp.tid()
+    pose = extrinsics_in[world]
+    if camera_body >= 0:
+        pose = wp.transform_multiply(body_q_in[world, camera_body], pose)
+    camera_q_out[world] = pose
+
+
+@wp.kernel
+def place_meshes_kernel(
+    # Model:
+    shape_body: wp.array[int],
+    # In:
+    camera_q_in: wp.array[wp.transform],
+    body_q_in: wp.array2d[wp.transform],
+    # Out:
+    rotation_out: wp.array2d[wp.mat33],
+    position_out: wp.array2d[wp.vec3],
+):
+    """Place every mesh before its camera. Launch: [N, S].
+
+    Args:
+        shape_body: Body that carries each shape, an index within a world; negative for the world, shape [S].
+        camera_q_in: Optical frames in the world frame, shape [N].
+        body_q_in: Body poses in the world frame, shape [N, B].
+        rotation_out: Rotation from mesh to optical frame, shape [N, S].
+        position_out: Origin of the mesh frame in the optical frame [m], shape [N, S].
+    """
+    world, shape = wp.tid()
+    pose = wp.transform_inverse(camera_q_in[world])
+    body = shape_body[shape]
+    if body >= 0:
+        pose = wp.transform_multiply(pose, body_q_in[world, body])
+    rotation_out[world, shape] = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+    position_out[world, shape] = wp.transform_get_translation(pose)
 
 
 @wp.func
@@ -46,7 +154,6 @@ def rasterise_kernel(
     # In:
     rotation_in: wp.array2d[wp.mat33],
     position_in: wp.array2d[wp.vec3],
-    window_in: wp.array2d[wp.vec4],
     # Out:
     depth_bits: wp.array3d[wp.int32],
 ):
@@ -63,7 +170,6 @@ def rasterise_kernel(
         shape_scale: Size factor of each shape, shape [N, S].
         rotation_in: Rotation from mesh to optical frame, shape [N, S].
         position_in: Origin of the mesh frame in the optical frame [m], shape [N, S].
-        window_in: Pixels that each shape's bounds cover, shape [N, S].
         depth_bits: Depth [m] as the bits of a float, whose order as integers is that of positive floats, for
             which devices have an atomic minimum; shape [N, H, W].
     """
@@ -71,8 +177,7 @@ def rasterise_kernel(
     shape = slot_shape[slot]
     mesh = shape_mesh[world, shape]
     triangle = mesh_first[mesh] + slot_index[slot]
-    window = window_in[world, shape]
-    if triangle >= mesh_first[mesh + 1] or window[0] > window[2]:
+    if triangle >= mesh_first[mesh + 1]:
         return
     view = views[world]
     rotation = rotation_in[world, shape] * shape_scale[world, shape]
@@ -81,7 +186,7 @@ def rasterise_kernel(
     a = rotation * points[corner[0]] + position
     b = rotation * points[corner[1]] + position
     c = rotation * points[corner[2]] + position
-    if wp.max(a[2], wp.max(b[2], c[2])) <= 0.0:
+    if not (wp.max(a[2], wp.max(b[2], c[2])) > 0.0):  # behind the camera, or no number
         return
 
     height = depth_bits.shape[1]
@@ -133,3 +238,42 @@ def rasterise_kernel(
                     bits = wp.cast(wp.clamp(offset / slope, nearest, farthest), wp.int32)
                     if bits < depth_bits[world, row, column]:
                         wp.atomic_min(depth_bits, world, row, column, bits)
+
+
+@wp.kernel
+def finish_depth_kernel(
+    # Model:
+    views: wp.array[View],
+    table_lower: wp.vec3,
+    table_upper: wp.vec3,
+    lanes: int,
+    # In:
+    table_in: wp.array[int],
+    camera_q_in: wp.array[wp.transform],
+    # In/Out:
+    depth: wp.array3d[float],
+):
+    """Add the table, and write 0 where nothing is within the camera's range. Launch: [N, H, lanes].
+
+    Args:
+        views: Camera of each world, shape [N].
+        table_lower: Lower corner of the table in the world frame [m].
+        table_upper: Upper corner [m].
+        lanes: Threads of a row.
+        table_in: Whether the table is there, shape [N].
+        camera_q_in: Optical frames in the world frame, shape [N].
+        depth: Depth of the nearest mesh along the optical axis [m], then of anything, shape [N, H, W].
+    """
+    world, row, lane = wp.tid()
+    view = views[world]
+    camera_q = camera_q_in[world]
+    eye = wp.transform_get_translation(camera_q)
+    rotation = wp.quat_to_matrix(wp.transform_get_rotation(camera_q))
+    for column in range(lane, depth.shape[2], lanes):
+        best = depth[world, row, column]
+        if table_in[world] != 0:
+            direction = rotation * pixel_direction(view, column, row)
+            best = wp.min(best, box_depth(eye, direction, table_lower, table_upper))
+        if best < view.near or best > view.far:
+            best = EMPTY
+        depth[world, row, column] = best
