@@ -7,7 +7,7 @@ Launch order: ``crop_pixels_kernel``, ``count_points_kernel``, ``choose_points_k
 import warp as wp
 
 from vd.kernels.rng import next_stream
-from vd.kernels.sensor.rasterise import View, pixel_direction
+from vd.kernels.sensor.raycast import View, pixel_direction
 
 wp.set_module_options({"enable_backward": False})
 

@@ -1,4 +1,4 @@
-"""Depth by rasterisation against closed forms; against Newton's camera see test_depth_camera.py.
+"""Depth by ray casting against closed forms; against Newton's camera see test_depth_camera.py.
 
 Rule of the silhouette: a pixel is left out of a comparison if the oracle, cast through four points a
 hundredth of a pixel around its centre, does not see one flat surface, or sees it at the very end of the

@@ -21,12 +21,12 @@ from vd.kernels.sensor.depth_sensor import (
     measure_depth_kernel,
     next_count_kernel,
 )
-from vd.kernels.sensor.rasterise import (
+from vd.kernels.sensor.raycast import (
     NO_HIT,
+    cast_rays_kernel,
     finish_depth_kernel,
     place_camera_kernel,
     place_meshes_kernel,
-    rasterise_kernel,
 )
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
@@ -198,7 +198,7 @@ class DepthCamera:
         )
         self.true_depth.fill_(NO_HIT)
         self._launch(
-            rasterise_kernel,
+            cast_rays_kernel,
             (n, len(surfaces.slot_shape)),
             [
                 self.views,

@@ -16,7 +16,7 @@ from vd.kernels.sensor.depth_cloud import (
     crop_pixels_kernel,
     next_frame_kernel,
 )
-from vd.kernels.sensor.rasterise import View
+from vd.kernels.sensor.raycast import View
 from vd.paper import PAPER
 
 

@@ -72,7 +72,7 @@ class SurfaceSet:
         # Worlds differ in their objects' triangles; there is a thread for each of the most.
         most = sizes[shape_mesh].max(axis=0)
         self.slot_shape = array(np.repeat(np.arange(self.num_shapes), most), wp.int32)
-        """Shape of each thread of the rasterisation, shape [K]."""
+        """Shape of each thread of the ray casting, shape [K]."""
         self.slot_index = array(np.concatenate([np.arange(n) for n in most]), wp.int32)
         """Triangle of each thread within its mesh, shape [K]."""
 

@@ -1,4 +1,4 @@
-"""Depth images by rasterisation: one thread a triangle, which looks at the pixels it can cover.
+"""Depth images by ray casting: one thread a triangle, which tests the rays of the pixels it can cover.
 
 Frames: *optical* is the camera's (x right, y down, z forward); depth is z of that frame, along the optical
 axis, not along the ray. Pixel (column, row) is seen along its centre, (column + 0.5, row + 0.5); the
@@ -9,7 +9,7 @@ centre meets the triangle, tested without dividing by depth, so that triangles b
 need no clipping.
 
 Launch order: ``place_camera_kernel``, ``place_meshes_kernel``, then ``depth.fill_(NO_HIT)``,
-``rasterise_kernel`` and ``finish_depth_kernel``.
+``cast_rays_kernel`` and ``finish_depth_kernel``.
 """
 
 import warp as wp
@@ -141,7 +141,7 @@ def edge_normal(a: wp.vec3, b: wp.vec3, index_a: int, index_b: int) -> wp.vec3:
 
 
 @wp.kernel
-def rasterise_kernel(
+def cast_rays_kernel(
     # Model:
     views: wp.array[View],
     points: wp.array[wp.vec3],
