@@ -366,7 +366,7 @@ def _session(
 
 def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":
     """The recording in the folder, or an empty one."""
-    from vd.assets_usd.hand_spec import HANDS
+    from vd.assets_usd.hands import HANDS
     from vd.gap.recording import Recording, read_recording
 
     hand = connection.hand

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.assets_usd.hand_spec import HANDS
+from vd.assets_usd.hands import HANDS
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.hardware.control_table import RAD_PER_COUNT
 from vd.files import make_folder, write_json, writing
