@@ -13,8 +13,8 @@ from pxr import Gf, Sdf
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CameraModel, HandError, HandModel
+from vd.assets_usd.hand_layer import open_layer, save_layer
 from vd.assets_usd.hand_model import OPTICAL_FROM_USD, read_hand
-from vd.files import atomic_path
 
 CAMERA_LAYER_FORMAT = "vd-camera-layer/1"
 """What ``customLayerData`` of a layer says it is."""
@@ -32,9 +32,7 @@ def write_camera_layer(path: Path, hand: HandModel, pose: np.ndarray, notes: Map
     Raises:
         HandError: The file is not to be a ``.usda``, or the pose is none.
     """
-    path, pose = Path(path), np.asarray(pose, dtype=float)
-    if path.suffix != ".usda":
-        raise HandError(f"{path}: a camera layer is plain text; give it the suffix .usda")
+    pose = np.asarray(pose, dtype=float)
     if pose.shape != (7,) or not np.isfinite(pose).all():
         raise HandError(f"{path}: the camera's pose is {pose}; it must be 7 finite numbers")
     layer = Sdf.Layer.CreateAnonymous(".usda")
@@ -48,9 +46,7 @@ def write_camera_layer(path: Path, hand: HandModel, pose: np.ndarray, notes: Map
         ("xformOp:orient", Sdf.ValueTypeNames.Quatd, Gf.Quatd(w, x, y, z)),
     ):
         Sdf.AttributeSpec(camera, name, kind).default = value
-    with atomic_path(path) as temporary:
-        if not layer.Export(str(temporary)):
-            raise OSError(f"{path}: USD could not write the layer; is the disk full?")
+    save_layer(layer, path)
 
 
 def read_camera(hand: HandModel, layer: Path) -> CameraModel:
@@ -63,8 +59,7 @@ def read_camera(hand: HandModel, layer: Path) -> CameraModel:
     Raises:
         HandError: The file is missing, no such layer, or not one of this hand.
     """
-    found = Sdf.Layer.FindOrOpen(str(layer)) if Path(layer).is_file() else None
-    if found is None or found.customLayerData.get("format") != CAMERA_LAYER_FORMAT:
+    if not Path(layer).is_file() or open_layer(layer).customLayerData.get("format") != CAMERA_LAYER_FORMAT:
         raise HandError(
             f"{layer}: no camera layer ({CAMERA_LAYER_FORMAT}); name the camera.usda that "
             "vd-deploy calibrate wrote"

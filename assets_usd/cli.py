@@ -1,11 +1,11 @@
-"""``vd-assets``: author hands, author objects, import meshes, draw contact sheets."""
+"""``vd-assets``: write hands, author objects, import meshes, draw contact sheets."""
 
-import json
 import re
 import sys
 import time
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -23,32 +23,29 @@ WORST_SHOWN = 3
 
 @dataclass(frozen=True)
 class Hand:
-    """Author the D'Claw hands in USD."""
+    """Say where the USD files of the D'Claw hands are, or copy them."""
 
     names: tyro.conf.Positional[tuple[str, ...]] = ()
-    """Hands to author; all of them by default."""
+    """Hands; all of them by default."""
     out: Path | None = None
-    """Folder to write to; the asset cache by default."""
-    json: bool = False
-    """Print the paths as JSON."""
+    """Folder to copy them to."""
 
 
 @dataclass(frozen=True)
 class Objects:
-    """Author our own objects: a procedural set, or the symmetric solids."""
+    """Author a set of procedural objects. Commands also author it when they are told its name.
+
+    The cube and the cuboid are the sets cube, cuboid and symmetric.
+    """
 
     procedural: int = 150
-    """Number of procedural objects."""
+    """Number of objects."""
     seed: int = 0
     """Seed of the set; equal seeds give equal objects."""
     held_out: bool = False
     """Take the held-out families, which share no kind with the training families."""
-    symmetric: bool = False
-    """Author the cube and the cuboid in place of a procedural set."""
     out: Path | None = None
     """Folder to write to; by default the named set in the asset cache (such as procedural-150-seed0)."""
-    json: bool = False
-    """Print folder and objects as JSON."""
 
 
 @dataclass(frozen=True)
@@ -75,28 +72,18 @@ class Import:
     mass: float | None = None
     """Mass of each object [kg]; without this and --density 0.1. Training draws masses of its own unless its
     randomisation is off."""
-    drop_gone: bool = False
-    """Remove from the set the objects whose mesh file is gone. Without it they stay, and are named."""
     jobs: int = 0
     """Meshes at a time; 0: one per core."""
-    force: bool = False
-    """Write every object anew, even if nothing has changed."""
     max_hulls: int = 32
     """Most convex parts per object. Eight are tried first, and more where these are off by more than 15 %."""
     threshold: float = 0.08
     """CoACD's concavity threshold, 0.01-1: smaller is finer and slower."""
     mcts_iterations: int = 20
     """CoACD's search effort; more is finer and slower."""
-    max_hull_vertices: int = 32
-    """Most vertices per part."""
     time_limit: float = 120.0
     """Processor time [s] of one decomposition, after which a mesh falls back to a coarser one."""
     licence: str = "unknown"
     """Licence to record where no objects.csv (columns name, source) lies with the meshes."""
-    split: str = ""
-    """Split to record, such as train or test, where no objects.csv names one."""
-    json: bool = False
-    """Print one record per mesh as JSON."""
 
 
 @dataclass(frozen=True)
@@ -107,16 +94,6 @@ class Show:
     """Folders, object files or set names (cube, procedural-150-seed0, ...)."""
     out: Path = Path("sheet.png")
     """PNG to write."""
-    tile: int = 170
-    """Side of one picture, pixels."""
-    columns: int = 0
-    """Objects per row; 0: about as wide as high."""
-    common_scale: bool = False
-    """Draw all objects at the same scale."""
-    limit: int = 0
-    """Draw only the first so many objects; 0: all."""
-    title: str = ""
-    """Headline; the names of the sets by default."""
 
 
 Command = (
@@ -127,76 +104,53 @@ Command = (
 )
 
 
-@dataclass
-class _Bar:
-    """Progress bar on standard error; nothing where that is no terminal and ``json`` is asked for."""
+def _bar(label: str) -> Callable[[str, int, int], None]:
+    """A progress bar on standard error, to be called with a name, the number done and the number of all."""
+    bars: list[Any] = []
 
-    total_label: str
-    bar: Any = field(default=None, init=False)
+    def advance(name: str, done: int, total: int) -> None:
+        from tqdm import tqdm
 
-    def __call__(self, name: str, done: int, total: int) -> None:
-        if self.bar is None:
-            from tqdm import tqdm
-
-            self.bar = tqdm(total=total, desc=self.total_label, unit="object", mininterval=0.5)
-        self.bar.set_postfix_str(name, refresh=False)
-        self.bar.update(done - self.bar.n)
+        if not bars:
+            bars.append(tqdm(total=total, desc=label, unit="object", mininterval=0.5))
+        bars[0].set_postfix_str(name, refresh=False)
+        bars[0].update(done - bars[0].n)
         if done == total:
-            self.bar.close()
+            bars[0].close()
 
-    def write(self, line: str) -> None:
-        """Print a line above the bar."""
-        self.bar.write(line, file=sys.stderr)
+    return advance
 
 
 def run_hand(command: Hand) -> int:
-    """Author hands."""
-    from vd.assets_usd.hand_author import hand_usd
-    from vd.assets_usd.hand_spec import HANDS
+    """Name or copy hands."""
+    from vd.assets_usd.hands import HANDS, hand_usd
     from vd.files import write_text
 
-    unknown = [name for name in command.names if name not in HANDS]
-    if unknown:
-        print(f"no hand named {', '.join(unknown)}; there are: {', '.join(HANDS)}", file=sys.stderr)
-        return 2
-    paths = {}
-    for name in command.names or tuple(HANDS):
-        path = hand_usd(name)
+    paths = [hand_usd(name) for name in command.names or HANDS]
+    for path in paths:
         if command.out is not None:
-            path, text = command.out / path.with_stem(name).name, path.read_text()
-            if path.exists() and path.read_text(errors="replace") != text:
-                raise ValueError(f"{path} is there and another hand; write to another folder (--out)")
-            write_text(path, text)
-        paths[name] = str(path)
-    print(json.dumps(paths, indent=1) if command.json else "\n".join(paths.values()))
+            target, text = command.out / path.name, path.read_text()
+            if target.exists() and target.read_text(errors="replace") != text:
+                raise ValueError(f"{target} is there and another hand; write to another folder (--out)")
+            write_text(target, text)
+            path = target
+        print(path)
     return 0
 
 
 def run_objects(command: Objects) -> int:
-    """Author procedural or symmetric objects."""
+    """Author procedural objects."""
     from vd.assets_usd.objects import procedural, sets
 
-    if command.symmetric:
-        name, models = "symmetric", [procedural.cube(), procedural.cuboid()]
-    else:
-        if command.procedural < 1 or command.seed < 0:
-            print("--procedural must be at least 1 and --seed at least 0", file=sys.stderr)
-            return 2
-        name = f"procedural-{'heldout-' if command.held_out else ''}{command.procedural}-seed{command.seed}"
-        models = procedural.procedural_set(
-            command.procedural, command.seed, held_out=command.held_out, progress=_Bar("authoring")
-        )
+    if command.procedural < 1 or command.seed < 0:
+        raise ValueError("--procedural must be at least 1 and --seed at least 0")
+    name = f"procedural-{'heldout-' if command.held_out else ''}{command.procedural}-seed{command.seed}"
     folder = command.out or sets.built_in_folder(name)
-    files = sets.write_set(folder, models)
-    size = sum(p.stat().st_size for p in files)
-    if command.json:
-        rows = [
-            {"name": m.name, "family": m.family, "hulls": len(m.hulls), "longest_side_m": m.longest_side}
-            for m in models
-        ]
-        print(json.dumps({"folder": str(folder), "bytes": size, "objects": rows}, indent=1))
-    else:
-        print(f"{len(files)} objects, {size / 1e6:.1f} MB in {folder}")
+    models = procedural.procedural_set(
+        command.procedural, command.seed, held_out=command.held_out, progress=_bar("authoring")
+    )
+    size = sum(path.stat().st_size for path in sets.write_set(folder, models))
+    print(f"{len(models)} objects, {size / 1e6:.1f} MB in {folder}")
     return 0
 
 
@@ -215,22 +169,14 @@ def run_import(command: Import) -> int:
             max_hulls=command.max_hulls,
             threshold=command.threshold,
             mcts_iterations=command.mcts_iterations,
-            max_hull_vertices=command.max_hull_vertices,
             time_limit_s=command.time_limit,
         ),
         licence=command.licence,
-        split=command.split,
         cache=str(assets_dir() / "decompositions"),
         sizing=Sizing(command.units, command.keep_size, command.density, command.mass),
     )
     out = command.out or default_set(command.paths)
-    bar = _Bar("importing")
-
-    def progress(result: "ImportResult", done: int, total: int) -> None:
-        bar(result.name, done, total)
-        if result.status == "refused":
-            bar.write(f"refused {result.source}: {result.reason}")
-
+    bar = _bar("importing")
     start = time.monotonic()
     try:
         results = import_meshes(
@@ -238,9 +184,7 @@ def run_import(command: Import) -> int:
             out,
             settings,
             jobs=command.jobs,
-            force=command.force,
-            drop_gone=command.drop_gone,
-            progress=progress,
+            progress=lambda result, done, total: bar(result.name, done, total),
         )
     except KeyboardInterrupt:
         print(
@@ -248,71 +192,58 @@ def run_import(command: Import) -> int:
             file=sys.stderr,
         )
         return interrupt.INTERRUPTED
-    seconds = time.monotonic() - start
-    if command.json:
-        record = {"out": str(out), "seconds": seconds, "objects": [asdict(r) for r in results]}
-        print(json.dumps(record, indent=1))
-    else:
-        print(_summary(results, out, seconds))
+    print(_summary(results, out, time.monotonic() - start))
     return 1 if any(r.status == "refused" for r in results) else 0
 
 
 def _summary(results: "list[ImportResult]", out: Path, seconds: float) -> str:
     """What became of an import, in a few lines."""
-    by = {status: [r for r in results if r.status == status] for status in {r.status for r in results}}
-    fresh, cached, refused = (by.get(status, []) for status in ("imported", "cached", "refused"))
-    good = fresh + cached
+    count = Counter(r.status for r in results)
     lines = [
-        f"{len(fresh)} imported, {len(cached)} unchanged, {len(refused)} refused in {seconds:.0f} s; {out}"
+        f"{count['imported']} imported, {count['cached']} unchanged, {count['refused']} refused in "
+        f"{seconds:.0f} s; {out}"
     ]
+    good = {r.name: r.model for r in results if r.model is not None}
     if good:
-        size = sum(Path(r.target).stat().st_size for r in good)
-        worst = sorted(good, key=lambda r: -r.volume_error)[:WORST_SHOWN]
-        median = sorted(r.volume_error for r in good)[len(good) // 2]
-        named = ", ".join(f"{r.name} {r.volume_error:.1%}" for r in worst)
-        hulls = sum(r.hulls for r in good) / len(good)
+        size = sum(Path(r.target).stat().st_size for r in results if r.model is not None)
+        worst = sorted(good.values(), key=lambda model: -model.volume_error)
+        named = ", ".join(f"{model.name} {model.volume_error:.1%}" for model in worst[:WORST_SHOWN])
+        hulls = sum(len(model.hulls) for model in worst) / len(worst)
         lines.append(f"{hulls:.1f} convex parts on average, {size / 1e6:.1f} MB")
+        median = worst[len(worst) // 2].volume_error
         lines.append(f"volume error of the parts: median {median:.1%}, worst {named}")
-        lines.append(_sizes(good))
-    lines += [f"warning {r.name}: {words}" for r in good for words in r.warnings]
-    lines += [f"refused {r.source}: {r.reason}" for r in refused]
-    lines += [f"dropped {r.name}: its mesh {r.source} is gone" for r in by.get("dropped", [])]
+        notes = [note for model in worst for note in model.notes]
+        units = Counter(found[1] for note in notes if (found := re.search(r"taken as ([^,]+)", note)))
+        units["m"] += len(worst) - units.total()
+        taken = ", ".join(f"{number} in {unit}" for unit, number in units.items() if number)
+        scaled = sum("scaled by" in note for note in notes)
+        lines.append(
+            f"longest side {_span([model.longest_side for model in worst])} m ({taken}; {scaled} of "
+            f"{len(worst)} scaled), mass {_span([model.mass_kg for model in worst])} kg"
+        )
+    lines += [f"warning {name}: {words}" for name, model in good.items() for words in model.warnings]
+    lines += [f"refused {r.source}: {r.reason}" for r in results if r.status == "refused"]
     lines += [
-        f"{r.name} stays in the set, although its mesh {r.source} is gone; --drop-gone removes it"
-        for r in by.get("gone", [])
+        f"{r.name} stays in the set, although its mesh {r.source} is gone; remove {r.target} if it shall go"
+        for r in results
+        if r.status == "gone"
     ]
     return "\n".join(lines)
 
 
-def _sizes(good: "list[ImportResult]") -> str:
-    """Ranges of size and mass of objects, and how many were taken to be in which unit."""
-
-    def span(values: list[float]) -> str:
-        low, high = f"{min(values):.3g}", f"{max(values):.3g}"
-        return low if low == high else f"{low}-{high}"
-
-    notes = [note for r in good for note in r.notes]
-    units = Counter(found[1] for note in notes if (found := re.search(r"taken as ([^,]+)", note)))
-    units["m"] += len(good) - units.total()
-    taken = ", ".join(f"{count} in {unit}" for unit, count in units.items() if count)
-    scaled = sum("scaled by" in note for note in notes)
-    return (
-        f"longest side {span([r.longest_side_m for r in good])} m ({taken}; {scaled} of {len(good)} scaled), "
-        f"mass {span([r.mass_kg for r in good])} kg"
-    )
+def _span(values: list[float]) -> str:
+    """Least and largest of some values; one where they are equal."""
+    low, high = f"{min(values):.3g}", f"{max(values):.3g}"
+    return low if low == high else f"{low}-{high}"
 
 
 def run_show(command: Show) -> int:
     """Draw a contact sheet."""
     from vd.assets_usd.objects.sets import load_set
-    from vd.assets_usd.objects.sheet import SheetStyle, contact_sheet
+    from vd.assets_usd.objects.sheet import contact_sheet
 
-    models = load_set(command.sets)
-    if command.limit:
-        models = models[: command.limit]
-    style = SheetStyle(tile=command.tile, columns=command.columns, common_scale=command.common_scale)
-    title = command.title or ", ".join(Path(s).name for s in command.sets)
-    print(contact_sheet(models, command.out, title=title, style=style, progress=_Bar("drawing")))
+    title = ", ".join(Path(name).name for name in command.sets)
+    print(contact_sheet(load_set(command.sets), command.out, title))
     return 0
 
 

@@ -1,6 +1,6 @@
-"""An identified servo model as a USD layer over a hand: ``identified.usda``.
+"""An identified servo model as a USD layer over a hand, or of bare joints: ``identified.usda``.
 
-The layer holds ``over`` prims for the hand's joints, ``/dclaw3/f0_j1`` for example, and nothing else:
+The layer holds ``over`` prims for joints, ``/dclaw3/f0_j1`` for example, and nothing else:
 
 * the drive as it was identified, in the attributes that every reader of UsdPhysics knows:
   ``drive:angular:physics:stiffness`` and ``damping`` (per degree), ``newton:velocityLimit`` (degrees per
@@ -11,12 +11,14 @@ The layer holds ``over`` prims for the hand's joints, ``/dclaw3/f0_j1`` for exam
   as the effect for stiffness, damping, speed limit and armature (``vd:baseline:kp:ci95``).
 
 The layer is plain USD: it can be a sublayer of any stage in which the hand is, and the same attributes may
-be authored in a hand's own file.
+be authored in a hand's own file. A motor on a bench, which has no hand, has the same on ``/servo/<joint>``
+or ``/pendulum/<joint>``.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd
@@ -26,15 +28,13 @@ from vd.files import atomic_path
 from vd.kernels.servo.actuators import PARAMETER_COLUMNS
 from vd.kernels.servo.effects import BASELINE, EFFECTS, Parameter, neutral_row
 
-__all__ = ["LAYER_FORMAT", "Estimate", "HandError", "add_layer", "read_servo", "write_layer"]
-
 LAYER_FORMAT = "vd-hand-layer/1"
 """What ``customLayerData`` of a layer says it is."""
 
 NAMESPACE = "vd"
 BASELINE_GROUP = "baseline"
 """In the place of an effect's name: intervals of the drive, whose values are in USD's own attributes."""
-INTERVAL = "ci95"
+INTERVAL = ":ci95"
 
 DRIVE: dict[str, tuple[str, float]] = {
     "kp": ("drive:angular:physics:stiffness", math.radians(1.0)),
@@ -47,6 +47,29 @@ DRIVE: dict[str, tuple[str, float]] = {
 
 Estimate = float | Sequence[float]
 """A value, or (value, low, high) with its 95 % interval."""
+
+
+class _Number(NamedTuple):
+    """Where a parameter is in USD: its attribute, and the factor from SI to its unit."""
+
+    group: str
+    parameter: Parameter
+    attribute: str
+    factor: float
+
+    @property
+    def interval(self) -> str:
+        return f"{NAMESPACE}:{self.group}:{self.parameter.name}{INTERVAL}"
+
+
+_NUMBERS: dict[str, dict[str, _Number]] = {
+    BASELINE_GROUP: {p.name: _Number(BASELINE_GROUP, p, *DRIVE[p.name]) for p in BASELINE},
+    **{
+        name: {p.name: _Number(name, p, f"{NAMESPACE}:{name}:{p.name}", 1.0) for p in effect.parameters}
+        for name, effect in EFFECTS.items()
+    },
+}
+"""Every number of a servo model, by effect (or the baseline) and parameter."""
 
 
 def write_layer(
@@ -72,9 +95,6 @@ def write_layer(
     Raises:
         HandError: An unknown joint, effect or parameter, or a number that cannot be one; names it.
     """
-    path = Path(path)
-    if path.suffix != ".usda":
-        raise HandError(f"{path}: a hand layer is plain text; give it the suffix .usda, not {path.suffix!r}")
     root = hand if isinstance(hand, str) else hand.name
     names = [*dict.fromkeys([*baseline, *effects])]
     if not isinstance(hand, str):
@@ -92,12 +112,46 @@ def write_layer(
     top = Sdf.PrimSpec(layer, root, Sdf.SpecifierOver)
     for name in names:
         joint = Sdf.PrimSpec(top, name, Sdf.SpecifierOver)
-        _write_baseline(path, joint, baseline.get(name, {}))
+        where = f"{path}: {joint.path}"
+        if name in baseline:
+            _write_numbers(where, joint, BASELINE_GROUP, baseline[name])
         for effect, values in effects.get(name, {}).items():
-            _write_effect(path, joint, effect, values)
+            _write_numbers(where, joint, effect, values)
+    save_layer(layer, path)
+
+
+def save_layer(layer: Sdf.Layer, path: Path) -> None:
+    """Write a layer as text, atomically.
+
+    Raises:
+        HandError: The suffix is not ``.usda``.
+    """
+    if Path(path).suffix != ".usda":
+        raise HandError(f"{path}: a layer is plain text; give it the suffix .usda")
     with atomic_path(path) as temporary:
         if not layer.Export(str(temporary)):
             raise OSError(f"{path}: USD could not write the layer; is the disk full?")
+
+
+def open_layer(path: Path) -> Sdf.Layer:
+    """A layer as its file is now.
+
+    Raises:
+        HandError: The file is missing or no USD.
+    """
+    if not Path(path).is_file():
+        raise HandError(
+            f"{path}: no such hand layer; name the identified.usda that vd-gap wrote, or, for a policy "
+            "trained with one that is not here, --hand-layer none"
+        )
+    try:
+        layer = Sdf.Layer.FindOrOpen(str(Path(path).resolve()))
+    except Tf.ErrorException as error:
+        raise HandError(f"{path}: not a USD layer ({error}); let vd-gap write it again") from error
+    if layer is None:
+        raise HandError(f"{path}: not a USD layer; let vd-gap write it again")
+    layer.Reload(force=True)  # it may be open elsewhere, from before it was written anew
+    return layer
 
 
 def add_layer(stage: Usd.Stage, path: Path) -> None:
@@ -110,18 +164,7 @@ def add_layer(stage: Usd.Stage, path: Path) -> None:
     Raises:
         HandError: The file is missing or no USD, or changes prims that the hand does not have.
     """
-    if not path.is_file():
-        raise HandError(
-            f"{path}: no such hand layer; name the identified.usda that vd-gap wrote, or, for a policy "
-            "trained with one that is not here, --hand-layer none"
-        )
-    try:
-        layer = Sdf.Layer.FindOrOpen(str(path.resolve()))
-    except Tf.ErrorException as error:
-        raise HandError(f"{path}: not a USD layer ({error}); let vd-gap write it again") from error
-    if layer is None:
-        raise HandError(f"{path}: not a USD layer; let vd-gap write it again")
-    layer.Reload(force=True)  # it may be open elsewhere, from before it was written anew
+    layer = open_layer(path)
     hand = stage.GetRootLayer().realPath
     root = stage.GetDefaultPrim().GetName()
     for prim in layer.rootPrims:
@@ -142,6 +185,38 @@ def add_layer(stage: Usd.Stage, path: Path) -> None:
             f"{path}: {min(unknown)}: {root} has no such prim ({hand}); name a joint that it has, f0_j1 ..."
         )
     stage.GetSessionLayer().subLayerPaths.append(layer.identifier)
+
+
+def read_bare_layer(path: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """The servo models of joints without a hand.
+
+    Args:
+        path: Layer that :func:`write_layer` wrote for a bare servo.
+        joints: Names of the joints, J.
+
+    Returns:
+        Rows of parameters [J, P] and their 95 % intervals [J, P, 2], NaN where none is authored.
+
+    Raises:
+        HandError: The file is missing, no such layer, or lacks a joint or its drive; names it.
+    """
+    layer = open_layer(path)
+    if layer.customLayerData.get("format") != LAYER_FORMAT:
+        raise HandError(f"{path}: not an identified servo model ({LAYER_FORMAT}); let vd-gap write it again")
+    stage = Usd.Stage.Open(layer)
+    prims = [stage.GetPrimAtPath(f"/{layer.defaultPrim}/{name}") for name in joints]
+    for name, prim in zip(joints, prims, strict=True):
+        if not prim:
+            raise HandError(f"{path}: there is no joint /{layer.defaultPrim}/{name}; identify it first")
+    baseline = {}
+    for name, (attribute, factor) in DRIVE.items():
+        if attribute.startswith(f"{NAMESPACE}:"):
+            continue
+        for prim in prims:
+            if not prim.GetAttribute(attribute).HasAuthoredValue():
+                raise HandError(f"{path}: {prim.GetPath()}: '{attribute}' is not authored; give it a value")
+        baseline[name] = np.array([prim.GetAttribute(attribute).Get() / factor for prim in prims])
+    return read_servo(prims, baseline, path)
 
 
 def read_servo(
@@ -169,68 +244,40 @@ def read_servo(
     for index, joint in enumerate(joints):
         where = f"{source}: {joint.GetPath()}"
         valued: dict[str, set[str]] = {}
-        ranges: list[tuple[str, str, str]] = []
-        for attribute in joint.GetAuthoredPropertiesInNamespace(NAMESPACE):
-            name = attribute.GetName()
-            effect, parameter, interval = _parse(where, name)
-            value = attribute.Get() if isinstance(attribute, Usd.Attribute) else None
-            if interval:
-                intervals[index, parameter.column] = _interval(where, name, parameter, value)
-                ranges.append((name, effect, parameter.name))
+        for name, number, is_interval, value in _authored(where, joint):
+            if is_interval:
+                intervals[index, number.parameter.column] = _interval(where, name, number.parameter, value)
             else:
-                rows[index, parameter.column] = _checked(where, name, parameter, value)
-                valued.setdefault(effect, set()).add(parameter.name)
-        valued.pop(BASELINE_GROUP, None)
-        _check_complete(where, valued, ranges)
+                rows[index, number.parameter.column] = _checked(where, name, number.parameter, value)
+                valued.setdefault(number.group, set()).add(number.parameter.name)
+        for name, number, is_interval, _ in _authored(where, joint):
+            given = valued.get(number.group, set())
+            if is_interval and number.group != BASELINE_GROUP and number.parameter.name not in given:
+                raise HandError(f"{where}: '{name}' is an interval without a value; author the value too")
+        for group, given in valued.items():
+            _check_complete(where, group, given)
     return rows, intervals
 
 
-def _check_complete(where: str, effects: dict[str, set[str]], ranges: list[tuple[str, str, str]]) -> None:
-    """Refuse an effect without one of its parameters, or an interval without its value.
-
-    Args:
-        where: File and joint, for errors.
-        effects: Names of the parameters that have a value, by effect.
-        ranges: Attribute, effect and parameter of each interval.
-    """
-    for effect, authored in effects.items():
-        if missing := _missing(effect, authored):
-            raise HandError(
-                f"{where}: {effect} lacks '{NAMESPACE}:{effect}:{missing[0]}'; author it, or remove {effect}"
-            )
-    for name, effect, parameter in ranges:
-        if effect != BASELINE_GROUP and parameter not in effects.get(effect, ()):
-            raise HandError(f"{where}: '{name}' is an interval without a value; author the value too")
+def _authored(where: str, joint: Usd.Prim) -> Iterator[tuple[str, _Number, bool, object]]:
+    """Name, number, whether it is its interval, and value of each attribute of ours that a joint authors."""
+    for attribute in joint.GetAuthoredPropertiesInNamespace(NAMESPACE):
+        name = attribute.GetName()
+        group = name.split(":")[1]
+        if group not in _NUMBERS:
+            raise HandError(f"{where}: '{name}': no effect is called {group!r}; one of {', '.join(EFFECTS)}")
+        known = {number.attribute: (number, False) for number in _NUMBERS[group].values()}
+        known |= {number.interval: (number, True) for number in _NUMBERS[group].values()}
+        if name not in known:
+            raise HandError(f"{where}: '{name}' is no attribute of {group}; one of {', '.join(known)}")
+        yield name, *known[name], attribute.Get() if isinstance(attribute, Usd.Attribute) else None
 
 
-def _parse(where: str, name: str) -> tuple[str, Parameter, bool]:
-    """Effect, parameter, and whether the attribute is an interval."""
-    parts = name.split(":")
-    effect = parts[1]
-    if effect == BASELINE_GROUP:
-        known, remedy = {p.name: p for p in BASELINE}, "the baseline"
-    elif effect in EFFECTS:
-        known, remedy = {p.name: p for p in EFFECTS[effect].parameters}, effect
-    else:
-        raise HandError(f"{where}: '{name}': no effect is called {effect!r}; one of {', '.join(EFFECTS)}")
-    if len(parts) < 3 or parts[2] not in known:
-        raise HandError(
-            f"{where}: '{name}' is no parameter of {remedy}; one of "
-            + ", ".join(f"{NAMESPACE}:{effect}:{p}" for p in known)
-        )
-    interval = parts[3:] == [INTERVAL]
-    if len(parts) > 3 and not interval:
-        raise HandError(f"{where}: '{name}': after a parameter only ':{INTERVAL}' can stand; rename it")
-    if effect == BASELINE_GROUP and not interval and DRIVE[parts[2]][0] != name:
-        raise HandError(
-            f"{where}: '{name}': the value belongs into '{DRIVE[parts[2]][0]}'; only ':{INTERVAL}' goes here"
-        )
-    return effect, known[parts[2]], interval
-
-
-def _missing(effect: str, given: "set[str] | Mapping[str, Estimate]") -> list[str]:
-    """Parameters that an effect cannot do without: those that have no value at which they do nothing."""
-    return [p.name for p in EFFECTS[effect].parameters if p.lower > 0.0 and p.name not in given]
+def _check_complete(where: str, group: str, given: "set[str] | Mapping[str, Estimate]") -> None:
+    """Refuse an effect without a parameter that has no value at which it does nothing."""
+    for name, number in _NUMBERS[group].items():
+        if group != BASELINE_GROUP and number.parameter.lower > 0.0 and name not in given:
+            raise HandError(f"{where}: {group} lacks '{number.attribute}'; author it, or remove {group}")
 
 
 def _checked(where: str, name: str, parameter: Parameter, value: object) -> float:
@@ -257,58 +304,29 @@ def _interval(where: str, name: str, parameter: Parameter, value: object) -> tup
     return low, high
 
 
-def _split(estimate: Estimate) -> tuple[object, object]:
-    """Value and interval (None if there is none) of an estimate."""
-    if isinstance(estimate, (int, float)):
-        return float(estimate), None
-    value, low, high = (float(number) for number in estimate)
-    return value, (low, high)
-
-
-def _write_baseline(path: Path, joint: Sdf.PrimSpec, values: Mapping[str, Estimate]) -> None:
-    where, known = f"{path}: {joint.path}", {p.name: p for p in BASELINE}
+def _write_numbers(where: str, joint: Sdf.PrimSpec, group: str, values: Mapping[str, Estimate]) -> None:
+    """Author the numbers of an effect, or of the baseline, on a joint."""
+    if group not in _NUMBERS:
+        raise HandError(f"{where}: no effect is called {group!r}; one of {', '.join(EFFECTS)}")
+    known = _NUMBERS[group]
+    _check_complete(where, group, values)
     for name, estimate in values.items():
         if name not in known:
-            raise HandError(f"{where}: the baseline has no parameter {name!r}; one of {', '.join(known)}")
-        parameter, (attribute, factor) = known[name], DRIVE[name]
-        value, interval = _split(estimate)
-        number = _checked(where, attribute, parameter, value)
-        own = attribute.startswith(f"{NAMESPACE}:")
+            raise HandError(f"{where}: {group} has no parameter {name!r}; one of {', '.join(known)}")
+        number, unit = known[name], known[name].parameter.unit
+        alone = isinstance(estimate, (int, float))
+        value, *bounds = [float(estimate)] if alone else map(float, estimate)  # type: ignore[arg-type]
+        checked = _checked(where, number.attribute, number.parameter, value)
+        own = number.attribute.startswith(f"{NAMESPACE}:")
         kind = Sdf.ValueTypeNames.Double if own else Sdf.ValueTypeNames.Float
-        spec = Sdf.AttributeSpec(joint, attribute, kind, Sdf.VariabilityVarying, declaresCustom=own)
-        spec.default = number * factor
-        spec.documentation = f"{name} = {number:g} {parameter.unit}"
-        _write_interval(where, joint, BASELINE_GROUP, parameter, interval)
-
-
-def _write_effect(path: Path, joint: Sdf.PrimSpec, effect: str, values: Mapping[str, Estimate]) -> None:
-    where = f"{path}: {joint.path}"
-    if effect not in EFFECTS:
-        raise HandError(f"{where}: no effect is called {effect!r}; one of {', '.join(EFFECTS)}")
-    missing = _missing(effect, values)
-    if missing:
-        raise HandError(f"{where}: {effect} lacks {missing[0]}; give it")
-    for name, estimate in values.items():
-        attribute = f"{NAMESPACE}:{effect}:{name}"
-        _, parameter, _ = _parse(where, attribute)
-        value, interval = _split(estimate)
-        spec = Sdf.AttributeSpec(
-            joint, attribute, Sdf.ValueTypeNames.Double, Sdf.VariabilityVarying, declaresCustom=True
-        )
-        spec.default = _checked(where, attribute, parameter, value)
-        spec.documentation = f"{EFFECTS[effect].meaning} [{parameter.unit}]"
-        _write_interval(where, joint, effect, parameter, interval)
-
-
-def _write_interval(
-    where: str, joint: Sdf.PrimSpec, group: str, parameter: Parameter, interval: object
-) -> None:
-    if interval is None:
-        return
-    attribute = f"{NAMESPACE}:{group}:{parameter.name}:{INTERVAL}"
-    low, high = _interval(where, attribute, parameter, interval)
-    spec = Sdf.AttributeSpec(
-        joint, attribute, Sdf.ValueTypeNames.Float2, Sdf.VariabilityVarying, declaresCustom=True
-    )
-    spec.default = Gf.Vec2f(low, high)
-    spec.documentation = f"95 % interval of {parameter.name} [{parameter.unit}]"
+        spec = Sdf.AttributeSpec(joint, number.attribute, kind, Sdf.VariabilityVarying, declaresCustom=own)
+        spec.default = checked * number.factor
+        meaning = f"{name} = {value:g} {unit}"
+        spec.documentation = f"{EFFECTS[group].meaning} [{unit}]" if group in EFFECTS else meaning
+        if bounds:
+            low, high = _interval(where, number.interval, number.parameter, bounds)
+            spec = Sdf.AttributeSpec(
+                joint, number.interval, Sdf.ValueTypeNames.Float2, Sdf.VariabilityVarying, declaresCustom=True
+            )
+            spec.default = Gf.Vec2f(low, high)
+            spec.documentation = f"95 % interval of {name} [{unit}]"

@@ -1,7 +1,6 @@
 """Read a hand back from USD: everything that simulator, training and deployment know about it.
 
-Nothing here comes from :mod:`vd.assets_usd.hand_spec`; a hand that someone else authored in the
-layout of :mod:`vd.assets_usd.hand_author` reads the same.
+The layout is that of docs/reference/hand.md; a hand of anyone reads the same as those of the package.
 
 Units are SI and radians, quaternions are xyzw. Frames: the base frame is that of link ``base``; a
 pose is a row ``(x, y, z, qx, qy, qz, qw)``.
@@ -45,11 +44,11 @@ def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) 
     """
     path = Path(path)
     if not path.is_file():
-        raise HandError(f"{path}: no such file; author one with vd.assets_usd.hand_author.hand_usd(name)")
+        raise HandError(f"{path}: no such file; name a hand of the package, or a USD file")
     try:
         stage = Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        raise HandError(f"{path}: not a USD file ({error}); author the hand again") from error
+        raise HandError(f"{path}: not a USD file ({error}); export it again") from error
     stage.Reload()  # a layer that is still open elsewhere would else be shown as it was
     root = stage.GetDefaultPrim()
     if not root:
@@ -59,7 +58,7 @@ def open_stage(path: Path, fingertip: str = "rigid", layer: Path | None = None) 
     if fingertip not in kinds:
         raise HandError(
             f"{path}: {root.GetPath()} has no variant {fingertip!r} in its set 'fingertip': "
-            f"choose one of {', '.join(kinds) or 'none (author the hand again)'}"
+            f"choose one of {', '.join(kinds) or 'none (add the variant)'}"
         )
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         variants.SetVariantSelection(fingertip)
@@ -72,7 +71,7 @@ def read_hand(path: Path, *, fingertip: str = "rigid", layer: Path | None = None
     """Read a hand from USD.
 
     Args:
-        path: File in the layout of :mod:`vd.assets_usd.hand_author`.
+        path: File in the layout of docs/reference/hand.md.
         fingertip: Kind of fingertip, a variant of the file (``rigid`` or ``soft``).
         layer: Layer over the hand with an identified servo model.
 
@@ -104,7 +103,7 @@ class _Reader:
         path = self.root.GetPath().AppendPath(relative)
         prim = self.stage.GetPrimAtPath(path)
         if not prim:
-            raise self.fail(path, "the prim is missing", "add it, or author the hand again")
+            raise self.fail(path, "the prim is missing", "add it, or export the hand again")
         return prim
 
     def value(self, prim: Usd.Prim, attribute: str) -> Any:

@@ -62,7 +62,7 @@ def read_surfaces(hand: HandModel) -> tuple[LinkSurface, ...]:
             motor = MOTOR_NAME.match(prim.GetName())
             parts.setdefault((link, motor[1] if motor else name), []).append((vertices, faces))
     if not parts:
-        raise HandError(f"{hand.path}: no link has a mesh to draw; author the hand again")
+        raise HandError(f"{hand.path}: no link has a mesh to draw; give the links meshes")
     return tuple(_joined(name, link, meshes) for (link, name), meshes in parts.items())
 
 

@@ -1,18 +1,19 @@
-"""Hands by name, as the rest of the project asks for them."""
+"""Hands by name, as the rest of the project asks for them: USD files of this package, or of anyone."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vd.assets_usd.hand_spec import HANDS
-
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
+
+HANDS = ("dclaw3", "dclaw4")
+"""Hands of the package; their numbers and sources are in ``assets_usd/usd``."""
 
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 
 
 def check_hand_name(name: str) -> None:
-    """Refuse a hand that :func:`load_hand` would not find, without reading or writing anything.
+    """Refuse a hand that :func:`load_hand` would not find, without reading it.
 
     Raises:
         ValueError: No hand has this name, or there is no such file.
@@ -24,8 +25,19 @@ def check_hand_name(name: str) -> None:
     )
 
 
+def hand_usd(name: str) -> Path:
+    """The USD file of a hand of the package.
+
+    Raises:
+        ValueError: No hand has this name.
+    """
+    if name not in HANDS:
+        raise ValueError(f"no hand is called {name!r}: choose one of {', '.join(HANDS)}")
+    return Path(__file__).parent / "usd" / f"{name}.usda"
+
+
 def load_hand(name: str, fingertip: str = "rigid", layer: str | Path | None = None) -> "HandModel":
-    """Read a hand by name (authored on demand) or by the path of its USD.
+    """Read a hand by name or by the path of its USD.
 
     Args:
         name: ``dclaw3``, ``dclaw4``, or a file.
@@ -34,8 +46,8 @@ def load_hand(name: str, fingertip: str = "rigid", layer: str | Path | None = No
 
     Raises:
         HandError: The file is not a hand, or the layer not one of it.
+        ValueError: No hand has this name.
     """
-    from vd.assets_usd.hand_author import hand_usd
     from vd.assets_usd.hand_model import read_hand
 
     path = Path(name) if name.endswith(USD_SUFFIXES) else hand_usd(name)

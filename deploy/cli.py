@@ -4,7 +4,6 @@ import importlib
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from vd import interrupt
 
@@ -12,69 +11,30 @@ OK, FAILED = 0, 1
 """Exit statuses: done, or not, with the reason; after a signal 128 and its number."""
 
 
-class Entry(NamedTuple):
-    """Where a command is: a dataclass of its options, and the function that takes it and returns a status."""
-
-    module: str
-    options: str
-    function: str
-    summary: str
-
-
-RUN = Entry("vd.deploy.loop.run", "RunCfg", "run", "drive the hand with a policy")
 COMMANDS = {
-    "scan": Entry(
-        "vd.deploy.hardware.scan",
-        "ScanCfg",
-        "scan",
-        "which motors are on the line, and what is wrong with them",
-    ),
-    "check": Entry(
-        "vd.deploy.hardware.check",
-        "CheckCfg",
-        "check",
-        "preflight: everything that must be right before it moves",
-    ),
-    "calibrate": Entry(
-        "vd.deploy.camera.calibrate",
-        "CalibrateCfg",
-        "calibrate",
-        "find where the camera is, by markers on fingertips",
-    ),
-    "reboot": Entry(
-        "vd.deploy.hardware.maintain",
-        "RebootCfg",
-        "reboot",
-        "restart a motor: clears its error, and its count of turns",
-    ),
-    "set-id": Entry("vd.deploy.hardware.maintain", "SetIdCfg", "set_id", "give a motor another ID"),
-    "set-baud": Entry(
-        "vd.deploy.hardware.maintain", "SetBaudCfg", "set_baud", "give a motor another baud rate"
-    ),
-    "home": Entry(
-        "vd.deploy.hardware.home", "HomeCfg", "home", "move slowly to the pose in which an episode starts"
-    ),
-    "record": Entry("vd.deploy.hardware.record", "RecordCfg", "record", "record motions for vd-gap"),
-    "shadow": Entry(
-        "vd.deploy.loop.shadow",
-        "ShadowCfg",
-        "shadow",
-        "compare what the policy saw with what the simulator shows",
-    ),
-    "score": Entry(
-        "vd.deploy.loop.score_command",
-        "ScoreCfg",
-        "score",
-        "the object's error at each stop, by motion capture",
-    ),
+    "run": ("loop.run", "drive the hand with a policy"),
+    "check": ("hardware.check", "preflight: everything that must be right before it moves"),
+    "calibrate": ("camera.calibrate", "find where the camera is, by markers on fingertips"),
+    "home": ("hardware.home", "move slowly to the pose in which an episode starts"),
+    "record": ("hardware.record", "record motions for vd-gap"),
+    "score": ("loop.score", "the object's error at each stop, by motion capture"),
 }
-"""The commands by name."""
+"""Module of each command and what it does. A module has its options, such as RunCfg, and a function of the
+command's name, which takes them and returns a status."""
+GONE = {
+    "scan": "vd-deploy check names what is silent; ROBOTIS' DYNAMIXEL Wizard 2.0 tries other rates",
+    "reboot": "switch the motors' power off and on",
+    "set-id": "ROBOTIS' DYNAMIXEL Wizard 2.0 sets IDs",
+    "set-baud": "ROBOTIS' DYNAMIXEL Wizard 2.0 sets baud rates",
+    "shadow": "vd-play shows logs; tests hold that the loop sees what the simulator shows",
+}
+"""Commands that went, and what is there instead."""
 
-USAGE = """usage: vd-deploy [POLICY] [flags]   {run}
+USAGE = """usage: vd-deploy [POLICY] [flags]   the same as vd-deploy run
        vd-deploy COMMAND [flags]
 
 commands:
-{commands}
+{}
 
 What talks to motors takes --hand dclaw3|dclaw4 and either --port DEVICE or --twin, a simulated hand on a
 pseudo-terminal. Nothing moves before the preflight has passed and you have said yes (--yes says so at once).
@@ -83,18 +43,20 @@ vd-deploy COMMAND --help lists the flags of a command, vd-deploy --hand dclaw3 -
 
 def usage() -> str:
     """The overview of the commands."""
-    lines = [f"  {name:<10} {entry.summary}" for name, entry in COMMANDS.items()]
-    return USAGE.format(run=RUN.summary, commands="\n".join(lines))
+    lines = [f"  {name:<10} {summary}" for name, (_, summary) in COMMANDS.items()]
+    return USAGE.format("\n".join(lines))
 
 
 def _no_policy(text: str) -> str:
     """Why it is no file, no folder and no installed policy; "" if it is one."""
     if Path(text).exists():
         return ""
-    from vd.evaluate.agents import find_policy
+    if text in GONE:
+        return f"there is no command {text} any more: {GONE[text]}"
+    from vd.evaluate.agents import check_names
 
     try:
-        find_policy(text)
+        check_names([text], [])
     except FileNotFoundError:
         return f"no command and no policy {text!r}; commands are {', '.join(COMMANDS)}"
     except ValueError as error:  # it has another name now
@@ -109,24 +71,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not arguments or arguments in (["-h"], ["--help"]):
         print(usage())
         return OK
-    name, entry = "", RUN
+    name = "run"
     if arguments[0] in COMMANDS:
         name = arguments.pop(0)
-        entry = COMMANDS[name]
     elif not arguments[0].startswith("-") and (wrong := _no_policy(arguments[0])):
         print(f"vd-deploy: {wrong}", file=sys.stderr)
         return FAILED
     import tyro
 
-    module = importlib.import_module(entry.module)
-    options = tyro.cli(
-        getattr(module, entry.options),
-        args=arguments,
-        prog=f"vd-deploy {name}".strip(),
-        description=module.__doc__,
-    )
+    module = importlib.import_module(f"vd.deploy.{COMMANDS[name][0]}")
+    options_of = getattr(module, f"{name.capitalize()}Cfg")
+    options = tyro.cli(options_of, args=arguments, prog=f"vd-deploy {name}", description=module.__doc__)
     try:
-        return int(getattr(module, entry.function)(options))
+        return int(getattr(module, name)(options))
     except (ValueError, OSError, RuntimeError) as error:  # BusError and StoppedError among them
         print(f"vd-deploy: {error}", file=sys.stderr)
         asked = int(getattr(error, "signal", 0))  # a moving hand is stopped first

@@ -3,8 +3,6 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-BAUD_RATE = 1_000_000
-"""Of the port, where the options name none."""
 NAMED = 3
 """Parts that a finding names; where more are wrong they have a cause in common."""
 
@@ -18,12 +16,6 @@ class Finding:
     ok: bool
     found: str
     """How it is; where it is wrong with the remedy."""
-
-
-def command(words: str, port: str, baud_rate: int = BAUD_RATE) -> str:
-    """A command of vd-deploy for the motors on a port, as a person can enter it."""
-    rate = "" if baud_rate == BAUD_RATE else f" --baud-rate {baud_rate}"
-    return f"`vd-deploy {words} --port {port}{rate}`"
 
 
 def listed(parts: Sequence[str]) -> str:

@@ -6,51 +6,36 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
-
-Priority = Literal["auto", "on", "off"]
-"""Real-time priority: where it is permitted, always, or never."""
 
 TURN_S = 1e-4
 """Longest turn of a thread of this process while another one waits: less than what a packet takes."""
 
 
 @contextlib.contextmanager
-def real_time(wanted: Priority, *, level: int = 0) -> Iterator[bool]:
-    """Run before all ordinary programs, as loop and twin need it on a busy machine; both mostly sleep.
+def real_time(wanted: bool, *, level: int = 0) -> Iterator[bool]:
+    """Run before all ordinary programs where the system permits it (root, ``ulimit -r 1``).
 
-    All threads do, those that begin later too: the watchdog must not wait for other programs.
+    All threads do, those that begin later too: the watchdog must not wait for other programs. Loop and twin
+    need it on a busy machine; both mostly sleep.
 
     Args:
-        wanted: Whether to.
+        wanted: Whether to try.
         level: Above the lowest real-time priority. A twin's is higher than the loop's, as motors' processors
             do not wait for ours.
 
     Yields:
         Whether it does.
-
-    Raises:
-        OSError: It is wanted, but the system does not have it, or does not permit it.
     """
     before: dict[int, tuple[int, os.sched_param]] = {}
-    try:
-        if wanted == "off":
-            raise PermissionError("off")
+    with contextlib.suppress(AttributeError, FileNotFoundError, PermissionError):  # not Linux, not permitted
         priority = os.sched_param(os.sched_get_priority_min(os.SCHED_RR) + level)
-        for thread in (int(entry.name) for entry in Path("/proc/self/task").iterdir()):
+        for thread in (int(entry.name) for entry in Path("/proc/self/task").iterdir() if wanted):
             with contextlib.suppress(ProcessLookupError):  # it has just ended
                 had = os.sched_getscheduler(thread), os.sched_getparam(thread)
                 os.sched_setscheduler(thread, os.SCHED_RR, priority)
                 before[thread] = had
-    except (AttributeError, FileNotFoundError, PermissionError) as error:
-        if wanted == "on":
-            raise OSError(
-                f"no real-time priority ({error}); on Linux allow it with `ulimit -r 1`, or leave it out"
-            ) from error
-        yield False
-        return
     try:
-        yield True
+        yield bool(before)
     finally:
         for thread, had in before.items():
             with contextlib.suppress(ProcessLookupError):

@@ -62,7 +62,7 @@ class FakeEnv:
         self.still, self.smoothed = zeros(n, wp.int32), zeros((n, self.num_actions))
         self.timed_out, self.done = zeros(n, wp.int32), zeros(n, wp.int32)
         self.rotation_error, self.goal_quat = zeros(n), zeros(n, wp.quat)
-        self.step_count, self.goals_reached = zeros(n, wp.int32), zeros(n, wp.int32)
+        self.step_count = zeros(n, wp.int32)
         self.object_pose_end = zeros(n, wp.transform)
         self.sim = SimpleNamespace(joint_q=zeros((n, self.num_actions + 7)))
         self._rng = np.random.default_rng(0)
@@ -117,7 +117,6 @@ class FakeEnv:
         self.object_pose_end.numpy()[:] = self._pose()
         self.reward_terms.numpy()[:] = np.stack([800.0 * success, 1 / (error + 0.1), -(a**2).sum(1)], axis=1)
         self.reward.numpy()[:] = self.reward_terms.numpy().sum(axis=1)
-        self.goals_reached.numpy()[:] += success
         self._restart(np.flatnonzero(done))
         self._publish()
 
@@ -151,7 +150,6 @@ class FakeEnv:
         return {
             "goal": self.goal_quat,
             "steps": self.step_count,
-            "goals": self.goals_reached,
         }
 
     def close(self):

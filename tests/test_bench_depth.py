@@ -16,12 +16,10 @@ def test_rows_hold_rates_and_agreement(tmp_path, capsys, monkeypatch):
     assert [row["envs"] for row in report["rows"]] == [1, 2]
     assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == report["rows"]
     for row in report["rows"]:
-        assert set(row["images"]) == {"rays", "raster"} and min(row["images"].values()) > 0
-        best = max(row["images"].values())
-        assert row["images_over_newton"] == pytest.approx(best / row["newton"])
+        assert row["images_over_newton"] == pytest.approx(row["images"] / row["newton"])
         # The hand covers some of the picture, and nobody sees it otherwise.
         assert row["points"] > 500
-        assert row["different"] < 1e-3 and row["methods_different"] < 1e-3
+        assert row["different"] < 1e-3
 
 
 def test_an_image_of_something_else_would_show(monkeypatch, tmp_path):

@@ -3,28 +3,38 @@
 The camera is where the hand's USD has it; views are what it would see, made here from forward kinematics.
 """
 
-import dataclasses
+import contextlib
 import json
+import re
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from camera_sdk import camera_sdk
 from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.camera_layer import read_camera, write_camera_layer
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandError, Intrinsics, compose, invert
+from vd.assets_usd.hand_data import HandError, Intrinsics, compose, invert
 from vd.assets_usd.hands import load_hand
-from vd.deploy.camera.calibrate import CalibrateCfg, Shot, calibrate, misplaced, object_place, save_views
-from vd.deploy.camera.calibration_poses import plan, seat
-from vd.deploy.camera.hand_eye import HandEyeError, Views, dual_quaternions, project, refine, solve, square
-from vd.deploy.camera.markers import MarkerFinder, draw
-from vd.deploy.camera.realsense import RealSenseCfg
-from vd.deploy.twin.calibration_twin import SLIP, CalibrationTwin
+from vd.deploy.camera import calibrate as command
+from vd.deploy.camera.calibrate import CalibrateCfg, calibrate, seat
+from vd.deploy.camera.camera import Frame, object_place
+from vd.deploy.camera.hand_eye import HandEyeError, Views, marker_corners, refine, solve
+from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, picture_of
+from vd.deploy.hardware.joints import uncalibrated
+from vd.deploy.hardware.motion import reset_pose
 
-pytest.importorskip("cv2", reason="OpenCV is not installed (extra: hardware)")
+cv2 = pytest.importorskip("cv2", reason="OpenCV is not installed (extra: hardware)")
 
 SIDE_M = 0.02
-COUNT = 18
+COUNT = 54
+SLIP = np.array(
+    [0.002, -0.003, 0.001, *Rotation.from_euler("xyz", (8.0, -5.0, 12.0), degrees=True).as_quat()]
+)
+"""From where a marker should sit to where somebody has stuck it."""
+AWAY = np.array([0.03, -0.03, 0.04, *Rotation.from_euler("xyz", (8.0, -6.0, 10.0), degrees=True).as_quat()])
+"""From where the camera is thought to be to where it is, in its own frame: mounted by eye."""
+QUARTER = np.array([0.0, 0.0, 0.0, *Rotation.from_euler("z", 90, degrees=True).as_quat()])
 
 
 @pytest.fixture(scope="module")
@@ -39,32 +49,75 @@ def lens(hand):
 
 
 @pytest.fixture(scope="module")
-def poses(hand, lens):
-    """Poses of the hand for a marker on its first finger alone, and on all."""
-    return {f: np.array(plan(hand, lens, f, COUNT, side_m=SIDE_M)) for f in ((0,), (0, 1, 2))}
-
-
-@pytest.fixture(scope="module")
 def camera(hand):
     return np.concatenate([hand.camera.position, hand.camera.quaternion])
 
 
-def views(hand, camera, lens, joints, fingers, *, noise_px=0.0, joint_rad=0.0, seed=0):
+@pytest.fixture(scope="module")
+def poses(hand, lens, camera):
+    """Joints of the hand, one finger bent after the other to show its marker: of the first, of all."""
+    generator = np.random.default_rng(0)
+    waiting = reset_pose(3)
+    rows = []
+    for finger in range(3):
+        axes, marker = slice(3 * finger, 3 * finger + 3), seat(hand, finger, camera)
+        found = 0
+        while found < COUNT // 3:
+            q = waiting.copy()
+            q[axes] = generator.uniform(hand.lower[axes], hand.upper[axes])
+            pose = compose(invert(camera), compose(hand.tip_poses(q)[finger], marker))
+            pixels = marker_corners(pose[None], lens, SIDE_M)[0]
+            facing = -Rotation.from_quat(pose[3:]).apply([0, 0, 1.0]) @ pose[:3] / np.linalg.norm(pose[:3])
+            if facing > 0.6 and (pixels > 20).all() and (pixels < [lens.width - 20, lens.height - 20]).all():
+                rows.append(q)
+                found += 1
+        rows.append(waiting)
+    return {(0,): np.array(rows[: COUNT // 3] + rows[-1:]), (0, 1, 2): np.array(rows)}
+
+
+@pytest.fixture(scope="module")
+def thought(hand, camera):
+    """Where camera and markers are thought to be."""
+    there = compose(camera, invert(AWAY))
+    return there, {finger: seat(hand, finger, there) for finger in range(3)}
+
+
+def views(hand, camera, lens, joints, fingers, *, noise_px=0.0, joint_rad=0.0, seed=0, stuck=SLIP):
     """What a camera sees of the fingers that move; the joints are off by ``joint_rad`` from what they say."""
     generator = np.random.default_rng(seed)
-    finder = MarkerFinder(lens, SIDE_M)
     tip, finger, corners = [], [], []
     for number in fingers:
-        marker = compose(seat(hand, number, camera), SLIP)
+        marker = compose(seat(hand, number, camera), stuck)
         for q in joints[np.abs(joints - joints[-1])[:, 3 * number : 3 * number + 3].max(axis=1) > 0.01]:
             pose = compose(invert(camera), compose(hand.tip_poses(q)[number], marker))
-            points = Rotation.from_quat(pose[3:]).apply(square(SIDE_M)) + pose[:3]
             said = q + joint_rad * generator.standard_normal(len(q))
             tip.append(hand.tip_poses(said)[number])
             finger.append(number)
-            corners.append(project(points, lens) + noise_px * generator.standard_normal((4, 2)))
-    candidates = tuple(finder.poses(c) for c in corners)
-    return Views(np.array(tip), np.array(finger), np.array(corners), candidates, lens, SIDE_M)
+            corners.append(
+                marker_corners(pose[None], lens, SIDE_M)[0] + noise_px * generator.standard_normal((4, 2))
+            )
+    return Views(np.array(tip), np.array(finger), np.array(corners), lens, SIDE_M)
+
+
+def misplaced(camera, truth):
+    """By how much what is where objects are seems moved to a camera [7] that is at another place [3] [m]."""
+    point = object_place()
+    return compose(camera, compose(invert(truth), np.array([*point, 0.0, 0.0, 0.0, 1.0])))[:3] - point
+
+
+def draw(image, number, pose, lens):
+    """An image with a marker at a pose in the camera in it, each pixel the mean of 16 rays through it."""
+    rim = marker_corners(pose[None], lens, SIDE_M * (CELLS + 2 * MARGIN_CELLS) / CELLS)[0]
+    low, high = np.floor(rim.min(axis=0)).astype(int), np.ceil(rim.max(axis=0)).astype(int)
+    (width, height), picture = high - low, np.minimum(picture_of(number), 230)
+    source = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float32) * len(picture) - 0.5
+    warp = cv2.getPerspectiveTransform(source, (4 * (rim - low) - 0.5).astype(np.float32))
+    size, ways = (int(4 * width), int(4 * height)), {"flags": cv2.INTER_NEAREST}
+    ink = cv2.warpPerspective(picture, warp, size, **ways)
+    inside = cv2.warpPerspective(np.ones_like(picture), warp, size, **ways) > 0
+    part = image[low[1] : high[1], low[0] : high[0]]
+    seen = np.where(inside, ink, part.repeat(4, axis=0).repeat(4, axis=1))
+    part[:] = np.rint(seen.reshape(height, 4, width, 4).mean(axis=(1, 3)))
 
 
 def off(camera, found):
@@ -74,37 +127,25 @@ def off(camera, found):
 
 
 @pytest.mark.parametrize("fingers", [(0,), (0, 1, 2)])
-def test_exact_views_give_the_exact_camera(hand, camera, lens, poses, fingers):
-    """Dual quaternions alone already do."""
-    seen = views(hand, camera, lens, poses[fingers], fingers)
-    found = solve(seen)
+@pytest.mark.parametrize("stuck", [SLIP, compose(QUARTER, SLIP)], ids=["upright", "turned"])
+def test_exact_views_give_the_exact_camera(hand, camera, lens, poses, thought, fingers, stuck):
+    """From a camera mounted by eye, and markers stuck on with another side up."""
+    seen = views(hand, camera, lens, poses[fingers], fingers, stuck=stuck)
+    found = solve(seen, *thought)
     assert len(found.inliers) == len(seen)
-    np.testing.assert_allclose(off(camera, found.linear), 0.0, atol=1e-4)  # IPPE stops at single precision
     np.testing.assert_allclose(off(camera, found.camera), 0.0, atol=1e-6)
     assert found.rms_px < 1e-3
-
-
-def test_motions_in_closed_form_give_the_camera_by_dual_quaternions():
-    generator = np.random.default_rng(3)
-
-    def random(n):
-        turn = Rotation.random(n, random_state=generator).as_quat()
-        return np.concatenate([generator.normal(size=(n, 3)), turn], axis=1)
-
-    camera, marker, tips = random(1)[0], random(1)[0], random(8)
-    seen = compose(invert(camera), compose(tips, marker))
-    found = dual_quaternions([tips], [seen])
-    np.testing.assert_allclose(off(camera, found), 0.0, atol=1e-9)
 
 
 def test_noisy_views_err_as_predicted(hand, camera, lens, poses):
     """Corners off by 0.3 pixels and joints by 0.2 degrees: 95 % intervals hold in about 95 of 100."""
     covered, errors, predicted = [], [], []
+    marker = {0: seat(hand, 0, camera)}
     for seed in range(40):
         seen = views(
             hand, camera, lens, poses[(0,)], (0,), noise_px=0.3, joint_rad=np.radians(0.2), seed=seed
         )
-        found = refine(seen, camera)
+        found = refine(seen, camera, marker)
         covered.append(np.abs(off(camera, found.camera)) < found.half_width)
         errors.append(np.linalg.norm(misplaced(found.camera, camera)))
         predicted.append(found.point_error(object_place()))
@@ -114,103 +155,117 @@ def test_noisy_views_err_as_predicted(hand, camera, lens, poses):
     assert np.median(errors) > 0.15 * np.median(predicted)
 
 
-def test_refinement_and_outliers(hand, camera, lens, poses):
-    """Least squares beats dual quaternions alone, and views with a wrong marker are left out."""
-    refined, linear, finder = [], [], MarkerFinder(lens, SIDE_M)
-    for seed in range(2):
-        seen = views(
-            hand, camera, lens, poses[(0, 1, 2)], (0, 1, 2), noise_px=0.3, joint_rad=0.003, seed=seed
-        )
-        wrong = np.arange(2, len(seen), 6)
-        corners = seen.corners.copy()
-        corners[wrong] += 40.0
-        candidates = tuple(finder.poses(c) for c in corners)
-        found = solve(dataclasses.replace(seen, corners=corners, candidates=candidates))
-        assert not set(wrong) & set(found.inliers)
-        assert len(found.inliers) >= len(seen) - len(wrong) - 2
-        refined.append(np.linalg.norm(misplaced(found.camera, camera)))
-        linear.append(np.linalg.norm(misplaced(found.linear, camera)))
-    assert max(refined) < 0.005
-    assert np.mean(refined) < 0.5 * np.mean(linear)
+@pytest.mark.parametrize("seed", range(2))
+def test_wrong_views_are_left_out(hand, camera, lens, poses, thought, seed):
+    seen = views(hand, camera, lens, poses[(0, 1, 2)], (0, 1, 2), noise_px=0.3, joint_rad=0.003, seed=seed)
+    wrong = np.arange(2, len(seen), 6)
+    corners = seen.corners.copy()
+    corners[wrong] += 40.0
+    found = solve(replace(seen, corners=corners), *thought)
+    assert not set(wrong) & set(found.inliers)
+    assert len(found.inliers) >= len(seen) - len(wrong) - 2
+    assert np.linalg.norm(misplaced(found.camera, camera)) < 0.005
 
 
-def test_too_little_motion_is_said(hand, camera, lens, poses):
-    one_way = np.tile(poses[(0,)][-1], (10, 1))
-    one_way[:-1, 1] = np.linspace(0.4, 1.2, 9)  # only the second joint: one axis
-    one_way[:-1, 2] = -1.1
-    with pytest.raises(HandEyeError, match=r"one direction only|do not determine"):
-        solve(views(hand, camera, lens, one_way, (0,)))
+def test_too_little_motion_is_said(hand, camera, lens, poses, thought):
+    still = np.tile(poses[(0,)][-1], (10, 1))
+    still[:-1, 1] = 0.9
+    with pytest.raises(HandEyeError, match="do not determine"):
+        solve(views(hand, camera, lens, still, (0,)), *thought)
     with pytest.raises(HandEyeError, match="at least"):
-        solve(views(hand, camera, lens, poses[(0,)][-4:], (0,)))
-
-
-def test_poses_are_within_the_joints_and_over_the_table(hand, lens, poses):
-    for joints in poses.values():
-        assert (joints >= hand.lower).all()
-        assert (joints <= hand.upper).all()
-        tips = hand.tip_poses(joints)[..., 2].max()
-        assert tips < BASE_IN_WORLD[2] - 0.005  # the base looks down: larger z is lower
+        solve(views(hand, camera, lens, poses[(0,)][-4:], (0,)), *thought)
 
 
 @pytest.mark.parametrize("noise", [0.0, 3.0])
-def test_drawn_markers_are_found_where_they_are(camera, lens, noise):
+def test_drawn_markers_are_found_where_they_are(lens, noise):
     generator = np.random.default_rng(0)
-    finder = MarkerFinder(lens, SIDE_M)
     errors = []
     for number in range(12):
         pose = np.array([*generator.uniform([-0.1, -0.05, 0.5], [0.1, 0.05, 0.7]), 0, 0, 0, 1.0])
         pose[3:] = (
             Rotation.from_euler("x", np.pi) * Rotation.from_rotvec(generator.normal(0, 0.35, 3))
         ).as_quat()
-        image = draw(np.full((lens.height, lens.width), 70, dtype=np.uint8), number, pose, lens, SIDE_M)
+        image = np.full((lens.height, lens.width), 70, dtype=np.uint8)
+        draw(image, number, pose, lens)
         image = np.clip(image + noise * generator.standard_normal(image.shape), 0, 255).astype(np.uint8)
-        found = finder.find(image)
+        found = find_markers(image)
         assert list(found) == [number]
-        truth = project(Rotation.from_quat(pose[3:]).apply(square(SIDE_M)) + pose[:3], lens)
-        errors.append(found[number] - truth)
+        errors.append(found[number] - marker_corners(pose[None], lens, SIDE_M)[0])
     assert np.sqrt(np.mean(np.square(errors))) < 0.5
     assert np.abs(np.mean(errors, axis=(0, 1))).max() < 0.1  # half a pixel of another convention would show
 
 
+class Bench:
+    """A camera that is not where the hand's file has it, and motors whose fingers somebody bends."""
+
+    def __init__(self, hand, lens, poses, camera):
+        self.hand, self.intrinsics, self.poses, self.at = hand, lens, list(poses), -1
+        self.camera, self.said = compose(camera, AWAY), camera
+        self.generator, self.joints = np.random.default_rng(0), uncalibrated(hand)
+        self.bus = self
+
+    def torque(self, on):
+        """It only ever goes off."""
+        assert not on
+        return {}
+
+    def read_state(self):
+        """Where somebody holds the fingers."""
+        return SimpleNamespace(position=self.joints.to_motor(self.poses[self.at]))
+
+    def read(self, timeout_s):
+        """The next picture: it shows a finger that rests from here on."""
+        self.at = min(self.at + 1, len(self.poses) - 1)
+        image = np.full((self.intrinsics.height, self.intrinsics.width), 70, dtype=np.uint8)
+        for number, tip in enumerate(self.hand.tip_poses(self.poses[self.at])):
+            marker = compose(seat(self.hand, number, self.said), SLIP)
+            with contextlib.suppress(ValueError):  # out of the picture
+                draw(image, number, compose(invert(self.camera), compose(tip, marker)), self.intrinsics)
+        noisy = image + 3.0 * self.generator.standard_normal(image.shape, dtype=np.float32)
+        return Frame(np.clip(np.rint(noisy), 0, 255).astype(np.uint8), 0.0)
+
+    def close(self):
+        """Nothing to stop."""
+
+
 @pytest.fixture(scope="module")
-def kept(hand, lens, poses, tmp_path_factory):
-    """A folder of drawn pictures by a camera that is not where the hand's file has it, and where it is."""
-    camera_sdk()
-    twin = CalibrationTwin(
-        hand, lambda: current[0], (0, 1, 2), RealSenseCfg(width=1280, height=720), side_m=SIDE_M
-    )
-    shots = []
-    current = [poses[(0, 1, 2)][0]]
-    for q in poses[(0, 1, 2)]:
-        current[0] = q
-        shots.append(Shot(q, twin.read(5.0).image))
-    twin.close()
-    folder = tmp_path_factory.mktemp("views")
-    save_views(folder, hand, twin.intrinsics, SIDE_M, shots)
-    return folder, twin.camera
+def kept(hand, lens, poses, camera, tmp_path_factory):
+    """What calibrate leaves where somebody holds each pose for two pictures, and where the camera is."""
+    bench = Bench(hand, lens, np.repeat(poses[(0, 1, 2)], 2, axis=0), camera)
+    folder = tmp_path_factory.mktemp("taken")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "connect", lambda cfg: contextlib.nullcontext(bench))
+        patch.setattr(command, "find_device", lambda serial: None)
+        patch.setattr(command, "RealSense", lambda *_, **__: bench)
+        cfg = CalibrateCfg(hand="dclaw3", port="none", out=folder / "camera.usda", count=18, yes=True)
+        assert calibrate(cfg) == 0
+    return folder, bench.camera
 
 
 def test_pictures_of_markers_give_the_layer_that_the_loop_reads(hand, kept, tmp_path, capsys):
     folder, truth = kept
     out = tmp_path / "camera.usda"
-    assert calibrate(CalibrateCfg(hand="dclaw3", views=folder, out=out, json=True)) == 0
-    record = json.loads(capsys.readouterr().out)
+    assert calibrate(CalibrateCfg(hand="dclaw3", views=folder / "camera.views", out=out)) == 0
+    assert out.read_text() == (folder / "camera.usda").read_text()
+    moved_m = (
+        float(re.search(r"([\d.]+) mm from where the hand's file has it", capsys.readouterr().out)[1]) / 1e3
+    )
     place = read_camera(hand, out)
     found = np.concatenate([place.position, place.quaternion])
     assert np.linalg.norm(misplaced(found, truth)) < 0.001
-    np.testing.assert_allclose(place.position, record["position_m"], atol=1e-9)
-    assert record["moved_m"] == pytest.approx(np.linalg.norm(truth[:3] - hand.camera.position), abs=2e-3)
+    assert moved_m == pytest.approx(np.linalg.norm(AWAY[:3]), abs=2e-3)
     assert place.fx == hand.camera.fx
+    with pytest.raises(ValueError, match="give --hand dclaw3"):
+        calibrate(CalibrateCfg(hand="dclaw4", views=folder / "camera.views"))
 
 
 def test_a_bad_condition_is_warned_of(kept, tmp_path, capsys):
     """Six pictures of one finger, in which its joints are off by half a degree, determine little."""
-    folder, _ = kept
+    folder = kept[0] / "camera.views"
     record = json.loads((folder / "views.json").read_text())
     generator = np.random.default_rng(0)
     for row in record["views"]:
         row["joint_q"] = list(row["joint_q"] + np.radians(0.5) * generator.standard_normal(9))
-    for row in record["views"]:
         row["image"] = str(folder / row["image"])
     (tmp_path / "views.json").write_text(json.dumps(record))
     cfg = CalibrateCfg(hand="dclaw3", views=tmp_path, out=tmp_path / "c.usda", fingers=(0,))
@@ -226,15 +281,6 @@ def test_camera_layers_are_refused_by_name(hand, camera, tmp_path):
     write_camera_layer(tmp_path / "camera.usda", load_hand("dclaw4"), camera, {})
     with pytest.raises(HandError, match="dclaw4"):
         read_camera(hand, tmp_path / "camera.usda")
-    moved = camera.copy()
-    moved[0] += 0.01
-    write_camera_layer(tmp_path / "camera.usda", hand, moved, {})
-    np.testing.assert_allclose(read_camera(hand, tmp_path / "camera.usda").position, moved[:3], atol=1e-12)
-
-
-def test_views_of_another_hand_are_refused(kept):
-    with pytest.raises(ValueError, match="give --hand dclaw3"):
-        calibrate(CalibrateCfg(hand="dclaw4", views=kept[0]))
 
 
 def test_markers_are_printed_at_their_size(tmp_path):

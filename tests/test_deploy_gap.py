@@ -1,4 +1,4 @@
-"""What vd-gap makes of a recording of the twin and of the log of a flight, exactly: on a simulated clock."""
+"""What vd-gap makes of a recording of the twin and of the log of a run, exactly: on a simulated clock."""
 
 import contextlib
 import json
@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
 
@@ -15,12 +17,13 @@ from vd.assets_usd.hands import load_hand
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware import record
 from vd.deploy.hardware.connect import Connection
+from vd.deploy.hardware.control_table import TICK_MODULUS
 from vd.deploy.hardware.joints import uncalibrated
 from vd.deploy.hardware.motion import move
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop, LoopCfg
-from vd.deploy.loop.pilot import Decision
+from vd.deploy.loop.policy_runner import Decision, PolicyRunner
 from vd.deploy.safety.safety import SafeHand
 from vd.deploy.twin.newton_hand import NewtonHand
 from vd.envs.cfg import ReorientCfg
@@ -51,6 +54,19 @@ THINKING_S = 0.03
 KINDS = ("step_medium", "step_large", "sine_0.50hz", "sine_1.00hz")
 
 
+@given(seed=st.integers(0, 2**32 - 1), rate=st.floats(-1e-4, 1e-4), begin=st.floats(0.0, 60.0))
+def test_late_packets_do_not_move_the_times_of_states(seed, rate, begin):
+    """The motors' own clocks time them."""
+    rng = np.random.default_rng(seed)
+    true = 1000.0 + 0.01 * np.arange(300) + rng.uniform(0.0, 0.002, 300)
+    phase = begin + rng.uniform(0.0, 1e-3, 9)
+    ticks = (1e3 * ((true[:, None] - 1000.0) * (1.0 + rate) + phase)).astype(int) % TICK_MODULUS
+    waited = np.where(rng.random(300) < 0.25, rng.uniform(0.0, 0.02, 300), rng.uniform(0.0, 1e-4, 300))
+    found = record.measured_at(true - waited, ticks)
+    assert np.abs(found - true).max() < 0.7e-3
+    assert np.sqrt(np.mean((found - true) ** 2)) < 0.3e-3
+
+
 @pytest.mark.slow
 def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     """Four motions of one joint, and three candidates: enough for one effect."""
@@ -70,7 +86,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(record, "connect", connect)
     monkeypatch.setattr(record, "motions_of", lambda *_: chosen)
     cfg = record.RecordCfg(hand="dclaw4", port="simulated", out=tmp_path / "rec", fingers=(0,))
-    assert record.record(replace(cfg, yes=True, realtime="off")) == 0
+    assert record.record(replace(cfg, yes=True, realtime=False)) == 0
     candidates = "command_delay,coulomb_friction,backlash"
     out = tmp_path / "gap"
     assert gap.main(["run", str(tmp_path / "rec"), "--out", str(out), "--effects", candidates]) == 0
@@ -80,16 +96,12 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     assert found["command_delay"]["parameters"]["delay_s"]["value"] == pytest.approx(DELAY_S, abs=0.001)
 
 
-class Waving:
+class Waving(PolicyRunner):
     """A policy that moves all joints of dclaw3 back and forth, each in its own time."""
 
     def __init__(self, clock):
-        self.rule, self._clock, self._step = StoppingRule(), clock, 0
-
-    def begin(self):
-        """Nothing to forget."""
-
-    new_goal = begin
+        super().__init__(ReorientCfg(), StoppingRule())
+        self._clock, self._step = clock, 0
 
     def decide(self, sensed):
         """After a while."""
@@ -98,8 +110,8 @@ class Waving:
         return Decision(0.8 * np.sin(0.4 * self._step + np.arange(9.0)), float("nan"))
 
 
-def fly(folder, plant_hand, episode_s):
-    """The log of a flight without an object."""
+def rollout(folder, plant_hand, episode_s):
+    """The log of a run without an object."""
     hand = load_hand("dclaw3")
     joints = uncalibrated(hand)
     plant = NewtonHand(plant_hand, joints, SimCfg(physics_hz=960.0))
@@ -116,27 +128,27 @@ def fly(folder, plant_hand, episode_s):
     return folder
 
 
-def test_a_flight_tells_when_its_goals_were_sent(tmp_path):
+def test_a_run_tells_when_its_goals_were_sent(tmp_path):
     """The true model follows them; with the times of the states it would be early."""
     hand = load_hand("dclaw3")
-    flight = read_recording(fly(tmp_path / "log", hand, 4.0))
-    (motion,) = flight.trajectories
-    stamped = replace(flight, trajectories=(replace(motion, command_time=None),))
+    run = read_recording(rollout(tmp_path / "log", hand, 4.0))
+    (motion,) = run.trajectories
+    stamped = replace(run, trajectories=(replace(motion, command_time=None),))
 
     def error(recording):
         chain = chains(recording, hand)[0]
         rollouts = Rollouts(chain, recording)
         return np.median(np.abs(rollouts.predict(chain.start_row[None])[0] - rollouts.measured))
 
-    assert error(flight) < 0.001 < 0.01 < error(stamped)
+    assert error(run) < 0.001 < 0.01 < error(stamped)
 
 
 @pytest.mark.slow
-def test_a_flight_alone_is_given_no_name(tmp_path):
+def test_a_run_alone_is_given_no_name(tmp_path):
     """Not even that of an effect which it has: one motion leaves none to hold out."""
     hand = load_hand("dclaw3")
     servo = hand.servo.copy()
     servo[:, COMMAND_DELAY] = 0.06
-    folder = fly(tmp_path / "log", replace(hand, servo=servo), 4.0)
+    folder = rollout(tmp_path / "log", replace(hand, servo=servo), 4.0)
     report = explain(folder, hand, tmp_path / "gap", effects=("command_delay",), workers=1)
     assert report.verdict == "under_excited" and not report.effects

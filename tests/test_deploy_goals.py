@@ -11,7 +11,7 @@ from vd.assets_usd.hand_data import BASE_IN_WORLD, compose, invert
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.deploy.loop.goals import GoalError, one_object, read_goals, scan_object
-from vd.deploy.loop.observation import Sensed, senses_of
+from vd.deploy.loop.policy_runner import Sensed, senses_of
 from vd.paper import PAPER
 from vd.vision.cfg import PRESETS
 from vd.vision.sight import Sight

@@ -2,14 +2,12 @@
 
 import numpy as np
 
-from vd.assets_usd.camera_layer import write_camera_layer
+from vd.assets_usd.camera_layer import read_camera, write_camera_layer
 from vd.assets_usd.hand_data import Intrinsics
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.config import to_dict
-from vd.deploy.loop.flight import Flight, look, make_flight
-from vd.deploy.loop.observation import Sensed
-from vd.deploy.loop.pilot import StudentPilot
+from vd.deploy.loop.policy_runner import Sensed, StudentRunner, load_runner
 from vd.envs.cfg import ReorientCfg
 from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRule
@@ -20,10 +18,8 @@ from vd.vision.saved import SavedStudent, StudentSpec
 SHIFT_M = 0.01
 
 
-class Source:
-    """A camera with another lens and size than the training's."""
-
-    intrinsics = Intrinsics(64, 36, 55.0, 55.0, 31.0, 19.0)
+LENS = Intrinsics(64, 36, 55.0, 55.0, 31.0, 19.0)
+"""Another one than the training's."""
 
 
 def make_student(**rules):
@@ -40,44 +36,41 @@ def make_student(**rules):
     )
 
 
-def test_a_pilot_stops_by_the_rule_for_its_tolerance():
+def test_a_runner_stops_by_the_rule_for_its_tolerance():
     near, precise = StoppingRule(0.37, 2.0), StoppingRule(0.07, 0.9)
     hand, (item,) = load_hand("dclaw3"), load_set("cube")
     student = make_student(stopping=near, precise=precise)
-    assert StudentPilot(student, hand, item).rule == near
-    assert StudentPilot(student, hand, item, tolerance_rad=0.1).rule == precise
-    teacher = make_flight("dclaw3-table", "dclaw3", "cube", hand, item, tolerance_rad=0.1)
-    assert teacher.pilot.rule == StoppingRule(0.1) and teacher.calibrated
+    assert StudentRunner(student, hand, item).rule == near
+    assert StudentRunner(student, hand, item, tolerance_rad=0.1).rule == precise
 
 
-def test_installed_trackers_stop_by_rules_from_episodes_and_a_flight_says_where_there_is_none():
+def test_installed_trackers_stop_by_rules_from_episodes_and_say_where_there_is_none():
     (item,) = load_set("cube")
     for name in ("dclaw3", "dclaw4"):
         hand = load_hand(name)
-        flights = {
-            tolerance: make_flight(f"{name}-tracking", name, "cube", hand, item, tolerance_rad=tolerance)
+        runners = {
+            tolerance: load_runner(f"{name}-tracking", name, hand, item, tolerance_rad=tolerance)
             for tolerance in (0.4, 0.2, 0.1)
         }
-        assert [flight.calibrated for flight in flights.values()] == [True, False, True]
-        bounds = [flight.pilot.rule.distance_rad for flight in flights.values()]
+        assert [runner.calibrated for runner in runners.values()] == [True, False, True]
+        bounds = [runner.rule.distance_rad for runner in runners.values()]
         assert bounds[0] > bounds[1] > bounds[2] > 0.0
 
 
 def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
     hand = load_hand("dclaw3")
-    pilot = StudentPilot(make_student(), hand, load_set("cube")[0])
-    flight = Flight("student", "student", pilot, ReorientCfg(hand="dclaw3"), pilot.camera)
+    runner = StudentRunner(make_student(), hand, load_set("cube")[0])
     zero, image = np.zeros(9), np.full((36, 64), 0.6, dtype=np.float32)
     sensed = Sensed(zero, zero, zero, np.array([0.0, 0.0, 0.0, 1.0]), depth=image)
 
     def middle():
-        points = pilot.sight.points(pilot.frame(sensed))[0, pilot.sight.ends[1] :].numpy()
+        points = runner.sight.points(runner.frame(sensed))[0, runner.sight.ends[1] :].numpy()
         return points[np.isfinite(points).all(axis=1)]
 
-    look(flight, Source(), hand, None)
+    runner.look_by(LENS.seen_from(runner.camera))
     before = middle()
     # Every point is one of the image by this lens, from the place of the training.
-    seen = pilot.camera.project(before)
+    seen = runner.camera.project(before)
     assert len(before) == len(seen) > 100
     np.testing.assert_allclose(seen[:, 2], 0.6, atol=1e-5)
     np.testing.assert_allclose(seen[:, :2] % 1.0, 0.5, atol=2e-3)
@@ -85,6 +78,6 @@ def test_lens_and_place_are_those_of_the_real_camera(tmp_path):
     place = np.concatenate([hand.camera.position, hand.camera.quaternion])
     place[1] += SHIFT_M
     write_camera_layer(tmp_path / "camera.usda", hand, place, {})
-    look(flight, Source(), hand, tmp_path / "camera.usda")
+    runner.look_by(LENS.seen_from(read_camera(hand, tmp_path / "camera.usda")))
     # Sideways in the base is level: the crop by height keeps the same pixels.
     np.testing.assert_allclose(np.sort(middle()[:, 1]), np.sort(before[:, 1]) + SHIFT_M, atol=1e-5)

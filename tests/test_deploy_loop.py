@@ -1,34 +1,25 @@
 """The control loop: its clock, how goals end, what is logged, and the whole of it on a twin."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from camera_sdk import camera_sdk
 from simulated_clock import SimulatedClock
-from student_dummy import TINY
 
 from vd.assets_usd.hands import load_hand
-from vd.bundle.store import write_student
-from vd.config import to_dict
 from vd.deploy import cli
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.loop.action import ActionFilter
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.loop import ControlLoop, LoopCfg
-from vd.deploy.loop.pilot import Decision, TeacherPilot
+from vd.deploy.loop.policy_runner import Decision, PolicyRunner, TrackingRunner
 from vd.deploy.loop.run_page import FILM_FILE, PAGE_FILE, goal_results, summary_line
 from vd.deploy.safety.safety import StoppedError
-from vd.deploy.twin.twin_link import TwinState
 from vd.envs.cfg import ReorientCfg
 from vd.hand_log import read_log
 from vd.paper import PAPER
-from vd.sensors.cfg import DepthCameraCfg
 from vd.stopping import StoppingRule
-from vd.vision.network import Student
-from vd.vision.saved import SavedStudent, StudentSpec
 
 HZ = PAPER.scene.control_hz
 GOAL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -60,32 +51,26 @@ class Hand:
         self.missed.append(missed)
 
 
-@dataclass
-class Countdown:
-    """A policy whose predicted distance falls by 0.1 rad a step from ``start``."""
+class Countdown(PolicyRunner):
+    """A policy whose predicted distance falls by 0.1 rad a step from ``start``; its first look takes long."""
 
-    start: float = 1.0
-    rule: StoppingRule = field(default_factory=lambda: StoppingRule(0.35, 2.0))
-    seen: list = field(default_factory=list)
-    """What it decided on, goals begun."""
-    begun: int = 0
-    look: Callable[[], None] = lambda: None
-    """What it does at its first look."""
+    def __init__(self, clock: SimulatedClock, start: float = 1.0):
+        super().__init__(ReorientCfg(), StoppingRule(0.35, 2.0))
+        self.clock, self.start = clock, start
 
     def begin(self) -> None:
         """Nothing is known."""
-        self.distance, self.begun, self.seen = self.start, 0, []
+        self.distance, self.begun, self.decided = self.start, 0, 0
 
     def new_goal(self) -> None:
         """From the start again."""
-        self.distance, self.begun = self.start, self.begun + 1
+        self.distance, self.begun, self.decided = self.start, self.begun + 1, 0
 
     def decide(self, sensed) -> Decision:
         """A tenth nearer."""
-        if self.begun:
-            self.seen.append(sensed)
-        else:
-            self.look()
+        if not self.begun:
+            self.clock.sleep(3.0 / HZ)
+        self.decided += 1
         self.distance -= 0.1
         return Decision(np.full(9, 0.1), self.distance)
 
@@ -96,7 +81,7 @@ def parts(tmp_path):
     hand = load_hand("dclaw3")
     log = LogWriter(tmp_path / "log", hand, {"goals": [list(GOAL)] * 2}, servo={}, truth=True, clock=clock)
     actions = ActionFilter(hand, ReorientCfg())
-    return Hand(clock), Countdown(), actions, Pacer(HZ, clock), log
+    return Hand(clock), Countdown(clock), actions, Pacer(HZ, clock), log
 
 
 @dataclass
@@ -106,10 +91,9 @@ class Truth:
     position: tuple[float, float, float] = (0.0, 0.0, 0.03)
     quat: tuple[float, ...] = tuple(GOAL)
 
-    def state(self) -> TwinState:
+    def object_pose(self) -> np.ndarray:
         """Where it lies."""
-        pose = np.array([*self.position, *self.quat])
-        return TwinState(0.0, 0.0, np.zeros(9), np.zeros(9), pose, np.zeros(6))
+        return np.array([*self.position, *self.quat])
 
 
 def test_the_grid_stays_where_it_was_whatever_is_late():
@@ -128,12 +112,12 @@ def test_the_grid_stays_where_it_was_whatever_is_late():
 
 
 def test_it_acts_until_the_policy_has_arrived_then_holds_and_goes_on(parts):
-    hand, pilot, actions, pacer, log = parts
-    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(episode_s=10.0, hold_s=0.5), truth=Truth())
+    hand, runner, actions, pacer, log = parts
+    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=10.0, hold_s=0.5), twin=Truth())
     assert loop.run([GOAL, GOAL]) == ["stopped", "stopped"]
     log.finish("done")
     read = read_log(log.folder)
-    assert pilot.begun == 2
+    assert runner.begun == 2 and pacer.missed == 0 and loop.times[0].late_s == 0.0
     # From 1.0 in steps of 0.1 below 0.35: the seventh decision stops, so six actions are taken.
     acting, number = read.columns["acting"], read.columns["goal"]
     assert acting[number == 0].sum() == 7 and (acting == 0).sum() == 2 * 6
@@ -163,12 +147,12 @@ def test_it_acts_until_the_policy_has_arrived_then_holds_and_goes_on(parts):
 )
 def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
     """By the truth, not by what the policy says: only a goal at which it stopped is reached."""
-    hand, pilot, actions, pacer, log = parts
+    hand, runner, actions, pacer, log = parts
     quat = np.array([0.0, 0.0, np.sin(0.5 * (turned or 0.0)), np.cos(0.5 * (turned or 0.0))])
     truth = None if turned is None else Truth(quat=tuple(quat))
     if truth is None:
         log = LogWriter(log.folder / "real", load_hand("dclaw3"), log._run, servo={}, clock=hand.clock)
-    ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(episode_s=limit_s, hold_s=0.2), truth=truth).run(
+    ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=limit_s, hold_s=0.2), twin=truth).run(
         [GOAL]
     )
     log.finish("done")
@@ -179,14 +163,22 @@ def test_what_came_of_each_goal_is_told(parts, turned, limit_s, said):
 
 
 def test_a_goal_that_is_not_reached_ends_by_its_time_and_a_lost_object_the_run(parts):
-    hand, pilot, actions, pacer, log = parts
-    pilot.start = 9.0
-    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), truth=Truth())
+    hand, runner, actions, pacer, log = parts
+    runner.start = 9.0
+    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), twin=Truth())
     assert loop.run([GOAL]) == ["time limit"]
-    assert len(pilot.seen) == 12
+    assert runner.decided == 12
     away = Truth((0.3, 0.0, 0.03))
-    lost = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), truth=away)
+    lost = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=1.0, hold_s=0.0), twin=away)
     assert lost.run([GOAL, GOAL]) == ["lost"]
+
+
+def test_there_is_nothing_to_stop_before_the_first_action(parts):
+    hand, runner, actions, pacer, log = parts
+    runner.start = 0.1
+    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(hold_s=0.0))
+    assert loop.run([GOAL]) == ["stopped"]
+    assert runner.decided == 2
 
 
 def test_one_long_step_makes_no_other_late():
@@ -203,31 +195,14 @@ def test_one_long_step_makes_no_other_late():
 
 
 def test_missed_deadlines_are_counted_and_told(parts):
-    hand, pilot, actions, pacer, log = parts
+    hand, runner, actions, pacer, log = parts
     hand.work = [0.01, 0.01, 0.1, 0.01]
-    pilot.start = 9.0
-    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(episode_s=0.5, hold_s=0.0))
+    runner.start = 9.0
+    loop = ControlLoop(hand, runner, actions, pacer, log, LoopCfg(episode_s=0.5, hold_s=0.0))
     loop.run([GOAL])
     look = [False, False]
     assert hand.missed == [*look, False, False, True, False, False, False] and pacer.missed == 1
     assert loop.times[2].sent_s == pytest.approx(0.1) and loop.times[3].late_s == pytest.approx(0.1 - 1 / HZ)
-
-
-def test_the_first_look_has_no_deadline(parts):
-    hand, pilot, actions, pacer, log = parts
-    looks = []
-    pilot.look = lambda: (looks.append(hand.clock.now()), hand.clock.sleep(3.0 / HZ))
-    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(hold_s=0.0))
-    assert loop.run([GOAL, GOAL]) == ["stopped", "stopped"]
-    assert len(looks) == 1 and pacer.missed == 0 and loop.times[0].late_s == 0.0
-
-
-def test_there_is_nothing_to_stop_before_the_first_action(parts):
-    hand, pilot, actions, pacer, log = parts
-    pilot.start = 0.1
-    loop = ControlLoop(hand, pilot, actions, pacer, log, LoopCfg(hold_s=0.0))
-    assert loop.run([GOAL]) == ["stopped"]
-    assert len(pilot.seen) == 2
 
 
 @pytest.fixture
@@ -236,19 +211,25 @@ def patient() -> list[str]:
     return ["--safety.misses", "1000", "--safety.lost-s", "30", "--safety.watchdog-s", "2.5"]
 
 
-@pytest.mark.slow
-def test_a_teacher_flies_a_twin(tmp_path, capsys, patient):
-    """Everything but a real hand: the process of the twin, its bus, limits, policy, log."""
+def driven(flags: list[str], capsys) -> tuple[int, str, str]:
+    """Status and output of vd-deploy; where this machine is too busy the test is skipped."""
     pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
+    status, (out, words) = cli.main(flags), capsys.readouterr()
+    if "loop rate" in words or "asked again" in words:
+        pytest.skip(f"this machine is too busy: {words.splitlines()[-1]}")
+    return status, out, words
+
+
+@pytest.mark.slow
+def test_the_installed_policy_drives_a_twin(tmp_path, capsys, patient):
+    """Everything but a real hand: the process of the twin, its bus, limits, policy, log."""
     folder = tmp_path / "log"
     flags = ["--hand", "dclaw3", "--twin", "--episode-s", "2", "--hold-s", "0.2", "--log", str(folder)]
     goals = ["--goal", "0,0,0,1", "0,0,0.84147,0.5403"]  # the second 2 rad away, so that it takes a while
-    status, (out, words) = cli.main([*flags, *patient, *goals]), capsys.readouterr()
-    if "loop rate" in words or "asked again" in words:
-        pytest.skip(f"this machine is too busy: {words.splitlines()[-1]}")
+    status, out, words = driven([*flags, *patient, *goals], capsys)
     assert status == 0, words
     log = read_log(folder)
-    assert log.run["kind"] == "teacher" and log.run["end"]["reason"] == "all goals pursued"
+    assert log.run["kind"] == "tracking" and log.run["end"]["reason"] == "all goals pursued"
     assert [stop.goal for stop in log.stops] == [0, 1]
     steps = len(log.columns["t"])
     assert log.run["end"]["steps"] == steps >= 10
@@ -261,57 +242,35 @@ def test_a_teacher_flies_a_twin(tmp_path, capsys, patient):
 
 
 @pytest.mark.slow
-def test_a_flight_that_a_fault_ends_leaves_its_page(tmp_path, capsys, patient, monkeypatch):
-    pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
+def test_a_camera_policy_drives_a_twin_and_a_fault_leaves_the_page(tmp_path, capsys, patient, monkeypatch):
     folder = tmp_path / "log"
-    decide, seen = TeacherPilot.decide, []
+    decide, seen = TrackingRunner.decide, []
 
-    def until_hot(pilot, sensed):
-        seen.append(sensed)
+    def until_hot(runner, sensed):
+        seen.append(sensed.depth)
         if len(seen) > 10:
             raise StoppedError("f0_j0, motor 10: 81 deg C, over 70")
-        return decide(pilot, sensed)
+        return decide(runner, sensed)
 
-    monkeypatch.setattr(TeacherPilot, "decide", until_hot)
-    flags = ["--hand", "dclaw4", "--twin", "--goal", "0,0,0.84147,0.5403", "--log", str(folder)]
-    status, (out, words) = cli.main([*flags, *patient]), capsys.readouterr()
-    if "loop rate" in words or "asked again" in words:
-        pytest.skip(f"this machine is too busy: {words.splitlines()[-1]}")
+    monkeypatch.setattr(TrackingRunner, "decide", until_hot)
+    flags = ["dclaw4-tracking", "--hand", "dclaw4", "--twin", "--goal", "0,0,0.84147,0.5403"]
+    status, out, words = driven([*flags, *patient, "--log", str(folder)], capsys)
     assert status == 1 and "81 deg C" in words
+    assert all(image.shape == (180, 320) and (image > 0.0).mean() > 0.5 for image in seen)
+    assert read_log(folder).run["kind"] == "tracking"
     assert "goal 1: not reached: aborted" in out
     assert "aborted" in (folder / PAGE_FILE).read_text() and (folder / FILM_FILE).stat().st_size > 1000
 
 
-@pytest.mark.slow
-def test_a_student_sees_a_twin_through_the_cameras_sdk(tmp_path, capsys, patient):
-    """Random weights that never stop; the simulator shows what the student saw, images included."""
-    pytest.importorskip("dynamixel_sdk", reason="needs the extra `hardware`")
-    camera_sdk()
-    spec = StudentSpec(
-        network=TINY, num_actions=9, stage=2, teacher="none", stopping=StoppingRule(-100.0, 1.0)
-    )
-    network = Student(TINY, 9).eval().requires_grad_(False)
-    task, depth = to_dict(ReorientCfg(hand="dclaw3")), to_dict(DepthCameraCfg())
-    write_student(tmp_path / "student", SavedStudent(spec, network, task, depth, 0, 0), load_hand("dclaw3"))
-    folder = tmp_path / "log"
-    flags = ["--hand", "dclaw3", "--twin", "--sdk", "--images", "--episode-s", "1", "--hold-s", "0"]
-    status = cli.main([*flags, *patient, "--log", str(folder), str(tmp_path / "student")])
-    words = capsys.readouterr().err
-    if "loop rate" in words or "asked again" in words:
-        pytest.skip(f"this machine is too busy: {words.splitlines()[-1]}")
-    assert status == 0, words
-    log = read_log(folder)
-    assert log.run["kind"] == "student" and len(log.columns["t"]) == 12
-    assert log.image(11).shape == (180, 320) and (log.image(11) > 0.0).mean() > 0.5
-    assert cli.main(["shadow", str(folder), "--every", "5"]) == 0, capsys.readouterr().out
-
-
-def test_what_cannot_be_flown_is_refused(tmp_path, capsys):
-    assert cli.main(["--hand", "dclaw3", "--port", "/dev/none", "dclaw3-table"]) == 1
-    assert "true pose, which no real hand tells" in capsys.readouterr().err
-    assert cli.main(["--hand", "dclaw4", "--twin", "dclaw3-table"]) == 1
-    assert "moves 9 joints, the hand dclaw4 has 12" in capsys.readouterr().err
-    assert cli.main(["--hand", "dclaw3", "--port", "/dev/none"]) == 1
-    assert "name the policy" in capsys.readouterr().err
-    assert cli.main(["--hand", "dclaw3", "--twin", "still", "--goal", "1,2,3"]) == 1
-    assert "give a quaternion" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("flags", "error"),
+    [
+        ("--hand dclaw3 --twin dclaw3-table", "no robot senses; vd-train tracker"),
+        ("--hand dclaw4 --twin dclaw3-tracking", "moves 9 joints, the hand dclaw4 has 12"),
+        ("--hand dclaw3 --port /dev/none", "name the policy"),
+        ("--hand dclaw3 --twin zero --goal 1,2,3", "give a quaternion"),
+    ],
+)
+def test_what_cannot_be_run_is_refused(flags, error, capsys):
+    assert cli.main(flags.split()) == 1
+    assert error in capsys.readouterr().err

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.deploy.loop.log import LogWriter
 from vd.deploy.loop.mocap import MocapError, read_mocap
-from vd.deploy.loop.score import find_offset, in_world, score_run
-from vd.deploy.loop.score_command import ScoreCfg, score
+from vd.deploy.loop.score import ScoreCfg, in_world, score, score_run
 from vd.evaluate.statistics import rotation_angle
 from vd.hand_log import JOINT_CHANNELS, STEP_COLUMNS, read_log
 
@@ -129,44 +128,25 @@ def test_errors_are_those_at_the_stops_and_lost_markers_discard(run, tmp_path):
         assert 0.0 <= share.low <= share.value <= share.high <= 1.0
 
 
-@pytest.mark.parametrize("start", [1234.5, -3.0])
-def test_a_clock_of_its_own_is_matched_by_the_predictions(run, tmp_path, start):
-    mocap = read_mocap(run.export(tmp_path / "m.csv", start=start))
-    assert find_offset(run.log, mocap) == pytest.approx(start, abs=0.05)
-    result = score_run(run.log, mocap, NONE)
-    assert result.trials[0].error_rad == pytest.approx(ERRORS[0], abs=0.05)
-
-
 def test_seconds_since_1970_need_no_search(run, tmp_path):
     mocap = read_mocap(run.export(tmp_path / "m.csv", start=run.log.run["unix_s"]))
     result = score_run(run.log, mocap, NONE)
     assert result.offset_s == run.log.run["unix_s"]
     assert result.trials[0].error_rad == pytest.approx(ERRORS[0], abs=1e-3)
-
-
-def test_a_track_of_something_else_matches_no_offset(run, tmp_path):
-    generator = np.random.default_rng(0)
-    run.turn = Rotation.random(len(run.turn), random_state=generator).as_quat()
-    with pytest.raises(MocapError, match="--offset-s"):
-        find_offset(run.log, read_mocap(run.export(tmp_path / "m.csv", start=50.0)))
-    mocap = read_mocap(run.export(tmp_path / "m.csv", start=run.log.run["unix_s"] + 3600.0))
     with pytest.raises(MocapError, match="right take"):
-        score_run(run.log, mocap, NONE)
+        score_run(run.log, mocap, NONE, offset_s=3600.0)
 
 
 def test_symmetric_objects_count_up_to_their_symmetry(tmp_path, monkeypatch, capsys):
     """A cube that was put down a quarter turn further is scored as if it had not been."""
     turned = Run(tmp_path / "log", monkeypatch, turn=QUARTER)
     path = turned.export(tmp_path / "m.csv")
-    cfg = ScoreCfg(log=tmp_path / "log", mocap=path, offset_s=0.0, json=True, page=tmp_path / "page.html")
+    cfg = ScoreCfg(log=tmp_path / "log", mocap=path, offset_s=0.0, json=True)
     assert score(cfg) == 0
     record = json.loads(capsys.readouterr().out)
     assert record["trials"][0]["error_rad"] == pytest.approx(ERRORS[0], abs=1e-3)
     plain = score_run(turned.log, read_mocap(path), NONE, offset_s=0.0)
     assert plain.trials[0].error_rad > 1.0
-    page = (tmp_path / "page.html").read_text()
-    assert page.count("<img") == 2
-    assert "time limit" in page
 
 
 def test_an_optitrack_export_is_read(run, tmp_path):
@@ -193,10 +173,10 @@ def test_the_markers_frame_on_the_object_is_taken_out(run, tmp_path):
     ("text", "why"),
     [
         ("time,x\n0,1\n", "no column 'y'"),
-        ("time,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,one\n", "line 2: 'one'"),
+        ("time,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,one\n", "'one'"),
         ("time,x,y,z,qx,qy,qz,qw\n0,0,0,0,0,0,0,2\n1,0,0,0,0,0,0,2\n", "not 1"),
         ("time,x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1\n0,0,0,0,0,0,0,1\n", "must rise"),
-        ("time,x,y,z,qx,qy,qz,qw\n", "no samples"),
+        ("time,x,y,z,qx,qy,qz,qw\n", "at least two samples"),
         ("", "no column"),
         ("Format Version,1.23,Rotation Type,XYZ\n", "as quaternions"),
         ("Format Version,1.23,Length Units,Feet\n", "feet"),

@@ -257,16 +257,3 @@ def test_a_force_gives_its_impulse_in_the_time_it_acts(force_s, share, sim):
     steps = round(share * env.cfg.sim.substeps)
     np.testing.assert_allclose(gained[steps - 1], gained[-1], atol=1e-5)
     assert np.linalg.norm(gained[0], axis=1) == pytest.approx(15.0 * force_s / steps, rel=0.02)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"observation": ObservationCfg(history=-1)}, "observation.history"),
-        ({"randomisation": late(0.7)}, "randomisation.observation_latency_s"),
-        ({"randomisation": RandomisationCfg(force_s=0.0)}, "randomisation.force_s"),
-    ],
-)
-def test_settings_that_cannot_work_are_named(changes, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(ReorientCfg(), **changes).validate()

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vd.assets_usd.hand_author import hand_usd
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hand_layer import write_layer
 from vd.assets_usd.hand_model import read_hand
+from vd.assets_usd.hands import hand_usd
 from vd.envs.cfg import RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.envs.servo import needs_servo, servo_ranges
@@ -71,13 +71,6 @@ def joints(env: ReorientEnv) -> np.ndarray:
     return env.sim.joint_q.numpy()[:, : env.num_actions].copy()
 
 
-def test_a_layer_that_changes_nothing_leaves_every_bit(layer):
-    same = {"f0_j1": {"velocity_limit": 6.552, "inertia": 0.001}}
-    plain, layered = (make(path, randomisation=RandomisationCfg()) for path in (None, layer(same)))
-    assert plain.sim.servo is None and layered.sim.servo is None, "without an effect no servo is simulated"
-    assert np.array_equal(run(plain, 6), run(layered, 6))
-
-
 def test_identified_gains_reach_the_solver_without_a_servo(layer):
     env = make(layer({"f1_j2": {"kp": 1.25, "kd": 0.1}}))
     assert env.sim.servo is None
@@ -85,28 +78,6 @@ def test_identified_gains_reach_the_solver_without_a_servo(layer):
     joint = JOINTS.index("f1_j2")
     assert model.actuator_gainprm.numpy()[:, joint, 0] == pytest.approx(1.25)
     assert model.actuator_biasprm.numpy()[:, joint, 1:3] == pytest.approx(np.tile([-1.25, -0.1], (WORLDS, 1)))
-
-
-def test_a_command_delay_delays_the_joint_by_itself(layer):
-    delay = 0.04
-    sim = SimCfg(physics_hz=240.0, control_hz=120.0)
-    paths = []
-    for path in (None, layer(command_delay={"delay_s": delay})):
-        env = make(path, sim=sim)
-        target = env.sim.target.numpy().copy()
-        target[:, :9] = joints(env)
-        positions = []
-        for step in range(60):
-            if step == 30:  # at rest by now
-                target[:, 0:9:3] += 0.3
-            env.sim.target.assign(target)
-            env.sim.step()
-            positions.append(joints(env)[:, 0] - 0.15)
-        paths.append(np.array(positions)[30:])
-    times = (np.arange(30) + 1) * sim.control_dt
-    for world in range(WORLDS):
-        reached = [np.interp(0.0, path[:, world], times) for path in paths]
-        assert reached[1] - reached[0] == pytest.approx(delay, abs=sim.physics_dt)
 
 
 def test_the_policy_sees_and_acts_on_what_the_encoder_reports(layer):
@@ -184,21 +155,6 @@ def test_servos_are_drawn_anew_and_started_anew_with_their_world_alone(layer):
     assert np.array_equal(env.measured_q.numpy()[1], joints(env)[1])
 
 
-def test_velocities_are_observed_as_late_as_positions(layer):
-    """A read delay of two control steps shows the joints' motion of then, positions and velocities."""
-    steps, control_dt = 2, make().cfg.sim.control_dt
-    late = make(layer(read_delay={"delay_s": steps * control_dt}))
-    d, seen, true = late.num_actions, [], []
-    for i in range(steps + 4):
-        late.action.fill_(0.8 if i % 2 else -0.8)
-        late.step(late.action)
-        true.append(late.sim.joint_qd.numpy()[0, :d].copy())
-        seen.append(late.measured_qd.numpy()[0, :d].copy())
-    assert np.abs(true).max() > 0.1
-    np.testing.assert_allclose(seen[-1], true[-1 - steps], atol=2e-3 * np.abs(true).max())
-    assert np.abs(seen[-1] - true[-1]).max() > 0.05 * np.abs(true).max()
-
-
 def test_a_torque_limit_bounds_the_torque_that_costs_energy(layer):
     env = make(layer(torque_limit={"tau_max_nm": 0.02}))
     plain = make()
@@ -237,11 +193,6 @@ def test_saved_state_continues_exactly_and_other_servos_are_refused(layer):
 def test_wrong_effects_are_refused(effects, message):
     with pytest.raises(ValueError, match=message.replace(".", r"\.")):
         make(randomisation=RandomisationCfg(effects=effects))
-
-
-def test_a_missing_layer_stops_at_once(tmp_path):
-    with pytest.raises(ValueError, match="no such hand layer"):
-        make(str(tmp_path / "identified.usda"))
 
 
 def test_an_interval_of_stiffness_alone_needs_no_servo(hand, layer):

@@ -11,8 +11,8 @@ import sys
 import numpy as np
 import pytest
 
-from vd.assets_usd.bare_layer import read_bare_layer
 from vd.assets_usd.hand_data import HandError
+from vd.assets_usd.hand_layer import read_bare_layer
 from vd.bench.hide import hide
 from vd.gap import cli, steps
 from vd.gap.chain import chains
@@ -271,7 +271,7 @@ def test_effects_of_the_layer_that_was_started_from_stay(recording, tmp_path):
 def test_layers_that_are_none_are_named(recording, tmp_path):
     report, _ = servo_report(recording)
     layer = tmp_path / "identified.usda"
-    with pytest.raises(HandError, match="no such layer"):
+    with pytest.raises(HandError, match="no such hand layer"):
         read_bare_layer(layer, (JOINT,))
     layer.write_text("not USD")
     with pytest.raises(HandError, match=re.escape(str(layer))):

@@ -7,8 +7,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from vd.assets_usd.hand_author import hand_usd
 from vd.assets_usd.hand_model import HandModel, read_hand
+from vd.assets_usd.hands import hand_usd
 
 GEOMS = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,
@@ -71,11 +71,6 @@ def test_no_self_penetration_at_reset_pose(hand: HandModel, distances: Distances
     assert min(clearances.values()) > 0.002, clearances
 
 
-def test_neighbours_in_a_finger_never_collide(hand: HandModel) -> None:
-    for joint in range(hand.num_joints):
-        assert (hand.joint_parent[joint], hand.joint_child[joint]) in hand.filtered_pairs
-
-
 def test_other_filtered_pairs_cannot_touch(hand: HandModel, distances: Distances) -> None:
     """Random poses, a third of the joints at a limit; by symmetry the pairs of finger 0 are enough."""
     joined = set(zip(hand.joint_parent.tolist(), hand.joint_child.tolist(), strict=True))
@@ -88,20 +83,3 @@ def test_other_filtered_pairs_cannot_touch(hand: HandModel, distances: Distances
         q = hand.lower + unit * (hand.upper - hand.lower)
         clearances = distances(q, pairs)
         assert min(clearances.values()) > 0.005, (clearances, q)
-
-
-def test_links_that_matter_do_collide(hand: HandModel) -> None:
-    """Fingertips may touch each other, every other finger's middle links, and the palm."""
-    index = {name: i for i, name in enumerate(hand.link_names)}
-    for f in range(1, hand.num_fingers):
-        assert (index["f0_l3"], index[f"f{f}_l3"]) not in hand.filtered_pairs
-        assert (index["f0_l3"], index[f"f{f}_l2"]) not in hand.filtered_pairs
-    assert (0, index["f0_l3"]) not in hand.filtered_pairs
-
-
-def test_few_shapes_and_no_cylinders(hand: HandModel) -> None:
-    """Contact candidates are what a step costs; cylinders are MuJoCo Warp's weak primitive."""
-    assert {shape.kind for shape in hand.shapes} <= {"box", "capsule", "sphere"}
-    for link in range(1, len(hand.link_names)):
-        assert sum(shape.link == link for shape in hand.shapes) <= 2
-    np.testing.assert_allclose([shape.gap for shape in hand.shapes], 0.002, rtol=1e-6)

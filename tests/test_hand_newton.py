@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import warp as wp
 
-from vd.assets_usd.hand_author import hand_usd
 from vd.assets_usd.hand_model import HandModel, open_stage, read_hand
+from vd.assets_usd.hands import hand_usd
 
 MOUNT = ((0.0, 0.0, 0.25), (0.0, 1.0, 0.0, 0.0))
 """Base frame in the world: 0.25 m up, turned by pi about +y."""

@@ -16,7 +16,7 @@ from vd.assets_usd.objects.plan import ImportSettings, default_set, find_meshes,
 @pytest.fixture
 def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """Imports in this process: another one takes seconds to start."""
-    monkeypatch.setattr(importer, "_run_child", lambda job, settings, *_: importer.import_mesh(job, settings))
+    monkeypatch.setattr(importer, "_import_in_child", importer.import_mesh)
 
 
 def brick(path: Path, sides: tuple[float, float, float] = (0.12, 0.06, 0.04)) -> Path:
@@ -36,9 +36,6 @@ def test_meshes_are_found_once_and_in_order(tmp_path: Path):
         find_meshes([tmp_path / "nowhere"])
     (tmp_path / "none").mkdir()
     with pytest.raises(m.MeshError, match="no mesh in"):
-        find_meshes([tmp_path / "none"])
-    (tmp_path / "none" / "mug.step").write_text("ISO-10303-21;\nHEADER;\n")
-    with pytest.raises(m.MeshError, match=r"no mesh in(.|\n)*mug\.step is a STEP file"):
         find_meshes([tmp_path / "none"])
 
 
@@ -67,17 +64,13 @@ def test_two_meshes_of_one_name_are_refused_whether_in_one_call_or_two(in_proces
     assert import_meshes([first], out)[0].name == "mug"
     before = (out / "mug.usd").read_bytes()
     with pytest.raises(m.MeshError) as later:
-        import_meshes([second], out, force=True)
+        import_meshes([second], out)
     assert (out / "mug.usd").read_bytes() == before
     for error in (both, later):
         assert all(word in str(error.value) for word in (str(first), str(second), "rename", "--out"))
-    # The same file by another way, or a copy of it, is no other object.
+    # The same file by another way is no other object.
     (tmp_path / "link").symlink_to(tmp_path / "a")
     assert import_meshes([tmp_path / "link" / "mug.stl"], out)[0].status == "cached"
-    copy = tmp_path / "c" / "mug.stl"
-    copy.parent.mkdir()
-    copy.write_bytes(first.read_bytes())
-    assert [r.status for r in import_meshes([first, copy], out)] == ["cached"]
 
 
 @pytest.mark.parametrize("text", ["#usda 1.0\n", "", "PXR-USDC cut short"])
@@ -87,20 +80,17 @@ def test_what_is_no_object_of_ours_is_never_written_over(text: str, tmp_path: Pa
     mine.parent.mkdir()
     mine.write_text(text)
     with pytest.raises(m.MeshError, match=r"mug\.usd is there and no object of vd-assets.*remove it.*--out"):
-        import_meshes([mesh], mine.parent, force=True)
+        import_meshes([mesh], mine.parent)
     assert mine.read_text() == text
 
 
-def test_objects_whose_mesh_is_gone_stay_until_they_are_dropped(in_process: None, tmp_path: Path):
+def test_objects_whose_mesh_is_gone_stay(in_process: None, tmp_path: Path):
     old, new, out = brick(tmp_path / "old.stl"), brick(tmp_path / "new.stl"), tmp_path / "out"
     import_meshes([old], out)
     old.unlink()
     result = {r.name: r.status for r in import_meshes([new], out)}
     assert result == {"new": "imported", "old": "gone"}
     assert (out / "old.usd").is_file()
-    result = {r.name: r.status for r in import_meshes([new], out, drop_gone=True)}
-    assert result == {"new": "cached", "old": "dropped"}
-    assert not (out / "old.usd").exists()
 
 
 def test_an_object_follows_its_mesh(in_process: None, tmp_path: Path):
@@ -131,19 +121,6 @@ def test_a_default_set_has_the_objects_of_one_folder(
             default_set([reserved if path == "cube.stl" else reserved.parent])
 
 
-def test_nameless_files_of_a_download_cache_come_by_their_links(in_process: None, tmp_path: Path):
-    blob = brick(tmp_path / "hub" / "blobs" / "mesh.ply").rename(tmp_path / "hub" / "blobs" / "0a1b2c")
-    (blob.parent / "ffff").write_text("no mesh")
-    link = tmp_path / "hub" / "snapshots" / "5d6e" / "Cup" / "model.ply"
-    link.parent.mkdir(parents=True)
-    link.symlink_to(blob)
-    assert find_meshes([tmp_path / "hub"]) == [link]
-    assert find_meshes([blob.parent]) == [blob]
-    for path, name in ((link, "Cup"), (blob, "o_0a1b2c")):
-        (result,) = import_meshes([path], tmp_path / "out")
-        assert (result.status, result.name) == ("imported", name)
-
-
 @pytest.mark.parametrize(
     ("sizing", "mass", "longest", "words"),
     [
@@ -161,40 +138,23 @@ def test_unit_size_and_mass(
     model = read_object(tmp_path / "out" / "block.usd")
     assert model.longest_side == pytest.approx(longest, rel=1e-3)
     assert model.scale * 6.0 == pytest.approx(longest, rel=1e-3)
-    assert (result.mass_kg, model.mass_kg) == pytest.approx((mass, mass), rel=1e-3)
+    assert (result.model.mass_kg, model.mass_kg) == pytest.approx((mass, mass), rel=1e-3)
     assert words in " ".join((*model.notes, *model.warnings))
 
 
 @pytest.mark.parametrize(
-    ("sizing", "words"),
+    ("settings", "words"),
     [
-        (m.Sizing("mm", density=2.7), "--density 2.7.*water"),
-        (m.Sizing("mm", density=1000.0, mass_kg=0.1), "--density and --mass"),
-        (m.Sizing("mm", mass_kg=-1.0), "--mass -1"),
-        (m.Sizing("foot"), "--units foot: choose"),
+        (ImportSettings(sizing=m.Sizing("mm", density=2.7)), "--density 2.7.*water"),
+        (ImportSettings(sizing=m.Sizing("mm", density=1000.0, mass_kg=0.1)), "--density and --mass"),
+        (ImportSettings(sizing=m.Sizing("mm", mass_kg=-1.0)), "--mass -1"),
+        (ImportSettings(DecomposeSettings(max_hulls=0)), "--max-hulls 0: give 1 or more"),
+        (ImportSettings(DecomposeSettings(threshold=5.0)), "--threshold 5: give 0.01 to 1"),
     ],
 )
-def test_sizes_that_cannot_be_meant_are_refused_before_anything_is_written(
-    sizing: m.Sizing, words: str, tmp_path: Path
+def test_what_cannot_be_meant_is_refused_before_anything_is_written(
+    settings: ImportSettings, words: str, tmp_path: Path
 ):
-    with pytest.raises(m.MeshError, match=words):
-        import_meshes([brick(tmp_path / "x.stl")], tmp_path / "out", ImportSettings(sizing=sizing))
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("setting", "words"),
-    [
-        ({"max_hulls": 0}, "--max-hulls 0: give 1 or more"),
-        ({"threshold": 5.0}, "--threshold 5: give 0.01 to 1"),
-        ({"max_hull_vertices": 3}, "--max-hull-vertices 3: give 4 or more"),
-        ({"time_limit_s": -3.0}, "--time-limit -3: give 1 or more"),
-    ],
-)
-def test_a_decomposition_that_cannot_be_is_refused_before_anything_is_written(
-    setting: dict[str, float], words: str, tmp_path: Path
-):
-    settings = ImportSettings(DecomposeSettings(**setting))
     with pytest.raises(m.MeshError, match=words):
         import_meshes([brick(tmp_path / "x.stl")], tmp_path / "out", settings)
     assert not (tmp_path / "out").exists()

@@ -83,6 +83,7 @@ def test_wheel_holds_modules_policies_and_what_else_is_read(wheel):
     assert {name for name in sizes if name.endswith(".py")} == installed_names()
     assert {name.split("/")[0] for name in sizes if ".dist-info/" not in name} == {"vd"}
     assert {f"vd/templates/{path.name}" for path in (ROOT / "vd/templates").iterdir()} <= sizes.keys()
+    assert {f"vd/assets_usd/usd/{path.name}" for path in (ROOT / "assets_usd/usd").iterdir()} <= sizes.keys()
     assert "vd/py.typed" in sizes and any(name.endswith("licenses/LICENSE") for name in sizes)
     assert {name for name in sizes if name.endswith(".pt")} == {
         f"vd/policies/{path.name}" for path in SHIPPED_POLICIES.values()

@@ -118,8 +118,8 @@ def test_a_table_that_is_taken_away_is_not_drawn():
 
 @pytest.fixture(scope="module")
 def hand(tmp_path_factory):
-    from vd.assets_usd.hand_author import hand_usd
     from vd.assets_usd.hand_model import read_hand
+    from vd.assets_usd.hands import hand_usd
 
     return {name: read_hand(hand_usd(name)) for name in ("dclaw3", "dclaw4")}
 

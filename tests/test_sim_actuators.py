@@ -10,7 +10,6 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
 from vd.kernels.servo import actuators as servo
 from vd.paper import PAPER
-from vd.sim.actuators import has_effects
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import build_scene
 from vd.sim.simulator import Simulator
@@ -84,41 +83,12 @@ def test_without_rows_nothing_of_the_servo_is_launched(monkeypatch):
     assert launched and not any("joint_servo" in kernel.module.name for kernel in launched)
 
 
-def test_only_effects_count_as_effects():
-    assert not has_effects(HAND.servo)
-    assert not has_effects(rows(KP=1.0, KD=0.1, VELOCITY_LIMIT=2.0, INERTIA=0.01))
-    assert has_effects(rows(COMMAND_DELAY=1e-3)) and has_effects(
-        np.tile(rows(PAYLOAD_INERTIA=1e-4), (2, 1, 1))
-    )
-
-
 def test_a_servo_without_effects_moves_as_the_plain_drive():
     plain, _ = response(simulator(None))
     with_servo, measured = response(simulator(rows()))
     # The drive's damping is late by half a physics step, the servo's is not.
     assert np.abs(with_servo - plain).max() < 0.01 and np.abs(plain[-1] - START).min() > 0.1
     assert np.array_equal(measured, with_servo)
-
-
-def test_delays_shift_the_motion_and_the_measurement():
-    """World 0 has none, world 1 a command two control steps late, world 2 measures two steps late."""
-    late = 2.0 * CFG.control_dt
-    each = np.stack([rows(), rows(COMMAND_DELAY=late), rows(READ_DELAY=late, ENCODER_BIAS=0.01)])
-    true, measured = response(simulator(each, worlds=3))
-    still, _ = response(simulator(rows()), offset=0.0, steps=2)
-    assert np.allclose(true[:2, 1], still[:, 0], atol=1e-6)
-    # What gravity did in the two steps before the command stays a small difference.
-    assert np.abs(true[2:, 1] - true[:-2, 0]).max() < 5e-3
-    assert np.array_equal(true[:, 2], true[:, 0])
-    assert np.allclose(measured[2:, 2], true[:-2, 2] + 0.01, atol=1e-6)
-    assert np.allclose(measured[0, 2], START + 0.01, atol=1e-6)
-
-
-def test_a_command_that_is_lost_does_nothing():
-    lost, _ = response(simulator(rows(JITTER_DROP=1.0)))
-    assert np.abs(lost - START).max() < 0.05  # what gravity does
-    kept, _ = response(simulator(rows(JITTER_DROP=0.0)))
-    assert np.abs(kept[-1] - START).min() > 0.1
 
 
 def test_dry_friction_holds_what_it_can_and_no_more():
@@ -139,23 +109,6 @@ def test_velocity_limit_and_inertia_are_per_world():
     true, _ = response(sim)
     speed = np.abs(np.diff(true, axis=0)) / CFG.control_dt
     assert speed[:, 0].max() <= 0.5 + 1e-4 < speed[:, 1].max()
-
-
-def test_reset_forgets_commands_and_motion_of_its_worlds_only():
-    sim = simulator(rows(COMMAND_DELAY=0.1, INTEGRAL_GAIN=2.0), worlds=2)
-    assert sim.servo is not None
-    response(sim, steps=3)
-    before = sim.servo.state.numpy().reshape(2, D, -1)
-    state = sim.joint_q.numpy()
-    state[1, :D] = START
-    sim.joint_q.assign(state)
-    sim.servo.reset(wp.array([0, 1], dtype=wp.int32))
-    after = sim.servo.state.numpy().reshape(2, D, -1)
-    assert np.array_equal(after[0], before[0])
-    assert np.all(after[1, :, servo.STATE_TIME] == 0.0) and np.all(after[1, :, servo.STATE_INTEGRAL] == 0.0)
-    command(sim, 0.0)
-    positions, _ = response(sim, offset=0.0)
-    assert np.abs(positions[:, 1] - START).max() < 0.05 < np.abs(positions[:, 0] - START).max()
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 import warp as wp
 
 from vd.assets_usd.hand_data import compose
@@ -105,21 +104,6 @@ def test_kinematics_match_the_hands(name, device):
     aligned = np.abs(np.sum(poses[:, links, 3:] * expected[..., 3:], axis=-1))
     np.testing.assert_allclose(aligned, 1.0, atol=1e-6)
     assert np.isnan(np.delete(poses, links, axis=1)).all()
-
-
-def test_voxels_of_a_scene(assets, device):
-    """A cloud has thousands of voxels, and points that a camera did not see count for nothing."""
-    clouds, body_q, goal = scene(assets, device)
-    voxelise = Voxeliser(device=device)
-    points = written(clouds, body_q, goal)
-    whole = voxelise(wp.array(points, dtype=wp.vec3, device=device))
-    assert 2000 < len(whole) < points.shape[1]
-    without = voxelise(
-        wp.array(written(clouds, body_q, goal, with_object=False), dtype=wp.vec3, device=device)
-    )
-    assert len(without) < len(whole)
-    tensor = torch.from_numpy(points).to(whole.device)
-    assert torch.equal(voxelise(tensor).coordinates, whole.coordinates)
 
 
 def test_noise_only_where_asked_for_and_never_shared(device):

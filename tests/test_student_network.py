@@ -206,29 +206,6 @@ def test_half_precision_stays_near_single(device, lower):
     torch.testing.assert_close(half.mean, single.mean, atol=0.05, rtol=0.05)
 
 
-def test_it_can_tell_two_shapes_apart(device):
-    """A few steps of training: large sphere or small, from voxels alone."""
-    net = student(SMALL, device).train()
-    generator = np.random.default_rng(2)
-    directions = generator.normal(size=(16, 200, 3))
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    large = np.arange(16) % 2
-    points = (directions * np.where(large, 0.06, 0.04)[:, None, None]).astype(np.float32)
-    scene = sites(points, device)
-    target = torch.tensor(large, dtype=torch.float32, device=scene.device)
-    optimiser = torch.optim.AdamW(net.parameters(), lr=3e-3)
-    losses = []
-    for _ in range(25):
-        embedding = net.encode(scene)[None]
-        output = net(embedding, torch.zeros(1, 16, ACTIONS, device=scene.device), net.initial_hidden(16))
-        loss = (output.distance[0, :, 0] - target).square().mean()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(loss.item())
-    assert losses[-1] < 0.1 * losses[0]
-
-
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_survive_a_dictionary(name):
     assert from_dict(StudentCfg, to_dict(PRESETS[name])) == PRESETS[name]

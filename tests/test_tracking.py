@@ -15,7 +15,7 @@ from vd.assets_usd.objects.sets import load_set
 from vd.bench.cli import StudentCommand
 from vd.config import to_dict
 from vd.deploy.cli import main as vd_deploy
-from vd.deploy.loop.pilot import TrackingPilot
+from vd.deploy.loop.policy_runner import TrackingRunner
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
 from vd.evaluate import cli
@@ -239,7 +239,7 @@ def test_a_former_command_is_refused_with_the_new_one(command, word, capsys):
 
 
 @pytest.mark.slow
-def test_a_pilot_decides_on_a_hand_as_in_the_simulator():
+def test_a_runner_decides_on_a_hand_as_in_the_simulator():
     """An episode of the policy; the deploy side is given joints, goal and image, nothing else."""
     policy = open_policy("dclaw3-tracking", "cpu")
     task = task_for(
@@ -255,18 +255,18 @@ def test_a_pilot_decides_on_a_hand_as_in_the_simulator():
         success_ends_episode=False,
     )
     env = ReorientEnv(task, "cpu")
-    actor, pilot = TrackingActor(env, policy), TrackingPilot(policy, env.hand, env.objects[0])
-    pilot.begin()
+    actor, runner = TrackingActor(env, policy), TrackingRunner(policy, env.hand, env.objects[0])
+    runner.begin()
     for step in range(env.max_episode_steps):
         sensed = state_of(env)
         action = actor.act(wp.to_torch(env.observation))
         image = actor._senses.camera.depth.numpy()[0].copy()
-        decision = pilot.decide(replace(sensed, depth=image))
+        decision = runner.decide(replace(sensed, depth=image))
         np.testing.assert_allclose(decision.action, action[0], atol=1e-3, err_msg=f"step {step}")
         assert decision.distance == pytest.approx(float(actor.predicted[0]), abs=1e-4)
         env.step(wp.from_torch(action.contiguous()))
     with pytest.raises(ValueError, match="there is no image"):
-        pilot.decide(sensed)
+        runner.decide(sensed)
 
 
 @pytest.mark.slow

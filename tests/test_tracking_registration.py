@@ -152,15 +152,6 @@ def test_what_is_not_seen_stays_where_it_was(corner):
     assert found.pose.shape == (2, KEPT, 7)
 
 
-def test_points_of_a_camera_are_needed_with_one_only(corner):
-    seen, count = seen_of(corner, poses(1))
-    fresh = torch.ones(1, dtype=torch.bool)
-    with pytest.raises(ValueError, match="camera"):
-        registration(corner, 1).look(seen, count, fresh=fresh, points=seen)
-    with pytest.raises(ValueError, match="camera"):
-        registration(corner, 1, camera=load_hand("dclaw3").camera).look(seen, count, fresh=fresh)
-
-
 def test_what_would_stand_before_what_is_seen_is_not_believed():
     """Boards with a leg behind them, which does not show: turned over they fit as well, but for the leg."""
     envs, camera, rng = 8, load_hand("dclaw3").camera, np.random.default_rng(1)

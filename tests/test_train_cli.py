@@ -262,7 +262,7 @@ def test_configuration_errors_name_the_path_of_the_field():
     good = to_dict(PRESETS["gpu"]())
     for path, value, message in (
         (("ppo", "epochs"), "three", "ppo.epochs: expected int"),
-        (("env", "sim", "cone"), 3, "env.sim.cone: expected str"),
+        (("env", "sim", "njmax"), "many", "env.sim.njmax: expected int"),
         (("policy", "std_range"), [0.1], "policy.std_range: expected 2 values"),
         (("ppo", "schedule"), "linear", "ppo.schedule: 'linear' is not one of"),
         (("env", "reward"), 3, "env.reward: expected fields of RewardCfg"),

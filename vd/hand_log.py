@@ -19,8 +19,6 @@ from vd.paper import PAPER
 
 LOG_FORMAT = "vd-hand-log/1"
 RUN_FILE, STEPS_FILE, EVENTS_FILE, RECORDING_FILE = "run.json", "steps.csv", "events.jsonl", "recording.json"
-IMAGES = "images"
-"""Folder of the depth images, by the number of their step."""
 JOINT_CHANNELS = ("command", "position", "velocity", "current", "temperature", "action", "smoothed")
 """Columns ``channel.joint``: goal sent [rad], measured [rad], [rad/s], [A], [deg C]; the policy's action, and
 its moving average as it was before that action."""
@@ -121,11 +119,6 @@ class HandLog:
         if TRUTH_COLUMNS[0] not in self.columns:
             return None
         return np.stack([self.columns[name] for name in TRUTH_COLUMNS[:7]], axis=1)
-
-    def image(self, step: int) -> np.ndarray | None:
-        """Depth image of a step [m] [H, W]; None where none was kept."""
-        path = self.path / IMAGES / f"{step:06d}.npy"
-        return np.load(path) if path.is_file() else None
 
 
 def is_log(path: str | Path) -> bool:

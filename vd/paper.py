@@ -11,7 +11,7 @@ Tags used in ``source(...)``:
 * ``D``: derived from the above; the derivation is in the text.
 
 Dimensions, limits, masses and gains of the hands are not here: they live in
-:mod:`vd.assets_usd.hand_spec`, from which the USD is authored, and are read back from the USD.
+their USD files, ``assets_usd/usd``, with their sources.
 """
 
 from dataclasses import dataclass, field, fields

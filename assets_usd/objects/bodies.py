@@ -1,7 +1,7 @@
 """What is inside of a mesh, its mass properties, and how far convex parts are from it."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -11,6 +11,7 @@ from vd.assets_usd.objects.geometry import (
     VOXELS,
     Hull,
     Solid,
+    inside,
     mesh_volume,
     solid_of_hulls,
     solid_of_mesh,
@@ -58,38 +59,16 @@ class Body:
     warnings: tuple[str, ...] = ()
 
 
-def inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, level: float = 0.5) -> np.ndarray:
-    """Whether the winding number of a mesh [V, 3], [T, 3] exceeds ``level`` at points [n, 3], bool [n]."""
-    import warp as wp
-
-    from vd.kernels.sensor.winding import inside_kernel
-
-    low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
-
-    def on_device(places: np.ndarray) -> wp.array:
-        return wp.array(((places - low) / size).astype(np.float32), dtype=wp.vec3, device="cpu")
-
-    corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
-    mesh = wp.Mesh(on_device(vertices), corners, support_winding_number=True)
-    found = wp.zeros(len(points), dtype=wp.bool, device="cpu")
-    wp.launch(
-        inside_kernel,
-        dim=len(points),
-        inputs=[mesh.id, level, on_device(points)],
-        outputs=[found],
-        device="cpu",
-    )
-    return np.asarray(found.numpy(), dtype=bool)
-
-
 def body_of(mesh: RepairedMesh) -> Body:
     """The solid that a mesh bounds: exact if it is closed, by winding numbers if it has holes.
 
     A surface that has no inside is a sheet: the solid is its voxels, below 1 % of the longest side thick.
     """
     body = _outer_body(mesh)
-    hollow = [solid_of_mesh(*cavity) for cavity in mesh.cavities]
-    return Body(body.inside, body.volume, _without(body.solid, hollow), body.method, body.warnings)
+    if not len(mesh.cavity_faces):
+        return body
+    solid = _joined(body.solid, solid_of_mesh(mesh.cavity_vertices, mesh.cavity_faces))
+    return replace(body, solid=solid)
 
 
 def _outer_body(mesh: RepairedMesh) -> Body:
@@ -147,20 +126,15 @@ def _solid_by_points(vertices: np.ndarray, within: Inside) -> Solid:
     return Solid(solid.volume, turn.T @ solid.centroid, turn.T @ solid.inertia @ turn)
 
 
-def _without(solid: Solid, hollow: Sequence[Solid]) -> Solid:
-    """Mass properties of a solid without parts of it."""
-
-    def about_origin(part: Solid) -> np.ndarray:
-        c = part.centroid
-        return np.asarray(part.inertia + part.volume * (c @ c * np.eye(3) - np.outer(c, c)))
-
-    if not hollow:
-        return solid
-    volume = solid.volume - sum(part.volume for part in hollow)
-    moment = solid.volume * solid.centroid - sum(part.volume * part.centroid for part in hollow)
-    inertia = about_origin(solid) - sum(about_origin(part) for part in hollow)
-    rest = Solid(volume, moment / volume, inertia)
-    return rest._replace(inertia=2.0 * inertia - about_origin(rest))
+def _joined(first: Solid, second: Solid) -> Solid:
+    """Mass properties of two solids together; the volume of one that is taken away is negative."""
+    volume = first.volume + second.volume
+    centroid = (first.volume * first.centroid + second.volume * second.centroid) / volume
+    inertia = first.inertia + second.inertia
+    for part in (first, second):
+        c = part.centroid - centroid
+        inertia = inertia + part.volume * (c @ c * np.eye(3) - np.outer(c, c))
+    return Solid(volume, centroid, inertia)
 
 
 def _points_around(vertices: np.ndarray) -> tuple[np.ndarray, float]:
@@ -174,23 +148,26 @@ def _points_around(vertices: np.ndarray) -> tuple[np.ndarray, float]:
     return (low + side * qmc.Sobol(3, rng=0).random(SAMPLES)) @ axes, float(side.prod())
 
 
-class PartsError:
-    """Volume in which convex parts and a body differ, as a share of the body's.
+def error_of_parts(body: Body, vertices: np.ndarray) -> Callable[[Sequence[Hull]], float]:
+    """A function: the volume in which convex parts and a body differ, as a share of the body's.
 
     What parts have too much and what they lack are counted apart, at their true volumes.
+
+    Args:
+        body: The body.
+        vertices: Vertices of its surface [V, 3].
     """
+    points, box = _points_around(vertices)
+    within = body.inside(points)
 
-    def __init__(self, body: Body, vertices: np.ndarray):
-        """Sample the body around the vertices of its surface [V, 3]."""
-        self._points, self._box = _points_around(vertices)
-        self._inside, self._volume = body.inside(self._points), body.volume
+    def error(hulls: Sequence[Hull]) -> float:
+        return float((within != _in_hulls(hulls, points)).mean() * box / body.volume)
 
-    def __call__(self, hulls: Sequence[Hull]) -> float:
-        """The error of parts."""
-        differ = self._inside != _in_hulls(hulls, self._points)
-        return float(differ.mean() * self._box / self._volume)
+    return error
 
 
 def cavity_share(mesh: RepairedMesh, body: Body) -> float:
     """Volume of a mesh's cavities as a share of its solid's."""
-    return sum(mesh_volume(*cavity) for cavity in mesh.cavities) / body.solid.volume
+    if not len(mesh.cavity_faces):
+        return 0.0
+    return -mesh_volume(mesh.cavity_vertices, mesh.cavity_faces) / body.solid.volume

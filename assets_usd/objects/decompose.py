@@ -1,24 +1,23 @@
 """Convex decomposition of a mesh: CoACD in a child process with a limit of processor time."""
 
-import multiprocessing
 import os
-import queue
 import resource
 import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
 
+from vd.assets_usd.objects.children import ChildError, in_child
 from vd.assets_usd.objects.geometry import (
     SLIVER_THICKNESS,
     Hull,
     convex_hull,
     hull_volume,
     mesh_volume,
+    sides_along_axes,
     simplify_hull,
 )
 from vd.assets_usd.objects.meshes import MeshError
@@ -46,11 +45,11 @@ MERGED_HULLS = (8, 12, 16, 24, 32)
 NEARLY = 1.1
 """More parts are not taken for an error less than a tenth smaller, unless it becomes good."""
 
-RUNS = 4
-"""Most runs of CoACD for one mesh: two decompositions, each also on a remeshed copy."""
+RUNS = 2
+"""Most runs of CoACD for one mesh."""
 
 HANG_S = 20.0
-"""Wall-clock time, per second of processor time allowed, after which a child is taken to hang: a busy machine
+"""Wall-clock time, per second of processor time allowed, after which CoACD is taken to hang: a busy machine
 gives it a twentieth of a core at least."""
 
 
@@ -99,9 +98,9 @@ class Decomposition:
 
     Attributes:
         hulls: The parts.
-        method: ``coacd``, ``coacd, remeshed`` or ``one hull``.
+        method: ``coacd``, ``coacd, merged`` or ``one hull``.
         fallback: What fell back, and why; empty for a full result.
-        error: :func:`vd.assets_usd.objects.bodies.PartsError`.
+        error: :func:`vd.assets_usd.objects.bodies.error_of_parts`.
     """
 
     hulls: tuple[Hull, ...]
@@ -110,9 +109,7 @@ class Decomposition:
     error: float = 0.0
 
 
-def _coacd_parts(
-    vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings, preprocess: str
-) -> list[np.ndarray]:
+def _coacd_parts(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings) -> list[np.ndarray]:
     """Vertices of CoACD's parts."""
     import coacd
 
@@ -121,7 +118,7 @@ def _coacd_parts(
         coacd.Mesh(vertices.astype(np.float64), faces.astype(np.int32)),
         threshold=settings.threshold,
         max_convex_hull=settings.max_hulls,
-        preprocess_mode=preprocess,
+        preprocess_mode="auto",
         mcts_iterations=settings.mcts_iterations,
         max_ch_vertex=settings.max_hull_vertices,
         seed=settings.seed,
@@ -129,33 +126,28 @@ def _coacd_parts(
     return [np.asarray(v, dtype=np.float64) for v, _ in parts]
 
 
-def _child(answer: Any, *arguments: Any) -> None:
-    """Run CoACD within its limits and put its parts, or the reason for none, into ``answer``."""
-    limit_s = arguments[2].time_limit_s
-    # The parent may be gone (killed, interrupted): never outlive its wait.
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    signal.alarm(int(HANG_S * limit_s) + 1)
-    seconds = int(time.process_time()) + max(1, round(limit_s))
+def _within_limits(
+    vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings
+) -> list[np.ndarray] | str:
+    """CoACD in this process, which its limit of processor time ends; the parts, or why there are none."""
+    seconds = int(time.process_time()) + max(1, round(settings.time_limit_s))
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     os.environ["OMP_WAIT_POLICY"] = "passive"  # threads that wait for each other take no processor time
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     try:
-        answer.put(_coacd_parts(*arguments))
+        return _coacd_parts(vertices, faces, settings) or "CoACD returned no part"
     except Exception as error:  # the reason travels to the parent
-        answer.put(f"{type(error).__name__}: {error}")
+        return f"{type(error).__name__}: {error}"
 
 
-def run_coacd(
-    vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings, preprocess: str = "auto"
-) -> list[np.ndarray] | str:
-    """CoACD in a child process, so that a bad mesh can neither hang nor crash the caller.
+def run_coacd(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings) -> list[np.ndarray] | str:
+    """CoACD in a child process.
 
     Args:
         vertices: [V, 3].
         faces: [T, 3].
         settings: Limits.
-        preprocess: CoACD's remeshing to a manifold: ``auto``, ``on`` or ``off``.
 
     Returns:
         The vertices of each part, or the reason why there are none.
@@ -163,36 +155,18 @@ def run_coacd(
     Raises:
         MeshError: The child hangs.
     """
-    context = multiprocessing.get_context("fork")
-    answer = context.Queue()
-    child = context.Process(target=_child, args=(answer, vertices, faces, settings, preprocess), daemon=True)
-    child.start()
-    deadline = time.monotonic() + HANG_S * settings.time_limit_s
-    result: list[np.ndarray] | str | None = None
+    limit, hang = settings.time_limit_s, HANG_S * settings.time_limit_s
     try:
-        while result is None:
-            alive = child.is_alive()  # asked first: what it answered before its end is then in the queue
-            try:
-                result = answer.get(timeout=0.2)
-            except queue.Empty:
-                if time.monotonic() > deadline:
-                    raise MeshError(
-                        f"CoACD hangs: no result within {HANG_S * settings.time_limit_s:g} s, though allowed "
-                        f"only {settings.time_limit_s:g} s of processor time; import it again"
-                    ) from None
-                if not alive:
-                    result = _end_of(child.exitcode, settings)
-    finally:
-        child.kill()
-        child.join()
-    return result or "CoACD returned no part"
-
-
-def _end_of(code: int | None, settings: DecomposeSettings) -> str:
-    """Why a child ended without an answer."""
-    if code == -signal.SIGXCPU:
-        return f"no result after {settings.time_limit_s:g} s of processor time (--time-limit)"
-    return f"CoACD ended with exit code {code}"
+        return in_child(_within_limits, vertices, faces, settings, start="fork", limit_s=hang)
+    except ChildError as error:
+        if error.code is None:
+            raise MeshError(
+                f"CoACD hangs: no result within {hang:g} s, though allowed only {limit:g} s of processor "
+                "time; import it again"
+            ) from error
+        if error.code == -signal.SIGXCPU:
+            return f"no result after {limit:g} s of processor time (--time-limit)"
+        return f"CoACD ended with exit code {error.code}"
 
 
 def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ...]:
@@ -207,17 +181,14 @@ def tidy_hulls(parts: Sequence[np.ndarray], max_vertices: int) -> tuple[Hull, ..
     volumes = np.array([mesh_volume(*h) for h in hulls])
     kept = []
     for hull, volume in zip(hulls, volumes, strict=True):
-        spread = hull.vertices - hull.vertices.mean(axis=0)
-        thickness = np.ptp(spread @ np.linalg.svd(spread, full_matrices=False)[2].T, axis=0).min()
+        thickness = sides_along_axes(hull.vertices).min()
         if volume > SLIVER_VOLUME * volumes.sum() and thickness > SLIVER_THICKNESS * size:
             kept.append(simplify_hull(hull, max_vertices))
     return tuple(kept)
 
 
 def decompose(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettings) -> Decomposition:
-    """Split a mesh into convex parts.
-
-    CoACD as the mesh is; then CoACD on a remeshed copy; then the convex hull alone.
+    """Split a mesh into convex parts: by CoACD, or its convex hull alone.
 
     Args:
         vertices: [V, 3], m.
@@ -227,18 +198,15 @@ def decompose(vertices: np.ndarray, faces: np.ndarray, settings: DecomposeSettin
     Raises:
         MeshError: CoACD hangs.
     """
-    fallback = []
-    for preprocess, method in (("auto", "coacd"), ("on", "coacd, remeshed")):
-        parts = run_coacd(vertices, faces, settings, preprocess)
-        if isinstance(parts, str):
-            fallback.append(f"{method} failed: {parts}")
-            continue
-        hulls = tidy_hulls(parts, settings.max_hull_vertices)
-        if hulls:
-            return Decomposition(hulls, method, tuple(fallback))
-        fallback.append(f"{method} gave only slivers")
+    parts = run_coacd(vertices, faces, settings)
+    hulls = () if isinstance(parts, str) else tidy_hulls(parts, settings.max_hull_vertices)
+    if hulls:
+        return Decomposition(hulls, "coacd")
+    why = parts if isinstance(parts, str) else "it gave only slivers"
     hull = simplify_hull(convex_hull(vertices), settings.max_hull_vertices)
-    return Decomposition((hull,), "one hull", (*fallback, "one convex hull stands for the whole mesh"))
+    return Decomposition(
+        (hull,), "one hull", (f"coacd failed: {why}", "one convex hull stands for the whole mesh")
+    )
 
 
 def merge_parts(parts: Sequence[np.ndarray], most: int) -> list[np.ndarray]:

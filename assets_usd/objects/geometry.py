@@ -111,20 +111,34 @@ def mesh_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
     return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
 
 
-def winding_numbers(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Generalised winding numbers [n] of a mesh at points [n, 3]: 1 inside, 0 outside of a closed one.
+def inside(vertices: np.ndarray, faces: np.ndarray, points: np.ndarray, level: float = 0.5) -> np.ndarray:
+    """Whether the winding number of a mesh [V, 3], [T, 3] exceeds ``level`` at points [n, 3], bool [n]."""
+    import warp as wp
 
-    The solid angles of all triangles over 4 pi (van Oosterom and Strackee 1983), n x T of them: for a few
-    points. For many there is :func:`vd.assets_usd.objects.bodies.inside`.
-    """
-    total = np.zeros(len(points))
-    for i, point in enumerate(np.asarray(points, dtype=np.float64)):
-        a, b, c = (np.asarray(vertices, dtype=np.float64)[faces[:, k]] - point for k in range(3))
-        la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
-        dots = [np.einsum("ij,ij->i", x, y) for x, y in ((a, b), (b, c), (c, a))]
-        spread = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
-        total[i] = np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), spread).sum() / (2.0 * np.pi)
-    return total
+    from vd.kernels.sensor.winding import inside_kernel
+
+    low, size = vertices.min(axis=0), float(np.ptp(vertices, axis=0).max())
+
+    def on_device(places: np.ndarray) -> wp.array:
+        return wp.array(((places - low) / size).astype(np.float32), dtype=wp.vec3, device="cpu")
+
+    corners = wp.array(faces.astype(np.int32).ravel(), dtype=wp.int32, device="cpu")
+    mesh = wp.Mesh(on_device(vertices), corners, support_winding_number=True)
+    found = wp.zeros(len(points), dtype=wp.bool, device="cpu")
+    wp.launch(
+        inside_kernel,
+        dim=len(points),
+        inputs=[mesh.id, level, on_device(points)],
+        outputs=[found],
+        device="cpu",
+    )
+    return np.asarray(found.numpy(), dtype=bool)
+
+
+def sides_along_axes(points: np.ndarray) -> np.ndarray:
+    """Extents of points [n, 3] along their principal axes, [3]."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    return np.ptp(points @ axes.T, axis=0)
 
 
 def simplify_hull(hull: Hull, max_vertices: int) -> Hull:
@@ -258,6 +272,12 @@ def principal_axes(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if np.linalg.det(axes) < 0.0:
         axes[:, 2] = -axes[:, 2]
     return moments, Rotation.from_matrix(axes).as_quat(canonical=True)
+
+
+def triangle_normals(corners: np.ndarray) -> np.ndarray:
+    """Unit normals [T, 3] of triangles [T, 3, 3]; zero of those without area."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
 
 
 def triangle_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -1,23 +1,20 @@
 """Import of meshes: one child process a mesh, cached by content, resumable, with refusals by name."""
 
-import contextlib
 import hashlib
 import json
+import multiprocessing
 import os
-import signal
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Callable, Container, Iterable
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from vd.assets_usd.objects.bodies import PartsError, body_of, cavity_share
+from vd.assets_usd.objects.bodies import body_of, cavity_share, error_of_parts
+from vd.assets_usd.objects.children import ChildError, in_child
 from vd.assets_usd.objects.decompose import (
     GOOD_ERROR,
     HANG_S,
@@ -30,6 +27,7 @@ from vd.assets_usd.objects.geometry import Hull, cluster_vertices, surface_point
 from vd.assets_usd.objects.meshes import MeshError
 from vd.assets_usd.objects.model import (
     SURFACE_POINTS,
+    ObjectError,
     ObjectModel,
     build_model,
     read_hash,
@@ -47,6 +45,7 @@ from vd.assets_usd.objects.plan import (
 from vd.assets_usd.objects.reading import declared_unit, load_mesh, mesh_kind
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.files import atomic_path, make_folder
+from vd.warp_quiet import quiet_warp
 
 IMPORT_VERSION = 5
 """Part of every content hash: raise it when the import computes something else."""
@@ -65,10 +64,8 @@ thin walls the first alone says little: a wall of 1 mm that is 2 mm thick as par
 WORKER_OVERHEAD_S = 600.0
 """Wall-clock time that a child gets beside its runs of CoACD before it is taken to hang."""
 
-ENDING_S = 5.0
-"""Time for a child to leave things in order before it is killed."""
-
-Status = Literal["imported", "cached", "refused", "gone", "dropped"]
+POLL_S = 0.1
+"""Between two looks whether all children have ended."""
 
 
 @dataclass(frozen=True)
@@ -78,33 +75,21 @@ class ImportResult:
     Attributes:
         source: Mesh file.
         name: Object name.
-        status: ``imported``, ``cached`` (nothing to do) or ``refused``; of an object whose mesh file is gone
-            ``gone`` (it stays in the set) or ``dropped``.
+        target: USD file of the object.
+        status: ``imported``, ``cached`` (nothing to do) or ``refused``; ``gone`` of an object whose mesh file
+            is gone (it stays in the set).
         reason: Why it was refused.
-        target: USD file, empty if refused.
-        seconds: Time of the import.
-        hulls: Number of convex parts.
-        volume_error: Volume in which parts and object differ, as a share of the object's.
-        longest_side_m: Longest side.
-        mass_kg: Mass.
+        model: The object, if it was imported now or earlier.
         decomposed: Whether CoACD ran.
-        notes: Repairs and assumptions.
-        warnings: What may be wrong with the object.
     """
 
     source: str
     name: str
-    status: Status
+    target: str
+    status: Literal["imported", "cached", "refused", "gone"]
     reason: str = ""
-    target: str = ""
-    seconds: float = 0.0
-    hulls: int = 0
-    volume_error: float = 0.0
-    longest_side_m: float = 0.0
-    mass_kg: float = 0.0
+    model: ObjectModel | None = None
     decomposed: bool = False
-    notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
 
 
 def content_hash(job: Job, settings: ImportSettings) -> str:
@@ -161,7 +146,17 @@ def _parts_warnings(parts: Decomposition, offset: float) -> list[str]:
 
 
 def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
-    """Import one mesh in this process (CoACD runs in a child).
+    """Import one mesh in this process (CoACD runs in a child). A mesh that is refused is a result."""
+    try:
+        model, decomposed = _object_of(job, settings)
+        write_object(Path(job.target), model)
+    except (MeshError, ObjectError, OSError) as error:
+        return ImportResult(job.source, job.name, job.target, "refused", str(error))
+    return ImportResult(job.source, job.name, job.target, "imported", model=model, decomposed=decomposed)
+
+
+def _object_of(job: Job, settings: ImportSettings) -> tuple[ObjectModel, bool]:
+    """The object of a mesh, and whether CoACD ran.
 
     Raises:
         MeshError: The mesh is refused; the message is the reason.
@@ -173,35 +168,21 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
     if not body.solid.volume > 0.0:
         raise MeshError("degenerate: encloses no volume")
     mass, mass_notes, mass_warnings = settings.sizing.mass(body.solid.volume)
-    notes = [*mesh.notes, *size_notes, *mass_notes]
-    error_of = PartsError(body, mesh.vertices)
-    key = hashlib.sha256(mesh.vertices.tobytes() + mesh.faces.tobytes())
-    key.update(json.dumps([DECOMPOSITION_VERSION, asdict(settings.decompose)], sort_keys=True).encode())
-    cache = Path(settings.cache) / f"{key.hexdigest()}.npz" if settings.cache else None
-    whole = 0 < len(mesh.pieces) <= settings.decompose.max_hulls
-    kept = None if whole or cache is None else _kept_decomposition(cache)
-    if whole:
+    error_of = error_of_parts(body, mesh.vertices)
+    decomposed = not 0 < len(mesh.pieces) <= settings.decompose.max_hulls
+    if decomposed:
+        parts, decomposed = _decomposition(mesh.vertices, mesh.faces, settings, error_of)
+    else:
         hulls = tidy_hulls([p.vertices for p in mesh.pieces], settings.decompose.max_hull_vertices)
         parts = Decomposition(hulls, "convex pieces", error=error_of(hulls))
-    elif kept:
-        parts = kept
-    else:
-        parts = best_decomposition(mesh.vertices, mesh.faces, settings.decompose, error_of)
-        # A fall-back forced by a limit may not be needed next time: only full results are kept.
-        if cache and not parts.fallback:
-            _keep_decomposition(cache, parts)
     offset = parts.error * body.volume / triangle_areas(mesh.vertices, mesh.faces).sum()
-    offset /= np.ptp(mesh.vertices, axis=0).max()
-    made = (*mesh.warnings, *body.warnings, *_parts_warnings(parts, offset))
-    warnings = (*made, *size_warnings, *mass_warnings)
-    points = surface_points(mesh.vertices, mesh.faces, SURFACE_POINTS)
-    visual = cluster_vertices(mesh.vertices, mesh.faces, MAX_VISUAL_FACES)
+    made = _parts_warnings(parts, offset / np.ptp(mesh.vertices, axis=0).max())
     model = build_model(
         job.name,
-        *visual,
+        *cluster_vertices(mesh.vertices, mesh.faces, MAX_VISUAL_FACES),
         parts.hulls,
         body.solid,
-        points,
+        surface_points(mesh.vertices, mesh.faces, SURFACE_POINTS),
         licence=job.licence,
         mass_kg=mass,
         source=job.provenance,
@@ -212,78 +193,46 @@ def import_mesh(job: Job, settings: ImportSettings) -> ImportResult:
         volume_error=parts.error + cavity_share(mesh, body),
         volume_method=f"{parts.method}; volume in which parts and solid differ; solid: {body.method}",
         content_hash="" if parts.fallback else content_hash(job, settings),
-        notes=tuple(notes),
-        warnings=warnings,
+        notes=(*mesh.notes, *size_notes, *mass_notes),
+        warnings=(*mesh.warnings, *body.warnings, *made, *size_warnings, *mass_warnings),
     )
-    write_object(Path(job.target), model)
-    return replace(_result_of(job, model, "imported"), decomposed=not whole and kept is None)
+    return model, decomposed
 
 
-def _result_of(job: Job, model: ObjectModel, status: Status) -> ImportResult:
-    return ImportResult(
-        job.source,
-        job.name,
-        status,
-        target=job.target,
-        hulls=len(model.hulls),
-        volume_error=model.volume_error,
-        longest_side_m=model.longest_side,
-        mass_kg=model.mass_kg,
-        notes=model.notes,
-        warnings=model.warnings,
-    )
+def _decomposition(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    settings: ImportSettings,
+    error_of: Callable[[Any], float],
+) -> tuple[Decomposition, bool]:
+    """The parts of a mesh, kept from an earlier import or made now, and whether they were made."""
+    key = hashlib.sha256(vertices.tobytes() + faces.tobytes())
+    key.update(json.dumps([DECOMPOSITION_VERSION, asdict(settings.decompose)], sort_keys=True).encode())
+    cache = Path(settings.cache) / f"{key.hexdigest()}.npz" if settings.cache else None
+    kept = None if cache is None else _kept_decomposition(cache)
+    if kept:
+        return kept, False
+    parts = best_decomposition(vertices, faces, settings.decompose, error_of)
+    # A fall-back forced by a limit may not be needed next time: only full results are kept.
+    if cache and not parts.fallback:
+        _keep_decomposition(cache, parts)
+    return parts, True
 
 
-def _run_child(
-    job: Job, settings: ImportSettings, threads: int, running: dict[str, subprocess.Popen[str]]
-) -> ImportResult:
-    """Import one mesh in a child of its own, killed if it hangs."""
-    start = time.monotonic()
+def _import_quietly(job: Job, settings: ImportSettings) -> ImportResult:
+    quiet_warp()
+    return import_mesh(job, settings)
 
-    def refused(reason: str) -> ImportResult:
-        return ImportResult(job.source, job.name, "refused", reason, seconds=time.monotonic() - start)
 
+def _import_in_child(job: Job, settings: ImportSettings) -> ImportResult:
+    """Import one mesh in a child of its own."""
     # A busy machine is no reason: processor time is limited, this only ends what hangs.
     limit = RUNS * HANG_S * settings.decompose.time_limit_s + WORKER_OVERHEAD_S
-    environment = os.environ | {"OMP_NUM_THREADS": str(threads), "OPENBLAS_NUM_THREADS": "1"}
-    request = json.dumps({"job": asdict(job), "settings": asdict(settings)})
-    with tempfile.TemporaryFile("w+") as errors:
-        # A session of its own: Ctrl-C reaches the parent alone, which then ends the children in order.
-        child = subprocess.Popen(
-            [sys.executable, "-m", "vd.assets_usd.objects.import_worker", str(os.getpid())],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            text=True,
-            start_new_session=True,
-            env=environment,
-        )
-        running[job.name] = child
-        try:
-            output, _ = child.communicate(request, timeout=limit)
-        except subprocess.TimeoutExpired:
-            return refused(f"no result after {limit:g} s")
-        finally:
-            _end_group(child)
-            running.pop(job.name, None)
-        lines = output.strip().splitlines()
-        if child.returncode != 0 or not lines:
-            errors.seek(0)
-            tail = errors.read().strip().splitlines()[-1:] or ["no message"]
-            return refused(f"the import ended with exit code {child.returncode}: {tail[0]}")
-    answer = json.loads(lines[-1])
-    answer |= {key: tuple(answer[key]) for key in ("notes", "warnings")}
-    return replace(ImportResult(**answer), seconds=time.monotonic() - start)
-
-
-def _end_group(child: subprocess.Popen[str]) -> None:
-    """End a child, which removes what it has half written, and kill what is left of it and its children."""
-    child.terminate()
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        child.wait(ENDING_S)
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(child.pid, signal.SIGKILL)
-    child.wait()
+    try:
+        return in_child(_import_quietly, job, settings, start="spawn", limit_s=limit)
+    except ChildError as error:
+        reason = f"the import ended with {error}; what it said is above"
+        return ImportResult(job.source, job.name, job.target, "refused", reason)
 
 
 def import_meshes(
@@ -292,8 +241,6 @@ def import_meshes(
     settings: ImportSettings | None = None,
     *,
     jobs: int = 0,
-    force: bool = False,
-    drop_gone: bool = False,
     progress: Callable[[ImportResult, int, int], None] | None = None,
 ) -> list[ImportResult]:
     """Import meshes, several at a time, each in a process of its own.
@@ -306,8 +253,6 @@ def import_meshes(
         out: Folder of the object files.
         settings: Settings; the defaults if None.
         jobs: Meshes at a time; 0 takes the machine's cores.
-        force: Write every file anew (kept decompositions are still used).
-        drop_gone: Remove the objects of the folder whose mesh file is gone.
         progress: Called after each mesh with its result, the number done and the number of all.
 
     Returns:
@@ -331,68 +276,55 @@ def import_meshes(
         if progress:
             progress(result, len(results), len(plan))
 
-    done, todo = _divide(plan, settings, gone, drop_gone=drop_gone, force=force)
+    known = {job.name: _without_work(job, settings, moved=Path(job.target) in gone) for job in plan}
+    todo = [job for job in plan if known[job.name] is None]
     new = not out.exists()
     make_folder(out)
-    left: Status = "dropped" if drop_gone else "gone"
-    stale = [ImportResult(file, path.stem, left, target=str(path)) for path, file in gone.items()]
-    for path in gone if drop_gone else ():
-        path.unlink()
-    for result in done:
+    for result in filter(None, known.values()):
         finish(result)
     _import_in_children(todo, settings, jobs or os.cpu_count() or 1, finish)
     if new and not any(out.iterdir()):  # all were refused
         out.rmdir()
     written = {job.target for job in todo}
+    stale = [ImportResult(file, path.stem, str(path), "gone") for path, file in gone.items()]
     return [*(results[job.name] for job in plan), *(r for r in stale if r.target not in written)]
 
 
-def _divide(
-    plan: list[Job], settings: ImportSettings, gone: Container[Path], *, drop_gone: bool, force: bool
-) -> tuple[list[ImportResult], list[Job]]:
-    """The results of the meshes that need no work, and those that do: also what has moved (is ``gone``).
+def _without_work(job: Job, settings: ImportSettings, *, moved: bool) -> ImportResult | None:
+    """The result of a mesh that needs no work: it is refused, or its object is there and unchanged.
 
     Raises:
         MeshError: An object would be written over something else.
     """
-    done: list[ImportResult] = []
-    todo: list[Job] = []
-    for job in plan:
-        target = Path(job.target)
-        try:
-            settings.sizing.check_unit(declared_unit(Path(job.source)))
-            content = content_hash(job, settings)
-        except MeshError as error:
-            done.append(ImportResult(job.source, job.name, "refused", str(error)))
-            continue
-        current = target.is_file() and read_hash(target) == content
-        if not (drop_gone and target in gone):
-            check_target(job, current)
-        if current and not force and target not in gone:
-            done.append(_result_of(job, read_object(target), "cached"))
-        else:
-            todo.append(job)
-    return done, todo
+    target = Path(job.target)
+    try:
+        settings.sizing.check_unit(declared_unit(Path(job.source)))
+        content = content_hash(job, settings)
+    except MeshError as error:
+        return ImportResult(job.source, job.name, job.target, "refused", str(error))
+    current = target.is_file() and read_hash(target) == content
+    check_target(job, current)
+    if not current or moved:
+        return None
+    return ImportResult(job.source, job.name, job.target, "cached", model=read_object(target))
 
 
 def _import_in_children(
     todo: list[Job], settings: ImportSettings, jobs: int, finish: Callable[[ImportResult], None]
 ) -> None:
     """Import meshes in so many children at a time; none is left when this is interrupted."""
-    cores = os.cpu_count() or 1
     workers = max(min(jobs, len(todo)), 1)
-    running: dict[str, subprocess.Popen[str]] = {}
+    threads = str(max((os.cpu_count() or 1) // workers, 1))
+    os.environ |= {"OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": "1"}  # which children inherit
     with ThreadPoolExecutor(workers) as pool:
-        pending: set[Future[ImportResult]] = {
-            pool.submit(_run_child, job, settings, max(cores // workers, 1), running) for job in todo
-        }
+        pending = [pool.submit(_import_in_child, job, settings) for job in todo]
         try:
-            while pending:
-                done, pending = wait(pending, return_when=FIRST_COMPLETED)
-                for future in done:
-                    finish(future.result())
+            for future in as_completed(pending):
+                finish(future.result())
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
-            for child in list(running.values()):
-                _end_group(child)
+            while any(future.running() for future in pending):
+                for child in multiprocessing.active_children():
+                    child.terminate()
+                time.sleep(POLL_S)
             raise

@@ -1,6 +1,6 @@
 """Letters and composites of random primitives.
 
-Conventions as in :mod:`.families`: x forward, y left, z up, any unit; at most eight parts that overlap.
+Conventions as in :mod:`.procedural`.
 """
 
 from itertools import pairwise

@@ -1,6 +1,6 @@
 """Shoes and tools.
 
-Conventions as in :mod:`.families`: x forward, y left, z up, any unit; at most eight parts that overlap.
+Conventions as in :mod:`.procedural`.
 """
 
 import numpy as np

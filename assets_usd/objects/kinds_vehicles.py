@@ -1,6 +1,6 @@
 """Vehicles: cars, trucks, locomotives, aeroplanes, boats.
 
-Conventions as in :mod:`.families`: x forward, y left, z up, any unit; at most eight parts that overlap.
+Conventions as in :mod:`.procedural`.
 """
 
 import numpy as np

@@ -93,8 +93,6 @@ class Sizing:
         Raises:
             MeshError: Names the option.
         """
-        if self.units != "auto" and self.units not in UNITS_M:
-            raise MeshError(f"--units {self.units}: choose {', '.join(UNITS_M)} or auto")
         if self.density is not None and self.mass_kg is not None:
             raise MeshError("--density and --mass both give the mass; leave one out")
         low, high = DENSITIES_KG_M3

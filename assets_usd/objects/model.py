@@ -31,6 +31,18 @@ SURFACE_POINTS = 500
 SUFFIXES = (".usd", ".usda", ".usdc")
 IDENTITY = np.array([[0.0, 0.0, 0.0, 1.0]])
 _CUSTOM = "visualDexterity"
+_STORED: dict[str, type] = {
+    "licence": str,
+    "source": str,
+    "file": str,
+    "family": str,
+    "split": str,
+    "scale": float,
+    "volume_error": float,
+    "volume_method": str,
+    "content_hash": str,
+}
+"""Fields of :class:`ObjectModel` that are custom data under their names in camel case."""
 
 
 class ObjectError(ValueError):
@@ -86,11 +98,6 @@ class ObjectModel:
     warnings: tuple[str, ...] = ()
 
     @property
-    def com(self) -> np.ndarray:
-        """Centre of mass in the object frame: zero by construction, [3]."""
-        return np.zeros(3)
-
-    @property
     def inertia_matrix(self) -> np.ndarray:
         """Inertia about the centre of mass in the object frame, [3, 3], kg m^2."""
         axes = Rotation.from_quat(self.inertia_quat).as_matrix()
@@ -100,19 +107,6 @@ class ObjectModel:
     def longest_side(self) -> float:
         """Longest side of the axis-aligned bounding box of the visual mesh, m."""
         return float(np.ptp(self.vertices, axis=0).max())
-
-    @property
-    def diameter(self) -> float:
-        """Largest distance between two points of the object, m."""
-        from scipy.spatial import ConvexHull
-        from scipy.spatial.distance import pdist
-
-        return float(pdist(self.vertices[ConvexHull(self.vertices).vertices]).max())
-
-    @property
-    def radius(self) -> float:
-        """Largest distance of the surface from the centre of mass, m."""
-        return float(np.linalg.norm(self.vertices, axis=1).max())
 
 
 def build_model(
@@ -231,15 +225,7 @@ def write_object(path: Path, model: ObjectModel) -> Path:
         _CUSTOM,
         {
             "formatVersion": FORMAT_VERSION,
-            "licence": model.licence,
-            "source": model.source,
-            "file": model.file,
-            "family": model.family,
-            "split": model.split,
-            "scale": float(model.scale),
-            "volumeError": float(model.volume_error),
-            "volumeMethod": model.volume_method,
-            "contentHash": model.content_hash,
+            **{_key(name): kind(getattr(model, name)) for name, kind in _STORED.items()},
             "notes": "\n".join(model.notes),
             "warnings": "\n".join(model.warnings),
             "symmetry": Vt.DoubleArray.FromNumpy(
@@ -253,58 +239,44 @@ def write_object(path: Path, model: ObjectModel) -> Path:
     return path
 
 
-def _open(path: Path) -> tuple[Any, Any, dict[str, Any]]:
-    """Stage, root prim and custom data of an object file."""
-    from pxr import Sdf, Tf, Usd
+def _key(name: str) -> str:
+    """A field's name in camel case."""
+    first, *rest = name.split("_")
+    return first + "".join(word.title() for word in rest)
 
-    path = Path(path)
-    if not path.is_file():
-        raise ObjectError(f"{path}: no such object file")
-    what = "not a USD file, or a damaged one; remove it, and import or author the object again"
+
+def _layer(path: Path) -> Any:
+    """The layer of a USD file as it is now; None if it is none."""
+    from pxr import Sdf, Tf
+
     try:
         # Anonymous: a layer cached by path would hide that the file was written anew.
-        layer = Sdf.Layer.OpenAsAnonymous(str(path))
-    except Tf.ErrorException as error:
-        raise ObjectError(f"{path}: {what}") from error
-    if layer is None:
-        raise ObjectError(f"{path}: {what}")
-    stage = Usd.Stage.Open(layer)
-    prim = stage.GetDefaultPrim()
-    data = dict(prim.GetCustomDataByKey(_CUSTOM) or {}) if prim else {}
-    version = data.get("formatVersion")
-    if version != FORMAT_VERSION:
-        raise ObjectError(
-            f"{path}: formatVersion is {version}, this version reads {FORMAT_VERSION}; "
-            "write the object again with vd-assets import or vd-assets objects"
-        )
-    return stage, prim, data
-
-
-def read_hash(path: Path) -> str | None:
-    """The content hash of an object file, or None where there is no readable one."""
-    try:
-        return str(_open(path)[2]["contentHash"])
-    except ObjectError:
+        return Sdf.Layer.OpenAsAnonymous(str(path))
+    except Tf.ErrorException:
         return None
+
+
+def _custom(layer: Any) -> dict[str, Any]:
+    """Custom data of an object's root prim; empty if the layer is no object of ours."""
+    prim = layer.GetPrimAtPath(f"/{layer.defaultPrim}") if layer and layer.defaultPrim else None
+    return dict(prim.customData.get(_CUSTOM, {})) if prim else {}
 
 
 def is_object(stage: Any) -> bool:
     """Whether a stage is an object file of ours, of any version."""
-    prim = stage.GetDefaultPrim()
-    return bool(prim and prim.GetCustomDataByKey(_CUSTOM))
+    return bool(_custom(stage.GetRootLayer()))
 
 
 def read_origin(path: Path) -> tuple[str, str] | None:
     """``source`` and ``file`` of an object file of any version; None if it is no object file of ours."""
-    from pxr import Sdf, Tf
-
-    try:
-        layer = Sdf.Layer.OpenAsAnonymous(str(path))
-    except Tf.ErrorException:
-        return None
-    prim = layer.GetPrimAtPath(f"/{layer.defaultPrim}") if layer and layer.defaultPrim else None
-    data = prim.customData.get(_CUSTOM) if prim else None
+    data = _custom(_layer(path))
     return (str(data.get("source", "")), str(data.get("file", ""))) if data else None
+
+
+def read_hash(path: Path) -> str | None:
+    """The content hash of an object file of this version, or None."""
+    data = _custom(_layer(path))
+    return str(data["contentHash"]) if data.get("formatVersion") == FORMAT_VERSION else None
 
 
 def read_object(path: Path) -> ObjectModel:
@@ -316,10 +288,24 @@ def read_object(path: Path) -> ObjectModel:
     Raises:
         ObjectError: The file is missing, no USD, of another version, or a part is missing.
     """
-    from pxr import UsdGeom, UsdPhysics
+    from pxr import Usd, UsdGeom, UsdPhysics
 
     path = Path(path)
-    stage, prim, data = _open(path)
+    if not path.is_file():
+        raise ObjectError(f"{path}: no such object file")
+    layer = _layer(path)
+    if layer is None:
+        raise ObjectError(
+            f"{path}: not a USD file, or a damaged one; remove it, and import or author the object again"
+        )
+    data = _custom(layer)
+    if data.get("formatVersion") != FORMAT_VERSION:
+        raise ObjectError(
+            f"{path}: formatVersion is {data.get('formatVersion')}, this version reads {FORMAT_VERSION}; "
+            "write the object again with vd-assets import or vd-assets objects"
+        )
+    stage = Usd.Stage.Open(layer)
+    prim = stage.GetDefaultPrim()
     root = prim.GetPath()
 
     def array(relative: str, attribute: str, columns: int, dtype: Any) -> np.ndarray:
@@ -342,7 +328,6 @@ def read_object(path: Path) -> ObjectModel:
     mass = UsdPhysics.MassAPI(prim)
     axes = mass.GetPrincipalAxesAttr().Get()
     quat = np.array([*axes.GetImaginary(), axes.GetReal()], dtype=np.float64)
-    notes = str(data["notes"])
     return ObjectModel(
         name=prim.GetName(),
         vertices=array("visual", "points", 3, np.float32),
@@ -353,16 +338,8 @@ def read_object(path: Path) -> ObjectModel:
         inertia_quat=quat / np.linalg.norm(quat),
         surface_points=array("surface_points", "points", 3, np.float32),
         symmetry=np.array(data["symmetry"], dtype=np.float64).reshape(-1, 4),
-        licence=str(data["licence"]),
-        source=str(data["source"]),
-        file=str(data.get("file", "")),
-        family=str(data["family"]),
-        split=str(data["split"]),
-        scale=float(data["scale"]),
-        volume_error=float(data["volumeError"]),
-        volume_method=str(data["volumeMethod"]),
-        content_hash=str(data["contentHash"]),
-        notes=tuple(notes.splitlines()),
+        **{name: kind(data.get(_key(name), "")) for name, kind in _STORED.items()},
+        notes=tuple(str(data["notes"]).splitlines()),
         warnings=tuple(str(data.get("warnings", "")).splitlines()),
     )
 

@@ -1,7 +1,6 @@
 """What an import reads, what the objects are called and where they are written."""
 
 import csv
-import filecmp
 import os
 import re
 from collections.abc import Iterable, Sequence
@@ -11,7 +10,7 @@ from pathlib import Path
 from vd.assets_usd.objects.decompose import DecomposeSettings
 from vd.assets_usd.objects.meshes import MeshError, Sizing
 from vd.assets_usd.objects.model import object_files, read_origin
-from vd.assets_usd.objects.reading import KINDS, MESH_SUFFIXES, mesh_kind
+from vd.assets_usd.objects.reading import KINDS, MESH_SUFFIXES
 from vd.assets_usd.objects.sets import built_in_models, objects_dir
 
 GENERIC_WORDS = frozenset(
@@ -36,14 +35,12 @@ class ImportSettings:
     Attributes:
         decompose: Convex decomposition.
         licence: Licence recorded where no ``objects.csv`` names one.
-        split: Split recorded where no ``objects.csv`` names one.
         cache: Folder of finished decompositions; none if empty.
         sizing: Unit, size and mass.
     """
 
     decompose: DecomposeSettings = field(default_factory=DecomposeSettings)
     licence: str = "unknown"
-    split: str = ""
     cache: str = ""
     sizing: Sizing = field(default_factory=Sizing)
 
@@ -100,9 +97,7 @@ def find_meshes(paths: Iterable[Path]) -> list[Path]:
     """Mesh files among files and folders (searched in depth), each once, in a fixed order, absolute.
 
     A file that was named is kept whatever it is, so that it is refused by name. In a folder files count that
-    have a mesh's suffix, or no suffix and a mesh's content (downloads are often kept under their hash). Left
-    out are what is hidden, our own objects, parts of a USD that is found too, and nameless files to which a
-    link was found.
+    have a mesh's suffix. Left out are what is hidden, our own objects, and parts of a USD that is found too.
 
     Raises:
         MeshError: A path does not exist, or nothing was found.
@@ -118,44 +113,26 @@ def find_meshes(paths: Iterable[Path]) -> list[Path]:
             raise MeshError(f"{path}: no such file or folder")
     if not found:
         raise MeshError(
-            f"no mesh in {', '.join(map(str, paths))}; supported: {', '.join(MESH_SUFFIXES)}{_seen(paths)}"
+            f"no mesh in {', '.join(map(str, paths))}; supported: {', '.join(MESH_SUFFIXES)}; to be told "
+            "what is wrong with a file, name it"
         )
     return list(dict.fromkeys(map(absolute, found)))
 
 
-def _files_below(folder: Path) -> list[Path]:
-    return sorted(
+def _meshes_below(folder: Path) -> list[Path]:
+    files = sorted(
         path
         for path in folder.rglob("*")
-        if path.is_file() and not any(part.startswith(".") for part in path.relative_to(folder).parts)
+        if path.is_file()
+        and path.suffix.lower() in MESH_SUFFIXES
+        and not any(part.startswith(".") for part in path.relative_to(folder).parts)
     )
-
-
-def _meshes_below(folder: Path) -> list[Path]:
-    files = [path for path in _files_below(folder) if _may_be_mesh(path)]
-    linked = {path.resolve() for path in files if path.is_symlink()}
-    parts: set[Path] = set()
-    for path in files:
-        if KINDS.get(path.suffix.lower()) == "usd":
-            parts |= _parts_of_usd(path)
-
-    def counts(path: Path) -> bool:
-        real = path.resolve()
-        return real not in parts and bool(path.suffix or path.is_symlink() or real not in linked)
-
-    return [path for path in files if counts(path)]
-
-
-def _may_be_mesh(path: Path) -> bool:
-    kind = KINDS.get(path.suffix.lower())
-    if kind == "usd":
-        return read_origin(path) is None
-    if kind or path.suffix:
-        return kind is not None
-    try:
-        return bool(mesh_kind(path))
-    except MeshError:
-        return False
+    usd = [path for path in files if KINDS[path.suffix.lower()] == "usd"]
+    left_out = {path for path in usd if read_origin(path) is not None}
+    for path in usd:
+        if path not in left_out:
+            left_out |= _parts_of_usd(path)
+    return [path for path in files if path not in left_out and path.resolve() not in left_out]
 
 
 def _parts_of_usd(path: Path) -> set[Path]:
@@ -166,17 +143,6 @@ def _parts_of_usd(path: Path) -> set[Path]:
         return set(usd_files(path)) - {path.resolve()}
     except MeshError:
         return set()
-
-
-def _seen(paths: Iterable[Path]) -> str:
-    """What lies in folders in place of meshes, as a hint: the first file that is known for what it is."""
-    for path in (file for folder in paths if folder.is_dir() for file in _files_below(folder)):
-        try:
-            mesh_kind(path)
-        except MeshError as error:
-            if not str(error).startswith(("unsupported type", "empty file")):
-                return f"\n  {path} is {error}"
-    return ""
 
 
 def read_sidecar(folder: Path) -> dict[str, dict[str, str]]:
@@ -194,7 +160,7 @@ def read_sidecar(folder: Path) -> dict[str, dict[str, str]]:
 
 
 def plan_jobs(meshes: Iterable[Path], out: Path, settings: ImportSettings) -> list[Job]:
-    """Name, target, licence and provenance of each mesh. Copies of a mesh under one name count once.
+    """Name, target, licence and provenance of each mesh.
 
     Raises:
         MeshError: Two meshes would have one name; the message has both, and the remedy.
@@ -203,7 +169,7 @@ def plan_jobs(meshes: Iterable[Path], out: Path, settings: ImportSettings) -> li
     clashes: list[str] = []
     for mesh in meshes:
         other = taken.setdefault(object_name(mesh), mesh)
-        if other != mesh and not _same_content(other, mesh):
+        if other != mesh:
             clashes.append(f"  {object_name(mesh)}: {other} and {mesh}")
     if clashes:
         more = f"\n  and {len(clashes) - CLASHES_SHOWN} more" if len(clashes) > CLASHES_SHOWN else ""
@@ -223,16 +189,9 @@ def plan_jobs(meshes: Iterable[Path], out: Path, settings: ImportSettings) -> li
         bracket = re.search(r"\(([^)]*)\)", source)
         licence = row.get("licence") or (bracket.group(1) if bracket else settings.licence)
         provenance = f"{source}: {mesh.name}" if source else mesh.name
-        split = row.get("split") or settings.split
+        split = row.get("split") or ""
         jobs.append(Job(str(mesh), name, str(out / f"{name}.usd"), licence, provenance, split))
     return jobs
-
-
-def _same_content(first: Path, second: Path) -> bool:
-    try:
-        return filecmp.cmp(first, second, shallow=False)
-    except OSError:
-        return False
 
 
 def check_target(job: Job, unchanged: bool) -> None:
@@ -262,7 +221,7 @@ def check_target(job: Job, unchanged: bool) -> None:
         return
     raise MeshError(
         f"{job.source} would be written over {target}, which was made from {file or source}; "
-        "rename the mesh, import it into another set (--out), or drop what is gone (--drop-gone)"
+        "rename the mesh, import it into another set (--out), or remove the object"
     )
 
 

@@ -1,4 +1,9 @@
-"""Procedural object sets: our own shapes, deterministic from a seed, with exact convex parts."""
+"""Procedural object sets: our own shapes, deterministic from a seed, with exact convex parts.
+
+Each kind is a function from a generator to convex parts. x points forward, y to the left, z up; units are
+arbitrary. Parts overlap, so that an object is one piece, and at most eight are used, one collision shape
+each. A left-right mirror plane is welcome, as in real things; a rotational symmetry is drawn again.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -7,7 +12,11 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.objects.families import HELD_OUT, TRAINING, Maker
+from vd.assets_usd.objects import kinds_abstract as abstract
+from vd.assets_usd.objects import kinds_animals as animals
+from vd.assets_usd.objects import kinds_goods as goods
+from vd.assets_usd.objects import kinds_held_out as held_out_kinds
+from vd.assets_usd.objects import kinds_vehicles as vehicles
 from vd.assets_usd.objects.geometry import (
     Hull,
     hull_depth,
@@ -21,7 +30,28 @@ from vd.assets_usd.objects.meshes import LONGEST_SIDE_M, mean_width, scales_that
 from vd.assets_usd.objects.model import SURFACE_POINTS, ObjectModel, build_model
 from vd.assets_usd.objects.primitives import box
 
-PROCEDURAL_VERSION = 3
+Maker = Callable[[np.random.Generator], list[Hull]]
+"""Draws one object of a kind."""
+
+TRAINING: dict[str, tuple[Maker, ...]] = {
+    "vehicles": (vehicles.car, vehicles.truck, vehicles.locomotive, vehicles.aeroplane, vehicles.boat),
+    "animals": (animals.quadruped, animals.bird, animals.fish, animals.dinosaur),
+    "shoes": (goods.sneaker, goods.boot, goods.heel_shoe),
+    "tools": (goods.hammer, goods.wrench, goods.drill, goods.axe, goods.pliers),
+    "letters": (abstract.letter, abstract.monogram),
+    "composites": (abstract.cluster, abstract.branch),
+}
+"""Kinds by training family."""
+
+HELD_OUT: dict[str, tuple[Maker, ...]] = {
+    "kitchen": (held_out_kinds.mug,),
+    "furniture": (held_out_kinds.chair,),
+    "figures": (held_out_kinds.robot,),
+    "cameras": (held_out_kinds.camera,),
+}
+"""Kinds by held-out family."""
+
+PROCEDURAL_VERSION = 4
 """Part of every content hash: raise it when a family draws something else."""
 
 SHAPE_ENTROPY = 1

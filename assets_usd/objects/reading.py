@@ -1,9 +1,8 @@
-"""Mesh files: what a file is, told by its content, and its triangles."""
+"""Mesh files: what a file is, and its triangles."""
 
 import json
 import re
 import struct
-import zipfile
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,12 @@ KINDS = {
     ".usdc": "usd",
     ".usdz": "usd",
 }
-"""Kind of mesh by suffix, for files whose content does not tell."""
+"""Kind of mesh by suffix."""
 
 MESH_SUFFIXES = tuple(KINDS)
 
 HEAD_BYTES = 65536
-"""Bytes from which a file's kind is told: an OBJ may begin with a long comment."""
+"""Bytes in which a file says what it is."""
 
 _EXPORT = "export it as STL, OBJ, PLY or GLB from the program that made it"
 _UNPACK = "unpack it and import what is in it"
@@ -58,7 +57,7 @@ _COMPRESSIONS = {"KHR_draco_mesh_compression": "Draco", "EXT_meshopt_compression
 
 
 def mesh_kind(path: Path) -> str:
-    """Kind of a mesh file, by its content, else by its suffix: ``obj``, ``stl``, ``ply``, ``glb`` or ``usd``.
+    """Kind of a mesh file: ``obj``, ``stl``, ``ply``, ``glb`` or ``usd``.
 
     Raises:
         MeshError: The file is missing or empty, or something else, which the message names with a remedy.
@@ -76,9 +75,9 @@ def mesh_kind(path: Path) -> str:
             raise MeshError(what)
     if suffix in _FOREIGN_SUFFIXES:
         raise MeshError(_FOREIGN_SUFFIXES[suffix])
-    if head.startswith(b"PK\x03\x04"):
-        return _kind_of_zip(path)
-    kind = _kind_of_content(head, path.stat().st_size) or KINDS.get(suffix)
+    kind = KINDS.get(suffix)
+    if head.startswith(b"PK\x03\x04") and suffix != ".usdz":
+        raise MeshError(f"a 3MF file; {_EXPORT}" if suffix == ".3mf" else f"a zip archive; {_UNPACK}")
     if kind is None:
         raise MeshError(f"unsupported type {suffix or '(no suffix)'}; use {', '.join(MESH_SUFFIXES)}")
     if kind == "glb":
@@ -86,55 +85,20 @@ def mesh_kind(path: Path) -> str:
     return kind
 
 
-def _kind_of_zip(path: Path) -> str:
-    """``usd`` for a package of USD; other zip archives are refused."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            first = archive.namelist()[0].lower()
-    except (zipfile.BadZipFile, IndexError):
-        first = ""
-    if KINDS.get(Path(first).suffix) == "usd":
-        return "usd"
-    raise MeshError(
-        f"a 3MF file; {_EXPORT}" if path.suffix.lower() == ".3mf" else f"a zip archive; {_UNPACK}"
-    )
-
-
-def _kind_of_content(head: bytes, size: int) -> str | None:
-    """Kind of a mesh by its beginning and its size in bytes; None if they do not tell."""
-    if head.startswith(b"glTF"):
-        return "glb"
-    if re.match(rb"ply\s", head):
-        return "ply"
-    if head.startswith((b"PXR-USDC", b"#usda")):
-        return "usd"
-    if len(head) > 84 and size == 84 + 50 * struct.unpack_from("<I", head, 80)[0]:
-        return "stl"
-    if b"\0" in head:
-        return None
-    if re.match(rb"\s*solid\b", head, re.IGNORECASE) and re.search(rb"\bfacet\b", head, re.IGNORECASE):
-        return "stl"
-    return "obj" if re.search(rb"(?m)^\s*v[ \t]+[-+.\d]", head) else None
-
-
-def _gltf(path: Path) -> dict[str, Any]:
-    """The description in a binary glTF; empty if it cannot be read."""
+def _refuse_compressed(path: Path) -> None:
+    """Refuse a binary glTF whose triangles need an extension that is not read."""
     with path.open("rb") as stream:
         header = stream.read(20)
         length = struct.unpack_from("<I", header, 12)[0] if len(header) == 20 else 0
         try:
-            return dict(json.loads(stream.read(length)))
-        except ValueError:
-            return {}
-
-
-def _refuse_compressed(path: Path) -> None:
-    for extension in _gltf(path).get("extensionsRequired", ()):
-        if extension in _COMPRESSIONS:
-            raise MeshError(
-                f"a GLB with {_COMPRESSIONS[extension]} compression ({extension}), which is not read; "
-                "export it again without compression"
-            )
+            required = json.loads(stream.read(length)).get("extensionsRequired", ())
+        except ValueError:  # reading it says so
+            return
+    for extension in _COMPRESSIONS.keys() & required:
+        raise MeshError(
+            f"a GLB with {_COMPRESSIONS[extension]} compression ({extension}), which is not read; "
+            "export it again without compression"
+        )
 
 
 def declared_unit(path: Path) -> float | None:
@@ -215,9 +179,9 @@ def declared_faces(path: Path, kind: str) -> int:
         return int(said.group(1)) if said else 0
     if kind == "stl":
         data = path.read_bytes()
-        if _kind_of_content(data[:HEAD_BYTES], len(data)) == "stl" and b"\0" not in data[:HEAD_BYTES]:
-            return len(re.findall(rb"\bfacet\s+normal\b", data, re.IGNORECASE))
-        return int(struct.unpack_from("<I", data, 80)[0]) if len(data) >= 84 else 0
+        count = int(struct.unpack_from("<I", data, 80)[0]) if len(data) >= 84 else 0
+        text = b"\0" not in data[:HEAD_BYTES] and len(data) != 84 + 50 * count
+        return len(re.findall(rb"\bfacet\s+normal\b", data, re.IGNORECASE)) if text else count
     return 0
 
 

@@ -4,19 +4,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from vd.assets_usd.objects.geometry import (
     SLIVER_THICKNESS,
     Hull,
     convex_hull,
     hull_volume,
+    inside,
     mesh_volume,
-    random_surface_points,
+    sides_along_axes,
     triangle_areas,
-    winding_numbers,
 )
 from vd.assets_usd.objects.meshes import MeshError
 
@@ -31,8 +28,11 @@ STRAYS_AREA = 0.05
 """Strays with more of the surface together are the surface itself, in pieces that do not join."""
 
 APART = 0.02
-"""Pieces farther from each other than this share of the longest side are apart: 2 mm of 10 cm. Models put
-together from pieces touch or overlap."""
+"""Pieces whose boxes are farther from each other than this share of the longest side are apart: 2 mm of
+10 cm. Models put together from pieces touch or overlap."""
+
+MOST_PIECES = 2000
+"""A surface of more pieces is torn, and no collection of bodies."""
 
 OTHER_BODIES = 0.05
 """Bodies apart that hold less than this share of the volume are debris and are left out. With more there are
@@ -59,8 +59,8 @@ class RepairedMesh:
         watertight: Closed, consistently wound and of one piece.
         pieces: Convex hulls of the closed pieces if all are convex, else empty: such a mesh is
             decomposed as it stands.
-        cavities: Closed surfaces within, as (vertices, faces) wound outward as if they were solids; inward
-            what is solid in a cavity.
+        cavity_vertices: Vertices of closed surfaces within [W, 3].
+        cavity_faces: Their faces [H, 3], wound as those of the solid: inward around a cavity.
         notes: What was done.
         warnings: What may be wrong with the object.
     """
@@ -70,7 +70,8 @@ class RepairedMesh:
     closed: bool
     watertight: bool
     pieces: tuple[Hull, ...]
-    cavities: tuple[tuple[np.ndarray, np.ndarray], ...]
+    cavity_vertices: np.ndarray
+    cavity_faces: np.ndarray
     notes: tuple[str, ...]
     warnings: tuple[str, ...]
 
@@ -80,7 +81,7 @@ class RepairedMesh:
             self,
             vertices=self.vertices * factor,
             pieces=tuple(Hull(p.vertices * factor, p.faces) for p in self.pieces),
-            cavities=tuple((vertices * factor, faces) for vertices, faces in self.cavities),
+            cavity_vertices=self.cavity_vertices * factor,
         )
 
 
@@ -110,12 +111,17 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
     if len(mesh.faces) < before:
         notes.append(f"removed {before - len(mesh.faces)} degenerate or duplicate faces")
     mesh = _largest_body(_without_strays(_opened_seams(mesh), notes, warnings), warnings)
-    _refuse_thin(mesh.vertices)
+    sides = sides_along_axes(mesh.vertices)
+    if sides.min() < SLIVER_THICKNESS * sides.max():
+        raise MeshError(
+            f"degenerate: flat ({sides.min():.3g} thick for {sides.max():.3g} long); contacts need at "
+            f"least {100 * SLIVER_THICKNESS:g} % of the length: give it thickness"
+        )
     if not mesh.is_winding_consistent:
         notes.append("fixed winding")
         trimesh.repair.fix_winding(mesh)
     mesh = _filled_holes(mesh, notes)
-    mesh, cavities = _turned_outward(mesh, warnings)
+    mesh, cavity_vertices, cavity_faces = _turned_outward(mesh, warnings)
     pieces = convex_pieces(mesh)
     closed = bool(mesh.is_watertight and mesh.is_winding_consistent and mesh.volume > 0.0)
     if pieces:
@@ -126,21 +132,11 @@ def repair_mesh(mesh: Any) -> RepairedMesh:
         closed,
         closed and mesh.body_count == 1,
         pieces,
-        cavities,
+        cavity_vertices,
+        cavity_faces,
         tuple(notes),
         tuple(warnings),
     )
-
-
-def _refuse_thin(vertices: np.ndarray) -> None:
-    """Raise MeshError for a mesh that is thinner than any convex part may be."""
-    axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
-    spread = np.ptp(vertices @ axes.T, axis=0)
-    if spread.min() < SLIVER_THICKNESS * spread.max():
-        raise MeshError(
-            f"degenerate: flat ({spread.min():.3g} thick for {spread.max():.3g} long); contacts need at "
-            f"least {100 * SLIVER_THICKNESS:g} % of the length: give it thickness"
-        )
 
 
 def _opened_seams(mesh: Any) -> Any:
@@ -164,9 +160,7 @@ def _opened_seams(mesh: Any) -> Any:
         vertex = faces[face[:, 0], first[:, 0]]
         other = np.argmax(faces[face[:, 1]] == vertex[:, None], axis=1)
         links.append(np.stack([3 * face[:, 0] + first[:, 0], 3 * face[:, 1] + other]))
-    row, column = np.concatenate(links, axis=1)
-    graph = coo_array((np.ones(len(row), dtype=bool), (row, column)), shape=(faces.size, faces.size))
-    corner = connected_components(graph, directed=False)[1]
+    corner = trimesh.graph.connected_component_labels(np.concatenate(links, axis=1).T, node_count=faces.size)
     vertices = np.zeros((corner.max() + 1, 3))
     vertices[corner] = mesh.vertices[faces.ravel()]
     return trimesh.Trimesh(vertices, corner.reshape(-1, 3), process=False)
@@ -174,28 +168,43 @@ def _opened_seams(mesh: Any) -> Any:
 
 @dataclass(frozen=True)
 class _Pieces:
-    """The connected pieces of a mesh: piece of each face, and of each piece area, closedness, volume."""
+    """The connected pieces of a mesh.
+
+    Attributes:
+        of_face: Piece of each face [T].
+        faces: Faces of each piece.
+        low: Lower corner of the box of each [P, 3].
+        high: Upper corner [P, 3].
+        area: Area of each [P].
+        closed: Which are closed [P].
+        volume: Signed volume of each, 0 of open ones [P].
+    """
 
     of_face: np.ndarray
+    faces: list[np.ndarray]
+    low: np.ndarray
+    high: np.ndarray
     area: np.ndarray
     closed: np.ndarray
     volume: np.ndarray
 
 
 def _pieces(mesh: Any) -> _Pieces:
-    """Connected pieces; the volume is signed, and 0 where a piece is open."""
-    count = len(mesh.faces)
-    pairs = mesh.face_adjacency
-    graph = coo_array((np.ones(len(pairs), dtype=bool), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
-    number, of_face = connected_components(graph, directed=False)
+    """The connected pieces of a ``trimesh.Trimesh``."""
+    import trimesh
+
+    of_face = trimesh.graph.connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
+    number = of_face.max() + 1
     area = np.bincount(of_face, triangle_areas(mesh.vertices, mesh.faces), number)
     open_edges = np.bincount(mesh.edges_unique_inverse)[mesh.edges_unique_inverse] != 2
     closed = np.bincount(of_face[mesh.edges_face], open_edges, number) == 0
     corner = mesh.vertices[mesh.faces] - mesh.vertices.mean(axis=0)
     six_volume = np.einsum("ij,ij->i", corner[:, 0], np.cross(corner[:, 1], corner[:, 2]))
-    return _Pieces(
-        of_face, area, closed, np.where(closed, np.bincount(of_face, six_volume, number) / 6.0, 0.0)
-    )
+    order = np.argsort(of_face, kind="stable")
+    faces = np.split(mesh.faces[order], np.cumsum(np.bincount(of_face))[:-1])
+    low, high = (np.array([b(mesh.vertices[f.ravel()], axis=0) for f in faces]) for b in (np.min, np.max))
+    volume = np.where(closed, np.bincount(of_face, six_volume, number) / 6.0, 0.0)
+    return _Pieces(of_face, faces, low, high, area, closed, volume)
 
 
 def _kept(mesh: Any, keep: np.ndarray) -> Any:
@@ -253,38 +262,25 @@ def _largest_body(mesh: Any, warnings: list[str]) -> Any:
 def _bodies(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     """Body of each face [T], and of each body the volume of its convex hull, which open ones have too.
 
-    Pieces belong to one body if they touch the same or neighbouring cells of a grid, or lie one in another.
+    Pieces belong to one body if their boxes touch, or nearly so.
     """
+    import trimesh
+
     pieces = _pieces(mesh)
     number = len(pieces.area)
-    if number == 1:
-        return pieces.of_face, np.ones(1)
-    low, side = mesh.vertices.min(axis=0), APART * float(np.ptp(mesh.vertices, axis=0).max())
-    dense = int(np.clip(pieces.area.sum() / side**2 * 16, 20_000, 500_000))
-    samples = random_surface_points(mesh.vertices, mesh.faces, dense, np.random.default_rng(0))
-    cell = ((mesh.vertices - low) / side).astype(int)
-    full = np.zeros(cell.max(axis=0) + 1, dtype=bool)
-    full[tuple(cell.T)] = full[tuple(((samples - low) / side).astype(int).T)] = True
-    region, regions = ndimage.label(full, np.ones((3, 3, 3)))
-    links = [np.stack([np.repeat(pieces.of_face, 3), number - 1 + region[tuple(cell[mesh.faces.ravel()].T)]])]
-    links += [np.array([[inner], [outer]]) for inner, outer in _containers(mesh, pieces).items()]
-    row, column = np.concatenate(links, axis=1)
-    nodes = number + regions
-    graph = coo_array((np.ones(len(row), dtype=bool), (row, column)), shape=(nodes, nodes))
-    joined = connected_components(graph, directed=False)[1][pieces.of_face]
-    body = np.unique(joined, return_inverse=True)[1]
-    corners = [mesh.vertices[mesh.faces[body == b].ravel()] for b in range(body.max() + 1)]
-    return body, np.array([hull_volume(points) for points in corners])
+    if number > MOST_PIECES:
+        return np.zeros(len(mesh.faces), dtype=int), np.ones(1)
+    low, high = pieces.low, pieces.high + APART * float(np.ptp(mesh.vertices, axis=0).max())
+    near = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=2)
+    body = trimesh.graph.connected_component_labels(np.argwhere(near), node_count=number)
+    of_face = body[pieces.of_face]
+    corners = [mesh.vertices[mesh.faces[of_face == b].ravel()] for b in range(body.max() + 1)]
+    return of_face, np.array([hull_volume(points) for points in corners])
 
 
 def _containers(mesh: Any, pieces: _Pieces) -> dict[int, int]:
     """Of each piece that lies wholly in a closed one: the smallest such one."""
-    order = np.argsort(pieces.of_face, kind="stable")
-    groups = np.split(mesh.faces[order], np.cumsum(np.bincount(pieces.of_face))[:-1])
-    low, high = (
-        np.array([bound(mesh.vertices[faces.ravel()], axis=0) for faces in groups])
-        for bound in (np.min, np.max)
-    )
+    groups, low, high = pieces.faces, pieces.low, pieces.high
     found: dict[int, int] = {}
     for outer in np.argsort(np.abs(pieces.volume))[::-1]:  # smaller ones last: they overrule
         if not pieces.closed[outer]:
@@ -292,7 +288,8 @@ def _containers(mesh: Any, pieces: _Pieces) -> dict[int, int]:
         for inner in np.flatnonzero((low > low[outer]).all(axis=1) & (high < high[outer]).all(axis=1)):
             corners = np.unique(groups[inner])
             some = mesh.vertices[corners[:: max(1, len(corners) // INSIDE_SAMPLES)]]
-            if (np.abs(winding_numbers(mesh.vertices, groups[outer], some)) > 0.5).all():
+            surface = groups[outer] if pieces.volume[outer] > 0.0 else groups[outer][:, ::-1]
+            if inside(mesh.vertices, surface, some).all():
                 found[int(inner)] = int(outer)
     return found
 
@@ -327,41 +324,40 @@ def _filled_holes(mesh: Any, notes: list[str]) -> Any:
     return trimesh.Trimesh(vertices, np.concatenate([mesh.faces, fans]), process=False)
 
 
-def _turned_outward(mesh: Any, warnings: list[str]) -> tuple[Any, tuple[tuple[np.ndarray, np.ndarray], ...]]:
-    """The outer surface with its closed pieces wound outward, and the cavities in it.
+def _turned_outward(mesh: Any, warnings: list[str]) -> tuple[Any, np.ndarray, np.ndarray]:
+    """The outer surface with its closed pieces wound outward, and vertices and faces of the cavities in it.
 
     A closed piece in another is a cavity if it is wound the other way round, and else inside of the solid.
-    What is in a cavity is solid again: it is given as a cavity of negative volume.
+    What is in a cavity is solid again.
     """
     import trimesh
 
     pieces = _pieces(mesh)
     inner = _containers(mesh, pieces)
+    side = np.sign(pieces.volume)
+    for piece in inner:  # as if the outermost piece were wound outward
+        side[piece] *= np.sign(pieces.volume[_outermost(piece, inner)])
+    side[np.setdiff1d(np.arange(len(side)), list(inner))] = 1.0
+    borders = [piece for piece, outer in inner.items() if side[piece] * side[outer] < 0.0]
     faces = mesh.faces.copy()
-    inward = pieces.volume[pieces.of_face] < 0.0
-    faces[inward] = faces[inward][:, ::-1]
-    hidden = np.isin(pieces.of_face, list(inner))
-    hollow = [k for k, outer in inner.items() if pieces.volume[k] * pieces.volume[outer] < 0.0]
-    again = [k for k in hollow if pieces.volume[k] * pieces.volume[_outermost(k, inner)] > 0.0]
-    turned = np.isin(pieces.of_face, again)
+    turned = (side * pieces.volume < 0.0)[pieces.of_face]
     faces[turned] = faces[turned][:, ::-1]
-    whole = np.abs(pieces.volume[np.setdiff1d(np.arange(len(pieces.volume)), list(inner))]).sum()
-    cavities = np.abs(pieces.volume[hollow]).sum() - 2.0 * np.abs(pieces.volume[again]).sum()
-    if cavities > CAVITY * whole:
+    outer = ~np.isin(pieces.of_face, list(inner))
+    whole = np.abs(pieces.volume[~np.isin(np.arange(len(side)), list(inner))]).sum()
+    hollow = -(side * np.abs(pieces.volume))[borders].sum()
+    if hollow > CAVITY * whole:
         warnings.append(
-            f"has a closed cavity of {100 * cavities / whole:.0f} % of its volume: mass and inertia are "
+            f"has a closed cavity of {100 * hollow / whole:.0f} % of its volume: mass and inertia are "
             "those of the hollow body, its convex parts are full"
         )
-    buried = np.abs(pieces.volume[[k for k in inner if k not in hollow]]).sum()
-    if buried > CAVITY * whole:
+    if np.abs(pieces.volume[[k for k in inner if k not in borders]]).sum() > CAVITY * whole:
         warnings.append(
             "a closed surface inside of another is wound like it, and taken as solid: if it is a cavity, "
             "turn its faces round"
         )
-    kept = tuple((mesh.vertices, faces[pieces.of_face == k]) for k in hollow)
-    outer = trimesh.Trimesh(mesh.vertices, faces[~hidden], process=False)
-    outer.remove_unreferenced_vertices()
-    return outer, kept
+    kept = trimesh.Trimesh(mesh.vertices, faces[outer], process=False)
+    kept.remove_unreferenced_vertices()
+    return kept, mesh.vertices, faces[np.isin(pieces.of_face, borders)]
 
 
 def _outermost(piece: int, inner: dict[int, int]) -> int:

@@ -1,8 +1,5 @@
 """A USD made elsewhere, read as one mesh; stage units, z up."""
 
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +8,14 @@ import numpy as np
 from vd.assets_usd.objects.meshes import MeshError
 from vd.assets_usd.objects.model import is_object
 
-_SUFFIXES = (".usd", ".usda", ".usdc", ".usdz")
-
-_UNREAD = ("PointInstancer", "NurbsPatch", "TetMesh")
+_UNREAD = ("Cube", "Sphere", "Cylinder", "Capsule", "Cone", "PointInstancer", "NurbsPatch", "TetMesh")
 """Kinds of solid geometry that are not read."""
 
 Z_FROM_Y = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """From a frame with y up to one with z up."""
 
 
-@contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def opened(path: Path) -> Any:
     """The stage of a USD file as it is composed: references, payloads and selected variants.
 
     Raises:
@@ -29,48 +23,41 @@ def opened(path: Path) -> Iterator[Any]:
     """
     from pxr import Tf, Usd, UsdUtils
 
-    silence = UsdUtils.CoalescingDiagnosticDelegate()  # what matters is raised below
-    with tempfile.TemporaryDirectory() as folder:
-        if path.suffix.lower() not in _SUFFIXES:
-            # USD chooses its reader by the suffix, which a file in a cache of downloads lacks.
-            link = Path(folder) / "object.usd"
-            link.symlink_to(path.resolve())
-            path = link
-        try:
-            stage = Usd.Stage.Open(str(path))
-        except Tf.ErrorException as error:
-            raise MeshError("not a USD file, or a damaged one; export it again") from error
-        if is_object(stage):
-            raise MeshError("an object of vd-assets already; name it, or its folder, as an object set")
-        errors = stage.GetCompositionErrors()
-        if errors:
-            raise MeshError(
-                f"incomplete: {errors[0]}; put the file there, or export with everything in one file"
-            )
-        yield stage
-    del silence
+    silence = UsdUtils.CoalescingDiagnosticDelegate()  # what matters is raised here
+    try:
+        stage = Usd.Stage.Open(str(path))
+    except Tf.ErrorException as error:
+        raise MeshError("not a USD file, or a damaged one; export it again") from error
+    finally:
+        del silence
+    if is_object(stage):
+        raise MeshError("an object of vd-assets already; name it, or its folder, as an object set")
+    errors = stage.GetCompositionErrors()
+    if errors:
+        raise MeshError(f"incomplete: {errors[0]}; put the file there, or export with everything in one file")
+    return stage
 
 
 def usd_unit(path: Path) -> float | None:
     """``metersPerUnit`` of a USD file; None where it is not authored."""
     from pxr import UsdGeom
 
-    with opened(path) as stage:
-        if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
-            return None
-        return float(UsdGeom.GetStageMetersPerUnit(stage))
+    stage = opened(path)
+    if not UsdGeom.StageHasAuthoredMetersPerUnit(stage):
+        return None
+    return float(UsdGeom.GetStageMetersPerUnit(stage))
 
 
 def usd_files(path: Path) -> list[Path]:
     """The files that a USD is composed of, itself included, sorted."""
-    with opened(path) as stage:
-        used = {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath}
+    stage = opened(path)  # its layers live as long as it does
+    used = {Path(layer.realPath).resolve() for layer in stage.GetUsedLayers() if layer.realPath}
     # Layers within a package have paths such as x.usdz[y.usdc].
     return sorted(file for file in used | {path.resolve()} if file.is_file())
 
 
 def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [V, 3] and triangles [T, 3] of all visible meshes and simple solids below the default prim.
+    """Vertices [V, 3] and triangles [T, 3] of all visible meshes below the default prim.
 
     Meshes for rendering are taken; where there are none, stand-ins (purpose ``proxy``). Those of purpose
     ``guide``, mostly colliders, are not. A surface to be subdivided is taken by its cage.
@@ -80,25 +67,25 @@ def read_usd(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     from pxr import UsdGeom
 
-    with opened(path) as stage:
-        prims = _shown(stage)
-        unread = [prim for prim in prims if str(prim.GetTypeName()) in _UNREAD]
-        if unread:
-            kind = unread[0].GetTypeName()
-            raise MeshError(f"{unread[0].GetPath()} is a {kind}, which is not read; make it a mesh")
-        cache = UsdGeom.XformCache()
-        parts = [
-            _placed(prim, np.array(cache.GetLocalToWorldTransform(prim)), *_geometry(prim))
-            for prim in prims
-            if prim.IsA(UsdGeom.Mesh) or str(prim.GetTypeName()) in _solids()
-        ]
-        if not parts:
-            raise MeshError("no visible mesh below the default prim")
-        start = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-        vertices = np.concatenate([vertices for vertices, _ in parts])
-        faces = np.concatenate([faces + first for (_, faces), first in zip(parts, start, strict=False)])
-        if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
-            vertices = vertices @ Z_FROM_Y.T
+    stage = opened(path)
+    prims = _shown(stage)
+    unread = [prim for prim in prims if str(prim.GetTypeName()) in _UNREAD]
+    if unread:
+        kind = unread[0].GetTypeName()
+        raise MeshError(f"{unread[0].GetPath()} is a {kind}, which is not read; make it a mesh")
+    cache = UsdGeom.XformCache()
+    parts = [
+        _placed(np.array(cache.GetLocalToWorldTransform(prim)), *_triangles(UsdGeom.Mesh(prim)))
+        for prim in prims
+        if prim.IsA(UsdGeom.Mesh)
+    ]
+    if not parts:
+        raise MeshError("no visible mesh below the default prim")
+    start = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    vertices = np.concatenate([vertices for vertices, _ in parts])
+    faces = np.concatenate([faces + first for (_, faces), first in zip(parts, start, strict=False)])
+    if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y:
+        vertices = vertices @ Z_FROM_Y.T
     return vertices, faces
 
 
@@ -114,37 +101,6 @@ def _shown(stage: Any) -> list[Any]:
             purposes[prim] = str(imageable.ComputePurpose())
     rendered = [prim for prim, purpose in purposes.items() if purpose in ("default", "render")]
     return rendered or [prim for prim, purpose in purposes.items() if purpose == "proxy"]
-
-
-def _solids() -> dict[str, Any]:
-    """Functions that make the mesh of a simple solid from a prim, by type; those with an axis along z."""
-    from trimesh import creation
-
-    def number(prim: Any, name: str) -> float:
-        return float(prim.GetAttribute(name).Get())
-
-    def cone(prim: Any) -> Any:
-        height = number(prim, "height")
-        return creation.cone(number(prim, "radius"), height).apply_translation((0.0, 0.0, -height / 2.0))
-
-    return {
-        "Cube": lambda prim: creation.box([number(prim, "size")] * 3),
-        "Sphere": lambda prim: creation.icosphere(radius=number(prim, "radius")),
-        "Cylinder": lambda prim: creation.cylinder(number(prim, "radius"), number(prim, "height")),
-        "Capsule": lambda prim: creation.capsule(number(prim, "height"), number(prim, "radius")),
-        "Cone": cone,
-    }
-
-
-def _geometry(prim: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and outward triangles of a prim in its own frame."""
-    from pxr import UsdGeom
-
-    if prim.IsA(UsdGeom.Mesh):
-        return _triangles(UsdGeom.Mesh(prim))
-    mesh = _solids()[str(prim.GetTypeName())](prim)
-    axis = prim.GetAttribute("axis").Get() if prim.HasAttribute("axis") else "Z"
-    return np.roll(mesh.vertices, "XYZ".index(axis) - 2, axis=1), mesh.faces
 
 
 def _triangles(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -171,9 +127,7 @@ def _triangles(mesh: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.array(points, dtype=float), faces
 
 
-def _placed(
-    prim: Any, matrix: np.ndarray, vertices: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _placed(matrix: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices moved into the stage by a transform of row vectors [4, 4]; a mirror turns the triangles."""
     linear = matrix[:3, :3]
     return vertices @ linear + matrix[3, :3], faces[:, ::-1] if np.linalg.det(linear) < 0.0 else faces

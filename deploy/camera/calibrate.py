@@ -1,35 +1,32 @@
-"""Find where the camera is: move fingers with markers on their tips before it, and solve for its place.
+"""Find where the camera is: a person bends fingers with markers on their tips before it.
 
 Print markers (--print-markers), stick marker k flat to the last link of finger k so that it faces the camera
-at the start pose, and run. Views are kept in a folder and can be solved again without the hand (--views).
-The result is a layer over the hand's USD, for vd-deploy --camera-layer.
+at the start pose, and run. The torque goes off. A picture is taken whenever the fingers rest and show
+something new. Views are kept in a folder and can be solved again without the hand (--views). The result is a
+layer over the hand's USD, for vd-deploy --camera-layer.
 """
 
 import json
 import sys
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated
 
 import numpy as np
 import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.assets_usd.hand_data import BASE_IN_WORLD, HandModel, Intrinsics, compose, invert
+from vd.assets_usd.hand_data import HandModel, Intrinsics, compose, invert
 from vd.config import from_dict
-from vd.deploy.camera.calibration_poses import plan
-from vd.deploy.camera.camera import GrayFrame, StaleCamera
+from vd.deploy.camera.camera import CameraError, object_place
 from vd.deploy.camera.hand_eye import HandEye, Views, solve
-from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, MarkerFinder, save_marker
-from vd.deploy.camera.realsense import RealSenseCfg, RealSenseInfrared, find_device
-from vd.deploy.hardware.check import ready
-from vd.deploy.hardware.connect import Connection, HandOptions, connect, read_hand_and_joints
-from vd.deploy.hardware.motion import move, reset_pose
-from vd.deploy.safety.limits import SafetyCfg
-from vd.deploy.safety.safety import SafeHand
-from vd.deploy.twin.calibration_twin import CalibrationTwin
+from vd.deploy.camera.markers import CELLS, MARGIN_CELLS, find_markers, save_marker
+from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
+from vd.deploy.hardware.answers import BusError
+from vd.deploy.hardware.check import confirm
+from vd.deploy.hardware.connect import HandOptions, connect, read_hand_and_joints
+from vd.deploy.hardware.motion import reset_pose
 from vd.files import atomic_path, make_folder, write_json
 from vd.paper import PAPER
 
@@ -37,16 +34,14 @@ FORMAT = "vd-calibration-views/1"
 VIEWS_FILE = "views.json"
 SIDE_M = 0.020
 """Side of a marker [m]: with its white border 27 mm, as wide as the last link of a D'Claw."""
-SPEED_RAD_S = 0.5
-"""Of the slow movements between views."""
-IMAGE_S = 0.15
-"""Longest wait for an image at rest [s]; below the watchdog's patience."""
-TRIES = 5
-"""Images that are waited for at each pose."""
+IMAGE_S = 1.0
+"""Longest wait for an image [s]."""
+STILL_RAD = 0.005
+"""Joints that move by less while an image is taken rest."""
+SEAT_M = 0.012
+"""Distance of a marker from the middle of its link."""
 SAME_RAD = 0.05
 """Joints of a finger that differ by less show its marker once more, not anew."""
-OBJECT_IN_WORLD_M = (0.0, 0.0, 0.1)
-"""Where objects are held: the place for which errors are said."""
 LARGEST_ERROR_M = PAPER.cloud.voxel_m
 """Uncertainty at the object above which the result is called ill-conditioned [m]: a voxel of the student."""
 
@@ -58,40 +53,19 @@ class CalibrateCfg(HandOptions):
     out: Path = Path("camera.usda")
     """Layer to write."""
     views: Path | None = None
-    """Solve these views again, without a hand: a folder that an earlier run kept."""
-    keep: Path | None = None
-    """Folder for the views; beside --out by default."""
+    """Solve these views again, without a hand: the folder that an earlier run left beside its --out."""
     fingers: tuple[int, ...] = ()
     """Fingers that carry a marker, from 0; all by default. Marker k is on finger k."""
-    count: int = 30
-    """Views to take."""
+    count: int = 10
+    """Views to take of each finger."""
     side_m: float = SIDE_M
     """Side of the markers' black square [m]; measure the print."""
     print_markers: Path | None = None
     """Write the markers as pictures into this folder, and do nothing else."""
     camera: RealSenseCfg = field(default_factory=lambda: RealSenseCfg(width=1280, height=720))
     """The camera."""
-    speed: float = SPEED_RAD_S
-    """Of the joint with the farthest way [rad/s]."""
-    safety: SafetyCfg = field(default_factory=SafetyCfg)
-    """Limits of the movements."""
-    seed: int = 0
-    """Of the poses that are chosen."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Do not ask before it moves."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print JSON."""
-
-
-class ImageSource(Protocol):
-    """Where pictures come from."""
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """Of the pictures."""
-
-    def read(self, timeout_s: float) -> GrayFrame:
-        """The newest picture; raises :class:`StaleCamera` if none comes."""
+    """Do not ask before the torque goes off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,35 +99,35 @@ class _ViewsFile:
 
 def calibrate(cfg: CalibrateCfg) -> int:
     """Take views, solve, write the layer; 1 if the result is too uncertain."""
-    if not cfg.side_m > 0.0 or not cfg.speed > 0.0 or cfg.count < 1:
-        raise ValueError("--side-m, --speed and --count have to be positive")
+    if not cfg.side_m > 0.0 or cfg.count < 1:
+        raise ValueError("--side-m and --count have to be positive")
     hand, _ = read_hand_and_joints(cfg)
     fingers = cfg.fingers or tuple(range(hand.num_fingers))
     if not all(0 <= f < hand.num_fingers for f in fingers) or len(set(fingers)) != len(fingers):
         raise ValueError(f"--fingers {fingers}: {hand.name} has fingers 0 to {hand.num_fingers - 1}")
     if cfg.print_markers is not None:
         return _print_markers(cfg.print_markers, fingers, cfg.side_m)
-    truth = None
     if cfg.views is not None:
         lens, side_m, shots = read_views(cfg.views, hand)
     else:
-        lens, shots, truth = take(cfg, fingers)
-        side_m = cfg.side_m
-        save_views(cfg.keep or cfg.out.with_suffix(".views"), hand, lens, side_m, shots)
-    views = find_markers(hand, lens, side_m, shots, fingers)
-    if not cfg.json:
-        print(f"{len(views)} views of markers in {len(shots)} pictures")
-    found = solve(views)
-    record = report(hand, found, views, pictures=len(shots))
-    if truth is not None:
-        record["twin_off_at_object_m"] = float(np.linalg.norm(misplaced(found.camera, truth)))
-    write_layer(cfg.out, hand, found, record)
-    if cfg.json:
-        print(json.dumps(record, indent=1))
-    else:
-        print("\n".join(lines(record)))
-        print(f"written to {cfg.out}; vd-deploy --camera-layer {cfg.out}")
-    return 1 if record["warnings"] else 0
+        (lens, shots), side_m = take(cfg, fingers), cfg.side_m
+        save_views(cfg.out.with_suffix(".views"), hand, lens, side_m, shots)
+    views = views_of(hand, lens, side_m, shots, fingers)
+    print(f"{len(views)} views of markers in {len(shots)} pictures")
+    thought = np.concatenate([hand.camera.position, hand.camera.quaternion])
+    found = solve(views, thought, {finger: seat(hand, finger, thought) for finger in fingers})
+    error_m = found.point_error(object_place())
+    write_layer(cfg.out, hand, found, error_m)
+    print("\n".join(report(hand, found, views, error_m)))
+    print(f"written to {cfg.out}; vd-deploy --camera-layer {cfg.out}")
+    if error_m <= LARGEST_ERROR_M:
+        return 0
+    print(
+        f"WARNING: ill-conditioned: where objects are, the cloud may be off by {1e3 * error_m:.1f} mm, more "
+        f"than a voxel ({1e3 * LARGEST_ERROR_M:.0f} mm). The fingers turn too little for these pictures: "
+        "take more views (--count), put markers on more fingers, larger ones, or move the camera nearer"
+    )
+    return 1
 
 
 def _print_markers(folder: Path, fingers: tuple[int, ...], side_m: float) -> int:
@@ -167,100 +141,72 @@ def _print_markers(folder: Path, fingers: tuple[int, ...], side_m: float) -> int
     return 0
 
 
-def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[Shot], np.ndarray | None]:
-    """Move the fingers before the camera and take pictures at rest.
-
-    Returns:
-        Lens, pictures, and where the camera is in truth [7], which only a twin knows.
+def take(cfg: CalibrateCfg, fingers: tuple[int, ...]) -> tuple[Intrinsics, list[Shot]]:
+    """Take pictures of fingers that a person moves: lens and pictures.
 
     Raises:
-        StoppedError: A limit was passed; the hand is safe.
+        BusError: A motor does not answer.
         CameraError: The camera does not serve.
     """
-    with ExitStack() as stack:
-        connection = stack.enter_context(connect(cfg))
-        camera = stack.enter_context(_pictures(cfg, connection, fingers))
-        hand = connection.hand
-        poses = plan(hand, camera.intrinsics, fingers, cfg.count, side_m=cfg.side_m, seed=cfg.seed)
-        question = f"The hand will move to {len(poses)} poses at {cfg.speed:g} rad/s."
-        ready(connection, question, yes=cfg.yes, quiet=cfg.json)
-        safe = stack.enter_context(SafeHand(connection.bus, connection.joints, hand, cfg.safety))
-        safe.arm()
-        shots = []
-        for number, pose in enumerate(poses):
-            move(safe, pose, cfg.speed)
-            shot = _shoot(safe, camera)
-            if shot is not None:
-                shots.append(shot)
-            print(f"\r{number + 1} of {len(poses)} poses", end="", file=sys.stderr, flush=True)
-        print(file=sys.stderr)
-        move(safe, reset_pose(hand.num_fingers), cfg.speed)
-        truth = camera.camera if isinstance(camera, CalibrationTwin) else None
-        return camera.intrinsics, shots, truth
-
-
-def _shoot(safe: SafeHand, camera: ImageSource) -> Shot | None:
-    """A picture taken between two readings of the resting joints."""
-    begin = safe.read()
-    for _ in range(TRIES):
-        try:
-            frame = camera.read(IMAGE_S)
-        except StaleCamera:
-            safe.read()
-            safe.beat()
-            continue
-        end = safe.read()
-        safe.beat()
-        if frame.time_s >= begin.time_s:
-            return Shot(0.5 * (begin.position + end.position), frame.image)
-    return None
-
-
-@contextmanager
-def _pictures(cfg: CalibrateCfg, connection: Connection, fingers: tuple[int, ...]) -> Iterator[ImageSource]:
-    """The infrared images of the camera, or those of its twin."""
-    camera: RealSenseInfrared | CalibrationTwin
     if cfg.twin:
+        raise CameraError("a twin has no camera that sees markers; give --port, or --views of an earlier run")
+    with ExitStack() as stack:
+        camera = RealSense(find_device(cfg.camera.serial), cfg.camera, infrared=True)
+        stack.callback(camera.close)
+        connection = stack.enter_context(connect(cfg))
+        hand, bus, joints = connection.hand, connection.bus, connection.joints
+        confirm("The torque goes off, and the hand lets go.", yes=cfg.yes)
+        if failed := bus.torque(False):
+            raise BusError(next(iter(failed.values())))
+        print("Bend one finger after the other, its marker to the camera; turn it all ways, hold it still.")
+        shots: list[Shot] = []
+        seen = np.zeros(len(fingers), dtype=int)
+        while seen.min() < cfg.count:
+            before = joints.to_joint(bus.read_state().position)
+            image = camera.read(IMAGE_S).image
+            after = joints.to_joint(bus.read_state().position)
+            if np.abs(after - before).max() > STILL_RAD:
+                continue
+            more = [*shots, Shot(0.5 * (before + after), image)]
+            views = views_of(hand, camera.intrinsics, cfg.side_m, more, fingers)
+            now = np.array([np.count_nonzero(views.finger == finger) for finger in fingers])
+            if now.sum() > seen.sum():
+                shots, seen = more, now
+                said = ", ".join(map(str, seen))
+                print(f"\r{said} of {cfg.count} views of each finger", end="", file=sys.stderr, flush=True)
+        print(file=sys.stderr)
+        return camera.intrinsics, shots
 
-        def joints() -> np.ndarray:
-            return connection.joints.to_joint(connection.bus.read_state().position)
 
-        camera = CalibrationTwin(
-            connection.hand, joints, fingers, cfg.camera, side_m=cfg.side_m, seed=cfg.seed
-        )
-    else:
-        camera = RealSenseInfrared(find_device(cfg.camera.serial), cfg.camera)
-    try:
-        yield camera
-    finally:
-        camera.close()
+def seat(hand: HandModel, finger: int, camera: np.ndarray) -> np.ndarray:
+    """Pose in the tip's frame [7] of a marker that faces a camera [7] when the hand is at its start."""
+    tip = hand.tip_poses(reset_pose(hand.num_fingers))[finger]
+    normal = camera[:3] - tip[:3]
+    normal /= np.linalg.norm(normal)
+    right = Rotation.from_quat(camera[3:]).apply([1.0, 0.0, 0.0])
+    right -= normal * (right @ normal)
+    right /= np.linalg.norm(right)
+    turn = Rotation.from_matrix(np.stack([right, np.cross(normal, right), normal], axis=1))
+    return compose(invert(tip), np.concatenate([tip[:3] + SEAT_M * normal, turn.as_quat()]))
 
 
-def find_markers(
+def views_of(
     hand: HandModel, lens: Intrinsics, side_m: float, shots: list[Shot], fingers: tuple[int, ...]
 ) -> Views:
     """The markers in the pictures, as views to solve; of a finger that waits only the first."""
-    finder = MarkerFinder(lens, side_m)
-    tip, finger, corners, candidates = [], [], [], []
+    tip, finger, corners = [], [], []
     seen: dict[int, list[np.ndarray]] = {number: [] for number in fingers}
     for shot in shots:
         poses = hand.tip_poses(shot.joint_q)
-        for number, square in finder.find(shot.image).items():
+        for number, square in find_markers(shot.image).items():
             own = shot.joint_q[3 * number : 3 * number + 3]
             if number in seen and all(np.abs(own - other).max() > SAME_RAD for other in seen[number]):
                 seen[number].append(own)
                 tip.append(poses[number])
                 finger.append(number)
                 corners.append(square)
-                candidates.append(finder.poses(square))
-    return Views(
-        np.array(tip).reshape(-1, 7),
-        np.array(finger, dtype=int),
-        np.array(corners).reshape(-1, 4, 2),
-        tuple(candidates),
-        lens,
-        side_m,
-    )
+    rows = np.array(tip).reshape(-1, 7), np.array(finger, dtype=int), np.array(corners).reshape(-1, 4, 2)
+    return Views(*rows, lens, side_m)
 
 
 def save_views(folder: Path, hand: HandModel, lens: Intrinsics, side_m: float, shots: list[Shot]) -> None:
@@ -284,7 +230,7 @@ def read_views(folder: Path, hand: HandModel) -> tuple[Intrinsics, float, list[S
     Raises:
         ValueError: The folder holds no views, or none of this hand; names the file.
     """
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
 
     file = Path(folder) / VIEWS_FILE
     try:
@@ -301,101 +247,36 @@ def read_views(folder: Path, hand: HandModel) -> tuple[Intrinsics, float, list[S
                 raise ValueError(f"{row.image} has another size than the lens, or other joints than the hand")
             shots.append(Shot(np.array(row.joint_q), image))
         return lens, record.side_m, shots
-    except (OSError, TypeError, ValueError, UnidentifiedImageError) as error:
+    except (OSError, TypeError, ValueError) as error:  # of JSON, fields and pictures too
         raise ValueError(f"{file} holds no views to solve ({error}); take them again") from error
 
 
-def object_place() -> np.ndarray:
-    """Where objects are held, in the hand's base [3] [m]."""
-    place = np.array([*OBJECT_IN_WORLD_M, 0.0, 0.0, 0.0, 1.0])
-    return compose(invert(np.array(BASE_IN_WORLD)), place)[:3]
-
-
-def misplaced(camera: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """By how much what is where objects are seems moved to a camera [7] that is at another place [3] [m]."""
-    point = object_place()
-    seen = compose(invert(truth), np.array([*point, 0.0, 0.0, 0.0, 1.0]))
-    return compose(camera, seen)[:3] - point
-
-
-def report(hand: HandModel, found: HandEye, views: Views, *, pictures: int) -> dict[str, Any]:
-    """What was found and how well, for people and scripts (SI units, radians)."""
-    point = object_place()
-    used = views.chosen(found.inliers)
-    error, condition = found.point_error(point), found.condition(point)
-    warnings = []
-    if error > LARGEST_ERROR_M:
-        warnings.append(
-            f"ill-conditioned: where objects are, the cloud may be off by {1e3 * error:.1f} mm, more than a "
-            f"voxel ({1e3 * LARGEST_ERROR_M:.0f} mm). The fingers turn too little for these pictures: take "
-            "more views (--count), put markers on more fingers, larger ones, or move the camera nearer"
-        )
-    return {
-        "hand": hand.name,
-        "position_m": [float(v) for v in found.camera[:3]],
-        "quaternion_xyzw": [float(v) for v in found.camera[3:]],
-        "position_half_width_m": [float(v) for v in found.half_width[:3]],
-        "turn_half_width_rad": [float(v) for v in found.half_width[3:]],
-        "error_at_object_m": error,
-        "condition": condition,
-        "residual_px": found.rms_px,
-        "pictures": pictures,
-        "views": len(views),
-        "used": len(found.inliers),
-        "fingers": [int(f) for f in np.unique(used.finger)],
-        "turned_rad": [float(v) for v in turned(used)],
-        "dual_quaternions": {
-            "position_m": [float(v) for v in found.linear[:3]],
-            "quaternion_xyzw": [float(v) for v in found.linear[3:]],
-        },
-        "moved_m": float(np.linalg.norm(found.camera[:3] - hand.camera.position)),
-        "warnings": warnings,
-    }
-
-
-def turned(views: Views) -> np.ndarray:
-    """How far the fingertips turned about the three directions about which they turned most [rad] [3]."""
-    spread = np.zeros((3, 3))
-    for finger in np.unique(views.finger):
-        turns = Rotation.from_quat(views.tip[views.finger == finger, 3:])
-        steps = (turns * turns.mean().inv()).as_rotvec()
-        spread += steps.T @ steps
-    return np.sqrt(np.linalg.eigvalsh(spread / len(views))[::-1].clip(0.0))
-
-
-def write_layer(path: Path, hand: HandModel, found: HandEye, record: dict[str, Any]) -> None:
-    """Write the layer, with what is known of its errors."""
+def write_layer(path: Path, hand: HandModel, found: HandEye, error_m: float) -> None:
+    """Write the layer, with what is known of its errors (SI units, radians)."""
     from vd.assets_usd.camera_layer import write_camera_layer
 
     notes = {
         "tool": "vd-deploy calibrate",
-        "position_half_width_m": json.dumps(record["position_half_width_m"]),
-        "turn_half_width_rad": json.dumps(record["turn_half_width_rad"]),
-        "error_at_object_m": f"{record['error_at_object_m']:.6f}",
-        "residual_px": f"{record['residual_px']:.3f}",
-        "views": str(record["used"]),
+        "position_half_width_m": json.dumps(found.half_width[:3].tolist()),
+        "turn_half_width_rad": json.dumps(found.half_width[3:].tolist()),
+        "error_at_object_m": f"{error_m:.6f}",
+        "residual_px": f"{found.rms_px:.3f}",
+        "views": str(len(found.inliers)),
     }
     write_camera_layer(path, hand, found.camera, notes)
 
 
-def lines(record: dict[str, Any]) -> list[str]:
-    """The report as text."""
+def report(hand: HandModel, found: HandEye, views: Views, error_m: float) -> list[str]:
+    """What was found and how well, as text."""
     rows = [
-        f"{record['used']} of {record['views']} views agree, {record['residual_px']:.2f} pixels apart",
+        f"{len(found.inliers)} of {len(views)} views agree, {found.rms_px:.2f} pixels apart",
         "camera in the hand's base, 95 % intervals:",
     ]
-    for axis, value, half in zip("xyz", record["position_m"], record["position_half_width_m"], strict=True):
+    for axis, value, half in zip("xyz", found.camera[:3], found.half_width[:3], strict=True):
         rows.append(f"  {axis}       {1e3 * value:8.1f} mm  +- {1e3 * half:.1f}")
-    for axis, half in zip(("right", "down", "ahead"), record["turn_half_width_rad"], strict=True):
+    for axis, half in zip(("right", "down", "ahead"), found.half_width[3:], strict=True):
         rows.append(f"  turn about its {axis:<6} +- {np.degrees(half):.2f} deg")
-    first = np.linalg.norm(np.subtract(record["dual_quaternions"]["position_m"], record["position_m"]))
-    turns = ", ".join(f"{np.degrees(t):.0f}" for t in record["turned_rad"])
-    rows += [
-        f"at the object: off by at most {1e3 * record['error_at_object_m']:.1f} mm (95 %)",
-        f"fingertips turned by {turns} deg (r.m.s., three directions); condition {record['condition']:.0f}",
-        f"dual quaternions alone: {1e3 * first:.1f} mm from this; "
-        f"the hand's file: {1e3 * record['moved_m']:.1f} mm",
-    ]
-    if "twin_off_at_object_m" in record:
-        rows.append(f"the twin knows: off by {1e3 * record['twin_off_at_object_m']:.1f} mm at the object")
-    return rows + [f"WARNING: {warning}" for warning in record["warnings"]]
+    moved_m = np.linalg.norm(found.camera[:3] - hand.camera.position)
+    rows.append(f"at the object: off by at most {1e3 * error_m:.1f} mm (95 %)")
+    rows.append(f"{1e3 * moved_m:.1f} mm from where the hand's file has it")
+    return rows

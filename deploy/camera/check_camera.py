@@ -1,17 +1,14 @@
 """The depth camera's part of the preflight: images come, in time, with depth, and the object is in view."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from vd.assets_usd.hand_data import CameraModel
-from vd.deploy.camera.camera import CameraError, DepthFrame, DepthSource
+from vd.deploy.camera.camera import Camera, CameraError, object_place
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.finding import Finding, finding
-from vd.paper import PAPER
-from vd.sim.scene import hand_mount
 
 FIRST_S = 5.0
 """Longest wait for the first image: a camera that starts tunes its exposure first."""
@@ -30,55 +27,44 @@ DEPTH_SHARE = 0.5
 
 
 def camera_findings(
-    source: DepthSource, place: CameraModel, *, fps: float, clock: Clock = MONOTONIC
+    camera: Camera, place: CameraModel, *, fps: float, clock: Clock = MONOTONIC
 ) -> Iterator[Finding]:
     """Look at a camera.
 
     What could not be looked at because of what came before is not in the findings.
 
     Args:
-        source: The camera, started.
+        camera: The camera, started.
         place: Where it is taken to be, and its range.
         fps: Images a second that it was asked for.
         clock: Time.
     """
     try:
-        frames, ages = _watch(source, clock)
+        frames = [camera.read(FIRST_S)]
+        begin = clock.now()
+        ages = [begin - frames[0].time_s]
+        while clock.now() < begin + LOOK_S:
+            frames.append(camera.read(WAIT_S))
+            ages.append(clock.now() - frames[-1].time_s)
     except CameraError as error:
         yield Finding("camera streams", False, str(error))
         return
-    height, width = frames[-1].depth_m.shape
+    height, width = frames[-1].image.shape
     yield Finding("camera streams", True, f"{len(frames)} images of {width} x {height}")
-    yield _rate(frames, ages, fps)
-    lens = source.intrinsics
-    if (lens.width, lens.height) != (width, height):
-        yield Finding("camera lens", False, f"it is for {lens.width} x {lens.height}, not {width} x {height}")
-        return
-    seen = lens.seen_from(place)
+    yield _rate(np.array([frame.time_s for frame in frames]), float(np.median(ages)), fps)
+    seen = camera.intrinsics.seen_from(place)
     yield _lens(seen)
-    yield _depth(frames, seen)
+    yield _depth(np.stack([frame.image for frame in frames]), seen)
 
 
-def _watch(source: DepthSource, clock: Clock) -> tuple[list[DepthFrame], list[float]]:
-    """Images of a while, and how old each was when it came [s]."""
-    frames = [source.read(FIRST_S)]
-    ages = [clock.now() - frames[0].time_s]
-    end = clock.now() + LOOK_S
-    while clock.now() < end:
-        frames.append(source.read(WAIT_S))
-        ages.append(clock.now() - frames[-1].time_s)
-    return frames, ages
-
-
-def _rate(frames: Sequence[DepthFrame], ages: Sequence[float], fps: float) -> Finding:
-    times = np.array([frame.time_s for frame in frames])
+def _rate(times: np.ndarray, age: float, fps: float) -> Finding:
     gaps = np.diff(times)
-    rate, age = float(len(gaps) / (times[-1] - times[0])), float(np.median(ages))
+    rate = 1.0 / float(gaps.mean())
     wrong = []
     if rate < RATE_SHARE * fps:
         wrong.append(f"{rate:.1f} images a second, not {fps:g}: use a USB 3 cable and port, and more light")
     if age > AGE_S:
-        wrong.append(f"images come {1e3 * age:.0f} ms old, more than {1e3 * AGE_S:.0f}: use fewer filters")
+        wrong.append(f"images come {1e3 * age:.0f} ms old, more than {1e3 * AGE_S:.0f}: use a USB 3 port")
     right = f"{rate:.1f} images a second, longest gap {1e3 * gaps.max():.0f} ms, {1e3 * age:.0f} ms old"
     return finding("camera rate", wrong, right)
 
@@ -86,7 +72,7 @@ def _rate(frames: Sequence[DepthFrame], ages: Sequence[float], fps: float) -> Fi
 def _lens(seen: CameraModel) -> Finding:
     wide = 2.0 * math.degrees(math.atan2(0.5 * seen.width, seen.fx))
     lens = f"{seen.width} x {seen.height}, f {seen.fx:.1f} {seen.fy:.1f} px, {wide:.0f} deg wide"
-    column, row, depth = seen.project(_object_place())
+    column, row, depth = seen.project(object_place())
     if depth > 0.0 and 0.0 <= column < seen.width and 0.0 <= row < seen.height:
         where = f"the object's place is at {column:.0f}, {row:.0f}, {depth:.2f} m away"
         return Finding("camera lens", True, f"{lens}; {where}")
@@ -94,10 +80,10 @@ def _lens(seen: CameraModel) -> Finding:
     return Finding("camera lens", False, f"{lens}; {remedy}")
 
 
-def _depth(frames: Sequence[DepthFrame], seen: CameraModel) -> Finding:
-    images = np.stack([frame.depth_m for frame in frames])
+def _depth(images: np.ndarray, seen: CameraModel) -> Finding:
+    """Share of the pixels [N, H, W] with depth, in all and where the object is handled."""
     valid = (images >= seen.near) & (images <= seen.far)
-    column, row, depth = seen.project(_object_place())
+    column, row, depth = seen.project(object_place())
     half = AROUND_M * np.array([seen.fx, seen.fy]) / abs(depth)
     first = np.maximum(np.round(np.array([column, row]) - half), 0).astype(int)
     last = np.maximum(np.round(np.array([column, row]) + half), 0).astype(int)
@@ -108,9 +94,3 @@ def _depth(frames: Sequence[DepthFrame], seen: CameraModel) -> Finding:
         remedy = "clean the lens, keep it off by what its range asks for, switch the emitter on"
         return Finding("camera depth", False, f"{found}, not {100 * DEPTH_SHARE:.0f}: {remedy}")
     return Finding("camera depth", True, found)
-
-
-def _object_place() -> np.ndarray:
-    """Where the object is handled, in the base frame [m]."""
-    mount = np.array(hand_mount())
-    return Rotation.from_quat(mount[3:]).inv().apply(np.array(PAPER.scene.goal_position_m) - mount[:3])

@@ -5,6 +5,7 @@ are accepted, :mod:`vd.deploy.hardware.answers` says. Everything goes through on
 """
 
 import contextlib
+import os
 import termios
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from vd.deploy.clock import MONOTONIC, Clock
-from vd.deploy.finding import BAUD_RATE, command
 from vd.deploy.hardware.answers import (
     CLOCK_TOLERANCE_S,
     OTHER_BYTES,
@@ -38,7 +38,7 @@ from vd.deploy.hardware.control_table import (
     to_counts,
 )
 from vd.deploy.hardware.packets import MAX_ID
-from vd.deploy.hardware.port import WAIT_S, KeptPacket, open_port, sdk
+from vd.deploy.hardware.port import BAUD_RATE, WAIT_S, KeptPacket, open_port, pseudo, sdk
 from vd.deploy.hardware.registers import MotorSettings, different
 
 STARVED_S = 0.02
@@ -46,26 +46,25 @@ STARVED_S = 0.02
 the SDK, once it runs again, finds that its 34 ms are over."""
 BUSY = "this computer is busy; end other programs, or give this one real-time priority (ulimit -r 1)"
 TORQUE_BYTES = 1
+RETRIES, TWIN_RETRIES = 1, 3
+"""The twin is a process among others, which may not run for longer than the SDK waits for an answer."""
 LATE_S = 0.02
 """Pause after a question that was asked in vain or again; what arrives meanwhile is dropped."""
 
 
-def check_wiring() -> str:
-    """What to try where a motor is silent."""
-    return "check its cable, power, baud rate and ID, which may be that of another motor"
-
-
 class MotorBus:
     """Motors of one model on one serial port.
+
+    Every exchange raises :class:`BusError` where a packet could not be sent, a motor refused, or no sound
+    answer came, also not when asked again.
 
     Args:
         port: Device, such as /dev/ttyUSB0, or an open port of the SDK's kind.
         ids: Motors in the order of the arrays.
         model: Name of their model.
         baud_rate: To open the device with.
-        retries: How often to ask again where no sound answer came.
+        retries: How often to ask again where no sound answer came; what suits the port by default.
         clock: Time.
-        remedy: What to try where a motor is silent though this program listened, in words.
 
     Raises:
         BusError: The port cannot be opened, or another program has it.
@@ -79,17 +78,15 @@ class MotorBus:
         model: str,
         *,
         baud_rate: int = BAUD_RATE,
-        retries: int = 1,
+        retries: int | None = None,
         clock: Clock = MONOTONIC,
-        remedy: Callable[[], str] = check_wiring,
     ):
         """Open the port."""
         if model not in MODELS:
             raise ValueError(f"no motor {model!r}; choose of {', '.join(MODELS)}")
         if not ids or len(set(ids)) != len(ids) or not all(0 <= id <= MAX_ID for id in ids):
             raise ValueError(f"ids are {list(ids)}; give each motor's own, within 0 and {MAX_ID}")
-        self.ids, self.model, self.retries, self.clock = tuple(ids), MODELS[model], retries, clock
-        self._remedy = remedy
+        self.ids, self.model, self.clock = tuple(ids), MODELS[model], clock
         self._items = table(self.model)
         self._sdk = sdk()
         self._lock = threading.RLock()
@@ -100,6 +97,9 @@ class MotorBus:
         self.rejected = 0
         """States that were not accepted."""
         self._port = open_port(port, baud_rate) if isinstance(port, str) else port
+        if retries is None:
+            retries = TWIN_RETRIES if pseudo(self.port) else RETRIES
+        self.retries = retries
         self._late_s = self._listened_s = 0.0
         self._hear, self._port.readPort = self._port.readPort, self._listen
 
@@ -114,10 +114,6 @@ class MotorBus:
         """Name of the port."""
         return str(self._port.getPortName())
 
-    def command(self, words: str) -> str:
-        """A command of vd-deploy for these motors, as a person can enter it."""
-        return command(words, self.port, self._port.getBaudRate())
-
     def _garbled(self, result: int) -> bool:
         """Whether what answered the last exchange is no sound packet, though this program listened."""
         return bool(result == self._sdk.COMM_RX_CORRUPT) and self._late_s <= STARVED_S
@@ -125,8 +121,8 @@ class MotorBus:
     def _twice(self, id: int) -> str:
         """What garbled answers mean."""
         return (
-            f"its answers are garbled: two motors have the ID {id} (unplug one, then "
-            f"{self.command(f'set-id {id} NEW')} for the other), or a cable is bad"
+            f"its answers are garbled: two motors have the ID {id} (unplug one, and give the other a new one "
+            "with ROBOTIS' DYNAMIXEL Wizard 2.0), or a cable is bad"
         )
 
     def close(self) -> None:
@@ -204,11 +200,7 @@ class MotorBus:
         return wrong
 
     def read(self, id: int, name: str) -> int:
-        """Value of one item of the control table.
-
-        Raises:
-            BusError: No sound answer.
-        """
+        """Value of one item of the control table."""
         item = self._items[name]
         return item.from_bytes(self._read(id, name, item.address, item.size))
 
@@ -243,11 +235,7 @@ class MotorBus:
         return bytes(data)
 
     def write(self, id: int, name: str, value: int) -> None:
-        """Write one item of the control table.
-
-        Raises:
-            BusError: No sound answer, or the motor refused.
-        """
+        """Write one item of the control table."""
         item = self._items[name]
         data = list(item.to_bytes(value))
 
@@ -293,20 +281,13 @@ class MotorBus:
         return failed
 
     def release(self) -> None:
-        """Switch the torque of all motors off with one packet, which none of them answers.
-
-        Raises:
-            BusError: The packet could not be sent.
-        """
+        """Switch the torque of all motors off with one packet, which none of them answers."""
         self._write_all("torque_enable", [0] * len(self.ids))
 
     def watch(self, seconds: float) -> None:
         """Have the motors stop where they are once the line was silent for so long; 0 switches that off.
 
         A motor that has stopped so refuses goals until this is called again.
-
-        Raises:
-            BusError: No sound answer, or a motor refused.
         """
         for id in self.ids:
             self.write(id, "bus_watchdog", 0)
@@ -317,19 +298,9 @@ class MotorBus:
         """Have the motors stop by themselves where they are, without an answer, within two units of silence.
 
         The shortest bus watchdog, in one packet: what a line that brings no states still can do.
-
-        Raises:
-            BusError: The packet could not be sent.
         """
         self._write_all("bus_watchdog", [1] * len(self.ids))
         self.clock.sleep(2.0 * WATCHDOG_UNIT_S)
-
-    def reboot(self, id: int) -> None:
-        """Restart a motor: clears its hardware error. Torque is off afterwards; configure it before use."""
-        with self._line():
-            result, error = self._packets.reboot(self._port, id)
-            self._states.forget()
-        self._check(id, "reboot", result, error)
 
     def hardware_errors(self) -> dict[int, str]:
         """Hardware errors of the motors that have one, in words, by ID."""
@@ -405,11 +376,7 @@ class MotorBus:
             return self._states.accept(heard, answers)
 
     def read_torque(self) -> np.ndarray:
-        """Whether each motor has its torque on, shape [D] bool.
-
-        Raises:
-            BusError: A motor did not answer, also not when asked again.
-        """
+        """Whether each motor has its torque on, shape [D] bool."""
         item = self._items["torque_enable"]
         for attempt in range(self.retries + 1):
             try:
@@ -467,7 +434,12 @@ class MotorBus:
         """Nobody was heard in the last exchange: by this program's own fault, or the motor's."""
         if self._late_s > STARVED_S:
             return LateError(f"{what}: this program was {self._late_s:.3f} s late to listen: {BUSY}")
-        return SilentError(f"{what}: {self._remedy()}")
+        if pseudo(self.port):  # a twin has no cable, but this computer's processors
+            load = f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
+            return SilentError(f"{what}: others may keep the twin from answering ({load}), or its options")
+        return SilentError(
+            f"{what}: check its cable, power, baud rate and ID, which may be that of another motor"
+        )
 
     def _failure(self, what: str, result: int) -> BusError:
         """What went wrong in the last exchange."""

@@ -4,30 +4,35 @@ import contextlib
 import itertools
 import json
 import sys
-import tempfile
-from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import tyro
 
-from vd.deploy.camera.realsense import RealSenseCfg
-from vd.deploy.finding import Finding, finding, show
-from vd.deploy.hardware.adapter import adapter_findings
-from vd.deploy.hardware.answers import BusError
-from vd.deploy.hardware.check_registers import read_tables, register_findings, to_be_set
+from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
+from vd.deploy.finding import Finding, finding, listed, show
+from vd.deploy.hardware.answers import BusError, GarbledError, LateError
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
+from vd.deploy.hardware.joints import CalibrationError
 from vd.deploy.hardware.motion import move
+from vd.deploy.hardware.registers import RESTART, Register, different, kept
 from vd.deploy.safety.limits import PERIOD_S, SafetyCfg
 from vd.deploy.safety.safety import SafeHand
-from vd.deploy.twin.child import TwinError
+from vd.deploy.twin.child import TwinCamera
 from vd.paper import PAPER
 
 if TYPE_CHECKING:
-    from vd.assets_usd.hand_model import HandModel
+    from vd.deploy.camera.camera import Camera
+    from vd.deploy.hardware.bus import MotorBus
 
+USB_SERIAL = Path("/sys/bus/usb-serial/devices")
+"""Where the kernel tells of adapters of the FTDI kind, the U2D2 among them."""
+LATENCY_MS = 1
+"""The shortest latency timer. The kernel's 16 ms leave a recording 54 of its 100 samples a second, and a
+policy sees every state that much later."""
 CYCLES = 24
 """Control cycles whose times are measured: two seconds."""
 BUS_SHARE = 0.5
@@ -44,6 +49,9 @@ RANGE_SPEED_RAD_S = 0.7
 """Speed of that."""
 FOLLOW_RAD = 0.25
 """How far a joint may be from its slow goal: gravity bends it by 0.1 rad at the paper's gain."""
+
+Tables = Mapping[int, Mapping[str, int]]
+"""Control tables of motors by ID, each by item."""
 
 
 @dataclass(frozen=True)
@@ -73,41 +81,95 @@ def preflight(connection: Connection) -> Iterator[Finding]:
     try:
         yield from adapter_findings(bus.port)
         missing = bus.missing()
-        tables, deaf = read_tables(bus, [id for id in bus.ids if id not in missing])
+        tables, deaf = _read_tables(bus, [id for id in bus.ids if id not in missing])
         wrong = [f"motor {id} {why}" for id, why in missing.items()] + deaf
+        if strangers := sorted(set(bus.ping_all()) - set(bus.ids)) if missing else []:
+            wrong.insert(0, f"ID {', '.join(map(str, strangers))} answers, and is none of the hand's")
         yield finding("motors answer", wrong, f"all {len(bus.ids)}")
         if wrong:
             return
-        errors = bus.hardware_errors()
-        yield finding(
-            "no hardware error",
-            [
-                f"motor {id}: {why}; once it is mended {bus.command(f'reboot {id}')} clears it"
-                for id, why in errors.items()
-            ],
-            "none",
-        )
+        errors = [f"motor {id}: {why}; mend it, then {RESTART}" for id, why in bus.hardware_errors().items()]
+        yield finding("no hardware error", errors, "none")
         yield from register_findings(connection, tables)
-        yield Finding("torque", True, holding(connection) or "off")
+        yield Finding("torque", True, _holding(bus) or "off")
         yield from _state(connection)
-        yield _cycles(connection)
+        yield _cycles(bus)
     except BusError as error:
         yield Finding("bus", False, str(error))
 
 
-def holding(connection: Connection) -> str:
-    """Which motors hold what the hand has, in words; empty where none has its torque on.
+def adapter_findings(port: str) -> Iterator[Finding]:
+    """Whether the USB adapter passes answers on at once; nothing of one that has no latency timer.
 
-    Raises:
-        BusError: A motor does not answer.
+    Args:
+        port: Device, or a link to it.
     """
+    timer = USB_SERIAL / Path(port).resolve().name / "latency_timer"
+    try:
+        latency = int(timer.read_text())
+    except (OSError, ValueError):
+        return
+    right = latency <= LATENCY_MS
+    remedy = f", which keeps answers that long: echo {LATENCY_MS} | sudo tee {timer}"
+    yield Finding("USB latency timer", right, f"{latency} ms" + ("" if right else remedy))
+
+
+def _read_tables(bus: "MotorBus", ids: Sequence[int]) -> tuple[dict[int, dict[str, int]], list[str]]:
+    """Control tables of motors that answer a ping, and what is wrong with those that answer nothing else."""
+    tables, wrong = {}, []
+    for id in ids:
+        try:
+            tables[id] = bus.read_table(id)
+        except (GarbledError, LateError) as error:
+            wrong.append(str(error))
+        except BusError:
+            wrong.append(f"motor {id} answers pings, but no reads: its status_return_level is 0; {RESTART}")
+    return tables, wrong
+
+
+def register_findings(connection: Connection, tables: Tables) -> Iterator[Finding]:
+    """Compare control tables with what is wanted of them: a finding for each register that differs."""
     bus = connection.bus
+    try:
+        settings = connection.joints.settings(connection.hand, bus.model.name)
+    except CalibrationError as error:
+        yield Finding("registers", False, str(error))
+        return
+    rows: dict[Register, list[tuple[int, int, int]]] = {}
+    for ours in (False, True):
+        for id, found in tables.items():
+            for one, values in different(found, bus.model, settings[id], ours=ours).items():
+                rows.setdefault(one, []).append((id, *values))
+    for one, motors in rows.items():
+        if one.remedy:
+            mend = [
+                f"motor {id}: {value}; {one.remedy.format(wanted=wanted)}" for id, value, wanted in motors
+            ]
+            yield Finding(one.name, False, f"{one.why}: {listed(mend)}")
+            continue
+        alike: dict[tuple[int, int], list[str]] = {}
+        for id, value, wanted in motors:
+            alike.setdefault((value, wanted), []).append(str(id))
+        changes = [
+            f"motor {', '.join(ids)}: {old}; will be set to {new}" for (old, new), ids in alike.items()
+        ]
+        where = " (kept without power)" if kept(bus.model, one) else ""
+        yield Finding(one.name, True, f"{listed(changes)}{where}; else {one.why}")
+    if not rows:
+        yield Finding("registers", True, "as the hand needs them")
+
+
+def _holding(bus: "MotorBus") -> str:
+    """Which motors hold what the hand has, in words; empty where none has its torque on."""
     on = bus.read_torque()
     if not on.any():
         return ""
     ids = ", ".join(str(id) for id, one in zip(bus.ids, on, strict=True) if one)
     current = float(np.abs(bus.read_state().current[on]).max())
-    return f"motors {ids} hold, with up to {current:.2f} A: they let go when their settings are written"
+    return (
+        f"motors {ids} hold, with up to {current:.2f} A: they let go when their settings are written; "
+        "support what the hand carries"
+    )
 
 
 def write_settings(connection: Connection) -> Finding:
@@ -124,18 +186,17 @@ def _state(connection: Connection) -> Iterator[Finding]:
     """Temperature, voltage and pose."""
     bus, joints, hand = connection.bus, connection.joints, connection.hand
     state = bus.read_state()
-    limit = COOL_C
     hot = [
-        f"motor {id}: {t:.0f} deg C, over {limit:g}: let it cool"
+        f"motor {id}: {t:.0f} deg C, over {COOL_C:g}: let it cool"
         for id, t in zip(bus.ids, state.temperature, strict=True)
-        if t > limit
+        if t > COOL_C
     ]
     yield finding("temperature", hot, f"up to {state.temperature.max():.0f} deg C")
-    supply, apart = bus.model.supply_v, VOLTAGE_SHARE * bus.model.supply_v
+    supply = bus.model.supply_v
     weak = [
         f"motor {id}: {v:.1f} V, not {supply:g}: check the supply and its wires"
         for id, v in zip(bus.ids, state.voltage, strict=True)
-        if abs(v - supply) > apart
+        if abs(v - supply) > VOLTAGE_SHARE * supply
     ]
     yield finding("voltage", weak, f"{state.voltage.min():.1f} to {state.voltage.max():.1f} V")
     q = joints.to_joint(state.position)
@@ -144,37 +205,34 @@ def _state(connection: Connection) -> Iterator[Finding]:
     outside = []
     for axis in np.flatnonzero(out > OUTSIDE_RAD):
         # Turned by hand without torque a motor counts on; one that starts counts within one turn.
-        mend = f"it was turned round; {bus.command(f'reboot {bus.ids[axis]}')}"
-        mend = mend if turns[axis] else "move it by hand, or mend its calibration"
+        mend = (
+            f"it was turned round: {RESTART}" if turns[axis] else "move it by hand, or mend its calibration"
+        )
         where = f"{q[axis]:.2f} rad, out of {hand.lower[axis]:.2f} to {hand.upper[axis]:.2f}"
         outside.append(f"{joints.names[axis]}: {where}: {mend}")
     yield finding("pose within limits", outside, "every joint")
 
 
-def _cycles(connection: Connection) -> Finding:
+def _cycles(bus: "MotorBus") -> Finding:
     """Time that a reading takes, at the control rate."""
-    bus, clock = connection.bus, connection.bus.clock
     rejected, took, failed, why = bus.rejected, [], 0, ""
-    begin = clock.now()
+    begin = bus.clock.now()
     for cycle in range(CYCLES):
-        clock.sleep(begin + cycle * PERIOD_S - clock.now())
-        start = clock.now()
+        bus.clock.sleep(begin + cycle * PERIOD_S - bus.clock.now())
+        start = bus.clock.now()
         try:
             bus.read_state()
         except BusError as error:
             failed, why = failed + 1, f"; {error}"
-        took.append(clock.now() - start)
+        took.append(bus.clock.now() - start)
+    median_s, limit_s = float(np.median(took)), BUS_SHARE * PERIOD_S
+    right = failed == 0 and median_s < limit_s
+    remedy = f": it may take {1e3 * limit_s:.0f} ms; check cables, and the adapter's latency"
     found = (
-        f"{1e3 * float(np.median(took)):.1f} ms a reading, longest {1e3 * max(took):.1f}; "
+        f"{1e3 * median_s:.1f} ms a reading, longest {1e3 * max(took):.1f}; "
         f"{bus.rejected - rejected} of {CYCLES} asked again, {failed} failed{why}"
     )
-    right = failed == 0 and float(np.median(took)) < BUS_SHARE * PERIOD_S
-    remedy = (
-        ""
-        if right
-        else f": it may take {1e3 * BUS_SHARE * PERIOD_S:.0f} ms; check cables, and the adapter's latency"
-    )
-    return Finding("loop rate", right, found + remedy)
+    return Finding("loop rate", right, found + ("" if right else remedy))
 
 
 def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
@@ -187,45 +245,28 @@ def sweep(connection: Connection, safe: SafeHand) -> Iterator[Finding]:
     lower, upper = safe.limits.lower, safe.limits.upper
     centre, half = 0.5 * (lower + upper), 0.5 * RANGE_SHARE * (upper - lower)
     for axis, name in enumerate(connection.joints.names):
-        worst = 0.0
-        for end in (centre[axis] - half[axis], centre[axis] + half[axis], home[axis]):
+        worst, low, high = 0.0, centre[axis] - half[axis], centre[axis] + half[axis]
+        for end in (low, high, home[axis]):
             goal = home.copy()
             goal[axis] = end
             worst = max(worst, abs(move(safe, goal, RANGE_SPEED_RAD_S)[axis]))
-        low, high = centre[axis] - half[axis], centre[axis] + half[axis]
-        where = f"{low:.2f} to {high:.2f} rad, at most {worst:.2f} from its goal"
         ok = worst < FOLLOW_RAD
-        yield Finding(
-            f"range of {name}", ok, where + ("" if ok else ": blocked, a wrong sign, or a wrong joint's ID?")
-        )
+        why = "" if ok else ": blocked, a wrong sign, or a wrong joint's ID?"
+        found = f"{low:.2f} to {high:.2f} rad, at most {worst:.2f} from its goal{why}"
+        yield Finding(f"range of {name}", ok, found)
 
 
 def ready(
     connection: Connection, question: str, *, yes: bool, quiet: bool = False, more: Iterable[Finding] = ()
-) -> list[Finding]:
+) -> None:
     """Preflight, and ``more`` of it, have the person confirm, and only then write the settings.
 
     Raises:
-        RuntimeError: Something is wrong, or the person did not say yes.
+        RuntimeError: Something is wrong, the person did not say yes, or a motor does not keep a setting.
     """
-    findings = show(itertools.chain(preflight(connection), more), quiet=quiet)
-    _stop_at_wrong(findings)
-    return findings + agreed(connection, question, yes=yes, quiet=quiet)
-
-
-def agreed(connection: Connection, question: str, *, yes: bool, quiet: bool = False) -> list[Finding]:
-    """Have the person confirm, say what the hand holds, and write the settings.
-
-    Raises:
-        RuntimeError: The person did not say yes, or a motor does not keep a setting.
-    """
-    if held := holding(connection):
-        held = f"{held[:1].upper()}{held[1:]}; support what the hand carries. "
-        print(held, file=sys.stderr, flush=True)
-    confirm(f"{to_be_set(connection)}{question}", yes=yes)
-    written = show([write_settings(connection)], quiet=quiet)
-    _stop_at_wrong(written)
-    return written
+    _stop_at_wrong(show(itertools.chain(preflight(connection), more), quiet=quiet))
+    confirm(question, yes=yes)
+    _stop_at_wrong(show([write_settings(connection)], quiet=quiet))
 
 
 def _stop_at_wrong(findings: Iterable[Finding]) -> None:
@@ -249,48 +290,41 @@ def confirm(question: str, *, yes: bool) -> None:
         raise RuntimeError("nothing moves: not confirmed")
 
 
-def camera_preflight(cfg: CheckCfg, hand: "HandModel", side: Path) -> Iterator[Finding]:
-    """Find the camera, and look at it.
-
-    Args:
-        cfg: Which camera.
-        hand: The hand.
-        side: Socket of the twin, if there is one.
-    """
+def camera_preflight(cfg: CheckCfg, connection: Connection) -> Iterator[Finding]:
+    """Find the camera, and look at it."""
     from vd.assets_usd.camera_layer import read_camera
     from vd.deploy.camera.camera import CameraError
     from vd.deploy.camera.check_camera import camera_findings
-    from vd.deploy.camera.eyes import open_camera
-    from vd.deploy.twin.twin_link import TwinLink
 
+    hand, twin = connection.hand, connection.twin
     place = hand.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
-    with contextlib.ExitStack() as stack:
+    camera: Camera
+    if twin is not None:
+        camera = TwinCamera(twin, place)
+    else:
         try:
-            link = stack.enter_context(TwinLink(side)) if cfg.twin else None
-            source, name = open_camera(place, link, cfg.camera, sdk=None)
-        except (CameraError, TwinError) as error:
+            camera = RealSense(find_device(cfg.camera.serial), cfg.camera)
+        except CameraError as error:
             yield Finding("camera", False, str(error))
             return
-        stack.callback(source.close)
-        yield Finding("camera", True, name)
-        yield from camera_findings(source, place, fps=PAPER.scene.control_hz if cfg.twin else cfg.camera.fps)
+    with contextlib.closing(camera):
+        fps = PAPER.scene.control_hz if twin is not None else cfg.camera.fps
+        yield from camera_findings(camera, place, fps=fps)
 
 
 def check(cfg: CheckCfg) -> int:
     """Look, and print a table; 1 if something is wrong."""
     with contextlib.ExitStack() as stack:
-        side = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vd-twin-"))) / "side"
-        seen = ["--object", "cube", "--side", str(side)] if cfg.twin and not cfg.no_camera else []
-        connection = stack.enter_context(connect(cfg, seen))
+        connection = stack.enter_context(connect(cfg, [] if cfg.no_camera else ["--object", "cube"]))
         findings = show(preflight(connection), quiet=cfg.json)
         if not cfg.no_camera:
-            findings += show(camera_preflight(cfg, connection.hand, side), quiet=cfg.json)
+            findings += show(camera_preflight(cfg, connection), quiet=cfg.json)
         if cfg.range and all(one.ok for one in findings):
-            question = "Every joint will move slowly through its range."
-            findings += agreed(connection, question, yes=cfg.yes, quiet=cfg.json)
-            limits = replace(SafetyCfg(), then="off")
-            safe = stack.enter_context(SafeHand(connection.bus, connection.joints, connection.hand, limits))
-            findings += show(sweep(connection, safe), quiet=cfg.json)
+            confirm("Every joint will move slowly through its range.", yes=cfg.yes)
+            findings += show([write_settings(connection)], quiet=cfg.json)
+            _stop_at_wrong(findings)
+            safe = SafeHand(connection.bus, connection.joints, connection.hand, SafetyCfg())
+            findings += show(sweep(connection, stack.enter_context(safe)), quiet=cfg.json)
     right = all(one.ok for one in findings)
     if cfg.json:
         print(json.dumps({"ok": right, "findings": [asdict(one) for one in findings]}, indent=1))

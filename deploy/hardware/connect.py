@@ -1,7 +1,6 @@
 """From options to a hand: its model, its motors' calibration, and the bus, to real motors or to a twin."""
 
 import contextlib
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,18 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from vd.deploy.finding import BAUD_RATE
-from vd.deploy.twin.child import TwinChild
+from vd.deploy.hardware.port import BAUD_RATE
 
 if TYPE_CHECKING:
     from vd.assets_usd.hand_model import HandModel
     from vd.deploy.hardware.bus import MotorBus
     from vd.deploy.hardware.joints import Joints
+    from vd.deploy.twin.child import TwinChild
 
 MOTOR = "XH430-V210"
 """The motors whose stall torque is the hand's effort limit."""
-RETRIES, TWIN_RETRIES = 1, 3
-"""The twin is a process among others, which may not run for longer than the SDK waits for an answer."""
 
 
 @dataclass(frozen=True)
@@ -56,13 +53,15 @@ class Connection:
     """Which motor turns which joint."""
     bus: "MotorBus"
     """Its motors, in the joints' order."""
+    twin: "TwinChild | None" = None
+    """The twin, if it is one."""
 
 
 def read_hand_and_joints(options: HandOptions) -> tuple["HandModel", "Joints"]:
     """The hand of the options and its motors.
 
     Raises:
-        ValueError: Motor, hand, layer or calibration cannot be used.
+        ValueError: Port and twin, motor, hand, layer or calibration cannot be used.
     """
     from vd.assets_usd.hands import load_hand
     from vd.deploy.hardware.control_table import MODELS
@@ -77,38 +76,8 @@ def read_hand_and_joints(options: HandOptions) -> tuple["HandModel", "Joints"]:
 
 
 @contextlib.contextmanager
-def open_port(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[str]:
-    """The serial port of the options; a twin behind it is started, and ended with the block.
-
-    Args:
-        options: The options.
-        twin_options: More of the twin's, if there is one.
-
-    Raises:
-        ValueError: Neither or both of a port and a twin are asked for.
-        TwinError: The twin did not start.
-    """
-    if options.twin == (options.port is not None):
-        raise ValueError("give --port, such as /dev/ttyUSB0, or --twin for a simulated hand")
-    if options.port is not None:
-        yield options.port
-        return
-    print("starting the twin ...", file=sys.stderr, flush=True)
-    arguments = ["--hand", options.hand, "--model", options.motor]
-    if options.hand_layer is not None:
-        arguments += ["--hand-layer", str(options.hand_layer)]
-    if options.calibration is not None:
-        arguments += ["--calibration", str(options.calibration)]
-    twin = TwinChild([*arguments, *twin_options, *options.twin_args.split()])
-    try:
-        yield twin.path
-    finally:
-        twin.close()
-
-
-@contextlib.contextmanager
 def connect(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[Connection]:
-    """Open the bus to the hand of the options.
+    """Open the bus to the hand of the options; a twin behind it is started, and ended with the block.
 
     Args:
         options: The options.
@@ -119,26 +88,27 @@ def connect(options: HandOptions, twin_options: Sequence[str] = ()) -> Iterator[
         TwinError: The twin did not start.
         BusError: The port cannot be opened.
     """
-    from vd.deploy.hardware.bus import MotorBus, check_wiring
+    from vd.deploy.hardware.bus import MotorBus
+    from vd.deploy.twin.child import TwinChild
 
     hand, joints = read_hand_and_joints(options)
-    retries = TWIN_RETRIES if options.twin else RETRIES
-    with open_port(options, twin_options) as port:
-        bus = MotorBus(
-            port,
-            joints.ids,
-            options.motor,
-            baud_rate=options.baud_rate,
-            retries=retries,
-            remedy=_check_twin if options.twin else check_wiring,
-        )
-        with bus:
-            yield Connection(hand, joints, bus)
-
-
-def _check_twin() -> str:
-    """What to try where a twin is silent: it has no cable, but this computer's processors."""
-    return (
-        f"the twin is a program on this computer (load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores): "
-        "others may keep it from answering, or its --twin-args have it be silent"
-    )
+    if options.twin == (options.port is not None):
+        raise ValueError("give --port, such as /dev/ttyUSB0, or --twin for a simulated hand")
+    with contextlib.ExitStack() as stack:
+        twin, port = None, options.port
+        if port is None:
+            print(
+                "starting the twin (the first start compiles its kernels for minutes) ...",
+                file=sys.stderr,
+                flush=True,
+            )
+            arguments = ["--hand", options.hand, "--model", options.motor]
+            if options.hand_layer is not None:
+                arguments += ["--hand-layer", str(options.hand_layer)]
+            if options.calibration is not None:
+                arguments += ["--calibration", str(options.calibration)]
+            twin = TwinChild([*arguments, *twin_options, *options.twin_args.split()])
+            stack.callback(twin.close)
+            port = twin.path
+        bus = MotorBus(port, joints.ids, options.motor, baud_rate=options.baud_rate)
+        yield Connection(hand, joints, stack.enter_context(bus), twin)

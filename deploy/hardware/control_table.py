@@ -14,17 +14,11 @@ FARTHEST_COUNTS = 256 * COUNTS_PER_TURN
 """Range of the extended position mode, 256 turns either way: no sound position lies beyond."""
 RAD_PER_COUNT = 2.0 * math.pi / COUNTS_PER_TURN
 RAD_S_PER_COUNT = 0.229 * 2.0 * math.pi / 60.0
-RAD_S2_PER_COUNT = 214.577 * 2.0 * math.pi / 3600.0
-"""Unit of the profile acceleration: 214.577 rev/min^2."""
 SIZE = 148
 """Bytes that are simulated: all but the indirect addresses behind."""
 EEPROM_END = 64
 """Items below are kept without power, and cannot be written while torque is on."""
 POSITION_MODE = 3
-LAST_SECONDARY_ID = 252
-"""Values above switch the secondary ID off."""
-BAUD_RATES = (9_600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000)
-"""Baud rates by the value of their item."""
 FULL_PWM = 885.0
 """Counts of the whole supply voltage."""
 WATCHDOG_UNIT_S = 0.02

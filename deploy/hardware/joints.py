@@ -15,7 +15,6 @@ from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.control_table import MODELS, RAD_S_PER_COUNT, to_angle
 from vd.deploy.hardware.packets import MAX_ID
 from vd.deploy.hardware.registers import MotorSettings
-from vd.files import write_json
 
 FORMAT = "vd-motors/1"
 LARGEST_VELOCITY_LIMIT = 1023
@@ -104,12 +103,6 @@ class Joints:
             )
         return result
 
-    def save(self, path: Path, hand: str) -> None:
-        """Write a calibration file."""
-        rows = zip(self.names, self.ids, self.sign, self.offset, strict=True)
-        motors = [{"joint": n, "id": i, "sign": int(s), "offset_rad": float(o)} for n, i, s, o in rows]
-        write_json(path, {"format": FORMAT, "hand": hand, "motors": motors})
-
 
 def uncalibrated(hand: HandModel) -> Joints:
     """Motors as they are numbered on ROBEL's D'Claw (10, 11, 12, 20, ...), zero in their middle."""
@@ -125,24 +118,10 @@ def read_joints(path: Path, hand: HandModel) -> Joints:
         CalibrationError: It is no calibration, or not one of this hand.
     """
     try:
-        file = from_dict(_File, json.loads(Path(path).read_text()), where="the file")
-        motors = _by_joint(file, hand)
+        motors = _by_joint(from_dict(_File, json.loads(Path(path).read_text()), where="the file"), hand)
     except (OSError, TypeError, ValueError) as error:  # of JSON, text and fields too
         raise CalibrationError(f"{path} is not a calibration of {hand.name}: {error}") from error
     ids = [motor.id for motor in motors]
-    if len(set(ids)) != len(ids) or not all(0 <= id <= MAX_ID for id in ids):
-        raise CalibrationError(f"{path}: motors.id are {ids}; give each motor its own, within 0 and {MAX_ID}")
-    for motor in motors:
-        if motor.sign not in (-1.0, 1.0):
-            raise CalibrationError(
-                f"{path}: motors.sign of {motor.joint} is {motor.sign:g}; it is 1, or -1 where the motor "
-                "turns the other way"
-            )
-        if not np.isfinite(motor.offset_rad):
-            raise CalibrationError(
-                f"{path}: motors.offset_rad of {motor.joint} is {motor.offset_rad}; give the motor's angle "
-                "[rad] where the joint is at zero"
-            )
     sign = np.array([motor.sign for motor in motors])
     return Joints(tuple(hand.joint_names), tuple(ids), sign, np.array([motor.offset_rad for motor in motors]))
 
@@ -155,10 +134,17 @@ def _by_joint(file: _File, hand: HandModel) -> list[_Motor]:
     """
     if file.format != FORMAT:
         raise ValueError(f"its format is {file.format!r}, not {FORMAT!r}")
-    named = [motor.joint for motor in file.motors]
+    named, ids = ([getattr(motor, name) for motor in file.motors] for name in ("joint", "id"))
     for name in hand.joint_names:
         if named.count(name) != 1:
             raise ValueError(f"motors has {named.count(name) or 'no'} entries of {name}; give one")
     if extra := sorted(set(named) - set(hand.joint_names)):
         raise ValueError(f"{extra[0]} is no joint of {hand.name}")
+    if len(set(ids)) != len(ids) or not all(0 <= id <= MAX_ID for id in ids):
+        raise ValueError(f"motors.id are {ids}; give each motor its own, within 0 and {MAX_ID}")
+    for motor in file.motors:
+        if motor.sign not in (-1.0, 1.0):
+            raise ValueError(f"motors.sign of {motor.joint} is {motor.sign:g}; it is 1, or -1")
+        if not np.isfinite(motor.offset_rad):
+            raise ValueError(f"motors.offset_rad of {motor.joint} is {motor.offset_rad}; give an angle [rad]")
     return [file.motors[named.index(name)] for name in hand.joint_names]

@@ -7,9 +7,10 @@ CRC-16. Within instruction and parameters FF FF FD is followed by one more FD, s
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cache
 
 HEADER = b"\xff\xff\xfd\x00"
-STUFFED, STUFFING = b"\xff\xff\xfd", 0xFD
+STUFFED, STUFFING = b"\xff\xff\xfd", b"\xfd"
 BROADCAST = 0xFE
 MAX_ID = 0xFC
 SHORTEST, LONGEST = 3, 1024
@@ -25,21 +26,15 @@ class Instruction(IntEnum):
     PING = 0x01
     READ = 0x02
     WRITE = 0x03
-    REG_WRITE = 0x04
-    ACTION = 0x05
-    REBOOT = 0x08
     STATUS = 0x55
     SYNC_READ = 0x82
     SYNC_WRITE = 0x83
-    BULK_READ = 0x92
-    BULK_WRITE = 0x93
 
 
 class Failure(IntEnum):
     """Error numbers of a status packet (its lower seven bits)."""
 
     NONE = 0
-    RESULT = 1
     INSTRUCTION = 2
     CRC = 3
     RANGE = 4
@@ -60,31 +55,26 @@ class Packet:
     """Parameters; of a status packet the error byte, then data."""
 
 
-def _table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        value = byte << 8
-        for _ in range(8):
-            value = (value << 1) ^ (POLYNOMIAL if value & 0x8000 else 0)
-        table.append(value & 0xFFFF)
-    return tuple(table)
-
-
-_CRC_TABLE = _table()
+@cache
+def _crc_of_byte(byte: int) -> int:
+    value = byte << 8
+    for _ in range(8):
+        value = (value << 1) ^ (POLYNOMIAL if value & 0x8000 else 0)
+    return value & 0xFFFF
 
 
 def crc16(data: bytes) -> int:
     """CRC-16 of the protocol: polynomial 0x8005, not reflected, starting at 0."""
     value = 0
     for byte in data:
-        value = ((value << 8) & 0xFFFF) ^ _CRC_TABLE[(value >> 8) ^ byte]
+        value = ((value << 8) & 0xFFFF) ^ _crc_of_byte((value >> 8) ^ byte)
     return value
 
 
 def encode(packet: Packet) -> bytes:
     """The bytes of a packet on the wire."""
     body = bytes([packet.instruction]) + packet.parameters
-    body = body.replace(STUFFED, STUFFED + bytes([STUFFING]))
+    body = body.replace(STUFFED, STUFFED + STUFFING)
     start = HEADER + bytes([packet.id]) + (len(body) + 2).to_bytes(2, "little") + body
     return start + crc16(start).to_bytes(2, "little")
 
@@ -100,8 +90,6 @@ class PacketReader:
     def __init__(self) -> None:
         """Begin with nothing read."""
         self._buffer = bytearray()
-        self.rejected = 0
-        """Frames that began as a packet and were not one."""
 
     @property
     def waiting(self) -> bool:
@@ -115,8 +103,6 @@ class PacketReader:
 
     def give_up(self) -> list[Packet]:
         """The line has fallen silent: drop the packet that has begun; returns what was behind its start."""
-        if self._buffer.startswith(HEADER):
-            self.rejected += 1
         del self._buffer[:1]
         return list(self._packets())
 
@@ -131,38 +117,20 @@ class PacketReader:
             if len(self._buffer) < 7:
                 return
             length = int.from_bytes(self._buffer[5:7], "little")
-            if not SHORTEST <= length <= LONGEST:
-                self._reject()
-                continue
-            if len(self._buffer) < 7 + length:
-                return
-            packet = decode(bytes(self._buffer[: 7 + length]))
-            if packet is None:
-                self._reject()
-                continue
-            del self._buffer[: 7 + length]
-            yield packet
-
-    def _reject(self) -> None:
-        """Skip one byte only: a sound packet may begin inside of a broken one."""
-        self.rejected += 1
-        del self._buffer[:1]
+            packet = None
+            if SHORTEST <= length <= LONGEST:
+                if len(self._buffer) < 7 + length:
+                    return
+                packet = decode(bytes(self._buffer[: 7 + length]))
+            # Skip one byte only of a broken one: a sound packet may begin inside of it.
+            del self._buffer[: 1 if packet is None else 7 + length]
+            if packet is not None:
+                yield packet
 
 
 def decode(frame: bytes) -> Packet | None:
     """The packet of one whole frame; None if it is not sound."""
     if crc16(frame[:-2]) != int.from_bytes(frame[-2:], "little"):
         return None
-    body = bytearray()
-    stuffing = False
-    for byte in frame[7:-2]:
-        if stuffing:
-            if byte != STUFFING:
-                return None
-            stuffing = False
-            continue
-        body.append(byte)
-        stuffing = body.endswith(STUFFED)
-    if stuffing:
-        return None
-    return Packet(frame[4], body[0], bytes(body[1:]))
+    body = frame[7:-2].replace(STUFFED + STUFFING, STUFFED)
+    return Packet(frame[4], body[0], body[1:])

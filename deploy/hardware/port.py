@@ -2,24 +2,22 @@
 
 import errno
 import fcntl
-import grp
 import os
-import re
 import termios
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vd.deploy.finding import BAUD_RATE
 from vd.deploy.hardware.answers import BusError
 
+BAUD_RATE = 1_000_000
+"""Of the port, where the options name none."""
 WAIT_S = 0.002
 """How long a read of the port sleeps at most until its bytes are there. The SDK's own does not sleep but asks
 again and again, which takes a core, and keeps whatever shares it from answering."""
 PSEUDO_TERMINALS = "/dev/pts/"
 """A twin holds its own end of these open, so exclusive use by one program is for the lock alone."""
-LONGEST_COMMAND = 80
 
 
 class KeptPacket:
@@ -93,8 +91,6 @@ def _ask_for(path: str) -> None:
         fcntl.flock(probe, fcntl.LOCK_EX | fcntl.LOCK_NB)
     finally:
         os.close(probe)
-    if not pseudo(path) and any(pid != os.getpid() for pid, _ in _holders(path)):
-        raise OSError(errno.EBUSY, "another program has it open")
 
 
 def pseudo(path: str) -> bool:
@@ -105,13 +101,9 @@ def pseudo(path: str) -> bool:
 def _why(path: str, error: OSError) -> str:
     """Why a port cannot be opened, with the remedy."""
     if error.errno in (errno.EBUSY, errno.EWOULDBLOCK):
-        held = list(_holders(path))
-        # On a pseudo-terminal the twin has its own end open: the one with the lock is meant.
-        named = [pid for pid, locked in held if locked] or [pid for pid, _ in held if pid != os.getpid()]
-        who = ", ".join(f"process {pid} ({_command(pid)})" for pid in named) or "another user's program"
-        return f"it is in use by {who}; one program at a time may drive the motors: end that one first"
+        return f"it is in use; one program at a time may drive the motors: `fuser -v {path}` names it, end it"
     if error.errno == errno.EACCES:
-        group = _group(path)
+        group = Path(path).group()  # dialout on Debian and Ubuntu, uucp elsewhere
         return (
             f"permission denied: it belongs to the group {group}; "
             f"`sudo usermod -aG {group} $USER`, then log out and in again"
@@ -120,33 +112,3 @@ def _why(path: str, error: OSError) -> str:
         there = sorted(str(one) for kind in ("ttyUSB*", "ttyACM*") for one in Path("/dev").glob(kind))
         return f"there is no such device; is the adapter plugged in? There are: {', '.join(there) or 'none'}"
     return f"{error}; is it the motors' adapter?"
-
-
-def _holders(path: str) -> Iterator[tuple[int, bool]]:
-    """Processes that have a device open, as far as we may know, and whether each has it locked."""
-    device = os.path.realpath(path)
-    for link in Path("/proc").glob("[0-9]*/fd/*"):
-        try:
-            if str(link.readlink()) == device:
-                lock = (link.parents[1] / "fdinfo" / link.name).read_text()
-                yield int(link.parts[2]), bool(re.search(r"^lock:.*FLOCK", lock, re.MULTILINE))
-        except OSError:  # it has just ended, or is another user's
-            continue
-
-
-def _command(pid: int) -> str:
-    """How a process was called."""
-    try:
-        words = Path(f"/proc/{pid}/cmdline").read_text(errors="replace").replace("\0", " ")
-    except OSError:
-        words = ""
-    words = " ".join(words.split())
-    return words if len(words) <= LONGEST_COMMAND else f"{words[:LONGEST_COMMAND]} ..."
-
-
-def _group(path: str) -> str:
-    """Group of a device: dialout on Debian and Ubuntu, uucp elsewhere."""
-    try:
-        return grp.getgrgid(Path(path).stat().st_gid).gr_name
-    except (KeyError, OSError):
-        return "dialout"

@@ -12,18 +12,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import tyro
+from scipy.stats import theilslopes
 
 from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
+from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import ready
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
-from vd.deploy.hardware.control_table import RAD_PER_COUNT
+from vd.deploy.hardware.control_table import RAD_PER_COUNT, TICK_MODULUS
 from vd.deploy.hardware.motion import move
-from vd.deploy.hardware.motor_time import measured_at
 from vd.deploy.hardware.registers import D_GAIN, P_GAIN
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand
-from vd.deploy.timely import Priority, real_time, undisturbed
+from vd.deploy.timely import real_time, undisturbed
 from vd.files import check_folder
 
 if TYPE_CHECKING:
@@ -43,13 +44,15 @@ ASIDE = 0.8
 hand a straight finger that bends through its range would press on its neighbour."""
 WIDE = SafetyCfg(step_rad=4.0)
 """Steps go through most of a joint's range at once, which a policy must not."""
-TWIN_ARGS = "--physics-hz 3840"
+TWIN_ARGS = ("--physics-hz", "3840")
 """Steps of the twin so short that its integrator is as exact as vd-gap's: at 960 Hz it is off by 0.3 mrad
 (median of a moving hand; up to 0.9), two thirds of what the encoders round."""
 RATE_SHARE = 0.95
 """Share of the rate that is wanted below which a recording says that it missed it."""
 AGAIN_S = 0.01
 """A state that was asked for so long after its goal was sent was asked for again."""
+CLOCK_SAMPLES = 200
+"""By which two clocks are compared."""
 STATE_CHANNELS = ("velocity", "current", "pwm", "voltage", "temperature")
 
 
@@ -76,13 +79,10 @@ class RecordCfg(HandOptions):
     """Samples a second, as far as the bus allows."""
     safety: SafetyCfg = field(default_factory=lambda: WIDE)
     """Limits."""
-    realtime: Priority = "auto"
-    """Run before all ordinary programs, the twin too: where that is permitted (root, ulimit -r), always, or
-    never."""
+    realtime: bool = True
+    """Run before all ordinary programs, the twin too, where that is permitted (root, ulimit -r)."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves."""
-    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Print what was recorded as JSON."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,106 +182,112 @@ def joints_of(hand: "HandModel", fingers: Sequence[int]) -> tuple[str, ...]:
     return tuple(name for f in chosen for name in hand.joint_names[3 * f : 3 * f + JOINTS_PER_FINGER])
 
 
-@dataclass(frozen=True, eq=False)
-class Row:
-    """One sample."""
+def measured_at(asked_s: np.ndarray, ticks: np.ndarray) -> np.ndarray:
+    """Times of states on this computer's clock, by those of the motors.
 
-    state: HandState
-    """What was measured."""
-    goal: np.ndarray
-    """Angles of the joints that were sent with the question for it [rad] [D]."""
-    sent_s: float
-    """When [s]."""
-    on: np.ndarray
-    """Whether each joint's torque is on [D]."""
-
-
-class Recorder:
-    """Plays motions on an armed hand and keeps what it answers.
+    Between a program and its motors lie an adapter, a driver and a scheduler, which pass a packet on
+    milliseconds later on a busy machine. The motors have a clock of their own in their state.
 
     Args:
-        connection: The hand.
-        joints: Names of the recorded joints.
-        rate_hz: Samples a second that are tried.
+        asked_s: When each was asked for [T] [s].
+        ticks: What the motors' clocks said [T, D] [ms], which start again at their modulus: whole
+            milliseconds, each from a moment of its own, so that the mean of nine is as good as 0.1 ms.
+
+    Returns:
+        When each was measured [T] [s]: as long after it was asked for as most of them were.
     """
+    gone = np.diff(ticks, axis=0) % TICK_MODULUS
+    own = np.concatenate([[0.0], 1e-3 * gone.mean(axis=1).cumsum()])
+    # The rates of two clocks differ; a share of the packets that comes late must not count. All pairs of some
+    # samples: those of all take longer than a hand may wait for its loop.
+    some = np.unique(np.linspace(0, len(own) - 1, CLOCK_SAMPLES).astype(int))
+    rate, begin, *_ = theilslopes((asked_s - own)[some], own[some])
+    return np.asarray(own * (1.0 + rate) + begin)
 
-    def __init__(self, connection: Connection, joints: Sequence[str], rate_hz: float):
-        self._connection, self._rate = connection, rate_hz
-        names = connection.joints.names
-        self._columns = [names.index(name) for name in joints]
 
-    def play(self, safe: SafeHand, motion: Motion) -> "Trajectory":
-        """Go to where the motion starts, play it, and give what was measured.
+def play(safe: SafeHand, motion: Motion, columns: Sequence[int], rate_hz: float) -> "Trajectory":
+    """Go to where a motion starts, play it on an armed hand, and give what was measured.
 
-        A sample is a goal and the state at the moment at which it arrived.
+    A sample is a goal and the state at the moment at which it arrived.
 
-        Raises:
-            StoppedError: The hand was stopped.
-            BusError: A gain could not be written.
-        """
-        excitation = motion.excitation
-        move(safe, excitation.command[0], SPEED_RAD_S)
-        gain = int(float(excitation.conditions["p_gain"]))
-        self._set_gain(gain)
-        rows: list[Row] = []
-        pacer, last = Pacer(self._rate, self._connection.bus.clock), -np.inf
+    Args:
+        safe: The hand.
+        motion: The motion.
+        columns: The joints that are recorded.
+        rate_hz: Samples a second that are tried.
+
+    Raises:
+        StoppedError: The hand was stopped.
+        BusError: A gain could not be written.
+    """
+    excitation, bus = motion.excitation, safe.bus
+    move(safe, excitation.command[0], SPEED_RAD_S)
+    motors = [bus.ids[column] for column in columns]
+    _set_gain(bus, motors, int(float(excitation.conditions["p_gain"])))
+    states, goals, sent, enabled = list[HandState](), list[np.ndarray](), list[float](), list[np.ndarray]()
+    pacer = Pacer(rate_hz, bus.clock)
+    pacer.wait()
+    begin = pacer.due_s
+    on = np.ones(len(bus.ids), dtype=bool)
+    while (now := pacer.due_s - begin) < excitation.duration:
+        at = int(np.searchsorted(excitation.time, now + ROUNDING_S, side="right")) - 1
+        if not np.array_equal(on, excitation.enabled[at]):
+            on = excitation.enabled[at]
+            safe.switch(on)
+        goal = safe.command(excitation.command[at], with_state=True)
+        sent_s = bus.clock.now()
+        state = safe.read()
+        if not states or state.time_s > states[-1].time_s:  # else the last one again
+            states.append(state)
+            goals.append(goal)
+            sent.append(sent_s)
+            enabled.append(on)
+        safe.beat()
         pacer.wait()
-        begin = pacer.due_s
-        on = np.ones(len(self._connection.joints.ids), dtype=bool)
-        while (now := pacer.due_s - begin) < excitation.duration:
-            at = int(np.searchsorted(excitation.time, now + ROUNDING_S, side="right")) - 1
-            if not np.array_equal(on, excitation.enabled[at]):
-                on = excitation.enabled[at]
-                safe.switch(on)
-            goal = safe.command(excitation.command[at], with_state=True)
-            sent_s = self._connection.bus.clock.now()
-            state = safe.read()
-            if state.time_s > last:  # else the last one again
-                rows.append(Row(state, goal, sent_s, on))
-                last = state.time_s
-            safe.beat()
-            pacer.wait()
-        if not on.all():
-            safe.switch(np.ones_like(on))
-        self._set_gain(P_GAIN)
-        return self._trajectory(motion, rows)
+    if not on.all():
+        safe.switch(np.ones_like(on))
+    _set_gain(bus, motors, P_GAIN)
+    return _trajectory(motion, columns, states, goals, np.array(sent), enabled)
 
-    def _set_gain(self, gain: int) -> None:
-        bus = self._connection.bus
-        for column in self._columns:
-            id = self._connection.joints.ids[column]
-            if bus.read(id, "position_p_gain") != gain:
-                bus.write(id, "position_p_gain", gain)
 
-    def _trajectory(self, motion: Motion, rows: Sequence["Row"]) -> "Trajectory":
-        from vd.gap.recording import Trajectory
+def _set_gain(bus: MotorBus, motors: Sequence[int], gain: int) -> None:
+    for id in motors:
+        if bus.read(id, "position_p_gain") != gain:
+            bus.write(id, "position_p_gain", gain)
 
-        states = [row.state for row in rows]
 
-        def column(values: Sequence[np.ndarray]) -> np.ndarray:
-            return np.array(values)[:, self._columns]
+def _trajectory(
+    motion: Motion,
+    columns: Sequence[int],
+    states: Sequence[HandState],
+    goals: Sequence[np.ndarray],
+    sent_s: np.ndarray,
+    enabled: Sequence[np.ndarray],
+) -> "Trajectory":
+    """What was measured, of some joints, at the times of the motors' clocks."""
+    from vd.gap.recording import Trajectory
 
-        asked_s, sent_s = np.array([state.time_s for state in states]), np.array([row.sent_s for row in rows])
-        measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
-        # A goal arrives with the question for its state, unless that was asked again.
-        sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
-        measured: dict[str, Any] = {
-            name: column([getattr(state, name) for state in states]) for name in STATE_CHANNELS
-        }
-        excitation = motion.excitation
-        return Trajectory(
-            file=motion.file,
-            excitation=excitation.name,
-            joints=excitation.joints,
-            conditions=excitation.conditions,
-            time=measured_s - measured_s[0],
-            command_time=sent_s - measured_s[0],
-            command=column([row.goal for row in rows]),
-            position=column([state.position for state in states]),
-            enabled=column([row.on for row in rows]),
-            # A motor that does not tell its duty cycle says zero.
-            **{name: values for name, values in measured.items() if name != "pwm" or values.any()},
-        )
+    def of(name: str) -> np.ndarray:
+        return np.array([getattr(state, name) for state in states])[:, columns]
+
+    asked_s = np.array([state.time_s for state in states])
+    measured_s = measured_at(asked_s, np.array([state.tick for state in states]))
+    # A goal arrives with the question for its state, unless that was asked again.
+    sent_s = np.where(asked_s - sent_s < AGAIN_S, measured_s, sent_s)
+    measured: dict[str, Any] = {name: of(name) for name in STATE_CHANNELS}
+    return Trajectory(
+        file=motion.file,
+        excitation=motion.excitation.name,
+        joints=motion.excitation.joints,
+        conditions=motion.excitation.conditions,
+        time=measured_s - measured_s[0],
+        command_time=sent_s - measured_s[0],
+        command=np.array(goals)[:, columns],
+        position=of("position"),
+        enabled=np.array(enabled)[:, columns],
+        # A motor that does not tell its duty cycle says zero.
+        **{name: values for name, values in measured.items() if name != "pwm" or values.any()},
+    )
 
 
 def record(cfg: RecordCfg) -> int:
@@ -291,9 +297,8 @@ def record(cfg: RecordCfg) -> int:
     if not cfg.rate_hz > 0.0:
         raise ValueError(f"--rate-hz is {cfg.rate_hz}; it has to be above 0")
     check_folder(cfg.out)
-    twin_args = f"{TWIN_ARGS} --realtime {cfg.realtime} {cfg.twin_args}"
     with (
-        connect(replace(cfg, twin_args=twin_args)) as connection,
+        connect(cfg, [*TWIN_ARGS, *["--realtime"] * cfg.realtime]) as connection,
         undisturbed(),
         real_time(cfg.realtime),
     ):
@@ -321,11 +326,7 @@ def record(cfg: RecordCfg) -> int:
                 _session(cfg, connection, joints, list(group), payload, keep)
         for one in written:
             one.result()
-    if cfg.json:
-        files = [trajectory.file for trajectory in recording.trajectories]
-        print(json.dumps({"recording": str(cfg.out), "trajectories": files}, indent=1))
-    else:
-        print(f"{cfg.out}: {len(recording.trajectories)} motions; vd-gap run {cfg.out} --out gap")
+    print(f"{cfg.out}: {len(recording.trajectories)} motions; vd-gap run {cfg.out} --out gap")
     return 0
 
 
@@ -345,34 +346,27 @@ def _session(
         if cfg.yes or cfg.twin:
             raise RecordError(f"{motions[0].file}: somebody has to hang {payload_kg:g} kg at the fingertip")
         question = f"Hang {payload_kg:g} kg at the fingertip of {finger}. {question}"
-    ready(connection, question, yes=cfg.yes, quiet=cfg.json)
-    recorder = Recorder(connection, joints, cfg.rate_hz)
+    ready(connection, question, yes=cfg.yes)
+    columns = [connection.joints.names.index(name) for name in joints]
     with SafeHand(connection.bus, connection.joints, connection.hand, cfg.safety) as safe:
         safe.arm()
         for number, motion in enumerate(motions, 1):
-            trajectory = recorder.play(safe, motion)
+            trajectory = play(safe, motion, columns, cfg.rate_hz)
             rate = (len(trajectory.time) - 1) / trajectory.time[-1]
             what = f"{number}/{len(motions)} {Path(motion.file).stem}"
-            missed = _missed(rate, cfg.rate_hz)
-            print(
-                f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz{missed}", file=sys.stderr, flush=True
-            )
+            said = f"{what}: {trajectory.time[-1]:.1f} s at {rate:.0f} Hz"
+            if rate < RATE_SHARE * cfg.rate_hz:
+                said += (
+                    f", not {cfg.rate_hz:g}: a sample takes {1e3 / rate:.1f} ms; look at the adapter's "
+                    f"latency timer, the baud rate, end other programs, or ask for --rate-hz {rate:.0f}"
+                )
+            print(said, file=sys.stderr, flush=True)
             keep(trajectory)
-
-
-def _missed(rate_hz: float, wanted_hz: float) -> str:
-    """What to say of a rate below the one that is wanted [Hz]; empty for one that is kept."""
-    if rate_hz >= RATE_SHARE * wanted_hz:
-        return ""
-    return (
-        f", not {wanted_hz:g}: a sample takes {1e3 / rate_hz:.1f} ms; look at the adapter's latency timer, "
-        f"the baud rate, end other programs, or ask for --rate-hz {rate_hz:.0f}"
-    )
 
 
 def _begun(cfg: RecordCfg, connection: Connection, joints: tuple[str, ...]) -> "Recording":
     """The recording in the folder, or an empty one."""
-    from vd.assets_usd.hand_spec import HANDS
+    from vd.assets_usd.hands import HANDS
     from vd.gap.recording import Recording, read_recording
 
     hand = connection.hand

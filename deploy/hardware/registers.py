@@ -12,6 +12,8 @@ from vd.deploy.hardware.control_table import EEPROM_END, RAD_S_PER_COUNT, Model,
 
 P_GAIN, D_GAIN = 200, 10
 """Position gains of the paper's motors, in their units."""
+RESTART = "switch its power off and on"
+"""Clears a motor's error, and has it count angles within one turn."""
 WIZARD = "set it to {wanted} with ROBOTIS' DYNAMIXEL Wizard 2.0"
 
 
@@ -38,7 +40,7 @@ REGISTERS = (
         "drive_mode", "angles, profiles or the torque follow other rules", f"{WIZARD}, and calibrate again"
     ),
     Register("homing_offset", "angles begin elsewhere", f"{WIZARD}, and calibrate again"),
-    Register("status_return_level", "writes or reads stay unanswered", "{reboot}"),
+    Register("status_return_level", "writes or reads stay unanswered", RESTART),
     # In the order to write them: the mode resets gains and profiles, a watchdog that acted locks the goals.
     Register("operating_mode", "goals are no positions"),
     Register("bus_watchdog", "goals are refused, or it stops too early"),
@@ -80,13 +82,11 @@ class MotorSettings:
     """Largest angle [rad]."""
     p_gain: int = P_GAIN
     d_gain: int = D_GAIN
-    return_delay_us: int = 0
-    """Wait before an answer [us]; 500 from the factory."""
 
     def values(self, model: Model) -> dict[str, int]:
         """Values of the control table that are the joint's own, by item."""
         return {
-            "return_delay_time": self.return_delay_us // 2,
+            "return_delay_time": 0,
             "current_limit": int(self.current_limit_a / model.current_unit_a),
             "velocity_limit": int(self.velocity_limit_rad_s / RAD_S_PER_COUNT),
             "min_position_limit": to_counts(self.lower_rad),

@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -30,6 +28,7 @@ from vd.assets_usd.objects.reading import load_points
 from vd.assets_usd.objects.repair import repair_mesh
 from vd.assets_usd.objects.scans import Surface, surface_of_scan
 from vd.assets_usd.objects.sets import load_set
+from vd.evaluate.rollout import draw_goals
 
 SCAN_SUFFIXES = (".ply", ".obj", ".glb")
 """Files that are taken as scans."""
@@ -43,8 +42,6 @@ NEIGHBOURS = 24
 """Samples by whose distance one is told that floats about by itself."""
 FAR = 6.0
 """Distance to the neighbours, of the usual, from which a sample floats about by itself."""
-LEAST_PIECE = 0.05
-"""Share of all samples below which a separate piece is taken for dirt."""
 THINNEST = 1e-3
 """Thickness below which points are of one side only, as a share of the longest side."""
 LARGER = 1.5
@@ -70,12 +67,11 @@ def one_object(name: str) -> ObjectModel:
     return found[0]
 
 
-def scan_object(path: Path, unit: str | None = None, *, seed: int = 0) -> ObjectModel:
+def scan_object(path: Path, *, seed: int = 0) -> ObjectModel:
     """An object from a scan, for its surface; its collision shape is its convex hull.
 
     Args:
-        path: PLY, OBJ or GLB; a mesh or points.
-        unit: m, cm or mm; None for the one in which it is as large as objects are.
+        path: PLY, OBJ or GLB; a mesh or points, in the unit in which it is as large as objects are.
         seed: Of the samples.
 
     Raises:
@@ -86,7 +82,7 @@ def scan_object(path: Path, unit: str | None = None, *, seed: int = 0) -> Object
         surface = _surface(path, np.random.default_rng(seed))
     except MeshError as error:
         raise GoalError(f"{path}: {error}; scan it again, or export it as PLY") from error
-    factor = _unit(path, float(np.ptp(surface.vertices, axis=0).max()), unit)
+    factor = _unit(path, float(np.ptp(surface.vertices, axis=0).max()))
     vertices, faces = surface.vertices * factor, surface.faces
     try:
         return build_model(
@@ -132,6 +128,29 @@ def read_goals(texts: Sequence[str]) -> list[np.ndarray]:
     return goals
 
 
+def make_goals(texts: Sequence[str], drawn: int, max_angle: float, *, seed: int) -> list[np.ndarray]:
+    """Goals as they were typed, or drawn ones, each within an angle of the one before.
+
+    Args:
+        texts: As :func:`read_goals` reads them.
+        drawn: How many to draw where there are none.
+        max_angle: Largest angle between two drawn goals [rad]; the first from no rotation.
+        seed: Of the draw.
+
+    Returns:
+        Quaternions xyzw.
+
+    Raises:
+        GoalError: A text that is no orientation.
+    """
+    goals = read_goals(texts)
+    rng, last = np.random.default_rng(seed), np.array([0.0, 0.0, 0.0, 1.0])
+    for _ in range(0 if goals else drawn):
+        last = draw_goals(last[None], rng, max_angle)[0]
+        goals.append(last)
+    return goals
+
+
 def _goal(text: str, where: str) -> np.ndarray:
     turn, _, degrees = text.partition("@")
     try:
@@ -167,7 +186,8 @@ def _surface(path: Path, generator: np.random.Generator) -> Surface:
         points = vertices[generator.permutation(len(vertices))[:CANDIDATES]]
     if len(points) < LEAST_POINTS:
         raise MeshError(f"{len(points)} points; {LEAST_POINTS} at least make a shape")
-    points = _without_dirt(points)
+    away = cKDTree(points).query(points, NEIGHBOURS)[0][:, -1]
+    points = points[away < FAR * np.median(away)]
     if _thickness(points) < THINNEST * np.ptp(points, axis=0).max():
         raise MeshError("flat: the scan shows one side only")
     try:
@@ -182,29 +202,14 @@ def _thickness(points: np.ndarray) -> float:
     return float(np.ptp(points @ axes.T, axis=0).min())
 
 
-def _without_dirt(points: np.ndarray) -> np.ndarray:
-    """The samples without those that float about, by themselves or in small pieces."""
-    near = cKDTree(points).query(points, NEIGHBOURS)[0][:, -1]
-    points = points[near < FAR * np.median(near)]
-    pairs = cKDTree(points).query_pairs(2.0 * float(np.median(near)), output_type="ndarray")
-    ones = np.ones(len(pairs), dtype=bool)
-    graph = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(len(points), len(points)))
-    piece = connected_components(graph, directed=False)[1]
-    size = np.bincount(piece)
-    return points[size[piece] >= LEAST_PIECE * len(points)]
-
-
-def _unit(path: Path, longest: float, unit: str | None) -> float:
+def _unit(path: Path, longest: float) -> float:
     """Factor from the scan's unit to metres."""
     low, high = LONGEST_SIDE_M[0] / LARGER, LONGEST_SIDE_M[1] * LARGER
-    if unit is not None and unit not in UNITS_M:
-        raise GoalError(f"{path}: unit {unit!r}; choose {', '.join(UNITS_M)}")
-    options = {name: UNITS_M[name] for name in (GUESSED_UNITS if unit is None else (unit,))}
-    fitting = [factor for factor in options.values() if low <= longest * factor <= high]
+    fitting = [UNITS_M[name] for name in GUESSED_UNITS if low <= longest * UNITS_M[name] <= high]
     if not fitting:
         raise GoalError(
-            f"{path}: its longest side is {longest:.4g} units, which in {' or '.join(options)} is not within "
-            f"{100 * low:.0f} to {100 * high:.0f} cm; cut away what is not the object, or scale the file to "
-            "metres"
+            f"{path}: its longest side is {longest:.4g} units, which in {' or '.join(GUESSED_UNITS)} is not "
+            f"within {100 * low:.0f} to {100 * high:.0f} cm; cut away what is not the object, or "
+            "scale the file to metres"
         )
     return fitting[0]

@@ -6,7 +6,7 @@ A write can wait for the disk as long as other programs keep that busy, and the 
 import json
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.assets_usd.hand_spec import HANDS
+from vd.assets_usd.hands import HANDS
 from vd.deploy.clock import MONOTONIC, Clock
 from vd.deploy.hardware.control_table import RAD_PER_COUNT
 from vd.files import make_folder, write_json, writing
@@ -22,7 +22,6 @@ from vd.gap.recording import COMMAND_TIME
 from vd.gap.recording import FORMAT as RECORDING_FORMAT
 from vd.hand_log import (
     EVENTS_FILE,
-    IMAGES,
     JOINT_CHANNELS,
     LOG_FORMAT,
     RECORDING_FILE,
@@ -126,10 +125,6 @@ class LogWriter:
         ]
         self._append(self._steps, ",".join(f"{value:.{DIGITS}f}" for value in row))
 
-    def image(self, step: int, depth_m: np.ndarray) -> None:
-        """Keep the depth image of a step [m] [H, W]."""
-        self._later(_save, self.folder / IMAGES / f"{step:06d}.npy", depth_m.copy())
-
     def event(self, event: str, **values: Any) -> None:
         """Append an event of this moment."""
         line = {"t": round(self.since(self._clock.now()), DIGITS), "event": event, **values}
@@ -149,20 +144,12 @@ class LogWriter:
         self._check()
 
     def _append(self, file: int, line: str) -> None:
-        self._later(os.write, file, line.encode() + b"\n")  # one call: whole, or not at all
-
-    def _later(self, write: Callable[..., Any], *arguments: Any) -> None:
         self._check()
-        self._written = self._writer.submit(write, *arguments)
+        data = line.encode() + b"\n"
+        self._written = self._writer.submit(lambda: os.write(file, data))  # one call: whole, or not at all
 
     def _check(self) -> None:
         """Raise what went wrong in writing: a run without its log is not worth going on with."""
         if self._written is not None and self._written.done():
             with writing(self.folder):
                 self._written.result()
-
-
-def _save(file: Path, values: np.ndarray) -> None:
-    """Write an array, in a folder that is made for the first one."""
-    file.parent.mkdir(exist_ok=True)
-    np.save(file, values)

@@ -1,15 +1,11 @@
 """Drive a hand with a policy: pursue goals one after the other, in one process at 12 Hz, and log every step.
 
-On a real hand the policy sees joints and a depth camera: a tracking policy, or a student. On a twin
-it can be a teacher too; that one reads the simulated object's true pose, which no real hand tells.
+The policy sees joints and a depth camera: a tracking policy, or a student.
 """
 
 import contextlib
 import select
 import sys
-import tempfile
-import threading
-import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -19,8 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import tyro
 
-from vd.deploy.camera.camera import DepthSource
-from vd.deploy.camera.realsense import RealSenseCfg
+from vd.deploy.camera.camera import Camera
+from vd.deploy.camera.realsense import RealSense, RealSenseCfg, find_device
 from vd.deploy.finding import Finding
 from vd.deploy.hardware.connect import Connection, HandOptions, connect
 from vd.deploy.hardware.motion import MOVE_S, move, reset_pose
@@ -28,7 +24,7 @@ from vd.deploy.hardware.registers import D_GAIN, P_GAIN
 from vd.deploy.loop.run_page import goal_results, summary_line, write_page
 from vd.deploy.safety.limits import SafetyCfg
 from vd.deploy.safety.safety import SafeHand, StoppedError
-from vd.deploy.timely import Priority, real_time, undisturbed
+from vd.deploy.timely import real_time, undisturbed
 from vd.evaluate.agents import check_names
 from vd.files import check_folder
 from vd.hand_log import LogError, read_log
@@ -36,10 +32,10 @@ from vd.paper import PAPER
 from vd.warp_quiet import quiet_warp
 
 if TYPE_CHECKING:
+    from vd.assets_usd.hand_model import HandModel
     from vd.assets_usd.objects.model import ObjectModel
-    from vd.deploy.loop.flight import Flight
-    from vd.deploy.loop.log import LogWriter
-    from vd.deploy.twin.twin_link import TwinLink
+    from vd.deploy.loop.policy_runner import PolicyRunner
+    from vd.deploy.twin.child import TwinChild
 
 LOGS = Path("runs/deploy")
 """Folder of the logs that are not named."""
@@ -49,8 +45,10 @@ SETTLE_S = 1.5
 """Time that an object of a twin has to come to rest between the fingers [s]."""
 LATEST = 0.25
 """Share of a control period by which a step may begin late: to find the object takes much of one."""
-STATUS_S = 5.0
-"""Seconds between status lines where there is no terminal to rewrite one on."""
+WARM_UP = 3
+"""Decisions before the hand is switched on: kernels are loaded, allocators have grown."""
+FIRST_IMAGE_S = 5.0
+"""Longest wait for a camera's first image."""
 
 
 @dataclass(frozen=True)
@@ -58,8 +56,8 @@ class RunCfg(HandOptions):
     """Drive a hand with a policy."""
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
-    """Bundle, file or name of a policy that sees by camera, or with --twin also of a teacher; with --twin
-    the installed teacher of the hand by default. "still" does nothing."""
+    """Bundle, file or name of a policy that sees by camera; with --twin the installed tracking policy of the
+    hand by default. "zero" does nothing."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj, .glb)."""
     goal: tuple[str, ...] = ()
@@ -75,12 +73,8 @@ class RunCfg(HandOptions):
     """How long the hand holds still between goals [s]."""
     precise: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Stop within 0.1 rad rather than 0.4, as the paper's precise variant does: fewer goals, nearer."""
-    in_air: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Take the twin's table away after 2 s, as the paper's test in the air does."""
     realistic: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Give the twin's depth images the errors of a real camera."""
-    sdk: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Take the twin's depth images through the software device of the camera's SDK."""
     camera: RealSenseCfg = field(default_factory=RealSenseCfg)
     """The depth camera."""
     camera_layer: Path | None = None
@@ -89,13 +83,10 @@ class RunCfg(HandOptions):
     """Limits."""
     log: Path | None = None
     """Folder of the log; runs/deploy/ and the time by default."""
-    images: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Keep the depth images in the log, 3 MB a second: vd-deploy shadow compares them."""
     seed: int = 0
     """Of drawn goals and of the choice of points."""
-    realtime: Priority = "auto"
-    """Run before all ordinary programs, the twin too: where that is permitted (root, ulimit -r), always, or
-    never."""
+    realtime: bool = True
+    """Run before all ordinary programs, the twin too, where that is permitted (root, ulimit -r)."""
     yes: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Do not ask before it moves; a twin is not asked for."""
 
@@ -106,16 +97,15 @@ class RunCfg(HandOptions):
 
     def validate(self) -> None:
         """Raise ValueError naming the flag and the remedy."""
-        policies = [] if self.policy in (None, "still") else [self.policy]
-        check_names(policies, [self.object], self.hand)
+        check_names([] if self.policy is None else [self.policy], [self.object], self.hand)
         from vd.deploy.loop.goals import SCAN_SUFFIXES
 
         if self.random_goals < 1:
             raise ValueError("--random-goals has to be at least 1")
         if not self.episode_s > 0.0 or self.hold_s < 0.0:
             raise ValueError("--episode-s has to be positive, and --hold-s must not be negative")
-        if (self.in_air or self.realistic or self.sdk) and not self.twin:
-            raise ValueError("--in-air, --realistic and --sdk are for --twin")
+        if self.realistic and not self.twin:
+            raise ValueError("--realistic is for --twin")
         if self.twin and Path(self.object).suffix.lower() in SCAN_SUFFIXES:
             raise ValueError(f"--object {self.object}: a twin cannot hold a scan; vd-assets import it first")
         if self.policy is None and not self.twin:
@@ -123,7 +113,7 @@ class RunCfg(HandOptions):
 
 
 def run(cfg: RunCfg) -> int:
-    """Fly the policy; 0 if all goals were pursued, 1 if the object was lost.
+    """Run the policy; 0 if all goals were pursued, 1 if the object was lost.
 
     Raises:
         StoppedError: A limit or a fault stopped the hand; the page of what it did is written before.
@@ -133,50 +123,39 @@ def run(cfg: RunCfg) -> int:
     import torch
 
     from vd.deploy.hardware.connect import read_hand_and_joints
-    from vd.deploy.loop.flight import make_flight
-    from vd.deploy.loop.goals import one_object
-    from vd.deploy.twin.twin_link import TwinLink
+    from vd.deploy.loop.goals import make_goals, one_object
+    from vd.deploy.loop.policy_runner import load_runner
 
     quiet_warp()
     torch.set_num_threads(1)  # of several, some would wait for one that has no core
+    goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
     hand, _ = read_hand_and_joints(cfg)
-    item = one_object(cfg.object)
-    flight = make_flight(
-        cfg.policy or f"{hand.name}-table",
+    item, name = one_object(cfg.object), cfg.policy or f"{hand.name}-tracking"
+    tolerance = cfg.tolerance_rad
+    runner = load_runner(
+        name,
         cfg.hand,
-        cfg.object,
         hand,
         item,
-        tolerance_rad=cfg.tolerance_rad,
+        tolerance_rad=tolerance,
         seed=cfg.seed,
     )
-    if cfg.precise and not flight.calibrated:
+    if not runner.calibrated:
         print(
-            f"{flight.name} has no rule of its own for {PAPER.success.precise_rad:g} rad: it stops where it "
-            "predicts that distance; vd-train tracker finds a better one",
+            f"{name} has no rule of its own for {tolerance:g} rad: it stops where it predicts that distance; "
+            "vd-train tracker finds a better one",
             file=sys.stderr,
-        )
-    if flight.needs_truth and not cfg.twin:
-        raise ValueError(
-            f"{cfg.policy} needs the object's true pose, which no real hand tells; give a policy "
-            "that sees by a camera"
         )
     folder = cfg.log or LOGS / datetime.now().strftime("%Y%m%d-%H%M%S")
     fault: StoppedError | None = None
     status = 0
-    with contextlib.ExitStack() as stack:
-        twin_options: list[str] = []
-        side = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="vd-twin-"))) / "side"
-        if cfg.twin:
-            camera = flight.camera or hand.camera
-            pose = [f"{value:.9g}" for value in (*camera.position, *camera.quaternion)]
-            twin_options = ["--object", cfg.object, "--side", str(side), "--camera", *pose]
-            twin_options += ["--realistic"] if cfg.realistic else []
-            twin_options += ["--realtime", cfg.realtime]
-        connection = stack.enter_context(connect(cfg, twin_options))
-        link = stack.enter_context(TwinLink(side)) if cfg.twin else None
+    camera = runner.camera or hand.camera
+    pose = [f"{value:.9g}" for value in (*camera.position, *camera.quaternion)]
+    twin_options = ["--object", cfg.object, "--camera", *pose]
+    twin_options += ["--realistic"] * cfg.realistic + ["--realtime"] * cfg.realtime
+    with connect(cfg, twin_options) as connection:
         try:
-            status = _fly(cfg, flight, connection, item, link, folder)
+            status = _pursue(cfg, name, runner, connection, item, goals, folder)
         except StoppedError as error:
             if error.signal:  # who ends it does not wait for a film
                 raise
@@ -192,38 +171,33 @@ def run(cfg: RunCfg) -> int:
     return status
 
 
-def _fly(
+def _pursue(
     cfg: RunCfg,
-    flight: "Flight",
+    name: str,
+    runner: "PolicyRunner",
     connection: Connection,
     item: "ObjectModel",
-    link: "TwinLink | None",
+    goals: Sequence[np.ndarray],
     folder: Path,
 ) -> int:
     """Preflight, way to the start, the loop, and its log in a folder; the exit status."""
     from vd.deploy.camera.check_camera import camera_findings
-    from vd.deploy.camera.eyes import open_camera
     from vd.deploy.clock import Pacer
     from vd.deploy.hardware.check import ready
     from vd.deploy.loop.action import ActionFilter
-    from vd.deploy.loop.flight import look, make_goals, warm_up
     from vd.deploy.loop.log import LogWriter
     from vd.deploy.loop.loop import ControlLoop, LoopCfg, summary
 
-    hand = connection.hand
-    goals = make_goals(cfg.goal, cfg.random_goals, cfg.max_goal_angle, seed=cfg.seed)
+    hand, twin, hz = connection.hand, connection.twin, runner.task.sim.control_hz
     pose = reset_pose(hand.num_fingers)
     with contextlib.ExitStack() as stack:
-        camera: DepthSource | None = None
+        camera: Camera | None = None
         seen: Iterable[Finding] = ()
-        if flight.camera is not None:
-            camera, _ = open_camera(flight.camera, link, cfg.camera, sdk=cfg.sdk)
+        if runner.camera is not None:
+            camera = open_camera(cfg, runner, hand, twin)
             stack.callback(camera.close)
-            view = look(flight, camera, hand, cfg.camera_layer)
-            fps = flight.task.sim.control_hz if cfg.twin else cfg.camera.fps
-            seen = camera_findings(camera, view, fps=fps)
-        pilot = flight.pilot
-        warm_up(pilot, hand, goals[0], camera, link)
+            seen = camera_findings(camera, runner.camera, fps=cfg.camera.fps if twin is None else hz)
+        warm_up(runner, pose, goals[0], camera)
         stack.enter_context(undisturbed())
         stack.enter_context(real_time(cfg.realtime))
         question = f"The hand will pursue {len(goals)} goals."
@@ -231,75 +205,107 @@ def _fly(
         log = LogWriter(
             folder,
             hand,
-            _description(cfg, flight, item, goals),
+            _description(cfg, name, runner, item, goals),
             servo={"model": cfg.motor, "p_gain": P_GAIN, "d_gain": D_GAIN},
-            truth=link is not None,
+            truth=twin is not None,
         )
-        pacer = Pacer(flight.task.sim.control_hz, latest=LATEST)
+        pacer = Pacer(hz, latest=LATEST)
         reason, outcomes = "aborted", list[str]()
-        status = StatusLine()
         loop: ControlLoop | None = None
         try:
             with SafeHand(connection.bus, connection.joints, hand, cfg.safety) as safe:
                 safe.arm()
                 move(safe, pose, HOME_RAD_S)
-                place(safe, pose, link, yes=cfg.yes)
+                place(safe, pose, twin, yes=cfg.yes)
                 loop = ControlLoop(
                     safe,
-                    pilot,
-                    ActionFilter(hand, flight.task),
+                    runner,
+                    ActionFilter(hand, runner.task),
                     pacer,
                     log,
-                    LoopCfg(cfg.episode_s, cfg.hold_s, cfg.images),
+                    LoopCfg(cfg.episode_s, cfg.hold_s),
                     camera=camera,
-                    truth=link,
+                    twin=twin,
                     symmetry=item.symmetry,
-                    status=status.show,
                 )
-                if cfg.in_air and link is not None:
-                    timer = threading.Timer(PAPER.scene.air_table_s, take_table_away, (link, log))
-                    timer.start()
-                    stack.callback(timer.cancel)
                 outcomes = loop.run(goals)
                 reason = "lost" if "lost" in outcomes else "all goals pursued"
         except BaseException as error:
             reason = f"{type(error).__name__}: {error}"
             raise
         finally:
-            status.end()
-            times = {} if loop is None else summary(loop.times)
             steps = 0 if loop is None else len(loop.times)
+            times = summary(loop.times) if loop else {}
             log.finish(reason, outcomes=outcomes, steps=steps, missed=pacer.missed, times=times)
             report(folder, steps, pacer.missed, times)
     return int(reason == "lost")
 
 
+def open_camera(cfg: RunCfg, runner: "PolicyRunner", hand: "HandModel", twin: "TwinChild | None") -> Camera:
+    """The depth camera, by whose own lens, from where it was found to be, the policy sees from now on.
+
+    Raises:
+        CameraError: There is none, or it has no such images.
+        HandError: The layer is none of this hand.
+    """
+    from vd.assets_usd.camera_layer import read_camera
+    from vd.deploy.twin.child import TwinCamera
+
+    assert runner.camera is not None
+    camera: Camera
+    if twin is None:
+        camera = RealSense(find_device(cfg.camera.serial), cfg.camera)
+    else:
+        camera = TwinCamera(twin, runner.camera)
+    where = runner.camera if cfg.camera_layer is None else read_camera(hand, cfg.camera_layer)
+    runner.look_by(camera.intrinsics.seen_from(where))
+    return camera
+
+
+def warm_up(
+    runner: "PolicyRunner",
+    pose: np.ndarray,
+    goal: np.ndarray,
+    camera: Camera | None,
+) -> None:
+    """Let the policy decide a few times on what is seen now; the run begins without that.
+
+    The object may not be between the fingers yet.
+    """
+    from vd.deploy.loop.policy_runner import Sensed
+
+    still = np.zeros_like(pose)
+    depth = None if camera is None else camera.read(FIRST_IMAGE_S).image
+    for _ in range(WARM_UP):
+        runner.decide(Sensed(pose, still, still, goal, depth))
+
+
 def _description(
-    cfg: RunCfg, flight: "Flight", item: "ObjectModel", goals: Sequence[np.ndarray]
+    cfg: RunCfg, name: str, runner: "PolicyRunner", item: "ObjectModel", goals: Sequence[np.ndarray]
 ) -> dict[str, Any]:
     """What a run's log says of it beside its steps."""
     return {
-        "policy": flight.name,
-        "kind": flight.kind,
+        "policy": name,
+        "kind": runner.kind,
         "twin": cfg.twin,
         "object": {"name": item.name, "set": cfg.object},
         "goals": [[float(value) for value in goal] for goal in goals],
-        "control_hz": flight.task.sim.control_hz,
-        "stopping": vars(flight.pilot.rule),
+        "control_hz": runner.task.sim.control_hz,
+        "stopping": vars(runner.rule),
         "tolerance_rad": cfg.tolerance_rad,
-        "action": vars(flight.task.action),
+        "action": vars(runner.task.action),
     }
 
 
-def place(safe: SafeHand, pose: np.ndarray, link: "TwinLink | None", *, yes: bool) -> None:
+def place(safe: SafeHand, pose: np.ndarray, twin: "TwinChild | None", *, yes: bool) -> None:
     """Hold the pose until the object is between the fingers: a person's or the twin's doing.
 
     Raises:
         StoppedError: The hand was stopped meanwhile.
     """
-    asked = link is None and not yes and sys.stdin.isatty()
-    if link is not None:
-        link.place_object((0.0, 0.0, 0.0, 1.0))
+    asked = twin is None and not yes and sys.stdin.isatty()
+    if twin is not None:
+        twin.place_object()
     elif asked:
         print("Put the object between the fingers, then press Enter. ", end="", file=sys.stderr, flush=True)
     clock = safe.bus.clock
@@ -311,32 +317,6 @@ def place(safe: SafeHand, pose: np.ndarray, link: "TwinLink | None", *, yes: boo
         clock.sleep(MOVE_S)
     if asked:
         sys.stdin.readline()
-
-
-def take_table_away(link: "TwinLink", log: "LogWriter") -> None:
-    """Leave the object in the air."""
-    link.place_table(present=False)
-    log.event("table", present=False)
-
-
-class StatusLine:
-    """One line that is rewritten on a terminal, and now and then a new one elsewhere."""
-
-    def __init__(self) -> None:
-        self._live, self._next = sys.stderr.isatty(), 0.0
-
-    def show(self, line: str) -> None:
-        """Show a line."""
-        if self._live:
-            print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
-        elif time.monotonic() >= self._next:
-            self._next = time.monotonic() + STATUS_S
-            print(line, file=sys.stderr, flush=True)
-
-    def end(self) -> None:
-        """Leave the line."""
-        if self._live:
-            print(file=sys.stderr)
 
 
 def report(folder: Path, steps: int, missed: int, times: dict[str, Any]) -> None:

@@ -5,25 +5,46 @@ object's symmetry. Trials whose markers were lost at the stop are discarded; tri
 error, and count as failures in the shares.
 """
 
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+import tyro
 from scipy.spatial.transform import Rotation
 
-from vd.deploy.loop.mocap import Mocap, MocapError
+from vd.config import to_dict
+from vd.deploy.loop.goals import one_object
+from vd.deploy.loop.mocap import Mocap, MocapError, read_mocap
 from vd.evaluate.statistics import TOLERANCES_RAD, Interval, median_interval, rate_intervals, symmetric_error
-from vd.hand_log import HandLog
+from vd.hand_log import HandLog, read_log
 
 NEAR_S = 0.1
 """Farthest sample [s] from a stop that counts for it: the object rests, and lost markers come back late."""
-OFFSET_STEP_S = 0.02
-"""Step of the search for the offset between two clocks [s]."""
-LEAST_OVERLAP = 0.5
-"""Share of the log's steps that motion capture has to cover for an offset to be considered."""
-LEAST_FALL = 0.5
-"""The best offset's disagreement over the typical one, above which no offset stands out."""
-NO_SYMMETRY = np.array([[0.0, 0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class ScoreCfg:
+    """Score a run by motion capture."""
+
+    log: Annotated[Path, tyro.conf.Positional]
+    """Folder that vd-deploy wrote."""
+    mocap: Path
+    """Export of the motion capture: CSV with time, x, y, z, qx, qy, qz, qw, tracked; or OptiTrack's."""
+    body: str | None = None
+    """Rigid body, of an export with several."""
+    offset_s: float | None = None
+    """Time of the motion capture at the log's beginning [s], to 0.3 s: the object rests at a stop. By default
+    times are seconds since 1970."""
+    up: Literal["z", "y"] = "z"
+    """Axis of the motion capture that points up; OptiTrack's is y unless it is exported otherwise."""
+    world: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    """Turn from the motion capture's frame, made z up, to the hand's world frame, quaternion xyzw."""
+    marker: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    """The object's frame in that of its rigid body, quaternion xyzw: how the markers were defined on it."""
+    json: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Print JSON."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +74,10 @@ class Trial:
 class Score:
     """A scored run."""
 
-    log: HandLog
+    log: Path
     """The run."""
-    mocap: Mocap
-    """Its motion capture: times since the start of the log, the object in the hand's world frame."""
+    mocap: Path
+    """Its motion capture."""
     offset_s: float
     """Time of the export at the log's beginning [s]."""
     trials: tuple[Trial, ...]
@@ -76,19 +97,15 @@ class Score:
         """Trials that were not discarded."""
         return sum(not trial.discarded for trial in self.trials)
 
-    def record(self) -> dict[str, Any]:
-        """For scripts: SI units, radians."""
-        return {
-            "log": str(self.log.path),
-            "mocap": str(self.mocap.path),
-            "offset_s": self.offset_s,
-            "trials": [asdict(trial) | {"discarded": trial.discarded} for trial in self.trials],
-            "scored": self.scored,
-            "discarded": len(self.trials) - self.scored,
-            "stopped": len(self.errors),
-            "median_rad": None if self.median is None else asdict(self.median),
-            "within": [{"tolerance_rad": t, **asdict(interval)} for t, interval in self.within],
-        }
+
+def score(cfg: ScoreCfg) -> int:
+    """Print the table; 1 if no trial could be scored."""
+    log = read_log(cfg.log)
+    symmetry = one_object(log.run["object"]["set"]).symmetry
+    mocap = in_world(read_mocap(cfg.mocap, cfg.body), up=cfg.up, world=cfg.world, marker=cfg.marker)
+    result = score_run(log, mocap, symmetry, offset_s=cfg.offset_s)
+    print(json.dumps(to_dict(result), indent=1) if cfg.json else "\n".join(lines(result)))
+    return 0 if result.scored else 1
 
 
 def in_world(mocap: Mocap, *, up: str, world: tuple[float, ...], marker: tuple[float, ...]) -> Mocap:
@@ -116,13 +133,13 @@ def score_run(log: HandLog, mocap: Mocap, symmetry: np.ndarray, *, offset_s: flo
         log: The run.
         mocap: The object's track in the hand's world frame.
         symmetry: Rotations of the object onto itself, xyzw [S, 4].
-        offset_s: Time of the export at the log's beginning [s]; None to find it.
+        offset_s: Time of the export at the log's beginning [s]; None: its times are seconds since 1970.
 
     Raises:
-        MocapError: The export does not cover the run, or no offset stands out.
+        MocapError: The export does not cover the run.
     """
     if offset_s is None:
-        offset_s = float(log.run["unix_s"]) if mocap.unix else find_offset(log, mocap)
+        offset_s = float(log.run["unix_s"])
     mocap = replace(mocap, time_s=mocap.time_s - offset_s)
     end = log.columns["t"][-1]
     if mocap.time_s[-1] < 0.0 or mocap.time_s[0] > end:
@@ -146,53 +163,13 @@ def score_run(log: HandLog, mocap: Mocap, symmetry: np.ndarray, *, offset_s: flo
         outcomes = np.stack([errors <= tolerance for tolerance in TOLERANCES_RAD])[:, None, :]
         rates = rate_intervals(outcomes, "episode")
     return Score(
-        log,
-        mocap,
+        log.path,
+        mocap.path,
         offset_s,
         tuple(trials),
         median_interval(found[None], "episode") if len(found) else None,
         tuple(zip(TOLERANCES_RAD, rates, strict=False)),
     )
-
-
-def step_errors(log: HandLog, mocap: Mocap, times: np.ndarray, symmetry: np.ndarray) -> np.ndarray:
-    """Angle to the goal that is pursued at the log's steps, the track read at ``times`` [rad]; NaN: lost."""
-    row = np.clip(np.searchsorted(mocap.time_s, times), 1, len(mocap.time_s) - 1)
-    row -= times - mocap.time_s[row - 1] < mocap.time_s[row] - times
-    near = np.abs(mocap.time_s[row] - times) <= NEAR_S
-    goals = log.goals[log.columns["goal"].astype(int)]
-    pose = mocap.pose[row]
-    known = near & np.isfinite(pose).all(axis=1)
-    errors = np.full(len(times), np.nan)
-    errors[known] = symmetric_error(pose[known, 3:], goals[known], symmetry)
-    return errors
-
-
-def find_offset(log: HandLog, mocap: Mocap) -> float:
-    """Time of the export at the log's beginning [s], at which errors agree best with the predicted distances.
-
-    Policies predict the distance without regard to symmetry, so none counts here.
-
-    Raises:
-        MocapError: No offset stands out.
-    """
-    predicted, t = log.columns["distance"], log.columns["t"]
-    best, all_off = (np.inf, 0.0), []
-    remedy = (
-        f"{mocap.path}: its clock cannot be matched to the log's; give --offset-s, or export times in UTC"
-    )
-    first, last = mocap.time_s[0] - t[-1], mocap.time_s[-1] - t[0]
-    for offset in np.arange(first, last, OFFSET_STEP_S):
-        off = step_errors(log, mocap, t + offset, NO_SYMMETRY) - predicted
-        off = off[np.isfinite(off)]
-        if len(off) < LEAST_OVERLAP * np.count_nonzero(np.isfinite(predicted)) or not len(off):
-            continue
-        middle = float(np.median(np.abs(off - np.median(off))))  # a bias of the policy is no shift in time
-        all_off.append(middle)
-        best = min(best, (middle, float(offset)))
-    if not all_off or best[0] > LEAST_FALL * np.median(all_off):
-        raise MocapError(f"{remedy} (errors and predictions differ by {best[0]:.2f} rad at best)")
-    return best[1]
 
 
 def lines(result: Score) -> list[str]:

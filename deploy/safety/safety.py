@@ -20,18 +20,15 @@ import contextlib
 import signal
 import sys
 import threading
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import numpy as np
 
 from vd.assets_usd.hand_data import HandModel
-from vd.deploy.camera.camera import AHEAD_S
-from vd.deploy.finding import NAMED
+from vd.deploy.finding import listed
 from vd.deploy.hardware.answers import BusError, HandState, LateError, SilentError
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.joints import Joints
@@ -43,8 +40,8 @@ TORQUE_S = PERIOD_S / 3.0
 """Age of what is known of the motors' torque from which it is asked for again, in a packet of its own, since
 its register lies far from the state's: with each reading of a control loop, each third of a recording."""
 TORQUE_GONE = "another program on the line switched it off, or it restarted"
-UNHEARD = ": motors do not answer, or this computer is busy"
-"""Said where the loop stands on the line."""
+AHEAD_S = 0.02
+"""An image cannot be newer than the moment it came [s]; what the SDK makes of its clock is off by some ms."""
 OFF_S = 1.0
 """How long switching off is tried on a bus that does not answer soundly."""
 FINISHED = "finished"
@@ -93,6 +90,8 @@ def unheard(error: BusError) -> str:
 class SafeHand:
     """A hand whose goals are limited and that stops by itself.
 
+    Once it is stopped, each method raises :class:`StoppedError` with the reason.
+
     Args:
         bus: Its motors, configured.
         joints: Which motor turns which joint.
@@ -113,10 +112,6 @@ class SafeHand:
         self.bus, self.joints, self.hand, self.cfg, self._say = bus, joints, hand, cfg or SafetyCfg(), say
         self._names = [f"{name}, motor {id}" for name, id in zip(joints.names, joints.ids, strict=True)]
         self.limits = Limits(hand, bus.model, self._names, self.cfg)
-        self.limited = 0
-        """Goals that were limited."""
-        self.missed = 0
-        """Deadlines missed, in all."""
         self.repeated = 0
         """Readings without a sound answer, for which the last state stood in."""
         self.report: StopReport | None = None
@@ -127,7 +122,6 @@ class SafeHand:
         self._torque_s = -np.inf
         self._armed = False
         self._on = np.ones(len(joints.ids), dtype=bool)
-        self._loop = threading.get_ident()
         self._stopping = threading.RLock()
         self._unwatch: Callable[[], None] = lambda: None
         self._handlers: dict[signal.Signals, Any] = {}
@@ -149,11 +143,7 @@ class SafeHand:
                 signal.signal(number, handler)
 
     def arm(self) -> HandState:
-        """Switch the torque on where the hand is, and start the watchdogs.
-
-        Raises:
-            StoppedError: A motor does not switch on.
-        """
+        """Switch the torque on where the hand is, and start the watchdogs."""
         with self._stopping:
             try:
                 self._state = state = self._read()
@@ -169,11 +159,7 @@ class SafeHand:
             return state
 
     def read(self) -> HandState:
-        """Read the joints; for a short gap in the bus the last state once more, with its own time.
-
-        Raises:
-            StoppedError: The bus is lost, a limit was passed, a motor reports an error, or another stop.
-        """
+        """Read the joints; for a short gap in the bus the last state once more, with its own time."""
         self._check()
         try:
             state = self._read()
@@ -197,9 +183,6 @@ class SafeHand:
 
         Returns:
             The goals that were sent [rad], shape [D].
-
-        Raises:
-            StoppedError: The hand is stopped, the target is no number, or the bus is lost.
         """
         self._check()
         target = np.asarray(target, dtype=float)
@@ -208,7 +191,6 @@ class SafeHand:
         if target.shape != self.limits.lower.shape or not np.isfinite(target).all():
             raise self._stop(f"the target is not {len(self.joints.ids)} finite angles: {target}")
         goal = self.limits.goal(target, self._state.position)
-        self.limited += int((goal != target).any())
         with self._stopping:  # never after the hold
             self._check()
             try:
@@ -222,9 +204,6 @@ class SafeHand:
 
         Args:
             on: Shape [D] bool.
-
-        Raises:
-            StoppedError: A motor does not switch.
         """
         self.command(self.read().position)
         for axis in np.flatnonzero(on != self._on):
@@ -238,13 +217,9 @@ class SafeHand:
 
         Args:
             missed: Whether it ended after its deadline.
-
-        Raises:
-            StoppedError: Too many in a row.
         """
         self._check()
         self._beat_s = self.bus.clock.now()
-        self.missed += missed
         self._misses = self._misses + 1 if missed else 0
         if self._misses >= self.cfg.misses:
             raise self._stop(f"{self._misses} deadlines missed in a row")
@@ -258,17 +233,10 @@ class SafeHand:
         ahead = time_s - self.bus.clock.now()
         if ahead > AHEAD_S:
             raise self._stop(
-                f"the newest image is {ahead:.2f} s from the future: its clock is not the monotonic one"
+                f"the newest image is {ahead:.2f} s from the future: wait until the computer's clock is set "
+                "(NTP), then plug the camera in again"
             )
         self._image_s = time_s
-
-    def stop(self, reason: str) -> None:
-        """Stop for a reason of the caller's.
-
-        Raises:
-            StoppedError: Always.
-        """
-        raise self._stop(reason)
 
     def _read(self) -> HandState:
         try:
@@ -303,8 +271,7 @@ class SafeHand:
         except BusError:
             errors = {}
         axes = np.flatnonzero(which)
-        words = [self._names[a] + ": " + errors.get(self.bus.ids[a], otherwise) for a in axes[:NAMED]]
-        return "; ".join(words) + (f"; and {len(axes) - NAMED} more" if len(axes) > NAMED else "")
+        return listed([f"{self._names[a]}: {errors.get(self.bus.ids[a], otherwise)}" for a in axes])
 
     def _check(self) -> None:
         if self.report is not None:
@@ -320,22 +287,10 @@ class SafeHand:
         if self._signal:
             return SIGNALS[signal.Signals(self._signal)]
         if silent > self.cfg.misses * PERIOD_S:
-            return f"the loop stands: no step ended for {silent:.2f} s{self._place()}"
+            return f"the loop stands: no step ended for {silent:.2f} s"
         if age > self.cfg.stale_s:
             return f"the newest image is {age:.2f} s old"
         return ""
-
-    def _place(self) -> str:
-        """What of ours the loop is in at present; empty where it is the loop itself that asks."""
-        if threading.get_ident() == self._loop:
-            return ""
-        own = Path(__file__).parent
-        stack = traceback.extract_stack(sys._current_frames().get(self._loop))
-        at = next((call for call in reversed(stack) if Path(call.filename).parent == own), None)
-        if at is None:
-            return ""
-        why = UNHEARD if at.filename == sys.modules[MotorBus.__module__].__file__ else ""
-        return f", in {at.name} ({Path(at.filename).name}, line {at.lineno}){why}"
 
     def _stop(self, reason: str, *, lost: bool = False) -> StoppedError:
         """Hold, and give what to raise.

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -44,9 +45,10 @@ SAFE_RAD = 0.15
 REST_S = 0.6
 """Time after the end in which even a motor that hears nothing has to have stopped by itself."""
 
-
 SETUP_RETRIES = 20
 """On a busy machine a twin may not run for longer than the SDK waits; before the start that is no matter."""
+START_S = 60.0
+"""Longest start of a command."""
 
 
 class Witness:
@@ -85,10 +87,6 @@ class Witness:
         """Places of the motors that have torque."""
         return [axis for axis, motor in enumerate(self._motors) if motor.get("torque_enable")]
 
-    def pushing(self) -> list[int]:
-        """Places of the motors that push."""
-        return [int(axis) for axis in np.flatnonzero(self.pushes[-1] > SAFE_RAD)]
-
     def safe_after(self, since: float) -> float:
         """Time from ``since`` until no motor that has been told pushed any more, for good [s].
 
@@ -110,6 +108,7 @@ class Scene:
 
     twin: Twin
     bus: MotorBus
+    witness: Witness
     injected_s: float = float("inf")
     """When the fault came [s]."""
     camera: bool = False
@@ -123,10 +122,13 @@ class Scene:
         """A motor of the twin, by its ID."""
         return next(motor for motor in self.twin.motors if motor.id == id)
 
+    def axes(self) -> FirstOrderPlant:
+        """The axes without mass that stand for the hand."""
+        assert isinstance(self.witness.plant, FirstOrderPlant)
+        return self.witness.plant
 
-def _faults(scene: Scene, **values: object) -> None:
-    for name, value in values.items():
-        setattr(scene.twin.faults, name, value)
+
+Inject = Callable[[Scene], None]
 
 
 @dataclass(frozen=True)
@@ -134,11 +136,11 @@ class Fault:
     """Something that goes wrong while the hand moves."""
 
     name: str
-    inject: Callable[[Scene], None]
-    prepare: Callable[[Scene], None] = lambda scene: None
-    """What is so from the start."""
+    inject: Inject
     stops: bool = True
     """Whether the hand has to stop; else it has to go on."""
+    camera: bool = False
+    """Whether there is a camera before."""
     cfg: SafetyCfg = field(default_factory=SafetyCfg)
     reach_rad: float = PUSH_RAD
     """Distance of the goals from the joints once it came."""
@@ -146,36 +148,60 @@ class Fault:
     """On axes without mass that can be blocked, in place of the hand."""
 
 
-def _set(**values: object) -> Callable[[Scene], None]:
+def _set(**values: object) -> Inject:
     """A fault that sets attributes of the scene."""
+    return lambda scene: vars(scene).update(values)
+
+
+def _line(**values: float) -> Inject:
+    """Faults of the line."""
+    return lambda scene: vars(scene.twin.faults).update(values)
+
+
+def _put(item: str, value: int, *motors: int) -> Inject:
+    """An item of some motors, or all, that is not as it should be."""
 
     def inject(scene: Scene) -> None:
-        for name, value in values.items():
-            setattr(scene, name, value)
+        for motor in scene.twin.motors:
+            if not motors or motor.id in motors:
+                motor.put(item, value)
 
     return inject
 
 
 def _block(scene: Scene) -> None:
-    plant = scene.twin.plant
-    assert isinstance(plant, Witness) and isinstance(plant.plant, FirstOrderPlant)
-    plant.plant.blocked[2] = True
+    scene.axes().blocked[2] = True
 
 
-def _overload(scene: Scene) -> None:
-    scene.motor(22).put("hardware_error_status", HardwareError.OVERLOAD)
+def _at(axis: int, angle: float) -> Inject:
+    """A motor at an angle [rad]."""
+    return lambda scene: scene.axes().position.__setitem__(axis, angle)
+
+
+def _twice(scene: Scene) -> None:
+    """Two motors with one ID, at different angles as any two are."""
+    _put("id", 11, 12)(scene)
+    _at(2, 0.4)(scene)
+
+
+def _stubborn(scene: Scene) -> None:
+    """A motor that does not keep a limit."""
+    motor, item = scene.twin.motors[4], "max_position_limit"
+    motor.put(item, 4000)
+    accept = motor._accept
+    motor._accept = lambda name, value: accept(name, 4000 if name == item else value)  # type: ignore[method-assign]
 
 
 WIDE = SafetyCfg(step_rad=4.0)
 """Limits that let goals far away through."""
 MOVING = (
-    Fault("1 % of packets lost", lambda s: _faults(s, lose=0.01), stops=False),
-    Fault("1 % of packets corrupted", lambda s: _faults(s, corrupt=0.01), stops=False),
-    Fault("1 % of packets cut off", lambda s: _faults(s, truncate=0.01), stops=False),
-    Fault("1 % of packets 0.1 s late", lambda s: _faults(s, late=0.01), stops=False),
-    Fault("every packet lost", lambda s: _faults(s, lose=1.0)),
-    Fault("every packet corrupted", lambda s: _faults(s, corrupt=1.0)),
-    Fault("every packet 0.1 s late", lambda s: _faults(s, late=1.0)),
+    Fault("1 % of packets lost", _line(lose=0.01), stops=False),
+    Fault("1 % of packets corrupted", _line(corrupt=0.01), stops=False),
+    Fault("1 % of packets cut off", _line(truncate=0.01), stops=False),
+    Fault("1 % of packets 0.1 s late", _line(late=0.01), stops=False),
+    Fault("every packet lost", _line(lose=1.0)),
+    Fault("every packet corrupted", _line(corrupt=1.0)),
+    Fault("every packet 0.1 s late", _line(late=1.0)),
     Fault("cable of one motor loose", lambda s: s.twin.faults.cut_off.add(11)),
     Fault("cable of all motors loose", lambda s: s.twin.faults.cut_off.update(m.id for m in s.twin.motors)),
     Fault("adapter unplugged", lambda s: s.bus.close()),
@@ -183,10 +209,10 @@ MOVING = (
     Fault("a motor shuts down, too hot", lambda s: setattr(s.motor(21), "heat_c_per_s", 5000.0)),
     Fault("a joint is blocked", _block, stops=False, blockable=True),
     Fault("a joint is blocked, goals far away", _block, cfg=WIDE, reach_rad=2.0, blockable=True),
-    Fault("a motor shuts down, overload", _overload),
+    Fault("a motor shuts down, overload", _put("hardware_error_status", HardwareError.OVERLOAD, 22)),
     Fault("a motor restarts", lambda s: s.motor(32).reboot()),
-    Fault("a motor takes another ID", lambda s: s.motor(11).put("id", 13)),
-    Fault("the camera stops", _set(camera=False), prepare=_set(camera=True)),
+    Fault("a motor takes another ID", _put("id", 13, 11)),
+    Fault("the camera stops", _set(camera=False), camera=True),
     Fault("every step takes 0.15 s", _set(pause_s=0.15)),
     Fault("the loop stands", _set(pause_s=2.0)),
     Fault("an exception in the loop", _set(error=ArithmeticError("no such number"))),
@@ -194,6 +220,25 @@ MOVING = (
     Fault("the terminal closes", lambda s: os.kill(os.getpid(), signal.SIGHUP)),
 )
 """Faults of a moving hand."""
+BEFORE: dict[str, Inject] = {
+    "a motor has a wrong ID": _put("id", 13, 11),
+    "two motors have the same ID": _twice,
+    "a motor does not keep its limit": _stubborn,
+    "a motor's direction was reversed": _put("drive_mode", 1, 20),
+    "a motor has an overload": _put("hardware_error_status", HardwareError.OVERLOAD, 22),
+    "a motor is hot": lambda scene: setattr(scene.twin.motors[0], "temperature", 66.0),
+    "the supply is low": _put("present_input_voltage", 190),
+    "a joint is out of its range": _at(5, 2.6),
+    "a joint was turned round": _at(5, 2.0 * np.pi),
+    "a cable is loose": lambda scene: scene.twin.faults.cut_off.add(32),
+}
+"""What the preflight has to find."""
+PROCESS = {
+    "vd-deploy gets Ctrl-C": signal.SIGINT,
+    "vd-deploy is asked to end": signal.SIGTERM,
+    "vd-deploy is killed": signal.SIGKILL,
+}
+"""Signals to a command that moves the hand."""
 
 
 @dataclass(frozen=True)
@@ -215,9 +260,17 @@ class Outcome:
     right: bool = True
     """Whether it went as it has to."""
 
+    def __str__(self) -> str:
+        """In one line."""
+        times = {"found after": self.detected_s, "safe after that": self.safe_s, "by themselves": self.own_s}
+        words = [f"{what} {1e3 * time_s:.0f} ms" for what, time_s in times.items() if time_s is not None]
+        left = f"{len(self.energised)} on, {len(self.pushing)} of them pushing"
+        mark = "ok   " if self.right else "WRONG"
+        return f"{mark}  {self.fault}: {self.happened} ({', '.join([*words, left])})"
+
 
 @contextlib.contextmanager
-def scene_of(hand: HandModel, joints: Joints, *, blockable: bool = False) -> Iterator[tuple[Scene, Witness]]:
+def scene_of(hand: HandModel, joints: Joints, *, blockable: bool = False) -> Iterator[Scene]:
     """A twin that serves, and a configured bus to it."""
     plant: Plant = FirstOrderPlant(len(joints.ids)) if blockable else NewtonHand(hand, joints)
     motors = [Motor(MODELS[MOTOR], id) for id in joints.ids]
@@ -226,13 +279,37 @@ def scene_of(hand: HandModel, joints: Joints, *, blockable: bool = False) -> Ite
         bus.retries = SETUP_RETRIES
         bus.configure(joints.settings(hand, MOTOR))
         bus.retries = 1
-        yield Scene(twin, bus), witness
+        yield Scene(twin, bus, witness)
+
+
+def _outcome(
+    scene: Scene,
+    name: str,
+    happened: str,
+    joints: Joints,
+    *,
+    right: bool,
+    since_s: float = 0.0,
+    **times: float | None,
+) -> Outcome:
+    """How it ended: a motor with torque at the end is right only where it has stopped by itself."""
+    left, pushing = scene.witness.left(), np.flatnonzero(scene.witness.pushes[-1] > SAFE_RAD)
+    own_s = max((scene.witness.own.get(axis, float("inf")) - since_s for axis in left), default=None)
+    return Outcome(
+        name,
+        happened,
+        **times,
+        own_s=own_s,
+        energised=tuple(joints.ids[axis] for axis in left),
+        pushing=tuple(joints.ids[axis] for axis in pushing),
+        right=right and not len(pushing) and (own_s is None or own_s < float("inf")),
+    )
 
 
 def try_fault(fault: Fault, hand: HandModel, joints: Joints) -> Outcome:
     """Move the hand's twin, inject a fault, and see how it ends."""
-    with scene_of(hand, joints, blockable=fault.blockable) as (scene, witness):
-        fault.prepare(scene)
+    with scene_of(hand, joints, blockable=fault.blockable) as scene:
+        scene.camera = fault.camera
         with contextlib.suppress(StoppedError, ArithmeticError):
             with SafeHand(scene.bus, joints, hand, fault.cfg, lambda text: None) as safe:
                 safe.arm()
@@ -243,14 +320,14 @@ def try_fault(fault: Fault, hand: HandModel, joints: Joints) -> Outcome:
         if not fault.stops:
             right = report.reason == FINISHED
             happened = f"went on; {safe.repeated} readings repeated" if right else report.reason
-            return _outcome(fault.name, happened, witness, joints, right=right)
+            return _outcome(scene, fault.name, happened, joints, right=right)
         told_s = PERIOD_S if report.held_s is None else report.held_s - report.detected_s
-        safe_s = max(told_s, witness.safe_after(report.detected_s))
+        safe_s = max(told_s, scene.witness.safe_after(report.detected_s))
         left = f"; {len(report.unreleased)} motors may still be on" if report.unreleased else ""
         return _outcome(
+            scene,
             fault.name,
             report.reason + left,
-            witness,
             joints,
             right=report.reason != FINISHED and report.detected_s >= scene.injected_s and safe_s <= PERIOD_S,
             since_s=scene.injected_s,
@@ -259,41 +336,14 @@ def try_fault(fault: Fault, hand: HandModel, joints: Joints) -> Outcome:
         )
 
 
-def _outcome(
-    name: str,
-    happened: str,
-    witness: Witness,
-    joints: Joints,
-    *,
-    right: bool,
-    since_s: float = 0.0,
-    detected_s: float | None = None,
-    safe_s: float | None = None,
-) -> Outcome:
-    """How it ended: a motor with torque at the end is right only where it has stopped by itself."""
-    left, pushing = witness.left(), witness.pushing()
-    own_s = max((witness.own.get(axis, float("inf")) - since_s for axis in left), default=None)
-    return Outcome(
-        fault=name,
-        happened=happened,
-        detected_s=detected_s,
-        safe_s=safe_s,
-        own_s=own_s,
-        energised=tuple(joints.ids[axis] for axis in left),
-        pushing=tuple(joints.ids[axis] for axis in pushing),
-        right=right and not pushing and (own_s is None or own_s < float("inf")),
-    )
-
-
 def _move(scene: Scene, safe: SafeHand, fault: Fault) -> None:
     """A loop at the control rate that pushes every joint about, and in which the fault comes."""
     rng = np.random.default_rng(0)
-    begin = time.monotonic()
-    due = begin
-    way = np.zeros(len(safe.limits.lower))
+    due = time.monotonic()
+    way, reach = np.zeros(len(safe.limits.lower)), PUSH_RAD
     for step in range(round((BEFORE_S + AFTER_S) / PERIOD_S)):
         if step == round(BEFORE_S / PERIOD_S):
-            scene.injected_s = time.monotonic()
+            scene.injected_s, reach = time.monotonic(), fault.reach_rad
             fault.inject(scene)
         if scene.error is not None:
             raise scene.error
@@ -301,135 +351,55 @@ def _move(scene: Scene, safe: SafeHand, fault: Fault) -> None:
             way = rng.choice([-1.0, 1.0], len(way))
         if fault.blockable and step >= round(BEFORE_S / PERIOD_S):
             way = np.sign(safe.limits.lower + safe.limits.upper - 2.0 * safe.read().position)
-        reach = PUSH_RAD if scene.injected_s == float("inf") else fault.reach_rad
         safe.command(safe.read().position + reach * way)
         if scene.camera:
             safe.image_at(time.monotonic())
         time.sleep(scene.pause_s)
         due += PERIOD_S
-        late = time.monotonic() > due
-        safe.beat(missed=late)
+        now = time.monotonic()
+        safe.beat(missed=now > due)
         due = max(due, time.monotonic())  # not to hurry after it
-        time.sleep(due - time.monotonic() if due > time.monotonic() else 0.0)
-
-
-def _put(item: str, value: int, *motors: int) -> Callable[[Twin], None]:
-    """An item of some motors, or all, that is not as it should be."""
-
-    def spoil(twin: Twin) -> None:
-        for motor in twin.motors:
-            if not motors or motor.id in motors:
-                motor.put(item, value)
-
-    return spoil
-
-
-def _stubborn(twin: Twin) -> None:
-    """A motor that does not keep a limit."""
-    motor = twin.motors[4]
-    motor.put("max_position_limit", 4000)
-    accept = motor._accept
-    motor._accept = lambda name, value: accept(name, 4000 if name == "max_position_limit" else value)  # type: ignore[method-assign]
-
-
-def _at(axis: int, angle: float) -> Callable[[Twin], None]:
-    """A motor at an angle [rad]."""
-
-    def spoil(twin: Twin) -> None:
-        plant = twin.plant
-        assert isinstance(plant, Witness) and isinstance(plant.plant, FirstOrderPlant)
-        plant.plant.position[axis] = angle
-
-    return spoil
-
-
-def _twice(twin: Twin) -> None:
-    """Two motors with one ID, at different angles as any two are."""
-    _put("id", 11, 12)(twin)
-    _at(2, 0.4)(twin)
-
-
-BEFORE: dict[str, Callable[[Twin], None]] = {
-    "a motor has a wrong ID": _put("id", 13, 11),
-    "two motors have the same ID": _twice,
-    "a motor does not keep its limit": _stubborn,
-    "a motor's direction was reversed": _put("drive_mode", 1, 20),
-    "a motor has an overload": _put("hardware_error_status", HardwareError.OVERLOAD, 22),
-    "a motor is hot": lambda twin: setattr(twin.motors[0], "temperature", 66.0),
-    "the supply is low": _put("present_input_voltage", 190),
-    "a joint is out of its range": _at(5, 2.6),
-    "a joint was turned round": _at(5, 2.0 * np.pi),
-    "a cable is loose": lambda twin: twin.faults.cut_off.add(32),
-}
-"""What the preflight has to find."""
+        time.sleep(max(0.0, due - time.monotonic()))
 
 
 def try_preflight(name: str, hand: HandModel, joints: Joints) -> Outcome:
     """Spoil something before the start; nothing may move."""
-    with scene_of(hand, joints, blockable=True) as (scene, witness):
+    with scene_of(hand, joints, blockable=True) as scene:
         scene.bus.release()
-        BEFORE[name](scene.twin)
+        BEFORE[name](scene)
         time.sleep(0.1)
         connection = Connection(hand, joints, scene.bus)
         wrong = [finding for finding in preflight(connection) if not finding.ok]
         if not wrong and not (written := write_settings(connection)).ok:
             wrong = [written]
         happened = f"nothing moves: {wrong[0].what}: {wrong[0].found}" if wrong else "was not found"
-        return _outcome(name, happened, witness, joints, right=bool(wrong) and not witness.left())
+        right = bool(wrong) and not scene.witness.left()
+        return _outcome(scene, name, happened, joints, right=right)
 
 
-def try_process(name: str, number: signal.Signals, hand: HandModel, joints: Joints) -> Outcome:
+def try_process(name: str, hand: HandModel, joints: Joints) -> Outcome:
     """Send a signal to `vd-deploy home` while it moves the twin."""
-    with scene_of(hand, joints) as (scene, witness):
+    with scene_of(hand, joints) as scene:
         scene.bus.close()  # one program at a time has the port
         command = [sys.executable, "-m", "vd.deploy.cli", "home", "--port", scene.twin.path, "--yes"]
         command += ["--hand", hand.name, "--speed", "0.2"]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         end = time.monotonic() + START_S
-        while not all(motor.get("torque_enable") for motor in scene.twin.motors):
-            if process.poll() is not None or time.monotonic() > end:
-                break
+        while (
+            len(scene.witness.left()) < len(joints.ids) and process.poll() is None and time.monotonic() < end
+        ):
             time.sleep(0.01)
         time.sleep(0.5)
         sent = time.monotonic()
-        process.send_signal(number)
+        process.send_signal(PROCESS[name])
         _, words = process.communicate()
         time.sleep(REST_S)
         said = [line for line in words.splitlines() if line.startswith("stopped")]
-        if number == signal.SIGKILL:
+        happened, right = (said or ["said nothing"])[-1], bool(said) and not scene.witness.left()
+        if PROCESS[name] == signal.SIGKILL:
             happened, right = "the motors stop by themselves and hold", True
-        else:
-            happened, right = (said or ["said nothing"])[-1], bool(said) and not witness.left()
-        safe_s = witness.safe_after(sent)
-        return _outcome(name, happened, witness, joints, right=right, since_s=sent, safe_s=safe_s)
-
-
-START_S = 60.0
-"""Longest start of a command."""
-PROCESS = {
-    "vd-deploy gets Ctrl-C": signal.SIGINT,
-    "vd-deploy is asked to end": signal.SIGTERM,
-    "vd-deploy is killed": signal.SIGKILL,
-}
-"""Signals to a command that moves the hand."""
-
-
-def table(outcomes: Sequence[Outcome]) -> str:
-    """The table as Markdown."""
-    lines = [
-        "| fault | what happened | found after | safe after that | others by themselves | on, pushing |",
-        "|---|---|---|---|---|---|",
-    ]
-
-    def ms(seconds: float | None) -> str:
-        return "-" if seconds is None else f"{1e3 * seconds:.0f} ms"
-
-    for one in outcomes:
-        mark = "" if one.right else " **(wrong)**"
-        times = " | ".join(map(ms, (one.detected_s, one.safe_s, one.own_s)))
-        left = f"{len(one.energised)}, {len(one.pushing)}"
-        lines.append(f"| {one.fault} | {one.happened}{mark} | {times} | {left} |")
-    return "\n".join(lines)
+        safe_s = scene.witness.safe_after(sent)
+        return _outcome(scene, name, happened, joints, right=right, since_s=sent, safe_s=safe_s)
 
 
 @dataclass(frozen=True)
@@ -448,18 +418,16 @@ class FaultsCommand:
         quiet_warp()
         hand = load_hand(self.hand)
         joints = uncalibrated(hand)
-        trials: list[tuple[str, Callable[[], Outcome]]] = [
-            *((f.name, lambda f=f: try_fault(f, hand, joints)) for f in MOVING),
-            *((name, lambda n=name: try_preflight(n, hand, joints)) for name in BEFORE),
-            *((name, lambda n=name: try_process(n, PROCESS[n], hand, joints)) for name in PROCESS),
-        ]
+        trials: dict[str, Callable[[], Outcome]] = {
+            **{fault.name: partial(try_fault, fault, hand, joints) for fault in MOVING},
+            **{name: partial(try_preflight, name, hand, joints) for name in BEFORE},
+            **{name: partial(try_process, name, hand, joints) for name in PROCESS},
+        }
         outcomes = []
-        for name, trial in trials:
+        for name, trial in trials.items():
             if self.only in name:
                 outcomes.append(trial())
-                how = "ok   " if outcomes[-1].right else "WRONG"
-                print(f"{how}  {name}: {outcomes[-1].happened}", file=sys.stderr, flush=True)
-        print(table(outcomes))
+                print(outcomes[-1], flush=True)
         if self.json is not None:
             write_json(self.json, [asdict(outcome) for outcome in outcomes])
         return 0 if all(outcome.right for outcome in outcomes) else 1

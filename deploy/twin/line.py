@@ -1,7 +1,6 @@
 """A line of simulated motors: bytes of a program in, bytes of the motors out, and what they move goes on.
 
-Where the bytes come from and how time goes on is for others: :mod:`vd.deploy.twin.twin` puts a
-pseudo-terminal and the computer's clock around it. Faults can be injected.
+:mod:`vd.deploy.twin.twin` puts a pseudo-terminal and the computer's clock around it. Faults can be injected.
 """
 
 import functools
@@ -81,7 +80,7 @@ class MotorLine:
         now = max(self._clock.now() if at is None else at, self._then)
         seconds, self._then = now - self._then, now
         if seconds > 0.0:
-            self.plant.advance(seconds, [motor.drive(seconds) for motor in self.motors])
+            self.plant.advance(seconds, [motor.drive() for motor in self.motors])
             self._sense(seconds)
         packets: list[Packet] = []
         if heard:
@@ -96,47 +95,18 @@ class MotorLine:
 
     def _handle(self, packet: Packet) -> None:
         """Carry out one instruction and send what the motors answer."""
-        named = list(ORDER[packet.instruction](packet.parameters)) if packet.instruction in ORDER else []
+        named = list(packet.parameters[4:]) if packet.instruction == Instruction.SYNC_READ else []
         # Motors that a packet names answer in its order; each waits for the one before.
-        answers: dict[int, list[tuple[Motor, list[bytes]]]] = {}
+        answers: dict[int, list[bytes]] = {}
         for motor in sorted(self.motors, key=lambda m: named.index(m.id) if m.id in named else len(named)):
-            if motor.id not in self.faults.cut_off:
-                frames = [encode(answer) for answer in self._answers(motor, packet)]
-                answers.setdefault(motor.id, []).append((motor, frames))
-        for same in answers.values():
-            for at_once in itertools.zip_longest(*(frames for _, frames in same), fillvalue=b""):
-                self._send(same[0][0], collide(at_once))
+            if motor.id not in self.faults.cut_off and (answer := _answer(motor, packet)) is not None:
+                answers.setdefault(motor.id, []).append(encode(answer))
+        for id, at_once in answers.items():
+            delay = next(motor for motor in self.motors if motor.id == id).get("return_delay_time")
+            self._clock.sleep(delay * RETURN_DELAY_UNIT_S)
+            self._send(collide(at_once))
 
-    def _answers(self, motor: Motor, packet: Packet) -> list[Packet]:
-        """What one motor makes of a packet on the bus."""
-        level = motor.get("status_return_level")
-        shared = SHARED.get(packet.instruction)
-        if packet.id == BROADCAST and shared is not None:
-            motor.heard()
-            answers = shared(motor, packet.parameters)
-            return answers if level else []
-        if packet.instruction == Instruction.STATUS:
-            return []
-        if packet.id == motor.secondary_id:
-            motor.heard()
-            if packet.instruction == Instruction.WRITE:
-                motor.write(_word(packet.parameters), packet.parameters[2:], secondary=True)
-            return []
-        if packet.id not in (motor.id, BROADCAST):
-            return []
-        motor.heard()
-        single = SINGLE.get(packet.instruction)
-        if single is None:
-            failure, data = int(Failure.INSTRUCTION), b""
-        else:
-            failure, data = single(motor, packet.parameters)
-        quiet = level == 0 or (level == 1 and packet.instruction != Instruction.READ)
-        if packet.instruction != Instruction.PING and (quiet or packet.id == BROADCAST):
-            return []
-        return [status(motor.id, failure | motor.alert, data)]
-
-    def _send(self, motor: Motor, frame: bytes) -> None:
-        self._clock.sleep(motor.get("return_delay_time") * RETURN_DELAY_UNIT_S)
+    def _send(self, frame: bytes) -> None:
         data, draw, faults = bytearray(frame), self._random.random, self.faults
         if draw() < faults.lose:
             return
@@ -165,110 +135,53 @@ def collide(frames: Sequence[bytes]) -> bytes:
     )
 
 
-Result = tuple[int, bytes]
+def _answer(motor: Motor, packet: Packet) -> Packet | None:
+    """What one motor makes of a packet on the bus; None for silence."""
+    broadcast, kind = packet.id == BROADCAST, packet.instruction
+    if kind == Instruction.STATUS or not (broadcast or packet.id == motor.id):
+        return None
+    motor.heard()
+    level = motor.get("status_return_level")
+    if broadcast and kind == Instruction.SYNC_WRITE:
+        _sync_write(motor, packet.parameters)
+        return None
+    if broadcast and kind == Instruction.SYNC_READ:
+        return _sync_read(motor, packet.parameters) if level else None
+    failure, data = _single(motor, kind, packet.parameters)
+    quiet = broadcast or level == 0 or (level == 1 and kind != Instruction.READ)
+    if quiet and kind != Instruction.PING:
+        return None
+    return status(motor.id, failure | motor.alert, data)
+
+
+def _single(motor: Motor, kind: int, parameters: bytes) -> tuple[int, bytes]:
+    """Carry out an instruction to one motor: error number and data."""
+    match kind, len(parameters):
+        case Instruction.PING, 0:
+            return Failure.NONE, motor.read(0, 2)[1] + motor.read(6, 1)[1]
+        case Instruction.READ, 4:
+            return motor.read(_word(parameters), _word(parameters, 2))
+        case Instruction.WRITE, _:
+            return motor.write(_word(parameters), parameters[2:]), b""
+        case ((Instruction.PING | Instruction.READ), _):
+            return Failure.LENGTH, b""
+    return Failure.INSTRUCTION, b""
+
+
+def _sync_read(motor: Motor, parameters: bytes) -> Packet | None:
+    if len(parameters) < 5 or motor.id not in parameters[4:]:
+        return None
+    failure, data = motor.read(_word(parameters), _word(parameters, 2))
+    return status(motor.id, failure | motor.alert, data)
+
+
+def _sync_write(motor: Motor, parameters: bytes) -> None:
+    address, length, rows = _word(parameters), _word(parameters, 2), parameters[4:]
+    if length and len(rows) % (length + 1) == 0:
+        for start in range(0, len(rows), length + 1):
+            if rows[start] == motor.id:
+                motor.write(address, rows[start + 1 : start + 1 + length])
 
 
 def _word(data: bytes, at: int = 0) -> int:
     return int.from_bytes(data[at : at + 2], "little")
-
-
-def _ping(motor: Motor, parameters: bytes) -> Result:
-    if parameters:
-        return Failure.LENGTH, b""
-    return Failure.NONE, motor.read(0, 2)[1] + motor.read(6, 1)[1]
-
-
-def _read(motor: Motor, parameters: bytes) -> Result:
-    return (
-        motor.read(_word(parameters), _word(parameters, 2)) if len(parameters) == 4 else (Failure.LENGTH, b"")
-    )
-
-
-def _write(motor: Motor, parameters: bytes) -> Result:
-    return motor.write(_word(parameters), parameters[2:]), b""
-
-
-def _register(motor: Motor, parameters: bytes) -> Result:
-    if len(parameters) < 3:
-        return Failure.LENGTH, b""
-    motor.registered = _word(parameters), parameters[2:]
-    motor.put("registered_instruction", 1)
-    return Failure.NONE, b""
-
-
-def _action(motor: Motor, parameters: bytes) -> Result:
-    if motor.registered is None:
-        return Failure.RESULT, b""
-    failure = motor.write(*motor.registered)
-    motor.registered = None
-    motor.put("registered_instruction", 0)
-    return failure, b""
-
-
-def _reboot(motor: Motor, parameters: bytes) -> Result:
-    motor.reboot()
-    return Failure.NONE, b""
-
-
-def _sync_read(motor: Motor, parameters: bytes) -> list[Packet]:
-    if len(parameters) < 5 or motor.id not in parameters[4:]:
-        return []
-    failure, data = motor.read(_word(parameters), _word(parameters, 2))
-    return [status(motor.id, failure | motor.alert, data)]
-
-
-def _sync_write(motor: Motor, parameters: bytes) -> list[Packet]:
-    address, length = _word(parameters), _word(parameters, 2)
-    rows = parameters[4:]
-    if length and len(rows) % (length + 1) == 0:
-        for start in range(0, len(rows), length + 1):
-            if rows[start] in (motor.id, motor.secondary_id):
-                row = rows[start + 1 : start + 1 + length]
-                motor.write(address, row, secondary=rows[start] != motor.id)
-    return []
-
-
-def _bulk_read(motor: Motor, parameters: bytes) -> list[Packet]:
-    if len(parameters) % 5:
-        return []
-    answers = []
-    for start in range(0, len(parameters), 5):
-        if parameters[start] == motor.id:
-            failure, data = motor.read(_word(parameters, start + 1), _word(parameters, start + 3))
-            answers.append(status(motor.id, failure | motor.alert, data))
-    return answers
-
-
-def _bulk_write(motor: Motor, parameters: bytes) -> list[Packet]:
-    while len(parameters) >= 5:
-        length = _word(parameters, 3)
-        data = parameters[5 : 5 + length]
-        if parameters[0] == motor.id and len(data) == length:
-            motor.write(_word(parameters, 1), data)
-        parameters = parameters[5 + length :]
-    return []
-
-
-SINGLE: dict[int, Callable[[Motor, bytes], Result]] = {
-    Instruction.PING: _ping,
-    Instruction.READ: _read,
-    Instruction.WRITE: _write,
-    Instruction.REG_WRITE: _register,
-    Instruction.ACTION: _action,
-    Instruction.REBOOT: _reboot,
-}
-"""Instructions to one motor, or broadcast."""
-SHARED: dict[int, Callable[[Motor, bytes], list[Packet]]] = {
-    Instruction.SYNC_READ: _sync_read,
-    Instruction.SYNC_WRITE: _sync_write,
-    Instruction.BULK_READ: _bulk_read,
-    Instruction.BULK_WRITE: _bulk_write,
-}
-"""Instructions to many motors, which name them in their parameters."""
-
-
-ORDER: dict[int, Callable[[bytes], bytes]] = {
-    Instruction.SYNC_READ: lambda parameters: parameters[4:],
-    Instruction.BULK_READ: lambda parameters: parameters[::5],
-}
-"""Where the instructions that several motors answer name them."""

@@ -6,11 +6,7 @@ from dataclasses import dataclass, field
 from vd.deploy.hardware.control_table import (
     COUNTS_PER_TURN,
     EEPROM_END,
-    FULL_PWM,
-    LAST_SECONDARY_ID,
     POSITION_MODE,
-    RAD_PER_COUNT,
-    RAD_S2_PER_COUNT,
     RAD_S_PER_COUNT,
     SIZE,
     TICK_MODULUS,
@@ -33,11 +29,6 @@ TICK_S = 1e-3
 """What its clock counts."""
 PHASE_S = 0.618e-3
 """Between the clocks of two motors whose IDs follow each other: none start at the same moment."""
-CONTROL_S = 1e-3
-"""Period of its position controller, in which the I gain sums the error; not published, and chosen."""
-P_UNIT, I_UNIT, FEEDFORWARD_UNIT = 128.0, 65536.0, 4.0
-"""What the gains are divided by (e-manual): a count of error, or of the trajectory's speed or acceleration,
-gives so many counts of PWM."""
 MODE_ITEMS = (
     "position_p_gain",
     "position_i_gain",
@@ -50,10 +41,6 @@ MODE_ITEMS = (
 )
 """What another operating mode brings back to its initial value."""
 GOALS = ("goal_pwm", "goal_current", "goal_velocity", "goal_position")
-
-
-def _clip(value: float, largest: float) -> float:
-    return max(-largest, min(largest, value))
 
 
 @dataclass
@@ -76,9 +63,10 @@ class Motor:
             self.put(name, item.initial)
         self.put("id", own)
         self.temperature, self._where = AMBIENT_C, 0.0
-        self._power_on()
+        self.reboot()
 
-    def _power_on(self) -> None:
+    def reboot(self) -> None:
+        """Start anew: torque off, errors cleared, RAM at its initial values; what is kept in EEPROM stays."""
         for name, item in self.items.items():
             if item.address >= EEPROM_END and item.writable:
                 self.put(name, item.initial)
@@ -86,13 +74,7 @@ class Motor:
         self._clock = self.id * PHASE_S % TICK_S
         self._strained = self._silence = 0.0
         self._turns = 0
-        self._follow(self._where)
         self._count_one_turn()
-        self.registered: tuple[int, bytes] | None = None
-
-    def reboot(self) -> None:
-        """Start anew: torque off, errors cleared, RAM at its initial values; what is kept in EEPROM stays."""
-        self._power_on()
 
     def get(self, name: str) -> int:
         """Value of an item."""
@@ -116,16 +98,6 @@ class Motor:
         """Whether an error has taken the torque away; only a reboot gives it back."""
         return bool(self.get("hardware_error_status") & self.get("shutdown"))
 
-    @property
-    def secondary_id(self) -> int | None:
-        """A further ID to which it listens without an answer, if it has one."""
-        id = self.get("secondary_id")
-        return id if id <= LAST_SECONDARY_ID and id != self.id else None
-
-    def _follow(self, angle: float) -> None:
-        """Begin a trajectory at rest at an angle of the axis [rad]."""
-        self._path, self._speed, self._acceleration, self._summed = angle, 0.0, 0.0, 0.0
-
     def _count_one_turn(self) -> None:
         """Count angles anew within one turn, as when switched on: turned by hand it has counted on."""
         self._turns = to_counts(self._where) // COUNTS_PER_TURN
@@ -137,8 +109,8 @@ class Motor:
             return Failure.LENGTH, b""
         return Failure.NONE, bytes(self.memory[address : address + length])
 
-    def write(self, address: int, data: bytes, *, secondary: bool = False) -> Failure:
-        """Write whole items; all or, with an error, none; as ``secondary`` ID nothing that is kept."""
+    def write(self, address: int, data: bytes) -> Failure:
+        """Write whole items; all or, with an error, none."""
         changes: list[tuple[str, int]] = []
         if not data:
             return Failure.LENGTH
@@ -150,8 +122,6 @@ class Motor:
                 return Failure.LENGTH
             value = item.from_bytes(data[: item.size])
             failure = self._refusal(name, value)
-            if secondary and address < EEPROM_END:
-                failure = Failure.ACCESS
             if failure:
                 return failure
             changes.append((name, value))
@@ -194,55 +164,19 @@ class Motor:
         """An instruction came for this motor."""
         self._silence = 0.0
 
-    def drive(self, seconds: float) -> Drive:
-        """What the motor does with its axis in the next seconds."""
-        power = min(abs(self.get("goal_pwm")), self.get("pwm_limit")) / FULL_PWM
+    def drive(self) -> Drive:
+        """What the motor does with its axis; profiles, I gain and feed-forward are not simulated."""
         limit = min(self.get("current_limit"), self.model.current_limit) * self.model.current_unit_a
         goal: float | None = None
         if self.get("torque_enable"):
             turns = 2.0 * math.pi * self._turns
-            self._plan(to_angle(self.get("goal_position")) + turns, seconds)
-            goal = self._path + self._push(seconds, power)
-        else:
-            self._follow(self._where)
+            goal = to_angle(self.get("goal_position")) + turns
         return Drive(
             goal_rad=goal,
             p_gain=float(self.get("position_p_gain")),
             velocity_limit=self.get("velocity_limit") * RAD_S_PER_COUNT,
             torque_limit=limit * self.model.torque_nm_per_a,
-            power=power,
         )
-
-    def _plan(self, goal: float, seconds: float) -> None:
-        """Go on with the trajectory to a goal [rad]: a step, or a profile of speed and acceleration."""
-        fastest = self.get("profile_velocity") * RAD_S_PER_COUNT
-        if fastest == 0.0:  # no profile, whatever its acceleration (e-manual)
-            self._path, self._speed, self._acceleration = goal, 0.0, 0.0
-            return
-        hardest = self.get("profile_acceleration") * RAD_S2_PER_COUNT or math.inf
-        left, before = goal - self._path, self._speed
-        wanted = math.copysign(min(fastest, math.sqrt(2.0 * hardest * abs(left))), left)
-        change = hardest * seconds
-        self._speed += _clip(wanted - self._speed, change)
-        step = self._speed * seconds
-        if abs(step) >= abs(left) and step * left >= 0.0:
-            step, self._speed = left, 0.0
-        self._path += step
-        self._acceleration = (self._speed - before) / seconds
-
-    def _push(self, seconds: float, power: float) -> float:
-        """What I gain and feed-forward add to the error of position [rad], no more than the full PWM."""
-        p_gain = self.get("position_p_gain") / P_UNIT
-        if p_gain == 0.0:
-            return 0.0
-        i_gain = self.get("position_i_gain") / I_UNIT
-        largest = power * FULL_PWM / p_gain * RAD_PER_COUNT
-        self._summed += i_gain / p_gain * (self._path - self._where) * seconds / CONTROL_S
-        self._summed = _clip(self._summed, largest)  # else it would wind up
-        speed = self.get("feedforward_1st_gain") * self._speed / RAD_S_PER_COUNT
-        acceleration = self.get("feedforward_2nd_gain") * self._acceleration / RAD_S2_PER_COUNT
-        forward = (speed + acceleration) / FEEDFORWARD_UNIT / p_gain * RAD_PER_COUNT
-        return _clip(self._summed + forward, largest)
 
     def sense(self, seconds: float, position: float, velocity: float, torque: float) -> None:
         """Take in the state of the axis after ``seconds`` more, and protect the motor.

@@ -20,8 +20,8 @@ from vd.kernels.task.actions import limit_joint_velocity_kernel
 from vd.paper import PAPER
 from vd.sim.actuators import JointServo, has_effects
 from vd.sim.cfg import SimCfg
-from vd.sim.scene import SHAPE_TABLE, Scene, add_table, build_hand, build_scene, new_builder
-from vd.sim.simulator import AWAY_M, make_solver
+from vd.sim.scene import Scene, add_table, build_hand, build_scene, new_builder
+from vd.sim.simulator import make_solver
 
 SHORTEST_COMMAND_S = 0.0025
 """Commands do not come more often, or some of those that are delayed are lost: two for each goal."""
@@ -75,8 +75,7 @@ class NewtonHand:
         self._pair_s, self._rest = 2.0 * cfg.physics_dt, 0.0
         self._pulled = np.zeros(self._axes)
         self._stiffness, self._damping = np.zeros(self._axes), np.zeros(self._axes)
-        self._strongest = hand.effort
-        self._gains: tuple[tuple[float, float, float], ...] = ()
+        self._gains: tuple[tuple[float, float], ...] = ()
         self._write(self._state.joint_q, self._target)
         if item is not None:
             self.place_object((0.0, 0.0, 0.0, 1.0))
@@ -117,15 +116,6 @@ class NewtonHand:
         self._write(self._state.joint_qd, np.zeros(6), self._axes)
         # The solver warm-starts from the last accelerations, which mean nothing after a jump.
         self._solver.reset(self._state, flags=newton.StateFlags(0))
-
-    def place_table(self, *, present: bool) -> None:
-        """Put the table where it belongs, or out of reach of everything."""
-        assert self.scene is not None
-        shapes = self._solver.mjc_geom_to_newton_shape.numpy()
-        table = (shapes >= 0) & (self.scene.shape_kind[shapes] == SHAPE_TABLE)
-        places = self._solver.mjw_data.geom_xpos.numpy()
-        places[..., 2] = np.where(table, PAPER.scene.table_top_m if present else AWAY_M, places[..., 2])
-        self._solver.mjw_data.geom_xpos.assign(places)
 
     @staticmethod
     def _write(array: wp.array, values: Sequence[float] | np.ndarray, first: int = 0) -> None:
@@ -174,7 +164,7 @@ class NewtonHand:
         self._set_gains(drives)
         goals = np.array([np.nan if drive.goal_rad is None else drive.goal_rad for drive in drives])
         self._target = np.where(np.isnan(goals), self._target, self.joints.to_joint(goals))
-        fastest = [drive.power * drive.velocity_limit for drive in drives]
+        fastest = [drive.velocity_limit for drive in drives]
         self._limits.assign(np.minimum(fastest, self.hand.velocity_limit))
         seconds = min(seconds, LONGEST_S)
         while self._rest + seconds >= self._pair_s:
@@ -207,7 +197,7 @@ class NewtonHand:
         q, qd = self.joint_q[: self._axes].astype(float), self.joint_qd[: self._axes].astype(float)
         reference = self._held if self._servo is None else self._servo.reference.numpy()[0]
         torque = self._stiffness * (reference - q) - self._damping * qd
-        torque = np.clip(torque, -self._strongest, self._strongest)
+        torque = np.clip(torque, -self.hand.effort, self.hand.effort)
         if self._servo is not None:  # late, or with an offset
             q = self._servo.measured_q.numpy()[0].astype(float)
             qd = self._servo.measured_qd.numpy()[0].astype(float)
@@ -217,15 +207,13 @@ class NewtonHand:
         return self.joints.to_motor(q), sign * qd, sign * torque
 
     def _set_gains(self, drives: Sequence[Drive]) -> None:
-        """Tell the solver of gains and limits of torque that changed, and of torque switched on or off."""
-        gains = tuple((drive.p_gain, float(drive.goal_rad is not None), drive.power) for drive in drives)
+        """Tell the solver of gains that changed, and of torque switched on or off."""
+        gains = tuple((drive.p_gain, float(drive.goal_rad is not None)) for drive in drives)
         if gains == self._gains:
             return
         self._gains = gains
-        p_gain, on, power = np.array(gains).T
+        p_gain, on = np.array(gains).T
         scale = on * p_gain / P_GAIN_UNIT
-        self._strongest = self.hand.effort * power
-        self._write(self._model.joint_effort_limit, self._strongest)
         self._stiffness, self._damping = self.hand.kp * scale, self.hand.kd * on
         if self._servo is not None:
             self._servo.power.assign(scale[None].astype(np.float32))

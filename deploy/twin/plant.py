@@ -30,8 +30,6 @@ class Drive:
     """Largest speed [rad/s]."""
     torque_limit: float
     """Largest torque [N m]."""
-    power: float = 1.0
-    """Share of the supply's voltage that it may use, and so of the torque and the speed that it can give."""
 
 
 class Plant(Protocol):
@@ -70,12 +68,11 @@ class FirstOrderPlant:
                 continue
             error = drive.goal_rad - self.position[axis]
             stiffness = STIFFNESS_NM * drive.p_gain / P_GAIN_UNIT
-            largest = drive.power * drive.torque_limit
-            self._torque[axis] = np.clip(stiffness * error, -largest, largest)
+            self._torque[axis] = np.clip(stiffness * error, -drive.torque_limit, drive.torque_limit)
             lag = max(SHORTEST_LAG_S, LAG_S * P_GAIN_UNIT / drive.p_gain)
             pull = self._torque[axis] / stiffness
             step = 0.0 if self.blocked[axis] else pull * -np.expm1(-seconds / lag)
-            furthest = drive.power * drive.velocity_limit * seconds
+            furthest = drive.velocity_limit * seconds
             step = float(np.clip(step, -furthest, furthest))
             self._velocity[axis] = step / seconds if seconds > 0.0 else 0.0
             self.position[axis] += step

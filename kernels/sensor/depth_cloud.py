@@ -1,16 +1,20 @@
 """From a depth image to a point cloud: crop by height, choose a fixed number of points, carry to the base.
 
-Its points are those of the cells: the image's own pixels, or one of each block.
-Launch order: ``crop_cells_kernel``, ``count_points_kernel``, ``choose_points_kernel``.
+Pixels are gathered in tiles, which have a bit of a word for each of theirs.
+Launch order: ``crop_pixels_kernel``, ``count_points_kernel``, ``choose_points_kernel``.
 """
 
 import warp as wp
 
 from vd.kernels.rng import next_stream
-from vd.kernels.sensor.depth_views import View, cell_pixel, pixel_direction
-from vd.kernels.sensor.raycast import TILE_CELLS, TILE_COLUMNS, TILE_ROWS
+from vd.kernels.sensor.raycast import View, pixel_direction
 
 wp.set_module_options({"enable_backward": False})
+
+TILE_COLUMNS = wp.constant(8)
+TILE_ROWS = wp.constant(4)
+TILE_PIXELS = wp.constant(32)
+"""A tile has one bit of a word for each of its pixels."""
 
 
 @wp.func
@@ -28,38 +32,30 @@ def last_not_above(value: int, world: int, start: int, end: int, sums: wp.array2
 
 
 @wp.kernel
-def crop_cells_kernel(
+def crop_pixels_kernel(
     # Model:
     views: wp.array[View],
     lowest: float,
     highest: float,
-    height: int,
-    width: int,
-    block: int,
     tile_columns: int,
     # In:
     camera_q_in: wp.array[wp.transform],
-    rng_in: wp.array[wp.uint32],
     depth_in: wp.array3d[float],
     # Out:
-    tile_cells_out: wp.array2d[wp.uint32],
+    tile_pixels_out: wp.array2d[wp.uint32],
     tile_first_out: wp.array2d[int],
     row_count_out: wp.array2d[int],
 ):
-    """Mark the cells whose point lies within the crop. Launch: [N, T / tile_columns], the rows of tiles.
+    """Mark the pixels whose point lies within the crop. Launch: [N, T / tile_columns], the rows of tiles.
 
     Args:
         views: Camera of each world, shape [N].
         lowest: Least height of a point in the world frame [m].
         highest: Largest height [m].
-        height: Rows of the image.
-        width: Columns of the image.
-        block: Pixels on a side of a cell.
         tile_columns: Tiles in a row of tiles.
         camera_q_in: Optical frames in the world frame, shape [N].
-        rng_in: Random state of each world, shape [N]; that of the ray casting, not advanced.
-        depth_in: Depth [m], 0 for none, shape [N, R, C].
-        tile_cells_out: Bit k is set if the tile's cell k is within the crop, shape [N, T].
+        depth_in: Depth [m], 0 for none, shape [N, H, W].
+        tile_pixels_out: Bit k is set if the tile's pixel k is within the crop, shape [N, T].
         tile_first_out: Points before each tile in its row of tiles, shape [N, T].
         row_count_out: Points of each row of tiles, shape [N, T / tile_columns].
     """
@@ -71,24 +67,22 @@ def crop_cells_kernel(
     eye_height = wp.transform_get_translation(camera_q)[2]
     rows = depth_in.shape[1]
     columns = depth_in.shape[2]
-    seed = rng_in[world]
     count = wp.int32(0)
     for tile_column in range(tile_columns):
         tile = tile_row * tile_columns + tile_column
         tile_first_out[world, tile] = count
         word = wp.uint32(0)
-        for cell in range(TILE_CELLS):
-            row = tile_row * TILE_ROWS + cell // TILE_COLUMNS
-            column = tile_column * TILE_COLUMNS + cell % TILE_COLUMNS
+        for pixel in range(TILE_PIXELS):
+            row = tile_row * TILE_ROWS + pixel // TILE_COLUMNS
+            column = tile_column * TILE_COLUMNS + pixel % TILE_COLUMNS
             if row < rows and column < columns:
                 depth = depth_in[world, row, column]
                 if depth > 0.0:
-                    pixel_row, pixel_column = cell_pixel(seed, row, column, columns, block, height, width)
-                    above = wp.dot(up, pixel_direction(view, pixel_column, pixel_row)) * depth + eye_height
+                    above = wp.dot(up, pixel_direction(view, column, row)) * depth + eye_height
                     if above >= lowest and above <= highest:
-                        word = word | (wp.uint32(1) << wp.uint32(cell))
+                        word = word | (wp.uint32(1) << wp.uint32(pixel))
                         count += 1
-        tile_cells_out[world, tile] = word
+        tile_pixels_out[world, tile] = word
     row_count_out[world, tile_row] = count
 
 
@@ -125,15 +119,12 @@ def count_points_kernel(
 def choose_points_kernel(
     # Model:
     views: wp.array[View],
-    height: int,
-    width: int,
-    block: int,
     tile_columns: int,
     # In:
     extrinsics_in: wp.array[wp.transform],
     rng_in: wp.array[wp.uint32],
     depth_in: wp.array3d[float],
-    tile_cells_in: wp.array2d[wp.uint32],
+    tile_pixels_in: wp.array2d[wp.uint32],
     tile_first_in: wp.array2d[int],
     row_first_in: wp.array2d[int],
     available_in: wp.array[int],
@@ -147,14 +138,11 @@ def choose_points_kernel(
 
     Args:
         views: Camera of each world, shape [N].
-        height: Rows of the image.
-        width: Columns of the image.
-        block: Pixels on a side of a cell.
         tile_columns: Tiles in a row of tiles.
         extrinsics_in: Optical frame in the frame of the camera's body (the hand's base), shape [N].
-        rng_in: Random state of each world, shape [N]; that of the ray casting, not advanced.
-        depth_in: Depth [m], 0 for none, shape [N, R, C].
-        tile_cells_in: Cells within the crop, a bit each, shape [N, T].
+        rng_in: Random state of each world, shape [N]; not advanced.
+        depth_in: Depth [m], 0 for none, shape [N, H, W].
+        tile_pixels_in: Pixels within the crop, a bit each, shape [N, T].
         tile_first_in: Points before each tile in its row of tiles, shape [N, T].
         row_first_in: Points before each row of tiles, shape [N, Y].
         available_in: Points within the crop, shape [N].
@@ -173,7 +161,7 @@ def choose_points_kernel(
         # 64 bits: k times the pixels of a large image does not fit 32.
         start = int(wp.int64(k) * wp.int64(available) // wp.int64(capacity))
         end = int(wp.int64(k + 1) * wp.int64(available) // wp.int64(capacity))
-        # Streams of the cells come first.
+        # Streams of the pixels come first.
         rng = wp.rand_init(int(rng_in[world]), rows * columns + k)
         wanted = wp.randi(rng, start, end)
 
@@ -182,18 +170,17 @@ def choose_points_kernel(
     first = tile_row * tile_columns
     tile = last_not_above(wanted, world, first, first + tile_columns, tile_first_in)
     wanted -= tile_first_in[world, tile]
-    word = tile_cells_in[world, tile]
+    word = tile_pixels_in[world, tile]
     chosen = wp.int32(0)
-    for cell in range(TILE_CELLS):
-        if (word & (wp.uint32(1) << wp.uint32(cell))) != wp.uint32(0):
+    for pixel in range(TILE_PIXELS):
+        if (word & (wp.uint32(1) << wp.uint32(pixel))) != wp.uint32(0):
             if wanted == 0:
-                chosen = cell
+                chosen = pixel
             wanted -= 1
 
     row = tile_row * TILE_ROWS + chosen // TILE_COLUMNS
     column = (tile % tile_columns) * TILE_COLUMNS + chosen % TILE_COLUMNS
-    pixel_row, pixel_column = cell_pixel(rng_in[world], row, column, columns, block, height, width)
-    seen = pixel_direction(views[world], pixel_column, pixel_row) * depth_in[world, row, column]
+    seen = pixel_direction(views[world], column, row) * depth_in[world, row, column]
     points_out[world, k] = wp.transform_point(extrinsics_in[world], seen)
 
 
@@ -205,5 +192,5 @@ def next_frame_kernel(
     """Advance the random state of each world, shape [N], past this frame's draws. Launch: [N]."""
     world = wp.tid()
     state = rng[world]
-    wp.randu(state)  # else the next frame's state would be that of one of this frame's cells
+    wp.randu(state)  # else the next frame's state would be that of one of this frame's pixels
     rng[world] = next_stream(state, world)

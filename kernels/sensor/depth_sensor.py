@@ -7,7 +7,7 @@ the matched patch covers near and far, which gives no value or one in between.
 
 import warp as wp
 
-from vd.kernels.sensor.depth_views import EMPTY
+from vd.kernels.sensor.raycast import EMPTY
 
 wp.set_module_options({"enable_backward": False})
 

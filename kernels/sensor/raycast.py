@@ -1,156 +1,279 @@
-"""Depth by ray casting: one ray a pixel against the bounding volume hierarchies of the meshes.
+"""Depth images by ray casting: one thread a triangle, which tests the rays of the pixels it can cover.
 
-Cells are gathered in tiles, and a tile looks only at meshes whose bounds reach into it, nearest first.
+Frames: *optical* is the camera's (x right, y down, z forward); depth is z of that frame, along the optical
+axis, not along the ray. Pixel (column, row) is seen along its centre, (column + 0.5, row + 0.5); the
+principal point is measured from the top left corner of the image. Metres, quaternions xyzw.
 
-Launch order: ``place_camera_kernel``, ``place_meshes_kernel``, then ``order_shapes_kernel``,
-``cull_tiles_kernel``, ``raycast_kernel``, and ``finish_depth_kernel`` (:mod:`vd.kernels.sensor.depth_views`).
+A mesh of the size of these covers few pixels with each triangle. A pixel is covered if the ray through its
+centre meets the triangle, tested without dividing by depth, so that triangles beside and behind the camera
+need no clipping.
+
+Launch order: ``place_camera_kernel``, ``place_meshes_kernel``, then ``depth.fill_(NO_HIT)``,
+``cast_rays_kernel`` and ``finish_depth_kernel``.
 """
 
 import warp as wp
 
-from vd.kernels.sensor.depth_views import NO_HIT, View, cell_pixel, pixel_direction
-
 wp.set_module_options({"enable_backward": False})
 
-TILE_COLUMNS = wp.constant(8)
-TILE_ROWS = wp.constant(4)
-TILE_CELLS = wp.constant(32)
-"""A tile has one bit of a word, and one thread of a warp, for each of its cells."""
+NO_HIT = wp.constant(1.0e9)
+"""Depth of nothing while the nearest surface is looked for [m]."""
 
-RAY_BLOCK = 128
-"""Threads of a block of rays on a GPU. The search keeps many registers: five such blocks fit a multiprocessor
-of 64 k registers almost without spilling, where two of 256 threads would without the bound."""
+EMPTY = wp.constant(0.0)
+"""Depth in a finished image where nothing was measured."""
 
-MAX_SHAPES = 32
-"""Shapes of a world: one bit of a tile's word each."""
+TINY = wp.constant(1.0e-9)
+"""Stands in for a zero component of a direction, so that its reciprocal is finite."""
+
+MARGIN = wp.constant(1.0e-3)
+"""Pixels by which a triangle's bounds are widened: above the rounding of a projection."""
+
+
+@wp.struct
+class View:
+    """A pinhole camera: focal lengths and principal point [pixel], nearest and farthest depth [m].
+
+    What is nearer than the range is opaque, but has no depth.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    near: float
+    far: float
+
+
+@wp.func
+def pixel_direction(view: View, column: int, row: int) -> wp.vec3:
+    """Direction through the centre of a pixel in the optical frame, z = 1: times depth it is the point."""
+    return wp.vec3(
+        (float(column) + 0.5 - view.cx) / view.fx,
+        (float(row) + 0.5 - view.cy) / view.fy,
+        1.0,
+    )
+
+
+@wp.func
+def box_depth(origin: wp.vec3, direction: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> float:
+    """Multiple of ``direction`` at which a ray enters a box; NO_HIT if it misses or starts inside."""
+    enter = wp.float32(0.0)
+    leave = wp.float32(NO_HIT)
+    for axis in range(3):
+        step = direction[axis]
+        if wp.abs(step) < TINY:
+            step = TINY
+        a = (lower[axis] - origin[axis]) / step
+        b = (upper[axis] - origin[axis]) / step
+        enter = wp.max(enter, wp.min(a, b))
+        leave = wp.min(leave, wp.max(a, b))
+    if enter > leave or enter <= 0.0:
+        return NO_HIT
+    return enter
 
 
 @wp.kernel
-def order_shapes_kernel(
-    # In:
-    nearest_in: wp.array2d[float],
-    # Out:
-    order_out: wp.array2d[int],
-):
-    """Shapes of each world from near to far, shape [N, S]. Launch: [N, S]."""
-    world, shape = wp.tid()
-    mine = nearest_in[world, shape]
-    rank = wp.int32(0)
-    for other in range(nearest_in.shape[1]):
-        theirs = nearest_in[world, other]
-        if theirs < mine or (theirs == mine and other < shape):
-            rank += 1
-    order_out[world, rank] = shape
-
-
-@wp.kernel
-def cull_tiles_kernel(
+def place_camera_kernel(
     # Model:
-    block: int,
-    tile_columns: int,
+    camera_body: int,
     # In:
-    window_in: wp.array2d[wp.vec4],
-    order_in: wp.array2d[int],
+    extrinsics_in: wp.array[wp.transform],
+    body_q_in: wp.array2d[wp.transform],
     # Out:
-    tile_shapes_out: wp.array2d[wp.uint32],
+    camera_q_out: wp.array[wp.transform],
 ):
-    """Mark the shapes that a tile has to look at. Launch: [N, T].
+    """Pose of each world's optical frame in the world frame, shape [N]. Launch: [N].
 
     Args:
-        block: Pixels on a side of a cell.
-        tile_columns: Tiles in a row of tiles.
-        window_in: Pixels that each shape's bounds cover, shape [N, S].
-        order_in: Shapes from near to far, shape [N, S].
-        tile_shapes_out: Bit k is set if shape ``order_in[world, k]`` may be seen in the tile, shape [N, T].
+        camera_body: Body that carries the camera, an index within a world; negative for the world itself.
+        extrinsics_in: Optical frame in the frame of that body, shape [N].
+        body_q_in: Body poses in the world frame, shape [N, B].
+        camera_q_out: Optical frame in the world frame, shape [N].
     """
-    world, tile = wp.tid()
-    left = float((tile % tile_columns) * TILE_COLUMNS * block)
-    top = float((tile // tile_columns) * TILE_ROWS * block)
-    right = left + float(TILE_COLUMNS * block)
-    bottom = top + float(TILE_ROWS * block)
-    word = wp.uint32(0)
-    for rank in range(order_in.shape[1]):
-        window = window_in[world, order_in[world, rank]]
-        if window[0] <= right and window[2] >= left and window[1] <= bottom and window[3] >= top:
-            word = word | (wp.uint32(1) << wp.uint32(rank))
-    tile_shapes_out[world, tile] = word
+    world = wp.tid()
+    pose = extrinsics_in[world]
+    if camera_body >= 0:
+        pose = wp.transform_multiply(body_q_in[world, camera_body], pose)
+    camera_q_out[world] = pose
 
 
-@wp.kernel(launch_bounds=(RAY_BLOCK, 5))
-def raycast_kernel(
+@wp.kernel
+def place_meshes_kernel(
+    # Model:
+    shape_body: wp.array[int],
+    # In:
+    camera_q_in: wp.array[wp.transform],
+    body_q_in: wp.array2d[wp.transform],
+    # Out:
+    rotation_out: wp.array2d[wp.mat33],
+    position_out: wp.array2d[wp.vec3],
+):
+    """Place every mesh before its camera. Launch: [N, S].
+
+    Args:
+        shape_body: Body that carries each shape, an index within a world; negative for the world, shape [S].
+        camera_q_in: Optical frames in the world frame, shape [N].
+        body_q_in: Body poses in the world frame, shape [N, B].
+        rotation_out: Rotation from mesh to optical frame, shape [N, S].
+        position_out: Origin of the mesh frame in the optical frame [m], shape [N, S].
+    """
+    world, shape = wp.tid()
+    pose = wp.transform_inverse(camera_q_in[world])
+    body = shape_body[shape]
+    if body >= 0:
+        pose = wp.transform_multiply(pose, body_q_in[world, body])
+    rotation_out[world, shape] = wp.quat_to_matrix(wp.transform_get_rotation(pose))
+    position_out[world, shape] = wp.transform_get_translation(pose)
+
+
+@wp.func
+def edge_normal(a: wp.vec3, b: wp.vec3, index_a: int, index_b: int) -> wp.vec3:
+    """Normal of the plane through the camera and an edge; exactly opposite for the edge turned around.
+
+    The two triangles at an edge must agree on which side a ray passes, or rays slip between them; the
+    rounding of a cross product depends on the order of its factors, so the indices choose the order.
+    """
+    if index_a < index_b:
+        first, second, sign = a, b, 1.0
+    else:
+        first, second, sign = b, a, -1.0
+    return wp.cross(first, second) * sign
+
+
+@wp.kernel
+def cast_rays_kernel(
     # Model:
     views: wp.array[View],
-    mesh_id: wp.array[wp.uint64],
+    points: wp.array[wp.vec3],
+    triangles: wp.array[wp.vec3i],
+    mesh_first: wp.array[int],
+    slot_shape: wp.array[int],
+    slot_index: wp.array[int],
     shape_mesh: wp.array2d[int],
     shape_scale: wp.array2d[float],
-    height: int,
-    width: int,
-    block: int,
-    tile_columns: int,
-    lanes: int,
     # In:
     rotation_in: wp.array2d[wp.mat33],
     position_in: wp.array2d[wp.vec3],
-    nearest_in: wp.array2d[float],
-    order_in: wp.array2d[int],
-    tile_shapes_in: wp.array2d[wp.uint32],
-    rng_in: wp.array[wp.uint32],
     # Out:
-    depth_out: wp.array3d[float],
+    depth_bits: wp.array3d[wp.int32],
 ):
-    """Depth of the nearest surface through each cell. Launch: [N, T, lanes].
-
-    The ray is cast in the mesh's own frame with a direction whose optical z is 1, so that its parameter is
-    the depth, whatever the size of the mesh.
+    """Lower the depth of every pixel that a triangle covers. Launch: [N, K].
 
     Args:
         views: Camera of each world, shape [N].
-        mesh_id: Meshes with their hierarchies, shape [M].
+        points: Vertices of all meshes in their frames [m], shape [V].
+        triangles: Vertices of all triangles, mesh after mesh, shape [F].
+        mesh_first: First triangle of each mesh, and the end of the last, shape [M + 1].
+        slot_shape: Shape of each thread, shape [K].
+        slot_index: Number of each thread's triangle within the shape's mesh; there may be fewer, shape [K].
         shape_mesh: Mesh of each shape, shape [N, S].
         shape_scale: Size factor of each shape, shape [N, S].
-        height: Rows of the image.
-        width: Columns of the image.
-        block: Pixels on a side of a cell.
-        tile_columns: Tiles in a row of tiles.
-        lanes: Threads of a tile, 1 to 32.
         rotation_in: Rotation from mesh to optical frame, shape [N, S].
         position_in: Origin of the mesh frame in the optical frame [m], shape [N, S].
-        nearest_in: Depth that no point of the shape is in front of [m], shape [N, S].
-        order_in: Shapes from near to far, shape [N, S].
-        tile_shapes_in: Shapes that each tile has to look at, shape [N, T].
-        rng_in: Random state of each world, shape [N]; not advanced.
-        depth_out: Depth along the optical axis [m], NO_HIT without a surface, shape [N, R, C].
+        depth_bits: Depth [m] as the bits of a float, whose order as integers is that of positive floats, for
+            which devices have an atomic minimum; shape [N, H, W].
     """
-    world, tile, lane = wp.tid()
+    world, slot = wp.tid()
+    shape = slot_shape[slot]
+    mesh = shape_mesh[world, shape]
+    triangle = mesh_first[mesh] + slot_index[slot]
+    if triangle >= mesh_first[mesh + 1]:
+        return
     view = views[world]
-    rows = depth_out.shape[1]
-    columns = depth_out.shape[2]
-    first_row = (tile // tile_columns) * TILE_ROWS
-    first_column = (tile % tile_columns) * TILE_COLUMNS
-    word = tile_shapes_in[world, tile]
-    for cell in range(lane, TILE_CELLS, lanes):
-        row = first_row + cell // TILE_COLUMNS
-        column = first_column + cell % TILE_COLUMNS
-        if row < rows and column < columns:
-            pixel_row, pixel_column = cell_pixel(rng_in[world], row, column, columns, block, height, width)
-            direction = pixel_direction(view, pixel_column, pixel_row)
-            best = wp.float32(NO_HIT)
-            remaining = word
-            rank = wp.int32(0)
-            while remaining != wp.uint32(0):
-                if (remaining & wp.uint32(1)) != wp.uint32(0):
-                    shape = order_in[world, rank]
-                    if nearest_in[world, shape] > best:
-                        break
-                    inverse = wp.transpose(rotation_in[world, shape]) / shape_scale[world, shape]
-                    hit = wp.mesh_query_ray(
-                        mesh_id[shape_mesh[world, shape]],
-                        -(inverse * position_in[world, shape]),
-                        inverse * direction,
-                        best,
-                    )
-                    if hit.result:
-                        best = hit.t
-                remaining = remaining >> wp.uint32(1)
-                rank += 1
-            depth_out[world, row, column] = best
+    rotation = rotation_in[world, shape] * shape_scale[world, shape]
+    position = position_in[world, shape]
+    corner = triangles[triangle]
+    a = rotation * points[corner[0]] + position
+    b = rotation * points[corner[1]] + position
+    c = rotation * points[corner[2]] + position
+    if not (wp.max(a[2], wp.max(b[2], c[2])) > 0.0):  # behind the camera, or no number
+        return
+
+    height = depth_bits.shape[1]
+    width = depth_bits.shape[2]
+    left = wp.int32(0)
+    top = wp.int32(0)
+    right = width
+    bottom = height
+    if wp.min(a[2], wp.min(b[2], c[2])) >= view.near:
+        pa = wp.vec2(a[0] / a[2], a[1] / a[2])
+        pb = wp.vec2(b[0] / b[2], b[1] / b[2])
+        pc = wp.vec2(c[0] / c[2], c[1] / c[2])
+        least = wp.min(pa, wp.min(pb, pc))
+        largest = wp.max(pa, wp.max(pb, pc))
+        # Pixel k is seen along k + 0.5. Clamped before the cast: a far column need not fit an integer.
+        last_column, last_row = float(width) - 1.0, float(height) - 1.0
+        left = int(wp.ceil(wp.clamp(view.cx + view.fx * least[0] - MARGIN - 0.5, 0.0, last_column + 1.0)))
+        top = int(wp.ceil(wp.clamp(view.cy + view.fy * least[1] - MARGIN - 0.5, 0.0, last_row + 1.0)))
+        right = int(wp.floor(wp.clamp(view.cx + view.fx * largest[0] + MARGIN - 0.5, -1.0, last_column))) + 1
+        bottom = int(wp.floor(wp.clamp(view.cy + view.fy * largest[1] + MARGIN - 0.5, -1.0, last_row))) + 1
+    if left >= right or top >= bottom:
+        return
+
+    # A ray d meets the plane of abc at u a + v b + w c with u : v : w = d.(b x c) : d.(c x a) : d.(a x b),
+    # and the triangle where none of the three has the other sign. The depth comes from the plane's normal, a
+    # product of short vectors and hence exact where these products of long ones are not.
+    na = edge_normal(b, c, corner[1], corner[2])
+    nb = edge_normal(c, a, corner[2], corner[0])
+    nc = edge_normal(a, b, corner[0], corner[1])
+    normal = wp.cross(b - a, c - a)
+    offset = wp.dot(a, normal)
+    if offset < 0.0:
+        na, nb, nc, normal, offset = -na, -nb, -nc, -normal, -offset
+    nearest = wp.min(a[2], wp.min(b[2], c[2]))
+    farthest = wp.max(a[2], wp.max(b[2], c[2]))
+    across = 1.0 / view.fx
+    for row in range(top, bottom):
+        # Along a row the direction is (x, y, 1) with x alone changing.
+        y = (float(row) + 0.5 - view.cy) / view.fy
+        ka = na[1] * y + na[2]
+        kb = nb[1] * y + nb[2]
+        kc = nc[1] * y + nc[2]
+        kn = normal[1] * y + normal[2]
+        for column in range(left, right):
+            x = (float(column) + 0.5 - view.cx) * across
+            if na[0] * x + ka >= 0.0 and nb[0] * x + kb >= 0.0 and nc[0] * x + kc >= 0.0:
+                slope = normal[0] * x + kn
+                if slope > 0.0:
+                    bits = wp.cast(wp.clamp(offset / slope, nearest, farthest), wp.int32)
+                    if bits < depth_bits[world, row, column]:
+                        wp.atomic_min(depth_bits, world, row, column, bits)
+
+
+@wp.kernel
+def finish_depth_kernel(
+    # Model:
+    views: wp.array[View],
+    table_lower: wp.vec3,
+    table_upper: wp.vec3,
+    lanes: int,
+    # In:
+    table_in: wp.array[int],
+    camera_q_in: wp.array[wp.transform],
+    # In/Out:
+    depth: wp.array3d[float],
+):
+    """Add the table, and write 0 where nothing is within the camera's range. Launch: [N, H, lanes].
+
+    Args:
+        views: Camera of each world, shape [N].
+        table_lower: Lower corner of the table in the world frame [m].
+        table_upper: Upper corner [m].
+        lanes: Threads of a row.
+        table_in: Whether the table is there, shape [N].
+        camera_q_in: Optical frames in the world frame, shape [N].
+        depth: Depth of the nearest mesh along the optical axis [m], then of anything, shape [N, H, W].
+    """
+    world, row, lane = wp.tid()
+    view = views[world]
+    camera_q = camera_q_in[world]
+    eye = wp.transform_get_translation(camera_q)
+    rotation = wp.quat_to_matrix(wp.transform_get_rotation(camera_q))
+    for column in range(lane, depth.shape[2], lanes):
+        best = depth[world, row, column]
+        if table_in[world] != 0:
+            direction = rotation * pixel_direction(view, column, row)
+            best = wp.min(best, box_depth(eye, direction, table_lower, table_upper))
+        if best < view.near or best > view.far:
+            best = EMPTY
+        depth[world, row, column] = best

@@ -2,8 +2,8 @@
 
 The plain model is the paper's: torque = kp (command - q) - kd qd, a velocity limit, the drive's
 armature. Every effect of :data:`vd.kernels.servo.effects.EFFECTS` changes one stage of it and is off at its
-neutral value; with all off, :func:`servo` returns the command itself, kp, kd, no friction and no
-torque, bit for bit. The same functions run in the gap workflow's rollouts and in the simulator: both
+neutral value; with all off, the command itself is the reference, with kp, kd, no friction and no torque,
+bit for bit. The same functions run in the gap workflow's rollouts and in the simulator: both
 apply ``stiffness (reference - q) - damping qd + torque`` with the damping treated implicitly, and
 ``friction`` as the bound of a dry friction force, so that a light joint holds still at coarse steps.
 Filter and profile give their mean over the step, as does a command that arrives within it.
@@ -299,7 +299,7 @@ def rest_play(
     Args:
         command: Command in force [rad].
         position: Position at which the joint rests [rad].
-        load: Torque on the joint besides the drive's and :func:`servo`'s own gravity load [N m].
+        load: Torque on the joint besides the drive's and :func:`drive_joint`'s own gravity load [N m].
         power: As in :func:`drive_joint`; with the torque off the play stays at the command.
         parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
         row: The joint's row.
@@ -436,34 +436,3 @@ def drive_joint(
     result.motor = carried
     result.motor_damping = wp.sign(motor[0]) * damping
     return result
-
-
-@wp.func
-def servo(
-    command: float,
-    coupled: float,
-    position: float,
-    speed: float,
-    power: float,
-    dt: float,
-    parameters: Any,
-    row: int,
-    state: wp.array2d[float],
-) -> Servo:
-    """One time step of a joint's servo: :func:`shape_command`, then :func:`drive_joint`.
-
-    Args:
-        command: Commanded position, already delayed, its mean over the step [rad].
-        coupled: Sum of the other joints' positions times this joint's coupling row [rad].
-        position: As in :func:`drive_joint`.
-        speed: As in :func:`drive_joint`.
-        power: As in :func:`drive_joint`.
-        dt: Time step [s].
-        parameters: Parameter rows, shape [R, PARAMETER_COLUMNS].
-        row: The joint's row.
-        state: State rows, shape [R, STATE_COLUMNS]; the joint's row is advanced.
-    """
-    reference = shape_command(command, dt, parameters, row, state) + coupled
-    return drive_joint(
-        reference, reference, 0.0, position, speed, power, dt, NO_EFFORT_LIMIT, parameters, row, state
-    )

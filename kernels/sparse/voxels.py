@@ -398,11 +398,11 @@ def voxelise(points: wp.array, voxel_size: float, noise: NoiseDraw | None = None
     Raises:
         ValueError: The voxel size is not positive, or there are too many points or clouds.
     """
-    return _voxelise(points, voxel_size, noise, None)[0]
+    return voxelise_marked(points, voxel_size, None, noise)[0]
 
 
 def voxelise_marked(
-    points: wp.array, voxel_size: float, ends: wp.array, noise: NoiseDraw | None = None
+    points: wp.array, voxel_size: float, ends: wp.array | None, noise: NoiseDraw | None = None
 ) -> tuple[wp.array, wp.array]:
     """:func:`voxelise`, telling of what the points in each voxel are samples.
 
@@ -410,7 +410,7 @@ def voxelise_marked(
         points: See :func:`voxelise`.
         voxel_size: See :func:`voxelise`.
         ends: Columns of ``points`` at which groups end, one after the other, ascending, int32, shape [C];
-            points after the last are of none.
+            points after the last are of none; None marks nothing.
         noise: See :func:`voxelise`.
 
     Returns:
@@ -419,15 +419,6 @@ def voxelise_marked(
     Raises:
         ValueError: See :func:`voxelise`.
     """
-    keys, marks = _voxelise(points, voxel_size, noise, ends)
-    assert marks is not None
-    return keys, marks
-
-
-def _voxelise(
-    points: wp.array, voxel_size: float, noise: NoiseDraw | None, ends: wp.array | None
-) -> tuple[wp.array, wp.array | None]:
-    """Keys, and marks if there are ``ends``."""
     clouds, per_cloud = points.shape
     count, device = clouds * per_cloud, points.device
     if not voxel_size > 0.0:
@@ -460,16 +451,15 @@ def _voxelise(
     wp.utils.radix_sort_pairs(keys, groups, count, end_bit=CLOUD_SHIFT + clouds.bit_length())
     limit = clouds << CLOUD_SHIFT
     voxels, run = unique_keys(keys, count, limit=limit)
-    if ends is None:
-        return voxels, None
-    marks = wp.zeros((voxels.shape[0], ends.shape[0]), dtype=float, device=device)
-    wp.launch(
-        voxel_mark_kernel,
-        dim=count,
-        inputs=[keys, wp.int64(limit), run, groups],
-        outputs=[marks],
-        device=device,
-    )
+    marks = wp.zeros((voxels.shape[0], 0 if ends is None else ends.shape[0]), dtype=float, device=device)
+    if ends is not None:
+        wp.launch(
+            voxel_mark_kernel,
+            dim=count,
+            inputs=[keys, wp.int64(limit), run, groups],
+            outputs=[marks],
+            device=device,
+        )
     return voxels, marks
 
 

@@ -8,18 +8,6 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel
-def world_mask_kernel(
-    # In:
-    mask_in: wp.array[wp.int32],
-    # Out:
-    mask_out: wp.array[wp.bool],
-):
-    """Turn a 0/1 mask, shape [N], into Newton's, shape [N + 1]; its last entry (global) is untouched."""
-    world = wp.tid()
-    mask_out[world] = mask_in[world] != 0
-
-
-@wp.kernel
 def redraw_mask_kernel(
     # In:
     reset_in: wp.array[wp.int32],
@@ -186,25 +174,6 @@ def record_step_kernel(
     object_pose_out[world] = wp.transform(
         read_vec3(world, object_column, joint_q), read_quat(world, object_column + 3, joint_q)
     )
-
-
-@wp.kernel
-def count_goals_kernel(
-    # In:
-    success: wp.array[wp.int32],
-    fell: wp.array[wp.int32],
-    done: wp.array[wp.int32],
-    # In/Out:
-    counts: wp.array[float],
-):
-    """Add up over worlds: goals ended, goals reached, objects dropped. ``counts`` has shape [3]."""
-    world = wp.tid()
-    if done[world] != 0:
-        wp.atomic_add(counts, 0, 1.0)
-    if success[world] != 0:
-        wp.atomic_add(counts, 1, 1.0)
-    if fell[world] != 0:
-        wp.atomic_add(counts, 2, 1.0)
 
 
 @wp.kernel

@@ -108,10 +108,10 @@ def record_state_kernel(
 @wp.kernel
 def begin_latency_kernel(
     # Model:
-    latency: wp.vec2,
     joints: int,
     slots: int,
     tip_body: wp.array[int],
+    latency: wp.vec2,
     # In:
     mask_in: wp.array[int],
     measured_q_in: wp.array2d[float],
@@ -129,10 +129,10 @@ def begin_latency_kernel(
     """Draw the latency of an episode that begins; its past is its first state. Launch: [N].
 
     Args:
-        latency: Range of the draw [s].
         joints: Joints of the hand, D.
         slots: Rows of each world, L.
         tip_body: Link of each fingertip, shape [G].
+        latency: Range of the draw [s].
         mask_in: 1 where an episode begins, shape [N].
         measured_q_in: As in :func:`record_state_kernel`, and the five after it.
         measured_qd_in: Likewise.
@@ -171,8 +171,8 @@ def recall_state_kernel(
     # Model:
     joints: int,
     slots: int,
-    physics_dt: float,
     tip_body: wp.array[int],
+    physics_dt: float,
     # In:
     latency_in: wp.array[float],
     head_in: wp.array[int],
@@ -190,8 +190,8 @@ def recall_state_kernel(
     Args:
         joints: Joints of the hand, D.
         slots: Rows of each world, L.
-        physics_dt: Time between two rows [s].
         tip_body: Link of each fingertip, shape [G]; only their poses are written.
+        physics_dt: Time between two rows [s].
         latency_in: How late each world is seen [s], at most (L - 1) steps, shape [N].
         head_in: Slot written last, shape [N].
         ring_in: Past states, shape [N L, C].

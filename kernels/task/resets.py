@@ -54,7 +54,7 @@ def episode_kernel(
     # In/Out:
     step_count: wp.array[int],
     goal_steps: wp.array[int],
-    goals_reached: wp.array[int],
+    counts: wp.array[float],
     # Out:
     timed_out_out: wp.array[int],
     done_out: wp.array[int],
@@ -74,7 +74,7 @@ def episode_kernel(
             (evaluation).
         step_count: Control steps since the reset, shape [N].
         goal_steps: Control steps since the goal was given, shape [N].
-        goals_reached: Successes since the reset, shape [N].
+        counts: Goals ended, goals reached and objects lost, over all environments, shape [3]; added to.
         timed_out_out: 1 where the episode ends only by its length, shape [N].
         done_out: 1 where the return ends for the learner: success, fall or time-out, shape [N].
         reset_out: 1 where the world is to be reset, shape [N].
@@ -85,14 +85,18 @@ def episode_kernel(
     fell = fell_in[world] != 0
     steps = step_count[world] + 1
     step_count[world] = steps
-    if success:
-        goals_reached[world] = goals_reached[world] + 1
     goal_steps[world] = goal_steps[world] + 1
 
     at_end = steps >= max_steps
     reset = fell or at_end or (success and hold != 0)
     timed_out_out[world] = wp.where(at_end and not success and not fell, 1, 0)
     done_out[world] = wp.where(success or fell or at_end, 1, 0)
+    if success or fell or at_end:
+        wp.atomic_add(counts, 0, 1.0)
+    if success:
+        wp.atomic_add(counts, 1, 1.0)
+    if fell:
+        wp.atomic_add(counts, 2, 1.0)
     reset_out[world] = wp.where(reset, 1, 0)
     new_goal_out[world] = wp.where(success and not reset, 1, 0)
 
@@ -119,9 +123,9 @@ def reset_kernel(
     smoothed_out: wp.array2d[float],
     step_count_out: wp.array[int],
     goal_steps_out: wp.array[int],
-    goals_reached_out: wp.array[int],
     goal_quat_out: wp.array[wp.quat],
     previous_error_out: wp.array[float],
+    env_mask_out: wp.array[wp.bool],
 ):
     """Reset the worlds of one mask; draw a goal for those of either mask. Launch: [N].
 
@@ -150,12 +154,14 @@ def reset_kernel(
         smoothed_out: Smoothed action, shape [N, D].
         step_count_out: Control steps since the reset, shape [N].
         goal_steps_out: Control steps since the goal was given, shape [N].
-        goals_reached_out: Successes since the reset, shape [N].
         goal_quat_out: Goal orientation, shape [N].
         previous_error_out: Rotation error to the new goal [rad], shape [N].
+        env_mask_out: Whether each environment is reset, as Newton wants it, shape [N + 1]; the last entry, of
+            what is in no environment, stays.
     """
     world = wp.tid()
     reset = reset_in[world] != 0
+    env_mask_out[world] = reset
     if not reset and new_goal_in[world] == 0:
         return
 
@@ -183,7 +189,6 @@ def reset_kernel(
         for i in range(joints + 6):
             joint_qd_out[world, i] = 0.0
         step_count_out[world] = 0
-        goals_reached_out[world] = 0
 
     goal_steps_out[world] = 0
     for joint in range(joints):

@@ -1,8 +1,7 @@
 """Small chains and their rollouts, for the tests of :mod:`vd.kernels.servo.chains`."""
 
 import numpy as np
-import warp as wp
-from kernel_oracle import device_array, unwritten
+from kernel_oracle import device_array, launch, unwritten
 
 from vd.gap.rollout import links_of
 from vd.kernels.servo import actuators as servo
@@ -78,28 +77,29 @@ def roll(
     links = Links() if bodies is None else links_struct(bodies, gravity)
     parameters = np.repeat(rows[:, None], runs, axis=1).reshape(-1, servo.PARAMETER_COLUMNS)
     predicted = unwritten((rolls * count, n), float, device)
-    wp.launch(
+    launch(
         rollout_kernel,
-        dim=rolls,
-        inputs=[
+        rolls,
+        [
             samples,
             by_roll(np.arange(runs) * count),
             by_roll(np.full(runs, count)),
-            device_array(np.arange(rolls) * count, int, device),
+            np.arange(rolls) * count,
             by_roll(np.arange(runs)),
             by_roll(start, float),
             by_roll(np.full(runs, -1)),
-            device_array(np.arange(n), int, device),
-            device_array(np.full(n, -stops), float, device),
-            device_array(np.full(n, stops), float, device),
-            device_array(np.full(n, effort), float, device),
+            np.arange(n),
+            np.full(n, -stops),
+            np.full(n, stops),
+            np.full(n, effort),
             int(bodies is not None),
             links,
-            device_array(parameters, float, device),
+            parameters,
             dt,
+            unwritten((rolls, n, servo.STATE_COLUMNS), float, device),
+            predicted,
         ],
-        outputs=[unwritten((rolls, n, servo.STATE_COLUMNS), float, device), predicted],
-        device=device,
+        device,
     )
     result = predicted.numpy().astype(float)
     assert np.isfinite(result).all(), "a sample was not written, or is no number"

@@ -25,6 +25,17 @@ def device_array(value: object, dtype: object, device: str) -> wp.array:
     return wp.array(np.ascontiguousarray(value), dtype=dtype, device=device)
 
 
+def launch(kernel: wp.Kernel, dim: object, arguments: list, device: str) -> None:
+    """Launch ``kernel``; what is not on the device is copied to arrays of the types that it declares."""
+    values = [
+        device_array(value, argument.type.dtype, device)
+        if wp.types.is_array(argument.type) and not isinstance(value, wp.array)
+        else value
+        for argument, value in zip(kernel.adj.args, arguments, strict=True)
+    ]
+    wp.launch(kernel, dim=dim, inputs=values, device=device)
+
+
 def unwritten(shape: int | tuple[int, ...], dtype: object, device: str) -> wp.array:
     """An array of NaN, or of ``SENTINEL`` for integers, so that a cell a kernel missed is seen."""
     array = wp.empty(shape, dtype=dtype, device=device)

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, device_array, unwritten
+from kernel_oracle import EXAMPLES, device_array, launch, unwritten
 
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.effects import BASELINE, EFFECTS, neutral_row
@@ -25,7 +25,6 @@ floats = st.floats
 @wp.kernel
 def step_kernel(
     command: wp.array2d[float],
-    coupled: wp.array[float],
     position: wp.array[float],
     speed: wp.array[float],
     power: wp.array[float],
@@ -39,8 +38,19 @@ def step_kernel(
     row = wp.tid()
     servo.start_servo(command[row, 0], position[row], row, state)
     for k in range(steps):
-        drive = servo.servo(
-            command[row, k], coupled[row], position[row], speed[row], power[row], dt, parameters, row, state
+        reference = servo.shape_command(command[row, k], dt, parameters, row, state)
+        drive = servo.drive_joint(
+            reference,
+            reference,
+            0.0,
+            position[row],
+            speed[row],
+            power[row],
+            dt,
+            servo.NO_EFFORT_LIMIT,
+            parameters,
+            row,
+            state,
         )
         out[row, k, 0] = drive.reference
         out[row, k, 1] = drive.stiffness
@@ -52,7 +62,7 @@ def step_kernel(
 REFERENCE, STIFFNESS, DAMPING, TORQUE, FRICTION = range(5)
 
 
-def steps_of(device, rows, command, position=0.0, speed=0.0, *, coupled=0.0, power=1.0, dt=DT):
+def steps_of(device, rows, command, position=0.0, speed=0.0, *, power=1.0, dt=DT):
     """Run the servos of rows [R, P] through commands [T] or [R, T]: out [R, T, 5], final state [R, S]."""
     rows = np.atleast_2d(rows)
     count = len(rows)
@@ -61,16 +71,10 @@ def steps_of(device, rows, command, position=0.0, speed=0.0, *, coupled=0.0, pow
     out = unwritten((count, command.shape[1], 5), float, device)
     each = [
         device_array(np.broadcast_to(v, count).astype(np.float32), float, device)
-        for v in (coupled, position, speed, power)
+        for v in (position, speed, power)
     ]
     parameters = device_array(rows, float, device)
-    wp.launch(
-        step_kernel,
-        dim=count,
-        inputs=[device_array(command, float, device), *each, command.shape[1], dt, parameters],
-        outputs=[state, out],
-        device=device,
-    )
+    launch(step_kernel, count, [command, *each, command.shape[1], dt, parameters, state, out], device)
     assert np.isfinite(out.numpy()).all() and np.isfinite(state.numpy()).all(), "not written, or no number"
     return out.numpy(), state.numpy()
 
@@ -138,88 +142,6 @@ def test_the_table_names_every_column_once():
 # --- The command ---
 
 
-@EXAMPLES
-@given(tau=floats(0.001, 1.0), seed=st.integers(0, 2**31), dt=st.sampled_from([1 / 120, 1 / 480]))
-def test_the_filter_is_exact_between_commands(device, tau, seed, dt):
-    command = np.random.default_rng(seed).uniform(-1, 1, 12)
-    out, state = steps_of(device, row_of(FILTER_TAU=tau), command, dt=dt)
-    value, means = command[0], []
-    for target in command:
-        # The integral of target + (value - target) exp(-t / tau), by Gauss-Legendre quadrature.
-        nodes, weights = np.polynomial.legendre.leggauss(20)
-        t = 0.5 * dt * (nodes + 1)
-        means.append(0.5 * weights @ (target + (value - target) * np.exp(-t / tau)))
-        value = target + (value - target) * np.exp(-dt / tau)
-    np.testing.assert_allclose(out[0, :, REFERENCE], means, atol=5e-5)
-    np.testing.assert_allclose(state[0, servo.STATE_FILTERED], value, atol=1e-5)
-
-
-@EXAMPLES
-@given(limit=floats(0.5, 300.0), way=floats(-1.5, 1.5))
-def test_a_profile_takes_the_least_time_and_stops(device, limit, way):
-    if abs(way) < 1e-3:
-        return
-    least = 2 * np.sqrt(abs(way) / limit)
-    count = int(1.2 * least / DT) + 10
-    command = np.full(count, way)
-    command[0] = 0.0  # the start
-    out, state = steps_of(device, row_of(ACCELERATION_LIMIT=limit), command)
-    # The middle of step k is at time (k - 1/2) dt after the command, which comes with step 1.
-    t = np.clip((np.arange(count) - 0.5) * DT, 0.0, least)
-    half = t < least / 2
-    expected = np.where(half, limit * t**2 / 2, abs(way) - limit * (least - t) ** 2 / 2) * np.sign(way)
-    np.testing.assert_allclose(out[0, :, REFERENCE], expected, atol=0.5 * limit * DT**2 + 2e-5)
-    assert state[0, servo.STATE_PROFILE] == pytest.approx(way, abs=1e-5)
-    speed = np.diff(out[0, :, REFERENCE].astype(float)) / DT
-    assert np.abs(np.diff(speed)).max() < limit * DT + 1e-3
-    # In double precision 1e-10 is left. In single, braking at the limit leaves nothing to correct rounding
-    # with: a unit in the last place a step of position (it and its distance to the target are rounded), half
-    # a one of speed, which the position adds up; and the eight roundings under the root of the speed, of
-    # terms up to 2 limit way, where that root vanishes. At most 2e-5 of 200 000 profiles.
-    steps = least / 2 / DT + 2
-    place, rate = np.spacing(np.float32([abs(way), np.sqrt(abs(way) * limit)])).astype(float)
-    root = np.sqrt(8 * np.finfo(np.float32).epsneg * 2 * limit * abs(way))
-    rounding = min(steps * place + 0.25 * steps**2 * DT * rate + 0.5 * DT * root, 3e-5)
-    assert np.abs(out[0, :, REFERENCE]).max() <= abs(way) + rounding, "overshoot beyond single precision"
-
-
-@EXAMPLES
-@given(width=floats(0.0, 0.5), seed=st.integers(0, 2**31))
-def test_backlash_is_the_play_operator(device, width, seed):
-    command = np.cumsum(np.random.default_rng(seed).uniform(-0.2, 0.2, 60))
-    out, _ = steps_of(device, row_of(BACKLASH_WIDTH=width), command)
-    got = out[0, :, REFERENCE]
-    assert (np.abs(got - command) <= width / 2 + 1e-6).all()
-    moves = np.diff(got)
-    touching = np.abs(np.abs(got[1:] - command[1:]) - width / 2) < 1e-5
-    assert (touching | (np.abs(moves) < 1e-7)).all(), "it moves only when pushed"
-    assert (moves[np.abs(moves) > 1e-6] * np.diff(command)[np.abs(moves) > 1e-6] > 0).all()
-
-
-@EXAMPLES
-@given(width=floats(0.0, 0.5), error=floats(-1.0, 1.0), position=floats(-1.0, 1.0))
-def test_the_dead_zone_takes_its_half_width_off_the_error(device, width, error, position):
-    out, _ = steps_of(device, row_of(DEAD_ZONE_WIDTH=width), [position + error], position)
-    expected = 3.0 * np.sign(error) * max(abs(error) - width / 2, 0.0)
-    assert total(out, position, 0.0)[0, 0] == pytest.approx(expected, abs=1e-5)
-
-
-@EXAMPLES
-@given(gain=floats(0.01, 100.0), error=floats(-1.0, 1.0), steps=st.integers(1, 100))
-def test_integral_action_adds_up_the_error(device, gain, error, steps):
-    row = row_of(INTEGRAL_GAIN=gain)
-    out, _ = steps_of(device, row, np.full(steps, error))
-    expected = 3.0 * error + gain * error * DT * np.arange(1, steps + 1)
-    np.testing.assert_allclose(total(out, 0.0, 0.0)[0], expected, rtol=1e-4, atol=1e-6)
-    off, state = steps_of(device, row, np.full(steps, error), power=0.0)
-    assert not total(off, 0.0, 0.0).any() and state[0, servo.STATE_INTEGRAL] == 0.0
-
-
-def test_coupling_moves_the_reference(device):
-    out, _ = steps_of(device, row_of(), [0.25], coupled=0.5)
-    assert out[0, 0, REFERENCE] == 0.75
-
-
 # --- The motor ---
 
 MOTOR = {
@@ -246,129 +168,7 @@ def test_a_loss_of_the_motor_is_its_formula(device, stage, size, error, speed, s
     assert out[0, -1, DAMPING] >= 0.0 and out[0, -1, STIFFNESS] >= 0.0
 
 
-def test_the_torque_speed_line_damps(device):
-    row = row_of(kp=100.0, kd=0.0, STALL_TORQUE=1.0, NO_LOAD_SPEED=4.0)
-    out, _ = steps_of(device, row, [1.0], 0.0, 2.0)
-    assert total(out, 0.0, 2.0)[0, 0] == pytest.approx(0.5)
-    assert out[0, 0, DAMPING] == pytest.approx(0.25), "the slope of the line, for the implicit step"
-
-
-@EXAMPLES
-@given(error=floats(-2.0, 2.0), speed=floats(-9.0, 9.0), idle=floats(0.1, 4.0))
-def test_beyond_the_no_load_speed_nothing_drives_and_nothing_brakes_for_it(device, error, speed, idle):
-    row = row_of(kd=0.0, STALL_TORQUE=0.7, NO_LOAD_SPEED=idle)
-    out, _ = steps_of(device, row, [error], 0.0, speed)
-    torque = total(out, 0.0, speed)[0, 0]
-    assert torque * error >= -1e-6, "the line turned the torque round"
-    if error * speed > 0.0 and abs(speed) >= idle * (1.0 + 1e-6):
-        assert torque == pytest.approx(0.0, abs=1e-6) and out[0, 0, DAMPING] == 0.0
-    assert abs(torque) <= 0.7 + 1e-6
-
-
 # --- Friction ---
 
 
-@EXAMPLES
-@given(
-    coulomb=floats(0, 1),
-    load=floats(0, 0.9),
-    static=floats(0, 1),
-    sliding=floats(0, 1),
-    scale=floats(0.01, 5),
-    plus=floats(0, 1),
-    minus=floats(0, 1),
-    error=floats(-1, 1),
-    speed=floats(-3, 3),
-)
-def test_friction_adds_up_and_each_direction_has_its_own(
-    device, coulomb, load, static, sliding, scale, plus, minus, error, speed
-):
-    row = row_of(
-        COULOMB_TORQUE=coulomb,
-        LOAD_FRICTION=load,
-        STRIBECK_STATIC=static,
-        STRIBECK_SLIDING=sliding,
-        STRIBECK_SPEED=scale,
-        FRICTION_PLUS=plus,
-        FRICTION_MINUS=minus,
-    )
-    out, _ = steps_of(device, row, [error], 0.0, speed)
-    motor = 3.0 * error - 0.3 * speed
-    common = coulomb + load * abs(motor) + sliding + (static - sliding) * np.exp(-((speed / scale) ** 2))
-    free = total(out, 0.0, speed)[0, 0]
-    moving_forward = free - out[0, 0, FRICTION]
-    moving_back = free + out[0, 0, FRICTION]
-    assert moving_forward == pytest.approx(motor - common - plus, abs=2e-5)
-    assert moving_back == pytest.approx(motor + common + minus, abs=2e-5)
-
-
 # --- The load ---
-
-
-@EXAMPLES
-@given(torque=floats(0, 5), phase=floats(-3, 3), position=floats(-3, 3))
-def test_gravity_pulls_to_its_phase(device, torque, phase, position):
-    out, _ = steps_of(device, row_of(GRAVITY_TORQUE=torque, GRAVITY_PHASE=phase), [position], position)
-    assert total(out, position, 0.0)[0, 0] == pytest.approx(-torque * np.sin(position + phase), abs=1e-5)
-
-
-@wp.kernel
-def swing_kernel(
-    angle: float,
-    rate: float,
-    dt: float,
-    parameters: wp.array2d[float],
-    state: wp.array2d[float],
-    angle_out: wp.array2d[float],
-    torque_out: wp.array2d[float],
-):
-    """The second mass of a joint that stands still, started elsewhere. Launch: [R]; out [R, steps]."""
-    row = wp.tid()
-    servo.start_servo(0.0, 0.0, row, state)
-    state[row, servo.STATE_ELASTIC] = angle
-    state[row, servo.STATE_ELASTIC_SPEED] = rate
-    for k in range(angle_out.shape[1]):
-        angle_out[row, k] = state[row, servo.STATE_ELASTIC]
-        load = servo.elastic_load(0.0, 0.0, dt, parameters, row, state)
-        torque_out[row, k] = load[0]
-
-
-@EXAMPLES
-@given(stiffness=floats(0.5, 20.0), damping=floats(0.0, 0.02), inertia=floats(5e-4, 1e-2))
-def test_the_second_mass_swings_like_an_oscillator(device, stiffness, damping, inertia):
-    dt, count, start = 1 / 960, 300, 0.3
-    row = row_of(ELASTIC_STIFFNESS=stiffness, ELASTIC_DAMPING=damping, ELASTIC_INERTIA=inertia)
-    matrix = np.array([[0.0, 1.0], [-stiffness / inertia, -damping / inertia]])
-    values, vectors = np.linalg.eig(matrix)
-    weights = np.linalg.solve(vectors, [start, 0.0])
-    t = np.arange(count) * dt
-    motion = np.real(vectors @ (weights[:, None] * np.exp(values[:, None] * t)))
-    # Leapfrog: the velocity at the start is that of half a step before.
-    rate = np.real(vectors[1] @ (weights * np.exp(-values * dt / 2)))
-    angle, torque = unwritten((1, count), float, device), unwritten((1, count), float, device)
-    wp.launch(
-        swing_kernel,
-        dim=1,
-        inputs=[start, rate, dt, device_array(row[None], float, device)],
-        outputs=[unwritten((1, servo.STATE_COLUMNS), float, device), angle, torque],
-        device=device,
-    )
-    # A phase error of (omega dt)^2 / 24 a radian, over all the time.
-    omega = np.sqrt(stiffness / inertia)
-    tolerance = start * (0.2 * (omega * dt) ** 2 * (1 + omega * t[-1]) + 1e-3)
-    np.testing.assert_allclose(angle.numpy()[0], motion[0], atol=tolerance)
-    expected = stiffness * motion[0] + damping * motion[1]
-    np.testing.assert_allclose(torque.numpy()[0], expected, atol=tolerance * (stiffness + damping * omega))
-
-
-@EXAMPLES
-@given(seed=st.integers(0, 2**31))
-def test_any_parameters_within_their_bounds_give_numbers(device, seed):
-    rng = np.random.default_rng(seed)
-    rows = np.tile(row_of(), (40, 1))
-    for p in (*BASELINE, *(p for effect in EFFECTS.values() for p in effect.parameters)):
-        low = -p.upper if p.signed else p.lower
-        rows[:, p.column] = rng.choice([low, p.upper, p.neutral, p.typical], 40)
-    command = rng.uniform(-3, 3, (40, 30))
-    out, _ = steps_of(device, rows, command, rng.uniform(-3, 3, 40), rng.choice([0.0, -1e2, 1e-6, 5.0], 40))
-    assert (out[..., [STIFFNESS, DAMPING, FRICTION]] >= 0.0).all()

@@ -18,23 +18,6 @@ from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.chains import DIVERGED
 from vd.kernels.servo.effects import EFFECTS, neutral_row
 
-
-@EXAMPLES
-@given(plus=st.floats(0.0, 0.4), minus=st.floats(0.0, 0.4), pull=st.floats(-0.6, 0.6))
-def test_breakaway_is_each_directions_own(device, plus, minus, pull):
-    settings = {servo.FRICTION_PLUS: plus, servo.FRICTION_MINUS: minus, servo.KP: 1.0}
-    if min(abs(pull - plus), abs(pull + minus)) < 2e-3:
-        return
-    time = np.arange(0, 0.5, 0.02)
-    got = one_joint(device, rows_of(settings), time, np.full(len(time), pull))[0]
-    moves = np.sign(pull) if (pull > plus or pull < -minus) else 0.0
-    assert np.sign(got[-1]) == moves
-    # The joint comes to rest, or creeps up to, where the friction of its direction holds the spring.
-    rest = pull - plus if moves > 0 else pull + minus
-    if moves:
-        assert 0.0 < abs(got[-1]) <= abs(rest) + 1e-4
-
-
 # --- Time ---
 
 
@@ -52,17 +35,6 @@ def test_delays_shift_in_time_by_any_fraction_of_a_step(device, delay, read, see
     got, plain = one_joint(device, rows, time, command)
     expected = np.interp(time - delay - read, time, plain)
     assert np.abs(got - expected).max() < 2e-3
-
-
-def test_motion_is_a_smooth_function_of_the_delays(device):
-    rng = np.random.default_rng(3)
-    time, command = excitation(rng)
-    delays = np.linspace(0.01, 0.014, 41)  # two steps of 1/480 s
-    for column in (servo.COMMAND_DELAY, servo.READ_DELAY):
-        got = one_joint(device, rows_of(*({column: d} for d in delays)), time, command)
-        slope = np.diff(got, axis=0) / np.diff(delays)[:, None]
-        size = np.sqrt(np.mean(slope**2))
-        assert np.sqrt(np.mean(np.diff(slope, axis=0) ** 2)) < 0.1 * size
 
 
 def test_commands_act_at_irregular_stamps(device):
@@ -117,34 +89,7 @@ def test_dropped_commands_leave_the_one_before_in_force(device):
     assert one_joint(device, rows_of({servo.JITTER_DROP: 1.0}), time, command).max() < 1e-6
 
 
-def test_torque_off_acts_with_the_command(device):
-    time = np.arange(0, 1.0, 0.01)
-    power = np.where(time < 0.5, 1.0, 0.0)[None, :, None]
-    settings = {servo.GRAVITY_TORQUE: 0.5, servo.KD: 0.05}
-    command = np.full(len(time), 1.0)
-    got = one_joint(device, rows_of(settings), time, command, 0.8, power=power)[0]
-    assert got[40:50].min() > 0.75, "held up by the servo"
-    assert got[50:].min() < 0.1, "falls without it"
-
-
-def test_without_torque_the_servo_does_not_damp(device):
-    time = np.arange(0, 4.0, 0.01)
-    settings = {servo.GRAVITY_TORQUE: 0.5, servo.KD: 0.05}
-    off = np.zeros((1, len(time), 1))
-    got = one_joint(device, rows_of(settings), time, np.zeros(len(time)), 0.8, power=off)[0]
-    assert got[-200:].max() == pytest.approx(0.8, abs=0.02), "swings as high as at first"
-
-
 # --- Bounds ---
-
-
-def test_speed_and_stops_bound_the_motion(device):
-    time = np.arange(0, 1.0, DT)
-    rows = rows_of({servo.VELOCITY_LIMIT: 2.0})
-    got = one_joint(device, rows, time, np.full(len(time), 3.0), stops=1.2)[0]
-    assert np.diff(got).max() / DT == pytest.approx(2.0, rel=1e-3)
-    assert got.max() == pytest.approx(1.2, abs=1e-6)
-    assert got[-1] == got.max()
 
 
 def test_a_coupled_joint_follows_its_neighbour(device):
@@ -174,14 +119,6 @@ def test_any_parameters_within_their_bounds_give_numbers(device, seed, n):
     bodies = random_bodies(rng, n) if rng.random() < 0.5 else None
     got = roll(device, rows, time, commands, np.zeros((1, n)), bodies=bodies)
     assert np.abs(got).max() < 2 * DIVERGED
-
-
-def test_stiff_servos_are_stable_at_any_stiffness(device):
-    time = np.arange(0, 1.0, 0.01)
-    settings = [{servo.KP: kp, servo.KD: 0.05 * kp, servo.INERTIA: 1e-6} for kp in (1.0, 30.0, 1000.0)]
-    got = one_joint(device, rows_of(*settings), time, np.full(len(time), 0.5))
-    np.testing.assert_allclose(got[:, -1], 0.5, atol=1e-3)
-    assert (np.diff(got, axis=1) > -1e-4).all(), "it rings"
 
 
 def test_trajectories_and_sets_do_not_mix(device):

@@ -10,7 +10,6 @@ from kernel_oracle import EXAMPLES, device_array
 from vd.kernels.sparse.coordinate_maps import (
     beside,
     coarsen,
-    hash_table,
     level_counts,
     neighbour_table,
     strided_table,
@@ -140,16 +139,6 @@ def test_voxels_beside_others_are_those_with_one_of_them_about(device, cells, ki
     ]
     parts = (wp.array(part, dtype=wp.bool, device=device) for part in (asked, others))
     assert beside(keys, *parts).numpy().tolist() == expected
-
-
-def test_hash_table_holds_every_key_once(device):
-    cells = np.random.default_rng(0).integers(-60, 60, (4, 5000, 3))
-    keys, rows = sites(cells, device, 0)
-    slot_key, slot_row = (a.numpy() for a in hash_table(keys))
-    used = slot_key >= 0
-    assert used.sum() == len(rows) <= len(slot_key) / 2
-    np.testing.assert_array_equal(keys.numpy()[slot_row[used]], slot_key[used])
-    assert len(set(slot_row[used])) == len(rows)
 
 
 def test_no_sites_give_empty_maps(device):

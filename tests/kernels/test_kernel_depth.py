@@ -1,4 +1,4 @@
-"""Depth by rays and by rasterisation against closed forms and trimesh's ray engine, and each other.
+"""Depth by ray casting against closed forms; against Newton's camera see test_depth_camera.py.
 
 Rule of the silhouette: a pixel is left out of a comparison if the oracle, cast through four points a
 hundredth of a pixel around its centre, does not see one flat surface, or sees it at the very end of the
@@ -6,14 +6,12 @@ camera's range. Single precision cannot say there.
 """
 
 import numpy as np
-import pytest
 import trimesh
 import warp as wp
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, device_array, floats, quaternions
 from scipy.spatial.transform import Rotation
-from trimesh.ray.ray_triangle import ray_triangle_id
 
 from vd.assets_usd.hand_data import CameraModel
 from vd.paper import PAPER
@@ -21,7 +19,6 @@ from vd.sensors.cfg import DepthCameraCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sensors.surfaces import Surface, SurfaceSet
 
-METHODS = ["rays", "raster"]
 WIDTH, HEIGHT = 37, 23  # neither is a multiple of a tile
 NEAR, FAR = 0.0437, 1.5  # no round number: surfaces should not lie there by chance
 DEPTH_TOLERANCE = 2e-6  # metres: single precision at half a metre, and a dozen operations
@@ -51,16 +48,14 @@ def directions(model, shift=(0.0, 0.0)):
     return np.stack([(u - model.cx) / model.fx, (v - model.cy) / model.fy, np.ones_like(u)], axis=-1)
 
 
-def shoot(device, meshes, poses, scales, method, *, model=None, eye=None, table=False):
+def shoot(device, meshes, poses, scales, *, model=None, eye=None, table=False):
     """Depth image [H, W] of meshes at ``poses`` [S, 7]; the camera's pose ``eye`` [7] in the world."""
     count = len(meshes)
     surfaces = SurfaceSet(
         meshes, np.arange(count), np.arange(count)[None], np.asarray(scales)[None], device=device
     )
     body_q = device_array(np.asarray(poses)[None], wp.transform, device)
-    depth_camera = DepthCamera(
-        surfaces, model or camera(), body_q, cfg=DepthCameraCfg(method=method, points=0)
-    )
+    depth_camera = DepthCamera(surfaces, model or camera(), body_q, cfg=DepthCameraCfg(points=0))
     if eye is not None:
         depth_camera.extrinsics.assign(np.asarray(eye, np.float32)[None])
     depth_camera.table.fill_(int(table))
@@ -119,122 +114,42 @@ def box_oracle(pose, scale, half):
     return depth
 
 
-@pytest.mark.parametrize("method", METHODS)
 @EXAMPLES
 @given(place=placements())
-def test_box_by_slabs_from_anywhere_even_inside(device, method, place):
+def test_box_by_slabs_from_anywhere_even_inside(device, place):
     poses, scales = place
-    depth = shoot(device, [solid(BOX)], poses, scales, method)
+    depth = shoot(device, [solid(BOX)], poses, scales)
     compare(depth, box_oracle(poses[0], scales[0], np.array([0.1, 0.06, 0.15])))
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_sphere_within_the_sagitta_of_its_facets(device, method):
-    radius, centre = 0.15, np.array([0.05, -0.03, 0.6])
-    ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    edge = np.linalg.norm(ball.vertices[ball.edges[:, 0]] - ball.vertices[ball.edges[:, 1]], axis=1).max()
-
-    depth = shoot(device, [solid(ball)], [[*centre, 0, 0, 0, 1]], [1.0], method)
-    rays = directions(camera())
-    hit = depth > 0
-    distance = np.linalg.norm(depth[hit, None] * rays[hit] - centre, axis=-1)
-    deepest = edge**2 / (6 * radius)  # middle of an equilateral triangle with its corners on the sphere
-    assert distance.max() < radius + DEPTH_TOLERANCE and distance.min() > radius - 1.1 * deepest
-    # A ray that passes nearer to the centre than any facet's middle hits.
-    through = np.linalg.norm(np.cross(rays, centre), axis=-1) / np.linalg.norm(rays, axis=-1)
-    assert hit[through < radius - 1.1 * deepest].all() and hit.sum() > 100
-    assert (depth[hit] < rays[hit] @ centre).all(), "the near side"
-
-
-@pytest.mark.parametrize("method", METHODS)
 @EXAMPLES
 @given(height=st.floats(0.1, 1.0), tilt=floats((2,), -0.6, 0.6))
-def test_table_is_a_box_seen_from_above(device, method, height, tilt):
+def test_table_is_a_box_seen_from_above(device, height, tilt):
     # Looking down (pi about x), then tilted; the far mesh only fills the set.
     eye_turn = Rotation.from_euler("x", np.pi) * Rotation.from_euler("xy", tilt)
     eye = np.array([0.1, -0.05, height, *eye_turn.as_quat()])
     far_away = [[0.0, 0.0, 100.0, 0, 0, 0, 1]]
-    depth = shoot(device, [solid(BOX)], far_away, [1.0], method, eye=eye, table=True)
+    depth = shoot(device, [solid(BOX)], far_away, [1.0], eye=eye, table=True)
     half = 0.5 * np.array(PAPER.scene.table_size_m)
     middle = np.array([0.0, 0.0, PAPER.scene.table_top_m - half[2]])
     pose = np.concatenate([eye_turn.inv().apply(middle - eye[:3]), eye_turn.inv().as_quat()])
     compare(depth, box_oracle(pose, 1.0, half), atol=1e-5)
-    bare = shoot(device, [solid(BOX)], far_away, [1.0], method, eye=eye, table=False)
+    bare = shoot(device, [solid(BOX)], far_away, [1.0], eye=eye, table=False)
     assert not bare.any()
 
 
-class AllTriangles:
-    """A search tree that finds every triangle: trimesh's own needs a package more."""
-
-    def __init__(self, triangles):
-        flat = triangles.reshape(-1, 3)
-        self.bounds = np.concatenate([flat.min(axis=0), flat.max(axis=0)])
-        self._all = list(range(len(triangles)))
-
-    def intersection(self, _bounds):
-        """Indices of all triangles."""
-        return self._all
-
-
-def trimesh_oracle(meshes, poses, scales):
-    """Nearest depth along each direction by trimesh's ray engine, in float64."""
-
-    def depth(rays):
-        flat = rays.reshape(-1, 3)
-        nearest = np.full(len(flat), np.inf)
-        for mesh, pose, scale in zip(meshes, poses, scales, strict=True):
-            corners = Rotation.from_quat(pose[3:]).apply(scale * mesh.vertices.astype(float)) + pose[:3]
-            triangles = corners[mesh.faces]
-            _, ray, location = ray_triangle_id(
-                triangles, np.zeros_like(flat), flat, tree=AllTriangles(triangles)
-            )
-            if len(ray):
-                np.minimum.at(nearest, ray, location[:, 2])
-        return nearest.reshape(rays.shape[:-1])
-
-    return depth
-
-
-SHAPES = [
-    solid(trimesh.creation.torus(0.1, 0.04, major_sections=12, minor_sections=8)),
-    solid(trimesh.creation.cylinder(0.05, 0.2, sections=10)),
-    solid(trimesh.creation.icosphere(subdivisions=1, radius=0.08)),
-]
-
-
-@pytest.mark.parametrize("method", METHODS)
-@settings(EXAMPLES, max_examples=8)  # trimesh tests every triangle against every ray
-@given(place=placements(count=3))
-def test_several_meshes_by_the_ray_engine_of_trimesh(device, method, place):
-    poses, scales = place
-    model = camera(width=19, height=13, focal=15.0)
-    depth = shoot(device, SHAPES, poses, scales, method, model=model)
-    compare(depth, trimesh_oracle(SHAPES, poses, scales), model, atol=2e-5)
-
-
-@EXAMPLES
-@given(place=placements(count=3))
-def test_both_methods_make_the_same_image(device, place):
-    poses, scales = place
-    rays, raster = (shoot(device, SHAPES, poses, scales, method) for method in METHODS)
-    at_the_limit = np.minimum(np.abs(np.maximum(rays, raster) - NEAR), np.abs(FAR - raster)) < 1e-5
-    assert np.mean((np.abs(rays - raster) < 1e-4) | at_the_limit) > 0.99, "but for silhouettes"
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_closed_surfaces_have_no_cracks(device, method):
+def test_closed_surfaces_have_no_cracks(device):
     # The inside of a sphere of 5120 triangles around the camera: a ray between two of them would show.
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.5)
     model = camera(width=301, height=203, focal=150.0)
     for seed in range(3):
         turn = Rotation.random(random_state=seed).as_quat()
-        depth = shoot(device, [solid(ball)], [[0.02, 0.01, 0.03, *turn]], [1.0], method, model=model)
+        depth = shoot(device, [solid(ball)], [[0.02, 0.01, 0.03, *turn]], [1.0], model=model)
         assert (depth > 0.2).all()
 
 
 def test_range_of_the_camera(device):
-    for method in METHODS:
-        for distance, seen in [(0.04, 0.0), (0.06, 0.06), (1.4, 1.4), (1.6, 0.0)]:
-            plate = solid(trimesh.creation.box(extents=(9.0, 9.0, 0.002)))
-            depth = shoot(device, [plate], [[0, 0, distance + 0.001, 0, 0, 0, 1]], [1.0], method)
-            np.testing.assert_allclose(depth, seen, atol=1e-5)
+    for distance, seen in [(0.04, 0.0), (0.06, 0.06), (1.4, 1.4), (1.6, 0.0)]:
+        plate = solid(trimesh.creation.box(extents=(9.0, 9.0, 0.002)))
+        depth = shoot(device, [plate], [[0, 0, distance + 0.001, 0, 0, 0, 1]], [1.0])
+        np.testing.assert_allclose(depth, seen, atol=1e-5)

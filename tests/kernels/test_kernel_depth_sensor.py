@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from kernel_oracle import (
     ALPHA,
     EXAMPLES,
-    device_array,
     floats,
+    launch,
     quaternions,
     settings_array,
     streams,
@@ -44,13 +44,7 @@ def measure(device, depth, *, seed=0, **effects):
     params = settings_array(DepthSensorParams, device, **{**OFF, **effects})
     params = wp.array(np.repeat(params.numpy(), worlds), dtype=DepthSensorParams, device=device)
     out = unwritten(depth.shape, float, device)
-    wp.launch(
-        measure_depth_kernel,
-        dim=depth.shape,
-        inputs=[params, device_array(depth, float, device), streams(worlds, seed, device)],
-        outputs=[out],
-        device=device,
-    )
+    launch(measure_depth_kernel, depth.shape, [params, depth, streams(worlds, seed, device), out], device)
     return out.numpy().copy()
 
 
@@ -60,12 +54,6 @@ def images(draw):
     shape = (draw(st.integers(1, 2)), draw(st.integers(1, 6)), draw(st.integers(1, 9)))
     depth = draw(floats(shape, 0.2, MAX_RANGE))
     return np.where(draw(floats(shape, 0.0, 1.0)) < 0.2, np.float32(0.0), depth)
-
-
-@EXAMPLES
-@given(depth=images())
-def test_with_everything_off_the_sensor_is_perfect(device, depth):
-    np.testing.assert_allclose(measure(device, depth), depth, rtol=3e-7)
 
 
 @EXAMPLES
@@ -137,20 +125,6 @@ def test_edges_fray_and_nothing_else_does(device):
     assert stats.kstest(place, "uniform").pvalue > ALPHA, "anywhere between the surfaces"
 
 
-def test_the_edge_of_nothing_flies_towards_the_end_of_the_range(device):
-    measured = measure(device, step_image(empty=True), edge_jump=0.02, flying=1.0)
-    assert not measured[:, :, 40:].any(), "nothing appears where nothing was"
-    column = measured[:, :, 39]
-    assert column.min() >= 0.5 - 1e-6 and column.max() > 0.5 + 0.9 * (MAX_RANGE - 0.5)
-    np.testing.assert_allclose(measured[:, :, :39], 0.5, rtol=3e-7)
-
-
-def test_a_slope_below_the_jump_is_no_edge(device):
-    depth = np.broadcast_to(np.linspace(0.3, 1.2, 80), (1, 50, 80))
-    measured = measure(device, depth, edge_jump=0.02, edge_dropout=1.0)
-    np.testing.assert_allclose(measured, depth, rtol=3e-7)
-
-
 @EXAMPLES
 @given(
     near=st.floats(0.3, 0.6),
@@ -189,18 +163,7 @@ def test_late_poses_are_interpolated_between_frames(device, poses, delay):
     history = unwritten((3, 1, 1), wp.transform, device)
     late = unwritten((1, 1), wp.transform, device)
     for k, frame in enumerate(frames):
-        wp.launch(
-            delay_poses_kernel,
-            dim=(1, 1),
-            inputs=[
-                device_array([k], int, device),
-                device_array([delay], float, device),
-                device_array(frame, wp.transform, device),
-                history,
-            ],
-            outputs=[late],
-            device=device,
-        )
+        launch(delay_poses_kernel, (1, 1), [[k], [delay], frame, history, late], device)
     shown = late.numpy()[0, 0]
     when = len(frames) - 1 - delay
     position = [np.interp(when, range(4), [f[0, 0, i] for f in frames]) for i in range(3)]

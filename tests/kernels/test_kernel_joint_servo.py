@@ -4,13 +4,12 @@ import numpy as np
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, device_array, floats, streams, unwritten
+from kernel_oracle import EXAMPLES, device_array, floats, launch, streams, unwritten
 
 from vd.kernels.servo import actuators as servo
 from vd.kernels.servo.effects import neutral_row
 from vd.kernels.servo.joint_servo import (
     finish_joint_kernel,
-    joint_inertia_kernel,
     measure_joint_kernel,
     receive_command_kernel,
     send_command_kernel,
@@ -57,16 +56,10 @@ def test_commands_arrive_after_their_delay(device, commands, start, delay):
     transit = [head, count, value, time]
     for control, command in enumerate(commands):
         both = device_array([[command, command]], float, device)
-        wp.launch(send_command_kernel, dim=1, inputs=[rows, DT, both, state, rng, *transit], device=device)
+        launch(send_command_kernel, 1, [rows, DT, both, state, rng, *transit], device)
         for k in range(SUBSTEPS):
             reference = unwritten((1, joints), float, device)
-            wp.launch(
-                receive_command_kernel,
-                dim=(1, joints),
-                inputs=[rows, DT, state, *transit, held],
-                outputs=[reference],
-                device=device,
-            )
+            launch(receive_command_kernel, (1, joints), [rows, DT, state, *transit, held, reference], device)
             step = control * SUBSTEPS + k
             expected = [mean_of_delayed(commands, start, d, step) for d in (0.0, delay)]
             # The grid resolves a thousandth of a step; commands jump by 4 at most.
@@ -86,7 +79,7 @@ def test_jitter_delays_in_order_and_drops_its_share(device):
     command = wp.zeros((worlds, 1), dtype=float, device=device)
     for _ in range(sends):
         inputs = [rows, DT, command, state, rng, head, count, value, time]
-        wp.launch(send_command_kernel, dim=worlds, inputs=inputs, device=device)
+        launch(send_command_kernel, worlds, [*inputs], device)
     kept = count.numpy()[:, 0]
     # Six standard deviations of a binomial mean.
     assert abs(kept.mean() / sends - 0.75) < 6.0 * np.sqrt(0.75 * 0.25 / (worlds * sends))
@@ -118,12 +111,8 @@ def test_what_is_measured_is_old_limited_and_biased(device, positions, delay, bi
         allowed = float(np.clip(speed, -limit, limit))
         after = position if abs(speed) <= limit else before + allowed * DT
         q, qd = device_array([[position]], float, device), device_array([[speed]], float, device)
-        wp.launch(
-            finish_joint_kernel,
-            dim=(1, 1),
-            inputs=[rows, DT, device_array([[before]], float, device), q, qd, index],
-            outputs=[history, speed_history],
-            device=device,
+        launch(
+            finish_joint_kernel, (1, 1), [rows, DT, [[before]], q, qd, index, history, speed_history], device
         )
         assert np.allclose(qd.numpy(), allowed, rtol=1e-4, atol=1e-4)
         assert np.allclose(q.numpy(), after, atol=1e-4)
@@ -131,27 +120,12 @@ def test_what_is_measured_is_old_limited_and_biased(device, positions, delay, bi
         past.append(before)
         past_speed.append(float(qd.numpy()[0, 0]))
         measured, measured_speed = (unwritten((1, 1), float, device) for _ in range(2))
-        wp.launch(
+        launch(
             measure_joint_kernel,
-            dim=(1, 1),
-            inputs=[rows, DT, index, history, speed_history],
-            outputs=[measured, measured_speed],
-            device=device,
+            (1, 1),
+            [rows, DT, index, history, speed_history, measured, measured_speed],
+            device,
         )
         when = np.arange(-len(past) + 1, 1) * DT
         assert np.allclose(measured.numpy(), np.interp(-delay, when, past) + bias, atol=1e-3)
         assert np.allclose(measured_speed.numpy(), np.interp(-delay, when, past_speed), atol=1e-2)
-
-
-def test_inertia_goes_to_its_joint(device):
-    rows = parameter_rows(6, INERTIA=np.arange(6.0), PAYLOAD_INERTIA=10.0)
-    armature = unwritten((2, 5), float, device)
-    wp.launch(
-        joint_inertia_kernel,
-        dim=(2, 3),
-        inputs=[device_array(rows, float, device)],
-        outputs=[armature],
-        device=device,
-    )
-    assert np.array_equal(armature.numpy()[:, :3], [[10.0, 11.0, 12.0], [13.0, 14.0, 15.0]])
-    assert np.isnan(armature.numpy()[:, 3:]).all()

@@ -3,7 +3,7 @@ import trimesh
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, device_array, pose_matrix, unwritten
+from kernel_oracle import EXAMPLES, device_array, launch, pose_matrix, unwritten
 from scipy.spatial.transform import Rotation
 
 from vd.kernels.sensor.registration import (
@@ -186,10 +186,10 @@ def test_distances_are_those_to_the_mesh_or_to_the_nearest_sample(device, seed):
     samples = device_array(scene.samples, wp.vec3, device)
     mesh = device_array([each.id for each in meshes], wp.uint64, device)
     off = unwritten(samples.shape, float, device)
-    wp.launch(off_mesh_kernel, dim=off.shape, inputs=[samples, mesh], outputs=[off], device=device)
+    launch(off_mesh_kernel, off.shape, [samples, mesh, off], device)
     out = unwritten(scene.distance.shape, float, device)
     inputs = [samples, mesh, device_array(scene.half, float, device), device_array(meshed, int, device)]
-    wp.launch(shape_distance_kernel, dim=out.shape, inputs=inputs, outputs=[out], device=device)
+    launch(shape_distance_kernel, out.shape, [*inputs, out], device)
     for shape, extent in enumerate(extents):
         wanted = np.abs(box_distance(extent, scene.samples[shape]))
         np.testing.assert_allclose(off.numpy()[shape], wanted, atol=1e-6)
@@ -214,7 +214,7 @@ def test_the_nearest_of_each_cell_is_kept(device, seed):
     nearness = wp.zeros((scene.worlds, *CELLS), dtype=float, device=device)
     cloud = device_array(points, wp.vec3, device)
     inputs = [scene.camera(), cloud]
-    wp.launch(nearness_kernel, dim=cloud.shape, inputs=inputs, outputs=[nearness], device=device)
+    launch(nearness_kernel, cloud.shape, [*inputs, nearness], device)
     np.testing.assert_allclose(nearness.numpy(), expected, rtol=1e-5)
 
 
@@ -228,7 +228,7 @@ def test_a_start_puts_the_near_side_where_the_points_are(device, seed, rendered,
     out = unwritten((len(scene.row_world), 4), wp.transform, device)
     inputs = [scene.model(device), scene.camera(), int(rendered), every, row_world]
     inputs += [device_array(first, int, device), device_array(rotations.as_quat(), wp.quat, device)]
-    wp.launch(start_poses_kernel, dim=out.shape, inputs=[*inputs, seen, count], outputs=[out], device=device)
+    launch(start_poses_kernel, out.shape, [*inputs, seen, count, out], device)
     for row, world in enumerate(scene.row_world):
         for c in range(4):
             turn = rotations[(first[row] + c) % 6]
@@ -253,7 +253,7 @@ def test_poses_that_fit_no_more_are_put_where_the_points_are_and_stay_turned(dev
     inputs += [device_array(before, wp.transform, device)]
     inputs += [device_array(values, float, device) for values in (misfit, now)]
     inputs += [seen, count]
-    wp.launch(replace_poses_kernel, dim=out.shape, inputs=inputs, outputs=[out, cost], device=device)
+    launch(replace_poses_kernel, out.shape, [*inputs, out, cost], device)
     for row, world in enumerate(scene.row_world):
         for c in range(poses):
             fits = now[row, c] <= worse * misfit[world, c]
@@ -276,7 +276,7 @@ def test_of_two_attempts_the_better_one_is_taken(device, seed):
     arrays = [device_array(found, wp.transform, device), device_array(cost, float, device)]
     row_world = np.where(np.arange(rows) == 1, -1, scene.row_world)
     inputs = [device_array(row_world, int, device), kept]
-    wp.launch(take_better_kernel, dim=(rows, kept), inputs=inputs, outputs=arrays, device=device)
+    launch(take_better_kernel, (rows, kept), [*inputs, *arrays], device)
     expected, poses = cost.copy(), found.copy()
     for row in np.flatnonzero(row_world >= 0):
         for k in range(kept):
@@ -301,10 +301,10 @@ def test_a_step_solves_the_normal_equations(device, seed, rendered, steps, every
     nearness = scene.nearness if rendered else np.zeros((scene.worlds, 0, 0))
     pose = device_array(scene.pose, wp.transform, device)
     misfit = unwritten(pose.shape, float, device)
-    wp.launch(
+    launch(
         fit_poses_kernel,
-        dim=pose.shape,
-        inputs=[
+        pose.shape,
+        [
             scene.model(device),
             scene.camera(),
             FAR,
@@ -314,10 +314,11 @@ def test_a_step_solves_the_normal_equations(device, seed, rendered, steps, every
             row_world,
             seen,
             count,
-            device_array(nearness, float, device),
+            nearness,
+            pose,
+            misfit,
         ],
-        outputs=[pose, misfit],
-        device=device,
+        device,
     )
     found = pose.numpy().astype(float)
     for row, world in enumerate(scene.row_world):
@@ -361,64 +362,12 @@ def test_the_best_poses_that_differ_are_kept(device, seed, known):
             angle = (turns * turns[best].inv()).magnitude()
             left = [c for c in left if c != best and angle[c] >= apart and cost[c] < NEVER]
     arrays = [device_array(pose, wp.transform, device), device_array(average, float, device)]
-    wp.launch(
+    launch(
         keep_poses_kernel,
-        dim=rows,
-        inputs=[
-            apart,
-            stay,
-            share,
-            kept if known else 0,
-            device_array(scene.row_world, int, device),
-            device_array(found, wp.transform, device),
-        ],
-        outputs=[device_array(misfit, float, device), *arrays],
-        device=device,
+        rows,
+        [apart, stay, share, kept if known else 0, scene.row_world, found, misfit, *arrays],
+        device,
     )
     np.testing.assert_allclose(arrays[1].numpy(), np.minimum(expected, NEVER), rtol=1e-5)
     there = np.isfinite(expected_pose)
     np.testing.assert_allclose(arrays[0].numpy()[there], expected_pose[there], atol=1e-6)
-
-
-def test_a_pose_that_is_not_to_be_looked_at_stays(device):
-    scene = Scene(0)
-    row_world, seen, count = scene.inputs(device)
-    rows = scene.pose.shape[:2]
-    pose, misfit = device_array(scene.pose, wp.transform, device), np.zeros(rows)
-    misfit[:, 1] = NEVER
-    left = device_array(misfit, float, device)
-    nearness = device_array(scene.nearness, float, device)
-    inputs = [scene.model(device), scene.camera(), FAR, 3, 1, 1, row_world, seen, count, nearness]
-    wp.launch(fit_poses_kernel, dim=rows, inputs=inputs, outputs=[pose, left], device=device)
-    stays = np.abs(pose.numpy() - scene.pose).max(axis=(0, 2)) < 1e-6
-    assert stays[1] and not stays[0]
-    assert (left.numpy()[:, 1] == np.float32(NEVER)).all() and (left.numpy()[:, 0] < 1.0).all()
-
-
-def test_rows_of_no_world_are_left_out(device):
-    """They are neither placed nor improved nor kept, in a launch that is of all rows."""
-    scene = Scene(0)
-    before, rows = scene.pose.copy(), scene.pose.shape[:2]
-    scene.row_world = np.full(len(scene.row_world), -1)
-    row_world, seen, count = scene.inputs(device)
-    started, misfit = unwritten(rows, wp.transform, device), unwritten(rows, float, device)
-    pose, nearness = (
-        device_array(before, wp.transform, device),
-        device_array(scene.nearness, float, device),
-    )
-    shapes, eye, first = scene.model(device), scene.camera(), wp.zeros(rows[0], dtype=int, device=device)
-    rotation = device_array(np.eye(4)[3:], wp.quat, device)
-    starting = [shapes, eye, 1, 1, row_world, first, rotation, seen, count]
-    wp.launch(start_poses_kernel, dim=rows, inputs=starting, outputs=[started], device=device)
-    fitting = [shapes, eye, FAR, 1, 1, 1, row_world, seen, count, nearness]
-    wp.launch(fit_poses_kernel, dim=rows, inputs=fitting, outputs=[pose, misfit], device=device)
-    kept, average = (
-        unwritten((scene.worlds, 2), wp.transform, device),
-        wp.zeros((scene.worlds, 2), dtype=float, device=device),
-    )
-    keeping = [0.3, 0.8, 0.1, 0, row_world, pose]
-    outputs = [misfit, kept, average]
-    wp.launch(keep_poses_kernel, dim=rows[0], inputs=keeping, outputs=outputs, device=device)
-    for array in (started, misfit, kept):
-        assert np.isnan(array.numpy()).all()
-    np.testing.assert_array_equal(pose.numpy(), np.float32(before))

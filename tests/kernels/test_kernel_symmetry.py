@@ -2,7 +2,7 @@ import numpy as np
 import warp as wp
 from hypothesis import given
 from hypothesis import strategies as st
-from kernel_oracle import EXAMPLES, SENTINEL, device_array, floats, quaternions, unwritten
+from kernel_oracle import EXAMPLES, SENTINEL, floats, launch, quaternions, unwritten
 from scipy.spatial.transform import Rotation
 
 from vd.kernels.task.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
@@ -28,19 +28,11 @@ def worlds(draw: st.DrawFn) -> dict[str, np.ndarray]:
 def test_a_new_goal_gets_the_view_that_turns_its_axis_nearest(device, scene):
     count, joints = len(scene["reset"]), scene["q"].shape[1] - 7
     view = wp.full(count, SENTINEL, dtype=wp.int32, device=device)
-    wp.launch(
+    launch(
         choose_view_kernel,
-        dim=count,
-        inputs=[
-            device_array(scene["sector"], wp.vec3, device),
-            joints,
-            device_array(scene["reset"], int, device),
-            device_array(scene["new_goal"], int, device),
-            device_array(scene["q"], float, device),
-            device_array(scene["goal"], wp.quat, device),
-        ],
-        outputs=[view],
-        device=device,
+        count,
+        [scene["sector"], joints, scene["reset"], scene["new_goal"], scene["q"], scene["goal"], view],
+        device,
     )
     turn = Rotation.from_quat(scene["goal"]) * Rotation.from_quat(scene["q"][:, -4:]).inv()
     half = np.sin(turn.magnitude() / 2.0)[:, None]
@@ -67,31 +59,8 @@ def test_views_take_observations_apart_and_put_actions_together(device, data):
     view = np.array(data.draw(st.lists(st.integers(0, views - 1), min_size=count, max_size=count)))
     values = data.draw(floats((count, width)))
     seen, done = (unwritten((count, width), float, device) for _ in range(2))
-    wp.launch(
-        view_observation_kernel,
-        dim=(count, width),
-        inputs=[
-            device_array(source, int, device),
-            device_array(factor, float, device),
-            device_array(offset, float, device),
-            device_array(view, int, device),
-            device_array(values, float, device),
-        ],
-        outputs=[seen],
-        device=device,
-    )
-    wp.launch(
-        world_action_kernel,
-        dim=(count, width),
-        inputs=[
-            device_array(source[:, :, 0], int, device),
-            device_array(sign, float, device),
-            device_array(view, int, device),
-            device_array(values, float, device),
-        ],
-        outputs=[done],
-        device=device,
-    )
+    launch(view_observation_kernel, (count, width), [source, factor, offset, view, values, seen], device)
+    launch(world_action_kernel, (count, width), [source[:, :, 0], sign, view, values, done], device)
     for world, k in enumerate(view):
         expected = (factor[k].astype(float) * values[world][source[k]]).sum(axis=1) + offset[k]
         np.testing.assert_allclose(seen.numpy()[world], expected, atol=1e-5)

@@ -162,7 +162,7 @@ def _pretrainer(
 ) -> "Pretrainer":
     from vd.assets_usd.hands import load_hand
     from vd.assets_usd.objects.sets import load_set
-    from vd.envs.objects import object_scales
+    from vd.envs.setup import object_scales
     from vd.train.student.pretrain import Pretrainer, RandomScenes
 
     objects = load_set(list(task.objects))

@@ -5,7 +5,7 @@ table. Rates count images, each from new poses: Newton's include the refit of it
 bodies need, ours the placing of meshes. Images of both are compared, so that a wrong one cannot look fast.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import newton
@@ -19,7 +19,7 @@ from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.model import ObjectModel
 from vd.bench.sim import captured, seconds_per_call
 from vd.paper import PAPER
-from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg, Method
+from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_camera import DepthCamera
 from vd.sim.cfg import SimCfg
 from vd.sim.scene import Scene, build_scene
@@ -51,20 +51,18 @@ class DepthRow:
     """Pixels."""
     newton: float
     """Newton's ``SensorCamera``, forward depth only."""
-    images: dict[Method, float] = field(default_factory=dict)
-    """Ours, depth images alone, by method."""
-    clouds: dict[Method, float] = field(default_factory=dict)
-    """Ours with a cloud of each image, by method."""
-    with_sensor: float = 0.0
-    """Ours with a cloud and every error of the sensor, by the faster method."""
-    images_over_newton: float = 0.0
-    """The faster of ours over Newton's, images alone."""
-    points: float = 0.0
+    images: float
+    """Ours, depth images alone."""
+    clouds: float
+    """Ours with a cloud of each image."""
+    with_sensor: float
+    """Ours with a cloud and every error of the sensor."""
+    images_over_newton: float
+    """Ours over Newton's, images alone."""
+    points: float
     """Points of a cloud, mean over environments."""
-    different: float = 0.0
+    different: float
     """Share of pixels that differ by more than 1 mm between Newton's image and ours (silhouettes)."""
-    methods_different: float = 0.0
-    """The same between ray casting and rasterisation."""
 
 
 def bench_scene(
@@ -160,27 +158,17 @@ def measure(
     body_q = state.body_q.reshape((envs, -1))
     camera = scene.hand.camera
 
-    images: dict[Method, float] = {}
-    depths: dict[Method, np.ndarray] = {}
-    camera_q = np.empty(0)
-    methods: tuple[Method, ...] = ("rays", "raster")
-    for method in methods:
-        ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method, points=0))
+    rates = []
+    for cfg in (
+        DepthCameraCfg(points=0),
+        DepthCameraCfg(),
+        DepthCameraCfg(sensor=DepthSensorCfg.realistic()),
+    ):
+        ours = DepthCamera.of_scene(scene, body_q, cfg)
         ours.capture()
-        images[method] = rate(envs, captured(ours.capture, device), device)
-        depths[method], camera_q = ours.depth.numpy().copy(), ours.camera_q.numpy()
-    best = max(images, key=lambda method: images[method])
-
-    clouds: dict[Method, float] = {}
-    points = 0.0
-    for method in methods:
-        ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=method))
-        ours.capture()
-        clouds[method] = rate(envs, captured(ours.capture, device), device)
-        points = float(ours.count.numpy().mean())
-    ours = DepthCamera.of_scene(scene, body_q, DepthCameraCfg(method=best, sensor=DepthSensorCfg.realistic()))
-    ours.capture()
-    with_sensor = rate(envs, captured(ours.capture, device), device)
+        rates.append(rate(envs, captured(ours.capture, device), device))
+    depth, camera_q = ours.true_depth.numpy().copy(), ours.camera_q.numpy()
+    points = float(ours.count.numpy().mean())
     del ours
 
     theirs = NewtonCamera(scene, camera_q)
@@ -191,21 +179,16 @@ def measure(
 
     newton_rate = rate(envs, frame, device)
     reference = theirs.depth.numpy()
+    reference = np.where(reference > camera.far, 0.0, reference)
     return DepthRow(
         envs=envs,
         width=camera.width,
         height=camera.height,
         newton=newton_rate,
-        images=images,
-        clouds=clouds,
-        with_sensor=with_sensor,
-        images_over_newton=images[best] / newton_rate,
+        images=rates[0],
+        clouds=rates[1],
+        with_sensor=rates[2],
+        images_over_newton=rates[0] / newton_rate,
         points=points,
-        different=_different(np.where(reference > camera.far, 0.0, reference), depths["rays"]),
-        methods_different=_different(depths["raster"], depths["rays"]),
+        different=float(np.mean(np.abs(reference - depth) > SAME_DEPTH_M)),
     )
-
-
-def _different(a: np.ndarray, b: np.ndarray) -> float:
-    """Share of pixels that differ by more than :data:`SAME_DEPTH_M`."""
-    return float(np.mean(np.abs(a - b) > SAME_DEPTH_M))

@@ -207,7 +207,7 @@ def pinch(
             tip,
             radius=FINGERTIP_RADIUS_M,
             cfg=shape_cfg(cfg, PAPER.materials.friction),
-            custom_attributes=contact_attributes(cfg, PRIORITY_HAND, CONDIM_TORSIONAL),
+            custom_attributes=contact_attributes(PRIORITY_HAND, CONDIM_TORSIONAL),
         )
     body = add_object(world, item, cfg, scale=1.0, visuals=False)
     start = world.joint_q_start[world.joint_child.index(body)]
@@ -249,7 +249,7 @@ def slide(
         hy=0.5 * side,
         hz=0.5 * height,
         cfg=shape_cfg(cfg, friction),
-        custom_attributes=contact_attributes(cfg, PRIORITY_OBJECT),
+        custom_attributes=contact_attributes(PRIORITY_OBJECT),
     )
     start = world.joint_qd_start[world.joint_child.index(body)]
     world.joint_qd[start] = speed
@@ -310,7 +310,7 @@ def bounce(
             body,
             radius=BALL_RADIUS_M,
             cfg=shape_cfg(cfg, PAPER.materials.friction),
-            custom_attributes=contact_attributes(cfg, PRIORITY_OBJECT),
+            custom_attributes=contact_attributes(PRIORITY_OBJECT),
         )
         builder.add_world(world)
     scene = SmallScene(builder, cfg, device)

@@ -38,20 +38,17 @@ class SeenState:
             return
         self.arrays = [wp.zeros_like(array) for array in present]
         d, f = state.num_actions, state.num_fingers
-        self._slots = math.ceil(random.observation_latency_s[1] / state.cfg.sim.physics_dt) + 1
+        slots = math.ceil(random.observation_latency_s[1] / state.cfg.sim.physics_dt) + 1
         columns = ring_columns(d, sim.joint_q.shape[1], sim.joint_qd.shape[1], f)
-        self._ring = wp.zeros((n * self._slots, columns), dtype=float, device=device)
+        self._ring = wp.zeros((n * slots, columns), dtype=float, device=device)
         self._head = wp.zeros(n, dtype=wp.int32, device=device)
+        self._model = [d, slots, state.fingers.tip_body]
         sim.after_physics_step = self.record
 
     def record(self, joint_q: wp.array, joint_qd: wp.array, body_q: wp.array, body_qd: wp.array) -> None:
         """Remember the state after a physics step, shapes [N, *]. Device work only."""
-        measured = self._measured(joint_q, joint_qd)
-        self._launch(
-            record_state_kernel,
-            [self._slots, self._state.fingers.tip_body, *measured, joint_q, joint_qd, body_q, body_qd],
-            [self._head, self._ring],
-        )
+        state, now = self._state, [*self._measured(joint_q, joint_qd), joint_q, joint_qd, body_q, body_qd]
+        state.launch(record_state_kernel, [*self._model, *now], [self._head, self._ring])
 
     def begin(self, mask: wp.array) -> None:
         """Draw the latency of the environments of ``mask`` [N], whose past is their present state."""
@@ -60,37 +57,18 @@ class SeenState:
         state, sim = self._state, self._state.sim
         measured = self._measured(sim.joint_q, sim.joint_qd)
         now = [*measured, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
-        wp.launch(
+        state.launch(
             begin_latency_kernel,
-            dim=state.num_envs,
-            inputs=[
-                wp.vec2(*state.cfg.randomisation.observation_latency_s),
-                state.num_actions,
-                self._slots,
-                state.fingers.tip_body,
-                mask,
-                *now,
-                state.rng,
-            ],
-            outputs=[self.latency, self._ring],
-            device=state.device,
+            [*self._model, wp.vec2(*state.cfg.randomisation.observation_latency_s), mask, *now, state.rng],
+            [self.latency, self._ring],
         )
 
     def recall(self) -> None:
         """Refresh :attr:`arrays`."""
         if self.is_late:
-            self._launch(
-                recall_state_kernel,
-                [
-                    self._slots,
-                    self._state.cfg.sim.physics_dt,
-                    self._state.fingers.tip_body,
-                    self.latency,
-                    self._head,
-                    self._ring,
-                ],
-                self.arrays,
-            )
+            state = self._state
+            inputs = [*self._model, state.cfg.sim.physics_dt, self.latency, self._head, self._ring]
+            state.launch(recall_state_kernel, inputs, self.arrays)
 
     def stateful(self) -> dict[str, wp.array]:
         """Arrays to save with a checkpoint, by name."""
@@ -104,13 +82,3 @@ class SeenState:
             return joint_q, joint_qd
         servo.measure()  # once a control step otherwise
         return servo.measured_q, servo.measured_qd
-
-    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        state = self._state
-        wp.launch(
-            kernel,
-            dim=state.num_envs,
-            inputs=[state.num_actions, *inputs],
-            outputs=outputs,
-            device=state.device,
-        )

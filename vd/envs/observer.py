@@ -39,8 +39,7 @@ class Observer:
         self.seen = SeenState(state)
         width = max(columns.stop for columns in self.parts.values())
 
-        def zeros(*shape: int, dtype: Any = float) -> wp.array:
-            return wp.zeros(shape, dtype=dtype, device=device)
+        zeros = state.zeros
 
         self.all_values = self.world_values = zeros(n, width)
         self.views = Views(state, self.all_values) if cfg.view != "world" else None
@@ -76,12 +75,12 @@ class Observer:
         """Begin the episodes of the environments of ``mask`` [N], after their state was reset."""
         self.seen.begin(mask)
         if self._frames:
-            self._launch(forget_kernel, [mask], [self._count])
+            self._state.launch(forget_kernel, [mask], [self._count])
 
     def remember(self) -> None:
         """Keep the present observation for the history, once a control step and before it."""
         if self._frames:
-            self._launch(
+            self._state.launch(
                 remember_kernel,
                 [*self._remembered, self._frames, self.world_values, self._state.goal_quat],
                 [self._head, self._count, self._past],
@@ -112,7 +111,7 @@ class Observer:
         """
         state = self._state
         settings, offset, rng = noise
-        self._launch(
+        state.launch(
             teacher_observation_kernel,
             [
                 state.lower,
@@ -139,10 +138,9 @@ class Observer:
 
     def _observe_history(self) -> None:
         if self._frames:
-            wp.launch(
+            self._state.launch(
                 history_kernel,
-                dim=(self._state.num_envs, self._frames),
-                inputs=[
+                [
                     *self._remembered,
                     self._frames,
                     self.parts["history"].start,
@@ -151,8 +149,8 @@ class Observer:
                     self._count,
                     self._past,
                 ],
-                outputs=[self.world_values],
-                device=self._state.device,
+                [self.world_values],
+                dim=(self._state.num_envs, self._frames),
             )
 
     def _tell(self) -> None:
@@ -162,7 +160,7 @@ class Observer:
         state, drawn = self._state, self._drawn
         servo = self._no_servo if state.sim.servo is None else state.sim.servo.parameters
         frictions = [drawn.hand_friction, drawn.object_friction, drawn.table_friction]
-        self._launch(
+        state.launch(
             dynamics_kernel,
             [
                 *self._gains,
@@ -184,6 +182,3 @@ class Observer:
         past |= {"history_next": self.world_values}  # remembered when the next step begins
         view = {} if self.views is None else {"view": self.views.view}
         return view | self.seen.stateful() | (past if self._frames else {})
-
-    def _launch(self, kernel: Any, inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, dim=self._state.num_envs, inputs=inputs, outputs=outputs, device=self._state.device)

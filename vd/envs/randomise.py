@@ -44,8 +44,7 @@ class Randomiser:
         n, d = state.num_envs, state.num_actions
         device = state.device
 
-        def zeros(*shape: int, dtype: Any = float) -> wp.array:
-            return wp.zeros(shape, dtype=dtype, device=device)
+        zeros = state.zeros
 
         self.kp, self.kd = zeros(n, d), zeros(n, d)
         """Joint stiffness [N m/rad] and damping [N m s/rad], shape [N, D]."""
@@ -88,12 +87,10 @@ class Randomiser:
         n, model = state.num_envs, state.sim.model
         link_scale = wp.ones((n, len(state.scene.link_body)), dtype=float, device=state.device)
         everywhere = wp.ones(n, dtype=wp.int32, device=state.device)
-        wp.launch(
+        state.launch(
             draw_masses_kernel,
-            dim=n,
-            inputs=[state.parameters.randomisation, everywhere, state.rng],
-            outputs=[link_scale, self.object_mass],
-            device=state.device,
+            [state.parameters.randomisation, everywhere, state.rng],
+            [link_scale, self.object_mass],
         )
         factor = np.ones((n, state.scene.bodies_per_world))
         factor[:, state.scene.link_body] = link_scale.numpy()
@@ -116,13 +113,7 @@ class Randomiser:
         """Draw anew for the environments of ``reset`` whose dynamics are old enough."""
         if not self.enabled:
             return
-        wp.launch(
-            redraw_mask_kernel,
-            dim=self._state.num_envs,
-            inputs=[reset, self._interval, self._age],
-            outputs=[self._due],
-            device=self._state.device,
-        )
+        self._state.launch(redraw_mask_kernel, [reset, self._interval, self._age], [self._due])
         self.draw(self._due)
 
     def draw(self, mask: wp.array) -> None:
@@ -131,30 +122,20 @@ class Randomiser:
         self._draw_dynamics(mask)
         if state.sim.restitution is not None:
             drawn = state.sim.restitution
-            wp.launch(
+            state.launch(
                 draw_restitution_kernel,
-                dim=state.num_envs,
-                inputs=[wp.vec2(*state.cfg.randomisation.restitution), mask, state.rng],
-                outputs=[drawn.hand, drawn.object, drawn.table],
-                device=state.device,
+                [wp.vec2(*state.cfg.randomisation.restitution), mask, state.rng],
+                [drawn.hand, drawn.object, drawn.table],
             )
 
     def _draw_dynamics(self, mask: wp.array) -> None:
         """Draw gains, frictions, constant errors and servos."""
         state = self._state
-        wp.launch(
+        ranges = self._kp_scale, self._kd_scale, state.parameters.randomisation
+        state.launch(
             draw_dynamics_kernel,
-            dim=state.num_envs,
-            inputs=[
-                self._nominal_kp,
-                self._nominal_kd,
-                self._kp_scale,
-                self._kd_scale,
-                state.parameters.randomisation,
-                mask,
-                state.rng,
-            ],
-            outputs=[
+            [self._nominal_kp, self._nominal_kd, *ranges, mask, state.rng],
+            [
                 self.kp,
                 self.kd,
                 self.hand_friction,
@@ -163,26 +144,22 @@ class Randomiser:
                 self.action_offset,
                 self.observation_offset,
             ],
-            device=state.device,
         )
         if state.sim.servo is not None:
-            wp.launch(
+            state.launch(
                 draw_servo_kernel,
-                dim=state.num_envs,
-                inputs=[self._servo_ranges, mask, self.kp, self.kd, state.rng],
-                outputs=[state.sim.servo.parameters],
-                device=state.device,
+                [self._servo_ranges, mask, self.kp, self.kd, state.rng],
+                [state.sim.servo.parameters],
             )
 
     def disturb(self) -> None:
         """Draw this control step's disturbance force, and apply it and what carries the object."""
         state = self._state
         if self.enabled:
-            wp.launch(
+            state.launch(
                 disturbance_force_kernel,
-                dim=state.num_envs,
-                inputs=[self.object_mass, state.parameters.force, self.force, state.rng],
-                device=state.device,
+                [self.object_mass, state.parameters.force, self.force, state.rng],
+                [],
             )
         elif not state.cfg.curriculum.lightens:
             return
@@ -193,10 +170,9 @@ class Randomiser:
     def _write_force(self, force: wp.array, out: wp.array) -> None:
         """Write a force on the objects, shape [N], and what carries them, as forces on bodies [N, B]."""
         state = self._state
-        wp.launch(
+        state.launch(
             write_object_force_kernel,
-            dim=state.num_envs,
-            inputs=[
+            [
                 self.object_mass,
                 state.must_lift,
                 self._gravity,
@@ -204,8 +180,7 @@ class Randomiser:
                 state.scene.object_body,
                 force,
             ],
-            outputs=[out],
-            device=state.device,
+            [out],
         )
 
     def after_step(self, steps: int) -> None:
@@ -238,17 +213,15 @@ class Randomiser:
         flags = newton.ModelFlags.SHAPE_PROPERTIES
         if state.sim.servo is None:  # which sets the gains itself, in every physics step
             flags |= newton.ModelFlags.JOINT_DOF_FORCE_PROPERTIES
-            wp.launch(
+            state.launch(
                 write_gains_kernel,
+                [self.kp, self.kd],
+                [self._model_kp, self._model_kd],
                 dim=(state.num_envs, state.num_actions),
-                inputs=[self.kp, self.kd],
-                outputs=[self._model_kp, self._model_kd],
-                device=state.device,
             )
-        wp.launch(
+        state.launch(
             write_friction_kernel,
-            dim=model.shape_count,
-            inputs=[
+            [
                 model.shape_world,
                 self._shape_kind,
                 self._nominal_friction,
@@ -260,8 +233,8 @@ class Randomiser:
                 self.object_friction,
                 self.table_friction,
             ],
-            outputs=[model.shape_material_mu],
-            device=state.device,
+            [model.shape_material_mu],
+            dim=model.shape_count,
         )
         state.sim.solver.notify_model_changed(flags)
 

@@ -2,6 +2,7 @@
 
 World frame: z up, table top at z = 0. SI units, radians, quaternions xyzw. Everything but the
 physics is Warp kernels; a step copies nothing to the host, and it is one captured graph, on CPU and CUDA.
+What a step does stands in :meth:`ReorientEnv.launch_step`, in its order.
 """
 
 from pathlib import Path
@@ -15,17 +16,17 @@ from vd.envs.cfg import ReorientCfg
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.observer import Observer
 from vd.envs.randomise import Randomiser
-from vd.envs.starts import SETTLE_S, rest_poses
-from vd.envs.state import load_arrays, motion_arrays, save_failed_step, save_state, saved_stage
-from vd.envs.table import table_array
+from vd.envs.setup import SETTLE_S, rest_poses, table_steps
+from vd.envs.state import load_arrays, save_state, saved_stage
 from vd.envs.task_state import build_task
 from vd.kernels.task.actions import apply_action_kernel
-from vd.kernels.task.environments import count_goals_kernel, record_step_kernel, world_mask_kernel
+from vd.kernels.task.environments import record_step_kernel
 from vd.kernels.task.guard import void_step_kernel
 from vd.kernels.task.resets import episode_kernel, give_goal_kernel, reset_kernel
 from vd.kernels.task.rewards import REWARD_TERMS, reward_kernel
 from vd.kernels.task.success import success_kernel
 from vd.paper import PAPER
+from vd.sim.replay import save_failed_step
 from vd.sim.simulator import SimulationError
 
 FAILURES_AT_FIRST = 10.0
@@ -54,6 +55,7 @@ class ReorientEnv:
         self.device = str(wp.get_device(device))
         self.state = state = build_task(cfg, self.device)
         """What this and its parts share."""
+        self._launch = state.launch
         self.hand, self.objects, self.scene, self.sim = state.hand, state.objects, state.scene, state.sim
         self.fingers, self.parameters = state.fingers, state.parameters
         self.measured_q, self.measured_qd = state.measured_q, state.measured_qd
@@ -62,7 +64,6 @@ class ReorientEnv:
         self.num_envs = cfg.num_envs
         self.num_fingers = self.hand.num_fingers
         self.num_actions = self.hand.num_joints
-        self.sees_shape = cfg.observation.shape != "none"
         self.max_episode_steps = cfg.max_episode_steps
         self.world_object = self.scene.world_object
         self.reward_term_names = REWARD_TERMS
@@ -70,7 +71,8 @@ class ReorientEnv:
         self._allocate()
         self._lifts = cfg.reward.lift != 0.0
         self.randomiser = Randomiser(state)
-        self.observer = Observer(state, self.randomiser, shapes=self.sees_shape or self._lifts)
+        shapes = cfg.observation.shape != "none" or self._lifts
+        self.observer = Observer(state, self.randomiser, shapes=shapes)
         """Writes what is observed."""
         self.num_observations = self.observer.num_observations
         self.observation, self.privileged = self.observer.split(self.observer.all_values)
@@ -85,7 +87,9 @@ class ReorientEnv:
         """The views in which the policy observes and acts; None where that is the world frame."""
         self.acts_in_view = True
         """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
-        self._table_steps = table_array(cfg, self.device)
+        self._table_steps: wp.array | None = None
+        if cfg.table.away_share > 0.0:
+            self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device)
 
         self.stage = first_stage(cfg.curriculum)
         """How hard the task is at present; all ones is the configured task."""
@@ -106,8 +110,7 @@ class ReorientEnv:
         """Arrays of what a step decides, and of its counts."""
         n, d, f = self.num_envs, self.num_actions, self.num_fingers
 
-        def zeros(*shape: int, dtype: Any = float) -> wp.array:
-            return wp.zeros(shape, dtype=dtype, device=self.device)
+        zeros = self.state.zeros
 
         self.action = zeros(n, d)
         """Action of the present step in [-1, 1], shape [N, D]."""
@@ -131,8 +134,6 @@ class ReorientEnv:
         """Control steps since the world's reset, shape [N]."""
         self.goal_steps = zeros(n, dtype=wp.int32)
         """Control steps since the world's goal was given, shape [N]."""
-        self.goals_reached = zeros(n, dtype=wp.int32)
-        """Goals reached since the world's reset, shape [N]."""
         self.object_pose_end = zeros(n, dtype=wp.transform)
         """Object pose at the end of the step, before resets, shape [N]."""
         self.goal_counts = zeros(3)
@@ -142,7 +143,7 @@ class ReorientEnv:
         self.previous_error = zeros(n)
         """Rotation error at the end of the last step, for the progress in it [rad], shape [N]."""
         self._reset, self._new_goal = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
-        self._world_mask = zeros(n + 1, dtype=wp.bool)
+        self._env_mask = zeros(n + 1, dtype=wp.bool)
         self._given_start, self._given_goal = zeros(n, dtype=wp.quat), zeros(n, dtype=wp.quat)
         self._rest_poses = zeros(n, 0, dtype=wp.transform)
         self._reset_q = wp.array(np.tile(PAPER.scene.reset_joint_rad, f), dtype=float, device=self.device)
@@ -180,7 +181,7 @@ class ReorientEnv:
         self._reset.fill_(1)
         self._new_goal.zero_()
         self.randomiser.draw(self._reset)
-        self._reset_worlds(use_start=object_quat is not None, use_goal=goal_quat is not None)
+        self._reset_envs(use_start=object_quat is not None, use_goal=goal_quat is not None)
         self.randomiser.push()
         self.observe()
 
@@ -191,12 +192,10 @@ class ReorientEnv:
             goal_quat: Goal orientations, xyzw, either sign, shape [N, 4].
         """
         self._given_goal.assign(np.asarray(goal_quat, dtype=np.float32))
-        wp.launch(
+        self._launch(
             give_goal_kernel,
-            dim=self.num_envs,
-            inputs=[self._given_goal, self.sim.joint_q, self.num_actions + 3],
-            outputs=[self.goal_quat, self.goal_steps],
-            device=self.device,
+            [self._given_goal, self.sim.joint_q, self.num_actions + 3],
+            [self.goal_quat, self.goal_steps],
         )
         if self.views is not None:
             self._new_goal.fill_(1)
@@ -224,8 +223,15 @@ class ReorientEnv:
         self.randomiser.after_step(self.steps)
 
     def motion(self) -> dict[str, wp.array]:
-        """What the motion goes on from, see :func:`vd.envs.state.motion_arrays`; not copies."""
-        return motion_arrays(self.sim)
+        """What the motion goes on from, the last targets included: arrays with a row for each; not copies."""
+        sim = self.sim
+        return {
+            "joint_q": sim.joint_q,
+            "joint_qd": sim.joint_qd,
+            "target": sim.target,
+            "warm_start": sim.solver.mjw_data.qacc_warmstart,
+            **({} if sim.servo is None else sim.servo.stateful()),
+        }
 
     def hold(self) -> None:
         """One control step in which no policy acts and the hand keeps its last targets; nothing is reset."""
@@ -245,10 +251,9 @@ class ReorientEnv:
         action = self.action
         if self.views is not None and self.acts_in_view:
             action = self.views.world_action(action)
-        wp.launch(
+        self._launch(
             apply_action_kernel,
-            dim=self.num_envs,
-            inputs=[
+            [
                 self.state.lower,
                 self.state.upper,
                 p.action,
@@ -258,8 +263,7 @@ class ReorientEnv:
                 self.smoothed,
                 self.state.rng,
             ],
-            outputs=[sim.target],
-            device=self.device,
+            [sim.target],
         )
 
     def launch_step(self) -> None:
@@ -278,24 +282,17 @@ class ReorientEnv:
             self.observer.shapes.measure_clearance(self.clearance)
         self._judge()
         self._end_episodes()
-        wp.launch(
-            record_step_kernel,
-            dim=self.num_envs,
-            inputs=[sim.joint_q, self.num_actions],
-            outputs=[self.object_pose_end],
-            device=self.device,
-        )
+        self._launch(record_step_kernel, [sim.joint_q, self.num_actions], [self.object_pose_end])
         self.randomiser.redraw(self._reset)
-        self._reset_worlds()
+        self._reset_envs()
         self.observe()
 
     def _judge(self) -> None:
         """Success and reward of the step, before resets."""
-        n, p, sim = self.num_envs, self.parameters, self.sim
-        wp.launch(
+        p, sim = self.parameters, self.sim
+        self._launch(
             success_kernel,
-            dim=n,
-            inputs=[
+            [
                 p.success,
                 sim.joint_q,
                 sim.joint_qd,
@@ -304,13 +301,11 @@ class ReorientEnv:
                 sim.table_force,
                 self.must_lift,
             ],
-            outputs=[self.rotation_error, self.still, self.success, self.fell],
-            device=self.device,
+            [self.rotation_error, self.still, self.success, self.fell],
         )
-        wp.launch(
+        self._launch(
             reward_kernel,
-            dim=n,
-            inputs=[
+            [
                 p.reward,
                 sim.joint_q,
                 sim.joint_qd,
@@ -323,50 +318,37 @@ class ReorientEnv:
                 self.fell,
                 self.previous_error,
             ],
-            outputs=[self.reward, self.reward_terms],
-            device=self.device,
+            [self.reward, self.reward_terms],
         )
         if self.cfg.failures_per_million > 0.0:
-            wp.launch(
+            self._launch(
                 void_step_kernel,
-                dim=n,
-                inputs=[sim.failed],
-                outputs=[self.reward, self.reward_terms, self.still, self.success, self.fell],
-                device=self.device,
+                [sim.failed],
+                [self.reward, self.reward_terms, self.still, self.success, self.fell],
             )
 
     def _end_episodes(self) -> None:
         """Which episodes end and which goals are new, and counts of goals."""
-        wp.launch(
+        self._launch(
             episode_kernel,
-            dim=self.num_envs,
-            inputs=[
+            [
                 self.success,
                 self.fell,
                 self.max_episode_steps,
                 int(self.cfg.success_ends_episode),
                 self.step_count,
                 self.goal_steps,
-                self.goals_reached,
+                self.goal_counts,
             ],
-            outputs=[self.timed_out, self.done, self._reset, self._new_goal],
-            device=self.device,
-        )
-        wp.launch(
-            count_goals_kernel,
-            dim=self.num_envs,
-            inputs=[self.success, self.fell, self.done],
-            outputs=[self.goal_counts],
-            device=self.device,
+            [self.timed_out, self.done, self._reset, self._new_goal],
         )
 
-    def _reset_worlds(self, *, use_start: bool = False, use_goal: bool = False) -> None:
+    def _reset_envs(self, *, use_start: bool = False, use_goal: bool = False) -> None:
         """Reset the environments of ``_reset``, give a goal to those of ``_new_goal`` too."""
         sim, p = self.sim, self.parameters
-        wp.launch(
+        self._launch(
             reset_kernel,
-            dim=self.num_envs,
-            inputs=[
+            [
                 self._reset_q,
                 p.start,
                 p.goal,
@@ -380,28 +362,20 @@ class ReorientEnv:
                 sim.joint_q,
                 self.state.rng,
             ],
-            outputs=[
+            [
                 sim.joint_qd,
                 self.smoothed,
                 self.step_count,
                 self.goal_steps,
-                self.goals_reached,
                 self.goal_quat,
                 self.previous_error,
+                self._env_mask,
             ],
-            device=self.device,
         )
         if self.views is not None:
             self.views.choose(self._reset, self._new_goal)
         # The solver warm-starts from the last accelerations, which mean nothing after a reset.
-        wp.launch(
-            world_mask_kernel,
-            dim=self.num_envs,
-            inputs=[self._reset],
-            outputs=[self._world_mask],
-            device=self.device,
-        )
-        sim.solver.reset(sim.state, world_mask=self._world_mask, flags=newton.StateFlags(0))
+        sim.solver.reset(sim.state, world_mask=self._env_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
         if sim.servo is not None:
             sim.servo.reset(self._reset)
@@ -433,7 +407,15 @@ class ReorientEnv:
         try:
             self.sim.check(tolerated)
         except SimulationError as error:
-            path = save_failed_step(self.sim, self.cfg, self.dump_dir)
+            cfg = self.cfg
+            path = save_failed_step(
+                self.sim,
+                self.dump_dir,
+                hand=cfg.hand,
+                fingertip=cfg.fingertip,
+                hand_layer=cfg.hand_layer,
+                objects=cfg.objects,
+            )
             if path is None:
                 raise
             raise SimulationError(f"{error} (dump: {path})") from error
@@ -486,7 +468,6 @@ class ReorientEnv:
             "goal_quat": self.goal_quat,
             "step_count": self.step_count,
             "goal_steps": self.goal_steps,
-            "goals_reached": self.goals_reached,
             "previous_error": self.previous_error,
             "goal_counts": self.goal_counts,
             "observation": self.observer.all_values,

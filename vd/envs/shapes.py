@@ -42,10 +42,9 @@ class ShapeObserver:
     def measure_clearance(self, out: wp.array) -> None:
         """Write the heights of the objects' lowest points above the table [m] into ``out``, shape [N]."""
         state = self._state
-        wp.launch(
+        state.launch(
             clearance_kernel,
-            dim=state.num_envs,
-            inputs=[
+            [
                 self._points,
                 self._object,
                 self._scale,
@@ -53,18 +52,16 @@ class ShapeObserver:
                 PAPER.scene.table_top_m,
                 state.sim.joint_q,
             ],
-            outputs=[out],
-            device=state.device,
+            [out],
         )
 
     def launch(self, seen: Sequence[Any], out: wp.array) -> None:
         """Write the values of a state (``SeenState.arrays``), and of the goal, to ``out``, shape [N, *]."""
         state = self._state
         _, _, joint_q, _, body_q, _ = seen
-        wp.launch(
+        state.launch(
             surface_kernel,
-            dim=(state.num_envs, state.num_fingers),
-            inputs=[
+            [
                 self._points,
                 self._object,
                 self._scale,
@@ -75,13 +72,12 @@ class ShapeObserver:
                 joint_q,
                 body_q,
             ],
-            outputs=[out],
-            device=state.device,
+            [out],
+            dim=(state.num_envs, state.num_fingers),
         )
-        wp.launch(
+        state.launch(
             extent_kernel,
-            dim=(state.num_envs, ORIENTATIONS, len(self._directions)),
-            inputs=[
+            [
                 self._points,
                 self._object,
                 self._scale,
@@ -91,6 +87,6 @@ class ShapeObserver:
                 joint_q,
                 state.goal_quat,
             ],
-            outputs=[out],
-            device=state.device,
+            [out],
+            dim=(state.num_envs, ORIENTATIONS, len(self._directions)),
         )

@@ -1,17 +1,14 @@
 """Saving an environment in the middle of its episodes, and going on from there."""
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from vd.envs.cfg import CurriculumCfg, ReorientCfg
+from vd.envs.cfg import CurriculumCfg
 from vd.envs.curriculum import Stage, first_stage
 from vd.envs.task_state import TaskState
-from vd.sim.replay import save_dump
-from vd.sim.simulator import Simulator
 
 
 def save_state(task: TaskState, arrays: Mapping[str, wp.array], stage: Stage, steps: int) -> dict[str, Any]:
@@ -56,8 +53,9 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         ValueError: If it belongs to another number of environments, other objects, another hand or servo
         model.
     """
-    # Checkpoints from before goals had an age: no goal is older than its episode.
+    # Checkpoints from before goals had an age: no goal is older than its episode. Later ones counted them.
     arrays = {"goal_steps": state["arrays"]["step_count"]} | state["arrays"]
+    arrays.pop("goals_reached", None)
     if arrays.keys() != here.keys():
         raise ValueError(
             "the saved environment has other servos, views, memory, latency or contacts; resume with "
@@ -82,35 +80,7 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
         array.assign(arrays[name])
 
 
-def save_failed_step(sim: Simulator, cfg: ReorientCfg, folder: Path) -> Path | None:
-    """Save the first control step that failed for ``vd-bench replay``; returns its file, None if none did."""
-    dumps = sim.dumps()
-    if not dumps:
-        return None
-    dump = dumps[0]
-    return save_dump(
-        folder / f"dump_{dump.object_name}_{dump.world}.json",
-        dump,
-        hand=cfg.hand,
-        fingertip=cfg.fingertip,
-        hand_layer=cfg.hand_layer,
-        objects=cfg.objects,
-        sim=cfg.sim,
-    )
-
-
 def _objects(task: TaskState) -> list[tuple[str, int]]:
     """Environments of each object, in the order of the environments."""
     counts = np.bincount(task.scene.world_object, minlength=len(task.objects))
     return [(item.name, int(count)) for item, count in zip(task.objects, counts, strict=True)]
-
-
-def motion_arrays(sim: Simulator) -> dict[str, wp.array]:
-    """What the motion of every world goes on from, the last targets included: arrays with a row for each."""
-    return {
-        "joint_q": sim.joint_q,
-        "joint_qd": sim.joint_qd,
-        "target": sim.target,
-        "warm_start": sim.solver.mjw_data.qacc_warmstart,
-        **({} if sim.servo is None else sim.servo.stateful()),
-    }

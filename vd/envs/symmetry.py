@@ -44,32 +44,25 @@ class Views:
     def choose(self, reset: wp.array, new_goal: wp.array) -> None:
         """Choose anew for environments in which either mask, shape [N], is set."""
         state = self._state
-        wp.launch(
+        state.launch(
             choose_view_kernel,
-            dim=state.num_envs,
-            inputs=[self._sector, state.num_actions, reset, new_goal, state.sim.joint_q, state.goal_quat],
-            outputs=[self.view],
-            device=state.device,
+            [self._sector, state.num_actions, reset, new_goal, state.sim.joint_q, state.goal_quat],
+            [self.view],
         )
 
     def observe(self) -> None:
         """Write the observation in the present views."""
-        wp.launch(
+        self._state.launch(
             view_observation_kernel,
+            [self._source, self._factor, self._offset, self.view, self.observation],
+            [self._out],
             dim=self._out.shape,
-            inputs=[self._source, self._factor, self._offset, self.view, self.observation],
-            outputs=[self._out],
-            device=self._state.device,
         )
 
     def world_action(self, action: wp.array, out: wp.array | None = None) -> wp.array:
         """Action of the views, shape [N, D], with the joints in the world's order; in ``out`` if given."""
         out = self._action if out is None else out
-        wp.launch(
-            world_action_kernel,
-            dim=action.shape,
-            inputs=[self._joints, self._sign, self.view, action],
-            outputs=[out],
-            device=self._state.device,
+        self._state.launch(
+            world_action_kernel, [self._joints, self._sign, self.view, action], [out], dim=action.shape
         )
         return out

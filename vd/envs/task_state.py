@@ -11,10 +11,9 @@ from vd.assets_usd.objects.model import ObjectModel
 from vd.assets_usd.objects.sets import load_set
 from vd.envs.cfg import ReorientCfg
 from vd.envs.fingers import Fingers
-from vd.envs.objects import object_scales
 from vd.envs.parameters import TaskParameters
 from vd.envs.servo import needs_servo, servo_ranges
-from vd.envs.table import must_lift
+from vd.envs.setup import must_lift, object_scales
 from vd.kernels.rng import init_rng_kernel
 from vd.sim.scene import Scene, build_scene
 from vd.sim.simulator import Simulator
@@ -50,6 +49,16 @@ class TaskState:
     """1 where success asks that the object does not touch the table, shape [N]."""
     rng: wp.array
     """Random stream of each world, shape [N]."""
+
+    def zeros(self, *shape: int, dtype: Any = float) -> wp.array:
+        """An array of zeros on the task's device."""
+        return wp.zeros(shape, dtype=dtype, device=self.device)
+
+    def launch(
+        self, kernel: wp.Kernel, inputs: list[Any], outputs: list[Any], *, dim: int | tuple[int, ...] = 0
+    ) -> None:
+        """Launch a kernel on the task's device; ``dim`` is N unless it is given."""
+        wp.launch(kernel, dim=dim or self.num_envs, inputs=inputs, outputs=outputs, device=self.device)
 
     @property
     def num_envs(self) -> int:

@@ -200,7 +200,7 @@ def _newton(
 
 def _bare(layer: Path, recording: Recording, curves: Predictions, device: str) -> Predictions:
     """The identified model of each joint as it comes back from the layer; the baseline as it was fitted."""
-    from vd.assets_usd.bare_layer import read_bare_layer
+    from vd.assets_usd.hand_layer import read_bare_layer
     from vd.gap.chain import chains
     from vd.gap.rollout import Rollouts
 

@@ -143,7 +143,7 @@ class Analysis:
         if self.hand is not None:
             names = self.hand.joint_names
             return {joint: self.hand.servo[names.index(joint)] for joint in joints if joint in names}
-        from vd.assets_usd.bare_layer import read_bare_layer
+        from vd.assets_usd.hand_layer import read_bare_layer
 
         rows, _ = read_bare_layer(self.settings.hand_layer, joints)
         return dict(zip(joints, rows, strict=True))

@@ -1,11 +1,10 @@
 """Settings of the depth camera and of its errors; by default a perfect camera at the hand's viewpoint."""
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import Any, ClassVar
 
+from vd.config import Dropped
 from vd.paper import PAPER
-
-Method = Literal["raster", "rays"]
 
 
 @dataclass(frozen=True)
@@ -105,11 +104,7 @@ class DepthSensorCfg:
 class DepthCameraCfg:
     """A depth camera on the hand's base in every world."""
 
-    method: Method = "raster"
-    """How depth is found. The images are the same; rays can be cast through some of the pixels only."""
-    block: int = 1
-    """Cast one ray through a random pixel of each block of this many pixels a side (rays only), which can be
-    enough for a cloud. 1 gives the image."""
+    RETIRED: ClassVar[dict[str, Any]] = {"method": Dropped("raster"), "block": 1}
     points: int = PAPER.camera.points
     """Points of a cloud at most; 0 makes no clouds."""
     crop_m: tuple[float, float] = PAPER.camera.crop_m
@@ -126,14 +121,9 @@ class DepthCameraCfg:
     """Errors of the measured depth."""
 
     def with_errors(self) -> "DepthCameraCfg":
-        """The same camera as a D415: its sensor's errors, late images, not quite where it is believed.
-
-        All pixels are measured, since the sensor's errors look at neighbours.
-        """
+        """The same camera as a D415: its sensor's errors, late images, not quite where it is believed."""
         return replace(
             self,
-            method="raster",
-            block=1,
             sensor=DepthSensorCfg.realistic(),
             latency_s=LATENCY_S,
             position_noise_m=POSITION_NOISE_M,
@@ -143,14 +133,8 @@ class DepthCameraCfg:
     def validate(self) -> None:
         """Raise ValueError naming the field and the remedy."""
         self.sensor.validate()
-        if self.method not in get_args(Method):
-            raise ValueError(f"method = {self.method!r}; choose raster or rays")
-        if self.block < 1 or self.points < 0:
-            raise ValueError(f"block = {self.block} must be at least 1, points = {self.points} at least 0")
-        if self.block > 1 and self.method != "rays":
-            raise ValueError(f"block = {self.block} needs method = rays; rasterisation fills whole images")
-        if self.block > 1 and (self.sensor.uses_edges or self.sensor.shadow):
-            raise ValueError("sensor.edge_dropout, flying and shadow look at neighbours; they need block = 1")
+        if self.points < 0:
+            raise ValueError(f"points = {self.points} must not be negative")
         if self.crop_m[0] > self.crop_m[1]:
             raise ValueError(f"crop_m = {self.crop_m}; name the lower height first")
         if not 0.0 <= self.latency_s[0] <= self.latency_s[1]:

@@ -21,14 +21,13 @@ from vd.kernels.sensor.depth_sensor import (
     measure_depth_kernel,
     next_count_kernel,
 )
-from vd.kernels.sensor.depth_views import (
+from vd.kernels.sensor.raycast import (
     NO_HIT,
+    cast_rays_kernel,
     finish_depth_kernel,
     place_camera_kernel,
     place_meshes_kernel,
 )
-from vd.kernels.sensor.rasterise import rasterise_kernel
-from vd.kernels.sensor.raycast import RAY_BLOCK, cull_tiles_kernel, order_shapes_kernel, raycast_kernel
 from vd.paper import PAPER
 from vd.sensors.cfg import DepthCameraCfg, DepthSensorCfg
 from vd.sensors.depth_cloud import DepthCloud, make_views
@@ -85,7 +84,6 @@ class DepthCamera:
             n,
             points=cfg.points,
             crop_m=cfg.crop_m,
-            block=cfg.block,
             device=device,
         )
         self.points = cloud.points
@@ -95,7 +93,7 @@ class DepthCamera:
         """Points of each cloud, shape [N]."""
         self.available = cloud.available
         """Pixels within the crop, of which the points were chosen, shape [N]."""
-        shapes, tiles = surfaces.num_shapes, cloud.tile_rows * cloud.tile_columns
+        shapes, image = surfaces.num_shapes, (camera.height, camera.width)
         self._table = _table_box()
         self._lanes = 1 if device == "cpu" else WARP_LANES
         generator = np.random.default_rng(seed)
@@ -121,18 +119,15 @@ class DepthCamera:
         self._believed_q = (
             self.camera_q if self._believed is self.extrinsics else empty(n, dtype=wp.transform)
         )
-        self.true_depth = empty(n, cloud.rows, cloud.columns)
-        """Depth without sensor errors [m], shape [N, H, W]; a row and column for each block of pixels."""
-        self.depth = empty(n, cloud.rows, cloud.columns) if cfg.sensor.enabled else self.true_depth
+        self.true_depth = empty(n, *image)
+        """Depth without sensor errors [m], shape [N, H, W]."""
+        self.depth = empty(n, *image) if cfg.sensor.enabled else self.true_depth
         """Measured depth [m], 0 for none; the same array as ``true_depth`` if the sensor is perfect."""
         self.rng = wp.empty(n, dtype=wp.uint32, device=device)
         """Random state of each world, shape [N]."""
         wp.launch(init_rng_kernel, dim=n, inputs=[seed], outputs=[self.rng], device=device)
 
         self._rotation, self._position = empty(n, shapes, dtype=wp.mat33), empty(n, shapes, dtype=wp.vec3)
-        self._window, self._nearest = empty(n, shapes, dtype=wp.vec4), empty(n, shapes)
-        self._order = empty(n, shapes, dtype=wp.int32)
-        self._tile_shapes = empty(n, tiles, dtype=wp.uint32)
         self._depth_bits = self.true_depth.view(wp.int32)
         self._history: wp.array | None = None
         if cfg.latency_s[1] > 0.0:
@@ -197,37 +192,32 @@ class DepthCamera:
         self._launch(place_camera_kernel, n, [self._camera_body, self.extrinsics, body_q], [self.camera_q])
         self._launch(
             place_meshes_kernel,
-            self._nearest.shape,
+            self._rotation.shape,
+            [surfaces.shape_body, self.camera_q, body_q],
+            [self._rotation, self._position],
+        )
+        self.true_depth.fill_(NO_HIT)
+        self._launch(
+            cast_rays_kernel,
+            (n, len(surfaces.slot_shape)),
             [
                 self.views,
-                surfaces.shape_body,
+                surfaces.points,
+                surfaces.triangles,
+                surfaces.mesh_first,
+                surfaces.slot_shape,
+                surfaces.slot_index,
                 surfaces.shape_mesh,
                 surfaces.shape_scale,
-                surfaces.mesh_lower,
-                surfaces.mesh_upper,
-                self.camera_q,
-                body_q,
+                self._rotation,
+                self._position,
             ],
-            [self._rotation, self._position, self._window, self._nearest],
+            [self._depth_bits],
         )
-        if self.cfg.method == "rays":
-            self._cast()
-        else:
-            self._rasterise()
         self._launch(
             finish_depth_kernel,
-            (n, self._cloud.rows, self._lanes),
-            [
-                self.views,
-                *self._table,
-                self.height,
-                self.width,
-                self.cfg.block,
-                self._lanes,
-                self.table,
-                self.camera_q,
-                self.rng,
-            ],
+            (n, self.height, self._lanes),
+            [self.views, *self._table, self._lanes, self.table, self.camera_q],
             [self.true_depth],
         )
         if self.depth is not self.true_depth:
@@ -244,16 +234,8 @@ class DepthCamera:
             self._cloud.make(self.depth, self.views, self._believed_q, self._believed, self.rng)
         self._launch(next_frame_kernel, n, [self.rng], [])
 
-    def _launch(
-        self,
-        kernel: wp.Kernel,
-        dim: int | tuple[int, ...],
-        inputs: list,
-        outputs: list,
-        *,
-        block_dim: int = 256,
-    ) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def _late_poses(self) -> wp.array:
         """Body poses that this capture shows."""
@@ -267,63 +249,6 @@ class DepthCamera:
         )
         self._launch(next_count_kernel, 1, [self._frame], [])
         return self._late_q
-
-    def _cast(self) -> None:
-        n, surfaces = self.num_envs, self.surfaces
-        cloud, lanes = self._cloud, self._lanes
-        tiles = cloud.tile_rows * cloud.tile_columns
-        self._launch(order_shapes_kernel, self._nearest.shape, [self._nearest], [self._order])
-        self._launch(
-            cull_tiles_kernel,
-            (n, tiles),
-            [self.cfg.block, cloud.tile_columns, self._window, self._order],
-            [self._tile_shapes],
-        )
-        self._launch(
-            raycast_kernel,
-            (n, tiles, lanes),
-            [
-                self.views,
-                surfaces.mesh_id,
-                surfaces.shape_mesh,
-                surfaces.shape_scale,
-                self.height,
-                self.width,
-                self.cfg.block,
-                cloud.tile_columns,
-                lanes,
-                self._rotation,
-                self._position,
-                self._nearest,
-                self._order,
-                self._tile_shapes,
-                self.rng,
-            ],
-            [self.true_depth],
-            block_dim=RAY_BLOCK,
-        )
-
-    def _rasterise(self) -> None:
-        surfaces = self.surfaces
-        self.true_depth.fill_(NO_HIT)
-        self._launch(
-            rasterise_kernel,
-            (self.num_envs, len(surfaces.slot_shape)),
-            [
-                self.views,
-                surfaces.points,
-                surfaces.triangles,
-                surfaces.mesh_first,
-                surfaces.slot_shape,
-                surfaces.slot_index,
-                surfaces.shape_mesh,
-                surfaces.shape_scale,
-                self._rotation,
-                self._position,
-                self._window,
-            ],
-            [self._depth_bits],
-        )
 
 
 def _table_box() -> tuple[wp.vec3, wp.vec3]:

@@ -9,13 +9,14 @@ import warp as wp
 from vd.assets_usd.hand_data import BASE_IN_WORLD, CameraModel, compose
 from vd.kernels.rng import init_rng_kernel
 from vd.kernels.sensor.depth_cloud import (
+    TILE_COLUMNS,
+    TILE_ROWS,
     choose_points_kernel,
     count_points_kernel,
-    crop_cells_kernel,
+    crop_pixels_kernel,
     next_frame_kernel,
 )
-from vd.kernels.sensor.depth_views import View
-from vd.kernels.sensor.raycast import TILE_COLUMNS, TILE_ROWS
+from vd.kernels.sensor.raycast import View
 from vd.paper import PAPER
 
 
@@ -32,10 +33,7 @@ def make_views(camera: CameraModel, focal_scale: Sequence[float] | np.ndarray, d
 
 
 class DepthCloud:
-    """Crops N depth images by height over the table and chooses K points of each, in the base's frame.
-
-    The cells of an image are its pixels, or blocks of pixels of which one was looked at (``block``).
-    """
+    """Crops N depth images by height over the table and chooses K points of each, in the base's frame."""
 
     def __init__(
         self,
@@ -45,7 +43,6 @@ class DepthCloud:
         *,
         points: int = PAPER.camera.points,
         crop_m: tuple[float, float] = PAPER.camera.crop_m,
-        block: int = 1,
         device: str = "cpu",
     ):
         """Allocate N clouds.
@@ -56,14 +53,12 @@ class DepthCloud:
             num_envs: N.
             points: K, points of a cloud at most.
             crop_m: Least and largest height of a point in the world frame [m].
-            block: Pixels on a side of a cell.
             device: Warp device.
         """
-        self.height, self.width, self.block, self.crop_m = height, width, block, crop_m
-        self.rows, self.columns = math.ceil(height / block), math.ceil(width / block)
-        self.tile_rows = math.ceil(self.rows / int(TILE_ROWS))
-        self.tile_columns = math.ceil(self.columns / int(TILE_COLUMNS))
-        tiles = self.tile_rows * self.tile_columns
+        self.crop_m = crop_m
+        self._tile_rows = math.ceil(height / int(TILE_ROWS))
+        self._tile_columns = math.ceil(width / int(TILE_COLUMNS))
+        tiles = self._tile_rows * self._tile_columns
 
         def empty(*shape: int, dtype: type = int) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
@@ -74,11 +69,11 @@ class DepthCloud:
         """Points of each cloud, shape [N]."""
         self.available = empty(num_envs)
         """Pixels within the crop, of which the points were chosen, shape [N]."""
-        self._tile_cells = empty(num_envs, tiles, dtype=wp.uint32)
+        self._tile_pixels = empty(num_envs, tiles, dtype=wp.uint32)
         self._tile_first = empty(num_envs, tiles)
         self._row_count, self._row_first = (
-            empty(num_envs, self.tile_rows),
-            empty(num_envs, self.tile_rows),
+            empty(num_envs, self._tile_rows),
+            empty(num_envs, self._tile_rows),
         )
 
     def make(
@@ -87,19 +82,18 @@ class DepthCloud:
         """Make the clouds of images. Launches only.
 
         Args:
-            depth: Depth along the optical axis [m], 0 for none, shape [N, R, C].
+            depth: Depth along the optical axis [m], 0 for none, shape [N, H, W].
             views: Intrinsics, shape [N].
             camera_q: Optical frames in the world frame, shape [N].
             extrinsics: Optical frames in the frame in which the points are wanted, shape [N].
             rng: Random state of each world, shape [N]; not advanced.
         """
         worlds, device = len(self.count), depth.device
-        size = [self.height, self.width, self.block, self.tile_columns]
         wp.launch(
-            crop_cells_kernel,
-            dim=(worlds, self.tile_rows),
-            inputs=[views, *self.crop_m, *size, camera_q, rng, depth],
-            outputs=[self._tile_cells, self._tile_first, self._row_count],
+            crop_pixels_kernel,
+            dim=(worlds, self._tile_rows),
+            inputs=[views, *self.crop_m, self._tile_columns, camera_q, depth],
+            outputs=[self._tile_pixels, self._tile_first, self._row_count],
             device=device,
         )
         wp.launch(
@@ -114,11 +108,11 @@ class DepthCloud:
             dim=self.points.shape,
             inputs=[
                 views,
-                *size,
+                self._tile_columns,
                 extrinsics,
                 rng,
                 depth,
-                self._tile_cells,
+                self._tile_pixels,
                 self._tile_first,
                 self._row_first,
                 self.available,

@@ -9,7 +9,6 @@ import warp as wp
 from vd.assets_usd.hand_data import HandModel
 from vd.assets_usd.hand_visuals import read_surfaces
 from vd.assets_usd.objects.model import ObjectModel
-from vd.kernels.sensor.raycast import MAX_SHAPES
 from vd.sim.scene import Scene
 
 
@@ -24,8 +23,7 @@ class Surface:
 class SurfaceSet:
     """M distinct meshes and which of them is where: S shapes in each of N worlds, B bodies a world.
 
-    Equal meshes (links of different fingers, objects of different worlds) are kept once, with one bounding
-    volume hierarchy.
+    Equal meshes (links of different fingers, objects of different worlds) are kept once.
     """
 
     def __init__(
@@ -37,7 +35,7 @@ class SurfaceSet:
         *,
         device: str,
     ):
-        """Copy meshes to the device and build their hierarchies.
+        """Copy meshes to the device.
 
         Args:
             meshes: The meshes.
@@ -47,13 +45,9 @@ class SurfaceSet:
             device: Warp device.
 
         Raises:
-            ValueError: More shapes than a tile's word has bits, or a mesh without triangles.
+            ValueError: A mesh without triangles.
         """
         self.num_envs, self.num_shapes = shape_mesh.shape
-        if self.num_shapes > MAX_SHAPES:
-            raise ValueError(
-                f"{self.num_shapes} shapes a world; the depth camera takes {MAX_SHAPES} at most: join some"
-            )
         if empty := [i for i, mesh in enumerate(meshes) if not len(mesh.faces)]:
             raise ValueError(f"meshes {empty} have no triangles; leave them out")
         sizes = np.array([len(mesh.faces) for mesh in meshes])
@@ -69,20 +63,6 @@ class SurfaceSet:
         """Their triangles, mesh after mesh, shape [F]."""
         self.mesh_first = array(np.concatenate([[0], np.cumsum(sizes)]), wp.int32)
         """First triangle of each mesh, and the end, shape [M + 1]."""
-        self._meshes = [
-            wp.Mesh(
-                array(mesh.vertices.astype(np.float32), wp.vec3),
-                array(mesh.faces.astype(np.int32).ravel(), wp.int32),
-                bvh_constructor="sah",  # slower to build than a GPU's default, faster to search
-            )
-            for mesh in meshes
-        ]
-        self.mesh_id = array(np.array([mesh.id for mesh in self._meshes]), wp.uint64)
-        """Hierarchies, shape [M]."""
-        self.mesh_lower = array(np.array([mesh.vertices.min(axis=0) for mesh in meshes]), wp.vec3)
-        """Lower corner of each mesh's bounds [m], shape [M]."""
-        self.mesh_upper = array(np.array([mesh.vertices.max(axis=0) for mesh in meshes]), wp.vec3)
-        """Upper corner, shape [M]."""
         self.shape_body = array(shape_body, wp.int32)
         """Body of each shape, shape [S]."""
         self.shape_mesh = array(shape_mesh, wp.int32)
@@ -92,7 +72,7 @@ class SurfaceSet:
         # Worlds differ in their objects' triangles; there is a thread for each of the most.
         most = sizes[shape_mesh].max(axis=0)
         self.slot_shape = array(np.repeat(np.arange(self.num_shapes), most), wp.int32)
-        """Shape of each thread of the rasterisation, shape [K]."""
+        """Shape of each thread of the ray casting, shape [K]."""
         self.slot_index = array(np.concatenate([np.arange(n) for n in most]), wp.int32)
         """Triangle of each thread within its mesh, shape [K]."""
 

@@ -1,57 +1,65 @@
 """Settings of the physics, each with the reason for its value."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, ClassVar
 
+from vd.config import Dropped
 from vd.paper import PAPER
+
+# Of a light object (0.1 kg) pinched by strong fingers (2.6 N m), measured in docs/concepts/physics.md.
+CONE = "elliptic"
+"""Friction cone. A pyramidal one lets a pinched object creep by millimetres per second."""
+IMPRATIO = 10.0
+"""Frictional over normal impedance. 1 creeps an order of magnitude faster than 10."""
+TOLERANCE = 1e-6
+"""Solver tolerance; single precision gains nothing below it."""
+JACOBIAN = "sparse"
+"""How the solver keeps the constraints' Jacobian. A contact moves one finger and the object, of four fingers
+9 of 18 coordinates; sparse, the solver passes over these alone: the same steps, to rounding."""
+CONTACT_IMPEDANCE = (0.99, 0.995)
+"""Contact ``solimp`` d0 and dmax of hand and object. Contact stiffness scales with the object's mass, so the
+default (0.9, 0.95) lets fingers sink more than a millimetre into a 0.1 kg object."""
+TABLE_IMPEDANCE = (0.97, 0.99)
+"""The same for contacts with the table: stiffer ones keep some light, slim objects rocking, softer ones let
+more of them roll on."""
+IMPEDANCE_WIDTH_M = 0.001
+"""Penetration over which the impedance rises from d0 to dmax [m]."""
+GAP_M = 0.002
+"""Detection distance beyond touching [m]. The default of 0.1 m, the size of the whole scene, makes hundreds
+of candidate contacts a world that never touch."""
+FINGERTIP_TORSION_M = 0.005
+"""Torsional friction radius of the fingertips [m], about the radius of their contact patch; fingertip
+contacts have condim 4, all others 3."""
 
 
 @dataclass(frozen=True)
 class SimCfg:
-    """Newton and SolverMuJoCo settings.
+    """Rates, sizes and limits of the physics; what is the same in every run is a constant of this module."""
 
-    The values were chosen on a light object (0.1 kg) pinched by strong fingers (2.6 N m):
-    see "Contact settings" in ARCHITECTURE.md for the measurements behind them.
-    """
+    RETIRED: ClassVar[dict[str, Any]] = {
+        "cone": CONE,
+        "impratio": IMPRATIO,
+        "tolerance": TOLERANCE,
+        "jacobian": Dropped(JACOBIAN),
+        "multiccd": False,
+        "contact_impedance": list(CONTACT_IMPEDANCE),
+        "table_impedance": list(TABLE_IMPEDANCE),
+        "contact_impedance_width_m": IMPEDANCE_WIDTH_M,
+        "gap_m": GAP_M,
+        "fingertip_torsion_m": FINGERTIP_TORSION_M,
+    }
 
     physics_hz: float = PAPER.scene.physics_hz
     """Physics rate [Hz]; a whole, even multiple of ``control_hz``."""
     control_hz: float = PAPER.scene.control_hz
     """Policy rate [Hz]."""
-    cone: str = "elliptic"
-    """Friction cone. A pyramidal one lets a pinched object creep by millimetres per second."""
-    impratio: float = 10.0
-    """Frictional over normal impedance. 1 creeps an order of magnitude faster than 10."""
     iterations: int = 10
     """Newton solver iterations at most; it stops earlier by ``tolerance``. Contact quality is that of
     100 iterations (rest, creep, penetration); 20 cost a fifth of the speed: all worlds wait for the last."""
     ls_iterations: int = 10
     """Line-search iterations at most."""
-    tolerance: float = 1e-6
-    """Solver tolerance; single precision gains nothing below it."""
-    jacobian: Literal["dense", "sparse"] = "sparse"
-    """How the solver keeps the constraints' Jacobian. A contact moves one finger and the object, of
-    four fingers 9 of 18 coordinates; sparse, the solver passes over these alone: the same steps, to
-    rounding."""
-    multiccd: bool = False
-    """Up to four contacts for a pair of convex parts. Not needed: the table is a plane, whose contacts are
-    exact, and fingertips are round. (Against a table made of a box, objects never rest without it.)"""
     contact_time_constant_s: float = 2.0 / 120.0
     """Contact ``solref`` time constant [s]: two physics steps, the stiffest that is stable."""
-    contact_impedance: tuple[float, float] = (0.99, 0.995)
-    """Contact ``solimp`` d0 and dmax of hand and object. Contact stiffness scales with the object's mass,
-    so the default (0.9, 0.95) lets fingers sink more than a millimetre into a 0.1 kg object."""
-    table_impedance: tuple[float, float] = (0.97, 0.99)
-    """The same for contacts with the table: stiffer ones keep some light, slim objects rocking, softer ones
-    let more of them roll on."""
-    contact_impedance_width_m: float = 0.001
-    """Penetration over which the impedance rises from d0 to dmax [m]."""
-    gap_m: float = 0.002
-    """Detection distance beyond touching [m]. The default of 0.1 m, the size of the whole scene,
-    makes hundreds of candidate contacts a world that never touch."""
-    fingertip_torsion_m: float = 0.005
-    """Torsional friction radius of the fingertips [m], about the radius of their contact patch;
-    fingertip contacts have condim 4, all others 3."""
     njmax: int = 160
     """Constraint rows a world may use; an overflow stops the run and names this setting."""
     nconmax: int = 32

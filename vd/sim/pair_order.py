@@ -17,15 +17,10 @@ _in_order_found = collision_driver._narrowphase
 
 
 class PairOrder:
-    """Sorts the candidate pairs of one solver's data, on its device and without waiting for it.
-
-    Attributes:
-        active: Whether it does.
-    """
+    """Sorts the candidate pairs of one solver's data, on its device and without waiting for it."""
 
     def __init__(self, data: Data):
         """Make room for all pairs that the data has room for."""
-        self.active = True
         self._most, self._device = data.naconmax, data.geom_xpos.device
 
         def room(count: int, dtype: type) -> wp.array:
@@ -37,13 +32,7 @@ class PairOrder:
         self._world = room(self._most, wp.int32)
 
     def sort(self, model: Any, data: Data, found: Any) -> None:
-        """Put the pairs that the broad phase found into order.
-
-        Args:
-            model: MuJoCo Warp's model.
-            data: Its data.
-            found: What the broad phase hands to the narrow phase; its arrays are replaced.
-        """
+        """Put the pairs that the broad phase ``found`` into order; its arrays are replaced."""
         wp.launch(
             pair_key_kernel,
             dim=self._most,
@@ -83,27 +72,11 @@ def sort_pairs(model: Any, data: Data) -> None:
         raise ValueError("pairs with signed distance fields cannot be sorted; make their shapes meshes")
     # The solver has no place for it between the phases: a function of its module is replaced, for all data.
     collision_driver._narrowphase = _narrowphase
-    if _order_of(data) is None:
-        data.pair_order = PairOrder(data)
-    data.pair_order.active = True
-
-
-def leave_pairs(data: Data) -> None:
-    """Take the candidate pairs of a solver's data as they are found, from now on.
-
-    Graphs that were captured before go on sorting.
-    """
-    order = _order_of(data)
-    if order is not None:
-        order.active = False
-
-
-def _order_of(data: Data) -> PairOrder | None:
-    return getattr(data, "pair_order", None)
+    data.pair_order = PairOrder(data)
 
 
 def _narrowphase(model: Any, data: Data, found: Any) -> None:
-    order = _order_of(data)
-    if order is not None and order.active:
+    order: PairOrder | None = getattr(data, "pair_order", None)
+    if order is not None:
         order.sort(model, data, found)
     _in_order_found(model, data, found)

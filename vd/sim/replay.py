@@ -16,40 +16,44 @@ from vd.config import from_dict, to_dict
 from vd.files import write_json
 from vd.sim.actuators import has_effects
 from vd.sim.cfg import SimCfg
-from vd.sim.simulator import NanDump, Simulator
+from vd.sim.simulator import Simulator
 
 
-def _numbers(array: np.ndarray) -> list[float | None]:
-    return [float(v) if np.isfinite(v) else None for v in array]
-
-
-def save_dump(
-    path: Path,
-    dump: NanDump,
+def save_failed_step(
+    sim: Simulator,
+    folder: Path,
     *,
     hand: str,
     fingertip: str,
-    hand_layer: str | None = None,
+    hand_layer: str | None,
     objects: tuple[str, ...],
-    sim: SimCfg,
-) -> Path:
-    """Write ``dump`` with what is needed to build its world again. Values that are not finite become null."""
-    write_json(
-        path,
-        {
-            "format": "vd-dump/1",
-            "hand": hand,
-            "fingertip": fingertip,
-            "hand_layer": hand_layer,
-            "objects": list(objects),
-            "object": dump.object_name,
-            "world": dump.world,
-            "sim": to_dict(sim),
-            "joint_q": _numbers(dump.joint_q),
-            "joint_qd": _numbers(dump.joint_qd),
-            "target": _numbers(dump.target),
-        },
-    )
+) -> Path | None:
+    """Save the first control step that failed, with what is needed to build its world again.
+
+    Values that are not finite become null.
+
+    Returns:
+        The file; None if no step failed.
+    """
+    failed = np.flatnonzero(sim.failures.numpy())
+    if not failed.size:
+        return None
+    world = int(failed[0])
+    item = sim.scene.objects[sim.scene.world_object[world]].name
+    path = folder / f"dump_{item}_{world}.json"
+    record: dict[str, Any] = {
+        "format": "vd-dump/1",
+        "hand": hand,
+        "fingertip": fingertip,
+        "hand_layer": hand_layer,
+        "objects": list(objects),
+        "object": item,
+        "world": world,
+        "sim": to_dict(sim.cfg),
+    }
+    for name, array in sim.failed_from.items():
+        record[name] = [float(v) if np.isfinite(v) else None for v in array.numpy()[world]]
+    write_json(path, record)
     return path
 
 

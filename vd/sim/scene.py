@@ -15,7 +15,14 @@ from vd.assets_usd.hand_data import BASE_IN_WORLD
 from vd.assets_usd.hand_model import HandModel, open_stage
 from vd.assets_usd.objects.model import ObjectModel
 from vd.paper import PAPER
-from vd.sim.cfg import SimCfg
+from vd.sim.cfg import (
+    CONTACT_IMPEDANCE,
+    FINGERTIP_TORSION_M,
+    GAP_M,
+    IMPEDANCE_WIDTH_M,
+    TABLE_IMPEDANCE,
+    SimCfg,
+)
 
 # Contact friction in MuJoCo is the larger of two geoms' unless one has a higher priority. The paper's
 # engine averages the two, so each pair's average is written to its higher-priority geom:
@@ -87,13 +94,13 @@ def new_builder() -> newton.ModelBuilder:
     return builder
 
 
-def contact_attributes(cfg: SimCfg, priority: int, condim: int = CONDIM_SLIDING) -> dict[str, object]:
+def contact_attributes(priority: int, condim: int = CONDIM_SLIDING) -> dict[str, object]:
     """MuJoCo attributes of a collision shape."""
-    d0, dmax = cfg.table_impedance if priority == PRIORITY_TABLE else cfg.contact_impedance
+    d0, dmax = TABLE_IMPEDANCE if priority == PRIORITY_TABLE else CONTACT_IMPEDANCE
     return {
         "mujoco:condim": condim,
         "mujoco:geom_priority": priority,
-        "mujoco:geom_solimp": wp.types.vector(5, float)(d0, dmax, cfg.contact_impedance_width_m, 0.5, 2.0),
+        "mujoco:geom_solimp": wp.types.vector(5, float)(d0, dmax, IMPEDANCE_WIDTH_M, 0.5, 2.0),
     }
 
 
@@ -106,9 +113,9 @@ def shape_cfg(cfg: SimCfg, friction: float, *, visual: bool = False) -> newton.M
         mu=friction,
         ke=(0.5 * kd) ** 2,
         kd=kd,
-        gap=cfg.gap_m,
+        gap=GAP_M,
         margin=0.0,
-        mu_torsional=cfg.fingertip_torsion_m,
+        mu_torsional=FINGERTIP_TORSION_M,
         has_shape_collision=not visual,
         has_particle_collision=False,
         is_visible=visual,
@@ -139,10 +146,10 @@ def build_hand(hand: HandModel, cfg: SimCfg, *, visuals: bool) -> newton.ModelBu
         if not builder.shape_flags[shape] & newton.ShapeFlags.COLLIDE_SHAPES:
             continue
         is_tip = builder.shape_label[shape] in tips
-        builder.shape_gap[shape] = cfg.gap_m
+        builder.shape_gap[shape] = GAP_M
         builder.shape_margin[shape] = 0.0
-        builder.shape_material_mu_torsional[shape] = cfg.fingertip_torsion_m
-        attributes = contact_attributes(cfg, PRIORITY_HAND, CONDIM_TORSIONAL if is_tip else CONDIM_SLIDING)
+        builder.shape_material_mu_torsional[shape] = FINGERTIP_TORSION_M
+        attributes = contact_attributes(PRIORITY_HAND, CONDIM_TORSIONAL if is_tip else CONDIM_SLIDING)
         for key, value in attributes.items():
             builder.custom_attributes[key].values[shape] = value
     return builder
@@ -162,7 +169,7 @@ def add_table(builder: newton.ModelBuilder, cfg: SimCfg, *, visible: bool) -> No
         body=-1,
         cfg=shape_cfg(cfg, PAPER.materials.table_friction),
         label=TABLE_LABEL,
-        custom_attributes=contact_attributes(cfg, PRIORITY_TABLE),
+        custom_attributes=contact_attributes(PRIORITY_TABLE),
     )
     if visible:
         show_table(builder, cfg)
@@ -215,7 +222,7 @@ def add_object(
             mesh=scaled_mesh(vertices, faces, scale),
             cfg=hull_cfg,
             label=f"{OBJECT_LABEL}/hull_{index}",
-            custom_attributes=contact_attributes(cfg, PRIORITY_OBJECT),
+            custom_attributes=contact_attributes(PRIORITY_OBJECT),
         )
     if visuals:
         builder.add_shape_mesh(

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import newton
 import numpy as np
@@ -15,7 +14,7 @@ from vd.kernels.task.environments import place_table_kernel
 from vd.kernels.task.guard import collect_overflow_kernel, guard_kernel, put_back_kernel
 from vd.paper import PAPER
 from vd.sim.actuators import JointServo
-from vd.sim.cfg import SimCfg
+from vd.sim.cfg import CONE, IMPRATIO, JACOBIAN, TOLERANCE, SimCfg
 from vd.sim.pair_order import sort_pairs
 from vd.sim.restitution import Restitution
 from vd.sim.scene import SHAPE_OBJECT, SHAPE_TABLE, Scene
@@ -52,22 +51,6 @@ class SimulationError(RuntimeError):
     """The simulation lost contacts or left the finite numbers; says what to change."""
 
 
-@dataclass
-class NanDump:
-    """The control step in which one world went bad, ready to be replayed."""
-
-    world: int
-    """World index."""
-    object_name: str
-    """Its object."""
-    joint_q: np.ndarray
-    """Positions before the step, shape [D + 7]."""
-    joint_qd: np.ndarray
-    """Velocities before the step, shape [D + 6]."""
-    target: np.ndarray
-    """Joint targets of the step [rad], shape [D]."""
-
-
 def make_solver(model: newton.Model, cfg: SimCfg) -> SolverMuJoCo:
     """The solver with the project's settings; overflow is left to the guards, which need no prints.
 
@@ -82,15 +65,15 @@ def make_solver(model: newton.Model, cfg: SimCfg) -> SolverMuJoCo:
         model,
         solver="newton",
         integrator="implicitfast",
-        cone=cfg.cone,
-        impratio=cfg.impratio,
+        cone=CONE,
+        impratio=IMPRATIO,
         iterations=cfg.iterations,
         ls_iterations=cfg.ls_iterations,
-        tolerance=cfg.tolerance,
-        jacobian=cfg.jacobian,
+        tolerance=TOLERANCE,
+        jacobian=JACOBIAN,
         njmax=rows,
         nconmax=math.ceil(room * cfg.nconmax),
-        enable_multiccd=cfg.multiccd,
+        enable_multiccd=False,  # the table is a plane, whose contacts are exact, and fingertips are round
         kinematic_switchable_roots=False,
     )
     solver.mjw_model.opt.warn_overflow = False
@@ -138,19 +121,15 @@ class Simulator:
         self._observables = self.solver.observables({SolverMuJoCo.ObservableKind.OVERFLOW})
         self._overflow_mask = sum(OVERFLOW_REMEDY)
 
-        self.joint_q = self.state.joint_q.reshape((n, -1))
-        self.joint_qd = self.state.joint_qd.reshape((n, -1))
+        def per_env(state: newton.State) -> list[wp.array]:
+            arrays = state.joint_q, state.joint_qd, state.body_q, state.body_qd, state.body_f
+            return [array.reshape((n, -1)) for array in arrays]
+
+        self.joint_q, self.joint_qd, self.body_q, self.body_qd, self.body_force = per_env(self.state)
+        *self._next_arrays, self._next_body_force = per_env(self._next)
         self.target = self.control.joint_target_q.reshape((n, -1))
         self.servo: JointServo | None = None
         """The identified servos, or None: then ``target`` goes to the solver's drives as it is."""
-        self.body_q = self.state.body_q.reshape((n, -1))
-        self.body_qd = self.state.body_qd.reshape((n, -1))
-        self.body_force = self.state.body_f.reshape((n, -1))
-        self._next_body_force = self._next.body_f.reshape((n, -1))
-        self._next_body_q = self._next.body_q.reshape((n, -1))
-        self._next_body_qd = self._next.body_qd.reshape((n, -1))
-        self._next_q = self._next.joint_q.reshape((n, -1))
-        self._next_qd = self._next.joint_qd.reshape((n, -1))
 
         def array(values: np.ndarray, dtype: type = wp.int32) -> wp.array:
             return wp.array(values, dtype=dtype, device=self.device)
@@ -178,8 +157,13 @@ class Simulator:
         """Called in every physics step with the new positions, velocities and link poses and velocities,
         shape [N, *]; device work only."""
         self._start_q, self._start_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
-        self._dump_q, self._dump_qd = wp.clone(self.joint_q), wp.clone(self.joint_qd)
-        self._dump_target = wp.clone(self.target)
+        self.failed_from = {
+            "joint_q": wp.clone(self.joint_q),
+            "joint_qd": wp.clone(self.joint_qd),
+            "target": wp.clone(self.target),
+        }
+        """Positions, velocities and joint targets from which a world's first step that failed began, shape
+        [N, *]; of a world in which none did those of the last."""
         if servo_rows is not None:
             self.target = wp.clone(self.target)  # the drives' references become the servos' output
             self.servo = JointServo(
@@ -206,28 +190,24 @@ class Simulator:
         if self.servo is not None:
             self.servo.measure()
         self._table_contact()
-        wp.launch(
+        self._launch(
             guard_kernel,
-            dim=self.num_envs,
-            inputs=[self.joint_q, self.joint_qd, self._start_q, self._start_qd, self.target, MAX_SPEED],
-            outputs=[self.failures, self._dump_q, self._dump_qd, self._dump_target, self.failed],
-            device=self.device,
+            [self.joint_q, self.joint_qd, self._start_q, self._start_qd, self.target, MAX_SPEED],
+            [self.failures, *self.failed_from.values(), self.failed],
         )
 
     def put_back(self, step_count: wp.array, last_step: int) -> None:
         """Put worlds of which this step failed back to its begin, as :func:`put_back_kernel` says."""
-        wp.launch(
+        self._launch(
             put_back_kernel,
-            dim=self.num_envs,
-            inputs=[self.failed, self._start_q, last_step],
-            outputs=[self.joint_q, self.joint_qd, step_count],
-            device=self.device,
+            [self.failed, self._start_q, last_step],
+            [self.joint_q, self.joint_qd, step_count],
         )
 
     def _physics_steps(self, *, ours: bool) -> None:
         """The physics steps of one control step, with our additions; states end where they began."""
         here = self.state, self.joint_q, self.joint_qd, self.body_q, self.body_qd
-        there = self._next, self._next_q, self._next_qd, self._next_body_q, self._next_body_qd
+        there = self._next, *self._next_arrays
         for step in range(self.cfg.substeps):
             if ours and step == self.force_steps:
                 wp.copy(self.body_force, self.lasting_force)
@@ -250,46 +230,44 @@ class Simulator:
         """The solver's share of a control step, nothing of ours (for benchmarks)."""
         self._physics_steps(ours=False)
 
+    def _launch(
+        self, kernel: wp.Kernel, inputs: list, outputs: list, *, dim: int | tuple[int, ...] = 0
+    ) -> None:
+        """Launch a kernel, for every environment unless ``dim`` is given."""
+        wp.launch(kernel, dim=dim or self.num_envs, inputs=inputs, outputs=outputs, device=self.device)
+
     def _limit_and_collect(self, previous_q: wp.array2d, q: wp.array2d, qd: wp.array2d) -> None:
         # The solver knows no joint velocity limits.
         if self.servo is not None:
             self.servo.finish(previous_q, q, qd)
         else:
-            wp.launch(
+            self._launch(
                 limit_joint_velocity_kernel,
+                [self.velocity_limit, self.cfg.physics_dt, previous_q],
+                [q, qd],
                 dim=(self.num_envs, len(self.velocity_limit)),
-                inputs=[self.velocity_limit, self.cfg.physics_dt, previous_q],
-                outputs=[q, qd],
-                device=self.device,
             )
-        wp.launch(
-            collect_overflow_kernel,
-            dim=self.num_envs,
-            inputs=[self._observables.overflow, self._overflow_mask],
-            outputs=[self.overflow],
-            device=self.device,
+        self._launch(
+            collect_overflow_kernel, [self._observables.overflow, self._overflow_mask], [self.overflow]
         )
 
     def _table_contact(self) -> None:
         data = self.solver.mjw_data
         self.table_force.zero_()
-        wp.launch(
+        self._launch(
             pair_force_kernel,
-            dim=data.naconmax,
-            inputs=[
+            [
                 data.nacon,
                 data.contact.worldid,
                 data.contact.geom,
                 data.contact.efc_address,
-                data.contact.dim,
                 data.efc.force,
                 self._geom_kind,
                 SHAPE_TABLE,
                 SHAPE_OBJECT,
-                int(self.cfg.cone == "pyramidal"),
             ],
-            outputs=[self.table_force],
-            device=self.device,
+            [self.table_force],
+            dim=data.naconmax,
         )
 
     def place_table(self, *, present: bool) -> None:
@@ -308,12 +286,11 @@ class Simulator:
             step_count: Control steps since the world's reset, shape [N].
             last_step: Control steps for which each table stays, shape [N].
         """
-        wp.launch(
+        self._launch(
             place_table_kernel,
+            [self._geom_kind, SHAPE_TABLE, step_count, last_step, PAPER.scene.table_top_m, AWAY_M],
+            [self.solver.mjw_data.geom_xpos],
             dim=self._geom_kind.shape,
-            inputs=[self._geom_kind, SHAPE_TABLE, step_count, last_step, PAPER.scene.table_top_m, AWAY_M],
-            outputs=[self.solver.mjw_data.geom_xpos],
-            device=self.device,
         )
 
     def forward_kinematics(self) -> None:
@@ -339,7 +316,7 @@ class Simulator:
                 if np.any(overflow & bit)
             ]
             raise SimulationError(
-                f"{len(worlds)} of {self.num_envs} worlds lost contacts (first: world {worlds[0]}; "
+                f"{len(worlds)} of {self.num_envs} environments lost contacts (first: {worlds[0]}; "
                 f"objects: {', '.join(sorted(names)[:5])}): {'; '.join(lines)}"
             )
         failures = self.failures.numpy()
@@ -347,18 +324,8 @@ class Simulator:
             worlds = np.flatnonzero(failures)
             name = self.scene.objects[self.scene.world_object[worlds[0]]].name
             raise SimulationError(
-                f"{len(worlds)} of {self.num_envs} worlds left the finite numbers or exceeded "
-                f"{MAX_SPEED:g} m/s or rad/s (first: world {worlds[0]}, object {name}). "
+                f"{len(worlds)} of {self.num_envs} environments left the finite numbers or "
+                f"exceeded {MAX_SPEED:g} m/s or rad/s (first: world {worlds[0]}, object {name}). "
                 "Replay the saved dump with "
                 "`vd-bench replay DUMP`; then raise sim.physics_hz or sim.contact_time_constant_s"
             )
-
-    def dumps(self) -> list[NanDump]:
-        """The step that went bad, for every bad world."""
-        names = self.scene.objects
-        q, qd, target = self._dump_q.numpy(), self._dump_qd.numpy(), self._dump_target.numpy()
-        dofs = len(self.velocity_limit)
-        return [
-            NanDump(int(w), names[self.scene.world_object[w]].name, q[w], qd[w], target[w, :dofs])
-            for w in np.flatnonzero(self.failures.numpy())
-        ]

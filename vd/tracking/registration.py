@@ -147,13 +147,13 @@ class Registration:
             [shapes.samples, mesh, shapes.half, meshed],
             [shapes.distance],
         )
-        self._eye, self._rendered, cells = Eye(), camera is not None, (0, 0)
+        self._eye, cells = Eye(), (0, 0)
         if camera is not None:
             self._eye.focal, self._eye.centre = wp.vec2(camera.fx, camera.fy), wp.vec2(camera.cx, camera.cy)
             self._eye.pose = wp.transform(*camera.position.tolist(), *camera.quaternion.tolist())
             self._eye.cell, self._eye.margin = CELL_PX, MARGIN_M
             cells = (math.ceil(camera.height / CELL_PX), math.ceil(camera.width / CELL_PX))
-        self._placing = [shapes, self._eye, int(self._rendered), EVERY_SAMPLE]
+        self._placing = [shapes, self._eye, int(camera is not None), EVERY_SAMPLE]
         self._nearness = wp.zeros((envs, *cells), dtype=float, device=device)
         self._rotations = array(even_rotations(ROTATIONS), wp.quat)
         self.pose = torch.zeros((envs, KEPT, 7), device=place)
@@ -180,13 +180,8 @@ class Registration:
             seen: Points seen of the object [m], [N, P, 3].
             count: How many there are, [N] int32.
             fresh: Where nothing is known from before, bool [N].
-            points: All that the camera saw [m], NaN for none, [N, K, 3].
-
-        Raises:
-            ValueError: There is a camera but no points, or the other way round.
+            points: All that the camera saw [m], NaN for none, [N, K, 3]; None without a camera.
         """
-        if (points is not None) != self._rendered:
-            raise ValueError("all points of a camera are needed, and only of one")
         inputs = [wp.from_torch(seen.contiguous(), dtype=wp.vec3), wp.from_torch(count)]
         if points is not None:
             self._nearness.zero_()

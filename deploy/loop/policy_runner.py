@@ -1,0 +1,271 @@
+"""Policies in the control loop: from what is sensed to an action and the distance to the goal."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from vd.assets_usd.hand_data import CameraModel, HandModel
+from vd.assets_usd.objects.model import ObjectModel
+from vd.config import from_dict
+from vd.envs.cfg import ReorientCfg
+from vd.evaluate.agents import check_bundle, is_saved_student, is_tracking_policy, open_policy, trained_task
+from vd.evaluate.student import RENDERED
+from vd.paper import PAPER
+from vd.senses import Senses
+from vd.sensors.cfg import DepthCameraCfg
+from vd.sensors.depth_cloud import CameraCloud
+from vd.stopping import StoppingRule
+from vd.tracking.policy import TrackingPolicy
+from vd.tracking.tracker import Tracker
+from vd.vision.saved import SavedStudent
+from vd.vision.sight import Frame, Sight
+
+ZERO = "zero"
+"""Name of the zero-action baseline."""
+
+
+@dataclass(frozen=True)
+class Sensed:
+    """What is known before an action; D joints, world frame."""
+
+    joint_q: np.ndarray
+    """Joint positions as measured [rad] [D]."""
+    joint_qd: np.ndarray
+    """Joint velocities as measured [rad/s] [D]."""
+    smoothed: np.ndarray
+    """Moving average of the actions so far [D]."""
+    goal_quat: np.ndarray
+    """Wanted orientation of the object, xyzw [4]."""
+    depth: np.ndarray | None = None
+    """Depth image [m], 0 for none [H, W]."""
+    object_pose: np.ndarray | None = None
+    """True pose of the object [7], which a twin tells and no policy is told."""
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What a policy says of a moment."""
+
+    action: np.ndarray
+    """Mean action [D]."""
+    distance: float
+    """Distance to the goal by which it is stopped [rad], as it is predicted; NaN: not known."""
+
+
+class PolicyRunner:
+    """A policy in the loop; this one does nothing, to try everything else.
+
+    Args:
+        task: Environment of its training.
+        rule: When it has arrived.
+
+    Attributes:
+        kind: student, tracking or zero.
+        camera: Where its depth camera has to be; None: it has none.
+        calibrated: Whether its rule to stop comes from episodes.
+    """
+
+    kind = ZERO
+    camera: CameraModel | None = None
+    calibrated = True
+
+    def __init__(self, task: ReorientCfg, rule: StoppingRule):
+        self.task, self.rule = task, rule
+
+    def look_by(self, camera: CameraModel) -> None:
+        """See by a camera with this lens at this place, in place of the one of the training."""
+
+    def begin(self) -> None:
+        """A run begins: nothing is known from before."""
+        self.new_goal()
+
+    def new_goal(self) -> None:
+        """A new goal: memory starts empty, as in training."""
+
+    def decide(self, sensed: Sensed) -> Decision:
+        """What to do now."""
+        return Decision(np.zeros_like(sensed.smoothed), float("nan"))
+
+
+class StudentRunner(PolicyRunner):
+    """A student: sees by a depth camera, remembers, and predicts its distance.
+
+    Arguments are those of :func:`load_runner`.
+
+    Raises:
+        ValueError: It is none of stage 2, and so does not see by a camera.
+    """
+
+    kind = "student"
+
+    def __init__(
+        self,
+        student: SavedStudent,
+        hand: HandModel,
+        item: ObjectModel,
+        *,
+        tolerance_rad: float = PAPER.success.rotation_rad,
+        seed: int = 0,
+    ):
+        spec = student.spec
+        if spec.stage != RENDERED:
+            raise ValueError(f"a student of stage {spec.stage} does not see by a camera; give one of stage 2")
+        super().__init__(trained_task(student), spec.rule_for(tolerance_rad))
+        self.calibrated, self._network = spec.calibrated_for(tolerance_rad), student.network
+        depth = from_dict(DepthCameraCfg, student.depth, where="depth camera of the student")
+        self._cloud = partial(CameraCloud, points=depth.points, crop_m=depth.crop_m, seed=seed)
+        self.sight = Sight(hand, [item], spec.network, complete=False)
+        self.look_by(hand.camera.at(spec.camera))
+        self._hidden = self._network.initial_hidden(1)
+
+    def look_by(self, camera: CameraModel) -> None:
+        """See by another camera."""
+        self.camera, self._eye = camera, self._cloud(camera)
+
+    def new_goal(self) -> None:
+        """The memory starts empty."""
+        self._hidden = self._network.initial_hidden(1)
+
+    def frame(self, sensed: Sensed) -> Frame:
+        """What it sees and senses.
+
+        Raises:
+            ValueError: There is no image.
+        """
+        return self.sight.frame(senses_of(sensed, seen_points(self._eye, sensed.depth)), None)
+
+    def decide(self, sensed: Sensed) -> Decision:
+        """Mean action and predicted distance."""
+        with torch.inference_mode():
+            seen = self.frame(sensed)
+            known = self._network.proprioception(seen)
+            output = self._network.act(self.sight.sites(seen), known, self._hidden)
+        self._hidden = output.hidden
+        return Decision(output.mean[0].numpy().copy(), float(output.distance[0, -1]))
+
+
+class TrackingRunner(PolicyRunner):
+    """A tracking policy: finds the object in the camera's images, and lets its teacher act.
+
+    Arguments are those of :func:`load_runner`.
+
+    Raises:
+        ValueError: It is for another hand.
+    """
+
+    kind = "tracking"
+
+    def __init__(
+        self,
+        policy: TrackingPolicy,
+        hand: HandModel,
+        item: ObjectModel,
+        *,
+        tolerance_rad: float = PAPER.success.rotation_rad,
+        seed: int = 0,
+    ):
+        super().__init__(trained_task(policy), policy.spec.rule_for(tolerance_rad))
+        self.calibrated, depth = policy.spec.calibrated_for(tolerance_rad), policy.spec.depth
+        self._cloud = partial(CameraCloud, points=depth.points, crop_m=depth.crop_m, seed=seed)
+        self._tracker_of = partial(Tracker, policy, hand, [item])
+        self._fresh = True
+        self.look_by(hand.camera.at(policy.spec.camera))
+
+    def look_by(self, camera: CameraModel) -> None:
+        """See by another camera."""
+        self.camera, self._eye, self._tracker = camera, self._cloud(camera), self._tracker_of(camera)
+
+    def begin(self) -> None:
+        """The object is looked for anew, which takes several times as long as a step."""
+        self._fresh = True
+
+    def decide(self, sensed: Sensed) -> Decision:
+        """Mean action, and the angle that was found."""
+        points = seen_points(self._eye, sensed.depth)
+        senses = senses_of(sensed, points, fresh=self._fresh)
+        decided = self._tracker.step(senses)
+        self._fresh = False
+        return Decision(decided.action[0].numpy().copy(), float(decided.angle[0]))
+
+
+def load_runner(
+    name: str,
+    hand_name: str,
+    hand: HandModel,
+    item: ObjectModel,
+    *,
+    tolerance_rad: float = PAPER.success.rotation_rad,
+    seed: int = 0,
+) -> PolicyRunner:
+    """Load a policy for the loop.
+
+    Args:
+        name: Bundle, file of a policy, installed policy, or ``zero``.
+        hand_name: Name of the hand or its USD.
+        hand: The hand.
+        item: The object.
+        tolerance_rad: How near to the goal it is to stop [rad].
+        seed: Of the choice of camera points.
+
+    Raises:
+        ValueError: It is for another hand, or does not see by a camera.
+    """
+    policy: Any = None if name == ZERO else open_policy(name, "cpu")
+    student = is_saved_student(policy)
+    if policy is None:
+        if name != ZERO:
+            raise ValueError(f"{name} is not for a hand; give a bundle, a policy's file, or {ZERO}")
+        return PolicyRunner(ReorientCfg(hand=hand_name), StoppingRule())
+    moves = policy.spec.num_actions if student else policy.num_actions
+    if moves != hand.num_joints:
+        raise ValueError(f"{name} moves {moves} joints, the hand {hand.name} has {hand.num_joints}")
+    check_bundle(name, replace(trained_task(policy), hand=hand_name))
+    if student:
+        return StudentRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
+    if is_tracking_policy(policy):
+        return TrackingRunner(policy, hand, item, tolerance_rad=tolerance_rad, seed=seed)
+    raise ValueError(
+        f"{name} is a teacher: it needs the object's true state, which no robot senses; vd-train tracker "
+        "makes a tracking policy of it"
+    )
+
+
+def seen_points(cloud: CameraCloud, depth: np.ndarray | None) -> torch.Tensor:
+    """What a camera sees in an image, base frame [m], NaN for none [1, K, 3]; overwritten by the next call.
+
+    Raises:
+        ValueError: There is no image.
+    """
+    if depth is None:
+        raise ValueError("the policy sees by a depth camera, but there is no image")
+    points, count = cloud.make(depth)
+    seen = wp.to_torch(points)
+    if not count.numpy()[0]:  # the false point of an empty cloud counts for nothing
+        seen.fill_(torch.nan)
+    return seen
+
+
+def senses_of(sensed: Sensed, points: torch.Tensor, *, fresh: bool = False) -> Senses:
+    """What a policy that sees by a camera is told of one hand.
+
+    Args:
+        sensed: What is known.
+        points: What its camera sees [1, K, 3].
+        fresh: Whether an episode begins.
+    """
+
+    def row(values: np.ndarray) -> torch.Tensor:
+        return torch.tensor(values, dtype=torch.float32)[None]
+
+    return Senses(
+        joint_q=row(sensed.joint_q),
+        joint_qd=row(sensed.joint_qd),
+        action=row(sensed.smoothed),
+        goal_quat=row(sensed.goal_quat),
+        points=points,
+        fresh=torch.tensor([fresh]),
+    )

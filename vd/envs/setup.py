@@ -1,0 +1,59 @@
+"""What is chosen once, when environments are built: sizes of objects, tables that leave, starts at rest."""
+
+import numpy as np
+
+from vd.envs.cfg import RandomisationCfg, ReorientCfg
+from vd.paper import PAPER
+
+ALWAYS = 2**31 - 1
+"""Last step of a table that stays."""
+SETTLE_S = 1.5
+"""Time an object has to come to rest after a drop [s]; some slim ones still rock then."""
+
+
+def object_scales(random: RandomisationCfg) -> list[float]:
+    """Size factors of the objects; 1 alone where nothing is randomised."""
+    if not random.enabled:
+        return [1.0]
+    return [float(scale) for scale in np.linspace(*random.object_scale, random.object_scale_count)]
+
+
+def table_steps(cfg: ReorientCfg) -> np.ndarray:
+    """Control steps for which each world's table stays, int32, shape [N].
+
+    Which environments lose it, and when, is drawn once from the seed: an episode says nothing of it to the
+    policy.
+    """
+    table, n = cfg.table, cfg.num_envs
+    draw = np.random.default_rng(cfg.seed)
+    away = draw.permutation(n) < round(table.away_share * n)
+    steps = np.maximum(1, np.round(draw.uniform(*table.away_s, size=n) * cfg.sim.control_hz))
+    return np.where(away, steps, ALWAYS).astype(np.int32)
+
+
+def must_lift(cfg: ReorientCfg) -> np.ndarray:
+    """1 where success asks that the object does not touch the table, int32, shape [N].
+
+    Environments are chosen in the order of :func:`table_steps`: of two shares the smaller is a part of the
+    larger.
+    """
+    n, share = cfg.num_envs, cfg.table.lift_share
+    return (np.random.default_rng(cfg.seed).permutation(n) < round(share * n)).astype(np.int32)
+
+
+def rest_poses(dropped: np.ndarray, fall_m: float) -> np.ndarray:
+    """Where the objects came to lie, of those drops that stayed in the claw, float, shape [N, K, 7].
+
+    A drop that left it is replaced by one of the same world that did not, or, if all did, by the start.
+
+    Args:
+        dropped: Poses after K drops, position [m] and quaternion xyzw, shape [N, K, 7].
+        fall_m: Distance from the goal position at which an object counts as lost [m].
+    """
+    count = dropped.shape[1]
+    inside = np.linalg.norm(dropped[:, :, :3] - PAPER.scene.goal_position_m, axis=2) < fall_m
+    # Choose, for every slot, the slot itself or the first good one of the world.
+    slot = np.where(inside, np.arange(count), np.argmax(inside, axis=1)[:, None])
+    poses = np.take_along_axis(dropped, slot[:, :, None], axis=1)
+    poses[~inside.any(axis=1)] = [*PAPER.scene.object_start_m, 0.0, 0.0, 0.0, 1.0]
+    return poses
