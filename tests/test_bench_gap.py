@@ -128,6 +128,8 @@ def test_bad_requests_are_refused():
     ):
         with pytest.raises(ValueError, match=words):
             gap.battery("servo", **options)
+    with pytest.raises(ValueError, match="--model is motor"):
+        gap.battery("motor")
     assert gap.parse_shard("2/3") == (1, 3)
     for text in ("0/3", "4/3", "1", "a/b"):
         with pytest.raises(ValueError, match="shard"):

@@ -241,6 +241,9 @@ def test_hide_writes_a_recording_and_the_truth(tmp_path, capsys):
     assert len(read_recording(out).trajectories) == 8
     assert cli.main(["hide", "servo", "--effect", "stiction", "--out", str(out)]) == 1
     assert "unknown effect 'stiction'" in capsys.readouterr().err
+    (tmp_path / "rec.truth.json").unlink()  # as a measured recording
+    assert cli.main(["hide", "servo", "--out", str(out)]) == 1
+    assert "holds a recording" in capsys.readouterr().err
 
 
 def test_layer_of_a_bare_servo_reads_back_as_it_was_identified(recording, tmp_path):

@@ -121,13 +121,15 @@ def test_load_set_takes_files_folders_and_names(tmp_path: Path, cache: Path, exa
 
 @pytest.mark.parametrize("name", ["cube", "cuboid", "symmetric", "procedural-2-seed5"])
 def test_a_users_folder_with_the_name_of_a_built_in_set_is_left_alone(
-    name: str, cache: Path, example: procedural.ObjectModel
+    name: str, cache: Path, example: procedural.ObjectModel, monkeypatch: pytest.MonkeyPatch
 ):
     mine = cache / "objects" / name / "cube.usd"
     write_object(mine, replace(example, name="cube", source="cube.stl", file="/home/me/cube.stl"))
     (mine.parent / "notes.txt").write_text("mine")
     before = mine.read_bytes()
+    monkeypatch.chdir(mine.parent.parent)  # nor is it the set where a command is started beside it
     assert all(not model.file for model in load_set(name))
+    assert load_set(f"./{name}")[0].file == "/home/me/cube.stl"
     assert mine.read_bytes() == before and (mine.parent / "notes.txt").read_text() == "mine"
 
 

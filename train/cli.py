@@ -31,7 +31,7 @@ commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --out runs/first
   student    imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
   tracker    let it act by a camera, learn nothing vd-train tracker dclaw3-table --objects SET
-  average    mean weights of several teachers     vd-train average runs/a runs/b --output policy.pt
+  average    mean weights of several teachers     vd-train average runs/a runs/b --out policy.pt
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
@@ -314,6 +314,7 @@ def _bundle(arguments: list[str], _started: float) -> int:
     cfg = tyro.cli(BundleCfg, args=arguments, prog="vd-train bundle")
     check_folder(cfg.output.parent)
 
+    quiet_warp()  # golden outputs of a student come from its kernels
     from vd.bundle.store import write_bundle
     from vd.evaluate.agents import find_policy, open_policy
 

@@ -166,7 +166,8 @@ def load_set(names_or_paths: str | Path | Iterable[str | Path]) -> list[ObjectMo
         if path.is_file():
             files.append(path)
             continue
-        folder = path if path.is_dir() else set_folder(str(entry))
+        reserved = isinstance(entry, str) and _is_plain(entry) and built_in_models(entry) is not None
+        folder = path if path.is_dir() and not reserved else set_folder(str(entry))
         found = object_files(folder)
         if not found:
             raise ObjectError(f"{folder}: no object file (*.usd); make some with: vd-assets import MESHES")

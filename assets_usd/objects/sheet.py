@@ -99,7 +99,7 @@ def contact_sheet(models: Sequence[ObjectModel], path: Path, title: str) -> Path
         The path.
     """
     errors = [model.volume_error for model in models]
-    title = f"{title}: {len(models)} objects, volume error {np.median(errors):.1%}, worst {max(errors):.1%}"
+    title = f"{title}, objects: {len(models)}\nvolume error {np.median(errors):.1%}, worst {max(errors):.1%}"
     columns = max(1, round(np.sqrt(len(models) / 2)))
     with atomic_path(Path(path)) as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of characters that its font lacks

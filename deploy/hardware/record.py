@@ -18,7 +18,7 @@ from vd.deploy.clock import Pacer
 from vd.deploy.hardware.answers import HandState
 from vd.deploy.hardware.bus import MotorBus
 from vd.deploy.hardware.check import ready
-from vd.deploy.hardware.connect import Connection, HandOptions, connect
+from vd.deploy.hardware.connect import Connection, HandOptions, connect, read_hand_and_joints
 from vd.deploy.hardware.control_table import RAD_PER_COUNT, TICK_MODULUS
 from vd.deploy.hardware.motion import move
 from vd.deploy.hardware.registers import D_GAIN, P_GAIN
@@ -297,16 +297,16 @@ def record(cfg: RecordCfg) -> int:
     if not cfg.rate_hz > 0.0:
         raise ValueError(f"--rate-hz is {cfg.rate_hz}; it has to be above 0")
     check_folder(cfg.out)
+    hand, _ = read_hand_and_joints(cfg)
+    joints = joints_of(hand, cfg.fingers)
+    motions = (
+        motions_of(hand, cfg.fingers, cfg.excitations) if cfg.plan is None else read_plan(cfg.plan, hand)
+    )
     with (
         connect(cfg, [*TWIN_ARGS, *["--realtime"] * cfg.realtime]) as connection,
         undisturbed(),
         real_time(cfg.realtime),
     ):
-        hand = connection.hand
-        joints = joints_of(hand, cfg.fingers)
-        motions = (
-            motions_of(hand, cfg.fingers, cfg.excitations) if cfg.plan is None else read_plan(cfg.plan, hand)
-        )
         recording = _begun(cfg, connection, joints)
         done = {trajectory.file for trajectory in recording.trajectories}
         left = [motion for motion in motions if motion.file not in done]

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from vd.assets_usd.hands import HANDS
 from vd.bench.gap_beside import beside
 from vd.bench.gap_score import KINDS, Case, said, score
 from vd.bench.gap_sizes import GAPS, showing
@@ -67,6 +68,8 @@ def battery(
         raise ValueError(f"no kinds of cases are called {', '.join(unknown)}; choose from {', '.join(KINDS)}")
     if bad := [size for size in sizes if size not in range(len(GAPS))]:
         raise ValueError(f"there is no size {bad[0]}; sizes are 0 to {len(GAPS) - 1}")
+    if model not in (*HANDS, *BARE_MODELS):
+        raise ValueError(f"--model is {model}; choose one of {', '.join((*HANDS, *BARE_MODELS))}")
     shown = showing(model)
     if unknown := sorted(set(effects) - set(shown)):
         raise ValueError(

@@ -133,7 +133,7 @@ class StartCfg:
     """Start at rest on the table, turned about the vertical at random, rather than falling (paper). Goals
     near the start are then near a pose that lasts."""
     poses: int = 4
-    """Poses at rest that each world keeps to choose from; found by dropping the object at the beginning."""
+    """Poses at rest that each environment chooses from, found by dropping the object at the beginning."""
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,7 @@ class RandomisationCfg:
     effects: dict[str, tuple[float, float]] = field(default_factory=dict)
     """Effects of servos to draw for every joint, by name and parameter: command_delay.delay_s 0 0.04 draws a
     delay of up to 40 ms. They replace what a hand layer says about the same parameter. Delays are of the bus:
-    all joints of a world have the same share of their range."""
+    all joints of an environment have the same share of their range."""
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old the state is that the policy sees [s], drawn for each episode, to the nearest physics step.
     Rewards and success are of the true state."""
@@ -360,7 +360,7 @@ class ReorientCfg:
     episode_s: float = PAPER.scene.episode_s
     """Length of an episode [s]."""
     success_ends_episode: bool = False
-    """Reset the world on success (evaluation) instead of giving a new goal (training)."""
+    """Reset the environment on success (evaluation) instead of giving a new goal (training)."""
     visuals: bool = False
     """Keep visual shapes, for rendering."""
     table_friction: float = PAPER.materials.table_friction
@@ -396,7 +396,7 @@ class ReorientCfg:
         if self.failures_per_million < 0.0:
             raise ValueError(f"failures_per_million = {self.failures_per_million}; it is 0 or positive")
         if self.num_envs < 1:
-            raise ValueError(f"num_envs = {self.num_envs}; at least 1 world is needed")
+            raise ValueError(f"num_envs = {self.num_envs}; at least 1 is needed")
         if self.max_episode_steps < 1:
             raise ValueError(f"episode_s = {self.episode_s} is shorter than one control step")
         if self.fingertip not in ("rigid", "soft"):
@@ -419,6 +419,6 @@ class ReorientCfg:
             )
         if tightening.object_weight != 1.0 and self.table.lift_share == 0.0:
             raise ValueError(
-                f"curriculum.tightening.object_weight is {tightening.object_weight:g}, but no world asks for "
-                "objects off the table, and only there are they light; give table.lift_share"
+                f"curriculum.tightening.object_weight is {tightening.object_weight:g}, but no environment "
+                "asks for objects off the table, and only there are they light; give table.lift_share"
             )

@@ -36,7 +36,7 @@ REPLACED = {
 }
 """Names of policies that were installed once, and what to take instead."""
 
-DEFAULT_POLICY = "dclaw4-cube"
+DEFAULT_POLICY = "dclaw4-table"
 DEFAULT_HAND = "dclaw4"
 NO_LAYER = "none"
 """What --hand-layer is to be for the hand as it is, whatever the training."""

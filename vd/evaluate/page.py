@@ -112,7 +112,7 @@ def write_page(
         path,
         "evaluation.html",
         title=title or f"Evaluation of {', '.join(shown)}",
-        lead=lead or (asked(result.rows[0].protocol) if result.rows else ""),
+        lead=lead or (asked([row.protocol for row in result.rows]) if result.rows else ""),
         notes=notes,
         header=_HEADER,
         rows=[_cells(row, short) for row in result.rows],
@@ -154,7 +154,7 @@ def terminal_text(result: Result) -> str:
         ]
     parts += ["\n".join("  ".join(cells) for cells in _difference_cells(result, short))]
     parts += [f"warning {name}: {words}" for name, words in result.warnings.items()]
-    parts += [] if suite else [asked(result.rows[0].protocol)]
+    parts += [] if suite else [asked([row.protocol for row in result.rows])]
     return "\n\n".join(part for part in parts if part)
 
 
@@ -246,9 +246,11 @@ def _bound_cells(result: Result, short: dict[str, str]) -> list[tuple[str, ...]]
     ]
 
 
-def asked(protocol: Protocol) -> str:
-    """What was asked: place, episodes, starts, goals, stop and randomisation."""
-    hand = protocol.hand if protocol.hand_layer is None else f"{protocol.hand} with {protocol.hand_layer}"
+def asked(protocols: Sequence[Protocol]) -> str:
+    """What was asked: hands, place, episodes, starts, goals, stop and randomisation. Only hands differ by policy."""
+    protocol = protocols[0]
+    layers = {shown_name(p.hand): "" if p.hand_layer is None else f" with {p.hand_layer}" for p in protocols}
+    hands = ", ".join(f"{hand}{layer}" for hand, layer in layers.items())
     angle = protocol.max_goal_angle_rad
     if protocol.goals_about_vertical:
         goals = f"turned about the vertical by at most {angle:g} rad"
@@ -259,7 +261,7 @@ def asked(protocol: Protocol) -> str:
     rest = "at rest on the table, as the environment draws them"
     table = "" if protocol.table_friction is None else f" of friction {protocol.table_friction:g}"
     parts = (
-        f"{shown_name(hand)} {'in the air' if protocol.in_air else 'on the table'}{table}",
+        f"{hands} {'in the air' if protocol.in_air else 'on the table'}{table}",
         f"{protocol.episodes} episodes of {protocol.episode_s:g} s for each object, seed {protocol.seed}",
         f"starts {rest if protocol.at_rest else 'dropped into the hand, uniform on SO(3)'}",
         f"goals {goals}",

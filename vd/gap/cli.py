@@ -182,6 +182,10 @@ class Hide:
         """Write the recording."""
         from vd.bench.hide import hide, parse_effect, truth_path
 
+        if (self.out / "recording.json").exists() and not truth_path(self.out).exists():
+            raise ValueError(
+                f"--out {self.out} holds a recording in which nothing was hidden; name another folder"
+            )
         parsed = [parse_effect(text) for text in self.effect]
         hidden = hide(
             self.model,

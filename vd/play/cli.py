@@ -48,7 +48,7 @@ class PlayCfg:
     """Watch a policy: in the browser, or as a video made without a display or GPU.
 
     The folder of a log that vd-deploy wrote in place of the policy replays that run, all of it, whatever the
-    other settings of the simulation. Without arguments it shows the installed policy that turns a cube.
+    other settings of the simulation. Without arguments it shows dclaw4-table.
     """
 
     policy: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(help=POLICY_HELP)] = None
@@ -79,7 +79,7 @@ class PlayCfg:
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float | None = None
-    """Time after which a world starts anew [s]; 10 by default, 15 with --in-air."""
+    """Time after which an episode ends and another starts [s]; 10 by default, 15 with --in-air."""
     in_air: tyro.conf.FlagCreatePairsOff[bool] = False
     """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
     randomise: bool = False
@@ -189,7 +189,7 @@ def record_video(cfg: PlayCfg, path: Path) -> int:
     steps = max(1, round(cfg.seconds * rate))
     frames: Iterable[Any] = record(env, policy, renderer, envs, steps)
     refresh = 0.5 if sys.stderr.isatty() else LOG_EVERY_S
-    frames = tqdm(frames, total=steps, unit="frame", desc="vd-play", mininterval=refresh)
+    frames = tqdm(frames, total=steps + 1, unit="frame", desc="vd-play", mininterval=refresh)
     count = write_frames(path, frames, rate)
     env.check()
     env.close()

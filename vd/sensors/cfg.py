@@ -102,7 +102,7 @@ class DepthSensorCfg:
 
 @dataclass(frozen=True)
 class DepthCameraCfg:
-    """A depth camera on the hand's base in every world."""
+    """A depth camera on the hand's base in every environment."""
 
     RETIRED: ClassVar[dict[str, Any]] = {"method": Dropped("raster"), "block": 1}
     points: int = PAPER.camera.points
@@ -110,13 +110,14 @@ class DepthCameraCfg:
     crop_m: tuple[float, float] = PAPER.camera.crop_m
     """Least and largest height over the table of a cloud's points [m]."""
     position_noise_m: float = 0.0
-    """Standard deviation of the camera's position in each world, along each axis [m]; clouds do not know."""
+    """Standard deviation of the camera's position along each axis [m], one draw an environment; clouds do not
+    know."""
     rotation_noise_rad: float = 0.0
     """Standard deviation of its orientation about each axis [rad], likewise."""
     focal_noise: float = 0.0
     """Standard deviation of the focal length, relative to it."""
     latency_s: tuple[float, float] = (0.0, 0.0)
-    """Range of the images' age [s], drawn evenly for each world."""
+    """Range of the images' age [s], drawn evenly for each environment."""
     sensor: DepthSensorCfg = field(default_factory=DepthSensorCfg)
     """Errors of the measured depth."""
 
