@@ -258,6 +258,9 @@ def test_options_and_commands_that_cannot_be_are_refused(capsys):
     ):
         with pytest.raises(ValueError, match=error), connect(options):
             pass
+    assert cli.main(["record", "--twin", "--fingers", "7"]) == cli.FAILED
+    said = capsys.readouterr().err
+    assert "dclaw3 has fingers 0 to 2" in said and "starting the twin" not in said
     assert cli.main(["fly"]) == cli.FAILED and "no policy 'fly'" in capsys.readouterr().err
     assert cli.main(["set-id", "1", "11"]) == cli.FAILED and "Wizard" in capsys.readouterr().err
     assert cli.main([]) == cli.OK and "vd-deploy COMMAND" in capsys.readouterr().out

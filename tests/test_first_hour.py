@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 import warp as wp
 
+from vd.train.cli import USAGE as TRAIN_USAGE
+
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 PAGES = (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")))
@@ -88,6 +90,8 @@ def documented_lines():
         running = re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE)
         for code in re.findall(r"`(vd-[^`]* --[^`]+)`", running):
             yield page.name, " ".join(code.split())
+    for example in re.findall(r" {2,}(vd-train .+)", TRAIN_USAGE):
+        yield "vd-train --help", example
 
 
 @pytest.mark.parametrize(("page", "line"), sorted(set(documented_lines())))

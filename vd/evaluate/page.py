@@ -247,7 +247,7 @@ def _bound_cells(result: Result, short: dict[str, str]) -> list[tuple[str, ...]]
 
 
 def asked(protocols: Sequence[Protocol]) -> str:
-    """What was asked: hands, place, episodes, starts, goals, stop and randomisation. Only hands differ by policy."""
+    """What was asked: hands, place, episodes, starts, goals, stop and randomisation; hands alone differ."""
     protocol = protocols[0]
     layers = {shown_name(p.hand): "" if p.hand_layer is None else f" with {p.hand_layer}" for p in protocols}
     hands = ", ".join(f"{hand}{layer}" for hand, layer in layers.items())
