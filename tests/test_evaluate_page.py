@@ -69,8 +69,10 @@ def test_the_page_says_which_task_it_was(tmp_path, found):
     assert "randomisation mixed" in text_of(randomisation="mixed")
     away = text_of(policy="/home/me/a/policy.pt", objects="/data/mugs, cube", hand="/opt/my/hand.usda")
     assert not any(root in away for root in ("/home", "/data", "/opt"))
-    other = replace(found.rows[0], policy="random", protocol=replace(found.rows[0].protocol, hand="dclaw3"))
-    assert "dclaw4, dclaw3 on the table" in terminal_text(replace(found, rows=(*found.rows, other)))
+    other = replace(
+        found.rows[0], policy="random", protocol=replace(found.rows[0].protocol, hand="other-hand")
+    )
+    assert ", other-hand on the table" in terminal_text(replace(found, rows=(*found.rows, other)))
 
 
 def test_what_predictions_are_worth_is_told(tmp_path):
