@@ -265,7 +265,9 @@ FINGER = FingerBody(
 )
 
 
-def test_the_finger_moves_as_in_another_engine():
+@pytest.mark.parametrize("payload", [0.0, 0.05])
+def test_the_finger_moves_as_in_another_engine(payload):
+    """Also with a load at its tip [kg]."""
     import mujoco
 
     def link(number, axis, height, inner):
@@ -276,7 +278,8 @@ def test_the_finger_moves_as_in_another_engine():
             f'<inertial pos="0 0 {c}" mass="{m}" diaginertia="{x} {y} {z}"/>{inner}</body>'
         )
 
-    chain = link(2, "0 1 0", FINGER.spacing, "")
+    load = f'<body pos="0 0 {FINGER.tip}"><inertial pos="0 0 0" mass="{payload}" diaginertia="0 0 0"/></body>'
+    chain = link(2, "0 1 0", FINGER.spacing, load if payload else "")
     chain = link(0, "1 0 0", 0, link(1, "0 1 0", FINGER.offset, chain))
     model = mujoco.MjModel.from_xml_string(
         f'<mujoco><option timestep="1e-4" gravity="0 0 9.81" integrator="RK4"/><worldbody>{chain}'
@@ -294,7 +297,8 @@ def test_the_finger_moves_as_in_another_engine():
     # Switched off at the start, and so without damping: it falls and swings, bends driving each other.
     time = np.arange(100) * 5e-3
     off = np.zeros((100, 3), dtype=bool)
-    (path,) = simulate([Run(plant, time, np.tile(start, (100, 1)), off)], dt=1e-4)
+    conditions = {"payload_kg": payload}
+    (path,) = simulate([Run(plant, time, np.tile(start, (100, 1)), off, conditions)], dt=1e-4)
     assert np.ptp(path, axis=0).min() > 0.1
     np.testing.assert_allclose(path, np.array(expected), atol=2e-3)
 

@@ -168,6 +168,11 @@ def test_a_loose_cable_and_a_wrong_id_are_named(bus, twin):
         bus.read_state()
 
 
+def test_a_motor_of_another_model_is_named():
+    with Twin([Motor(MODELS["XM430-W210"], 10)]) as twin, MotorBus(twin.path, [10], MODEL, retries=20) as bus:
+        assert bus.missing() == {10: "is XM430-W210, not XH430-V210"}
+
+
 def test_the_bus_watchdog_stops_a_motor_that_hears_nothing():
     clock = SimulatedClock()
     motor = Motor(MODELS[MODEL], 1)

@@ -17,7 +17,6 @@ from vd.envs.cfg import (
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.parameters import GOAL_START_RAD, STILLNESS_START
 from vd.envs.reorient import ReorientEnv
-from vd.paper import PAPER
 
 TIGHTENING = TighteningCfg(enabled=True, rate=0.25, raise_at=0.5, lower_at=0.3)
 WELL, SO_SO, BADLY = 0.9, 0.4, 0.1
@@ -41,9 +40,10 @@ def update(env: ReorientEnv, success_rate: float) -> dict[str, float]:
 
 
 def thresholds(env: ReorientEnv) -> list[float]:
-    """Joint speed, speed and spin of the object, norm of the action: what success asks at present."""
+    """Joint speed, speed and spin of the object, norm of the action, angle: what success asks at present."""
     values = env.parameters.success.numpy()
-    return [float(values[name][0]) for name in ("joint_speed", "object_speed", "object_spin", "action_norm")]
+    names = ("joint_speed", "object_speed", "object_spin", "action_norm", "rotation")
+    return [float(values[name][0]) for name in names]
 
 
 def test_goals_recede_only_while_they_are_reached():
@@ -78,10 +78,10 @@ def test_stillness_tightens_after_the_goals_and_loosens_before_them():
 
 
 def test_thresholds_shrink_by_the_same_factor_from_loose_to_those_of_success():
-    env = make(CurriculumCfg(tightening=TIGHTENING), success=SuccessCfg(object_spin_rad_s=0.0))
-    loose = [TIGHTENING.joint_speed_rad_s, TIGHTENING.object_speed_m_s, 0.0, TIGHTENING.action_norm]
-    success = PAPER.success
-    tight = [success.joint_speed_rad_s, success.object_speed_m_s, 0.0, success.action_norm]
+    success = SuccessCfg(object_spin_rad_s=0.0, rotation_rad=0.1)
+    env = make(CurriculumCfg(tightening=TIGHTENING), success=success)
+    loose = [TIGHTENING.joint_speed_rad_s, TIGHTENING.object_speed_m_s, 0.0, TIGHTENING.action_norm, 0.4]
+    tight = [success.joint_speed_rad_s, success.object_speed_m_s, 0.0, success.action_norm, 0.1]
     seen = [thresholds(env)]
     for tightness in (0.25, 0.5, 0.75, 1.0):
         assert update(env, WELL)["tightness"] == tightness
@@ -134,3 +134,17 @@ def test_a_saved_environment_goes_on_with_its_tightness():
         begun = make(cfg)
         begun.load_state_dict(old)
         assert begun.stage == Stage(1.0, 0.0), "a run that did not tighten had learned none of it"
+
+
+def test_a_state_from_before_goals_had_an_age_goes_on():
+    """It counted the goals of each episode instead."""
+    env, other = make(CurriculumCfg()), make(CurriculumCfg())
+    env.step_count.assign([5, 2])
+    env.goal_steps.assign([1, 2])
+    state = env.state_dict()
+    other.load_state_dict(state)
+    assert other.goal_steps.numpy().tolist() == [1, 2]
+    del state["arrays"]["goal_steps"]
+    state["arrays"]["goals_reached"] = np.zeros(2, dtype=np.int32)
+    other.load_state_dict(state)
+    assert other.goal_steps.numpy().tolist() == [5, 2]

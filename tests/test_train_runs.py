@@ -78,6 +78,18 @@ def test_keeps_the_last_few_and_the_best_since_two_episodes_are_over(tmp_path):
     assert load_policy(tmp_path / "policy.pt").iteration == best["iter"]
 
 
+def test_before_two_episodes_are_over_the_latest_is_the_best_and_the_best_stands_in_for_lost_ones(tmp_path):
+    make_runner(tmp_path, save_every=1).learn(3)
+    best = find_checkpoint(tmp_path, "best")
+    assert load_checkpoint(best)["iter"] == 3
+    assert load_policy(tmp_path / "policy.pt").iteration == 3
+    for path in list_checkpoints(tmp_path):
+        path.rename(path.with_name(f"{path.name}.damaged"))
+    assert find_checkpoint(tmp_path, "latest") == find_checkpoint(tmp_path, "auto") == best
+    with pytest.raises(FileExistsError, match="add --resume"):
+        find_checkpoint(tmp_path, None)
+
+
 def test_keeps_some_for_good_of_which_a_mean_can_be_taken(tmp_path):
     make_runner(tmp_path, save_every=1, keep_every=2).learn(6)
     kept = [p.name for p in list_checkpoints(tmp_path)]
