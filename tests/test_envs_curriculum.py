@@ -134,17 +134,3 @@ def test_a_saved_environment_goes_on_with_its_tightness():
         begun = make(cfg)
         begun.load_state_dict(old)
         assert begun.stage == Stage(1.0, 0.0), "a run that did not tighten had learned none of it"
-
-
-def test_a_state_from_before_goals_had_an_age_goes_on():
-    """It counted the goals of each episode instead."""
-    env, other = make(CurriculumCfg()), make(CurriculumCfg())
-    env.step_count.assign([5, 2])
-    env.goal_steps.assign([1, 2])
-    state = env.state_dict()
-    other.load_state_dict(state)
-    assert other.goal_steps.numpy().tolist() == [1, 2]
-    del state["arrays"]["goal_steps"]
-    state["arrays"]["goals_reached"] = np.zeros(2, dtype=np.int32)
-    other.load_state_dict(state)
-    assert other.goal_steps.numpy().tolist() == [5, 2]
