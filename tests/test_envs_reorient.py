@@ -380,7 +380,6 @@ def tightening(**changes) -> CurriculumCfg:
         ),
         ({"randomisation": RandomisationCfg(observation_latency_s=(0.7, 0.7))}, "observation_latency_s"),
         ({"randomisation": RandomisationCfg(force_s=0.0)}, r"randomisation\.force_s"),
-        ({"randomisation": RandomisationCfg(nominal_share=1.5)}, r"randomisation\.nominal_share"),
         ({"observation": ObservationCfg(history=-1)}, r"observation\.history"),
         ({"table": TableCfg(away_share=0.3, away_s=(3.0, 1.0))}, r"table\.away_s"),
         ({"table": TableCfg(away_share=3.0)}, r"table\.away_share"),

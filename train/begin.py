@@ -18,8 +18,6 @@ MOMENTS_WARMUP = 3
 """Iterations of it where only the optimiser is missing: about a hundred steps, for Adam's second moment."""
 NETWORK = ("hidden", "distribution", "normalise_observations")
 """Settings of ``PolicyCfg`` that a network's shape decides."""
-_APPENDED = {"history": 0, "dynamics": "none"}
-"""Settings of the observation whose values come last, as they are in a policy without them."""
 _SENSES = ("hand", "fingertip", "hand_layer", "sim", "action", "observation")
 """Parts of a task that say what a policy's observations and actions mean."""
 
@@ -148,7 +146,27 @@ def at_stage(state: dict[str, Any], stage: tuple[float, float]) -> dict[str, Any
     return state | {"ranks": [rank | {"env": rank["env"] | moved} for rank in state["ranks"]]}
 
 
-def check_fit(
+def fitting(
+    state: dict[str, Any], spec: "PolicySpec", task: Mapping[str, Any], path: str | Path
+) -> dict[str, Any]:
+    """The part of a file that a run can take over.
+
+    What a critic is told comes after the actor's history. So where a run adds a history, a critic that was
+    told something would read other values, and begins anew.
+
+    Raises:
+        ValueError: Another hand, or an actor of another shape.
+    """
+    from vd.policy import policy_export
+
+    _check_fit(state, spec, task, path)
+    told = state["task"].get("observation", {}).get("dynamics", "none") != "none"
+    if not told or _history(state["task"]) == _history(task):
+        return state
+    return {key: value for key, value in policy_export(state).items() if key != "critic_state_dict"}
+
+
+def _check_fit(
     state: Mapping[str, Any], spec: "PolicySpec", task: Mapping[str, Any], path: str | Path
 ) -> None:
     """Refuse networks that a run cannot take over, with the remedy.
@@ -171,18 +189,11 @@ def check_fit(
         if theirs != ours:
             flag = f"--policy.{name.replace('_', '-')}"
             raise ValueError(f"--init: {path} has {flag} {theirs}, and this run {ours}; {remedy}")
-    before, now = (
-        {name: t.get("observation", {}).get(name, default) for name, default in _APPENDED.items()}
-        for t in (state["task"], task)
-    )
-    if before not in (_APPENDED, now):
-        flags = [
-            " ".join(f"--env.observation.{name} {value}" for name, value in one.items())
-            for one in (before, now)
-        ]
+    before, now = _history(state["task"]), _history(task)
+    if before not in (0, now):
         raise ValueError(
-            f"--init: {path} observes {flags[0]} and this run {flags[1]}; only a policy without them can go "
-            f"on with others: {remedy}"
+            f"--init: {path} observes --env.observation.history {before} and this run {now}; only a policy "
+            f"without history can go on with one: {remedy}"
         )
     if found.num_observations > spec.num_observations:
         raise ValueError(
@@ -205,6 +216,11 @@ def unlike(trained: Mapping[str, Any], task: Mapping[str, Any]) -> list[str]:
     )
     before = {k: default[k] for k in now if k in default} | before
     return [f"{k} {before[k]}, here {now[k]}" for k in before if k in now and before[k] != now[k]]
+
+
+def _history(task: Mapping[str, Any]) -> int:
+    """Past steps that a policy of a task reads, which files of before the history do not name."""
+    return task.get("observation", {}).get("history", 0)
 
 
 def _leaves(values: Mapping[str, Any], where: str) -> Iterator[tuple[str, Any]]:

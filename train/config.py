@@ -59,7 +59,7 @@ class PpoCfg:
     """Joint gradient norm of actor and critic is clipped to this."""
     cuda_graph: bool = False
     """Record forward and backward pass of a minibatch once as a CUDA graph, and replay it: where launching
-    some hundred kernels takes longer than running them, as on busy processors. On one GPU; else ignored."""
+    some hundred kernels takes longer than running them, as on busy processors. Ignored on a CPU."""
     imitation_iterations: int = 0
     """Iterations after --init in which the actor imitates, in what it does itself, the policy that it began
     from, which sees the present state and shape (--env.observation.dynamics); the critic learns alone."""

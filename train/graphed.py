@@ -73,7 +73,8 @@ class Recorded:
         gc.collect()
         gc.disable()
         try:
-            with torch.cuda.graph(graph):
+            # Threads that watch over other processes go on asking the device meanwhile.
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):
                 self._result = self._run()
         finally:
             if collecting:

@@ -21,7 +21,7 @@ KL_BAND = 2.0
 
 ACTION_BOUND = 1.0
 """The environment clips actions to this; a mean beyond it changes nothing but how far it is to come back."""
-STATISTICS = ("surrogate", "value", "entropy", "kl", "clip_fraction", "grad_norm", "beyond_bound")
+STATISTICS = ("surrogate", "value", "entropy", "kl", "clip_fraction", "beyond_bound", "grad_norm")
 """What every minibatch reports."""
 OBSERVED = "observed "
 """How the names of samples begin that are observations, before that of their group."""
@@ -43,8 +43,9 @@ class TeacherPPO(PPO):
       coefficient acts through that norm alone, because Adam ignores the scale of a gradient;
     * samples are permuted in every epoch (rsl-rl repeats the same minibatches), and statistics stay on
       the device until the end of the update (rsl-rl waits for the device after each minibatch);
-    * forward and backward pass of a minibatch can be a CUDA graph (:mod:`vd.train.graphed`). The optimiser's
-      step stays outside: its rates are numbers that change, and its state is that of any checkpoint.
+    * forward and backward pass of a minibatch can be a CUDA graph (:mod:`vd.train.graphed`). Outside stay
+      what several GPUs exchange, and the optimiser's step: its rates are numbers that change, and its state
+      is that of any checkpoint.
 
     Time-outs: rsl-rl adds ``gamma * V(s_t)`` to the reward of a step that timed out and treats it as
     terminal. The value belongs to the stored observation *before* the step, because the observation
@@ -57,8 +58,7 @@ class TeacherPPO(PPO):
         storage: Rollout of T steps in N environments.
         critic_learning_rate: The critic's rate; ``learning_rate`` is the actor's.
         bound_coef: Weight of the squared excess of mean actions beyond :data:`ACTION_BOUND`.
-        cuda_graph: Whether to record the passes of a minibatch; with several GPUs, which exchange gradients
-            in the middle, never.
+        cuda_graph: Whether to record the passes of a minibatch.
         **kwargs: rsl-rl's PPO arguments.
 
     Attributes:
@@ -96,7 +96,7 @@ class TeacherPPO(PPO):
             self._compute_gradients,
             [self._rows],
             self._parameters,
-            record=cuda_graph and not self.is_multi_gpu and str(self.device).startswith("cuda"),
+            record=cuda_graph and str(self.device).startswith("cuda"),
         )
         self.optimizer = type(self.optimizer)(
             [
@@ -176,16 +176,19 @@ class TeacherPPO(PPO):
             :data:`STATISTICS`, shape [7], on the device.
         """
         statistics = self._gradients(rows)
+        if self.is_multi_gpu:
+            self.reduce_parameters()
+        grad_norm = nn.utils.clip_grad_norm_(self._parameters, self.max_grad_norm)
         self.optimizer.step()
-        return statistics
+        return torch.cat((statistics, grad_norm[None]))
 
     def _compute_gradients(self) -> torch.Tensor:
-        """Gradients of the loss over the samples in ``_rows``, clipped; nothing else changes.
+        """Gradients of the loss over the samples in ``_rows``; nothing else changes.
 
         All it reads stays where it is in memory, and nothing waits for the device: it can be recorded.
 
         Returns:
-            :data:`STATISTICS`, shape [7], on the device.
+            :data:`STATISTICS` but the last, shape [6], on the device.
         """
         batch = {name: tensor[self._rows] for name, tensor in self.samples.items()}
         observed = {name.removeprefix(OBSERVED): t for name, t in batch.items() if name.startswith(OBSERVED)}
@@ -207,14 +210,11 @@ class TeacherPPO(PPO):
             loss = loss + self.bound_coef * excess.square().sum(dim=-1).mean()
 
         loss.backward()
-        if self.is_multi_gpu:
-            self.reduce_parameters()
-        grad_norm = nn.utils.clip_grad_norm_(self._parameters, self.max_grad_norm)
         self.actor.distribution._distribution = None  # or this pass would outlive itself, and a recording
         with torch.no_grad():
             clip_fraction = ((ratio - 1.0).abs() > self.clip_param).float().mean()
             beyond = (excess > 0.0).float().mean()
-            return torch.stack((surrogate, value, entropy, kl, clip_fraction, grad_norm, beyond)).detach()
+            return torch.stack((surrogate, value, entropy, kl, clip_fraction, beyond)).detach()
 
     def _update_normalisation(self, network: MLPModel) -> None:
         """Let a network's normaliser learn from the rollout; its numbers stay where they are in memory."""

@@ -113,7 +113,7 @@ def gpu() -> TeacherCfg:
             desired_kl=0.06,  # longer steps pay once the floor holds the std
             gamma=PAPER.teacher.gamma,  # far enough to let go and grasp anew; 0.97 before
             bound_coefficient=0.01,  # a third of the means lay beyond the clip; paper: none
-            cuda_graph=True,  # a seventh of the time of learning; ignored but on one GPU
+            cuda_graph=True,  # a seventh of the time of learning
         ),
         policy=PolicyCfg(
             distribution="state-dependent",

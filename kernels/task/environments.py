@@ -34,19 +34,6 @@ def redraw_mask_kernel(
 
 
 @wp.kernel
-def both_masks_kernel(
-    # In:
-    first_in: wp.array[wp.int32],
-    second_in: wp.array[wp.int32],
-    # Out:
-    mask_out: wp.array[wp.int32],
-):
-    """Select worlds that both masks select, shape [N] each. Launch: [N]."""
-    world = wp.tid()
-    mask_out[world] = first_in[world] * second_in[world]
-
-
-@wp.kernel
 def write_gains_kernel(
     # In:
     kp_in: wp.array2d[float],

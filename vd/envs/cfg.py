@@ -253,6 +253,7 @@ class CurriculumCfg:
 class RandomisationCfg:
     """Table S3 and the disturbance force."""
 
+    RETIRED: ClassVar[dict[str, Any]] = {"nominal_share": Dropped(0.0)}
     enabled: bool = True
     """Randomise at all."""
     stiffness_scale: tuple[float, float] = PAPER.randomisation.stiffness_scale
@@ -302,9 +303,6 @@ class RandomisationCfg:
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old the state is that the policy sees [s], drawn for each episode, to the nearest physics step.
     Rewards and success are of the true state."""
-    nominal_share: float = 0.0
-    """Ours: share of the environments, the same ones throughout, that keep nominal masses, joints and
-    frictions and get neither forces nor latency. Sizes and noise are drawn there too."""
     redraw_s: float = PAPER.randomisation.redraw_s
     """Gains and frictions are drawn anew at the first reset after this time [s]."""
 
@@ -327,10 +325,6 @@ class RandomisationCfg:
             raise ValueError(
                 f"randomisation.observation_latency_s is {low:g} {high:g}; it has to rise within 0 and "
                 f"{MAX_LATENCY_S:g}"
-            )
-        if not 0.0 <= self.nominal_share <= 1.0:
-            raise ValueError(
-                f"randomisation.nominal_share is {self.nominal_share:g}; it has to lie within 0 and 1"
             )
         if self.force_s <= 0.0:
             raise ValueError(f"randomisation.force_s is {self.force_s:g}; it has to be positive")

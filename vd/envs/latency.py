@@ -50,26 +50,18 @@ class SeenState:
         state, now = self._state, [*self._measured(joint_q, joint_qd), joint_q, joint_qd, body_q, body_qd]
         state.launch(record_state_kernel, [*self._model, *now], [self._head, self._ring])
 
-    def begin(self, mask: wp.array, nominal: wp.array | None) -> None:
-        """Draw the latency of the environments of ``mask`` [N], whose past is their present state.
-
-        Args:
-            mask: 1 where an episode begins, shape [N].
-            nominal: 1 where it is seen at once, among those, shape [N]; None: nowhere.
-        """
+    def begin(self, mask: wp.array) -> None:
+        """Draw the latency of the environments of ``mask`` [N], whose past is their present state."""
         if not self.is_late:
             return
         state, sim = self._state, self._state.sim
         measured = self._measured(sim.joint_q, sim.joint_qd)
         now = [*measured, sim.joint_q, sim.joint_qd, sim.body_q, sim.body_qd]
-        for envs, span in ((mask, state.cfg.randomisation.observation_latency_s), (nominal, (0.0, 0.0))):
-            if envs is None:
-                continue
-            state.launch(
-                begin_latency_kernel,
-                [*self._model, wp.vec2(*span), envs, *now, state.rng],
-                [self.latency, self._ring],
-            )
+        state.launch(
+            begin_latency_kernel,
+            [*self._model, wp.vec2(*state.cfg.randomisation.observation_latency_s), mask, *now, state.rng],
+            [self.latency, self._ring],
+        )
 
     def recall(self) -> None:
         """Refresh :attr:`arrays`."""

@@ -73,7 +73,7 @@ class Observer:
 
     def begin(self, mask: wp.array) -> None:
         """Begin the episodes of the environments of ``mask`` [N], after their state was reset."""
-        self.seen.begin(mask, self._drawn.nominal_of(mask))
+        self.seen.begin(mask)
         if self._frames:
             self._state.launch(forget_kernel, [mask], [self._count])
 

@@ -73,21 +73,18 @@ class TaskParameters:
         )
         materials = PAPER.materials
 
-        def ranges(drawn: bool) -> wp.array:
-            def span(value: tuple[float, float], nominal: float) -> wp.vec2:
-                return wp.vec2(*value) if drawn else wp.vec2(nominal, nominal)
+        def span(value: tuple[float, float], nominal: float) -> wp.vec2:
+            return wp.vec2(*value) if random.enabled else wp.vec2(nominal, nominal)
 
-            return array(
-                RandomisationParams,
-                friction=span(random.friction, materials.friction),
-                table_friction=span(random.table_friction, cfg.table_friction),
-                link_mass_scale=span(random.link_mass_scale, 1.0),
-                object_mass=span(random.object_mass_kg, materials.object_mass_kg),
-                action_offset_std=drawn * random.action_offset_std,
-                observation_offset_std=drawn * random.observation_offset_std,
-            )
-
-        self.randomisation, self.nominal = ranges(random.enabled), ranges(False)
+        self.randomisation = array(
+            RandomisationParams,
+            friction=span(random.friction, materials.friction),
+            table_friction=span(random.table_friction, cfg.table_friction),
+            link_mass_scale=span(random.link_mass_scale, 1.0),
+            object_mass=span(random.object_mass_kg, materials.object_mass_kg),
+            action_offset_std=on * random.action_offset_std,
+            observation_offset_std=on * random.observation_offset_std,
+        )
         self.reward = array(RewardParams)
         self.success = array(SuccessParams)
         self.goal = array(GoalParams)

@@ -1,17 +1,15 @@
 """Domain randomisation (Table S3): draws on the device, written into the simulator's model."""
 
-from dataclasses import replace
-from typing import Any, TypeAlias
+from typing import Any
 
 import newton
 import numpy as np
 import warp as wp
 
-from vd.envs.servo import gain_scales, servo_ranges
+from vd.envs.servo import gain_scales
 from vd.envs.task_state import TaskState
 from vd.kernels.servo.actuators import INERTIA, PAYLOAD_INERTIA
 from vd.kernels.task.environments import (
-    both_masks_kernel,
     redraw_mask_kernel,
     write_friction_kernel,
     write_gains_kernel,
@@ -30,14 +28,12 @@ from vd.sim.scene import SHAPE_HAND, SHAPE_OBJECT, SHAPE_TABLE
 
 # Drawn gains and frictions reach the solver once a second: a world in this many has new ones then.
 PUSH_INTERVAL_S = 1.0
-_Ranges: TypeAlias = tuple[wp.array, wp.array, wp.array, wp.array]
 
 
 class Randomiser:
     """Masses once at start-up; gains, servos, frictions and constant errors at resets; forces every step.
 
-    With randomisation off the same arrays hold the nominal values, and so they do in the environments of
-    ``nominal_share``.
+    With randomisation off the same arrays hold the nominal values.
     """
 
     def __init__(self, state: TaskState):
@@ -53,8 +49,8 @@ class Randomiser:
         self.kp, self.kd = zeros(n, d), zeros(n, d)
         """Joint stiffness [N m/rad] and damping [N m s/rad], shape [N, D]."""
         self.hand_friction, self.object_friction, self.table_friction = zeros(n), zeros(n), zeros(n)
-        self.object_mass = self._pushed_mass = zeros(n)
-        """Object mass [kg], shape [N]; forces are in proportion to it, but for the nominal environments."""
+        self.object_mass = zeros(n)
+        """Object mass [kg], shape [N]."""
         self.action_offset = zeros(n, d)
         # Not of the shape's values, which no sensor measures.
         self.observation_offset = zeros(n, teacher_observation_size(state.num_fingers))
@@ -73,15 +69,10 @@ class Randomiser:
         self._nominal_kp = wp.array(state.hand.kp, dtype=float, device=device)
         self._nominal_kd = wp.array(state.hand.kd, dtype=float, device=device)
         kp_scale, kd_scale = gain_scales(state.hand, cfg.randomisation)
-        self._drawn = self._ranges(state.parameters.randomisation, kp_scale, kd_scale, state.servo_ranges)
-        self._nominal: _Ranges | None = None
-        self._nominal_world, self._among_nominal = zeros(n, dtype=wp.int32), zeros(n, dtype=wp.int32)
-        if self.enabled and cfg.randomisation.nominal_share > 0.0:
-            order = np.random.default_rng((cfg.seed, 1)).permutation(n)
-            self._nominal_world.assign((order < round(cfg.randomisation.nominal_share * n)).astype(np.int32))
-            nominal = replace(cfg.randomisation, enabled=False)
-            scales = gain_scales(state.hand, nominal)
-            self._nominal = self._ranges(state.parameters.nominal, *scales, servo_ranges(state.hand, nominal))
+        self._kp_scale, self._kd_scale, self._servo_ranges = (
+            wp.array(scale, dtype=wp.vec2, device=device)
+            for scale in (kp_scale, kd_scale, state.servo_ranges)
+        )
         inertia = state.servo_ranges[:, [INERTIA, PAYLOAD_INERTIA]]
         self._inertia_varies = bool(np.any(inertia[..., 0] != inertia[..., 1]))
         self._shape_kind = wp.array(scene.shape_kind, dtype=wp.int32, device=device)
@@ -90,32 +81,17 @@ class Randomiser:
         self._model_kd = model.joint_target_kd.reshape((n, -1))
         self._draw_masses()
 
-    def _ranges(self, params: wp.array, *scales: np.ndarray) -> _Ranges:
-        """Parameters of the draws, and ranges of stiffness, damping and servos on the device."""
-        return params, *(wp.array(scale, dtype=wp.vec2, device=self._state.device) for scale in scales)
-
-    def nominal_of(self, mask: wp.array) -> wp.array | None:
-        """Those of the environments of ``mask`` [N] that stay nominal; None where all are drawn."""
-        if self._nominal is None:
-            return None
-        self._state.launch(both_masks_kernel, [mask, self._nominal_world], [self._among_nominal])
-        return self._among_nominal
-
     def _draw_masses(self) -> None:
         """Draw link and object masses; inertias scale with them."""
         state = self._state
         n, model = state.num_envs, state.sim.model
         link_scale = wp.ones((n, len(state.scene.link_body)), dtype=float, device=state.device)
         everywhere = wp.ones(n, dtype=wp.int32, device=state.device)
-        draws = [
-            (state.parameters.randomisation, everywhere),
-            (state.parameters.nominal, self._nominal_world),
-        ]
-        for params, mask in draws[: 1 if self._nominal is None else 2]:
-            state.launch(draw_masses_kernel, [params, mask, state.rng], [link_scale, self.object_mass])
-        if self._nominal is not None:
-            pushed = self.object_mass.numpy() * (1 - self._nominal_world.numpy())
-            self._pushed_mass = wp.array(pushed, dtype=float, device=state.device)
+        state.launch(
+            draw_masses_kernel,
+            [state.parameters.randomisation, everywhere, state.rng],
+            [link_scale, self.object_mass],
+        )
         factor = np.ones((n, state.scene.bodies_per_world))
         factor[:, state.scene.link_body] = link_scale.numpy()
         mass = model.body_mass.numpy().reshape(n, -1)
@@ -143,9 +119,7 @@ class Randomiser:
     def draw(self, mask: wp.array) -> None:
         """Draw gains, servos, frictions, restitution and constant errors where ``mask`` [N] is set."""
         state = self._state
-        self._draw(mask, self._drawn)
-        if self._nominal is not None:
-            self._draw(self.nominal_of(mask), self._nominal)
+        self._draw_dynamics(mask)
         if state.sim.restitution is not None:
             drawn = state.sim.restitution
             state.launch(
@@ -154,13 +128,13 @@ class Randomiser:
                 [drawn.hand, drawn.object, drawn.table],
             )
 
-    def _draw(self, mask: wp.array, ranges: _Ranges) -> None:
-        """Draw gains, frictions, constant errors and servos from these ranges."""
+    def _draw_dynamics(self, mask: wp.array) -> None:
+        """Draw gains, frictions, constant errors and servos."""
         state = self._state
-        params, kp_scale, kd_scale, servo = ranges
+        ranges = self._kp_scale, self._kd_scale, state.parameters.randomisation
         state.launch(
             draw_dynamics_kernel,
-            [self._nominal_kp, self._nominal_kd, kp_scale, kd_scale, params, mask, state.rng],
+            [self._nominal_kp, self._nominal_kd, *ranges, mask, state.rng],
             [
                 self.kp,
                 self.kd,
@@ -173,7 +147,9 @@ class Randomiser:
         )
         if state.sim.servo is not None:
             state.launch(
-                draw_servo_kernel, [servo, mask, self.kp, self.kd, state.rng], [state.sim.servo.parameters]
+                draw_servo_kernel,
+                [self._servo_ranges, mask, self.kp, self.kd, state.rng],
+                [state.sim.servo.parameters],
             )
 
     def disturb(self) -> None:
@@ -182,7 +158,7 @@ class Randomiser:
         if self.enabled:
             state.launch(
                 disturbance_force_kernel,
-                [self._pushed_mass, state.parameters.force, self.force, state.rng],
+                [self.object_mass, state.parameters.force, self.force, state.rng],
                 [],
             )
         elif not state.cfg.curriculum.lightens:
