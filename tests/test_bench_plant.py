@@ -68,7 +68,7 @@ SMALL = ("thermal_drift", "load_friction", "supply_sag", "torque_saturation")
 def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect():
     """They share no code; both are rounded to encoder counts, of 0.44 mrad root mean square."""
     names = [name for name in EFFECTS if name not in (COUPLING, "command_jitter")]
-    exact = {"noise_rad": 0.0, "jitter_s": 0.0, "base_spread": 0.0}
+    exact = {"noise_rad": 0.0, "jitter_s": 0.0, "base_spread": 0.0, "excitations": ("gain_ladder",)}
     sizes = {name: effect_at(name, 3.0 if name in SMALL else 1.0) for name in names}
     hidden = simulate_hidden([Hiding("servo", {name: sizes[name]}, seed=1, **exact) for name in names])
     for name, made in zip(names, hidden, strict=True):
@@ -81,7 +81,7 @@ def test_it_and_the_rollouts_of_the_analysis_agree_on_every_effect():
         measured = np.concatenate([t.position for t in made.recording.trajectories])
         predicted = Rollouts(chain, made.recording).predict(rows)
         true, without = np.sqrt(np.mean((predicted - measured) ** 2, axis=(1, 2)))
-        assert true < 0.7e-3 and without > 2.0 * true, f"{name}: {true:.1e} rad, without it {without:.1e}"
+        assert true < 0.7e-3 and without > 1.2 * true, f"{name}: {true:.1e} rad, without it {without:.1e}"
 
 
 def test_jitter_delays_on_average_and_drops_hold_the_last_command():
