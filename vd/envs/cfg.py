@@ -419,6 +419,6 @@ class ReorientCfg:
             )
         if tightening.object_weight != 1.0 and self.table.lift_share == 0.0:
             raise ValueError(
-                f"curriculum.tightening.object_weight is {tightening.object_weight:g}, but no environment asks "
-                "for objects off the table, and only there are they light; give table.lift_share"
+                f"curriculum.tightening.object_weight is {tightening.object_weight:g}, but no environment "
+                "asks for objects off the table, and only there are they light; give table.lift_share"
             )

@@ -388,7 +388,7 @@ class ReorientEnv:
     # Reading
 
     def has_table(self) -> np.ndarray:
-        """Whether each table was there in its environment's last step, by the task, bool, shape [N] (host copy)."""
+        """Whether each table was there in the last step, by the task, bool, shape [N] (host copy)."""
         last = self._table_steps
         return np.ones(self.num_envs, bool) if last is None else self.step_count.numpy() <= last.numpy()
 

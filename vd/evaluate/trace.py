@@ -306,7 +306,7 @@ def _record_round(
     on_step: Callable[[], object],
     stops: Sequence[_Stops],
 ) -> None:
-    """One episode in each environment that has one; ``numbers`` [N]: place among its object's, -1 for none."""
+    """One episode in environments that have one; ``numbers`` [N]: place among its object's, -1 for none."""
     envs = np.flatnonzero(numbers >= 0)
     place = np.asarray(env.world_object)[envs], numbers[envs]
     goal = unit_quats(env.goal_quat.numpy())[envs]
