@@ -31,7 +31,7 @@ commands:
   teacher    train the teacher with PPO           vd-train teacher --preset gpu --out runs/first
   student    imitate it from point clouds         vd-train student --stage 1 --teacher dclaw3-table
   tracker    let it act by a camera, learn nothing vd-train tracker dclaw3-table --objects SET
-  average    mean weights of several teachers     vd-train average runs/a runs/b --output policy.pt
+  average    mean weights of several teachers     vd-train average runs/a runs/b --out policy.pt
   export     write a policy without its optimiser vd-train export runs/first/checkpoints/best.pt policy.pt
              or a small checkpoint to go on from  vd-train export --resumable CHECKPOINT small.pt
              or a teacher's network as ONNX       vd-train export CHECKPOINT policy.onnx
@@ -68,8 +68,7 @@ class ExportCfg:
 
     A policy keeps its critic, so that --init can go on from it.
 
-    A student is written in a third of its space: 8 bits for convolutions, half precision for other matrices.
-    It is used as before, --init included.
+    A student keeps its weights, and --init goes on from it.
     """
 
     checkpoint: Annotated[Path, tyro.conf.Positional]

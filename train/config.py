@@ -30,7 +30,7 @@ class PpoCfg:
         "imitation_learning_rate": Dropped(1e-3),
     }
     rollout_steps: int = PAPER.teacher.rollout_steps
-    """Control steps of every world between two updates."""
+    """Control steps of every environment between two updates."""
     minibatch_size: int = PAPER.teacher.minibatch_size
     """Samples of an optimiser step on one GPU (at most environments x rollout steps)."""
     epochs: int = PAPER.teacher.epochs

@@ -37,7 +37,7 @@ class DaggerCfg:
         "validation_envs": Dropped(0),
     }
     rollout_steps: int = PAPER.dagger.rollout_steps
-    """Control steps of every world between two updates; gradients flow through all of them."""
+    """Control steps of every environment between two updates; gradients flow through all of them."""
     minibatch_envs: int = PAPER.dagger.synthetic_minibatch
     """Environments of an optimiser step on one GPU, whole sequences each."""
     epochs: int = PAPER.dagger.epochs
