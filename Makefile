@@ -23,7 +23,7 @@ BENCH_ARGS ?=
 .PHONY: help env demo test lint type format docs bench clean
 
 help:
-	@echo 'make demo     turn unseen objects, close a gap, fly a hand, train a little: demo/index.html'
+	@echo 'make demo     turn unseen objects, close a gap, drive a simulated hand, train a little: demo/index.html'
 	@echo '              MESHES=DIR turns your own meshes; DEMO_ARGS=--quick ends after the first part'
 	@echo 'make test     all tests; TEST_ARGS="-k rewards" chooses some'
 	@echo 'make lint     ruff, without changing files      make format   the same, changing files'

@@ -60,8 +60,6 @@ def commands() -> str:
         parts += [f"## {script}", f"```text\n{text}\n```"]
         for name in _subcommands(text):
             parts += [f"### {script} {name}", f"```text\n{_help(main, script, (name,))}\n```"]
-        if script == "vd-deploy":  # alone it lists its commands; a policy's flags come with any option
-            parts += ["### vd-deploy POLICY", f"```text\n{_help(main, script, ('--twin',))}\n```"]
     return "\n\n".join(parts)
 
 

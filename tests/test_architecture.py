@@ -24,9 +24,17 @@ DOCUMENTS = sorted({*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")} - {ROOT / "C
 MAX_LINES = 600
 MAX_FUNCTION_LINES = 80
 LEAVES = ("vd.paper", "vd.files", "vd.interrupt")
-SHARED = ("vd.config", "vd.policy", "vd.clouds", "vd.quaternions", "vd.senses", "vd.stopping", "vd.views")
+SHARED = (
+    "vd.config",
+    "vd.policy",
+    "vd.clouds",
+    "vd.quaternions",
+    "vd.senses",
+    "vd.stopping",
+    "vd.frame_maps",
+)
 """What camera policies share; no simulator."""
-DESCRIPTIONS = ("vd.envs.cfg", "vd.envs.view_tables", "vd.sensors.cfg")
+DESCRIPTIONS = ("vd.envs.cfg", "vd.envs.symmetry_frames", "vd.sensors.cfg")
 """What describes a task, and needs no simulator either."""
 # What each part may import of this project; the longest prefix of a module's name decides.
 ALLOWED: dict[str, tuple[str, ...]] = {
@@ -41,7 +49,7 @@ ALLOWED: dict[str, tuple[str, ...]] = {
     "vd.quaternions": (),
     "vd.senses": (),
     "vd.stopping": LEAVES,
-    "vd.views": ("vd.kernels", "vd.assets_usd", *DESCRIPTIONS),
+    "vd.frame_maps": ("vd.kernels", "vd.assets_usd", *DESCRIPTIONS),
     "vd.tracking": (*LEAVES, *SHARED, *DESCRIPTIONS, "vd.kernels", "vd.assets_usd", "vd.tracking"),
     "vd.vision": (*LEAVES, *SHARED, "vd.kernels", "vd.assets_usd", "vd.vision"),
     "vd.envs": (*LEAVES, "vd.config", "vd.kernels", "vd.assets_usd", "vd.sim", "vd.envs"),

@@ -117,9 +117,14 @@ def test_the_page_shows_every_part(played, tmp_path):
     assert (tmp_path / "demo" / "gap" / "analysis" / "report.html").is_file()
 
 
-def test_quick_ends_after_the_first_part(played, tmp_path):
+def test_quick_ends_after_the_first_part_and_a_demo_again_replaces_the_one_before(played, tmp_path):
     assert main(["--out", str(tmp_path), "--quick"]) == 0
     assert {line[0] for line in played} == {"vd-eval", "vd-play"}
+    for file in (tmp_path / "camera" / "old.txt", tmp_path / "mine.txt"):
+        file.touch()
+    assert main(["--out", str(tmp_path), "--quick"]) == 0
+    assert not (tmp_path / "camera" / "old.txt").exists() and (tmp_path / "mine.txt").exists()
+    assert Result.read(tmp_path / "camera" / "eval.json").rows
 
 
 def test_training_gets_what_the_other_parts_leave_and_a_minute_at_least(played, tmp_path):

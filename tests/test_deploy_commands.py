@@ -222,6 +222,19 @@ def test_a_recording_says_that_it_missed_its_rate(line, plan, tmp_path, capsys):
     assert rate and int(rate[1]) < 60
 
 
+def test_motions_go_finger_by_finger_and_a_plan_of_another_hand_is_refused(hand, tmp_path):
+    motions = record.motions_of(hand, (), ("gain_ladder", "slow_triangle"))
+    fingers = [motion.excitation.joints[0][:2] for motion in motions]
+    assert fingers == sorted(fingers) and len({motion.file for motion in motions}) == len(motions)
+    assert {motion.excitation.conditions["p_gain"] for motion in motions} == {200.0, 100.0, 50.0}
+    with pytest.raises(ValueError, match="fingers 0 to 2"):
+        record.motions_of(hand, (3,), ("chirp",))
+    (tmp_path / "next_experiment.json").write_text('{"trajectories": [], "joints": ["f9_j1"]}')
+    for path in (tmp_path, tmp_path / "nowhere.json"):
+        with pytest.raises(record.RecordError, match="no plan for dclaw3"):
+            record.read_plan(path, hand)
+
+
 @pytest.mark.parametrize("name", ["dclaw3", "dclaw4"])
 def test_the_largest_motions_touch_nothing(name):
     hand = load_hand(name)

@@ -78,7 +78,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
     chosen = [m for m in motions if m.excitation.joints == ("f0_j1",) and m.excitation.name in KINDS]
 
     @contextlib.contextmanager
-    def connect(_):
+    def connect(_, twin_options=()):
         plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=1920.0))
         with simulated_bus(hand, joints, plant) as (_, bus):
             yield Connection(hand, joints, bus)

@@ -4,13 +4,17 @@ import json
 import os
 import threading
 
+import imageio.v3 as iio
 import numpy as np
 import pytest
+from simulated_clock import SimulatedClock
 
 from vd.assets_usd.hands import load_hand
 from vd.deploy.loop.log import LogWriter
 from vd.gap.recording import read_recording
 from vd.hand_log import JOINT_CHANNELS, STEP_COLUMNS, STEPS_FILE, TRUTH_COLUMNS, LogError, is_log, read_log
+from vd.play.cli import main as play
+from vd.play.replay import Replay, ReplaySession
 
 STEPS = 30
 SENT_S = 0.02
@@ -20,18 +24,25 @@ GOALS = [[0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 1.0, 0.0]]
 @pytest.fixture
 def folder(tmp_path):
     """A log with two goals, the first of which was reached."""
-    hand = load_hand("dclaw3")
-    log = LogWriter(tmp_path / "log", hand, {"goals": GOALS}, servo={"p_gain": 200}, truth=True)
+    hand, clock = load_hand("dclaw3"), SimulatedClock()
+    run = {
+        "goals": GOALS,
+        "object": {"name": "cube", "set": "cube"},
+        "control_hz": 12.0,
+        "tolerance_rad": 1.0,
+    }
+    log = LogWriter(tmp_path / "log", hand, run, servo={"p_gain": 200}, truth=True, clock=clock)
     for step in range(STEPS):
         wave = 0.3 * np.sin(0.5 * step + np.arange(9))
         joints = {channel: wave + 0.01 * i for i, channel in enumerate(JOINT_CHANNELS)}
         values = [float(step >= 10), 1.0, 0.5, 0.001, 0.002, 0.02, 0.02, 0.0]
         assert len(values) == len(STEP_COLUMNS)
-        now = log.started_s + step / 12
+        now = clock.now()
         log.step(now, now + SENT_S, joints, values, [0.0, 0.0, 0.03, 0.0, 0.0, 0.0, 1.0, 0.1 * step])
         if step == 9:
             log.event("stop", goal=0, outcome="stopped", distance=0.2)
-    log.event("stop", goal=1, outcome="time limit", distance=0.7)
+        clock.sleep(1 / 12)
+    log.event("stop", goal=1, outcome="lost", distance=0.7)
     log.finish("all goals done", steps=STEPS)
     return tmp_path / "log"
 
@@ -45,10 +56,40 @@ def test_what_is_written_is_read(folder):
     np.testing.assert_allclose(log.channel("position"), expected + 0.01, atol=1e-6)
     assert log.object_pose.shape == (STEPS, 7) and log.object_pose[3, 2] == 0.03
     first, second = log.stops
-    assert (first.outcome, second.outcome) == ("stopped", "time limit")
+    assert (first.outcome, second.outcome) == ("stopped", "lost")
     assert second.goal_quat == tuple(GOALS[1])
     assert second.unix_s == pytest.approx(log.run["unix_s"] + second.time_s)
     assert len(TRUTH_COLUMNS) == 8
+
+
+def test_a_log_is_shown(folder, tmp_path, capsys):
+    shots = Replay(read_log(folder)).snapshots
+    assert len(shots) == STEPS
+    np.testing.assert_allclose(shots[5].joint_q[:9], read_log(folder).channel("position")[5])
+    np.testing.assert_allclose(shots[12].goal_quat, GOALS[1])
+    # Stopped 0.9 rad from its goal.
+    assert [shot.success for shot in shots].index(True) == 9 and shots[-1].goals == 1
+    assert [shot.fell for shot in shots].index(True) == STEPS - 1
+    assert play([str(folder), "--video", str(tmp_path / "log.mp4")]) == 0
+    assert iio.imread(tmp_path / "log.mp4").shape[0] == STEPS
+    run = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(run | {"tolerance_rad": 0.8}))
+    assert not any(shot.success for shot in Replay(read_log(folder)).snapshots)
+    run["object"]["set"] = str(tmp_path / "gone.usda")
+    (folder / "run.json").write_text(json.dumps(run))
+    assert play([str(folder), "--video", str(tmp_path / "gone.mp4")]) == 1
+    assert "cannot be shown" in capsys.readouterr().err
+
+
+def test_the_viewer_steps_through_a_log(folder):
+    session = ReplaySession(Replay(read_log(folder)))
+    first = session.step().time_s
+    assert session.step().time_s > first > 0.0
+    np.testing.assert_allclose(session.new_goal().goal_quat, GOALS[1])
+    assert session.reset().time_s == 0.0
+    for _ in range(STEPS):
+        session.step()
+    assert session.snapshot.time_s == 0.0
 
 
 def test_the_log_is_a_recording(folder):

@@ -17,7 +17,6 @@ from vd.envs.cfg import (
 from vd.envs.curriculum import Stage, first_stage, next_stage
 from vd.envs.parameters import GOAL_START_RAD, STILLNESS_START
 from vd.envs.reorient import ReorientEnv
-from vd.paper import PAPER
 
 TIGHTENING = TighteningCfg(enabled=True, rate=0.25, raise_at=0.5, lower_at=0.3)
 WELL, SO_SO, BADLY = 0.9, 0.4, 0.1
@@ -41,9 +40,10 @@ def update(env: ReorientEnv, success_rate: float) -> dict[str, float]:
 
 
 def thresholds(env: ReorientEnv) -> list[float]:
-    """Joint speed, speed and spin of the object, norm of the action: what success asks at present."""
+    """Joint speed, speed and spin of the object, norm of the action, angle: what success asks at present."""
     values = env.parameters.success.numpy()
-    return [float(values[name][0]) for name in ("joint_speed", "object_speed", "object_spin", "action_norm")]
+    names = ("joint_speed", "object_speed", "object_spin", "action_norm", "rotation")
+    return [float(values[name][0]) for name in names]
 
 
 def test_goals_recede_only_while_they_are_reached():
@@ -78,10 +78,10 @@ def test_stillness_tightens_after_the_goals_and_loosens_before_them():
 
 
 def test_thresholds_shrink_by_the_same_factor_from_loose_to_those_of_success():
-    env = make(CurriculumCfg(tightening=TIGHTENING), success=SuccessCfg(object_spin_rad_s=0.0))
-    loose = [TIGHTENING.joint_speed_rad_s, TIGHTENING.object_speed_m_s, 0.0, TIGHTENING.action_norm]
-    success = PAPER.success
-    tight = [success.joint_speed_rad_s, success.object_speed_m_s, 0.0, success.action_norm]
+    success = SuccessCfg(object_spin_rad_s=0.0, rotation_rad=0.1)
+    env = make(CurriculumCfg(tightening=TIGHTENING), success=success)
+    loose = [TIGHTENING.joint_speed_rad_s, TIGHTENING.object_speed_m_s, 0.0, TIGHTENING.action_norm, 0.4]
+    tight = [success.joint_speed_rad_s, success.object_speed_m_s, 0.0, success.action_norm, 0.1]
     seen = [thresholds(env)]
     for tightness in (0.25, 0.5, 0.75, 1.0):
         assert update(env, WELL)["tightness"] == tightness

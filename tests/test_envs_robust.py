@@ -132,7 +132,7 @@ def test_the_history_is_what_was_observed_in_any_view(view):
     env = make(observation=observation, randomisation=random)
     seen = run(env, 7)["seen"]
     if view != "world":
-        assert env.views.view.numpy().any(), "worlds are seen turned"
+        assert env.symmetry_frames.chosen.numpy().any(), "worlds are seen turned"
     columns = env.observer.parts["history"]
     for step in range(len(seen)):
         got = seen[step][:, columns].reshape(WORLDS, 4, -1)
@@ -165,7 +165,7 @@ def test_dynamics_are_told_in_the_order_of_the_joints_that_are_seen(view):
     order, drawn = np.tile(np.arange(9), (WORLDS, 1)), env.randomiser
     if view == "goal":
         # Joint of the view that is each joint of the world, turned round.
-        order = np.argsort(env.views.tables.joints[env.views.view.numpy()], axis=1)
+        order = np.argsort(env.symmetry_frames.tables.joints[env.symmetry_frames.chosen.numpy()], axis=1)
     channels = [
         (drawn.kp.numpy() / env.hand.kp - 1.0) / dynamics.GAIN_UNIT,
         (drawn.kd.numpy() / env.hand.kd - 1.0) / dynamics.GAIN_UNIT,

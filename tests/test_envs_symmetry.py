@@ -1,4 +1,4 @@
-"""Seen in its goal's view, a turned world looks the same, and moves the same under the same action."""
+"""In its goal's symmetry frame a turned world looks the same, and moves the same under the same action."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from vd.assets_usd.hands import load_hand
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
-from vd.envs.view_tables import SECTOR
+from vd.envs.symmetry_frames import SECTOR
 from vd.kernels.task.observations import teacher_observation_slices
 
 WORLDS = 6
@@ -41,9 +41,9 @@ def with_signs_of(reference: np.ndarray, observation: np.ndarray, fingers: int) 
 
 
 def look(env: ReorientEnv) -> None:
-    """Observe anew, in the views for where the objects are now."""
+    """Observe anew, in the frames for where the objects are now."""
     every = wp.ones(WORLDS, dtype=wp.int32, device=env.device)
-    env.views.choose(every, every)
+    env.symmetry_frames.choose(every, every)
     env.observe()
 
 
@@ -64,7 +64,7 @@ def test_turned_worlds_look_and_move_the_same(hand):
     action = rng.uniform(-1, 1, (WORLDS, joints)).astype(np.float32)
     act(env, action)
     after, kept = env.observation.numpy().copy(), env.done.numpy() == 0
-    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the environments are in different views"
+    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the environments are in different frames"
 
     tips = load_hand(hand).tip_poses(np.zeros(joints))
     azimuth = np.arctan2(tips[:, 1], -tips[:, 0])  # the base is upside down, turned about y
@@ -86,8 +86,8 @@ def test_turned_worlds_look_and_move_the_same(hand):
         arrays["warm_start"][:] = 0.0
         env.load_state_dict(state | {"arrays": arrays})
         look(env)
-        turned = (state["arrays"]["view"] - env.views.view.numpy()) % fingers
-        assert (turned == step).all(), "the view goes with the world"
+        turned = (state["arrays"]["view"] - env.symmetry_frames.chosen.numpy()) % fingers
+        assert (turned == step).all(), "the frame goes with the world"
         seen = with_signs_of(before, env.observation.numpy(), fingers)
         np.testing.assert_allclose(seen, before, atol=2e-4)
 
@@ -109,7 +109,7 @@ def test_mirrored_worlds_look_and_move_the_same():
     action = rng.uniform(-1, 1, (WORLDS, 9)).astype(np.float32)
     act(env, action)
     after, kept = env.observation.numpy().copy(), env.done.numpy() == 0
-    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the environments are in different views"
+    assert kept.any() and len(set(state["arrays"]["view"])) > 1, "the environments are in different frames"
 
     points = env.observer.shapes._points  # drawn at random, so that theirs is another cuboid
     surface = points.numpy().copy()
@@ -140,7 +140,7 @@ def test_mirrored_worlds_look_and_move_the_same():
         env.load_state_dict(state | {"arrays": arrays})
         points.assign(surface * [1.0, -1.0, 1.0])
         look(env)
-        was, now = state["arrays"]["view"] >= 3, env.views.view.numpy() >= 3
+        was, now = state["arrays"]["view"] >= 3, env.symmetry_frames.chosen.numpy() >= 3
         assert (was != now).all(), "what was seen in the mirror is seen as it is, and the other way round"
         seen = with_signs_of(before, env.observation.numpy(), 3)
         np.testing.assert_allclose(seen, before, atol=2e-4)
@@ -165,37 +165,37 @@ def test_the_axis_of_the_wanted_rotation_is_in_one_sector_when_the_goal_is_new()
     seen = np.stack(
         [
             Rotation.from_euler("z", 2.0 * np.pi * k / 3).apply(w)
-            for k, w in zip(env.views.view.numpy(), wanted, strict=True)
+            for k, w in zip(env.symmetry_frames.chosen.numpy(), wanted, strict=True)
         ]
     )
     cosine = seen @ SECTOR / np.linalg.norm(seen[:, :2], axis=1)
     assert (cosine > 0.5 - 1e-4).all(), "within 60 degrees of the direction"
-    assert len(set(env.views.view.numpy())) == 3
-    views = env.views.view.numpy().copy()
+    assert len(set(env.symmetry_frames.chosen.numpy())) == 3
+    frames = env.symmetry_frames.chosen.numpy().copy()
     for _ in range(5):
         act(env, np.full((60, 9), 0.5, dtype=np.float32))
     same = env.step_count.numpy() == 5
-    assert (env.views.view.numpy() == views)[same].all(), "a view lasts as long as its goal"
+    assert (env.symmetry_frames.chosen.numpy() == frames)[same].all(), "a frame lasts as long as its goal"
 
 
 def test_the_world_frame_is_a_view_too():
     plain = ReorientEnv(dataclasses.replace(CFG, observation=ObservationCfg(shape="full")), "cpu")
     viewed = ReorientEnv(CFG, "cpu")
-    assert plain.views is None
+    assert plain.symmetry_frames is None
     assert np.array_equal(plain.observation.numpy(), viewed.world_observation.numpy())
-    first = viewed.views.view.numpy() == 0
+    first = viewed.symmetry_frames.chosen.numpy() == 0
     assert first.any()
     np.testing.assert_allclose(viewed.observation.numpy()[first], plain.observation.numpy()[first], atol=1e-6)
 
-    viewed.acts_in_view = False
+    viewed.acts_in_frame = False
     rng = np.random.default_rng(0)
     for action in rng.uniform(-1, 1, (4, WORLDS, 9)).astype(np.float32):
         act(plain, action)
         act(viewed, action)
     assert np.array_equal(plain.sim.joint_q.numpy(), viewed.sim.joint_q.numpy())
     viewed.action.assign(rng.uniform(-1, 1, (WORLDS, 9)).astype(np.float32))
-    order = viewed.views.world_action(viewed.action).numpy()
-    for world, view in enumerate(viewed.views.view.numpy()):
+    order = viewed.symmetry_frames.world_action(viewed.action).numpy()
+    for world, view in enumerate(viewed.symmetry_frames.chosen.numpy()):
         block = viewed.action.numpy()[world].reshape(3, 3)
         assert any(np.array_equal(np.roll(block, roll, axis=0).ravel(), order[world]) for roll in range(3))
         if view == 0:

@@ -117,7 +117,7 @@ def test_starts_and_goals_the_environment_draws_do_not_depend_on_the_policy():
 def test_fewer_worlds_than_objects_is_refused():
     env = fake([FakeObject("a"), FakeObject("b")], num_envs=2)
     env.world_object[:] = 0
-    with pytest.raises(ValueError, match="no world simulates object 1"):
+    with pytest.raises(ValueError, match="no environment simulates object 1"):
         collect(env, Turn(0.0), *(np.tile(x, (2, 1, 1)) for x in quarter_turn_ahead()))
 
 

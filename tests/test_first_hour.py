@@ -15,7 +15,8 @@ from vd.train.cli import USAGE as TRAIN_USAGE
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-PAGES = (*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md")))
+PAGES = (*sorted({*ROOT.glob("*.md")} - {ROOT / "CHANGELOG.md"}), *sorted((ROOT / "docs").rglob("*.md")))
+"""What users read; the list of changes names what is gone."""
 HEAVY = ("torch", "newton", "warp", "pxr", "mujoco", "matplotlib", "viser")
 RUN = """
 import importlib, sys

@@ -123,7 +123,7 @@ def test_links_of_other_mass_are_no_finding_and_friction_beside_them_is_named(
     friction: float, tmp_path: Path
 ) -> None:
     recording, _ = recorded((0.86, 1.14, 0.9), {servo.COULOMB_TORQUE: friction}, dt=1.0 / 960.0)
-    effects = ("coulomb_friction", "command_filter", "gravity_load")
+    effects = ("coulomb_friction", "gravity_load")
     report = explain(recording, load_hand("dclaw3"), tmp_path, effects=effects, workers=1)
     assert all("with the masses of its links" in joint.reason for joint in report.joints)
     assert report.verdict == ("effects" if friction else "no_gap")

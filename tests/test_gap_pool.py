@@ -19,7 +19,7 @@ import vd.kernels.servo.actuators as servo
 from vd.gap.assemble import curves
 from vd.gap.chain import chains
 from vd.gap.design import design
-from vd.gap.fit_cache import FitCache, digest_of
+from vd.gap.fit_cache import FitCache
 from vd.gap.launch_batch import LaunchBatch
 from vd.gap.rollout import STEP_S, Rollouts
 from vd.gap.statistics import noise_floor
@@ -166,19 +166,6 @@ def test_the_curves_of_a_report_do_not_show_the_step_of_the_search() -> None:
     drawn = curves(recording, problems, [("j", spec, rows)])
     searched = Rollouts(chain, recording, dt=STEP_S).predict(rows[None])[0]
     assert np.std(drawn - exact) < 0.25 * np.std(searched - exact)
-
-
-def test_equal_calls_have_one_digest_and_others_another() -> None:
-    call = ("fit", {"base": np.arange(3.0), "starts": [{"kp": 1.0, "kd": 2.0}], "fit": made_up((), 1.0)})
-    same = {"fit": made_up((), 1.0), "starts": [{"kd": 2.0, "kp": np.float64(1.0)}], "base": np.arange(3.0)}
-    assert digest_of(call) == digest_of(("fit", same)) == digest_of(pickle.loads(pickle.dumps(call)))
-    others = [
-        ("fits", call[1]),
-        ("fit", {**call[1], "base": np.arange(3)}),
-        ("fit", {**call[1], "starts": [{"kp": 1.0}, {"kd": 2.0}]}),
-        ("fit", {**call[1], "fit": made_up((), 1.1)}),
-    ]
-    assert len({digest_of(other) for other in (call, *others)}) == len(others) + 1
 
 
 def test_fits_that_are_kept_are_of_one_recording_and_those_that_are_damaged_none(tmp_path: Path) -> None:

@@ -270,43 +270,6 @@ def test_every_verdict_has_its_sentence_and_its_page(curves, tmp_path, verdict):
     assert all(step in page for step in steps) and steps[0].endswith(".")
 
 
-def test_an_encoder_bias_is_said_to_be_a_difference_of_zeros_first(curves):
-    size = Estimate(0.3, (0.298, 0.302), "rad")
-    bias = NamedEffect("encoder_bias", JOINTS[:1], 0.99, {"bias_rad": size}, ())
-    said = words.verdict_sentence(sample_report(curves, effects=(bias,)))
-    assert "common zero of command and reading (encoder bias) on f0_j1 (300 mrad)" in said
-    assert "first of all a difference of zeros" in said and "compare the zeros" in said
-    assert "zero" not in words.verdict_sentence(sample_report(curves))
-
-
-def test_many_open_sets_are_a_list_by_joint(curves, tmp_path):
-    friction, limits = ("coulomb_friction", "dead_zone"), ("torque_limit", "supply_sag", "torque_saturation")
-    other = ("elastic_transmission", "command_filter")
-    report = sample_report(
-        curves,
-        verdict="ambiguous",
-        closing=None,
-        effects=(),
-        ambiguous=(friction, limits, other),
-        next_experiment="Record long holds on f0_j1 (20 s). The commands are in x/; go on.",
-    )
-    sets = {JOINTS[0]: (friction,), JOINTS[1]: (friction[::-1], limits), JOINTS[2]: (other,)}
-    joints = tuple(dataclasses.replace(j, open_sets=sets.get(j.joint, ())) for j in report.joints)
-    report = Report.from_dict(dataclasses.replace(report, joints=joints).validate().to_dict())
-    assert words.open_questions(report) == [
-        "f0_j1 and f0_j2: coulomb friction or dead zone",
-        "f0_j2: torque limit, supply sag or torque saturation",
-        "f0_j3: elastic transmission or command filter",
-    ]
-    assert "3 sets of causes" in words.verdict_sentence(report)
-    assert len(words.verdict_sentence(report)) < 330
-    write_report(report, None, tmp_path)
-    page = (tmp_path / "report.html").read_text()
-    assert "<span>3 sets of causes</span>" in page, "a tile has no room for them"
-    for line in (*words.open_questions(report), "The commands are in x/; go on."):
-        assert f"<li>{line}</li>" in page
-
-
 def test_of_one_recorded_finger_the_layer_of_all_is_to_be_trained_with(report, tmp_path):
     assert "pass identified.usda with --hand-layer" in words.next_step(report)
     closing = dataclasses.replace(report.closing, whole_hand_layer="identified-all-fingers.usda")
@@ -325,17 +288,3 @@ def test_torques_of_a_bare_servo_are_said_to_be_relative(report, tmp_path, told)
     source = dataclasses.replace(report.recording, model="servo", relative_torques=told)
     write_report(dataclasses.replace(report, recording=source), None, tmp_path)
     assert ("Torques are relative" in (tmp_path / "report.html").read_text()) == told
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "text"),
-    [
-        (0.0402, "s", "40.2 ms"),
-        (2.5, "s", "2.5 s"),
-        (0.031, "N m", "31 mN m"),
-        (0.2, "1", "0.2"),
-        (math.nan, "s", "not known"),
-    ],
-)
-def test_amounts_are_said_in_their_usual_size(value, unit, text):
-    assert words.amount(value, unit) == text

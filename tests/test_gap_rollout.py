@@ -208,26 +208,6 @@ def test_unrecorded_joints_stand_still(hand):
     assert alone.inertia_scale(0) == pytest.approx(chain.inertia_scale(1))
 
 
-def test_the_chain_has_the_kinetic_energy_of_the_hand(hand):
-    data = recording("dclaw3", hand.joint_names[:3], trajectory("a", np.zeros((30, 3))))
-    (chain,) = chains(data, hand)
-    for joint in range(3):
-        # Energy at 1 rad/s by finite differences of the poses.
-        step = 1e-4
-        turned = np.zeros((2, hand.num_joints))
-        turned[:, joint] = -step / 2, step / 2
-        poses = hand.forward_kinematics(turned)[:, 1:4]
-        turns = [Rotation.from_quat(pose[:, 3:]) for pose in poses]
-        centres = [
-            pose[:, :3] + turn.apply(hand.link_com[1:4]) for pose, turn in zip(poses, turns, strict=True)
-        ]
-        speed = (centres[1] - centres[0]) / step
-        spin = (turns[0].inv() * turns[1]).as_rotvec() / step
-        inertia = hand.link_mass[1:4] @ (speed**2).sum(axis=1)
-        inertia += np.einsum("li,lij,lj->", spin, hand.link_inertia[1:4], spin)
-        assert chain.inertia_scale(joint) == pytest.approx(inertia, rel=1e-4)
-
-
 def test_bad_input_says_what_to_do(hand):
     data = recording("dclaw3", ("f0_j1",), trajectory("a", wave()))
     with pytest.raises(ValueError, match="needs its hand"):

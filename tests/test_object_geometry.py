@@ -46,6 +46,13 @@ def test_union_of_overlapping_boxes_counts_the_overlap_once():
     np.testing.assert_allclose(solid.centroid, [x, 0, 0], atol=5e-4)
 
 
+def test_thin_plates_along_the_axes_are_measured_without_bias():
+    """Two crossed sheets of 1 mm on a grid of about 1.7 mm: no layer is gained or lost."""
+    sheets = [box((0, 0, 0), (0.12, 0.08, 0.001)), box((0, 0, 0.05), (0.001, 0.08, 0.1))]
+    exact = 0.12 * 0.08 * 0.001 + 0.001 * 0.08 * (0.1 - 0.0005)
+    assert g.solid_of_hulls(sheets).volume == pytest.approx(exact, rel=0.03)
+
+
 @pytest.mark.parametrize("open_lid", [False, True])
 def test_voxelised_mesh_needs_no_closed_surface(open_lid: bool):
     """A box with a hole of two voxels still encloses its volume."""

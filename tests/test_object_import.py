@@ -17,7 +17,7 @@ import trimesh
 from vd.assets_usd.objects import decompose as d
 from vd.assets_usd.objects import meshes as m
 from vd.assets_usd.objects.bodies import body_of, error_of_parts
-from vd.assets_usd.objects.geometry import Hull, hull_depth, union_depth
+from vd.assets_usd.objects.geometry import Hull, hull_depth, mesh_volume, union_depth
 from vd.assets_usd.objects.importer import (
     _keep_decomposition,
     _kept_decomposition,
@@ -360,6 +360,15 @@ def test_the_error_of_parts_counts_what_they_lack_and_what_they_have_too_much():
     longer = Hull(cube.vertices * [1.1, 1.0, 1.0 / 1.1], cube.faces)
     assert error_of([longer]) == pytest.approx(2.0 * (1.0 - 1.0 / 1.1), rel=0.02)
     assert error_of([Hull(cube.vertices, cube.faces)]) < 1e-3
+
+
+def test_slivers_among_the_parts_are_dropped():
+    block = trimesh.creation.box((0.1, 0.05, 0.05)).vertices
+    sheet = trimesh.creation.box((0.1, 0.05, 1e-5)).vertices
+    crumb = trimesh.creation.box((0.002, 0.002, 0.002)).vertices
+    line = np.linspace([0, 0, 0], [0.1, 0, 0], 5)
+    (kept,) = d.tidy_hulls([sheet, block, crumb, line], 32)
+    assert mesh_volume(*kept) == pytest.approx(0.1 * 0.05 * 0.05)
 
 
 def test_parts_are_merged_where_that_fills_least():

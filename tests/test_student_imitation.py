@@ -2,6 +2,7 @@
 
 import math
 import os
+import re
 import signal
 from types import SimpleNamespace
 
@@ -265,6 +266,23 @@ def test_a_student_is_exported_from_a_checkpoint(tmp_path, capsys):
     np.testing.assert_array_equal(weights(load_student(out).network), weights(runner.student))
     assert main(["export", "--resumable", str(checkpoint), str(out)]) == 1
     assert "--init" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "said"),
+    [
+        ("senses", ["action", "object"], "that is a tracking policy now. .*: vd-train tracker"),
+        ("turn", {"vectors": 3}, "network.turn.vectors is 3, and this version .*; it was written by another"),
+    ],
+)
+def test_a_student_of_an_earlier_version_is_refused_in_words(tmp_path, field, value, said, capsys):
+    make_dagger(tmp_path).learn(1)
+    state = torch.load(tmp_path / "student.pt", weights_only=True)
+    state["spec"]["network"][field] = value
+    torch.save(state, tmp_path / "old.pt")
+    assert main(["export", str(tmp_path / "old.pt"), str(tmp_path / "out.pt")]) == 1
+    assert re.search(rf"old\.pt.*{said}", capsys.readouterr().err)
+    assert not (tmp_path / "out.pt").exists()
 
 
 def test_ctrl_c_saves_within_a_rollout(tmp_path):

@@ -1,5 +1,6 @@
 """Runs that meet damaged files, refused settings and full disks: nothing is lost, and it is said."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -69,7 +70,9 @@ def teacher(*flags: str) -> int:
     return main(["teacher", *flags])
 
 
-def test_a_setting_that_is_refused_leaves_a_run_that_can_go_on(tmp_path, monkeypatch, capsys):
+def test_a_setting_that_is_refused_leaves_a_run_that_can_go_on_also_an_older_one(
+    tmp_path, monkeypatch, capsys
+):
     simulating_the_dummy(monkeypatch)
     run = ["--out", str(tmp_path)]
     assert teacher("--smoke", *run, "--max-steps", "256") == 0
@@ -78,6 +81,12 @@ def test_a_setting_that_is_refused_leaves_a_run_that_can_go_on(tmp_path, monkeyp
         assert teacher(*run, *how, "--objects", "cuboid") == 1
         assert "other objects" in capsys.readouterr().err
         assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+    # As an earlier version wrote it.
+    file = tmp_path / "config.json"
+    config = json.loads(file.read_text())
+    config["run"]["run_dir"] = config["run"].pop("out")
+    config["env"]["num_worlds"] = config["env"].pop("num_envs")
+    file.write_text(json.dumps(config))
     assert teacher(*run, "--resume", "--max-steps", "512") == 0
     assert "resumed after iteration 2 of 4" in capsys.readouterr().out
 

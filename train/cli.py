@@ -68,8 +68,7 @@ class ExportCfg:
 
     A policy keeps its critic, so that --init can go on from it.
 
-    A student is written in a third of its space: 8 bits for convolutions, half precision for other matrices.
-    It is used as before, --init included.
+    A student keeps its weights, and --init goes on from it.
     """
 
     checkpoint: Annotated[Path, tyro.conf.Positional]

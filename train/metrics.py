@@ -50,7 +50,7 @@ class GoalWindow:
     """How goals ended over the last episode's worth of iterations.
 
     Success per goal is a ratio of rare events; a window as long as an episode holds about one ended goal
-    of every world, and weighs early and late steps of an episode alike.
+    of every environment, and weighs early and late steps of an episode alike.
 
     Args:
         length: Iterations in the window.

@@ -28,7 +28,7 @@ class ReorientVecEnv(VecEnv):
     Warp and torch work on different CUDA streams. Warp's are ordered against torch's default stream by
     CUDA itself, so torch has to stay on that stream, and nothing waits on the host.
 
-    ``done`` for PPO is success, fall or time-out. A success gives the world a new goal and no reset, but ends
+    ``done`` for PPO is success, fall or time-out. A success gives a new goal and no reset, but ends
     the goal's return: it is not bootstrapped. Only a time-out without success or fall is
     (``extras["time_outs"]``). The observation returned is always that of the next action, after a reset
     or with the new goal.
@@ -78,7 +78,7 @@ class ReorientVecEnv(VecEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """Control steps since the last reset of every world [N], a view; assigning copies into it."""
+        """Control steps since the last reset of every environment [N], a view; assigning copies into it."""
         return self._step_count
 
     @episode_length_buf.setter

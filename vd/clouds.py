@@ -45,8 +45,8 @@ class SceneClouds:
             objects: The objects; without any the cloud is the hand's alone.
             link_body: Body of each link of the hand, an index within a world, base first, shape [L].
             object_body: Body of the object, an index within a world.
-            world_object: Object of each world, shape [N].
-            world_scale: Size factor of each world's object, shape [N].
+            world_object: Object of each environment, shape [N].
+            world_scale: Size factor of each environment's object, shape [N].
             device: Warp device.
             goals: The objects as their goals are shown; as they are by default.
         """
@@ -93,7 +93,7 @@ class SceneClouds:
             body_q: Body poses in the world frame, shape [R, B].
             goal_quat: Wanted orientations in the world frame, shape [R].
             with_object: Write the object too; without it its columns are left to a camera's points.
-            envs: World of each row, shape [R]; row i is of world i by default.
+            envs: Environment of each row, shape [R]; row i is of environment i by default.
         """
         columns = self.item.stop if with_object else self.item.start
         wp.launch(

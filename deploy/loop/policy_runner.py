@@ -57,7 +57,7 @@ class Decision:
 
 
 class PolicyRunner:
-    """A policy in the loop; this one does nothing, to try everything else.
+    """A policy in the loop; this one is the zero-action baseline, to try everything else.
 
     Args:
         task: Environment of its training.

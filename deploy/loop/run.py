@@ -57,7 +57,7 @@ class RunCfg(HandOptions):
 
     policy: Annotated[str | None, tyro.conf.Positional] = None
     """Bundle, file or name of a policy that sees by camera; with --twin the installed tracking policy of the
-    hand by default. "zero" does nothing."""
+    hand by default. "zero" is the zero-action baseline."""
     object: str = "cube"
     """The object: name of a built-in set, its USD, or on a real hand a scan of it (.ply, .obj, .glb)."""
     goal: tuple[str, ...] = ()

@@ -117,7 +117,7 @@ def test_finger_follows_mujoco(device, n, friction):
 # --- One joint: every effect against a finer integration that shares no code ---
 
 
-def integrate(rows, time, command, start, dt):
+def integrate(rows, time, command, start, dt, stops=np.inf):
     """Semi-implicit Euler in float64, C joints [C, P] at once; positions [C, T] at the stamps."""
     names = [name for name, value in vars(servo).items() if type(value) is int and "STATE" not in name]
     p = {name: rows[:, getattr(servo, name)] for name in names if name != "PARAMETER_COLUMNS"}
@@ -173,6 +173,8 @@ def integrate(rows, time, command, start, dt):
         other_speed = other_speed - dt * between / p["ELASTIC_INERTIA"]
         other = other + dt * other_speed
         q = q + dt * v
+        v = np.where(np.abs(q) > stops, 0.0, v)
+        q = np.clip(q, -stops, stops)
         history.append(q)
     grid = np.arange(len(history)) * dt
     past = np.array(history)
@@ -255,6 +257,23 @@ def test_a_drive_gives_no_more_than_its_effort(device):
     # The smaller of the two counts.
     both = one_joint(device, rows_of({servo.TORQUE_LIMIT: 4.0 * limit}), time, command, effort=limit)
     np.testing.assert_array_equal(both, got)
+
+
+def test_stops_and_speed_limits_bound_the_motion(device):
+    rng = np.random.default_rng(6)
+    time, command = excitation(rng)
+    stops, limit = 0.25, 2.0
+    rows = rows_of({servo.VELOCITY_LIMIT: limit})
+    got = one_joint(device, rows, time, command, stops=stops)
+    fine = integrate(rows[:, 0], time, command, np.zeros(1), DT / FINE, stops)
+    assert np.sqrt(np.mean((got - fine) ** 2)) < 1.5e-3
+    assert np.abs(got).max() == pytest.approx(stops, abs=1e-6)
+    assert np.abs(np.diff(got) / np.diff(time)).max() == pytest.approx(limit, rel=1e-3)
+    for without in (
+        one_joint(device, rows, time, command),
+        one_joint(device, rows_of({}), time, command, stops=stops),
+    ):
+        assert np.abs(without - got).max() > 0.02, "a bound does nothing"
 
 
 def test_a_joint_that_is_switched_off_swings_out_by_what_damping_is_left(device):

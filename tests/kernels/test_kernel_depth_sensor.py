@@ -126,6 +126,23 @@ def test_edges_fray_and_nothing_else_does(device):
 
 
 @EXAMPLES
+@given(depth=images(), jump=st.floats(0.05, 0.6))
+def test_an_edge_is_where_a_neighbour_is_further_away_than_the_jump(device, depth, jump):
+    """A slope is none; a neighbour without depth is as far as the range, and itself stays without."""
+    far = np.pad(np.where(depth > 0, depth, MAX_RANGE), ((0, 0), (1, 1), (1, 1)), mode="edge")
+    middle = far[:, 1:-1, 1:-1]
+    others = (far[:, :-2, 1:-1], far[:, 2:, 1:-1], far[:, 1:-1, :-2], far[:, 1:-1, 2:])
+    apart = np.max([np.abs(other - middle) for other in others], axis=0)
+    assume((np.abs(apart - jump) > 1e-6).all())
+    edge = (apart > jump) & (depth > 0)
+    lost = measure(device, depth, edge_jump=jump, edge_dropout=1.0)
+    np.testing.assert_allclose(lost, np.where(edge, 0.0, depth), rtol=3e-7)
+    flying = measure(device, depth, edge_jump=jump, flying=1.0)
+    assert (np.abs(flying - depth)[edge] <= apart[edge] + 1e-6).all()
+    np.testing.assert_allclose(flying[~edge], depth[~edge], rtol=3e-7)
+
+
+@EXAMPLES
 @given(
     near=st.floats(0.3, 0.6),
     gap=st.floats(0.05, 0.6),

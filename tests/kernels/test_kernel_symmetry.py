@@ -5,17 +5,17 @@ from hypothesis import strategies as st
 from kernel_oracle import EXAMPLES, SENTINEL, floats, launch, quaternions, unwritten
 from scipy.spatial.transform import Rotation
 
-from vd.kernels.task.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
+from vd.kernels.task.symmetry import choose_frame_kernel, frame_observation_kernel, world_action_kernel
 
 
 @st.composite
 def worlds(draw: st.DrawFn) -> dict[str, np.ndarray]:
     """N worlds with new goals or old ones, and F directions."""
-    count, views, joints = draw(st.integers(1, 6)), draw(st.integers(1, 4)), draw(st.integers(0, 4))
+    count, frames, joints = draw(st.integers(1, 6)), draw(st.integers(1, 4)), draw(st.integers(0, 4))
     flags = st.lists(st.integers(0, 1), min_size=count, max_size=count)
     orientation = draw(quaternions((count,)))
     return {
-        "sector": draw(floats((views, 3), -1.0, 1.0)),
+        "sector": draw(floats((frames, 3), -1.0, 1.0)),
         "reset": np.array(draw(flags)),
         "new_goal": np.array(draw(flags)),
         "q": np.concatenate([draw(floats((count, joints + 3))), orientation], axis=1),
@@ -27,20 +27,20 @@ def worlds(draw: st.DrawFn) -> dict[str, np.ndarray]:
 @given(scene=worlds())
 def test_a_new_goal_gets_the_view_that_turns_its_axis_nearest(device, scene):
     count, joints = len(scene["reset"]), scene["q"].shape[1] - 7
-    view = wp.full(count, SENTINEL, dtype=wp.int32, device=device)
+    frame = wp.full(count, SENTINEL, dtype=wp.int32, device=device)
     launch(
-        choose_view_kernel,
+        choose_frame_kernel,
         count,
-        [scene["sector"], joints, scene["reset"], scene["new_goal"], scene["q"], scene["goal"], view],
+        [scene["sector"], joints, scene["reset"], scene["new_goal"], scene["q"], scene["goal"], frame],
         device,
     )
     turn = Rotation.from_quat(scene["goal"]) * Rotation.from_quat(scene["q"][:, -4:]).inv()
     half = np.sin(turn.magnitude() / 2.0)[:, None]
     axis = turn.as_rotvec() / np.maximum(turn.magnitude(), 1e-12)[:, None] * half
     score = axis @ scene["sector"].astype(float).T
-    for world, chosen in enumerate(view.numpy()):
+    for world, chosen in enumerate(frame.numpy()):
         if not scene["reset"][world] and not scene["new_goal"][world]:
-            assert chosen == SENTINEL, "a view lasts as long as its goal"
+            assert chosen == SENTINEL, "a frame lasts as long as its goal"
         elif abs(turn.magnitude()[world] - np.pi) > 1e-3:  # at pi both axes are right
             assert score[world, chosen] > score[world].max() - 1e-5
 
@@ -48,20 +48,20 @@ def test_a_new_goal_gets_the_view_that_turns_its_axis_nearest(device, scene):
 @EXAMPLES
 @given(data=st.data())
 def test_views_take_observations_apart_and_put_actions_together(device, data):
-    count, views = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 3))
+    count, frames = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 3))
     width, terms = data.draw(st.integers(1, 6)), data.draw(st.integers(1, 3))
-    source = data.draw(st.lists(st.integers(0, width - 1), min_size=views * width * terms,
-                                max_size=views * width * terms))  # fmt: skip
-    source = np.array(source).reshape(views, width, terms)
-    factor = data.draw(floats((views, width, terms)))
-    offset = data.draw(floats((views, width)))
-    sign = np.sign(data.draw(floats((views, width))) + 0.5)
-    view = np.array(data.draw(st.lists(st.integers(0, views - 1), min_size=count, max_size=count)))
+    source = data.draw(st.lists(st.integers(0, width - 1), min_size=frames * width * terms,
+                                max_size=frames * width * terms))  # fmt: skip
+    source = np.array(source).reshape(frames, width, terms)
+    factor = data.draw(floats((frames, width, terms)))
+    offset = data.draw(floats((frames, width)))
+    sign = np.sign(data.draw(floats((frames, width))) + 0.5)
+    frame = np.array(data.draw(st.lists(st.integers(0, frames - 1), min_size=count, max_size=count)))
     values = data.draw(floats((count, width)))
     seen, done = (unwritten((count, width), float, device) for _ in range(2))
-    launch(view_observation_kernel, (count, width), [source, factor, offset, view, values, seen], device)
-    launch(world_action_kernel, (count, width), [source[:, :, 0], sign, view, values, done], device)
-    for world, k in enumerate(view):
+    launch(frame_observation_kernel, (count, width), [source, factor, offset, frame, values, seen], device)
+    launch(world_action_kernel, (count, width), [source[:, :, 0], sign, frame, values, done], device)
+    for world, k in enumerate(frame):
         expected = (factor[k].astype(float) * values[world][source[k]]).sum(axis=1) + offset[k]
         np.testing.assert_allclose(seen.numpy()[world], expected, atol=1e-5)
         wanted = sign[k] * values[world][source[k, :, 0]]

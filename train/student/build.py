@@ -43,7 +43,7 @@ def student_task(policy: "TrainedPolicy", cfg: StudentTrainCfg) -> ReorientCfg:
         observation_noise_std=0.0,
         observation_offset_std=0.0,
     )
-    # In the world frame, where the student sees; the teacher's views are chosen from what is observed there.
+    # In the world frame, where the student sees; the teacher's frames are chosen from what is observed there.
     return replace(task, randomisation=exact, observation=replace(task.observation, view="world"))
 
 
@@ -189,9 +189,9 @@ def _dagger(
     from vd.envs.reorient import ReorientEnv
     from vd.evaluate.agents import trained_task
     from vd.evaluate.student import StudentView
+    from vd.frame_maps import FrameMaps
     from vd.train.student.dagger import Dagger, WorldTeacher
     from vd.train.vec_env import ReorientVecEnv
-    from vd.views import ViewMaps
 
     simulation = ReorientEnv(task, kept["device"])
     if simulation.num_observations != teacher.num_observations:
@@ -212,6 +212,6 @@ def _dagger(
     )
     seen, maps = trained_task(teacher).observation, None
     if seen.view != "world":
-        maps = ViewMaps(simulation.hand, seen, kept["device"])
+        maps = FrameMaps(simulation.hand, seen, kept["device"])
     labels = WorldTeacher(teacher, maps)
     return Dagger(ReorientVecEnv(simulation), view, student, labels, cfg.dagger, cfg.run, **kept)

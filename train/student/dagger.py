@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import nn
 
+from vd.frame_maps import FrameMaps
 from vd.policy import Policy
 from vd.train.config import RunCfg
 from vd.train.ending import TrainingDivergedError, check_update
@@ -21,7 +22,6 @@ from vd.train.student.losses import POSE_VALUES, imitation_figures, imitation_lo
 from vd.train.student.rollout import UNCLIPPED, Rollout, taken
 from vd.train.student.runner import StudentRunner, scheduled
 from vd.train.vec_env import OBSERVATION_GROUP, ReorientVecEnv
-from vd.views import ViewMaps
 from vd.vision.network import Student
 
 CHECKPOINT_ROLLOUT_BYTES = 2**28
@@ -32,14 +32,14 @@ LOWER_RATES = "lower --dagger.learning-rate or --dagger.grad-norm, or take --dag
 
 
 class WorldTeacher:
-    """A teacher of views on observations in the world frame: it acts in the view that each state calls for.
+    """A teacher of symmetry frames on observations in the world frame: each state says in which it acts.
 
     Args:
         policy: The teacher.
-        maps: Its views; ``None`` if it has none.
+        maps: Its frames; ``None`` if it has none.
     """
 
-    def __init__(self, policy: Policy, maps: ViewMaps | None) -> None:
+    def __init__(self, policy: Policy, maps: FrameMaps | None) -> None:
         self.num_actions = policy.num_actions
         self._policy, self._maps = policy, maps
 
@@ -47,8 +47,8 @@ class WorldTeacher:
         """Mean actions [N, D], in the world's order, for observations [N, O]."""
         if self._maps is None:
             return self._policy.act(observation)
-        view = self._maps.choose(observation)
-        return self._maps.world_action(self._policy.act(self._maps.take(observation, view)), view)
+        frame = self._maps.choose(observation)
+        return self._maps.world_action(self._policy.act(self._maps.take(observation, frame)), frame)
 
 
 class Dagger(StudentRunner):
@@ -130,7 +130,7 @@ class Dagger(StudentRunner):
             self.env.env.reset()
             self._hidden = self.student.initial_hidden(envs)
         first = self._hidden
-        # Whole rollouts of a world: mixed from step to step it would be what neither of the two does.
+        # Whole rollouts of an environment: mixed from step to step it would be what neither of the two does.
         taught = torch.rand((envs, 1), device=self.device) < self.teacher_share()
         frames: dict[str, torch.Tensor] = {}
         labels: list[torch.Tensor] = []
@@ -182,8 +182,8 @@ class Dagger(StudentRunner):
     def minibatches(self, rollouts: int) -> Iterator[torch.Tensor]:
         """Sequences of each optimiser step: as many a pass as environments, none twice, in a new order.
 
-        Sequence n of rollout k is number k N + n. Of the latest rollout alone that is every world once. The
-        last minibatch of a pass may be smaller.
+        Sequence n of rollout k is number k N + n. Of the latest rollout alone that is every environment once.
+        The last minibatch of a pass may be smaller.
         """
         envs = self.env.num_envs
         for _ in range(self.cfg.epochs):
@@ -249,7 +249,7 @@ class Dagger(StudentRunner):
         """Write the frame of a step [N, ...] into those of the rollout [T, N, ...]."""
         for name, value in frame.items():
             if step == 0:
-                # A tenth of a millimetre is lost of camera points, and half of the memory won.
+                # A tenth of a millimetre is lost of camera points, and half of the memory gained.
                 dtype = torch.half if name in UNCLIPPED else value.dtype
                 frames[name] = value.new_empty((self.cfg.rollout_steps, *value.shape), dtype=dtype)
             frames[name][step] = value

@@ -26,7 +26,7 @@ class Rollout:
     hidden: torch.Tensor
     """The student's memory before the first step [N, G]."""
     envs: torch.Tensor
-    """World of each sequence [N]."""
+    """Environment of each sequence [N]."""
 
     def state_dict(self) -> dict[str, Any]:
         """Its tensors, on the CPU."""

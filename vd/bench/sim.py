@@ -47,9 +47,9 @@ class SimRow:
     start_s: float
     """From an empty process state to the first finished step, kernels included [s]."""
     contacts_mean: float
-    """Contacts per world, mean over environments at the end."""
+    """Contacts per environment, mean over environments at the end."""
     rows_max: int
-    """Most constraint rows in any world at the end."""
+    """Most constraint rows in any environment at the end."""
 
 
 def seconds_per_call(

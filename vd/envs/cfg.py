@@ -9,7 +9,7 @@ from vd.paper import PAPER
 from vd.sim.cfg import SimCfg
 
 MAX_LATENCY_S = 0.5
-"""Largest latency of observations that can be drawn [s] (ours): every world keeps all of it in memory."""
+"""Largest latency of observations that can be drawn [s] (ours): environments keep all of it in memory."""
 View = Literal["world", "goal", "mirrored"]
 """What a policy sees its goals in, see :attr:`ObservationCfg.view`."""
 
@@ -109,8 +109,8 @@ class ObservationCfg:
         if self.history < 0:
             raise ValueError(f"observation.history is {self.history}; it is a number of steps, 0 for none")
 
-    def views(self, fingers: int) -> int:
-        """Views in which a hand of so many fingers sees its goals; 0: it sees the world as it is."""
+    def num_frames(self, fingers: int) -> int:
+        """Symmetry frames of a hand of so many fingers; 0: it sees the world as it is."""
         return {"world": 0, "goal": fingers, "mirrored": 2 * fingers}[self.view]
 
 
@@ -133,7 +133,7 @@ class StartCfg:
     """Start at rest on the table, turned about the vertical at random, rather than falling (paper). Goals
     near the start are then near a pose that lasts."""
     poses: int = 4
-    """Poses at rest that each environment chooses from, found by dropping the object at the beginning."""
+    """Poses at rest of each environment, to choose from; found by dropping the object at the beginning."""
 
 
 @dataclass(frozen=True)
@@ -366,8 +366,8 @@ class ReorientCfg:
     table_friction: float = PAPER.materials.table_friction
     """Friction coefficient of the table where nothing is randomised; its contacts get the mean of the two."""
     failures_per_million: float = 0.0
-    """Steps of environments in a million that may leave the finite numbers or fly off: their episode ends
-    like one that times out. Ten more (few steps say little) stop the run, at 0 the first one does."""
+    """Steps of environments in a million that may leave the finite numbers or become too fast: their episode
+    ends like one that times out. Ten more (few steps say little) stop the run, at 0 the first one does."""
     sim: SimCfg = field(default_factory=SimCfg)
     action: ActionCfg = field(default_factory=ActionCfg)
     observation: ObservationCfg = field(default_factory=ObservationCfg)
@@ -396,7 +396,7 @@ class ReorientCfg:
         if self.failures_per_million < 0.0:
             raise ValueError(f"failures_per_million = {self.failures_per_million}; it is 0 or positive")
         if self.num_envs < 1:
-            raise ValueError(f"num_envs = {self.num_envs}; at least 1 is needed")
+            raise ValueError(f"num_envs = {self.num_envs}; at least 1 environment is needed")
         if self.max_episode_steps < 1:
             raise ValueError(f"episode_s = {self.episode_s} is shorter than one control step")
         if self.fingertip not in ("rigid", "soft"):

@@ -1,4 +1,4 @@
-"""How hard the task is while a policy learns it: nearer goals first, then stillness that tightens."""
+"""How hard the task is while a policy learns it: nearer goals first, then success thresholds that tighten."""
 
 from dataclasses import dataclass
 

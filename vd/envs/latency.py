@@ -21,7 +21,7 @@ class SeenState:
         state: The task.
 
     Attributes:
-        latency: How late each world is seen in its episode [s], shape [N].
+        latency: How late each environment is seen in its episode [s], shape [N].
         arrays: Joint positions and velocities as the encoders report them, positions and velocities of hand
             and object, poses and velocities of the links (of fingertips alone where they are late).
     """

@@ -9,7 +9,7 @@ from vd.envs.latency import SeenState
 from vd.envs.parts import actor_size, observation_parts
 from vd.envs.randomise import Randomiser
 from vd.envs.shapes import ShapeObserver
-from vd.envs.symmetry import Views
+from vd.envs.symmetry import ChosenFrames
 from vd.envs.task_state import TaskState
 from vd.kernels.task.dynamics import dynamics_kernel
 from vd.kernels.task.history import forget_kernel, history_kernel, remember_kernel
@@ -24,9 +24,9 @@ class Observer:
         parts: Columns of what is observed.
         num_observations: Values that the actor reads, O.
         seen: The state that observations are made of.
-        all_values: Everything, in the views if there are any, shape [N, A].
+        all_values: Everything, in the symmetry frames if there are any, shape [N, A].
         world_values: Everything in the world frame, shape [N, A].
-        views: The views in which the policy observes and acts; None where that is the world frame.
+        symmetry_frames: The frames in which the policy observes and acts; None where that is the world frame.
         shapes: Observes and measures shapes, or None.
     """
 
@@ -42,9 +42,9 @@ class Observer:
         zeros = state.zeros
 
         self.all_values = self.world_values = zeros(n, width)
-        self.views = Views(state, self.all_values) if cfg.view != "world" else None
-        if self.views is not None:
-            self.world_values = self.views.observation
+        self.symmetry_frames = ChosenFrames(state, self.all_values) if cfg.view != "world" else None
+        if self.symmetry_frames is not None:
+            self.world_values = self.symmetry_frames.observation
         self.shapes = ShapeObserver(state) if shapes else None
         slices = teacher_observation_slices(state.num_fingers)
         self._pose_columns = [slices["object_position"].start, slices["relative_orientation"].start]
@@ -98,8 +98,8 @@ class Observer:
             self._observe_state(true, self._exact, self.world_values[:, self.parts["present"].start :])
         self._observe_history()
         self._tell()
-        if self.views is not None:
-            self.views.observe()
+        if self.symmetry_frames is not None:
+            self.symmetry_frames.observe()
 
     def _observe_state(self, seen: Sequence[Any], noise: Sequence[Any], out: wp.array) -> None:
         """Write state and shape to the first columns of ``out``.
@@ -180,5 +180,5 @@ class Observer:
         """Arrays to save with a checkpoint, by name."""
         past = {"history": self._past, "history_head": self._head, "history_count": self._count}
         past |= {"history_next": self.world_values}  # remembered when the next step begins
-        view = {} if self.views is None else {"view": self.views.view}
-        return view | self.seen.stateful() | (past if self._frames else {})
+        chosen = {} if self.symmetry_frames is None else {"view": self.symmetry_frames.chosen}
+        return chosen | self.seen.stateful() | (past if self._frames else {})

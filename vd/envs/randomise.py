@@ -26,7 +26,7 @@ from vd.kernels.task.randomisation import (
 from vd.paper import PAPER
 from vd.sim.scene import SHAPE_HAND, SHAPE_OBJECT, SHAPE_TABLE
 
-# Drawn gains and frictions reach the solver once a second: a world in this many has new ones then.
+# Drawn gains and frictions reach the solver once a second: an environment in this many has new ones then.
 PUSH_INTERVAL_S = 1.0
 
 

@@ -83,10 +83,10 @@ class ReorientEnv:
         """Values of the present state and shape, the last of ``privileged``; 0 where none are told."""
         self.world_observation, _ = self.observer.split(self.observer.world_values)
         """Observation in the world frame, shape [N, O]."""
-        self.views = self.observer.views
-        """The views in which the policy observes and acts; None where that is the world frame."""
-        self.acts_in_view = True
-        """Whether :meth:`step` takes actions in the views, if there are any, or in the world's order."""
+        self.symmetry_frames = self.observer.symmetry_frames
+        """The symmetry frames in which the policy observes and acts; None where that is the world frame."""
+        self.acts_in_frame = True
+        """Whether :meth:`step` takes actions in the symmetry frames, if any, or in the world's order."""
         self._table_steps: wp.array | None = None
         if cfg.table.away_share > 0.0:
             self._table_steps = wp.array(table_steps(cfg), dtype=wp.int32, device=self.device)
@@ -131,9 +131,9 @@ class ReorientEnv:
         self.done = zeros(n, dtype=wp.int32)
         """1 where the return ends: success, fall or time-out, shape [N]."""
         self.step_count = zeros(n, dtype=wp.int32)
-        """Control steps since the world's reset, shape [N]."""
+        """Control steps since the environment's reset, shape [N]."""
         self.goal_steps = zeros(n, dtype=wp.int32)
-        """Control steps since the world's goal was given, shape [N]."""
+        """Control steps since the environment's goal was given, shape [N]."""
         self.object_pose_end = zeros(n, dtype=wp.transform)
         """Object pose at the end of the step, before resets, shape [N]."""
         self.goal_counts = zeros(3)
@@ -186,7 +186,7 @@ class ReorientEnv:
         self.observe()
 
     def give_goals(self, goal_quat: np.ndarray) -> None:
-        """Give every world a new goal where it is; what is observed is to be refreshed (:meth:`observe`).
+        """Give every environment a new goal; what is observed is to be refreshed (:meth:`observe`).
 
         Args:
             goal_quat: Goal orientations, xyzw, either sign, shape [N, 4].
@@ -197,9 +197,9 @@ class ReorientEnv:
             [self._given_goal, self.sim.joint_q, self.num_actions + 3],
             [self.goal_quat, self.goal_steps],
         )
-        if self.views is not None:
+        if self.symmetry_frames is not None:
             self._new_goal.fill_(1)
-            self.views.choose(self._new_goal, self._new_goal)
+            self.symmetry_frames.choose(self._new_goal, self._new_goal)
 
     def step(self, action: Any) -> None:
         """Simulate one control step; environments that end are reset, and the observation is fresh.
@@ -249,8 +249,8 @@ class ReorientEnv:
     def _apply_action(self) -> None:
         p, sim = self.parameters, self.sim
         action = self.action
-        if self.views is not None and self.acts_in_view:
-            action = self.views.world_action(action)
+        if self.symmetry_frames is not None and self.acts_in_frame:
+            action = self.symmetry_frames.world_action(action)
         self._launch(
             apply_action_kernel,
             [
@@ -372,8 +372,8 @@ class ReorientEnv:
                 self._env_mask,
             ],
         )
-        if self.views is not None:
-            self.views.choose(self._reset, self._new_goal)
+        if self.symmetry_frames is not None:
+            self.symmetry_frames.choose(self._reset, self._new_goal)
         # The solver warm-starts from the last accelerations, which mean nothing after a reset.
         sim.solver.reset(sim.state, world_mask=self._env_mask, flags=newton.StateFlags(0))
         sim.forward_kinematics()
@@ -388,7 +388,7 @@ class ReorientEnv:
     # Reading
 
     def has_table(self) -> np.ndarray:
-        """Whether each world's table was there in its last step, by the task, bool, shape [N] (host copy)."""
+        """Whether each table was there in the last step, by the task, bool, shape [N] (host copy)."""
         last = self._table_steps
         return np.ones(self.num_envs, bool) if last is None else self.step_count.numpy() <= last.numpy()
 

@@ -41,7 +41,7 @@ def servo_ranges(hand: HandModel, cfg: RandomisationCfg) -> np.ndarray:
 
 
 def needs_servo(ranges: np.ndarray) -> bool:
-    """Whether any joint in any world has more than a plain drive.
+    """Whether any joint in any environment has more than a plain drive.
 
     Stiffness and damping are randomised in the plain model too; a speed limit or an armature that differs
     between environments takes the servo.

@@ -19,7 +19,7 @@ def object_scales(random: RandomisationCfg) -> list[float]:
 
 
 def table_steps(cfg: ReorientCfg) -> np.ndarray:
-    """Control steps for which each world's table stays, int32, shape [N].
+    """Control steps for which each environment's table stays, int32, shape [N].
 
     Which environments lose it, and when, is drawn once from the seed: an episode says nothing of it to the
     policy.
@@ -44,7 +44,7 @@ def must_lift(cfg: ReorientCfg) -> np.ndarray:
 def rest_poses(dropped: np.ndarray, fall_m: float) -> np.ndarray:
     """Where the objects came to lie, of those drops that stayed in the claw, float, shape [N, K, 7].
 
-    A drop that left it is replaced by one of the same world that did not, or, if all did, by the start.
+    A drop that left it is replaced by one of the same environment that did not, or, if all did, by the start.
 
     Args:
         dropped: Poses after K drops, position [m] and quaternion xyzw, shape [N, K, 7].

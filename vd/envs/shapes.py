@@ -1,4 +1,4 @@
-"""The shape of each world's object: its points on the device, what a teacher sees of it, how high it is."""
+"""The shapes of the objects: their points on the device, what a teacher sees of them, how high they are."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -58,7 +58,7 @@ def load_arrays(task: TaskState, here: Mapping[str, wp.array], state: dict[str, 
     arrays.pop("goals_reached", None)
     if arrays.keys() != here.keys():
         raise ValueError(
-            "the saved environment has other servos, views, memory, latency or contacts; resume with "
+            "the saved environment has other servos, frames, memory, latency or contacts; resume with "
             "hand_layer, observation, randomisation.effects, randomisation.restitution and "
             "randomisation.observation_latency_s of the checkpoint, or from one without environments "
             "(vd-train export --resumable)"

@@ -1,19 +1,19 @@
-"""The views of :mod:`vd.kernels.task.symmetry` in the environments of a task: their launches."""
+"""The symmetry frames of :mod:`vd.kernels.task.symmetry` in the environments of a task: their launches."""
 
 import warp as wp
 
+from vd.envs.symmetry_frames import symmetry_frames
 from vd.envs.task_state import TaskState
-from vd.envs.view_tables import view_tables
-from vd.kernels.task.symmetry import choose_view_kernel, view_observation_kernel, world_action_kernel
+from vd.kernels.task.symmetry import choose_frame_kernel, frame_observation_kernel, world_action_kernel
 
 
-class Views:
-    """The view of each world, and what the policy sees and does in it.
+class ChosenFrames:
+    """The symmetry frame of each environment, and what the policy sees and does in it.
 
     Attributes:
         tables: What they are made of.
-        view: View of each world, from 0, shape [N].
-        observation: Observation in the world frame, shape [N, A]; views of it go to ``out``.
+        chosen: Symmetry frame of each environment, from 0, shape [N].
+        observation: Observation in the world frame, shape [N, A]; what its frames show goes to ``out``.
     """
 
     def __init__(self, state: TaskState, out: wp.array):
@@ -21,16 +21,16 @@ class Views:
 
         Args:
             state: The task.
-            out: Where views of the observation are written, shape [N, A].
+            out: Where the observation is written as its frames show it, shape [N, A].
 
         Raises:
-            ValueError: The hand has no such views, see :func:`vd.envs.view_tables.view_tables`.
+            ValueError: The hand has no such frames, see :func:`vd.envs.symmetry_frames.symmetry_frames`.
         """
         self._state, self._out = state, out
         device, envs = state.device, state.num_envs
         seen = state.cfg.observation
-        tables = self.tables = view_tables(state.hand, seen, seen.view)
-        chosen_from = seen.views(state.num_fingers)
+        tables = self.tables = symmetry_frames(state.hand, seen, seen.view)
+        chosen_from = seen.num_frames(state.num_fingers)
         self._source = wp.array(tables.source, dtype=wp.int32, device=device)
         self._factor = wp.array(tables.factor, dtype=float, device=device)
         self._joints = wp.array(tables.joints, dtype=wp.int32, device=device)
@@ -38,31 +38,31 @@ class Views:
         self._sign = wp.array(tables.sign, dtype=float, device=device)
         self._sector = wp.array(tables.sector[:chosen_from], dtype=wp.vec3, device=device)
         self._action = wp.zeros((envs, state.num_actions), dtype=float, device=device)
-        self.view = wp.zeros(envs, dtype=wp.int32, device=device)
+        self.chosen = wp.zeros(envs, dtype=wp.int32, device=device)
         self.observation = wp.zeros_like(out)
 
     def choose(self, reset: wp.array, new_goal: wp.array) -> None:
         """Choose anew for environments in which either mask, shape [N], is set."""
         state = self._state
         state.launch(
-            choose_view_kernel,
+            choose_frame_kernel,
             [self._sector, state.num_actions, reset, new_goal, state.sim.joint_q, state.goal_quat],
-            [self.view],
+            [self.chosen],
         )
 
     def observe(self) -> None:
-        """Write the observation in the present views."""
+        """Write the observation in the present frames."""
         self._state.launch(
-            view_observation_kernel,
-            [self._source, self._factor, self._offset, self.view, self.observation],
+            frame_observation_kernel,
+            [self._source, self._factor, self._offset, self.chosen, self.observation],
             [self._out],
             dim=self._out.shape,
         )
 
     def world_action(self, action: wp.array, out: wp.array | None = None) -> wp.array:
-        """Action of the views, shape [N, D], with the joints in the world's order; in ``out`` if given."""
+        """Action of the frames, shape [N, D], with the joints in the world's order; in ``out`` if given."""
         out = self._action if out is None else out
         self._state.launch(
-            world_action_kernel, [self._joints, self._sign, self.view, action], [out], dim=action.shape
+            world_action_kernel, [self._joints, self._sign, self.chosen, action], [out], dim=action.shape
         )
         return out

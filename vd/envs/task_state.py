@@ -1,4 +1,4 @@
-"""What the parts of the environment share: the task, its simulation, and arrays with a row for each world."""
+"""What the parts of the environment share: the task, its simulation, and arrays of a row an environment."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -48,7 +48,7 @@ class TaskState:
     must_lift: wp.array
     """1 where success asks that the object does not touch the table, shape [N]."""
     rng: wp.array
-    """Random stream of each world, shape [N]."""
+    """Random stream of each environment, shape [N]."""
 
     def zeros(self, *shape: int, dtype: Any = float) -> wp.array:
         """An array of zeros on the task's device."""

@@ -166,7 +166,9 @@ class EvalCfg:
         self._validate_suite()
         start_at_rest(self.at_rest, self.no_at_rest)
         if self.num_envs is not None and self.num_envs < 1:
-            raise ValueError(f"--num-envs is {self.num_envs}; at least one for each object is needed")
+            raise ValueError(
+                f"--num-envs is {self.num_envs}; at least one environment for each object is needed"
+            )
 
     def _validate_suite(self) -> None:
         if self.jobs < 1:

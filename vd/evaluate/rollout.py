@@ -53,13 +53,13 @@ def draw_goals(start: np.ndarray, rng: np.random.Generator, max_goal_angle: floa
 
 
 def episode_rounds(world_object: np.ndarray, objects: int, episodes: int) -> list[np.ndarray]:
-    """For every round the episode number of each world, -1 for none: a list of [N] arrays."""
+    """For every round the episode number of each environment, -1 for none: a list of [N] arrays."""
     missing = sorted(set(range(objects)) - set(world_object.tolist()))
     if missing:
         raise ValueError(
-            f"no world simulates object {missing[0]}; raise the number of environments to {objects}"
+            f"no environment simulates object {missing[0]}; raise the number of environments to {objects}"
         )
-    # The position of each world among those of its object.
+    # The position of each environment among those of its object.
     order = np.array([np.count_nonzero(world_object[:w] == k) for w, k in enumerate(world_object)])
     share = np.bincount(world_object, minlength=objects)
     count = int(np.ceil(episodes / share.min()))

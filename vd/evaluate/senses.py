@@ -1,4 +1,4 @@
-"""What the hands of an environment sense: their encoders, and a depth camera in every world."""
+"""What the hands of an environment sense: their encoders, and a depth camera in every environment."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from vd.sensors.surfaces import scene_surfaces
 
 
 class EnvironmentSenses:
-    """What the hands of an environment sense: their encoders, and a depth camera in every world.
+    """What the hands of an environment sense: their encoders, and a depth camera in every environment.
 
     Args:
         env: The environment; from now on it takes actions in the world's order.
@@ -24,7 +24,7 @@ class EnvironmentSenses:
 
     def __init__(self, env: Any, model: CameraModel | None, depth: DepthCameraCfg | None, *, seed: int = 0):
         self._env, scene = env, env.scene
-        env.acts_in_view = False  # who sees by a camera acts in the world, whatever its teacher does
+        env.acts_in_frame = False  # who sees by a camera acts in the world, whatever its teacher does
         self.camera: DepthCamera | None = None
         if model is not None:
             self.camera = DepthCamera(

@@ -27,7 +27,7 @@ CLOUDS = 256
 
 
 class StudentView:
-    """What students see in every world of an environment, and what only their training knows.
+    """What students see in every environment of an environment, and what only their training knows.
 
     Args:
         env: The environment.
@@ -115,7 +115,7 @@ class StudentView:
             array.assign(state[name])
 
     def _towards(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """True orientation of each world's object, and the nearest that looks like its goal [N, 4]."""
+        """True orientation of each environment's object, and the nearest that looks like its goal [N, 4]."""
         orientation = self._object_pose[:, 3:]
         return orientation, nearest_goal(orientation, self._goal, self._symmetry)
 
@@ -143,7 +143,7 @@ class StudentActor:
         sensor_errors: bool = False,
         seed: int = 0,
     ):
-        """Open its eyes in every world.
+        """Open its eyes in every environment.
 
         Args:
             env: The environment.

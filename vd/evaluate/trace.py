@@ -291,7 +291,7 @@ def _rows(array: wp.array, envs: int) -> torch.Tensor:
 
 
 def _int_arrays(env: Any, *values: Any) -> list[wp.array]:
-    """One number, or one of each world, as device arrays [N]."""
+    """One number, or one of each environment, as device arrays [N]."""
     rows = (np.broadcast_to(np.asarray(value, dtype=np.int32), env.num_envs) for value in values)
     return [wp.array(row, dtype=wp.int32, device=env.device) for row in rows]
 
@@ -306,7 +306,7 @@ def _record_round(
     on_step: Callable[[], object],
     stops: Sequence[_Stops],
 ) -> None:
-    """One episode in every world that has one; ``numbers`` [N]: its place among its object's, -1 for none."""
+    """One episode in environments that have one; ``numbers`` [N]: place among its object's, -1 for none."""
     envs = np.flatnonzero(numbers >= 0)
     place = np.asarray(env.world_object)[envs], numbers[envs]
     goal = unit_quats(env.goal_quat.numpy())[envs]

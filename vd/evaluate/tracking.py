@@ -13,7 +13,7 @@ from vd.tracking.tracker import Tracker
 
 
 class TrackingActor:
-    """A tracking policy in every world of an environment.
+    """A tracking policy in every environment of an environment.
 
     Attributes:
         num_actions: D.
@@ -30,7 +30,7 @@ class TrackingActor:
         sensor_errors: bool = False,
         seed: int = 0,
     ):
-        """Open its eyes in every world.
+        """Open its eyes in every environment.
 
         Args:
             env: The environment.

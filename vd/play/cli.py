@@ -79,7 +79,7 @@ class PlayCfg:
     stop_tolerance: float = PAPER.success.rotation_rad
     """Error [rad] at which a goal counts as reached, with fingers and object still."""
     episode_s: float | None = None
-    """Time after which an episode ends and another starts [s]; 10 by default, 15 with --in-air."""
+    """Time after which an environment starts anew [s]; 10 by default, 15 with --in-air."""
     in_air: tyro.conf.FlagCreatePairsOff[bool] = False
     """Take the table away after 2 s, as in the paper's test of reorientation in the air."""
     randomise: bool = False
@@ -253,7 +253,7 @@ def _policy(cfg: PlayCfg) -> Any:
 
 
 def _open(cfg: PlayCfg, trained: Any, *, num_envs: int) -> tuple[Any, Any]:
-    """Environment with at least one world for each object, and what acts in it."""
+    """Environment with at least one environment for each object, and what acts in it."""
     from vd.evaluate.agents import check_bundle, task_for
 
     device = resolve_device(cfg.device)

@@ -12,7 +12,7 @@ class Session:
     """One environment is watched at a time; all of them run.
 
     Args:
-        env: An environment with at least one world for each object.
+        env: An environment with at least one environment for each object.
         policy: What acts.
         seed: Of the goals drawn on demand.
     """
@@ -30,7 +30,7 @@ class Session:
         return self.env.objects[self.env.world_object[self.world]].name
 
     def choose_object(self, name: str) -> None:
-        """Watch the first world with this object; counts start anew."""
+        """Watch the first environment with this object; counts start anew."""
         index = self.object_names.index(name)
         self.world = next(w for w, k in enumerate(self.env.world_object) if k == index)
         self._watcher = Watcher(self.env, [self.world])

@@ -36,7 +36,7 @@ VIDEO_CRF, VIDEO_SUFFIX = 22, ".mp4"
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What is shown of one world after one control step."""
+    """What is shown of one environment after one control step."""
 
     name: str
     """Object name."""

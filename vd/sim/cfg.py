@@ -55,20 +55,20 @@ class SimCfg:
     """Policy rate [Hz]."""
     iterations: int = 10
     """Newton solver iterations at most; it stops earlier by ``tolerance``. Contact quality is that of
-    100 iterations (rest, creep, penetration); 20 cost a fifth of the speed: all worlds wait for the last."""
+    100 iterations (rest, creep, penetration); 20 cost a fifth of the speed: all wait for the slowest."""
     ls_iterations: int = 10
     """Line-search iterations at most."""
     contact_time_constant_s: float = 2.0 / 120.0
     """Contact ``solref`` time constant [s]: two physics steps, the stiffest that is stable."""
     njmax: int = 160
-    """Constraint rows a world may use; an overflow stops the run and names this setting."""
+    """Constraint rows an environment may use; an overflow stops the run and names this setting."""
     nconmax: int = 32
-    """Contacts a world may use on average over all worlds (about 10 are used, 20 in a handful); likewise.
+    """Contacts an environment may use, averaged over all (about 10 are used, 20 in a handful); likewise.
     Of objects of more than 8 convex parts in proportion more."""
     nccdmax: int = 3
-    """Pairs of convex shapes, of any one combination of kinds, that may overlap in a world on average over
-    all worlds (0.1 to 0.25 do while fingers push); likewise. Each takes 5 kB of work space: with one for each
-    contact, the solver's choice, they were most of the memory."""
+    """Pairs of convex shapes, of any one combination of kinds, that may overlap in an environment, averaged
+    over all (0.1 to 0.25 do while fingers push); likewise. Each takes 5 kB of work space: with one for
+    each contact, the solver's choice, they were most of the memory."""
 
     @property
     def physics_dt(self) -> float:

@@ -89,12 +89,12 @@ def even_rotations(count: int) -> np.ndarray:
 
 
 class Registration:
-    """Finds and follows the object of each world.
+    """Finds and follows the object of each environment.
 
     Attributes:
         pose: Kept poses of the object in the base frame, the one that is believed first, [N, K, 7].
         misfit: Their misfits, averaged over time [m^2], [N, K].
-        looks: How often each world's object was seen since it was begun anew, [N] int32.
+        looks: How often each environment's object was seen since it was begun anew, [N] int32.
     """
 
     def __init__(
@@ -111,8 +111,8 @@ class Registration:
 
         Args:
             objects: What may be looked for.
-            world_object: Object of each world, shape [N].
-            world_scale: Size factor of each world's object, shape [N].
+            world_object: Object of each environment, shape [N].
+            world_scale: Size factor of each environment's object, shape [N].
             camera: What sees it, posed in the base frame; None where points are of all sides.
             device: Warp device.
             grid: Grid points along a side of a shape's distances.
@@ -174,7 +174,7 @@ class Registration:
         fresh: torch.Tensor,
         points: torch.Tensor | None = None,
     ) -> None:
-        """Look once in every world; where nothing is seen of the object all stays as it is.
+        """Look once in every environment; where nothing is seen of the object all stays as it is.
 
         Args:
             seen: Points seen of the object [m], [N, P, 3].
@@ -237,7 +237,7 @@ class Registration:
         self._keep(0, envs, chosen, cost)
 
     def _follow(self, envs: wp.array, inputs: list[wp.array]) -> None:
-        """Go on from the kept poses, and try a few others; a row for each world, -1 where it is left out."""
+        """Go on from the kept poses, and try a few others; a row an environment, -1 where it is left out."""
         known, again, others = slice(KEPT), slice(KEPT, 2 * KEPT), slice(2 * KEPT, None)
         self._cost.zero_()
         wp.copy(self._found[:, known], self._kept[0])

@@ -75,11 +75,11 @@ def with_symmetries(objects: Sequence[ObjectModel], device: str) -> list[ObjectM
 def symmetries_of_worlds(
     objects: Sequence[ObjectModel], world_object: np.ndarray, device: str
 ) -> torch.Tensor:
-    """Symmetries of the object of each world [N, S, 4], the identity where a shape has fewer than another.
+    """Symmetries of the object of each environment [N, S, 4], the identity where there are fewer.
 
     Args:
         objects: The shapes.
-        world_object: Object of each world, shape [N].
+        world_object: Object of each environment, shape [N].
         device: Warp device.
     """
     found = symmetries(objects, device)
@@ -95,7 +95,7 @@ def equivalent_goals(goal: torch.Tensor, turns: torch.Tensor) -> torch.Tensor:
 
     Args:
         goal: Wanted orientations [N, 4].
-        turns: Symmetries of each world's shape [N, S, 4].
+        turns: Symmetries of each environment's shape [N, S, 4].
 
     Returns:
         Orientations [N, S, 4], the wanted one first.

@@ -11,10 +11,10 @@ from vd.assets_usd.hand_data import CameraModel, HandModel
 from vd.assets_usd.objects.model import ObjectModel
 from vd.config import from_dict
 from vd.envs.cfg import ReorientCfg
+from vd.frame_maps import FrameMaps
 from vd.senses import Senses
 from vd.tracking.observer import Observer
 from vd.tracking.policy import TrackingPolicy
-from vd.views import ViewMaps
 
 
 @dataclass(frozen=True)
@@ -77,20 +77,20 @@ class Tracker:
         )
         place, seen = wp.device_to_torch(device), task.observation
         self._teacher = teacher.network.to(place)
-        self._maps: ViewMaps | None = None
+        self._maps: FrameMaps | None = None
         if seen.view != "world":
-            self._maps = ViewMaps(hand, seen, place)
+            self._maps = FrameMaps(hand, seen, place)
 
     def step(self, senses: Senses) -> Decision:
-        """One control step: see, find, observe, choose a view, act."""
+        """One control step: see, find, observe, choose a symmetry frame, act."""
         with torch.no_grad():
             observation, angle = self.observer(senses)
             if self._maps is None:
                 return Decision(self._teacher(self._guessed(observation)), angle)
-            view = self._maps.choose(observation)  # in whose sector the goal is believed to lie
-            action = self._teacher(self._guessed(self._maps.take(observation, view)))
-            return Decision(self._maps.world_action(action, view), angle)
+            frame = self._maps.choose(observation)  # in whose sector the goal is believed to lie
+            action = self._teacher(self._guessed(self._maps.take(observation, frame)))
+            return Decision(self._maps.world_action(action, frame), angle)
 
     def _guessed(self, seen: torch.Tensor) -> torch.Tensor:
-        """Observations as a view shows them [N, O], with the teacher's mean for what no camera shows."""
+        """Observations as a frame shows them [N, O], with the teacher's mean for what no camera shows."""
         return torch.where(self.observer.known > 0.0, seen, self._teacher.offset)

@@ -199,7 +199,7 @@ class Student(nn.Module):
             embedding: From :meth:`encode`, shape [T, N, E].
             proprioception: From :meth:`proprioception`, before each step, shape [T, N, S].
             hidden: Memory before the first step, shape [N, G].
-            done: Where a world ended with step t, so that step t + 1 starts without memory, shape [T, N].
+            done: Where an episode ended with step t, so that step t + 1 starts without memory, shape [T, N].
         """
         inputs = torch.cat([embedding, self.action_layers(proprioception)], dim=-1)
         remembered, hidden = self._remember(self.merge_action(inputs), hidden, done)
@@ -227,7 +227,7 @@ class Student(nn.Module):
         if done is None:
             outputs, state = self.memory(inputs, hidden[None])
             return outputs, state[0]
-        # A world's steps are cut into runs at its ends, and all runs go through the GRU side by side.
+        # An environment's steps are cut into runs at its ends, and all runs go through the GRU side by side.
         ended = done.bool()
         steps, envs = ended.shape
         begins = torch.cat([torch.ones_like(ended[:1]), ended[:-1]])

@@ -1,4 +1,4 @@
-"""Symmetry views without a simulator are those of the environment."""
+"""Symmetry frames without a simulator are those of the environment."""
 
 import numpy as np
 import pytest
@@ -8,15 +8,15 @@ from scipy.spatial.transform import Rotation
 
 from vd.envs.cfg import ObservationCfg, RandomisationCfg, ReorientCfg
 from vd.envs.reorient import ReorientEnv
+from vd.frame_maps import FrameMaps
 from vd.kernels.task.observations import teacher_observation_slices
-from vd.views import ViewMaps
 
 WORLDS = 48
 
 
 @pytest.fixture(scope="module", params=[("dclaw3", "goal"), ("dclaw4", "goal"), ("dclaw3", "mirrored")])
 def env(request):
-    """Worlds after some random steps, in views that were chosen for where the objects are then."""
+    """Worlds after some random steps, in frames that were chosen for where the objects are then."""
     made = ReorientEnv(
         ReorientCfg(
             hand=request.param[0],
@@ -31,23 +31,23 @@ def env(request):
     for _ in range(5):
         made.step(wp.array(random.uniform(-1, 1, (WORLDS, made.num_actions)), dtype=float, device="cpu"))
     every = wp.ones(WORLDS, dtype=wp.int32, device="cpu")
-    made.views.choose(every, every)
+    made.symmetry_frames.choose(every, every)
     made.observe()
     return made
 
 
 @pytest.fixture
 def maps(env):
-    return ViewMaps(env.hand, env.cfg.observation)
+    return FrameMaps(env.hand, env.cfg.observation)
 
 
 def test_views_are_chosen_seen_and_acted_in_as_in_the_simulator(env, maps):
-    world, view = wp.to_torch(env.world_observation), wp.to_torch(env.views.view).long()
-    assert set(view.tolist()) == set(range(env.cfg.observation.views(env.num_fingers))), "all are tried"
+    world, view = wp.to_torch(env.world_observation), wp.to_torch(env.symmetry_frames.chosen).long()
+    assert set(view.tolist()) == set(range(env.cfg.observation.num_frames(env.num_fingers))), "all are tried"
     assert torch.equal(maps.choose(world), view)
     torch.testing.assert_close(maps.take(world, view), wp.to_torch(env.observation), rtol=1e-5, atol=1e-6)
     action = torch.rand(WORLDS, env.num_actions)
-    wanted = wp.to_torch(env.views.world_action(wp.from_torch(action)))
+    wanted = wp.to_torch(env.symmetry_frames.world_action(wp.from_torch(action)))
     torch.testing.assert_close(maps.world_action(action, view), wanted)
 
 

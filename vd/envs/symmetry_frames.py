@@ -1,6 +1,6 @@
-"""The symmetry frames ("views") of a hand and an observation: what they are made of, without a simulator.
+"""The symmetry frames of a hand and an observation: what they are made of, without a simulator.
 
-How they are used: :mod:`vd.envs.symmetry` and :mod:`vd.views`.
+How they are used: :mod:`vd.envs.symmetry` and :mod:`vd.frame_maps`.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ TOLERANCE_M = 1e-4
 """Farthest that a turned fingertip may be from the one whose place it takes; of a mirrored one's axes
 likewise."""
 SECTOR = np.array([1.0, 0.0, 0.0])
-"""Views turn the axis of the wanted rotation near to this direction, world frame; any would do."""
+"""Frames turn the axis of the wanted rotation near to this direction, world frame; any would do."""
 UP = np.array([0.0, 0.0, 10.0])
 """Added to it where there are mirrors, so that up counts before the sector does: seen from above, wanted
 rotations are counter-clockwise, but for axes within 2 degrees of level (ours)."""
@@ -36,30 +36,30 @@ BENT = np.array([0.3, 0.5, -0.4])
 
 
 @dataclass(frozen=True)
-class ViewTables:
-    """What the V views of a hand are made of: one for each finger, and as many in the mirror, if any."""
+class SymmetryFrames:
+    """The V symmetry frames of a hand: one for each finger, and as many in the mirror, if any."""
 
     source: np.ndarray
-    """Values of the world frame that make each value of a view, int [V, O, T]."""
+    """Values of the world frame that make each value of a frame, int [V, O, T]."""
     factor: np.ndarray
     """Their factors [V, O, T]."""
     offset: np.ndarray
     """What is added to their sum [V, O]: limits about which a joint is observed may be uneven."""
     joints: np.ndarray
-    """Joint of the view that is each joint of the world, int [V, D]."""
+    """Joint of the frame that is each joint of the world, int [V, D]."""
     sign: np.ndarray
     """-1 where that joint turns the other way, else 1 [V, D]."""
     sector: np.ndarray
-    """The direction near which a view has the axis of the wanted rotation, as it is in the world [V, 3]."""
+    """The direction near which a frame has the axis of the wanted rotation, as it is in the world [V, 3]."""
 
 
-def view_tables(hand: HandModel, observation: ObservationCfg, view: View) -> ViewTables:
-    """The views of a hand and an observation.
+def symmetry_frames(hand: HandModel, observation: ObservationCfg, view: View) -> SymmetryFrames:
+    """The symmetry frames of a hand and an observation.
 
     Args:
         hand: The hand.
         observation: What is observed.
-        view: What goals are seen in (``ObservationCfg.view``); views in the mirror come after the others.
+        view: What goals are seen in (``ObservationCfg.view``); frames in the mirror come after the others.
 
     Raises:
         ValueError: The fingers are not spaced evenly about the vertical, or the hand is not its own mirror
@@ -74,7 +74,7 @@ def view_tables(hand: HandModel, observation: ObservationCfg, view: View) -> Vie
     maps = np.stack([_observation_map(observation, tips, turn) for turn in turns])
     source = np.argsort(-np.abs(maps), axis=2, kind="stable")[:, :, :TERMS]
     order = [_joint_source(_finger_source(tips, turn.T)) for turn in turns]
-    return ViewTables(
+    return SymmetryFrames(
         source=source,
         factor=np.take_along_axis(maps, source, axis=2),
         offset=np.stack([_observation_offset(hand, observation, turn) for turn in turns]),
@@ -135,12 +135,12 @@ def _joint_source(fingers: np.ndarray) -> np.ndarray:
 
 
 def _joint_signs(turn: np.ndarray, fingers: int) -> np.ndarray:
-    """Factors on joints in a view [D]."""
+    """Factors on joints in a frame [D]."""
     return np.tile(MIRROR_SIGNS if np.linalg.det(turn) < 0.0 else np.ones(JOINTS_PER_FINGER), fingers)
 
 
 def _observation_offset(hand: HandModel, observation: ObservationCfg, turn: np.ndarray) -> np.ndarray:
-    """What is added in a view to what :func:`_observation_map` makes [A].
+    """What is added in a frame to what :func:`_observation_map` makes [A].
 
     An angle is observed as it lies between its limits, from -1 to 1; of one that is turned round these are
     the limits of the other side.
@@ -156,12 +156,12 @@ def _observation_offset(hand: HandModel, observation: ObservationCfg, turn: np.n
 
 
 def _observation_map(observation: ObservationCfg, tips: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Matrix [A, A] from an observation in the world frame to that of a view.
+    """Matrix [A, A] from an observation in the world frame to that of a frame.
 
     Args:
         observation: What is observed.
         tips: Fingertip poses with all angles zero, shape [F, 7].
-        turn: Turn or reflection [3, 3] of the world that makes the view.
+        turn: Turn or reflection [3, 3] of the world that makes the frame.
     """
     parts = observation_parts(observation, len(tips))
     count, fingers = len(tips), _finger_source(tips, turn)
