@@ -88,7 +88,7 @@ def test_a_bundle_that_does_not_fit_is_not_there(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_folders_that_cannot_be_made_are_refused_before_anything_is_written(tmp_path):
+def test_folders_that_cannot_be_made_are_refused_before_anything_is_written(tmp_path, capsys):
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=r"cannot write .*file/a/b: .*file is a file; choose another"):
         check_folder(tmp_path / "file" / "a" / "b")
@@ -109,7 +109,9 @@ def test_folders_that_cannot_be_made_are_refused_before_anything_is_written(tmp_
             write_text(folder / "a.txt", "")
     check_folder(tmp_path / "new" / "folder")
     check_file(tmp_path / "new.txt")
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+    assert [path.name for path in tmp_path.iterdir()] == ["file"] and not capsys.readouterr().err
+    check_file(tmp_path / "file")
+    assert "file is there, and will be replaced" in capsys.readouterr().err
 
 
 def commands(taken: str) -> dict[str, list[str]]:

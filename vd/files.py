@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -88,7 +89,7 @@ def check_folder(folder: Path) -> None:
 
 
 def check_file(path: Path) -> None:
-    """Refuse a file that cannot be written to, as :func:`check_folder` does.
+    """Refuse a file that cannot be written to, as :func:`check_folder` does; say if one is there already.
 
     Raises:
         OutputError: It names the file and the remedy.
@@ -99,6 +100,8 @@ def check_file(path: Path) -> None:
         check_folder(Path(path).parent)
     except OutputError as error:
         raise output_error(path, error) from error
+    if Path(path).exists():
+        print(f"{path} is there, and will be replaced", file=sys.stderr, flush=True)
 
 
 @contextmanager

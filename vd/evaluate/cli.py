@@ -10,7 +10,7 @@ import tyro
 from vd import interrupt
 from vd.evaluate.agents import check_names
 from vd.evaluate.cfg import EvalCfg, parse_groups
-from vd.files import check_folder
+from vd.files import check_file, check_folder
 
 
 @interrupt.command("vd-eval")
@@ -21,6 +21,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         cfg.validate()
         check_names(cfg.agent_names, chain(*parse_groups(cfg.object_sets).values()), cfg.hand)
         check_folder(cfg.out)
+        if cfg.suite is None:
+            check_file(cfg.out / "eval.json")
         return _evaluate(cfg) if cfg.suite is None else _run_suite(cfg)
     except (ValueError, OSError, RuntimeError) as error:
         print(f"vd-eval: {error}", file=sys.stderr)

@@ -37,8 +37,12 @@ SLOWEST_MODULES = (
     "newton._src.sensors.sensor_camera_render.camera_utils",
     "newton._src.geometry.bvh",
     "mujoco_warp._src.set_const",
+    "mujoco_warp._src.forward",
+    "mujoco_warp._src.derivative",
+    "mujoco_warp._src.passive",
+    "mujoco_warp._src.solver",
 )
-"""Kernels that take longest to compile on a CPU, a third of a first start (found by Warp's own log)."""
+"""Kernels that take longest to compile on a CPU, found by Warp's own log; they are compiled side by side."""
 # A CPU simulates this many environments about in real time.
 FAST_WORLDS_CPU = 16
 
