@@ -3,6 +3,7 @@
 import importlib
 import os
 import signal
+import subprocess
 import sys
 import tomllib
 import warnings
@@ -88,3 +89,20 @@ def test_a_warning_is_a_line_of_the_command_without_the_source(monkeypatch):
     monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
     said = interrupt.command("vd-some")(lambda: warnings.formatwarning("ignored", UserWarning, "x.py", 93))
     assert said() == "vd-some: ignored\n"
+
+
+def test_a_child_whose_library_swallows_the_first_signal_ends_with_its_parent_still():
+    """Some catch everything, the exception of a signal's handler too."""
+    script = """
+import signal, sys, time
+from vd import interrupt
+interrupt.ENDING_S = interrupt.PARENT_S = 0.1
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(3))
+interrupt.end_with_parent(-1)
+try:
+    time.sleep(60)
+except BaseException:
+    pass
+time.sleep(60)
+"""
+    assert subprocess.run([sys.executable, "-c", script], timeout=50).returncode == 3

@@ -23,6 +23,8 @@ USAGE_ERROR = 2
 
 PARENT_S = 0.5
 """Between two looks at the parent [s]."""
+ENDING_S = 5.0
+"""Time for a process to leave things in order before it is asked again, or killed [s]."""
 
 RENAMED = {
     "--output": "--out",
@@ -148,6 +150,8 @@ def end_with_parent(parent: int) -> None:
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(PARENT_S)
-        os.kill(os.getpid(), signal.SIGTERM)
+        while True:  # a library that catches everything may swallow the first
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(ENDING_S)
 
     threading.Thread(target=watch, daemon=True).start()

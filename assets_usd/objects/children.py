@@ -7,10 +7,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, Literal
 
-from vd.interrupt import end_with_parent
-
-ENDING_S = 5.0
-"""Time for a child to leave things in order before it is killed."""
+from vd.interrupt import ENDING_S, end_with_parent
 
 
 class ChildError(RuntimeError):
