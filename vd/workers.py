@@ -38,9 +38,8 @@ def run_tasks(
     *,
     jobs: int,
     limit_s: float,
-    stop_after_s: float = float("inf"),
     gpu: bool = False,
-) -> int:
+) -> None:
     """Run ``work`` on every task in fresh processes, each with one thread of linear algebra.
 
     Args:
@@ -50,19 +49,15 @@ def run_tasks(
             it took longer than ``limit_s``, or its process died.
         jobs: Processes.
         limit_s: Longest time of a task [s].
-        stop_after_s: Time [s] after which all ends; tasks that run then are as if never begun.
         gpu: Whether the workers may see a GPU; a context each would fill it.
-
-    Returns:
-        The tasks left over.
     """
-    end, waiting = time.monotonic() + stop_after_s, deque(tasks)
+    waiting = deque(tasks)
     # A pool for each process: one that dies takes its pool along.
     idle = [_worker() for _ in range(min(jobs, len(tasks)))]
     running: dict[Future[Any], tuple[Any, ProcessPoolExecutor, float]] = {}
     try:
         with _environment(gpu):
-            while (waiting or running) and time.monotonic() < end:
+            while waiting or running:
                 while idle and waiting:
                     worker, task = idle.pop(), waiting.popleft()
                     running[worker.submit(work, task)] = task, worker, time.monotonic()
@@ -71,7 +66,6 @@ def run_tasks(
                     if future.done() or time.monotonic() - begun > limit_s:
                         del running[future]
                         idle.append(_end(future, task, worker, finished, limit_s))
-        return len(waiting) + len(running)
     finally:
         for worker in (*idle, *(worker for _, worker, _ in running.values())):
             _kill(worker)
