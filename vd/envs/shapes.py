@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from vd.envs.task_state import TaskState
@@ -28,12 +27,8 @@ class ShapeObserver:
 
     def __init__(self, state: TaskState):
         self._state = state
-        device = state.device
-        points = np.stack([item.surface_points for item in state.objects])
-        self._points = wp.array(points, dtype=wp.vec3, device=device)
-        self._object = wp.array(state.scene.world_object, dtype=wp.int32, device=device)
-        self._scale = wp.array(state.scene.world_scale, dtype=float, device=device)
-        self._directions = wp.array(extent_directions(state.num_fingers), dtype=wp.vec3, device=device)
+        self._objects = [state.surface_points, state.world_object, state.world_scale]
+        self._directions = wp.array(extent_directions(state.num_fingers), dtype=wp.vec3, device=state.device)
         first = teacher_observation_size(state.num_fingers)
         slices = shape_observation_slices(state.num_fingers)
         self._surface_column = first + slices["surface"].start
@@ -45,9 +40,7 @@ class ShapeObserver:
         state.launch(
             clearance_kernel,
             [
-                self._points,
-                self._object,
-                self._scale,
+                *self._objects,
                 state.num_actions,
                 PAPER.scene.table_top_m,
                 state.sim.joint_q,
@@ -62,9 +55,7 @@ class ShapeObserver:
         state.launch(
             surface_kernel,
             [
-                self._points,
-                self._object,
-                self._scale,
+                *self._objects,
                 state.fingers.tip_body,
                 state.fingers.tip_offset,
                 state.num_actions,
@@ -78,9 +69,7 @@ class ShapeObserver:
         state.launch(
             extent_kernel,
             [
-                self._points,
-                self._object,
-                self._scale,
+                *self._objects,
                 self._directions,
                 state.num_actions,
                 self._extent_column,
