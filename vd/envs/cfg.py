@@ -297,14 +297,15 @@ class RandomisationCfg:
     force_decay: float = 0.0
     """What remains of a force in the next control step: 0 in the paper, 0.998 in the released code."""
     effects: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Effects of servos to draw for every joint, by name and parameter: command_delay.delay_s 0 0.04 draws a
-    delay of up to 40 ms. They replace what a hand layer says about the same parameter. Delays are of the bus:
-    all joints of an environment have the same share of their range."""
+    """Effects of servos to draw for every joint in each episode, by name and parameter: command_delay.delay_s
+    0 0.04 draws a delay of up to 40 ms. They replace what a hand layer says about the same parameter. Delays
+    are of the bus: all joints of an environment have the same share of their range."""
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old the state is that the policy sees [s], drawn for each episode, to the nearest physics step.
     Rewards and success are of the true state."""
     redraw_s: float = PAPER.randomisation.redraw_s
-    """Gains and frictions are drawn anew at the first reset after this time [s]."""
+    """Gains, contact frictions and constant errors are drawn anew at the first reset after this time [s]: the
+    solver takes them once a second. Servos (``effects``) and latency are drawn at every reset."""
 
     @property
     def bounces(self) -> bool:

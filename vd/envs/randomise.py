@@ -31,7 +31,7 @@ PUSH_INTERVAL_S = 1.0
 
 
 class Randomiser:
-    """Masses once at start-up; gains, servos, frictions and constant errors at resets; forces every step.
+    """Masses once at start-up; servos at resets, frictions and the like at some; forces every step.
 
     With randomisation off the same arrays hold the nominal values.
     """
@@ -110,26 +110,20 @@ class Randomiser:
         state.sim.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def redraw(self, reset: wp.array) -> None:
-        """Draw anew for the environments of ``reset`` whose dynamics are old enough."""
+        """Draw servos for the environments of ``reset``, and what the solver holds where it is old enough."""
         if not self.enabled:
             return
         self._state.launch(redraw_mask_kernel, [reset, self._interval, self._age], [self._due])
-        self.draw(self._due)
+        self._draw_dynamics(self._due)
+        self._draw_servos(reset)
 
     def draw(self, mask: wp.array) -> None:
-        """Draw gains, servos, frictions, restitution and constant errors where ``mask`` [N] is set."""
-        state = self._state
+        """Draw all but the masses where ``mask`` [N] is set."""
         self._draw_dynamics(mask)
-        if state.sim.restitution is not None:
-            drawn = state.sim.restitution
-            state.launch(
-                draw_restitution_kernel,
-                [wp.vec2(*state.cfg.randomisation.restitution), mask, state.rng],
-                [drawn.hand, drawn.object, drawn.table],
-            )
+        self._draw_servos(mask)
 
     def _draw_dynamics(self, mask: wp.array) -> None:
-        """Draw gains, frictions, constant errors and servos."""
+        """Draw gains, frictions, restitution and constant errors."""
         state = self._state
         ranges = self._kp_scale, self._kd_scale, state.parameters.randomisation
         state.launch(
@@ -145,6 +139,17 @@ class Randomiser:
                 self.observation_offset,
             ],
         )
+        if state.sim.restitution is not None:
+            drawn = state.sim.restitution
+            state.launch(
+                draw_restitution_kernel,
+                [wp.vec2(*state.cfg.randomisation.restitution), mask, state.rng],
+                [drawn.hand, drawn.object, drawn.table],
+            )
+
+    def _draw_servos(self, mask: wp.array) -> None:
+        """Draw delays, friction, backlash and the like: the servos read them in every physics step."""
+        state = self._state
         if state.sim.servo is not None:
             state.launch(
                 draw_servo_kernel,
