@@ -276,6 +276,8 @@ class RandomisationCfg:
     """Object sizes are this many even steps of ``object_scale``: every size is a set of compiled meshes."""
     object_mass_kg: tuple[float, float] = PAPER.randomisation.object_mass_kg
     """Masses of the object [kg]."""
+    object_com_m: float = 0.0
+    """Ours: how far the object's centre of mass is from where its file has it [m], to a side drawn once."""
     action_noise_std: float = PAPER.randomisation.action_noise_std
     """Standard deviation of the noise of each action, drawn anew in every control step; 1 is
     action.scale_rad_s."""
@@ -303,6 +305,8 @@ class RandomisationCfg:
     observation_latency_s: tuple[float, float] = (0.0, 0.0)
     """How old the state is that the policy sees [s], drawn for each episode, to the nearest physics step.
     Rewards and success are of the true state."""
+    object_pose_error: tuple[float, float] = (0.0, 0.0)
+    """Ours: by how much the observed pose of the object is wrong [m] [rad], alike all through an episode."""
     redraw_s: float = PAPER.randomisation.redraw_s
     """Gains, contact frictions and constant errors are drawn anew at the first reset after this time [s]: the
     solver takes them once a second. Servos (``effects``) and latency are drawn at every reset."""

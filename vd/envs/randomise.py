@@ -82,7 +82,7 @@ class Randomiser:
         self._draw_masses()
 
     def _draw_masses(self) -> None:
-        """Draw link and object masses; inertias scale with them."""
+        """Draw link and object masses, with which inertias scale, and where the objects' centres are."""
         state = self._state
         n, model = state.num_envs, state.sim.model
         link_scale = wp.ones((n, len(state.scene.link_body)), dtype=float, device=state.device)
@@ -107,6 +107,13 @@ class Randomiser:
             (model.body_inv_inertia, inverse[:, None, None]),
         ):
             array.assign((array.numpy() * scale).astype(np.float32))
+        shift = state.cfg.randomisation.object_com_m
+        if self.enabled and shift > 0.0:
+            direction = np.random.default_rng(state.cfg.seed).normal(size=(n, 3))
+            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+            centre = model.body_com.numpy().reshape(n, -1, 3)
+            centre[:, state.scene.object_body] += shift * direction
+            model.body_com.assign(centre.reshape(-1, 3))
         state.sim.solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
 
     def redraw(self, reset: wp.array) -> None:
