@@ -27,9 +27,11 @@ STEP_LATE_S = 1.0 / PAPER.scene.control_hz
 FRICTION_NM, PLAY_RAD = 0.15, 0.03
 """Largest dry friction [N m] and backlash [rad] of a joint (ours; identified servos have up to half)."""
 COMMAND_DELAY_S, OBSERVATION_LATENCY_S = 0.04, 0.12
-"""Largest delay of commands, latency of observations [s] (ours): motor bus; depth camera and its loop."""
+"""Largest delay of commands, latency of the object [s] (ours): motor bus; depth camera and its loop."""
 
-Condition = Literal["nominal", "s3", "hard", "mixed", "observation-late", "command-late"]
+_LATE = (STEP_LATE_S, STEP_LATE_S)
+
+Condition = Literal["nominal", "s3", "hard", "mixed", "observation-late", "all-late", "command-late"]
 CONDITIONS: dict[Condition, RandomisationCfg] = {
     "nominal": replace(EXACT, enabled=False),
     "s3": RandomisationCfg(),
@@ -42,8 +44,9 @@ CONDITIONS: dict[Condition, RandomisationCfg] = {
         },
         observation_latency_s=(0.0, OBSERVATION_LATENCY_S),
     ),
-    "observation-late": replace(EXACT, observation_latency_s=(STEP_LATE_S, STEP_LATE_S)),
-    "command-late": replace(EXACT, effects={"command_delay.delay_s": (STEP_LATE_S, STEP_LATE_S)}),
+    "observation-late": replace(EXACT, observation_latency_s=_LATE),
+    "all-late": replace(EXACT, observation_latency_s=_LATE, encoder_latency_s=_LATE),
+    "command-late": replace(EXACT, effects={"command_delay.delay_s": _LATE}),
 }
 """Nothing drawn; Table S3; the same with forces that last a control step; Table S3, friction, backlash, late
-commands and late observations; observations, and commands, a control step late and nothing else."""
+commands and a late object; and a control step late and nothing else: the object, object and joints, commands."""
