@@ -124,8 +124,8 @@ class TeacherPPO(PPO):
         """Run all epochs over the rollout, or those until the adaptive schedule sees the actor run away.
 
         Returns:
-            Means over the minibatches that were run: ``surrogate``, ``value``, ``entropy``, ``kl`` (old to new policy),
-            ``clip_fraction``, ``grad_norm`` (before clipping), ``beyond_bound`` (share of mean
+            Means over the minibatches that were run: ``surrogate``, ``value``, ``entropy``, ``kl`` (old to
+            new policy), ``clip_fraction``, ``grad_norm`` (before clipping), ``beyond_bound`` (share of mean
             actions), and ``explained_variance`` of the returns by the values of the rollout.
         """
         group = self.optimizer.param_groups[ACTOR_GROUP]

@@ -304,8 +304,8 @@ class RandomisationCfg:
     """How old the object's state is that the policy sees [s], drawn for each episode, to the nearest physics
     step: a camera and its loop. Rewards and success are of the true state."""
     encoder_latency_s: tuple[float, float] = (0.0, 0.0)
-    """How old joints and fingertips are that the policy sees [s]; a loop reads them when its step begins. Drawn
-    at the same share of its range as the object's."""
+    """How old joints and fingertips are that the policy sees [s]; a loop reads them when its step begins.
+    Drawn at the same share of its range as the object's."""
     redraw_s: float = PAPER.randomisation.redraw_s
     """Gains and frictions are drawn anew at the first reset after this time [s]."""
 

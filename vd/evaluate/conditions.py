@@ -49,4 +49,4 @@ CONDITIONS: dict[Condition, RandomisationCfg] = {
     "command-late": replace(EXACT, effects={"command_delay.delay_s": _LATE}),
 }
 """Nothing drawn; Table S3; the same with forces that last a control step; Table S3, friction, backlash, late
-commands and a late object; and a control step late and nothing else: the object, object and joints, commands."""
+commands and a late object; and 83 ms late and nothing else: the object, object and joints, commands."""
