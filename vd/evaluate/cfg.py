@@ -99,9 +99,9 @@ class EvalCfg:
     """Randomise dynamics and add noise and disturbances as in training."""
     condition: Condition | None = None
     """Evaluate in a named condition, whatever the training: nominal; s3, Table S3; hard, the same with forces
-    that last a control step; mixed, Table S3 with friction, backlash, late commands and observations;
-    observation-late and command-late, 83 ms and nothing else; the others change one thing, which the page of
-    --suite robust names."""
+    that last a control step; mixed, Table S3 with friction, backlash, late commands and a late object;
+    observation-late (the object), all-late (joints too) and command-late, 83 ms and nothing else; the others
+    change one thing, which the page of --suite robust names."""
     num_envs: int | None = None
     """Environments simulated at once; by default as many as episodes, up to 64 on a CPU, 8192 on a GPU (1024
     with camera policies)."""

@@ -28,7 +28,7 @@ STEP_LATE_S = 1.0 / PAPER.scene.control_hz
 FRICTION_NM, PLAY_RAD = 0.15, 0.03
 """Largest dry friction [N m] and backlash [rad] of a joint (ours; identified servos have up to half)."""
 COMMAND_DELAY_S, OBSERVATION_LATENCY_S = 0.04, 0.12
-"""Largest delay of commands, latency of observations [s] (ours): motor bus; depth camera and its loop."""
+"""Largest delay of commands, latency of the object [s] (ours): motor bus; depth camera and its loop."""
 
 MASS_KG = (0.03, 0.18)
 """The paper's base range of the object's mass [kg]."""
@@ -37,12 +37,15 @@ OFF_CENTRE_M = 0.01
 POSE_ERROR = (0.005, 0.1)
 """Errors of the object's pose [m] [rad] (ours), all through an episode: a bad registration."""
 
+_LATE = (STEP_LATE_S, STEP_LATE_S)
+
 Condition = Literal[
     "nominal",
     "s3",
     "hard",
     "mixed",
     "observation-late",
+    "all-late",
     "command-late",
     "joint-friction",
     "light",
@@ -66,8 +69,9 @@ CONDITIONS: dict[Condition, RandomisationCfg] = {
         },
         observation_latency_s=(0.0, OBSERVATION_LATENCY_S),
     ),
-    "observation-late": replace(EXACT, observation_latency_s=(STEP_LATE_S, STEP_LATE_S)),
-    "command-late": replace(EXACT, effects={"command_delay.delay_s": (STEP_LATE_S, STEP_LATE_S)}),
+    "observation-late": replace(EXACT, observation_latency_s=_LATE),
+    "all-late": replace(EXACT, observation_latency_s=_LATE, encoder_latency_s=_LATE),
+    "command-late": replace(EXACT, effects={"command_delay.delay_s": _LATE}),
     "joint-friction": replace(EXACT, effects={"coulomb_friction.tau_c_nm": (FRICTION_NM, FRICTION_NM)}),
     "light": replace(EXACT, object_mass_kg=(MASS_KG[0], MASS_KG[0])),
     "heavy": replace(EXACT, object_mass_kg=(MASS_KG[1], MASS_KG[1])),
@@ -79,8 +83,8 @@ CONDITIONS: dict[Condition, RandomisationCfg] = {
     "pose-error": replace(EXACT, object_pose_error=POSE_ERROR),
 }
 """Nothing drawn; Table S3; the same with forces that last a control step; Table S3, friction, backlash, late
-commands and late observations; observations, and commands, a control step late; then one thing each, of which
-two are no draws (:func:`in_condition`)."""
+commands and a late object; the object, object and joints, commands a control step late; then one thing each,
+of which two are no draws (:func:`in_condition`)."""
 
 
 def in_condition(task: ReorientCfg, name: Condition) -> ReorientCfg:
