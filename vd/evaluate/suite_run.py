@@ -100,9 +100,9 @@ def run_suite(cfg: EvalCfg) -> Result:
     begun = time.monotonic()
     stop_at = begun + QUICK_S if cfg.quick else math.inf
     assert cfg.suite is not None
-    listed = tuple(c for c in SUITES[cfg.suite] if c.quick or not cfg.quick)
-    groups = object_groups(cfg.objects, {c.objects for c in listed}, quick=cfg.quick)
-    conditions = tuple(c for c in listed if c.objects in groups)
+    suite = SUITES[cfg.suite]
+    groups = object_groups(cfg.objects, {c.objects for c in suite}, quick=cfg.quick)
+    conditions = tuple(c for c in suite if (c.quick or not cfg.quick) and c.objects in groups)
     tasks = make_tasks(cfg, conditions, groups)
     found = {(task.condition, task.policy): task.there() for task in tasks}
     missing = {key: NOT_RUN for key, result in found.items() if result is None}
