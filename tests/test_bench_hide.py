@@ -29,7 +29,7 @@ from vd.kernels.servo.effects import EFFECTS
 
 def test_the_recording_tells_nothing_and_the_truth_lies_beside_it(tmp_path):
     out = tmp_path / "r"
-    hidden = hide("servo", {"backlash": {"width_rad": 0.05}}, out, seed=4)
+    hidden = hide(Hiding("servo", {"backlash": {"width_rad": 0.05}}, seed=4), out)
     text = (out / "recording.json").read_text() + " ".join(p.name for p in out.iterdir())
     assert not any(name in text for name in (*EFFECTS, *OUTSIDE, "seed", "truth"))
     truth = json.loads(truth_path(out).read_text())
@@ -66,7 +66,7 @@ def test_the_duty_cycle_is_the_controllers_output():
 
 @pytest.mark.parametrize("late", ["command_delay", "read_delay"])
 def test_the_duty_cycle_tells_a_late_command_from_a_late_reading(late, tmp_path):
-    hide("servo", {late: {"delay_s": 0.03}}, tmp_path / "r", seed=6, pwm=True)
+    hide(Hiding("servo", {late: {"delay_s": 0.03}}, seed=6, pwm=True), tmp_path / "r")
     recording = read_recording(tmp_path / "r")
     (chain,) = chains(recording)
     everything = tuple(range(len(recording.trajectories)))
@@ -170,7 +170,7 @@ def test_excitations_stay_within_the_joints_and_excite_one_each():
 
 
 def test_sizes_grow_and_stay_within_the_bounds():
-    for model in ("dclaw3", "servo", "pendulum"):
+    for model in ("dclaw3", "servo"):
         for name in showing(model):
             sizes = [sized_effect(name, size, model) for size in range(4)]
             assert sizes[0] != sizes[3]

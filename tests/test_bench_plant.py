@@ -34,7 +34,7 @@ def answer(plant, command, duration=2.0, rate=500.0, dt=4e-4, **run) -> tuple[np
     time = np.arange(int(duration * rate) + 1) / rate
     values = np.stack([np.broadcast_to(command(time), time.shape)] * len(plant.joints), axis=1)
     enabled = run.pop("enabled", np.ones(values.shape, dtype=bool))
-    return time, simulate([Run(plant, time, values, enabled, **run)], dt=dt)[0]
+    return time, simulate([Run(plant, time, values, enabled, **run)], dt=dt)[0].position
 
 
 def step(time):
@@ -104,7 +104,7 @@ def test_a_motor_at_its_limit_acts_when_the_command_comes():
         time[1:] += shift * STEP_S
         command = np.where(np.arange(len(time)) < 20, 0.0, 0.8)[:, None]
         run = Run(servo(**limited), time, command, np.ones(command.shape, bool))
-        paths.append(simulate([run])[0][:, 0])
+        paths.append(simulate([run])[0].position[:, 0])
     assert np.ptp(paths[0]) > 0.5
     assert max(np.abs(path - paths[0]).max() for path in paths[1:]) < 2e-4
 
@@ -146,7 +146,7 @@ def test_the_time_step_does_not_show():
         runs.append(Run(plant, time, command, np.ones(command.shape, dtype=bool), seed=3))
     for name, coarse, fine in zip(names, simulate(runs), simulate(runs, dt=1e-4), strict=True):
         # Under half the noise floor of 0.5 mrad.
-        assert np.sqrt(np.mean((coarse - fine) ** 2)) < 2e-4, name
+        assert np.sqrt(np.mean((coarse.position - fine.position) ** 2)) < 2e-4, name
 
 
 FINGER = FingerBody(
@@ -192,9 +192,9 @@ def test_the_finger_moves_as_in_another_engine(payload):
     time = np.arange(100) * 5e-3
     off = np.zeros((100, 3), dtype=bool)
     conditions = {"payload_kg": payload}
-    (path,) = simulate([Run(plant, time, np.tile(start, (100, 1)), off, conditions)], dt=1e-4)
-    assert np.ptp(path, axis=0).min() > 0.1
-    np.testing.assert_allclose(path, np.array(expected), atol=2e-3)
+    (moved,) = simulate([Run(plant, time, np.tile(start, (100, 1)), off, conditions)], dt=1e-4)
+    assert np.ptp(moved.position, axis=0).min() > 0.1
+    np.testing.assert_allclose(moved.position, np.array(expected), atol=2e-3)
 
 
 def test_too_stiff_a_spring_is_refused():

@@ -12,7 +12,6 @@ from sensed_world import state_of
 
 from vd.assets_usd.hands import load_hand
 from vd.assets_usd.objects.sets import load_set
-from vd.bench.cli import StudentCommand
 from vd.config import to_dict
 from vd.deploy.cli import main as vd_deploy
 from vd.deploy.loop.policy_runner import TrackingRunner
@@ -211,8 +210,6 @@ def test_a_former_name_is_refused_with_the_one_to_take(name, capsys, tmp_path):
     assert REPLACED[name] in capsys.readouterr().err
     assert vd_deploy([name, "--twin"]) == 1
     assert REPLACED[name] in capsys.readouterr().err
-    with pytest.raises(ValueError, match=REPLACED[name]):
-        StudentCommand(networks=("lean", name)).run()
 
 
 def test_what_has_no_checkpoints_does_not_speak_of_resuming(monkeypatch, capsys):

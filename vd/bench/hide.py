@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from vd.bench.hidden_finger import FingerBody
-from vd.bench.hidden_plant import OUTSIDE, Plant, Run, simulate, simulate_with_duty
+from vd.bench.hidden_plant import OUTSIDE, Motion, Plant, Run, simulate
 from vd.files import write_json
 from vd.gap.excitations import Excitation, JointRange, excitation_set
 from vd.gap.recording import BARE_MODELS, STIFFNESS, Recording, Trajectory, write_recording
@@ -51,6 +51,9 @@ INERTIA_SPREAD = math.log(2.0)
 
 COUPLING = "joint_coupling"
 """The effect that takes more than one joint."""
+
+BASE = ("kp", "kd", "velocity_limit", "inertia", "gravity_torque")
+"""Base parameters of a plant that the truth tells."""
 
 Effects = Mapping[str, Mapping[str, float]]
 
@@ -139,36 +142,16 @@ def effect_parameters(name: str) -> dict[str, float]:
     raise ValueError(f"unknown effect {name!r}; choose from {', '.join((*EFFECTS, *OUTSIDE))}")
 
 
-def hide(
-    model: str,
-    effects: Effects,
-    out: str | Path,
-    *,
-    seed: int = 0,
-    **options: Any,
-) -> Hidden:
-    """Write a recording in which effects are hidden, and the truth beside it as ``OUT.truth.json``.
-
-    Args:
-        model: A hand's name, ``servo`` or ``pendulum``.
-        effects: Name to parameter to value; absent parameters take typical values.
-        out: Folder to write.
-        seed: Of everything random.
-        options: Further fields of :class:`Hiding`.
+def hide(hiding: Hiding, out: str | Path) -> Hidden:
+    """Write a recording in which effects are hidden to ``out``, and the truth beside it, ``OUT.truth.json``.
 
     Raises:
         ValueError: An unknown model, joint, effect, parameter or excitation.
     """
-    (hidden,) = simulate_hidden([Hiding(model=model, effects=effects, seed=seed, **options)])
-    write_hidden(hidden, out)
-    return hidden
-
-
-def write_hidden(hidden: Hidden, out: str | Path) -> None:
-    """Write the recording to the folder ``out`` and the truth to ``OUT.truth.json`` beside it."""
-    out = Path(out)
-    write_recording(hidden.recording, out)
+    (hidden,) = simulate_hidden([hiding])
+    write_recording(hidden.recording, Path(out))
     write_json(truth_path(out), hidden.truth)
+    return hidden
 
 
 def truth_path(out: str | Path) -> Path:
@@ -190,23 +173,12 @@ def simulate_hidden(hidings: Sequence[Hiding]) -> list[Hidden]:
     runs = [run for session in sessions for run in session.runs]
     # Long trajectories with long ones: a batch runs as long as its longest.
     order = sorted(range(len(runs)), key=lambda i: runs[i].time[-1])
-    positions: dict[int, np.ndarray] = {}
-    duties: dict[int, np.ndarray] = {}
+    moved: dict[int, Motion] = {}
     for start in range(0, len(order), CHUNK):
         part = order[start : start + CHUNK]
-        chosen = [runs[i] for i in part]
-        if any(hiding.pwm for hiding in hidings):
-            for i, (position, duty) in zip(part, simulate_with_duty(chosen), strict=True):
-                positions[i], duties[i] = position, duty
-        else:
-            positions.update(zip(part, simulate(chosen), strict=True))
-    results, first = [], 0
-    for session in sessions:
-        own = range(first, first + len(session.runs))
-        told = [duties[i] for i in own] if session.hiding.pwm else None
-        results.append(session.finish([positions[i] for i in own], told))
-        first += len(session.runs)
-    return results
+        moved.update(zip(part, simulate([runs[i] for i in part]), strict=True))
+    motions = (moved[i] for i in range(len(runs)))
+    return [session.finish([next(motions) for _ in session.runs]) for session in sessions]
 
 
 class _Session:
@@ -236,12 +208,12 @@ class _Session:
             time[i] = max(time[i], time[i - 1] + SHORTEST_PERIOD_S)
         return np.round(time, 6)
 
-    def finish(self, positions: Sequence[np.ndarray], duties: Sequence[np.ndarray] | None = None) -> Hidden:
+    def finish(self, moved: Sequence[Motion]) -> Hidden:
         """Add noise and rounding; the recording and the truth."""
         hiding = self.hiding
         trajectories = []
-        for i, (motion, run, position) in enumerate(zip(self.motions, self.runs, positions, strict=True)):
-            noisy = position + self.rng.normal(0.0, hiding.noise_rad, position.shape)
+        for i, (motion, run, own) in enumerate(zip(self.motions, self.runs, moved, strict=True)):
+            noisy = own.position + self.rng.normal(0.0, hiding.noise_rad, own.position.shape)
             trajectories.append(
                 Trajectory(
                     file=f"{i:03d}_{motion.joints[0]}_{motion.name}.csv",
@@ -252,7 +224,7 @@ class _Session:
                     command=motion.command,
                     position=np.round(noisy / ENCODER_COUNT) * ENCODER_COUNT,
                     enabled=motion.enabled,
-                    pwm=None if duties is None else np.round(duties[i] * PWM_COUNTS) / PWM_COUNTS,
+                    pwm=np.round(own.duty * PWM_COUNTS) / PWM_COUNTS if hiding.pwm else None,
                 )
             )
         servo: dict[str, Any] = {"model": "test rig", "p_gain": self.plant.full_gain}
@@ -262,7 +234,7 @@ class _Session:
             Path(),
             hiding.model,
             self.plant.joints,
-            servo if duties is None else {**servo, "pwm_full_scale": PWM_COUNTS},
+            {**servo, "pwm_full_scale": PWM_COUNTS} if hiding.pwm else servo,
             ENCODER_COUNT,
             tuple(trajectories),
         )
@@ -276,13 +248,7 @@ class _Session:
             "seed": hiding.seed,
             "noise_floor_rad": noise_floor(hiding.noise_rad),
             "mass_spread": hiding.mass_spread,
-            "base": {
-                "kp": _by_joint(plant, plant.kp),
-                "kd": _by_joint(plant, plant.kd),
-                "velocity_limit": _by_joint(plant, plant.velocity_limit),
-                "inertia": _by_joint(plant, plant.inertia),
-                "gravity_torque": _by_joint(plant, plant.gravity_torque),
-            },
+            "base": {name: _by_joint(plant, getattr(plant, name)) for name in BASE},
             "effects": {
                 name: {
                     "joints": list(_effect_joints(hiding, name, plant.joints)),
