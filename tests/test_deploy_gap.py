@@ -79,7 +79,7 @@ def test_a_late_command_of_the_twin_is_named(tmp_path, monkeypatch):
 
     @contextlib.contextmanager
     def connect(_, twin_options=()):
-        plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=1920.0))
+        plant = NewtonHand(load_hand("dclaw4", layer=layer), joints, SimCfg(physics_hz=960.0))
         with simulated_bus(hand, joints, plant) as (_, bus):
             yield Connection(hand, joints, bus)
 

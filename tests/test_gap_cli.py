@@ -9,42 +9,23 @@ import sys
 
 import numpy as np
 import pytest
+from gap_reports import BASE, FRICTION, JOINT, base_columns, rubbing_servo, servo_report
 
 from vd.assets_usd.hand_data import HandError
 from vd.assets_usd.hand_layer import read_bare_layer
-from vd.bench.hide import Hiding, hide
 from vd.gap import cli, steps
 from vd.gap.chain import chains
 from vd.gap.close import counterparts, simulate_again, write_identified
 from vd.gap.plan import discard_plan, plan, write_plan
 from vd.gap.recording import read_recording
-from vd.gap.result import (
-    Candidate,
-    Estimate,
-    Fit,
-    HeldOut,
-    JointGap,
-    NamedEffect,
-    Predictions,
-    Report,
-    Source,
-    TrajectoryError,
-)
-from vd.gap.rollout import Rollouts
+from vd.gap.result import Candidate, Report
 from vd.kernels.servo import actuators
-
-JOINT = "joint"
-FLOOR = 1e-3
-BASE = {"kp": 3.0, "kd": 0.3, "velocity_limit": 7.0, "inertia": 2e-3}
-FRICTION = 0.15
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
     """A bare servo with friction."""
-    folder = tmp_path_factory.mktemp("recordings") / "servo"
-    hide(Hiding("servo", {"coulomb_friction": {"tau_c_nm": FRICTION}}, seed=3, base_spread=0.0), folder)
-    return folder
+    return rubbing_servo(tmp_path_factory.mktemp("recordings") / "servo")
 
 
 @pytest.mark.parametrize("command", ["run", "identify"])
@@ -61,71 +42,6 @@ def test_a_recording_that_cannot_be_used_is_refused_before_warp_is_imported(reco
     said = subprocess.run(arguments, capture_output=True, text=True, timeout=120).stderr
     assert "cut the file there" in said and table.name in said
     assert said.endswith("2 False\n") and not (tmp_path / "out").exists()
-
-
-def servo_curves(folder, rows):
-    """Curves of rows (baseline, identified), each {column: value} on the fitted base."""
-    found = read_recording(folder)
-    (chain,) = chains(found, None)
-    models = np.tile(chain.start_row, (2, 1, 1))
-    for model, values in zip(models, rows, strict=True):
-        for column, value in {**base_columns(), **values}.items():
-            model[0, column] = value
-    rollouts = Rollouts(chain, found)
-    predicted = rollouts.predict(models)
-    return Predictions(
-        time=rollouts.time,
-        trajectory=rollouts.sample_trajectory,
-        command=np.concatenate([t.command for t in found.trajectories]),
-        measured=rollouts.measured,
-        baseline=predicted[0].astype(float),
-        identified=predicted[1].astype(float),
-        joints=found.joints,
-        files=tuple(t.file for t in found.trajectories),
-    )
-
-
-def base_columns():
-    return {
-        actuators.KP: BASE["kp"],
-        actuators.KD: BASE["kd"],
-        actuators.VELOCITY_LIMIT: BASE["velocity_limit"],
-        actuators.INERTIA: BASE["inertia"],
-    }
-
-
-def servo_report(folder, *, verdict="effects", ambiguous=()):
-    """What a fit might say about the recording, and its curves."""
-    curves = servo_curves(folder, ({}, {actuators.COULOMB_TORQUE: FRICTION}))
-    before = float(np.sqrt(np.mean((curves.baseline - curves.measured) ** 2)))
-    after = float(np.sqrt(np.mean((curves.identified - curves.measured) ** 2)))
-    friction = NamedEffect(
-        "coulomb_friction", (JOINT,), 0.98, {"tau_c_nm": Estimate(FRICTION, (0.14, 0.16), "N m")}
-    )
-    decision = "named" if verdict == "effects" else "tied"
-    names = {"coulomb_friction": {"tau_c_nm": FRICTION}, "backlash": {"width_rad": 0.08}}
-    report = Report(
-        verdict=verdict,
-        noise_floor_rad=FLOOR,
-        baseline=Fit(before, {JOINT: before}, before, {JOINT: BASE}),
-        findings=(),
-        effects=(friction,) if verdict == "effects" else (),
-        ambiguous=ambiguous,
-        identified=Fit(after, {JOINT: after}, after, {JOINT: BASE}),
-        held_out=HeldOut(curves.files, before, after, 1.0 - after / before, (0.5, 0.9)),
-        next_experiment="",
-        seconds=1.0,
-        recording=Source(str(folder), "servo", (JOINT,), len(curves.files), len(curves.time), 40.0),
-        joints=(
-            JointGap(JOINT, FLOOR, before, (0.0, 1.0), after, (0.0, 1.0), verdict, "made up", ambiguous),
-        ),
-        evidence=tuple(
-            Candidate((JOINT,), 1, name, after, 0.8, (0.7, 0.9), decision, "made up", values)
-            for name, values in names.items()
-        ),
-        trajectories=tuple(TrajectoryError(file, file, JOINT, True, before, after) for file in curves.files),
-    )
-    return report, curves
 
 
 @pytest.fixture
@@ -301,9 +217,7 @@ def test_plan_chooses_motions_that_separate_friction_from_backlash(recording, tm
 def test_plan_does_not_explain_two_rivals_away_together(tmp_path):
     """Friction and a dead zone leave the same errors at one gain; at others they cannot both be right."""
     friction = 0.015
-    hide(
-        Hiding("servo", {"coulomb_friction": {"tau_c_nm": friction}}, seed=3, base_spread=0.0), tmp_path / "r"
-    )
+    rubbing_servo(tmp_path / "r", friction)
     names = ("coulomb_friction", "dead_zone")
     report, _ = servo_report(tmp_path / "r", verdict="ambiguous", ambiguous=(names,))
     values = ({"tau_c_nm": friction}, {"width_rad": 2.0 * friction / BASE["kp"]})

@@ -45,7 +45,12 @@ class Observer:
         self.symmetry_frames = ChosenFrames(state, self.all_values) if cfg.view != "world" else None
         if self.symmetry_frames is not None:
             self.world_values = self.symmetry_frames.observation
-        self.shapes = ShapeObserver(state) if shapes else None
+        self.shapes: ShapeObserver | None = None
+        if shapes:
+            scene, tips = state.scene, state.fingers
+            self.shapes = ShapeObserver(
+                state.objects, scene.world_object, scene.world_scale, tips.tip_body, tips.tip_offset
+            )
         slices = teacher_observation_slices(state.num_fingers)
         self._pose_columns = [slices["object_position"].start, slices["relative_orientation"].start]
         self._action_column = slices["previous_action"].start
@@ -130,7 +135,9 @@ class Observer:
         )
         if "shape" in self.parts:
             assert self.shapes is not None
-            self.shapes.launch(seen, out)
+            _, _, joint_q, _, body_q, _ = seen
+            first = self.parts["shape"].start
+            self.shapes.observe(joint_q, state.num_actions, body_q, state.goal_quat, out, first)
 
     @property
     def _remembered(self) -> list[int]:
