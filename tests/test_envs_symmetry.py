@@ -111,7 +111,7 @@ def test_mirrored_worlds_look_and_move_the_same():
     cfg = dataclasses.replace(CFG, observation=ObservationCfg(shape="full", view="mirrored"))
     env = ReorientEnv(cfg, "cpu")
     state, before, action, after = moved(env)
-    points = env.observer.shapes.points  # drawn at random, so that theirs is another cuboid
+    points = env.state.surface_points  # drawn at random, so that theirs is another cuboid
     surface = points.numpy().copy()
     tips = load_hand("dclaw3").tip_poses(np.zeros(9))
     azimuth = np.arctan2(tips[:, 1], -tips[:, 0])  # the base is upside down, turned about y

@@ -63,13 +63,9 @@ class SimCommand:
         return 0
 
 
-RESTITUTIONS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-"""Coefficients asked for when the map to rebounds is measured."""
-
-
 @dataclass(frozen=True)
 class PhysicsCommand:
-    """Contact quality: objects at rest, a pinched cube, sliding against Coulomb's law, a bouncing ball."""
+    """Contact quality: objects at rest, a pinched cube."""
 
     objects: tuple[str, ...] = ("procedural-150-seed0",)
     """Object sets to drop on the table."""
@@ -84,22 +80,18 @@ class PhysicsCommand:
         """Measure and print."""
         quiet_warp()
         from vd.assets_usd.objects.sets import load_set
-        from vd.bench.physics import bounce, pinch, rest, slide
+        from vd.bench.physics import pinch, rest
         from vd.sim.cfg import SimCfg
 
         cfg = SimCfg()
         results = rest(load_set(list(self.objects)), cfg, device=self.device, seed=self.seed)
         moving = [r for r in results if not r.rests]
-        measured, coulomb = slide(cfg, device=self.device)
         row = {
             "objects": len(results),
             "at_rest_share": 1.0 - len(moving) / len(results),
             "deepest_contact_m": max(r.penetration for r in results),
             "moving": [dataclasses.asdict(r) for r in moving],
             "pinch": dataclasses.asdict(pinch(load_set("cube")[0], cfg, device=self.device)),
-            "slide_m": measured,
-            "slide_coulomb_m": coulomb,
-            "bounce": [dataclasses.asdict(bounce(cfg, e, device=self.device)) for e in RESTITUTIONS],
         }
         report([row], self.device, self.json)
         return 0

@@ -25,7 +25,6 @@ from vd.bench.gap_sizes import GAPS, showing
 from vd.bench.hidden_plant import OUTSIDE
 from vd.bench.hide import hide
 from vd.files import make_folder, write_json
-from vd.gap.recording import BARE_MODELS
 from vd.versions import source_commit
 from vd.warp_quiet import quiet_warp
 from vd.workers import run_tasks
@@ -114,16 +113,17 @@ def run_case(case: Case, folder: Path, device: str = "cpu", keep: bool = False) 
     """
     from vd.assets_usd.hands import load_hand
     from vd.gap import workflow
+    from vd.gap.torque_unit import in_known_unit
 
     quiet_warp()
     work, begin = folder / "work" / case.name, time.process_time()
     try:
         hidden = hide(case.hiding(), work / "recording")
-        hand = None if case.model in BARE_MODELS else load_hand(case.model)
+        hand = load_hand(case.model) if case.model in HANDS else None
         report = workflow.explain(
             work / "recording", hand, work / "analysis", seed=case.seed, device=device, workers=1
         )
-        result = score(case, report.to_dict(), hidden.truth)
+        result = score(case, in_known_unit(report, hidden.recording).to_dict(), hidden.truth)
     except Exception:  # one case that fails is a figure of the battery, not its end
         result = {"case": asdict(case), "error": traceback.format_exc(limit=6)}
     result |= {"commit": source_commit(), "cpu_s": time.process_time() - begin}

@@ -12,7 +12,6 @@ import numpy as np
 from vd.bench.gap_sizes import sized_effect
 from vd.bench.hidden_plant import CABLE, COGGING, WARMING
 from vd.bench.hide import Hiding
-from vd.gap.recording import BARE_MODELS
 from vd.kernels.servo.effects import EFFECTS, TOGETHER, equivalent
 
 KINDS = ("single", "none", "pair", "outside")
@@ -77,7 +76,7 @@ class Case:
 
 
 def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> dict[str, Any]:
-    """Compare a report (``vd-gap-report/1``) with the truth.
+    """Compare a report (``vd-gap-report/1``), in the truth's unit of torque, with the truth.
 
     Returns:
         The case; verdict; names and sets given; which are right and wrong; gaps in noise floors; relative
@@ -118,7 +117,7 @@ def score(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> di
         "gap": _ratio(report["baseline"]["rmse_rad"], floor),
         "left": _ratio(held_out["identified_rmse_rad"], floor),
         "shrunk": _ratio(held_out["baseline_rmse_rad"], held_out["identified_rmse_rad"]),
-        "parameters": _parameters(case, report, truth),
+        "parameters": _parameters(report, truth),
         "seconds": report["seconds"],
     }
 
@@ -127,16 +126,15 @@ def _ratio(a: float | None, b: float | None) -> float | None:
     return a / b if a is not None and b else None
 
 
-def _parameters(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any]) -> list[dict[str, Any]]:
+def _parameters(report: Mapping[str, Any], truth: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Relative error and coverage of every parameter of every effect named rightly, joint by joint."""
     rows = []
     for effect in report["effects"]:
         hidden = truth["effects"].get(effect["name"])
         if hidden is None or effect["name"] not in EFFECTS:
             continue
-        units = {p.name: p.unit for p in EFFECTS[effect["name"]].parameters}
         for joint, (key, estimate) in itertools.product(effect["joints"], effect["parameters"].items()):
-            true = hidden["parameters"][key][joint] * _torque_unit(case, report, truth, joint, units[key])
+            true = hidden["parameters"][key][joint]
             low, high = estimate["ci95"]
             if not true or estimate["value"] is None:
                 continue  # a parameter that is not hidden has no relative error
@@ -149,22 +147,6 @@ def _parameters(case: Case, report: Mapping[str, Any], truth: Mapping[str, Any])
                 }
             )
     return rows
-
-
-def _torque_unit(
-    case: Case, report: Mapping[str, Any], truth: Mapping[str, Any], joint: str, unit: str
-) -> float:
-    """True torques in the report's unit of torque.
-
-    Of a bare servo every torque is known up to one factor only, and the fit holds the stiffness at its
-    nominal value; the other torques follow.
-    """
-    if case.model not in BARE_MODELS or not ("N m" in unit or "kg" in unit):
-        return 1.0
-    factor = report["identified"]["parameters"][joint].get("kp", math.nan) / truth["base"]["kp"][joint]
-    if not math.isfinite(factor):
-        return 1.0
-    return 1.0 / factor if unit == "1/(N m)" else factor
 
 
 def said(result: Mapping[str, Any]) -> str:

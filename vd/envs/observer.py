@@ -47,10 +47,8 @@ class Observer:
             self.world_values = self.symmetry_frames.observation
         self.shapes: ShapeObserver | None = None
         if shapes:
-            scene, tips = state.scene, state.fingers
-            self.shapes = ShapeObserver(
-                state.objects, scene.world_object, scene.world_scale, tips.tip_body, tips.tip_offset
-            )
+            items = state.surface_points, state.world_object, state.world_scale
+            self.shapes = ShapeObserver(*items, state.fingers.tip_body, state.fingers.tip_offset)
         slices = teacher_observation_slices(state.num_fingers)
         self._pose_columns = [slices["object_position"].start, slices["relative_orientation"].start]
         self._action_column = slices["previous_action"].start

@@ -3,13 +3,10 @@
 N environments, D joints, F fingers, B bodies. World frame: z up; metres, quaternions xyzw.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import warp as wp
 
-from vd.assets_usd.objects.model import ObjectModel
 from vd.kernels.task.shapes import (
     ORIENTATIONS,
     clearance_kernel,
@@ -25,27 +22,23 @@ class ShapeObserver:
     """Writes the values of ``vd.kernels.task.shapes``, and how high the objects are.
 
     Args:
-        objects: The objects.
+        points: Samples of each object's surface in its frame, unscaled [m], shape [K, P].
         world_object: Object of each environment, shape [N].
-        world_scale: Size factor of each environment's object, shape [N].
-        tip_body: Link of each fingertip, int32 [F].
-        tip_offset: Fingertip frames in the frames of their links, transform [F].
+        world_scale: Factor on its size, shape [N].
+        tip_body: Link of each fingertip, shape [F].
+        tip_offset: Fingertip frames in the frames of their links, shape [F].
     """
 
     def __init__(
         self,
-        objects: Sequence[ObjectModel],
-        world_object: np.ndarray,
-        world_scale: np.ndarray,
+        points: wp.array,
+        world_object: wp.array,
+        world_scale: wp.array,
         tip_body: wp.array,
         tip_offset: wp.array,
     ):
-        device = self._device = tip_body.device
-        surfaces = np.stack([item.surface_points for item in objects])
-        self.points = wp.array(surfaces, dtype=wp.vec3, device=device)
-        """Surface points of the objects, object frame [m]."""
-        item = wp.array(world_object, dtype=wp.int32, device=device)
-        self._shapes = [self.points, item, wp.array(world_scale, dtype=float, device=device)]
+        device = self._device = points.device
+        self._shapes = [points, world_object, world_scale]
         self._tips, fingers = [tip_body, tip_offset], len(tip_body)
         self._directions = wp.array(extent_directions(fingers), dtype=wp.vec3, device=device)
         self._slices = shape_observation_slices(fingers)

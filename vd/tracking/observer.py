@@ -94,8 +94,13 @@ class Observer:
         self._columns = teacher_observation_slices(hand.num_fingers)
         self._size, state = num_observations, teacher_observation_size(hand.num_fingers)
         self._columns["shape"] = slice(state, num_observations)
-        tips = array(hand.tip_link, wp.int32), array(hand.tip_frame, wp.transform)
-        self._shapes = ShapeObserver(objects, world_object, world_scale, *tips)
+        self._shapes = ShapeObserver(
+            array(np.stack([item.surface_points for item in objects]), wp.vec3),
+            array(world_object, wp.int32),
+            array(world_scale, float),
+            array(hand.tip_link, wp.int32),
+            array(hand.tip_frame, wp.transform),
+        )
         known = torch.ones(num_observations, device=place)
         for name in UNSEEN:
             known[self._columns[name]] = 0.0
