@@ -11,10 +11,10 @@ from vd.bench.hidden_plant import FULL_DUTY_RAD, OUTSIDE
 from vd.bench.hide import (
     ENCODER_COUNT,
     FULL_P_GAIN,
+    NOISE_FLOOR_RAD,
     Hiding,
     effect_parameters,
     hide,
-    noise_floor,
     parse_effect,
     simulate_hidden,
     truth_path,
@@ -90,18 +90,17 @@ def test_seeds_repeat_and_differ_alone_and_in_batches():
     assert one.truth["base"] != other.truth["base"]
 
 
-def test_the_noise_is_the_stated_floor():
-    quiet, noisy = (
-        simulate_hidden([Hiding("servo", seed=1, noise_rad=noise, jitter_s=0.0)])[0] for noise in (0.0, 3e-4)
-    )
-    slow = [i for i, t in enumerate(quiet.recording.trajectories) if t.excitation.startswith("sine")]
-    for hidden, noise in ((quiet, 0.0), (noisy, 3e-4)):
-        assert hidden.truth["noise_floor_rad"] == pytest.approx(noise_floor(noise))
-    differences = [noisy.recording.trajectories[i].position - quiet.recording.trajectories[i].position
-                   for i in slow]  # fmt: skip
-    both = np.concatenate(differences).std()
+def test_the_noise_is_the_stated_floor(monkeypatch):
+    def readings():
+        (hidden,) = simulate_hidden([Hiding("servo", seed=1)])
+        assert hidden.truth["noise_floor_rad"] == NOISE_FLOOR_RAD
+        motions = hidden.recording.trajectories
+        return np.concatenate([t.position for t in motions if t.excitation.startswith("sine")])
+
+    noisy = readings()
+    monkeypatch.setattr("vd.bench.hide.NOISE_RAD", 0.0)
     # Both are rounded, one is noisy: the variances of two roundings and of the noise, not quite independent.
-    assert noise_floor(3e-4) < both < np.sqrt(2.0) * noise_floor(3e-4)
+    assert NOISE_FLOOR_RAD < (noisy - readings()).std() < np.sqrt(2.0) * NOISE_FLOOR_RAD
 
 
 def test_a_finger_is_recorded_by_name():

@@ -23,6 +23,8 @@ ENCODER_COUNT = 2.0 * math.pi / 4096
 """Twelve bits a turn, as of Dynamixel X and Feetech STS servos [rad]."""
 NOISE_RAD = 3.0e-4
 """Standard deviation of the reading before it is rounded to counts [rad]."""
+NOISE_FLOOR_RAD = math.hypot(NOISE_RAD, ENCODER_COUNT / math.sqrt(12.0))
+"""Standard deviation of a reading about the true position: noise, and rounding to counts [rad]."""
 STAMP_JITTER_S = 1.0e-3
 """Standard deviation of the sampling instants about the regular ones [s]; the stamps tell them."""
 SHORTEST_PERIOD_S = 1.0e-3
@@ -69,8 +71,6 @@ class Hiding:
         joints: Joints recorded; empty: the first finger, or the one joint of a bare model.
         effect_joints: Joints that have the effect; absent or empty: all.
         excitations: Sets of :data:`vd.gap.excitations.MENU`.
-        noise_rad: Noise of readings before rounding [rad].
-        jitter_s: Jitter of the sampling instants [s].
         base_spread: Spread of stiffness, damping and speed limit about the hand's; 0: exactly the hand's.
         mass_spread: Spread of the finger's masses and inertias about the hand's.
         pwm: Record the duty cycle as well.
@@ -82,8 +82,6 @@ class Hiding:
     joints: tuple[str, ...] = ()
     effect_joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     excitations: tuple[str, ...] = ("steps_and_sines",)
-    noise_rad: float = NOISE_RAD
-    jitter_s: float = STAMP_JITTER_S
     base_spread: float = BASE_SPREAD
     mass_spread: float = 0.0
     pwm: bool = False
@@ -201,7 +199,7 @@ class _Session:
 
     def _stamps(self, motion: Excitation) -> np.ndarray:
         """The instants at which commands are written and positions read [T] [s], from 0."""
-        time = motion.time + self.rng.normal(0.0, self.hiding.jitter_s, len(motion.time))
+        time = motion.time + self.rng.normal(0.0, STAMP_JITTER_S, len(motion.time))
         time[0] = 0.0
         # Late ones push the next; as many digits as are written, so that readers see the same stamps.
         for i in range(1, len(time)):
@@ -213,7 +211,7 @@ class _Session:
         hiding = self.hiding
         trajectories = []
         for i, (motion, run, own) in enumerate(zip(self.motions, self.runs, moved, strict=True)):
-            noisy = own.position + self.rng.normal(0.0, hiding.noise_rad, own.position.shape)
+            noisy = own.position + self.rng.normal(0.0, NOISE_RAD, own.position.shape)
             trajectories.append(
                 Trajectory(
                     file=f"{i:03d}_{motion.joints[0]}_{motion.name}.csv",
@@ -246,7 +244,7 @@ class _Session:
             "format": "vd-hidden/1",
             "model": hiding.model,
             "seed": hiding.seed,
-            "noise_floor_rad": noise_floor(hiding.noise_rad),
+            "noise_floor_rad": NOISE_FLOOR_RAD,
             "mass_spread": hiding.mass_spread,
             "base": {name: _by_joint(plant, getattr(plant, name)) for name in BASE},
             "effects": {
@@ -257,11 +255,6 @@ class _Session:
                 for name, parameters in plant.effects.items()
             },
         }
-
-
-def noise_floor(noise_rad: float = NOISE_RAD, count_rad: float = ENCODER_COUNT) -> float:
-    """Standard deviation of a reading about the true position [rad]: noise, and rounding to counts."""
-    return math.hypot(noise_rad, count_rad / math.sqrt(12.0))
 
 
 def _by_joint(plant: Plant, values: np.ndarray) -> dict[str, float]:
