@@ -109,14 +109,6 @@ def test_tables_leave_their_share_of_worlds_in_time():
     assert (after[lost] < before[lost] - 0.02).all() and np.allclose(after[~lost], before[~lost], atol=2e-3)
 
 
-def test_environments_that_must_lift_are_those_that_lose_their_table_first():
-    cfg = ReorientCfg(num_envs=1000, table=TableCfg(away_share=0.3, away_s=(1.0, 3.0), lift_share=0.5))
-    steps, lift = table_steps(cfg), must_lift(cfg) == 1
-    away = steps < ALWAYS
-    assert away.sum() == 300 and steps[away].min() == 12 and steps[away].max() == 36
-    assert lift.sum() == 500 and lift[away].all()
-
-
 def test_a_goal_on_the_table_counts_only_where_nothing_is_to_be_lifted():
     """Objects at rest on the table, each at its goal: half of the environments must lift theirs."""
     loose = SuccessCfg(rotation_rad=4.0, joint_speed_rad_s=0.0, action_norm=0.0)

@@ -15,7 +15,7 @@ from vd.assets_usd.hand_data import HandError
 from vd.assets_usd.hand_layer import read_bare_layer
 from vd.gap import cli, steps
 from vd.gap.chain import chains
-from vd.gap.close import counterparts, simulate_again, write_identified
+from vd.gap.close import simulate_again, write_identified
 from vd.gap.plan import discard_plan, plan, write_plan
 from vd.gap.recording import read_recording
 from vd.gap.result import Candidate, Report
@@ -250,9 +250,3 @@ def test_plan_for_motions_that_show_too_little(recording):
     assert tuple(result.competing) == (JOINT,)
     assert "what these motions do not show" in result.sentence
     assert slow.trajectories[0].excitation not in {motion.name for motion in result.motions}
-
-
-def test_other_fingers_take_the_model_of_the_recorded_one():
-    joints = tuple(f"f{f}_j{j}" for f in range(3) for j in (1, 2, 3))
-    found = counterparts(joints, ("f1_j1", "f1_j3"))
-    assert found == {"f0_j1": "f1_j1", "f2_j1": "f1_j1", "f0_j3": "f1_j3", "f2_j3": "f1_j3"}
