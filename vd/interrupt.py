@@ -40,7 +40,7 @@ GONE = {
     "--ppo.optimizer": "Adam is the only one",
     "--agent": "name zero or random in place of a policy",
     "--allegro": "the comparison is in docs/results.md",
-    "--shard": "give each machine seeds of its own, --first-seed",
+    "--shard": "give each machine other --kinds",
     "--collect": "give the same command again: it runs what is missing and prints the tables",
     "--second-view": "symmetry-view selection gained too little (docs/lessons.md)",
 }

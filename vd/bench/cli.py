@@ -151,7 +151,8 @@ class ReplayCommand:
 class GapCommand:
     """The battery of vd-gap: effects hidden in recordings, found or not, and the figures of the goals.
 
-    One result file per case: run it again to go on.
+    One result file per case: run it again to go on. Several machines take different kinds; once their files
+    are together, a run of all kinds prints the tables.
     """
 
     out: Path = Path("runs/gap-battery")
@@ -168,7 +169,7 @@ class GapCommand:
     """Recordings of each effect and size; 40 times as many with nothing hidden, or only another stiffness,
     damping or mass."""
     first_seed: int = 0
-    """Seed of the first recording: others than those that the method was tuned on, or of other machines."""
+    """Seed of the first recording: others than those that the method was tuned on."""
     cases: int | None = None
     """Run this many of the cases, a fair sample; all by default."""
     jobs: int = 1
