@@ -47,7 +47,10 @@ class Observer:
         self.symmetry_frames = ChosenFrames(state, self.all_values) if cfg.view != "world" else None
         if self.symmetry_frames is not None:
             self.world_values = self.symmetry_frames.observation
-        self.shapes = ShapeObserver(state) if shapes else None
+        self.shapes: ShapeObserver | None = None
+        if shapes:
+            items = state.surface_points, state.world_object, state.world_scale
+            self.shapes = ShapeObserver(*items, state.fingers.tip_body, state.fingers.tip_offset)
         slices = teacher_observation_slices(state.num_fingers)
         self._pose_columns = [slices["object_position"].start, slices["relative_orientation"].start]
         self._action_column = slices["previous_action"].start
@@ -133,7 +136,9 @@ class Observer:
         )
         if "shape" in self.parts:
             assert self.shapes is not None
-            self.shapes.launch(seen, out)
+            _, _, joint_q, _, body_q, _ = seen
+            first = self.parts["shape"].start
+            self.shapes.observe(joint_q, state.num_actions, body_q, state.goal_quat, out, first)
 
     @property
     def _remembered(self) -> list[int]:

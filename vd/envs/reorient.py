@@ -282,7 +282,7 @@ class ReorientEnv:
             sim.put_back(self.step_count, self.max_episode_steps - 1)
         self.fingers.measure(self.randomiser.kp, self.randomiser.kd)
         if self._lifts and self.observer.shapes is not None:
-            self.observer.shapes.measure_clearance(self.clearance)
+            self.observer.shapes.measure_clearance(sim.joint_q, self.num_actions, self.clearance)
         self._judge()
         self._end_episodes()
         self._launch(record_step_kernel, [sim.joint_q, self.num_actions], [self.object_pose_end])

@@ -2,7 +2,7 @@
 
 MuJoCo's contacts are damped springs, not impulses. A spring of damping ratio z throws back with
 e = exp(-pi z / sqrt(1 - z^2)) of the speed; here z is lowered at equal stiffness, so that an object at rest
-sinks in as before. Two limits, both measured by ``vd-bench physics``:
+sinks in as before. Two limits (``tests/test_sim_physics.py``):
 
 * z is at least :data:`LOWEST_RATIO`. A contact lasts six physics steps, and with less damping sampling alone
   could add energy.
